@@ -1,0 +1,61 @@
+"""One RGB-D frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ms_slam_env.errors import InputError
+
+_LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
+
+
+@dataclass(frozen=True)
+class RGBDFrame:
+    """Registered colour and depth of one instant.
+
+    Attributes:
+        color: (H, W, 3) uint8, RGB.
+        depth: (H, W) float32, metres along the optical axis; 0 = no reading.
+        timestamp: seconds.
+
+    Raises:
+        InputError: wrong shapes or types, NaN, infinite or negative depth.
+    """
+
+    color: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    timestamp: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse frames that would poison what follows."""
+        if self.color.ndim != 3 or self.color.shape[2] != 3 or self.color.dtype != np.uint8:
+            raise InputError(
+                f"color must be (H, W, 3) uint8, got {self.color.shape} {self.color.dtype}"
+            )
+        if self.depth.ndim != 2 or self.depth.shape != self.color.shape[:2]:
+            raise InputError(
+                f"depth must have the shape of color {self.color.shape[:2]}, got {self.depth.shape}"
+            )
+        if not np.isfinite(self.depth).all():
+            raise InputError("depth holds NaN or infinite values; 0 means no reading")
+        if (self.depth < 0).any():
+            raise InputError("depth holds negative values; 0 means no reading")
+
+
+def intensity_image(image: ArrayLike) -> NDArray[np.uint8]:
+    """Grey image (H, W) uint8 of a colour image (H, W, 3) uint8 (BT.601); grey passes through.
+
+    Raises:
+        InputError: another shape or type.
+    """
+    array = np.asarray(image)
+    if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3):
+        raise InputError(f"an image must be (H, W) or (H, W, 3), got {array.shape}")
+    if array.dtype != np.uint8:
+        raise InputError(f"an image must be uint8, got {array.dtype}")
+    if array.ndim == 2:
+        return array
+    return np.rint(array.astype(np.float32) @ _LUMA).astype(np.uint8)

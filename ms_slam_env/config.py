@@ -1,0 +1,62 @@
+"""Frozen-dataclass configuration: built from nested mappings, misspelt keys refused at any depth."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, TypeVar, get_type_hints
+
+from ms_slam_env.errors import InputError, unknown
+
+T = TypeVar("T")
+
+
+def from_dict(cls: type[T], values: Mapping[str, Any], path: str = "") -> T:
+    """Build dataclass ``cls`` from a nested mapping.
+
+    Args:
+        cls: a dataclass; fields that are themselves dataclasses take nested mappings.
+        values: field name to value; missing fields keep their default.
+        path: dotted prefix used in error messages.
+
+    Raises:
+        InputError: an unknown key at any depth (the message lists the valid ones), or a value
+            that the dataclass itself refuses.
+    """
+    fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    hints = get_type_hints(cls)
+    arguments: dict[str, Any] = {}
+    for key, value in values.items():
+        where = f"{path}.{key}" if path else str(key)
+        if key not in fields:
+            raise unknown(f"option of {cls.__name__}", where, fields)
+        hint = hints[key]
+        if dataclasses.is_dataclass(hint) and isinstance(value, Mapping):
+            value = from_dict(hint, value, where)  # type: ignore[arg-type]
+        arguments[key] = value
+    return cls(**arguments)
+
+
+def check_range(owner: object, name: str, low: float, high: float) -> None:
+    """Refuse ``owner.name`` outside [low, high]; NaN is outside every range.
+
+    Raises:
+        InputError: naming the class, the field, its value and the permitted range.
+    """
+    value = getattr(owner, name)
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not is_number or not low <= value <= high:
+        raise InputError(
+            f"{type(owner).__name__}.{name} = {value!r} is outside [{low:g}, {high:g}]"
+        )
+
+
+def check_choice(owner: object, name: str, choices: tuple[str, ...]) -> None:
+    """Refuse a value of ``owner.name`` that is not one of ``choices``.
+
+    Raises:
+        InputError: listing the valid choices.
+    """
+    value = getattr(owner, name)
+    if value not in choices:
+        raise unknown(f"{type(owner).__name__}.{name}", value, choices)

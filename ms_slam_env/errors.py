@@ -1,0 +1,15 @@
+"""Errors that name the offending thing and the valid choices."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+
+class InputError(ValueError):
+    """A value given by the user is wrong; the message is one line fit to be shown as it is."""
+
+
+def unknown(kind: str, name: object, choices: Iterable[object]) -> InputError:
+    """Return the error for an unknown ``name`` of some ``kind``, listing the valid ``choices``."""
+    valid = ", ".join(str(choice) for choice in choices)
+    return InputError(f"unknown {kind} {str(name)!r}; valid choices: {valid}")

@@ -1,0 +1,29 @@
+"""Rigid motions: SO(3) and SE(3) maps, quaternions, pose checks."""
+
+from ms_slam_env.geometry.pose import (
+    check_pose,
+    invert,
+    look_at,
+    make_pose,
+    pose_from_quaternion,
+    quaternion_from_pose,
+    relative_angle,
+    transform_points,
+)
+from ms_slam_env.geometry.so3 import hat, se3_exp, se3_log, so3_exp, so3_log
+
+__all__ = [
+    "check_pose",
+    "hat",
+    "invert",
+    "look_at",
+    "make_pose",
+    "pose_from_quaternion",
+    "quaternion_from_pose",
+    "relative_angle",
+    "se3_exp",
+    "se3_log",
+    "so3_exp",
+    "so3_log",
+    "transform_points",
+]

@@ -1,0 +1,96 @@
+"""Poses as (4, 4) float64 matrices; ``T_a_b`` maps points of frame b into frame a."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from ms_slam_env.errors import InputError
+
+Array = NDArray[np.float64]
+
+
+def check_pose(T: ArrayLike, name: str = "pose") -> Array:
+    """Return ``T`` as float64 (4, 4) after checking that it is a rigid motion.
+
+    Raises:
+        InputError: wrong shape, a value that is not finite, or a rotation part that is not
+            orthonormal to 1e-4 with determinant +1.
+    """
+    matrix = np.asarray(T, dtype=np.float64)
+    if matrix.shape != (4, 4):
+        raise InputError(f"{name} must have shape (4, 4), got {matrix.shape}")
+    if not np.isfinite(matrix).all():
+        raise InputError(f"{name} holds a value that is not finite")
+    R = matrix[:3, :3]
+    is_rigid = (
+        np.allclose(R @ R.T, np.eye(3), atol=1e-4)
+        and np.linalg.det(R) > 0
+        and np.allclose(matrix[3], [0, 0, 0, 1])
+    )
+    if not is_rigid:
+        raise InputError(f"{name} is not a rigid motion (rotation part not orthonormal)")
+    return matrix
+
+
+def make_pose(R: ArrayLike, t: ArrayLike) -> Array:
+    """Return the (4, 4) rigid motion [R | t] of a rotation (3, 3) and a translation (3,) in m."""
+    T = np.eye(4)
+    T[:3, :3] = R
+    T[:3, 3] = t
+    return T
+
+
+def invert(T: ArrayLike) -> Array:
+    """Inverse of rigid motions (..., 4, 4) without a general matrix inversion."""
+    matrix = np.asarray(T, dtype=np.float64)
+    inverse = np.zeros_like(matrix)
+    R_transposed = np.swapaxes(matrix[..., :3, :3], -1, -2)
+    inverse[..., :3, :3] = R_transposed
+    inverse[..., :3, 3] = -np.einsum("...ij,...j->...i", R_transposed, matrix[..., :3, 3])
+    inverse[..., 3, 3] = 1.0
+    return inverse
+
+
+def transform_points(T_a_b: ArrayLike, points_b: ArrayLike) -> Array:
+    """Map points (..., 3) of frame b into frame a with one motion (4, 4)."""
+    T = np.asarray(T_a_b, dtype=np.float64)
+    return np.asarray(points_b, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]
+
+
+def relative_angle(R_a: ArrayLike, R_b: ArrayLike) -> float:
+    """Angle in radians of the rotation between two rotation matrices (3, 3)."""
+    difference = np.asarray(R_a, dtype=np.float64).T @ np.asarray(R_b, dtype=np.float64)
+    return float(Rotation.from_matrix(difference).magnitude())
+
+
+def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
+    """Camera pose T_world_camera (x right, y down, z forward) at ``eye`` looking at ``target``.
+
+    Raises:
+        InputError: if ``eye`` and ``target`` coincide.
+    """
+    origin = np.asarray(eye, dtype=np.float64)
+    forward = np.asarray(target, dtype=np.float64) - origin
+    distance = np.linalg.norm(forward)
+    if distance < 1e-9:
+        raise InputError("look_at needs an eye and a target that differ")
+    forward = forward / distance
+    right = np.cross(forward, np.asarray(up, dtype=np.float64))
+    if np.linalg.norm(right) < 1e-6:  # looking along `up`: any perpendicular will do
+        right = np.cross(forward, [0.0, 1.0, 0.0])
+    right = right / np.linalg.norm(right)
+    down = np.cross(forward, right)
+    return make_pose(np.stack([right, down, forward], axis=1), origin)
+
+
+def pose_from_quaternion(t: ArrayLike, q_xyzw: ArrayLike) -> Array:
+    """Pose (4, 4) from a translation (3,) in m and a quaternion (qx, qy, qz, qw)."""
+    return make_pose(Rotation.from_quat(np.asarray(q_xyzw, dtype=np.float64)).as_matrix(), t)
+
+
+def quaternion_from_pose(T: ArrayLike) -> Array:
+    """Quaternion (qx, qy, qz, qw), of unit length with qw >= 0, of a pose (4, 4)."""
+    R = np.asarray(T, dtype=np.float64)[:3, :3]
+    return Rotation.from_matrix(R).as_quat(canonical=True)

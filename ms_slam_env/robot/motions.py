@@ -1,0 +1,68 @@
+"""The paper's decomposition of the space around the camera: 7 translations x 7 rotations.
+
+Saeedi et al., ICRA 2017, section V-D and Algorithm 1, line 2. Axes are those of the current
+camera frame: x right, y down, z forward.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import make_pose, so3_exp
+
+Float64 = NDArray[np.float64]
+
+TRANSLATIONS = ("none", "up", "down", "left", "right", "forward", "backward")
+ROTATIONS = (
+    "none",
+    "roll right",
+    "roll left",
+    "pitch forward",
+    "pitch backward",
+    "yaw anticlockwise",
+    "yaw clockwise",
+)
+NUM_TRANSLATIONS = len(TRANSLATIONS)
+NUM_ROTATIONS = len(ROTATIONS)
+NUM_MOTIONS = NUM_TRANSLATIONS * NUM_ROTATIONS
+
+TRANSLATION_DIRECTIONS: Float64 = np.array(
+    [[0, 0, 0], [0, -1, 0], [0, 1, 0], [-1, 0, 0], [1, 0, 0], [0, 0, 1], [0, 0, -1]],
+    dtype=np.float64,
+)
+# Right-handed about x right, y down, z forward: +z turns x towards y, so the horizon falls to the
+# left and the camera's right side goes down (roll right); +x turns y towards z, so the view goes
+# up (pitch backward); +y turns z towards x, so the view goes right (yaw clockwise from above).
+ROTATION_AXES: Float64 = np.array(
+    [[0, 0, 0], [0, 0, 1], [0, 0, -1], [-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0]],
+    dtype=np.float64,
+)
+
+
+def decompose(step_m: float, step_rad: float) -> Float64:
+    """The 49 motions ``T_camera_next`` (49, 4, 4); motion ``7 * translation + rotation``.
+
+    Each is one rigid motion [R | t]: R the rotation by ``step_rad``, t the translation by
+    ``step_m`` along an axis of the current camera frame.
+
+    Raises:
+        InputError: a step that is negative or not finite.
+    """
+    if not (np.isfinite(step_m) and np.isfinite(step_rad) and min(step_m, step_rad) >= 0):
+        raise InputError(f"steps must be finite and >= 0, got {step_m} m and {step_rad} rad")
+    rotations = [so3_exp(axis * step_rad) for axis in ROTATION_AXES]
+    return np.stack(
+        [
+            make_pose(R, direction * step_m)
+            for direction in TRANSLATION_DIRECTIONS
+            for R in rotations
+        ]
+    )
+
+
+def describe(action: int) -> str:
+    """Words for one of the 49 motions, such as ``"forward, yaw clockwise"``."""
+    translation, rotation = divmod(int(action), NUM_ROTATIONS)
+    return f"{TRANSLATIONS[translation]}, {ROTATIONS[rotation]}"

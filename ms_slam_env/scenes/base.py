@@ -1,0 +1,70 @@
+"""What a scene is: textured, lit geometry with free space, start poses and true surface."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int32 = NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class TexturedMesh:
+    """Triangles with texture, object label and baked light.
+
+    The radiance leaving a surface point is diffuse: linear(albedo texel) * irradiance, where the
+    irradiance (ambient, sun or lamps with shadows) was computed once per face corner.
+
+    Attributes:
+        vertices: (V, 3) float32, world frame, metres, z up.
+        faces: (F, 3) int32 vertex indices, counter-clockwise seen from outside.
+        uv: (F, 3, 2) float32 texture coordinates of the corners; textures repeat outside [0, 1),
+            u along the texture's columns, v along its rows.
+        face_texture: (F,) int32 index into ``textures``.
+        face_label: (F,) int32 index into ``labels``.
+        irradiance: (F, 3, 3) float32 linear RGB light at the corners, 1.0 = nominal white.
+        textures: sRGB albedo images, each (h, w, 3) uint8.
+        labels: name of each object; one object is one label.
+    """
+
+    vertices: Float32
+    faces: Int32
+    uv: Float32
+    face_texture: Int32
+    face_label: Int32
+    irradiance: Float32
+    textures: tuple[NDArray[np.uint8], ...]
+    labels: tuple[str, ...]
+
+
+class Scene(ABC):
+    """A world that a camera can look at and move in."""
+
+    name: str
+    seed: int
+    mesh: TexturedMesh
+    exposure: float  # factor from linear radiance to sensor value before the sRGB curve
+
+    @abstractmethod
+    def clearance(self, points: Float64) -> Float64:
+        """Distance (N,) in metres from points (N, 3) to the nearest surface.
+
+        0 for points inside an object or outside the scene.
+        """
+
+    @abstractmethod
+    def segment_is_free(self, start: Float64, end: Float64, radius_m: float) -> bool:
+        """Whether a ball of ``radius_m`` moves from ``start`` (3,) to ``end`` (3,) untouched."""
+
+    @abstractmethod
+    def sample_start(self, rng: np.random.Generator) -> Float64:
+        """Draw a start pose T_world_camera (4, 4) in free space with furniture in view."""
+
+    @abstractmethod
+    def surface_points(self, spacing_m: float = 0.01) -> tuple[Float64, Int32]:
+        """True surface as points (N, 3) about ``spacing_m`` apart and their labels (N,)."""

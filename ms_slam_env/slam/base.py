@@ -1,0 +1,88 @@
+"""The interface of every SLAM backend."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ms_slam_env.camera import Intrinsics, RGBDFrame
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TrackResult:
+    """What SLAM says after one frame.
+
+    Attributes:
+        T_world_camera: (4, 4) estimated pose; the last good one while tracking is lost.
+        tracking_ok: whether the frame was aligned with the map and fused into it.
+        relocalised: whether this frame ended a period of lost tracking.
+        inlier_fraction: share of the frame's valid pixels that the alignment explained.
+        residual_m: RMS point-to-plane residual of the inliers, metres.
+        reason: why tracking failed, in words; empty when it did not.
+    """
+
+    T_world_camera: Float64
+    tracking_ok: bool
+    relocalised: bool = False
+    inlier_fraction: float = 1.0
+    residual_m: float = 0.0
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Views:
+    """Images predicted from the map.
+
+    Attributes:
+        intensity: (N, h, w) float32 in [0, 255]; 0 where the map is empty.
+        depth: (N, h, w) float32 metres; 0 where the map is empty.
+        normals: (N, h, w, 3) float32 unit vectors in the camera frame, towards the camera;
+            0 where the map is empty.
+        intrinsics: of the predicted images.
+    """
+
+    intensity: Float32
+    depth: Float32
+    normals: Float32
+    intrinsics: Intrinsics
+
+
+class SlamBackend(ABC):
+    """Estimates the camera's pose from RGB-D frames and keeps a map that it can render."""
+
+    intrinsics: Intrinsics
+
+    @abstractmethod
+    def reset(self, T_world_camera: ArrayLike | None = None) -> None:
+        """Forget everything; the next frame is taken at ``T_world_camera`` (identity if None)."""
+
+    @abstractmethod
+    def track(self, frame: RGBDFrame) -> TrackResult:
+        """Estimate the pose of ``frame`` and fuse it into the map.
+
+        Raises:
+            InputError: the frame's size is not that of the intrinsics.
+        """
+
+    @abstractmethod
+    def predict(self, poses: ArrayLike, scale: float = 1.0) -> Views:
+        """Render the map from ``poses`` (N, 4, 4) T_world_camera at ``scale`` times the size."""
+
+    @abstractmethod
+    def surface_points(self) -> Float64:
+        """Points (M, 3) of the estimated surface in the world frame, metres."""
+
+    @abstractmethod
+    def get_state(self) -> dict[str, Any]:
+        """Everything needed to go on bit-exactly, as NumPy arrays and plain values."""
+
+    @abstractmethod
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state that ``get_state`` returned."""
