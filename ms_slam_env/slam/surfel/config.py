@@ -1,0 +1,74 @@
+"""Parameters of the surfel SLAM, with the names, ranges and defaults of the paper where it has them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ms_slam_env.config import check_range
+from ms_slam_env.errors import InputError
+
+
+@dataclass(frozen=True)
+class SurfelConfig:
+    """Parameters of tracking, fusion and prediction.
+
+    Attributes:
+        depth_cutoff_m: readings beyond are ignored, [0, 10].
+        icp_rgb_weight: relative weight w of the geometric and photometric terms, [0, 1]; see
+            ``tracking`` for its exact meaning.
+        confidence_threshold: observations after which a surfel is stable, [0, 12].
+        iterations: Gauss-Newton iterations per pyramid level, finest first.
+        max_surfels: capacity of the map, per env.
+        fusion_upsampling: the association image is this many times finer than the camera's.
+        unstable_window: frames after which a surfel still below the confidence threshold and
+            not seen again is removed.
+        fusion_distance_m: largest distance along the ray between a reading and the surfel that
+            it updates, at 1 m; grows with depth squared like the sensor's noise.
+        fusion_angle_deg: largest angle between their normals.
+        bilateral_sigma_px: width of the bilateral depth filter in the image, pixels.
+        bilateral_sigma_m: width of the filter in depth at 1 m; grows with depth squared.
+        bilateral_radius_px: half-size of the filter's window, pixels.
+        icp_distance_m: largest distance between associated points in tracking.
+        icp_angle_deg: largest angle between their normals.
+
+    Raises:
+        InputError: a value outside its range.
+    """
+
+    depth_cutoff_m: float = 3.0
+    icp_rgb_weight: float = 0.1
+    confidence_threshold: float = 10.0
+    iterations: tuple[int, ...] = (4, 5, 10)
+    max_surfels: int = 200_000
+    fusion_upsampling: int = 4
+    unstable_window: int = 20
+    fusion_distance_m: float = 0.02
+    fusion_angle_deg: float = 45.0
+    bilateral_sigma_px: float = 1.5
+    bilateral_sigma_m: float = 0.01
+    bilateral_radius_px: int = 2
+    icp_distance_m: float = 0.10
+    icp_angle_deg: float = 30.0
+
+    def __post_init__(self) -> None:
+        """Refuse values outside the ranges."""
+        check_range(self, "depth_cutoff_m", 0.0, 10.0)
+        check_range(self, "icp_rgb_weight", 0.0, 1.0)
+        check_range(self, "confidence_threshold", 0.0, 12.0)
+        object.__setattr__(self, "iterations", tuple(self.iterations))
+        if not 1 <= len(self.iterations) <= 5 or any(
+            not isinstance(count, int) or not 0 <= count <= 100 for count in self.iterations
+        ):
+            raise InputError(
+                f"SurfelConfig.iterations = {self.iterations!r} must be 1 to 5 integers in [0, 100]"
+            )
+        check_range(self, "max_surfels", 1000, 50_000_000)
+        check_range(self, "fusion_upsampling", 1, 8)
+        check_range(self, "unstable_window", 1, 100_000)
+        check_range(self, "fusion_distance_m", 0.0001, 1.0)
+        check_range(self, "fusion_angle_deg", 1.0, 90.0)
+        check_range(self, "bilateral_sigma_px", 0.1, 20.0)
+        check_range(self, "bilateral_sigma_m", 0.0001, 1.0)
+        check_range(self, "bilateral_radius_px", 0, 10)
+        check_range(self, "icp_distance_m", 0.001, 1.0)
+        check_range(self, "icp_angle_deg", 1.0, 90.0)
