@@ -1,0 +1,138 @@
+"""A camera that flies freely and arrives exactly where it was sent."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.geometry import invert
+from ms_slam_env.robot.base import Embodiment
+from ms_slam_env.robot.motions import (
+    NUM_ROTATIONS,
+    NUM_TRANSLATIONS,
+    TRANSLATION_DIRECTIONS,
+    decompose,
+)
+from ms_slam_env.scenes.base import Scene
+
+Float64 = NDArray[np.float64]
+
+CAMERA_RADIUS_M = 0.1  # half the width of an ASUS Xtion (18 cm), rounded up
+
+
+class FreeCamera(Embodiment):
+    """The 49 motions of the paper's decomposition, each made exactly."""
+
+    num_actions = NUM_TRANSLATIONS * NUM_ROTATIONS
+
+    def __init__(self, scene: Scene, step_m: float, step_rad: float) -> None:
+        self.scene = scene
+        self.step_m = step_m
+        self._motions = decompose(step_m, step_rad)
+        self.T_world_camera = np.eye(4)
+
+    def reset(self, T_world_camera: Float64, rng: np.random.Generator) -> None:
+        """Put the camera at a start pose (4, 4)."""
+        self.T_world_camera = np.array(T_world_camera, dtype=np.float64)
+
+    def candidate_motions(self) -> Float64:
+        """The 49 motions ``T_camera_next`` (49, 4, 4), the same everywhere."""
+        return self._motions
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """(49,) whether the camera's ball reaches each target; depends on the translation only."""
+        R, position = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
+        ends = position + self.step_m * TRANSLATION_DIRECTIONS @ R.T
+        free = [
+            index == 0 or self.scene.segment_is_free(position, end, CAMERA_RADIUS_M)
+            for index, end in enumerate(ends)
+        ]
+        return np.repeat(np.array(free), NUM_ROTATIONS)
+
+    def move(self, action: int) -> bool:
+        """Make motion ``action`` if nothing blocks it; return whether it was made."""
+        if not self.action_masks()[action]:
+            return False
+        self.T_world_camera = self.T_world_camera @ self._motions[action]
+        return True
+
+    def get_state(self) -> dict[str, Any]:
+        """The pose."""
+        return {"T_world_camera": self.T_world_camera.copy()}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state that ``get_state`` returned."""
+        self.T_world_camera = state["T_world_camera"].copy()
+
+
+class FixedTranslation(Embodiment):
+    """The paper's second simulation: straight-line translation, the rotation is chosen.
+
+    The line's direction is drawn at the start among those with the most room; where the camera
+    would touch something it turns back along the same line.
+    """
+
+    num_actions = NUM_ROTATIONS
+    _DIRECTIONS_TRIED = 16
+
+    def __init__(self, scene: Scene, step_m: float, step_rad: float) -> None:
+        self.scene = scene
+        self.step_m = step_m
+        self._rotations = decompose(0.0, step_rad)[:NUM_ROTATIONS]
+        self.T_world_camera = np.eye(4)
+        self._direction = np.zeros(3)
+
+    def reset(self, T_world_camera: Float64, rng: np.random.Generator) -> None:
+        """Put the camera at a start pose (4, 4) and choose the line: the longest of 16 level ones."""
+        self.T_world_camera = np.array(T_world_camera, dtype=np.float64)
+        offset = rng.uniform(0, 2 * np.pi)
+        angles = offset + np.arange(self._DIRECTIONS_TRIED) * 2 * np.pi / self._DIRECTIONS_TRIED
+        directions = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1)
+        self._direction = max(directions, key=self._free_steps)
+
+    def _free_steps(self, direction: Float64, most: int = 100) -> int:
+        position = self.T_world_camera[:3, 3]
+        for steps in range(most):
+            following = position + self.step_m * direction
+            if not self.scene.segment_is_free(position, following, CAMERA_RADIUS_M):
+                return steps
+            position = following
+        return most
+
+    def _translation(self) -> Float64:
+        """The next step (3,) along the line in the world frame; zero if both ways are blocked."""
+        position = self.T_world_camera[:3, 3]
+        for direction in (self._direction, -self._direction):
+            step = self.step_m * direction
+            if self.scene.segment_is_free(position, position + step, CAMERA_RADIUS_M):
+                return step
+        return np.zeros(3)
+
+    def candidate_motions(self) -> Float64:
+        """The 7 motions ``T_camera_next`` (7, 4, 4): one translation, seven rotations."""
+        motions = self._rotations.copy()
+        motions[:, :3, 3] = invert(self.T_world_camera)[:3, :3] @ self._translation()
+        return motions
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """(7,) all true: turning is always possible and the line turns back by itself."""
+        return np.ones(NUM_ROTATIONS, dtype=bool)
+
+    def move(self, action: int) -> bool:
+        """Step along the line and turn; always possible."""
+        step = self._translation()
+        self.T_world_camera = self.T_world_camera @ self.candidate_motions()[action]
+        if step @ self._direction < 0:
+            self._direction = -self._direction
+        return True
+
+    def get_state(self) -> dict[str, Any]:
+        """The pose and the line."""
+        return {"T_world_camera": self.T_world_camera.copy(), "direction": self._direction.copy()}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state that ``get_state`` returned."""
+        self.T_world_camera = state["T_world_camera"].copy()
+        self._direction = state["direction"].copy()
