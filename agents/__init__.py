@@ -1,0 +1,1 @@
+"""Training scripts, one readable file each; installed as `ms_slam_agents`."""
