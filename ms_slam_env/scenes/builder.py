@@ -1,0 +1,263 @@
+"""Assembles a scene's triangles from parametric patches, in local frames, with texture in metres."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ms_slam_env.scenes.base import Float32, Float64, Int32
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Material:
+    """A texture and the size of one of its tiles on the surface.
+
+    Attributes:
+        texture: index of the image among the builder's textures.
+        tile_m: (width, height) in metres that the image covers; None stretches the image over
+            the whole patch, as for a picture.
+    """
+
+    texture: int
+    tile_m: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Everything of a mesh but its light.
+
+    Attributes:
+        vertices: (V, 3) float64 metres.
+        normals: (V, 3) float64 smooth unit normals.
+        light_points: (V, 3) float64 where the light of each vertex is gathered: the vertex moved
+            a little off the surface and away from the border of its patch, so that a vertex in a
+            corner or on an edge does not lie inside a neighbour.
+        faces: (F, 3) int32.
+        uv: (F, 3, 2) float32.
+        face_texture: (F,) int32.
+        face_label: (F,) int32.
+        textures: sRGB images (h, w, 3) uint8.
+        labels: object names.
+    """
+
+    vertices: Float64
+    normals: Float64
+    light_points: Float64
+    faces: Int32
+    uv: Float32
+    face_texture: Int32
+    face_label: Int32
+    textures: tuple[NDArray[np.uint8], ...]
+    labels: tuple[str, ...]
+
+
+class MeshBuilder:
+    """Collects patches; every primitive below is one or more of them."""
+
+    def __init__(self, cell_m: float = 0.1) -> None:
+        """Start empty; flat patches are cut into cells of at most ``cell_m``."""
+        self.cell_m = cell_m
+        self._pose = np.eye(4)
+        self._label = 0
+        self._vertices: list[Float64] = []
+        self._normals: list[Float64] = []
+        self._light_points: list[Float64] = []
+        self._faces: list[NDArray[np.int64]] = []
+        self._uv: list[Float64] = []
+        self._face_texture: list[NDArray[np.int64]] = []
+        self._face_label: list[NDArray[np.int64]] = []
+        self._textures: list[NDArray[np.uint8]] = []
+        self._labels: list[str] = []
+        self._count = 0
+
+    def material(
+        self, image: NDArray[np.uint8], tile_m: tuple[float, float] | None = None
+    ) -> Material:
+        """Register an sRGB image (h, w, 3) and return the material that shows it."""
+        for index, known in enumerate(self._textures):
+            if known is image:
+                return Material(index, tile_m)
+        self._textures.append(image)
+        return Material(len(self._textures) - 1, tile_m)
+
+    def plain(self, rgb: ArrayLike) -> Material:
+        """Return a material of one sRGB colour (0 to 255)."""
+        colour = np.clip(np.asarray(rgb, dtype=np.float64), 0, 255).astype(np.uint8)
+        return self.material(np.broadcast_to(colour, (4, 4, 3)).copy(), (1.0, 1.0))
+
+    @contextmanager
+    def object(self, name: str) -> Iterator[None]:
+        """Give every patch added inside the block the label ``name`` (reused if known)."""
+        previous = self._label
+        if name not in self._labels:
+            self._labels.append(name)
+        self._label = self._labels.index(name)
+        yield
+        self._label = previous
+
+    @contextmanager
+    def frame(self, origin: ArrayLike, yaw: float = 0.0) -> Iterator[None]:
+        """Add patches in a frame at ``origin`` (3,), turned by ``yaw`` radians about z."""
+        previous = self._pose
+        local = np.eye(4)
+        local[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+        local[:3, 3] = np.asarray(origin, dtype=np.float64)
+        self._pose = previous @ local
+        yield
+        self._pose = previous
+
+    def patch(
+        self, points: ArrayLike, material: Material, uv: Float64 | None = None, inset: bool = True
+    ) -> None:
+        """Add a surface given as a grid of points.
+
+        Args:
+            points: (n, m, 3); the outside is where (change along m) x (change along n) points.
+            material: its texture; columns run along m, rows against n (n goes up the image).
+            uv: (n, m, 2) texture coordinates in images; None takes arc lengths over the
+                material's tile, or [0, 1] where the material stretches.
+            inset: gather the light of border vertices a little inside the patch.
+        """
+        grid = np.asarray(points, dtype=np.float64)
+        n, m = grid.shape[:2]
+        if uv is None:
+            uv = _arc_length_uv(grid, material.tile_m)
+        normals = _grid_normals(grid)
+        gather = grid.copy()
+        if inset:
+            gather[[0, -1]] = 0.8 * gather[[0, -1]] + 0.2 * grid[[min(1, n - 1), max(n - 2, 0)]]
+            gather[:, [0, -1]] = (
+                0.8 * gather[:, [0, -1]] + 0.2 * gather[:, [min(1, m - 1), max(m - 2, 0)]]
+            )
+        gather = gather + 0.006 * normals
+        index = np.arange(n * m).reshape(n, m)
+        a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
+        faces = np.stack([np.stack([a, b, c], -1), np.stack([a, c, d], -1)], 2).reshape(-1, 3)
+        corners = grid.reshape(-1, 3)[faces]
+        area = np.linalg.norm(
+            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+        )
+        faces = faces[area > 1e-10]  # the poles of a sphere
+        R, t = self._pose[:3, :3], self._pose[:3, 3]
+        self._vertices.append(grid.reshape(-1, 3) @ R.T + t)
+        self._normals.append(normals.reshape(-1, 3) @ R.T)
+        self._light_points.append(gather.reshape(-1, 3) @ R.T + t)
+        self._faces.append(faces + self._count)
+        self._uv.append(uv.reshape(-1, 2)[faces])
+        self._face_texture.append(np.full(len(faces), material.texture))
+        self._face_label.append(np.full(len(faces), self._label))
+        self._count += n * m
+
+    def quad(
+        self, origin: ArrayLike, edge_u: ArrayLike, edge_v: ArrayLike, material: Material
+    ) -> None:
+        """Add the parallelogram origin + [0,1] edge_u + [0,1] edge_v, outside = edge_u x edge_v."""
+        o, u, v = (np.asarray(x, dtype=np.float64) for x in (origin, edge_u, edge_v))
+        s = np.linspace(0, 1, self._cuts(np.linalg.norm(u)) + 1)
+        t = np.linspace(0, 1, self._cuts(np.linalg.norm(v)) + 1)
+        self.patch(o + s[None, :, None] * u + t[:, None, None] * v, material)
+
+    def box(
+        self,
+        low: ArrayLike,
+        high: ArrayLike,
+        material: Material,
+        skip: str = "",
+        top: Material | None = None,
+        front: Material | None = None,
+    ) -> None:
+        """Add an axis-aligned box seen from outside.
+
+        Args:
+            low: (3,) least corner.
+            high: (3,) greatest corner.
+            material: of all sides.
+            skip: sides to leave out, of "xXyYzZ" (lower case: the low side).
+            top: material of the upper side instead.
+            front: material of the low-y side instead.
+        """
+        lo, hi = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+        x, y, z = np.diag(hi - lo)
+        sides = {
+            "x": (lo + y, -y, z),
+            "X": (lo + x, y, z),
+            "y": (lo, x, z),
+            "Y": (lo + x + y, -x, z),
+            "z": (lo + y, x, -y),
+            "Z": (lo + z, x, y),
+        }
+        for side, (o, u, v) in sides.items():
+            if side not in skip:
+                special = {"Z": top, "y": front}.get(side)
+                self.quad(o, u, v, special or material)
+
+    def lathe(
+        self, profile: ArrayLike, material: Material, sides: int = 20, centre: ArrayLike = (0, 0, 0)
+    ) -> None:
+        """Add a surface of revolution about the z axis through ``centre``.
+
+        Args:
+            profile: (n, 2) radius and height; going up shows the outside, going down the inside.
+            material: its texture.
+            sides: facets around.
+            centre: (3,).
+        """
+        r, z = np.asarray(profile, dtype=np.float64).T
+        angle = np.linspace(0, 2 * np.pi, sides + 1)
+        ring = np.stack([np.cos(angle), np.sin(angle)], -1)
+        grid = np.concatenate(
+            [
+                r[:, None, None] * ring[None],
+                np.broadcast_to(z[:, None, None], (len(r), sides + 1, 1)),
+            ],
+            -1,
+        )
+        self.patch(grid + np.asarray(centre, dtype=np.float64), material, inset=False)
+
+    def _cuts(self, length: float) -> int:
+        return max(1, int(np.ceil(length / self.cell_m)))
+
+    def build(self) -> Geometry:
+        """Return everything added so far."""
+        return Geometry(
+            vertices=np.concatenate(self._vertices),
+            normals=np.concatenate(self._normals),
+            light_points=np.concatenate(self._light_points),
+            faces=np.concatenate(self._faces).astype(np.int32),
+            uv=np.concatenate(self._uv).astype(np.float32),
+            face_texture=np.concatenate(self._face_texture).astype(np.int32),
+            face_label=np.concatenate(self._face_label).astype(np.int32),
+            textures=tuple(self._textures),
+            labels=tuple(self._labels),
+        )
+
+
+def _arc_length_uv(grid: Float64, tile_m: tuple[float, float] | None) -> Float64:
+    """Texture coordinates (n, m, 2) proportional to the longest row's and column's length."""
+    n, m = grid.shape[:2]
+    along_m = np.linalg.norm(np.diff(grid, axis=1), axis=-1)  # (n, m-1)
+    along_n = np.linalg.norm(np.diff(grid, axis=0), axis=-1)  # (n-1, m)
+    u = np.concatenate([[0.0], np.cumsum(along_m[np.argmax(along_m.sum(1))])])
+    v = np.concatenate([[0.0], np.cumsum(along_n[:, np.argmax(along_n.sum(0))])])
+    if tile_m is None:
+        u, v = u / u[-1] * 0.998 + 0.001, v / v[-1] * 0.998 + 0.001
+    else:
+        u, v = u / tile_m[0], v / tile_m[1]
+    return np.stack(np.broadcast_arrays(u[None, :], 1.0 - v[:, None]), -1).reshape(n, m, 2)
+
+
+def _grid_normals(grid: Float64) -> Float64:
+    """Unit normals (n, m, 3) of a grid of points, averaged over the cells that meet there."""
+    cell = np.cross(grid[1:, 1:] - grid[:-1, :-1], grid[1:, :-1] - grid[:-1, 1:])
+    padded = np.pad(cell, ((1, 1), (1, 1), (0, 0)))
+    if np.allclose(grid[:, 0], grid[:, -1]):  # closed around, as a lathe
+        padded[:, 0], padded[:, -1] = padded[:, -2], padded[:, 1]
+    normals = padded[1:, 1:] + padded[:-1, 1:] + padded[1:, :-1] + padded[:-1, :-1]
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    return normals / np.where(length > 0, length, 1.0)

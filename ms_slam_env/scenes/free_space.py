@@ -1,0 +1,102 @@
+"""Where a camera may be: a grid of distances to the surface, 0 inside objects and outside."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from ms_slam_env.scenes.base import Float32, Float64
+
+_MAX_CELLS = 6_000_000
+
+
+class FreeSpace:
+    """Distance to the nearest surface on a voxel grid, looked up trilinearly.
+
+    Attributes:
+        origin: (3,) centre of the first voxel, metres.
+        voxel_m: edge of a voxel.
+        distance: (nx, ny, nz) float32 metres from the voxel's centre to the surface; 0 where the
+            voxel is not in the free component.
+    """
+
+    def __init__(self, points: Float64, inside: Float64, voxel_m: float = 0.05) -> None:
+        """Build the grid.
+
+        Args:
+            points: (N, 3) samples of the surface, closer together than ``voxel_m``.
+            inside: (K, 3) points in free space; the connected components of empty voxels that
+                hold them are the free space.
+            voxel_m: edge of a voxel; made larger where the scene is so big that the grid would
+                not fit in memory.
+        """
+        low, high = points.min(0), points.max(0)
+        volume = float(np.prod(high - low + 4 * voxel_m))
+        self.voxel_m = max(voxel_m, (volume / _MAX_CELLS) ** (1 / 3))
+        self.origin = low - 1.5 * self.voxel_m
+        shape = tuple(np.ceil((high - low) / self.voxel_m).astype(int) + 4)
+        index = np.rint((points - self.origin) / self.voxel_m).astype(np.int64)
+        flat = np.ravel_multi_index(tuple(index.T), shape)
+        # The surface's mean point in each occupied voxel makes distances finer than the voxel.
+        count = np.bincount(flat, minlength=int(np.prod(shape)))
+        occupied = count > 0
+        cells = np.flatnonzero(occupied)
+        mean = np.stack(
+            [np.bincount(flat, points[:, k], minlength=len(count))[cells] for k in range(3)], -1
+        )
+        mean /= count[cells, None]
+        slot = np.zeros(len(count), dtype=np.int32)
+        slot[cells] = np.arange(len(cells))
+        empty = ~occupied.reshape(shape)
+        nearest = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
+        nearest_flat = np.ravel_multi_index(tuple(nearest), shape)
+        surface = mean[slot[nearest_flat]]  # (nx, ny, nz, 3)
+        axes = [self.origin[k] + self.voxel_m * np.arange(shape[k]) for k in range(3)]
+        square = sum(
+            (surface[..., k] - np.expand_dims(axes[k], [j for j in range(3) if j != k])) ** 2
+            for k in range(3)
+        )
+        free = self._component(empty, inside)
+        self.distance: Float32 = np.where(free, np.sqrt(square), 0.0).astype(np.float32)
+        nx, ny, nz = shape
+        self._limit = np.array(shape) - 1.001
+        corner = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+        self._corner_offset = corner @ np.array([ny * nz, nz, 1])
+        self._stride = np.array([ny * nz, nz, 1])
+        self._flat = self.distance.ravel()
+
+    def _component(self, empty: NDArray[np.bool_], inside: Float64) -> NDArray[np.bool_]:
+        component, _ = ndimage.label(empty)
+        seeds = np.rint((np.atleast_2d(inside) - self.origin) / self.voxel_m).astype(int)
+        seeds = np.clip(seeds, 0, np.array(empty.shape) - 1)
+        wanted = np.unique(component[tuple(seeds.T)])
+        return np.isin(component, wanted[wanted > 0])
+
+    def clearance(self, points: Float64) -> Float64:
+        """Distance (N,) from points (N, 3) to the nearest surface, 0 inside objects or outside."""
+        position = (
+            np.asarray(points, dtype=np.float64).reshape(-1, 3) - self.origin
+        ) / self.voxel_m
+        clipped = np.clip(position, 0.0, self._limit)
+        base = clipped.astype(np.int64)
+        f = clipped - base
+        values = self._flat[(base @ self._stride)[:, None] + self._corner_offset]  # (N, 8)
+        values = values.reshape(-1, 2, 2, 2)
+        along_x = values[:, 0] + (values[:, 1] - values[:, 0]) * f[:, 0, None, None]
+        along_y = along_x[:, 0] + (along_x[:, 1] - along_x[:, 0]) * f[:, 1, None]
+        result = along_y[:, 0] + (along_y[:, 1] - along_y[:, 0]) * f[:, 2]
+        return np.where((position == clipped).all(1), result, 0.0)
+
+    def segment_is_free(self, start: Float64, end: Float64, radius_m: float) -> bool:
+        """Whether a ball moves from ``start`` to ``end`` untouched.
+
+        The distance to the surface changes by at most the distance walked, so samples ``step``
+        apart need a clearance of ``radius_m`` + step / 2: the answer errs to "no".
+        """
+        a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
+        length = float(np.linalg.norm(b - a))
+        steps = max(1, int(np.ceil(length / (0.4 * self.voxel_m))))
+        t = np.linspace(0.0, 1.0, steps + 1)[:, None]
+        slack = 0.5 * length / steps
+        return bool((self.clearance(a + t * (b - a)) > radius_m + slack).all())

@@ -1,0 +1,102 @@
+"""The scene made of one lit mesh, its free space and a rule for start poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ms_slam_env.geometry import look_at, so3_exp
+from ms_slam_env.scenes.base import Float64, Int32, Scene, TexturedMesh
+from ms_slam_env.scenes.free_space import FreeSpace
+from ms_slam_env.scenes.rays import RayCaster
+from ms_slam_env.scenes.sampling import sample_surface
+
+StartRule = Callable[[np.random.Generator], tuple[Float64, Float64]]
+"""Draws a candidate (eye (3,), target (3,)) of a start pose."""
+
+MIN_START_CLEARANCE_M = 0.25
+START_DEPTH_M = (0.5, 3.5)
+MIN_START_SHARE = 0.8
+_TRIES = 2000
+_FACING_M = 0.06
+
+
+class MeshScene(Scene):
+    """Everything a scene must answer, from its mesh."""
+
+    def __init__(
+        self,
+        name: str,
+        seed: int,
+        mesh: TexturedMesh,
+        inside: Float64,
+        start_rule: StartRule,
+        exposure: float = 1.0,
+        voxel_m: float = 0.05,
+    ) -> None:
+        """Build the free space around the points ``inside`` (K, 3)."""
+        self.name = name
+        self.seed = seed
+        self.mesh = mesh
+        self.exposure = exposure
+        self._start_rule = start_rule
+        points, _ = sample_surface(mesh.vertices, mesh.faces, 0.4 * voxel_m)
+        self.free_space = FreeSpace(points, np.asarray(inside, dtype=np.float64), voxel_m)
+        self._rays = RayCaster(mesh.vertices, mesh.faces)
+
+    def clearance(self, points: Float64) -> Float64:
+        """See the base class."""
+        return self.free_space.clearance(points)
+
+    def segment_is_free(self, start: Float64, end: Float64, radius_m: float) -> bool:
+        """See the base class."""
+        return self.free_space.segment_is_free(start, end, radius_m)
+
+    def sample_start(self, rng: np.random.Generator) -> Float64:
+        """See the base class; the best of the candidates tried if none is perfect."""
+        best, best_score = np.eye(4), -1.0
+        for _ in range(_TRIES):
+            eye, target = self._start_rule(rng)
+            clearance = float(self.clearance(eye[None])[0])
+            if clearance < MIN_START_CLEARANCE_M:
+                continue
+            T = look_at(eye, target)
+            T[:3, :3] = T[:3, :3] @ so3_exp(np.array([0.0, 0.0, rng.normal(0.0, 0.02)]))
+            share, objects = self._view_quality(T)
+            if share >= MIN_START_SHARE and objects >= 2:
+                return T
+            if share + 0.1 * min(objects, 2) > best_score:
+                best, best_score = T, share + 0.1 * min(objects, 2)
+        return best
+
+    def _view_quality(self, T_world_camera: Float64) -> tuple[float, int]:
+        """Share of the view at a good depth, and the number of objects in view."""
+        u, v = np.meshgrid(np.linspace(-0.55, 0.55, 12), np.linspace(-0.42, 0.42, 9))
+        rays = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], -1)
+        origins = np.broadcast_to(T_world_camera[:3, 3], rays.shape)
+        depth, face = self._rays.first_hit(origins, rays @ T_world_camera[:3, :3].T)
+        good = (depth >= START_DEPTH_M[0]) & (depth <= START_DEPTH_M[1])
+        return float(good.mean()), len(np.unique(self.mesh.face_label[face[face >= 0]]))
+
+    def surface_points(self, spacing_m: float = 0.01) -> tuple[Float64, Int32]:
+        """See the base class.
+
+        Points whose front does not open into free space (backs of furniture against a wall,
+        insides of boxes) are left out, since no camera can see them.
+        """
+        points, face = sample_surface(self.mesh.vertices, self.mesh.faces, spacing_m)
+        corners = self.mesh.vertices[self.mesh.faces].astype(np.float64)
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+        visible = self.clearance(points + _FACING_M * normal[face]) > 0.0
+        return points[visible], self.mesh.face_label[face[visible]]
+
+    def __getstate__(self) -> dict[str, object]:
+        """Leave the ray caster out: it is rebuilt."""
+        return {key: value for key, value in self.__dict__.items() if key != "_rays"}
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        """Rebuild the ray caster."""
+        self.__dict__.update(state)
+        self._rays = RayCaster(self.mesh.vertices, self.mesh.faces)
