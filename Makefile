@@ -21,7 +21,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@echo "installing into .venv (a few minutes the first time)"
 	@index=; if ! command -v nvidia-smi >/dev/null && $(REACHABLE) 2>/dev/null; then \
 	    index="--extra-index-url $(TORCH_CPU_INDEX)"; fi; \
-	    $(BIN)/python -m pip install -q $$index -c constraints.txt -e ".[$(EXTRAS)]"
+	    $(BIN)/python -m pip install -qq $$index -c constraints.txt -e ".[$(EXTRAS)]"
 	@if $(BIN)/python -c 'import ctypes; [ctypes.CDLL(n) for n in ("libusb-1.0.so.0", "libGL.so.1")]' \
 	    2>/dev/null; then :; \
 	elif [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get update -qq && \
