@@ -1,0 +1,47 @@
+"""The ids of the environments; registering costs no import of the environment itself."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+from gymnasium.vector import SyncVectorEnv
+
+MAX_EPISODE_STEPS = 150
+
+_EMBODIMENT_OF_ID = {
+    "MSActiveSLAM-v0": "free",
+    "MSActiveSLAM-FreeCamera-v0": "free",
+    "MSActiveSLAM-FixedTranslation-v0": "fixed-translation",
+}
+
+ENV_IDS = tuple(_EMBODIMENT_OF_ID)
+"""Every registered environment id."""
+
+
+class InProcessVectorEnv(SyncVectorEnv):
+    """Vector entry point: ``num_envs`` time-limited environments stepped in this process."""
+
+    def __init__(
+        self, num_envs: int, max_episode_steps: int = MAX_EPISODE_STEPS, **options: Any
+    ) -> None:
+        def make() -> gymnasium.Env[Any, Any]:
+            from ms_slam_env.env.active_slam import ActiveSlamEnv
+
+            return gymnasium.wrappers.TimeLimit(ActiveSlamEnv(**options), max_episode_steps)
+
+        super().__init__([make] * num_envs)
+
+
+def register_all() -> None:
+    """Register the ids with Gymnasium; a second call changes nothing."""
+    for env_id, embodiment in _EMBODIMENT_OF_ID.items():
+        if env_id in gymnasium.registry:
+            continue
+        gymnasium.register(
+            env_id,
+            entry_point="ms_slam_env.env.active_slam:ActiveSlamEnv",
+            vector_entry_point="ms_slam_env.registration:InProcessVectorEnv",
+            max_episode_steps=MAX_EPISODE_STEPS,
+            kwargs={"embodiment": embodiment},
+        )
