@@ -80,6 +80,10 @@ class SlamBackend(ABC):
         """Points (M, 3) of the estimated surface in the world frame, metres."""
 
     @abstractmethod
+    def surface_colors(self) -> NDArray[np.uint8]:
+        """Colours (M, 3) RGB of ``surface_points``, in the same order."""
+
+    @abstractmethod
     def get_state(self) -> dict[str, Any]:
         """Everything needed to go on bit-exactly, as NumPy arrays and plain values."""
 
