@@ -1,0 +1,37 @@
+"""Information divergence between frames (Saeedi et al., ICRA 2017, section III)."""
+
+from __future__ import annotations
+
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.divergence.base import Divergence
+from ms_slam_env.divergence.config import MEASURES, DivergenceConfig
+from ms_slam_env.divergence.counting import Histograms
+from ms_slam_env.divergence.earth_movers import EarthMoversDivergence
+from ms_slam_env.divergence.kl import KLDivergence
+from ms_slam_env.divergence.pairwise import depth_divergence, intensity_divergence, ms_parameters
+from ms_slam_env.divergence.windowed_kl import WindowedKLDivergence
+
+_VARIANTS: dict[str, type[Divergence]] = {
+    "kl": KLDivergence,
+    "windowed-kl": WindowedKLDivergence,
+    "earth-movers": EarthMoversDivergence,
+}
+
+
+def make_divergence(
+    config: DivergenceConfig, intrinsics: Intrinsics, device: str = "cpu"
+) -> Divergence:
+    """Return the divergence that ``config.measure`` names, for images of ``intrinsics``."""
+    return _VARIANTS[config.measure](config, intrinsics, device)
+
+
+__all__ = [
+    "MEASURES",
+    "Divergence",
+    "DivergenceConfig",
+    "Histograms",
+    "depth_divergence",
+    "intensity_divergence",
+    "make_divergence",
+    "ms_parameters",
+]

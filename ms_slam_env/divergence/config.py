@@ -1,0 +1,87 @@
+"""Options of the divergence between two frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ms_slam_env.config import check_choice, check_range
+from ms_slam_env.errors import InputError
+
+MEASURES = ("kl", "windowed-kl", "earth-movers")
+
+
+@dataclass(frozen=True)
+class DivergenceConfig:
+    """How the histograms of a frame are made and compared.
+
+    Attributes:
+        measure: ``kl`` (equations (5) and (10) of Saeedi et al., ICRA 2017), ``windowed-kl`` (its
+            mean over spatial windows) or ``earth-movers``; the last two are improvements that the
+            paper proposes in its section VII.
+        bins: intensity bins P of equation (5), 2 to 256.
+        smoothing: standard deviation of the Parzen window that smooths the intensity histogram,
+            in grey levels; 0 = none.
+        pseudo_count: pixels added to every bin before a histogram is normalised, so that no bin
+            is empty and the logarithm of (5) and (10) is finite. The paper does not say what it
+            does with empty bins.
+        intensity_pixels: ``all``, or only those ``with-depth``. In a view predicted from a map
+            the pixels without depth are holes, whose intensity (0) is not that of any surface.
+        inclinations: N of equation (6).
+        alpha_deg: influence angle alpha of equation (8), degrees.
+        normal_radius: reach of the differences that give a pixel's normal, pixels.
+        edge_threshold: relative second difference of inverse depth above which two pixels are
+            taken to lie on different surfaces, so that no normal is computed across.
+        windows: rows and columns of spatial windows (``windowed-kl`` only).
+
+    Raises:
+        InputError: a value outside its range.
+    """
+
+    measure: str = "kl"
+    bins: int = 32
+    smoothing: float = 0.0
+    pseudo_count: float = 0.5
+    intensity_pixels: str = "all"
+    inclinations: int = 8
+    alpha_deg: float = 30.0
+    normal_radius: int = 1
+    edge_threshold: float = 0.05
+    windows: tuple[int, int] = (2, 2)
+
+    def __post_init__(self) -> None:
+        """Refuse values that make no histogram."""
+        check_choice(self, "measure", MEASURES)
+        check_choice(self, "intensity_pixels", ("all", "with-depth"))
+        check_range(self, "bins", 2, 256)
+        check_range(self, "smoothing", 0, 64)
+        check_range(self, "pseudo_count", 1e-6, 1e3)
+        check_range(self, "inclinations", 2, 32)
+        check_range(self, "alpha_deg", 1, 90)
+        check_range(self, "normal_radius", 1, 8)
+        check_range(self, "edge_threshold", 1e-4, 1)
+        for name in ("bins", "inclinations", "normal_radius"):
+            if not isinstance(getattr(self, name), int):
+                raise InputError(f"DivergenceConfig.{name} must be an integer")
+        windows = tuple(self.windows)
+        object.__setattr__(self, "windows", windows)  # lists come from YAML
+        is_grid = len(windows) == 2 and all(isinstance(n, int) and 1 <= n <= 16 for n in windows)
+        if not is_grid:
+            raise InputError(
+                f"DivergenceConfig.windows = {windows!r} must be two integers in [1, 16]"
+            )
+
+    @classmethod
+    def paper(cls) -> DivergenceConfig:
+        """The paper's own setting: 256 intensity bins, no smoothing, all pixels, plain KL.
+
+        The paper gives no numbers for N and alpha; 8 and 30 degrees are ours.
+        """
+        return cls(
+            measure="kl",
+            bins=256,
+            smoothing=0.0,
+            intensity_pixels="all",
+            inclinations=8,
+            alpha_deg=30.0,
+            normal_radius=1,
+        )

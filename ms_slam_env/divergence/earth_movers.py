@@ -1,0 +1,75 @@
+"""Earth mover's distance of whole-image histograms."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.divergence.base import Divergence
+from ms_slam_env.divergence.sphere import bin_directions
+
+Float64 = NDArray[np.float64]
+
+REGULARISATION_RAD = 0.1
+ITERATIONS = 100
+
+
+def earth_movers_1d(p: Float64, q: Float64) -> Float64:
+    """Earth mover's distance (...) of distributions (..., K) over K equal bins of [0, 1].
+
+    In one dimension it is the area between the cumulative distributions.
+    """
+    return np.abs(np.cumsum(p - q, axis=-1)[..., :-1]).sum(axis=-1) / p.shape[-1]
+
+
+class SphereTransport:
+    """Transport between distributions over fixed directions; the ground distance is the angle.
+
+    The exact distance is a linear program of L^2 variables. This is Sinkhorn's entropic
+    approximation with its bias removed (Cuturi, NeurIPS 2013; Feydy et al., AISTATS 2019,
+    equation (3)): S(p, q) = OT(p, q) - OT(p, p) / 2 - OT(q, q) / 2.
+    """
+
+    def __init__(self, directions: Float64) -> None:
+        """Prepare for unit vectors (L, 3)."""
+        self.angles = np.arccos(np.clip(directions @ directions.T, -1.0, 1.0))
+        self._kernel = np.exp(-self.angles / REGULARISATION_RAD)
+
+    def distance(self, p: Float64, q: Float64) -> Float64:
+        """Distance (B,) in radians between positive distributions (B, L) and (1 or B, L)."""
+        q = np.broadcast_to(q, p.shape)
+        return np.maximum(
+            self._entropic(p, q) - (self._entropic(p, p) + self._entropic(q, q)) / 2, 0.0
+        )
+
+    def _entropic(self, p: Float64, q: Float64) -> Float64:
+        """Dual value (B,) of the entropic transport of p (B, L) onto q (B, L)."""
+        left = np.ones_like(p)
+        for _ in range(ITERATIONS):
+            right = q / (left @ self._kernel)
+            left = p / (right @ self._kernel)
+        dual = (p * np.log(left)).sum(axis=1) + (q * np.log(right)).sum(axis=1)
+        return REGULARISATION_RAD * dual
+
+
+class EarthMoversDivergence(Divergence):
+    """Tolerates small changes of light, which move grey levels to neighbouring bins.
+
+    "Using the Earth mover's distance to provide tolerance to small illumination changes"
+    (Saeedi et al., ICRA 2017, section VII). Intensity: share of the grey range; normals: radians.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        """Prepare as every divergence, plus the ground distance between the bins."""
+        super().__init__(*args, **kwargs)
+        self._transport = SphereTransport(bin_directions(self.config.inclinations))
+
+    def compare_intensity(self, current: Float64, reference: Float64) -> Float64:
+        """Exact one-dimensional distance, as a share of the grey range."""
+        return earth_movers_1d(current[:, 0], reference[:, 0])
+
+    def compare_normals(self, current: Float64, reference: Float64) -> Float64:
+        """Debiased Sinkhorn distance on the sphere, radians."""
+        return self._transport.distance(current[:, 0], reference[:, 0])
