@@ -1,0 +1,14 @@
+"""The Gymnasium environments."""
+
+from ms_slam_env.env.active_slam import ActiveSlamEnv
+from ms_slam_env.env.config import EnvConfig, LookaheadConfig, RewardConfig, TargetConfig
+from ms_slam_env.env.planner import Planner
+
+__all__ = [
+    "ActiveSlamEnv",
+    "EnvConfig",
+    "LookaheadConfig",
+    "Planner",
+    "RewardConfig",
+    "TargetConfig",
+]

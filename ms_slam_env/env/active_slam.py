@@ -1,0 +1,411 @@
+"""The environment: plan, move, render, track, judge."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from ms_slam_env import slam as slam_backends
+from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image, xtion
+from ms_slam_env.config import from_dict
+from ms_slam_env.divergence import make_divergence
+from ms_slam_env.env.config import EnvConfig
+from ms_slam_env.env.coverage import CoverageGrid
+from ms_slam_env.env.lookahead import Lookahead
+from ms_slam_env.env.observations import RobotKnowledge, make_observation
+from ms_slam_env.env.rendering import Renderer
+from ms_slam_env.env.reward import Outcome, reward_terms
+from ms_slam_env.env.state import EpisodeState
+from ms_slam_env.env.timings import Timings
+from ms_slam_env.env.worlds import get_scene, get_sensor
+from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import check_pose, invert, transform_points
+from ms_slam_env.robot import CAMERA_RADIUS_M, Embodiment, FixedTranslation, FreeCamera
+from ms_slam_env.scenes import SEED_SPLITS
+from ms_slam_env.scenes.base import Scene
+from ms_slam_env.sensor import RGBDSensor
+from ms_slam_env.slam.base import SlamBackend, TrackResult, Views
+
+Float64 = NDArray[np.float64]
+
+FRAME_PERIOD_S = 1 / 30
+_COVERAGE_STRIDE = 2  # every second pixel in each direction marks coverage
+
+EMBODIMENTS: dict[str, Callable[[Scene, float, float], Embodiment]] = {
+    "free": FreeCamera,
+    "fixed-translation": FixedTranslation,
+}
+
+
+class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
+    """A camera chooses its next motion while a dense RGB-D SLAM estimates where it is.
+
+    Each step the camera makes one of 49 small motions (Saeedi et al., ICRA 2017, section V-D), a
+    noisy RGB-D frame is rendered, SLAM tracks and fuses it, and the information divergence
+    between consecutive frames says how hard the motion was.
+
+    ## Action space
+    ``Discrete(49)``: ``7 * translation + rotation`` with translations none, up, down, left, right,
+    forward, backward and rotations none, roll right, roll left, pitch forward, pitch backward, yaw
+    anticlockwise, yaw clockwise, along and about the axes of the current camera frame.
+    ``MSActiveSLAM-FixedTranslation-v0``: ``Discrete(7)``, the rotation; the camera translates along
+    a straight line by itself. A masked action does nothing.
+
+    ## Observation space
+    Option ``observation``: ``features`` (vector: state, grey histogram, coarse depth, action mask),
+    ``lookahead`` (features and the predicted divergences of every action) or ``rgbd`` (images and
+    state). Only what the robot itself has; see :mod:`ms_slam_env.env.observations`.
+
+    ## Reward
+    Weighted sum of the terms of :func:`ms_slam_env.env.reward.reward_terms`.
+
+    ## Start
+    A free pose of the scene, drawn from the seed; SLAM starts at the true pose with one frame.
+
+    ## End
+    Terminated when tracking was lost for ``lost_patience`` consecutive steps; truncated by the time
+    limit (``max_episode_steps`` of ``gym.make``, 150 by default).
+
+    ## Info
+    ``T_world_camera``, ``T_world_camera_estimate`` (4, 4); ``pose_error`` m; ``ate`` running RMSE of
+    the pose error, m, no alignment; ``divergence`` (2,) intensity and depth, nats; ``tracking_ok``;
+    ``reward_terms``; ``action_mask`` (n,) bool; ``mapped_area`` m2; ``scene``, ``scene_seed``.
+    No clock: timings are in ``env.unwrapped.timings``.
+
+    ## Arguments
+    The fields of :class:`ms_slam_env.env.EnvConfig`, by keyword; nested ones as dataclass or mapping.
+
+    ## Version history
+    v0: first version.
+
+    Args:
+        embodiment: ``free`` or ``fixed-translation``.
+        render_mode: None or ``rgb_array``.
+        **options: fields of ``EnvConfig``.
+
+    Raises:
+        InputError: an unknown option or choice, or a value out of range.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
+
+    def __init__(
+        self, embodiment: str = "free", render_mode: str | None = None, **options: Any
+    ) -> None:
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise InputError(f"unknown render_mode {render_mode!r}; valid choices: None, rgb_array")
+        self._options = {"embodiment": embodiment, "render_mode": render_mode, **options}
+        self.config = from_dict(EnvConfig, options)
+        self.render_mode = render_mode
+        self.intrinsics: Intrinsics = xtion(self.config.image_size)
+        self.timings = Timings()
+        self.slam: SlamBackend = slam_backends.make(
+            self.config.slam, self.intrinsics, **self.config.slam_config
+        )
+        self._make_embodiment = EMBODIMENTS[embodiment]
+        self._measure = make_divergence(self.config.divergence, self.intrinsics)
+        self._lookahead = Lookahead(self.config.lookahead, self.config.divergence, self.intrinsics)
+        num_actions = EMBODIMENTS[embodiment].num_actions  # type: ignore[attr-defined]
+        self.action_space = spaces.Discrete(num_actions)
+        self._observation = make_observation(self.config.observation, self.intrinsics, num_actions)
+        self.observation_space = self._observation.space
+        self._renderer = Renderer()
+        self._rays = self.intrinsics.rays()[::_COVERAGE_STRIDE, ::_COVERAGE_STRIDE].reshape(-1, 3)
+        self._episode: EpisodeState | None = None
+
+    # -- Gymnasium ---------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start an episode.
+
+        Args:
+            seed: seeds the environment's generator.
+            options: ``T_world_camera`` (4, 4) to start from instead of a drawn pose.
+        """
+        super().reset(seed=seed)
+        unknown_options = set(options or {}) - {"T_world_camera"}
+        if unknown_options:
+            raise InputError(
+                f"unknown reset option {sorted(unknown_options)}; valid choices: T_world_camera"
+            )
+        name, scene_seed = self._draw_scene()
+        self._enter_scene(name, scene_seed)
+        start = self.scene.sample_start(self.np_random)
+        if options and "T_world_camera" in options:
+            start = self._check_start(options["T_world_camera"])
+        self.embodiment.reset(start, self.np_random)
+        self._episode = EpisodeState(
+            scene=name,
+            scene_seed=scene_seed,
+            noise_seed=int(self.np_random.integers(2**31)),
+        )
+        self.slam.reset(start)
+        self._observe_world()
+        self._episode.reward_terms = {}
+        return self._build_observation(), self._info()
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Make one motion and track the frame that follows.
+
+        Raises:
+            InputError: an action that is not an integer of the action space, or no reset before.
+        """
+        chosen = self._check_action(action)
+        episode = self._current()
+        episode.action = chosen
+        with self.timings.stage("move"):
+            moved = self.embodiment.move(chosen)
+        error_before = episode.pose_error
+        new_surface = self._observe_world()
+        lost_for_good = episode.steps_lost >= self.config.lost_patience
+        outcome = Outcome(
+            divergence=episode.divergence,
+            pose_error_growth_m=episode.pose_error - error_before,
+            new_surface_m2=new_surface,
+            tracking_ok=episode.tracking_ok,
+            lost_for_good=lost_for_good,
+            blocked=not moved,
+        )
+        episode.reward_terms = reward_terms(outcome, self.config.reward, self.config.targets)
+        reward = float(sum(episode.reward_terms.values()))
+        return self._build_observation(), reward, lost_for_good, False, self._info()
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """One picture that explains the moment, (480, 1120, 3) uint8; None without render mode."""
+        if self.render_mode is None:
+            return None
+        return self._renderer.draw(self)
+
+    # -- What planners use -------------------------------------------------------------------
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """(n,) which actions are possible now; the name is sb3-contrib's."""
+        self._current()
+        return self.embodiment.action_masks()
+
+    def candidate_poses(self) -> Float64:
+        """(n, 4, 4) where each action would bring the camera, by SLAM's estimate of now."""
+        return self._current().T_world_camera_estimate @ self.embodiment.candidate_motions()
+
+    def predict_candidates(self) -> Views:
+        """The view of each candidate as the map predicts it."""
+        with self.timings.stage("lookahead"):
+            return self._lookahead.predict(self.slam, self.candidate_poses())
+
+    def lookahead(self) -> Float64:
+        """(n, 2) predicted intensity and depth divergence of each action, nats."""
+        episode = self._current()
+        if episode.predicted_divergences is None:
+            with self.timings.stage("lookahead"):
+                episode.predicted_divergences = self._lookahead.divergences(
+                    self.slam,
+                    self.candidate_poses(),
+                    episode.T_world_camera_estimate,
+                    episode.last_frame,
+                )
+        return episode.predicted_divergences.copy()
+
+    @property
+    def divergence_targets(self) -> Float64:
+        """(2,) the divergences to aim at: rho_I M_I and rho_D M_D."""
+        return self.config.targets.divergence
+
+    @property
+    def depth_weight(self) -> float:
+        """Lambda of Algorithm 1, line 9."""
+        return self.config.targets.depth_weight
+
+    # -- What evaluation uses ----------------------------------------------------------------
+
+    @property
+    def trajectory_truth(self) -> Float64:
+        """(N, 4, 4) true poses of the episode so far."""
+        return np.stack(self._current().truth)
+
+    @property
+    def trajectory_estimate(self) -> Float64:
+        """(N, 4, 4) poses estimated when they were current."""
+        return np.stack(self._current().estimates)
+
+    @property
+    def divergences(self) -> Float64:
+        """(N, 2) divergence of each frame from the one before; zero for the first."""
+        return np.stack(self._current().divergences)
+
+    @property
+    def pose_errors(self) -> Float64:
+        """(N,) distance between true and estimated position at each frame, metres."""
+        return np.array(self._current().errors)
+
+    @property
+    def tracking_ok(self) -> bool:
+        """Whether the last frame was tracked."""
+        return self._current().tracking_ok
+
+    @property
+    def last_frame(self) -> RGBDFrame:
+        """The last live frame."""
+        return self._current().last_frame
+
+    @property
+    def last_motion(self) -> int:
+        """The last action; 0 before the first."""
+        return self._current().action
+
+    def visible_truth(self) -> Float64:
+        """(K, 3) voxel centres (5 cm) of the true surface seen so far."""
+        return self.coverage.seen_points()
+
+    def save_state(self) -> dict[str, Any]:
+        """Everything needed to go on bit-exactly (the time limit's counter excepted)."""
+        return {
+            "episode": self._current().copy(),
+            "slam": self.slam.get_state(),
+            "embodiment": self.embodiment.get_state(),
+            "coverage": self.coverage.get_state(),
+            "random": self.np_random.bit_generator.state,
+        }
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Go on from a state that ``save_state`` of an env with the same options returned."""
+        episode: EpisodeState = state["episode"]
+        self._enter_scene(episode.scene, episode.scene_seed)
+        self._episode = episode.copy()
+        self.slam.set_state(state["slam"])
+        self.embodiment.set_state(state["embodiment"])
+        self.coverage.set_state(state["coverage"])
+        self.np_random.bit_generator.state = state["random"]
+
+    # -- The world ---------------------------------------------------------------------------
+
+    def _draw_scene(self) -> tuple[str, int]:
+        names = self.config.scenes
+        name = names[int(self.np_random.integers(len(names)))]
+        if self.config.scene_seed is not None:
+            return name, self.config.scene_seed
+        split = SEED_SPLITS[self.config.split]
+        return name, split[int(self.np_random.integers(self.config.num_scene_seeds))]
+
+    def _enter_scene(self, name: str, scene_seed: int) -> None:
+        self.scene: Scene = get_scene(name, scene_seed)
+        self.sensor: RGBDSensor = get_sensor(
+            name, scene_seed, self.config.image_size, self.config.noise
+        )
+        self.embodiment = self._make_embodiment(
+            self.scene, self.config.step_m, self.config.step_rad
+        )
+        self.coverage = CoverageGrid(self.scene)
+
+    def _observe_world(self) -> float:
+        """Render, measure, track and judge one frame; return the newly mapped area, m2."""
+        episode = self._current()
+        T_world_camera = self.embodiment.T_world_camera
+        with self.timings.stage("render"):
+            frame = self.sensor.capture(
+                T_world_camera,
+                index=episode.frame_index,
+                timestamp=episode.frame_index * FRAME_PERIOD_S,
+                seed=episode.noise_seed,
+            )
+        with self.timings.stage("slam"):
+            result = self.slam.track(frame)
+        with self.timings.stage("divergence"):
+            divergence = self._frame_divergence(frame)
+        with self.timings.stage("coverage"):
+            area = self._cover(frame, T_world_camera, result)
+        episode.record(frame, T_world_camera, result, divergence)
+        return area
+
+    def _frame_divergence(self, frame: RGBDFrame) -> Float64:
+        episode = self._current()
+        grey = intensity_image(frame.color)[None].astype(np.float32)
+        histograms = self._measure.histograms(grey, frame.depth[None])
+        previous, episode.histograms = episode.histograms, histograms
+        if previous is None:
+            return np.zeros(2)
+        return self._measure.divergence(histograms, previous)[0]
+
+    def _cover(self, frame: RGBDFrame, T_world_camera: Float64, result: TrackResult) -> float:
+        if not result.tracking_ok:
+            return 0.0
+        depth = frame.depth[::_COVERAGE_STRIDE, ::_COVERAGE_STRIDE].reshape(-1, 1)
+        valid = depth[:, 0] > 0
+        points = (depth * self._rays)[valid]
+        true = transform_points(T_world_camera, points)
+        return self.coverage.add(true, transform_points(result.T_world_camera, points))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Options and, once reset, the episode: device arrays are made anew."""
+        state = None if self._episode is None else self.save_state()
+        return {"options": self._options, "state": state}
+
+    def __setstate__(self, pickled: dict[str, Any]) -> None:
+        """Build the environment anew and go on from where the pickled one was."""
+        self.__init__(**pickled["options"])  # type: ignore[misc]
+        if pickled["state"] is not None:
+            self.load_state(pickled["state"])
+
+    # -- Checks and views --------------------------------------------------------------------
+
+    def _current(self) -> EpisodeState:
+        if self._episode is None:
+            raise InputError("the environment must be reset before it is used: call env.reset()")
+        return self._episode
+
+    def _check_start(self, T_world_camera: Any) -> Float64:
+        start = check_pose(T_world_camera, "reset option T_world_camera")
+        if self.scene.clearance(start[None, :3, 3])[0] < CAMERA_RADIUS_M:
+            raise InputError(
+                f"reset option T_world_camera: no free space of {CAMERA_RADIUS_M} m around "
+                f"{np.round(start[:3, 3], 3).tolist()} in scene {self.scene.name}"
+            )
+        return start
+
+    def _check_action(self, action: Any) -> int:
+        self._current()
+        array = np.asarray(action)
+        is_integer = array.shape == () and np.issubdtype(array.dtype, np.integer)
+        last = int(self.action_space.n) - 1  # type: ignore[attr-defined]
+        if not is_integer or not 0 <= int(array) <= last:
+            raise InputError(f"action {action!r} is not an integer in [0, {last}]")
+        return int(array)
+
+    def _build_observation(self) -> Any:
+        episode = self._current()
+        with self.timings.stage("observation"):
+            return self._observation.build(
+                RobotKnowledge(
+                    frame=episode.last_frame,
+                    T_start_camera=invert(episode.estimates[0]) @ episode.T_world_camera_estimate,
+                    divergence=episode.divergence / self.config.targets.maxima,
+                    tracking_ok=episode.tracking_ok,
+                    inlier_fraction=episode.inlier_fraction,
+                    lost_share=min(1.0, episode.steps_lost / self.config.lost_patience),
+                    motion=episode.action,
+                    action_mask=self.action_masks(),
+                    lookahead=lambda: self.lookahead() / self.config.targets.maxima,
+                )
+            )
+
+    def _info(self) -> dict[str, Any]:
+        episode = self._current()
+        return {
+            "T_world_camera": episode.truth[-1].copy(),
+            "T_world_camera_estimate": episode.T_world_camera_estimate.copy(),
+            "pose_error": episode.pose_error,
+            "ate": episode.ate,
+            "divergence": episode.divergence.copy(),
+            "tracking_ok": episode.tracking_ok,
+            "reward_terms": dict(episode.reward_terms),
+            "action_mask": self.action_masks(),
+            "mapped_area": self.coverage.mapped_area,
+            "scene": episode.scene,
+            "scene_seed": episode.scene_seed,
+        }

@@ -1,0 +1,169 @@
+"""Configuration of the environment: one frozen dataclass a stage, composed in ``EnvConfig``."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.camera import XTION_SIZES
+from ms_slam_env.config import check_choice, check_range
+from ms_slam_env.divergence import DivergenceConfig
+from ms_slam_env.env.observations import OBSERVATIONS
+from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.scenes import SCENES, SEED_SPLITS
+
+
+@dataclass(frozen=True)
+class TargetConfig:
+    """Motion-and-structure parameters and thresholds of the paper's Algorithm 1, line 9.
+
+    Attributes:
+        M_I: permitted maximum of the intensity divergence, equation (11), nats.
+        M_D: permitted maximum of the depth divergence, equation (12), nats.
+        rho_I: share of M_I to aim at, in [0, 1]; 0 keeps the camera almost still.
+        rho_D: share of M_D to aim at, in [0, 1].
+        depth_weight: lambda, significance of depth over intensity.
+    """
+
+    M_I: float = 0.02
+    M_D: float = 0.02
+    rho_I: float = 0.5
+    rho_D: float = 0.5
+    depth_weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        check_range(self, "M_I", 1e-6, 100)
+        check_range(self, "M_D", 1e-6, 100)
+        check_range(self, "rho_I", 0, 1)
+        check_range(self, "rho_D", 0, 1)
+        check_range(self, "depth_weight", 0, 1e6)
+
+    @property
+    def maxima(self) -> NDArray[np.float64]:
+        """(M_I, M_D)."""
+        return np.array([self.M_I, self.M_D])
+
+    @property
+    def divergence(self) -> NDArray[np.float64]:
+        """The divergences to aim at, (rho_I M_I, rho_D M_D)."""
+        return np.array([self.rho_I * self.M_I, self.rho_D * self.M_D])
+
+
+@dataclass(frozen=True)
+class RewardConfig:
+    """Weights of the reward terms; see :mod:`ms_slam_env.env.reward` for each term.
+
+    Attributes:
+        intensity_divergence: per M_I of distance to the intensity target.
+        depth_divergence: per M_D of distance to the depth target (times lambda).
+        trajectory_error: per metre of growth of the pose error.
+        new_surface: per square metre of surface newly mapped in its true place.
+        lost: per step with tracking lost.
+        lost_for_good: once, when the episode ends because tracking was lost beyond recovery.
+        blocked: per masked action chosen.
+    """
+
+    intensity_divergence: float = 0.1
+    depth_divergence: float = 0.1
+    trajectory_error: float = 5.0
+    new_surface: float = 5.0
+    lost: float = 0.5
+    lost_for_good: float = 5.0
+    blocked: float = 0.2
+
+    def __post_init__(self) -> None:
+        """Refuse negative weights."""
+        for name in self.__dataclass_fields__:
+            check_range(self, name, 0, 1e6)
+
+
+@dataclass(frozen=True)
+class LookaheadConfig:
+    """How the 49 views are predicted and compared.
+
+    Attributes:
+        reference: ``live`` compares with the last live frame, as Algorithm 1 does; ``predicted``
+            compares with the view that the map predicts at the current pose.
+        scale: size of the predicted views relative to the camera's image.
+    """
+
+    reference: str = "predicted"
+    scale: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Refuse unknown choices and values out of range."""
+        check_choice(self, "reference", ("live", "predicted"))
+        check_range(self, "scale", 0.125, 1)
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """Everything about an environment but its id.
+
+    Attributes:
+        scene: a scene's name, a mesh file, or several to draw from at each reset.
+        scene_seed: one seed, or None to draw from ``split`` at each reset.
+        split: which seeds to draw from: train, validation or test.
+        num_scene_seeds: how many seeds of the split are used; a scene takes seconds to build, so
+            a small pool is kept in memory.
+        image_size: of the camera, width x height.
+        noise: sensor noise, ``kinect`` or ``none``.
+        slam: SLAM backend.
+        slam_config: options of the backend.
+        observation: ``rgbd``, ``features`` or ``lookahead``.
+        step_m: translation of a motion, metres.
+        step_rad: rotation of a motion, radians.
+        lost_patience: steps that tracking may stay lost before the episode ends.
+        divergence: how divergence is measured.
+        lookahead: how candidates are predicted.
+        targets: motion-and-structure parameters and thresholds.
+        reward: weights of the reward terms.
+    """
+
+    scene: str | tuple[str, ...] = "living_room"
+    scene_seed: int | None = None
+    split: str = "train"
+    num_scene_seeds: int = 4
+    image_size: str = "160x120"
+    noise: str = "kinect"
+    slam: str = "surfel"
+    slam_config: dict[str, object] = field(default_factory=dict)
+    observation: str = "features"
+    step_m: float = 0.06
+    step_rad: float = math.radians(6)
+    lost_patience: int = 10
+    divergence: DivergenceConfig = field(default_factory=DivergenceConfig)
+    lookahead: LookaheadConfig = field(default_factory=LookaheadConfig)
+    targets: TargetConfig = field(default_factory=TargetConfig)
+    reward: RewardConfig = field(default_factory=RewardConfig)
+
+    def __post_init__(self) -> None:
+        """Refuse unknown choices and values out of range."""
+        check_choice(self, "split", tuple(SEED_SPLITS))
+        check_choice(self, "image_size", tuple(XTION_SIZES))
+        check_choice(self, "noise", ("kinect", "none"))
+        check_choice(self, "observation", tuple(OBSERVATIONS))
+        check_range(self, "num_scene_seeds", 1, len(SEED_SPLITS[self.split]))
+        check_range(self, "step_m", 0, 1)
+        check_range(self, "step_rad", 0, math.pi / 2)
+        check_range(self, "lost_patience", 1, 1_000_000)
+        if self.scene_seed is not None and (
+            isinstance(self.scene_seed, bool) or not isinstance(self.scene_seed, (int, np.integer))
+        ):
+            raise InputError(
+                f"EnvConfig.scene_seed = {self.scene_seed!r} must be an integer or None"
+            )
+        if not self.scenes:
+            raise InputError("EnvConfig.scene names no scene")
+        for name in self.scenes:
+            if name not in SCENES and "." not in name:
+                raise unknown("scene", name, (*SCENES, "or the path of a .glb, .obj or .ply mesh"))
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """The scenes to draw from."""
+        return (self.scene,) if isinstance(self.scene, str) else tuple(self.scene)

@@ -1,0 +1,169 @@
+"""One composed picture that explains the moment."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.geometry import invert, look_at, transform_points
+from ms_slam_env.robot import describe
+
+if TYPE_CHECKING:
+    from ms_slam_env.env.active_slam import ActiveSlamEnv
+
+Image = NDArray[np.uint8]
+Float64 = NDArray[np.float64]
+
+_PANEL = (240, 320)  # (height, width) of the live images
+_MAP = (480, 480)
+_PLOT = (160, 320)
+_TRUE_COLOR = (60, 180, 75)
+_ESTIMATE_COLOR = (230, 60, 60)
+_TARGET_COLOR = (120, 120, 120)
+_BACKGROUND = 250
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+_MAX_DEPTH_M = 5.0
+_OUTSIDE_PITCH = 0.9  # radians below the horizon
+_ERROR_AXIS_M = 0.05
+_DIVERGENCE_AXIS = 2.0  # the plots end at this many times M
+
+
+class Renderer:
+    """Draws colour, depth, map from outside, divergences against targets, error so far."""
+
+    def draw(self, env: ActiveSlamEnv) -> Image:
+        """Return the picture (480, 1120, 3) uint8 of an environment that was reset."""
+        left = np.vstack([self._color(env), self._depth(env)])
+        right = np.vstack(self._plots(env))
+        return np.hstack([left, self._map(env), right])
+
+    def _color(self, env: ActiveSlamEnv) -> Image:
+        image = cv2.resize(env.last_frame.color, _PANEL[::-1], interpolation=cv2.INTER_LINEAR)
+        return _caption(image, f"{env.scene.name}, step {len(env.trajectory_truth) - 1}")
+
+    def _depth(self, env: ActiveSlamEnv) -> Image:
+        depth = env.last_frame.depth
+        grey = (255 * (1 - np.clip(depth / _MAX_DEPTH_M, 0, 1))).astype(np.uint8)
+        colored = cv2.cvtColor(cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB)
+        colored[depth == 0] = 0
+        image = cv2.resize(colored, _PANEL[::-1], interpolation=cv2.INTER_NEAREST)
+        return _caption(image, f"depth, 0 to {_MAX_DEPTH_M:g} m, black: no reading")
+
+    def _map(self, env: ActiveSlamEnv) -> Image:
+        truth = env.trajectory_truth
+        camera = Intrinsics(fx=420, fy=420, cx=239.5, cy=239.5, width=_MAP[1], height=_MAP[0])
+        T_world_outside = _outside_pose(env)
+        canvas = np.full((*_MAP, 3), _BACKGROUND, np.uint8)
+        points, colors = env.slam.surface_points(), env.slam.surface_colors()
+        _splat(canvas, camera, T_world_outside, points, colors)
+        _draw_path(canvas, camera, T_world_outside, truth, _TRUE_COLOR)
+        _draw_path(canvas, camera, T_world_outside, env.trajectory_estimate, _ESTIMATE_COLOR)
+        return _caption(canvas, f"map: {len(points)} points; path: true green, estimated red")
+
+    def _plots(self, env: ActiveSlamEnv) -> list[Image]:
+        divergences = env.divergences
+        targets = env.config.targets
+        errors = np.asarray(env.pose_errors)
+        state = "tracking" if env.tracking_ok else "LOST"
+        rows = [
+            (
+                divergences[:, 0],
+                targets.divergence[0],
+                _DIVERGENCE_AXIS * targets.M_I,
+                "intensity divergence",
+            ),
+            (
+                divergences[:, 1],
+                targets.divergence[1],
+                _DIVERGENCE_AXIS * targets.M_D,
+                "depth divergence",
+            ),
+            (errors, None, max(_ERROR_AXIS_M, errors.max()), f"pose error (m), {state}"),
+        ]
+        plots = [_plot(*row) for row in rows]
+        _caption(plots[-1], describe(env.last_motion), bottom=True)
+        return plots
+
+
+def _outside_pose(env: ActiveSlamEnv) -> Float64:
+    """A view from above and behind the start, far enough to see what the camera can map."""
+    start = env.trajectory_truth[0]
+    heading = start[:3, 2] * [1, 1, 0]
+    heading = heading / max(1e-9, float(np.linalg.norm(heading)))
+    centre = start[:3, 3] + 1.2 * heading - [0, 0, 0.4]
+    distance = 5.0
+    offset = -np.cos(_OUTSIDE_PITCH) * heading + np.sin(_OUTSIDE_PITCH) * np.array([0, 0, 1.0])
+    return look_at(centre + distance * offset, centre)
+
+
+def _project(
+    camera: Intrinsics, T_world_camera: Float64, points: Float64
+) -> tuple[Float64, Float64]:
+    local = transform_points(invert(T_world_camera), points)
+    in_front = local[:, 2] > 0.1
+    pixels = np.full((len(local), 2), -1.0)
+    pixels[in_front] = camera.project(local[in_front])
+    return pixels, local[:, 2]
+
+
+def _splat(
+    canvas: Image, camera: Intrinsics, T_world_camera: Float64, points: Float64, colors: Image
+) -> None:
+    """Paint points back to front as 2 x 2 pixels."""
+    pixels, depth = _project(camera, T_world_camera, points)
+    order = np.argsort(-depth)
+    u, v = np.rint(pixels[order]).astype(np.int64).T
+    inside = (u >= 0) & (v >= 0) & (u < camera.width - 1) & (v < camera.height - 1)
+    u, v, rgb = u[inside], v[inside], colors[order][inside]
+    for dv in (0, 1):
+        for du in (0, 1):
+            canvas[v + dv, u + du] = rgb
+
+
+def _draw_path(
+    canvas: Image,
+    camera: Intrinsics,
+    T_world_camera: Float64,
+    poses: Float64,
+    color: tuple[int, int, int],
+) -> None:
+    pixels, _ = _project(camera, T_world_camera, poses[:, :3, 3])
+    line = np.rint(pixels).astype(np.int32)
+    cv2.polylines(canvas, [line], False, color, 2, cv2.LINE_AA)
+    cv2.circle(canvas, (int(line[-1, 0]), int(line[-1, 1])), 4, color, -1, cv2.LINE_AA)
+
+
+def _plot(values: Float64, target: float | None, top: float, title: str) -> Image:
+    """A line plot (160, 320, 3) of ``values`` in [0, top], with a dashed target."""
+    height, width = _PLOT
+    canvas = np.full((height, width, 3), _BACKGROUND, np.uint8)
+    low, high, margin = height - 12, 24, 8
+
+    def row(value: float) -> float:
+        return low - (low - high) * min(value / top, 1.0)
+
+    cv2.line(canvas, (margin, low), (width - margin, low), (0, 0, 0), 1)
+    if target is not None:
+        y = round(row(target))
+        for x in range(margin, width - margin, 10):
+            cv2.line(canvas, (x, y), (x + 5, y), _TARGET_COLOR, 1)
+    x = np.linspace(margin, width - margin, max(2, len(values)))[: len(values)]
+    y = np.array([row(float(value)) for value in values])
+    line = np.rint(np.stack([x, y], axis=1)).astype(np.int32)
+    cv2.polylines(canvas, [line], False, _ESTIMATE_COLOR, 1, cv2.LINE_AA)
+    return _caption(canvas, f"{title}: {values[-1]:.4f}", dark=True)
+
+
+def _caption(image: Image, text: str, bottom: bool = False, dark: bool = False) -> Image:
+    """Write one line on ``image`` in place and return it."""
+    y = image.shape[0] - 4 if bottom else 14
+    if not dark:
+        band = slice(y - 14, y + 6) if not bottom else slice(y - 14, y + 4)
+        image[band] = image[band] // 3
+    color = (20, 20, 20) if dark else (255, 255, 255)
+    cv2.putText(image, text, (6, y), _FONT, 0.42, color, 1, cv2.LINE_AA)
+    return image

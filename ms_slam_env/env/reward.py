@@ -1,0 +1,58 @@
+"""The reward: named terms, one weighted sum."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.env.config import RewardConfig, TargetConfig
+
+_DISTANCE_CAP = 2.0  # in units of M: one violent frame must not outweigh a whole episode
+_ERROR_CAP_M = 0.1  # a lost camera's error is arbitrary; the terms for lost tracking judge it
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one step led to.
+
+    Attributes:
+        divergence: (2,) intensity and depth divergence between the last two live frames.
+        pose_error_growth_m: change of the distance between true and estimated position.
+        new_surface_m2: surface newly mapped in its true place.
+        tracking_ok: whether the frame was tracked.
+        lost_for_good: whether the episode ends because tracking was lost beyond recovery.
+        blocked: whether the action was masked and so did nothing.
+    """
+
+    divergence: NDArray[np.float64]
+    pose_error_growth_m: float
+    new_surface_m2: float
+    tracking_ok: bool
+    lost_for_good: bool
+    blocked: bool
+
+
+def reward_terms(
+    outcome: Outcome, weights: RewardConfig, targets: TargetConfig
+) -> dict[str, float]:
+    """Weighted terms, name to value; the reward is their sum.
+
+    The two divergence terms are the summands of Algorithm 1, line 9, in units of M_I and M_D so
+    that one weight serves every scene; they alone would make an agent imitate the greedy planner.
+    Surface newly mapped in its true place is what a user wants from the camera: neither standing
+    still nor getting lost gathers any. The error terms say at once what lost surface says late.
+    """
+    distance = np.abs(outcome.divergence - targets.divergence) / targets.maxima
+    intensity, depth = np.minimum(distance, _DISTANCE_CAP)
+    growth = float(np.clip(outcome.pose_error_growth_m, -_ERROR_CAP_M, _ERROR_CAP_M))
+    return {
+        "intensity_divergence": -weights.intensity_divergence * float(intensity),
+        "depth_divergence": -weights.depth_divergence * targets.depth_weight * float(depth),
+        "trajectory_error": -weights.trajectory_error * growth,
+        "new_surface": weights.new_surface * outcome.new_surface_m2,
+        "lost": -weights.lost * float(not outcome.tracking_ok),
+        "lost_for_good": -weights.lost_for_good * float(outcome.lost_for_good),
+        "blocked": -weights.blocked * float(outcome.blocked),
+    }

@@ -1,0 +1,85 @@
+"""What an episode consists of so far."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.camera import RGBDFrame
+from ms_slam_env.divergence import Histograms
+from ms_slam_env.slam.base import TrackResult
+
+Float64 = NDArray[np.float64]
+
+
+@dataclass
+class EpisodeState:
+    """Trajectories, last frame and running measures of one episode."""
+
+    scene: str
+    scene_seed: int
+    noise_seed: int
+    frame_index: int = 0
+    action: int = 0
+    steps_lost: int = 0
+    tracking_ok: bool = True
+    inlier_fraction: float = 1.0
+    squared_error_sum: float = 0.0
+    truth: list[Float64] = field(default_factory=list)
+    estimates: list[Float64] = field(default_factory=list)
+    divergences: list[Float64] = field(default_factory=list)
+    errors: list[float] = field(default_factory=list)
+    reward_terms: dict[str, float] = field(default_factory=dict)
+    histograms: Histograms | None = None
+    frame: RGBDFrame | None = None
+    predicted_divergences: Float64 | None = None
+
+    def record(
+        self, frame: RGBDFrame, T_world_camera: Float64, result: TrackResult, divergence: Float64
+    ) -> None:
+        """Append what one frame brought."""
+        self.frame = frame
+        self.frame_index += 1
+        self.tracking_ok = result.tracking_ok
+        self.inlier_fraction = result.inlier_fraction
+        self.steps_lost = 0 if result.tracking_ok else self.steps_lost + 1
+        self.truth.append(T_world_camera.copy())
+        self.estimates.append(result.T_world_camera.copy())
+        self.divergences.append(divergence)
+        error = float(np.linalg.norm(result.T_world_camera[:3, 3] - T_world_camera[:3, 3]))
+        self.errors.append(error)
+        self.squared_error_sum += error**2
+        self.predicted_divergences = None
+
+    @property
+    def last_frame(self) -> RGBDFrame:
+        """The last live frame."""
+        assert self.frame is not None  # reset records a frame before anyone can ask
+        return self.frame
+
+    @property
+    def divergence(self) -> Float64:
+        """(2,) divergence between the last two live frames; zero after one frame."""
+        return self.divergences[-1]
+
+    @property
+    def T_world_camera_estimate(self) -> Float64:
+        """(4, 4) the last estimated pose."""
+        return self.estimates[-1]
+
+    @property
+    def pose_error(self) -> float:
+        """Distance between the true and the estimated position now, metres."""
+        return self.errors[-1] if self.errors else 0.0
+
+    @property
+    def ate(self) -> float:
+        """RMSE of the position over the episode so far, metres, no alignment."""
+        return float(np.sqrt(self.squared_error_sum / max(1, len(self.errors))))
+
+    def copy(self) -> EpisodeState:
+        """An independent copy."""
+        return copy.deepcopy(self)

@@ -1,0 +1,24 @@
+"""Scenes and their sensors, built once a process and shared by its environments."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+from ms_slam_env import scenes
+from ms_slam_env.camera import xtion
+from ms_slam_env.scenes.base import Scene
+from ms_slam_env.sensor import RGBDSensor
+
+_SCENES_KEPT = 32  # a scene with its textures takes tens of megabytes
+
+
+@lru_cache(maxsize=_SCENES_KEPT)
+def get_scene(name: str, seed: int) -> Scene:
+    """The scene ``name`` with ``seed``; built at the first call."""
+    return scenes.make(name, seed=seed)
+
+
+@lru_cache(maxsize=_SCENES_KEPT)
+def get_sensor(name: str, seed: int, image_size: str, noise: str) -> RGBDSensor:
+    """A sensor looking at that scene; its noise seed is set by each environment."""
+    return RGBDSensor(get_scene(name, seed), xtion(image_size), noise=noise)

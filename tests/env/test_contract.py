@@ -1,0 +1,273 @@
+"""The environment's contract: spaces, infos, determinism, state, vector envs, bad input."""
+
+import pickle
+import re
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import ms_slam_env
+from ms_slam_env.env import ActiveSlamEnv
+from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import look_at
+from ms_slam_env.robot import decompose
+
+OPTIONS = {"scene": "living_room", "scene_seed": 0}
+NUM_ACTIONS = {
+    "MSActiveSLAM-v0": 49,
+    "MSActiveSLAM-FreeCamera-v0": 49,
+    "MSActiveSLAM-FixedTranslation-v0": 7,
+}
+
+
+def assert_same(a, b, where="value"):
+    assert type(a) is type(b), where
+    if isinstance(a, dict):
+        assert a.keys() == b.keys(), where
+        for key in a:
+            assert_same(a[key], b[key], f"{where}[{key!r}]")
+    elif isinstance(a, np.ndarray):
+        np.testing.assert_array_equal(a, b, where)
+    else:
+        assert a == b, where
+
+
+def random_actions(env, count, seed=0):
+    rng = np.random.default_rng(seed)
+    for _ in range(count):
+        yield int(rng.choice(np.flatnonzero(env.unwrapped.action_masks())))
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = gym.make("MSActiveSLAM-FreeCamera-v0", **OPTIONS)
+    yield env
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", ms_slam_env.ENV_IDS)
+@pytest.mark.parametrize("observation", ["rgbd", "features", "lookahead"])
+def test_gymnasium_checker_finds_nothing(env_id, observation, recwarn):
+    env = gym.make(env_id, observation=observation, **OPTIONS)
+    assert env.action_space.n == NUM_ACTIONS[env_id]
+    check_env(env.unwrapped, skip_render_check=True)
+    complaints = [str(w.message) for w in recwarn if "infinity" not in str(w.message)]
+    assert not complaints
+
+
+def test_every_documented_info_key_exists_and_no_other(env):
+    documented = set(
+        re.findall(r"``(\w+)``", ActiveSlamEnv.__doc__.split("## Info")[1].split("No")[0])
+    )
+    env.reset(seed=0)
+    _, reward, _, _, info = env.step(0)
+    assert documented == set(info)
+    assert reward == pytest.approx(sum(info["reward_terms"].values()), abs=1e-12)
+    assert info["T_world_camera"].shape == info["T_world_camera_estimate"].shape == (4, 4)
+    assert info["divergence"].shape == (2,)
+    assert info["action_mask"].shape == (49,)
+    assert info["action_mask"].dtype == bool
+
+
+def test_ate_is_the_running_rmse_of_the_pose_error(env):
+    _, info = env.reset(seed=3)
+    errors = [info["pose_error"]]
+    for action in random_actions(env, 5):
+        info = env.step(action)[4]
+        difference = info["T_world_camera"][:3, 3] - info["T_world_camera_estimate"][:3, 3]
+        assert info["pose_error"] == pytest.approx(np.linalg.norm(difference))
+        errors.append(info["pose_error"])
+        assert info["ate"] == pytest.approx(np.sqrt(np.mean(np.square(errors))))
+
+
+@pytest.mark.parametrize("env_id", ms_slam_env.ENV_IDS[1:])
+def test_two_envs_with_one_seed_agree_to_the_bit(env_id):
+    a, b = (gym.make(env_id, observation="rgbd", **OPTIONS) for _ in range(2))
+    assert_same(a.reset(seed=7), b.reset(seed=7))
+    for action in random_actions(a, 6):
+        assert_same(a.step(action), b.step(action))
+
+
+def test_another_seed_gives_another_episode(env):
+    first, _ = env.reset(seed=1)
+    second, _ = env.reset(seed=2)
+    assert not np.array_equal(first, second)
+
+
+@pytest.mark.parametrize("env_id", ms_slam_env.ENV_IDS[1:])
+def test_saved_state_goes_on_to_the_bit_in_a_fresh_env(env_id):
+    env = gym.make(env_id, **OPTIONS)
+    env.reset(seed=5)
+    for action in random_actions(env, 4):
+        env.step(action)
+    state = pickle.loads(pickle.dumps(env.unwrapped.save_state()))
+    actions = list(random_actions(env, 5, seed=1))
+    expected = [env.step(action) for action in actions]
+    expected_lookahead = env.unwrapped.lookahead()
+
+    fresh = gym.make(env_id, **OPTIONS)
+    fresh.reset(seed=99)
+    fresh.unwrapped.load_state(state)
+    for action, outcome in zip(actions, expected, strict=True):
+        assert_same(fresh.step(action), outcome)
+    np.testing.assert_array_equal(fresh.unwrapped.lookahead(), expected_lookahead)
+
+
+def test_pickled_env_goes_on_to_the_bit(env):
+    env.reset(seed=6)
+    env.step(5)
+    twin = pickle.loads(pickle.dumps(env.unwrapped))
+    assert_same(env.unwrapped.step(36), twin.step(36))
+
+
+def test_pickling_before_reset_keeps_the_options():
+    env = ActiveSlamEnv(step_m=0.03, **OPTIONS)
+    assert pickle.loads(pickle.dumps(env)).config == env.config
+
+
+@pytest.mark.parametrize("mode", ["sync", "async", "vector_entry_point"])
+def test_vector_modes_agree_with_the_single_env(env, mode):
+    vector = gym.make_vec(
+        "MSActiveSLAM-FreeCamera-v0", num_envs=2, vectorization_mode=mode, **OPTIONS
+    )
+    try:
+        observations, _ = vector.reset(seed=[11, 12])
+        stepped, rewards, *_ = vector.step(np.array([5, 36]))
+    finally:
+        vector.close()
+    for index, (seed, action) in enumerate([(11, 5), (12, 36)]):
+        observation, _ = env.reset(seed=seed)
+        np.testing.assert_array_equal(observations[index], observation)
+        observation, reward, *_ = env.step(action)
+        np.testing.assert_array_equal(stepped[index], observation)
+        assert rewards[index] == reward
+
+
+def test_blocked_motion_is_masked_and_does_nothing(env):
+    env.reset(seed=0)
+    scene = env.unwrapped.scene
+    pose = scene.sample_start(np.random.default_rng(0))
+    while scene.segment_is_free(pose[:3, 3], pose[:3, 3] + 0.06 * pose[:3, 2], 0.1):
+        pose[:3, 3] += 0.02 * pose[:3, 2]
+    _, info = env.reset(seed=0, options={"T_world_camera": pose})
+    forward = 7 * 5
+    assert not info["action_mask"][forward]
+    assert info["action_mask"][:7].all()
+    _, _, _, _, info = env.step(forward)
+    np.testing.assert_array_equal(info["T_world_camera"], pose)
+    assert info["reward_terms"]["blocked"] < 0
+
+
+def test_motion_is_the_papers_decomposition(env):
+    _, info = env.reset(seed=4)
+    action = next(a for a in (8, 15, 22, 29) if info["action_mask"][a])
+    before = info["T_world_camera"]
+    config = env.unwrapped.config
+    info = env.step(action)[4]
+    expected = before @ decompose(config.step_m, config.step_rad)[action]
+    np.testing.assert_allclose(info["T_world_camera"], expected, atol=1e-12)
+
+
+def test_fixed_translation_moves_along_one_line():
+    env = gym.make("MSActiveSLAM-FixedTranslation-v0", **OPTIONS)
+    _, info = env.reset(seed=0)
+    positions = [info["T_world_camera"][:3, 3]]
+    for action in random_actions(env, 12):
+        positions.append(env.step(action)[4]["T_world_camera"][:3, 3])
+    steps = np.diff(positions, axis=0)
+    np.testing.assert_allclose(np.linalg.norm(steps, axis=1), env.unwrapped.config.step_m)
+    assert np.linalg.matrix_rank(steps, tol=1e-9) == 1
+
+
+@pytest.mark.parametrize("reference", ["live", "predicted"])
+def test_lookahead_predicts_every_candidate(reference):
+    env = gym.make("MSActiveSLAM-v0", lookahead={"reference": reference}, **OPTIONS).unwrapped
+    env.reset(seed=0)
+    for action in random_actions(env, 3):
+        env.step(action)
+    predicted = env.lookahead()
+    assert predicted.shape == (49, 2)
+    assert np.isfinite(predicted).all()
+    assert (predicted >= 0).all()
+    views = env.predict_candidates()
+    assert views.depth.shape[0] == 49
+    if reference == "predicted":  # the first candidate is the reference itself
+        np.testing.assert_allclose(predicted[0], 0, atol=1e-9)
+        assert predicted[1:].max() > 0
+
+
+def test_black_frames_end_the_episode_as_lost(env, monkeypatch):
+    env.reset(seed=0)
+    frame = env.unwrapped.last_frame
+    black = type(frame)(np.zeros_like(frame.color), np.zeros_like(frame.depth), 0.0)
+    monkeypatch.setattr(type(env.unwrapped.sensor), "capture", lambda *_, **__: black)
+    patience = env.unwrapped.config.lost_patience
+    for step in range(1, patience + 1):
+        _, _, terminated, _, info = env.step(1)
+        assert not info["tracking_ok"]
+        assert info["reward_terms"]["lost"] < 0
+        assert terminated == (step == patience)
+    assert info["reward_terms"]["lost_for_good"] < 0
+
+
+def test_render_explains_the_moment():
+    env = gym.make("MSActiveSLAM-v0", render_mode="rgb_array", **OPTIONS)
+    env.reset(seed=0)
+    before = env.render()
+    env.step(5)
+    after = env.render()
+    assert before.shape == after.shape == (480, 1120, 3)
+    assert before.dtype == np.uint8
+    for columns in (slice(0, 320), slice(320, 800), slice(800, 1120)):
+        assert (before[:, columns] != after[:, columns]).any()
+
+
+@pytest.mark.parametrize("action", [49, -1, 3.0, "left", None, np.array([1, 2]), True])
+def test_bad_action_names_the_range(env, action):
+    env.reset(seed=0)
+    with pytest.raises(InputError, match=r"not an integer in \[0, 48\]"):
+        env.unwrapped.step(action)
+
+
+def test_use_before_reset_says_so():
+    env = ActiveSlamEnv(**OPTIONS)
+    for use in (lambda: env.step(0), env.lookahead, env.save_state, env.action_masks):
+        with pytest.raises(InputError, match="reset"):
+            use()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"scene": "kitchen"}, "valid choices: living_room"),
+        ({"slam": "orb"}, "valid choices: .*surfel"),
+        ({"observation": "pixels"}, "valid choices: rgbd, features, lookahead"),
+        ({"steps": 3}, "unknown option of EnvConfig 'steps'; valid choices: scene"),
+        ({"targets": {"M_X": 1}}, "unknown option of TargetConfig 'targets.M_X'"),
+        ({"reward": {"lost": -1}}, r"RewardConfig.lost = -1 is outside \[0"),
+        ({"slam_config": {"depth": 1}}, "depth_cutoff_m"),
+        ({"slam_config": {"depth_cutoff_m": 11}}, r"outside \[0, 10\]"),
+        ({"image_size": "1x1"}, "valid choices: 80x60"),
+        ({"noise": "lots"}, "valid choices: kinect, none"),
+        ({"split": "exam"}, "valid choices: train, validation, test"),
+        ({"step_m": float("nan")}, "step_m = nan is outside"),
+        ({"render_mode": "human"}, "valid choices: None, rgb_array"),
+        ({"scene": "missing.glb"}, "missing.glb"),
+    ],
+)
+def test_bad_option_gives_one_clear_line(options, message):
+    with pytest.raises(InputError, match=message) as caught:
+        ActiveSlamEnv(**options).reset(seed=0)
+    assert "\n" not in str(caught.value)
+
+
+def test_bad_reset_options(env):
+    with pytest.raises(InputError, match="T_world_camera"):
+        env.reset(options={"pose": 1})
+    with pytest.raises(InputError, match="finite"):
+        env.reset(options={"T_world_camera": np.full((4, 4), np.nan)})
+    inside_wall = look_at([100.0, 0, 0], [0.0, 0, 0])
+    with pytest.raises(InputError, match="free"):
+        env.reset(options={"T_world_camera": inside_wall})

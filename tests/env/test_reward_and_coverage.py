@@ -1,0 +1,91 @@
+"""Reward terms and coverage against closed forms."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from box_scene import BoxScene
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ms_slam_env.env.config import RewardConfig, TargetConfig
+from ms_slam_env.env.coverage import CoverageGrid
+from ms_slam_env.env.reward import Outcome, reward_terms
+
+WEIGHTS = RewardConfig()
+TARGETS = TargetConfig(M_I=0.02, M_D=0.04, rho_I=0.5, rho_D=0.25, depth_weight=3.0)
+ON_TARGET = Outcome(
+    divergence=np.array([0.01, 0.01]),
+    pose_error_growth_m=0.0,
+    new_surface_m2=0.0,
+    tracking_ok=True,
+    lost_for_good=False,
+    blocked=False,
+)
+
+
+def test_all_terms_are_zero_on_target():
+    assert set(reward_terms(ON_TARGET, WEIGHTS, TARGETS).values()) == {0.0}
+
+
+@given(st.floats(0, 0.05), st.floats(0, 0.09))
+def test_divergence_terms_are_the_summands_of_line_9(delta_I, delta_D):
+    outcome = dataclasses.replace(ON_TARGET, divergence=np.array([delta_I, delta_D]))
+    terms = reward_terms(outcome, WEIGHTS, TARGETS)
+    assert terms["intensity_divergence"] == pytest.approx(
+        -WEIGHTS.intensity_divergence * min(2, abs(delta_I - 0.01) / 0.02)
+    )
+    assert terms["depth_divergence"] == pytest.approx(
+        -WEIGHTS.depth_divergence * 3 * min(2, abs(delta_D - 0.01) / 0.04)
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "term", "sign"),
+    [
+        ({"pose_error_growth_m": 0.01}, "trajectory_error", -1),
+        ({"pose_error_growth_m": -0.01}, "trajectory_error", 1),
+        ({"new_surface_m2": 0.5}, "new_surface", 1),
+        ({"tracking_ok": False}, "lost", -1),
+        ({"lost_for_good": True}, "lost_for_good", -1),
+        ({"blocked": True}, "blocked", -1),
+    ],
+)
+def test_each_outcome_moves_its_own_term(change, term, sign):
+    terms = reward_terms(dataclasses.replace(ON_TARGET, **change), WEIGHTS, TARGETS)
+    assert np.sign(terms.pop(term)) == sign
+    assert set(terms.values()) == {0.0}
+
+
+def wall(count=40, spacing=0.05):
+    """Centres of count x count voxels of the plane x = 1."""
+    a, b = np.meshgrid(np.arange(count) * spacing, np.arange(count) * spacing)
+    return np.stack([np.full(a.size, 1.0), a.ravel() - 1, b.ravel() + 0.01], axis=1)
+
+
+def test_area_of_a_wall_counts_once():
+    grid = CoverageGrid(BoxScene())
+    points = wall()
+    assert grid.add(points, points) == pytest.approx((40 * 0.05) ** 2)
+    assert grid.add(points, points) == 0
+    assert grid.mapped_area == pytest.approx(4.0)
+    assert len(grid.seen_points()) == 1600
+
+
+def test_surface_mapped_in_the_wrong_place_counts_as_seen_only():
+    grid = CoverageGrid(BoxScene())
+    points = wall()
+    assert grid.add(points, points + np.array([0.06, 0, 0])) == 0
+    assert grid.mapped_area == 0
+    assert len(grid.seen_points()) == 1600
+    centre_error = np.abs(grid.seen_points()[:, 0] - 1.0)
+    assert centre_error.max() <= 0.05
+
+
+def test_state_round_trip():
+    scene = BoxScene()
+    grid, twin = CoverageGrid(scene), CoverageGrid(scene)
+    grid.add(wall(), wall())
+    twin.set_state(grid.get_state())
+    assert twin.mapped_area == grid.mapped_area
+    assert twin.add(wall(), wall()) == 0
