@@ -72,13 +72,15 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
     limit (``max_episode_steps`` of ``gym.make``, 150 by default).
 
     ## Info
-    ``T_world_camera``, ``T_world_camera_estimate`` (4, 4); ``pose_error`` m; ``ate`` running RMSE of
-    the pose error, m, no alignment; ``divergence`` (2,) intensity and depth, nats; ``tracking_ok``;
-    ``reward_terms``; ``action_mask`` (n,) bool; ``mapped_area`` m2; ``scene``, ``scene_seed``.
+    ``T_world_camera``, ``T_world_camera_estimate`` (4, 4); ``pose_error`` m; ``ate`` running RMSE
+    of the pose error, m, no alignment; ``divergence`` (2,) intensity and depth, nats;
+    ``tracking_ok``; ``reward_terms``; ``action_mask`` (n,) bool; ``mapped_area`` m2; ``scene``,
+    ``scene_seed``.
     No clock: timings are in ``env.unwrapped.timings``.
 
     ## Arguments
-    The fields of :class:`ms_slam_env.env.EnvConfig`, by keyword; nested ones as dataclass or mapping.
+    The fields of :class:`ms_slam_env.env.EnvConfig`, by keyword; nested ones as dataclass or
+    mapping.
 
     ## Version history
     v0: first version.

@@ -85,7 +85,7 @@ class FixedTranslation(Embodiment):
         self._direction = np.zeros(3)
 
     def reset(self, T_world_camera: Float64, rng: np.random.Generator) -> None:
-        """Put the camera at a start pose (4, 4) and choose the line: the longest of 16 level ones."""
+        """Put the camera at a start pose (4, 4) and choose the longest of 16 level lines."""
         self.T_world_camera = np.array(T_world_camera, dtype=np.float64)
         offset = rng.uniform(0, 2 * np.pi)
         angles = offset + np.arange(self._DIRECTIONS_TRIED) * 2 * np.pi / self._DIRECTIONS_TRIED

@@ -1,0 +1,60 @@
+"""``python -m ms_slam_env.benchmark.episode_gif``: an episode of a planner as a GIF."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import gymnasium
+import imageio.v3 as iio
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from ms_slam_env.benchmark.planners import load_planner
+
+
+@dataclass(frozen=True)
+class Args:
+    """What to show."""
+
+    out: Path = Path("docs/pictures/greedy.gif")
+    planner: str = "greedy"
+    scene: str = "living_room"
+    scene_seed: int = 2000
+    seed: int = 2000
+    steps: int = 60
+    step_m: float = 0.06
+    step_deg: float = 6.0
+    width: int = 840
+
+
+def main(args: Args) -> None:
+    """Run the episode and write one picture a step."""
+    env = gymnasium.make(
+        "MSActiveSLAM-v0",
+        scene=args.scene,
+        scene_seed=args.scene_seed,
+        step_m=args.step_m,
+        step_rad=float(np.deg2rad(args.step_deg)),
+        render_mode="rgb_array",
+    )
+    observation, info = env.reset(seed=args.seed)
+    planner = load_planner(args.planner)(env.unwrapped, seed=args.seed)
+    planner.reset()
+    pictures = []
+    for _ in tqdm(range(args.steps), desc=args.planner):
+        observation, _, terminated, truncated, info = env.step(planner.act(observation, info))
+        picture = np.asarray(env.render())
+        height = round(picture.shape[0] * args.width / picture.shape[1])
+        pictures.append(cv2.resize(picture, (args.width, height), interpolation=cv2.INTER_AREA))
+        if terminated or truncated:
+            break
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    iio.imwrite(args.out, np.stack(pictures), duration=150, loop=0, plugin="pillow")
+    print(f"{args.out}: {len(pictures)} steps, ATE {1e3 * info['ate']:.1f} mm")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
