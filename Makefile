@@ -4,9 +4,6 @@ WORKERS ?= 2
 BIN := .venv/bin
 STAMP := .venv/.installed
 EXTRAS := open3d,train,statistics,dev
-# Without an NVIDIA driver, PyTorch comes from here if reachable: PyPI's wheel brings CUDA along.
-TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
-REACHABLE = $(BIN)/python -c 'import urllib.request as u; u.urlopen("$(TORCH_CPU_INDEX)/torch/", timeout=5)'
 SYSTEM_LIBRARIES := libusb-1.0-0 libgl1
 # One thread per process: the tests and the benchmark run in parallel processes.
 export OMP_NUM_THREADS := 1
@@ -19,9 +16,7 @@ install: $(STAMP)
 $(STAMP): pyproject.toml constraints.txt
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	@echo "installing into .venv (a few minutes the first time)"
-	@index=; if ! command -v nvidia-smi >/dev/null && $(REACHABLE) 2>/dev/null; then \
-	    index="--extra-index-url $(TORCH_CPU_INDEX)"; fi; \
-	    $(BIN)/python -m pip install -qq $$index -c constraints.txt -e ".[$(EXTRAS)]"
+	@$(BIN)/python -m pip install -qq -c constraints.txt -e ".[$(EXTRAS)]"
 	@if $(BIN)/python -c 'import ctypes; [ctypes.CDLL(n) for n in ("libusb-1.0.so.0", "libGL.so.1")]' \
 	    2>/dev/null; then :; \
 	elif [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get update -qq && \
