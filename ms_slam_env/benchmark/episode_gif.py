@@ -12,7 +12,7 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from ms_slam_env.benchmark.planners import load_planner
+from ms_slam_env.benchmark.planners import make_planner
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ def main(args: Args) -> None:
         render_mode="rgb_array",
     )
     observation, info = env.reset(seed=args.seed)
-    planner = load_planner(args.planner)(env.unwrapped, seed=args.seed)
+    planner = make_planner(args.planner, env.unwrapped, seed=args.seed)
     planner.reset()
     pictures = []
     for _ in tqdm(range(args.steps), desc=args.planner):
