@@ -1,0 +1,118 @@
+"""Noise of a structured-light RGB-D sensor (Kinect v1, Xtion): parameters and variants."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ms_slam_env.config import check_range
+from ms_slam_env.errors import InputError, unknown
+
+NATIVE_WIDTH = 640
+"""Width in pixels of the physical sensor; its disparity is quantised there for every size."""
+
+
+@dataclass(frozen=True)
+class NoiseConfig:
+    """Strengths of the noise; 1 = as published, 0 = off. The defaults are the Kinect's.
+
+    An image smaller than 640x480 is a subsample of the native pixels, not their average, so each
+    pixel has the noise of one native pixel whatever the size. Noise is independent between pixels.
+
+    Sources: [K] Khoshelham and Elberink, "Accuracy and Resolution of Kinect Depth Data for Indoor
+    Mapping Applications", Sensors 2012; [N] Nguyen, Izadi and Lovell, "Modeling Kinect Sensor
+    Noise for Improved 3D Reconstruction and Tracking", 3DIMPVT 2012; [F] Foi et al., "Practical
+    Poissonian-Gaussian Noise Modeling and Fitting for Single-Image Raw-Data", IEEE TIP 2008.
+
+    Attributes:
+        baseline_m: distance between projector and camera [K].
+        disparity_step_px: step of the measured disparity at 640 pixels [K]; 0 = not quantised.
+        axial: factor on the depth noise [N]. [N] measured quantised depth, so the variance of
+            the quantisation is taken off before this noise is added: the sum is as published.
+        lateral: factor on the jitter of the image position at which depth is sampled [N].
+        grazing_start_deg: incidence angle from which readings drop out; [N] found none beyond 80.
+        grazing_end_deg: incidence angle from which all readings drop out.
+        edge_dropout: probability that a pixel beside a depth edge has no reading.
+        edge_jump_px: disparity jump (640 pixels) between neighbours that is a depth edge.
+        shadow: 1 = surfaces that the projector does not reach have no reading, 0 = they have.
+        min_range_m: nearest reading; [N] measured from 0.4 m.
+        max_range_m: farthest reading; [K] measured up to 5 m.
+        shot: variance of the linear intensity per unit of intensity [F].
+        read: standard deviation of the linear intensity in the dark [F].
+
+    Raises:
+        InputError: a value outside its range.
+    """
+
+    baseline_m: float = 0.075
+    disparity_step_px: float = 0.125
+    axial: float = 1.0
+    lateral: float = 1.0
+    grazing_start_deg: float = 70.0
+    grazing_end_deg: float = 82.0
+    edge_dropout: float = 0.5
+    edge_jump_px: float = 2.0
+    shadow: float = 1.0
+    min_range_m: float = 0.4
+    max_range_m: float = 5.0
+    shot: float = 2e-4
+    read: float = 2e-3
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        check_range(self, "baseline_m", 1e-3, 1.0)
+        check_range(self, "disparity_step_px", 0.0, 8.0)
+        check_range(self, "axial", 0.0, 100.0)
+        check_range(self, "lateral", 0.0, 100.0)
+        check_range(self, "grazing_start_deg", 0.0, 90.0)
+        check_range(self, "grazing_end_deg", 0.0, 90.0)
+        check_range(self, "edge_dropout", 0.0, 1.0)
+        check_range(self, "edge_jump_px", 0.0, 1e6)
+        check_range(self, "shadow", 0.0, 1.0)
+        check_range(self, "min_range_m", 0.0, 100.0)
+        check_range(self, "max_range_m", 0.0, 1e6)
+        check_range(self, "shot", 0.0, 1.0)
+        check_range(self, "read", 0.0, 1.0)
+        if self.grazing_end_deg < self.grazing_start_deg:
+            raise InputError(
+                f"NoiseConfig.grazing_end_deg = {self.grazing_end_deg} is below "
+                f"grazing_start_deg = {self.grazing_start_deg}"
+            )
+        if self.max_range_m <= self.min_range_m:
+            raise InputError(
+                f"NoiseConfig.max_range_m = {self.max_range_m} is not above "
+                f"min_range_m = {self.min_range_m}"
+            )
+
+
+@dataclass(frozen=True)
+class NoNoise(NoiseConfig):
+    """The ideal sensor: every visible surface is read exactly, at any distance and angle."""
+
+    disparity_step_px: float = 0.0
+    axial: float = 0.0
+    lateral: float = 0.0
+    grazing_start_deg: float = 90.0
+    grazing_end_deg: float = 90.0
+    edge_dropout: float = 0.0
+    shadow: float = 0.0
+    min_range_m: float = 0.0
+    max_range_m: float = 1e6
+    shot: float = 0.0
+    read: float = 0.0
+
+
+NOISE_MODELS: dict[str, NoiseConfig] = {"kinect": NoiseConfig(), "none": NoNoise()}
+"""Noise models by name."""
+
+
+def noise_config(noise: str | NoiseConfig) -> NoiseConfig:
+    """Return the configuration of a noise model given by name or directly.
+
+    Raises:
+        InputError: unknown name, or neither a name nor a NoiseConfig.
+    """
+    if isinstance(noise, NoiseConfig):
+        return noise
+    if not isinstance(noise, str) or noise not in NOISE_MODELS:
+        raise unknown("noise model", noise, NOISE_MODELS)
+    return NOISE_MODELS[noise]

@@ -1,0 +1,89 @@
+# mypy: ignore-errors
+# Warp code: the annotations are Warp types, which mypy cannot read.
+"""Kernels that make viewing rays and cast them, and the pinhole camera as a Warp struct."""
+
+from __future__ import annotations
+
+from ms_slam_env._warp import wp
+from ms_slam_env.camera import Intrinsics
+
+
+@wp.struct
+class Pinhole:
+    """Intrinsics for kernels, in pixels."""
+
+    fx: wp.float32
+    fy: wp.float32
+    cx: wp.float32
+    cy: wp.float32
+    width: wp.int32
+    height: wp.int32
+
+
+def make_pinhole(intrinsics: Intrinsics) -> Pinhole:
+    """Copy intrinsics into the struct."""
+    pinhole = Pinhole()
+    pinhole.fx, pinhole.fy = intrinsics.fx, intrinsics.fy
+    pinhole.cx, pinhole.cy = intrinsics.cx, intrinsics.cy
+    pinhole.width, pinhole.height = intrinsics.width, intrinsics.height
+    return pinhole
+
+
+@wp.func
+def rotate(T: wp.mat44, d: wp.vec3) -> wp.vec3:
+    """Rotate a direction by the rotation part of a pose."""
+    return wp.vec3(
+        T[0, 0] * d[0] + T[0, 1] * d[1] + T[0, 2] * d[2],
+        T[1, 0] * d[0] + T[1, 1] * d[1] + T[1, 2] * d[2],
+        T[2, 0] * d[0] + T[2, 1] * d[1] + T[2, 2] * d[2],
+    )
+
+
+@wp.func
+def world_ray(T: wp.mat44, camera: Pinhole, u: float, v: float) -> wp.vec3:
+    """Direction in the world of image position (u, v); one unit of it is one metre of depth."""
+    return rotate(T, wp.vec3((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0))
+
+
+@wp.func
+def camera_centre(T: wp.mat44) -> wp.vec3:
+    """Position of the camera in the world."""
+    return wp.vec3(T[0, 3], T[1, 3], T[2, 3])
+
+
+@wp.kernel
+def generate_rays(
+    T_world_camera: wp.array(dtype=wp.mat44),  # (B,)
+    camera: Pinhole,
+    origins: wp.array(dtype=wp.vec3),  # (B * H * W,)
+    directions: wp.array(dtype=wp.vec3),  # (B * H * W,)
+):
+    """One ray per pixel."""
+    b, y, x = wp.tid()
+    T = T_world_camera[b]
+    i = (b * camera.height + y) * camera.width + x
+    origins[i] = camera_centre(T)
+    directions[i] = world_ray(T, camera, float(x), float(y))
+
+
+@wp.kernel
+def query_rays(
+    mesh: wp.uint64,
+    origins: wp.array(dtype=wp.vec3),  # (N,)
+    directions: wp.array(dtype=wp.vec3),  # (N,)
+    t: wp.array(dtype=wp.float32),  # (N,)
+    u: wp.array(dtype=wp.float32),  # (N,)
+    v: wp.array(dtype=wp.float32),  # (N,)
+    face: wp.array(dtype=wp.int32),  # (N,)
+):
+    """First hit of each ray; face -1 where there is none."""
+    i = wp.tid()
+    query = wp.mesh_query_ray(mesh, origins[i], directions[i], 1.0e6)
+    if query.result:
+        t[i] = query.t
+        # Warp's u and v weigh the first and second corner
+        u[i] = query.v
+        v[i] = 1.0 - query.u - query.v
+        face[i] = query.face
+    else:
+        face[i] = -1
