@@ -1,4 +1,4 @@
-"""Parameters of the surfel SLAM, with the names, ranges and defaults of the paper where it has them."""
+"""Parameters of the surfel SLAM, named as in the paper where it has them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,11 @@ class SurfelConfig:
         confidence_threshold: observations after which a surfel is stable, [0, 12].
         iterations: Gauss-Newton iterations per pyramid level, finest first.
         max_surfels: capacity of the map, per env.
-        fusion_upsampling: the association image is this many times finer than the camera's.
+        coverage_px: a reading starts a new surfel only where none of its surface projects this
+            close to its pixel.
+        surfel_radius_px: radius of a new surfel in pixels of the view that made it.
+        max_confidence: where the confidence of a surfel, the weight of its past, stops growing.
+        compaction_interval: frames between two removals of unstable surfels.
         unstable_window: frames after which a surfel still below the confidence threshold and
             not seen again is removed.
         fusion_distance_m: largest distance along the ray between a reading and the surfel that
@@ -28,8 +32,15 @@ class SurfelConfig:
         bilateral_sigma_px: width of the bilateral depth filter in the image, pixels.
         bilateral_sigma_m: width of the filter in depth at 1 m; grows with depth squared.
         bilateral_radius_px: half-size of the filter's window, pixels.
+        normal_edge_per_m: a jump of inverse depth between neighbours (of a 160-column image)
+            beyond which there is an edge and no normal, 1/m.
         icp_distance_m: largest distance between associated points in tracking.
         icp_angle_deg: largest angle between their normals.
+        depth_noise_m: axial noise of depth at 1 m, grows with depth squared; the unit of
+            geometric residuals.
+        cauchy_icp: scale of Cauchy's loss on geometric residuals, in units of that noise.
+        cauchy_rgb: scale of Cauchy's loss on photometric residuals, grey levels.
+        points_per_level: tracking looks at about this many pixels of a pyramid level.
 
     Raises:
         InputError: a value outside its range.
@@ -40,15 +51,23 @@ class SurfelConfig:
     confidence_threshold: float = 10.0
     iterations: tuple[int, ...] = (4, 5, 10)
     max_surfels: int = 200_000
-    fusion_upsampling: int = 4
+    coverage_px: float = 0.85
+    surfel_radius_px: float = 0.9
+    max_confidence: float = 50.0
+    compaction_interval: int = 10
     unstable_window: int = 20
     fusion_distance_m: float = 0.02
     fusion_angle_deg: float = 45.0
     bilateral_sigma_px: float = 1.5
     bilateral_sigma_m: float = 0.01
     bilateral_radius_px: int = 2
+    normal_edge_per_m: float = 0.03
     icp_distance_m: float = 0.10
-    icp_angle_deg: float = 30.0
+    icp_angle_deg: float = 40.0
+    depth_noise_m: float = 0.003
+    cauchy_icp: float = 2.0
+    cauchy_rgb: float = 10.0
+    points_per_level: int = 5000
 
     def __post_init__(self) -> None:
         """Refuse values outside the ranges."""
@@ -63,12 +82,20 @@ class SurfelConfig:
                 f"SurfelConfig.iterations = {self.iterations!r} must be 1 to 5 integers in [0, 100]"
             )
         check_range(self, "max_surfels", 1000, 50_000_000)
-        check_range(self, "fusion_upsampling", 1, 8)
+        check_range(self, "coverage_px", 0.5, 1.0)
+        check_range(self, "surfel_radius_px", 0.5, 3.0)
+        check_range(self, "max_confidence", 1.0, 10_000.0)
+        check_range(self, "compaction_interval", 1, 10_000)
         check_range(self, "unstable_window", 1, 100_000)
         check_range(self, "fusion_distance_m", 0.0001, 1.0)
         check_range(self, "fusion_angle_deg", 1.0, 90.0)
         check_range(self, "bilateral_sigma_px", 0.1, 20.0)
         check_range(self, "bilateral_sigma_m", 0.0001, 1.0)
         check_range(self, "bilateral_radius_px", 0, 10)
+        check_range(self, "normal_edge_per_m", 0.001, 10.0)
         check_range(self, "icp_distance_m", 0.001, 1.0)
         check_range(self, "icp_angle_deg", 1.0, 90.0)
+        check_range(self, "depth_noise_m", 0.00001, 1.0)
+        check_range(self, "cauchy_icp", 0.01, 1000.0)
+        check_range(self, "cauchy_rgb", 0.01, 1000.0)
+        check_range(self, "points_per_level", 100, 10_000_000)

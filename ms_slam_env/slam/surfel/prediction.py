@@ -1,0 +1,285 @@
+"""Predicts the images of many camera poses from the map."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env._warp import wp
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import invert
+from ms_slam_env.slam.surfel.prediction_kernels import (
+    EMPTY,
+    PointCloud,
+    collect_points,
+    copy_view,
+    resolve_views,
+    scatter_points,
+)
+from ms_slam_env.slam.surfel.splat_renderer import SplatParameters, SplatRenderer, camera_vector
+from ms_slam_env.slam.surfel.surfel_arrays import Surfels, VisibleList
+from ms_slam_env.slam.surfel.types import ModelView
+
+Float64 = NDArray[np.float64]
+
+MAX_MARGIN = 1.0  # a reference view wider than the views by more than their own size is refused
+NEAREST_M = 0.5  # surfaces closer than this may leave the reference view's margin
+SIZE_STEP_PX = 8  # reference views come in such steps, so that few sets of buffers are needed
+
+
+@dataclass(frozen=True)
+class DeviceViews:
+    """Predicted images on the device; see ``ms_slam_env.slam.base.Views``.
+
+    Attributes:
+        intensity: (V, h, w) float32 in [0, 255].
+        depth: (V, h, w) float32 metres.
+        normals: (V, h, w) vec3, camera frame.
+        intrinsics: of the images.
+    """
+
+    intensity: wp.array
+    depth: wp.array
+    normals: wp.array
+    intrinsics: Intrinsics
+
+
+def mean_pose(poses: Float64) -> Float64:
+    """Pose (4, 4) in the middle of poses (N, 4, 4): mean position, chordal mean of rotations."""
+    U, _, Vt = np.linalg.svd(poses[:, :3, :3].mean(axis=0))
+    result = np.eye(4)
+    result[:3, :3] = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    result[:3, 3] = poses[:, :3, 3].mean(axis=0)
+    return result
+
+
+def wide_intrinsics(intrinsics: Intrinsics, motions: Float64) -> Intrinsics | None:
+    """Intrinsics of a reference view that sees what views at T_reference_view (V, 4, 4) see.
+
+    None if no image of at most (1 + 2 MAX_MARGIN) times the size does: the views are too far apart.
+    """
+    w, h = intrinsics.width, intrinsics.height
+    u, v = np.array([-0.5, w - 0.5, -0.5, w - 0.5]), np.array([-0.5, -0.5, h - 0.5, h - 0.5])
+    rays = np.stack(
+        [(u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy, np.ones(4)], 1
+    )
+    corners = np.einsum("vij,cj->vci", motions[:, :3, :3], rays)
+    if corners[..., 2].min() < 0.2:
+        return None
+    pixels = intrinsics.project(corners)
+    parallax = np.linalg.norm(motions[:, :3, 3], axis=1).max() * intrinsics.fx / NEAREST_M
+    limits = ((pixels[..., 0], w), (pixels[..., 1], h))
+    margins = []
+    for coordinate, size in limits:
+        beyond = max(-0.5 - coordinate.min(), coordinate.max() - (size - 0.5), 0.0) + parallax
+        if beyond > MAX_MARGIN * size:
+            return None
+        margins.append(SIZE_STEP_PX * math.ceil(beyond / SIZE_STEP_PX))
+    return Intrinsics(
+        fx=intrinsics.fx,
+        fy=intrinsics.fy,
+        cx=intrinsics.cx + margins[0],
+        cy=intrinsics.cy + margins[1],
+        width=w + 2 * margins[0],
+        height=h + 2 * margins[1],
+    )
+
+
+class _Reference:
+    """Two rendered layers of E maps at one image size, and the points in them."""
+
+    def __init__(
+        self,
+        envs: int,
+        intrinsics: Intrinsics,
+        parameters: SplatParameters,
+        workers: int,
+        device: str,
+    ) -> None:
+        self.renderer = SplatRenderer(envs, intrinsics, parameters, workers, device)
+        self.layer = self.renderer.new_view()
+        self.front_depth = wp.zeros((envs, *intrinsics.shape), dtype=wp.float32, device=device)
+        capacity = 2 * intrinsics.width * intrinsics.height
+        self.points = PointCloud()
+        self.points.position = wp.zeros((envs, capacity), dtype=wp.vec3, device=device)
+        self.points.normal = wp.zeros((envs, capacity), dtype=wp.vec3, device=device)
+        self.points.intensity = wp.zeros((envs, capacity), dtype=wp.float32, device=device)
+        self.points.count = wp.zeros(envs, dtype=wp.int32, device=device)
+
+    def render(
+        self, surfels: Surfels, visible: VisibleList, poses: wp.array, first_env: int
+    ) -> None:
+        """Fill ``points`` from the front surface and the one behind it."""
+        renderer = self.renderer
+        self.points.count.zero_()
+        renderer.cull(surfels, poses, visible, first_env)
+        renderer.splat(surfels, visible, self.layer, first_env)
+        self._collect(self.layer)
+        wp.copy(self.front_depth, renderer.z_buffer)
+        renderer.splat(surfels, visible, self.layer, first_env, behind=self.front_depth)
+        self._collect(self.layer)
+
+    def _collect(self, layer: ModelView) -> None:
+        wp.launch(
+            collect_points,
+            dim=(self.renderer.envs, self.renderer.intrinsics.height),
+            inputs=[layer.vertices, layer.normals, layer.intensity, self.points],
+            device=self.renderer.device,
+        )
+
+
+class ViewPredictor:
+    """Predicts views near each other by warping one reference view; far ones one by one.
+
+    Args:
+        intrinsics: of the live camera.
+        parameters: how discs are drawn.
+        workers: threads per env or view.
+        device: Warp device.
+    """
+
+    def __init__(
+        self, intrinsics: Intrinsics, parameters: SplatParameters, workers: int, device: str
+    ) -> None:
+        self.intrinsics = intrinsics
+        self.parameters = parameters
+        self.workers = workers
+        self.device = device
+        self._references: dict[tuple[int, Intrinsics], _Reference] = {}
+        self._single: dict[tuple[int, Intrinsics], tuple[SplatRenderer, ModelView]] = {}
+        self._outputs: dict[tuple[int, Intrinsics], tuple[wp.array, DeviceViews]] = {}
+
+    def predict(
+        self,
+        surfels: Surfels,
+        visible: VisibleList,
+        poses: Float64,
+        scale: float,
+        first_env: int,
+    ) -> DeviceViews:
+        """Images (E * N, h, w) from ``poses`` (E, N, 4, 4) of the envs from ``first_env`` on.
+
+        Raises:
+            InputError: poses of another shape, no pose, a scale that is not in (0, 4].
+        """
+        if poses.ndim != 4 or poses.shape[2:] != (4, 4) or 0 in poses.shape:
+            raise InputError(f"poses must be (envs, views, 4, 4), got {poses.shape}")
+        if not np.isfinite(poses).all():
+            raise InputError("poses hold a value that is not finite")
+        if not 0.0 < scale <= 4.0:
+            raise InputError(f"scale = {scale!r} is outside (0, 4]")
+        envs, count = poses.shape[:2]
+        intrinsics = self.intrinsics.scaled(scale)
+        keys, views = self._buffers(envs * count, intrinsics)
+        references = np.stack([mean_pose(poses[e]) for e in range(envs)])
+        motions = invert(references)[:, None] @ poses
+        wide = wide_intrinsics(intrinsics, motions.reshape(-1, 4, 4))
+        if wide is None:
+            self._predict_singly(surfels, visible, poses, views, first_env)
+            return views
+        reference = self._reference(envs, wide)
+        reference.render(surfels, visible, self._upload(references), first_env)
+        self._warp(reference.points, count, self._upload(invert(motions)), keys, views)
+        return views
+
+    def _warp(
+        self, points: PointCloud, count: int, motions: wp.array, keys: wp.array, views: DeviceViews
+    ) -> None:
+        """Scatter the points into all views and fill in the images."""
+        camera = camera_vector(views.intrinsics)
+        keys.fill_(int(EMPTY))
+        wp.launch(
+            scatter_points,
+            dim=(keys.shape[0], self.workers),
+            inputs=[
+                points,
+                count,
+                motions,
+                camera,
+                self.parameters.z_near,
+                self.workers,
+                keys,
+            ],
+            device=self.device,
+        )
+        wp.launch(
+            resolve_views,
+            dim=keys.shape[:2],
+            inputs=[
+                points,
+                count,
+                motions,
+                camera,
+                keys,
+                views.intensity,
+                views.depth,
+                views.normals,
+            ],
+            device=self.device,
+        )
+
+    def _predict_singly(
+        self,
+        surfels: Surfels,
+        visible: VisibleList,
+        poses: Float64,
+        views: DeviceViews,
+        first_env: int,
+    ) -> None:
+        """Splat the surfels themselves into every view, one view per env at a time."""
+        envs, count = poses.shape[:2]
+        key = (envs, views.intrinsics)
+        if key not in self._single:
+            renderer = SplatRenderer(
+                envs, views.intrinsics, self.parameters, self.workers, self.device
+            )
+            self._single[key] = (renderer, renderer.new_view())
+        renderer, image = self._single[key]
+        for n in range(count):
+            renderer.cull(surfels, self._upload(poses[:, n]), visible, first_env)
+            renderer.splat(surfels, visible, image, first_env)
+            wp.launch(
+                copy_view,
+                dim=(envs, *views.intrinsics.shape),
+                inputs=[
+                    image.vertices,
+                    image.normals,
+                    image.intensity,
+                    count,
+                    n,
+                    views.intensity,
+                    views.depth,
+                    views.normals,
+                ],
+                device=self.device,
+            )
+
+    def _upload(self, poses: Float64) -> wp.array:
+        """(..., 4, 4) float64 as a flat device array of mat44."""
+        flat = np.ascontiguousarray(poses.reshape(-1, 4, 4), dtype=np.float32)
+        return wp.array(flat, dtype=wp.mat44, device=self.device)
+
+    def _reference(self, envs: int, intrinsics: Intrinsics) -> _Reference:
+        key = (envs, intrinsics)
+        if key not in self._references:
+            self._references[key] = _Reference(
+                envs, intrinsics, self.parameters, self.workers, self.device
+            )
+        return self._references[key]
+
+    def _buffers(self, count: int, intrinsics: Intrinsics) -> tuple[wp.array, DeviceViews]:
+        key = (count, intrinsics)
+        if key not in self._outputs:
+            shape = (count, *intrinsics.shape)
+            views = DeviceViews(
+                intensity=wp.zeros(shape, dtype=wp.float32, device=self.device),
+                depth=wp.zeros(shape, dtype=wp.float32, device=self.device),
+                normals=wp.zeros(shape, dtype=wp.vec3, device=self.device),
+                intrinsics=intrinsics,
+            )
+            self._outputs[key] = (wp.zeros(shape, dtype=wp.int64, device=self.device), views)
+        return self._outputs[key]

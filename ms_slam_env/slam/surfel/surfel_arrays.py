@@ -1,0 +1,90 @@
+"""The surfels of B maps as structure of arrays, and the small functions that kernels share."""
+
+from __future__ import annotations
+
+from ms_slam_env._warp import wp
+
+ATTRIBUTES = {
+    "position": wp.vec3,
+    "normal": wp.vec3,
+    "color": wp.vec3,
+    "radius": wp.float32,
+    "confidence": wp.float32,
+    "created": wp.int32,
+    "seen": wp.int32,
+}
+"""Arrays (B, capacity) of ``Surfels`` and their types."""
+
+COUNTERS = ("count", "dead", "dropped")
+"""Arrays (B,) int32 of ``Surfels``."""
+
+
+@wp.struct
+class Surfels:
+    """Discs in the world frame; slots ``count[b]`` and later of env b are free.
+
+    A surfel with confidence 0 is dead: it keeps its slot until the next compaction.
+    """
+
+    position: wp.array2d(dtype=wp.vec3)
+    normal: wp.array2d(dtype=wp.vec3)
+    color: wp.array2d(dtype=wp.vec3)
+    radius: wp.array2d(dtype=wp.float32)
+    confidence: wp.array2d(dtype=wp.float32)
+    created: wp.array2d(dtype=wp.int32)
+    seen: wp.array2d(dtype=wp.int32)
+    count: wp.array(dtype=wp.int32)
+    dead: wp.array(dtype=wp.int32)
+    dropped: wp.array(dtype=wp.int32)
+
+
+@wp.struct
+class VisibleList:
+    """Surfels inside the frustum of one camera per env, with their camera-frame geometry."""
+
+    index: wp.array2d(dtype=wp.int32)
+    position: wp.array2d(dtype=wp.vec3)
+    normal: wp.array2d(dtype=wp.vec3)
+    count: wp.array(dtype=wp.int32)
+
+
+def allocate_surfels(batch: int, capacity: int, device: str) -> Surfels:
+    """Empty maps of ``batch`` envs with ``capacity`` slots each."""
+    surfels = Surfels()
+    for name, dtype in ATTRIBUTES.items():
+        setattr(surfels, name, wp.zeros((batch, capacity), dtype=dtype, device=device))
+    for name in COUNTERS:
+        setattr(surfels, name, wp.zeros(batch, dtype=wp.int32, device=device))
+    return surfels
+
+
+def allocate_visible(batch: int, capacity: int, device: str) -> VisibleList:
+    """Empty list of visible surfels."""
+    visible = VisibleList()
+    visible.index = wp.zeros((batch, capacity), dtype=wp.int32, device=device)
+    visible.position = wp.zeros((batch, capacity), dtype=wp.vec3, device=device)
+    visible.normal = wp.zeros((batch, capacity), dtype=wp.vec3, device=device)
+    visible.count = wp.zeros(batch, dtype=wp.int32, device=device)
+    return visible
+
+
+@wp.func
+def rotation_of(T: wp.mat44):
+    """Rotation part of a rigid motion."""
+    return wp.mat33(T[0, 0], T[0, 1], T[0, 2], T[1, 0], T[1, 1], T[1, 2], T[2, 0], T[2, 1], T[2, 2])
+
+
+@wp.func
+def translation_of(T: wp.mat44):
+    """Translation part of a rigid motion."""
+    return wp.vec3(T[0, 3], T[1, 3], T[2, 3])
+
+
+@wp.func
+def depth_tolerance(distance_at_1m: float, z: float):
+    """Allowed distance between two readings of one surface at depth z, metres.
+
+    The axial noise of a structured-light sensor grows with z squared (Nguyen et al., 3DIMPVT
+    2012); the constant part allows for errors of the pose.
+    """
+    return distance_at_1m * (0.7 + 0.3 * z * z)

@@ -1,0 +1,246 @@
+"""The surfel maps of B envs: fuse frames, render the model, predict views, save and restore."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ms_slam_env._warp import wp
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.slam.base import Views
+from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.fusion import (
+    FusionParameters,
+    add_surfels,
+    clamp_count,
+    update_surfels,
+)
+from ms_slam_env.slam.surfel.prediction import DeviceViews, ViewPredictor
+from ms_slam_env.slam.surfel.removal import gather, list_survivors, put_back
+from ms_slam_env.slam.surfel.splat_renderer import SplatParameters, SplatRenderer, camera_vector
+from ms_slam_env.slam.surfel.surfel_arrays import (
+    ATTRIBUTES,
+    COUNTERS,
+    allocate_surfels,
+    allocate_visible,
+)
+from ms_slam_env.slam.surfel.types import LiveFrame, ModelView
+
+Float64 = NDArray[np.float64]
+
+GPU_WORKERS = 8192  # threads that share one env's surfels
+
+
+class SurfelMap:
+    """Dense maps of ``batch`` envs (Keller et al., 3DV 2013; Whelan et al., IJRR 2016).
+
+    Args:
+        batch: number of envs B.
+        intrinsics: of the live camera.
+        config: parameters of fusion and removal.
+        device: Warp device, ``"cpu"`` or ``"cuda"``.
+
+    Attributes:
+        surfels: the maps on the device.
+    """
+
+    def __init__(
+        self, batch: int, intrinsics: Intrinsics, config: SurfelConfig, device: str = "cpu"
+    ) -> None:
+        self.batch = batch
+        self.intrinsics = intrinsics
+        self.config = config
+        self.device = device
+        self._workers = 1 if device == "cpu" else GPU_WORKERS
+        capacity = config.max_surfels
+        self.surfels = allocate_surfels(batch, capacity, device)
+        self._spare = allocate_surfels(batch, capacity, device)
+        self._visible = allocate_visible(batch, capacity, device)
+        self._survivors = wp.zeros((batch, capacity), dtype=wp.int32, device=device)
+        self._kept = wp.zeros(batch, dtype=wp.int32, device=device)
+        self._covered = wp.zeros((batch, *intrinsics.shape), dtype=wp.int32, device=device)
+        self._camera = camera_vector(intrinsics)
+        self._fusion = FusionParameters()
+        self._fusion.distance_m = config.fusion_distance_m
+        self._fusion.min_cosine = math.cos(math.radians(config.fusion_angle_deg))
+        self._fusion.coverage_px = config.coverage_px
+        self._fusion.radius_px = config.surfel_radius_px
+        self._fusion.max_confidence = config.max_confidence
+        parameters = SplatParameters(tolerance_m=config.fusion_distance_m)
+        self._renderer = SplatRenderer(batch, intrinsics, parameters, self._workers, device)
+        self._view = self._renderer.new_view()
+        self._predictor = ViewPredictor(intrinsics, parameters, self._workers, device)
+
+    def clear(self, env: int | None = None) -> None:
+        """Forget the map of one env, or of all."""
+        for name in COUNTERS:
+            counter = getattr(self.surfels, name)
+            if env is None:
+                counter.zero_()
+            else:
+                counter[env : env + 1].zero_()
+
+    def fuse(
+        self,
+        live: LiveFrame,
+        poses: wp.array,
+        time: wp.array,
+        weight: wp.array,
+        mask: wp.array,
+    ) -> None:
+        """Fuse one frame per env.
+
+        Args:
+            live: the frames.
+            poses: (B,) mat44 T_world_camera.
+            time: (B,) int32 number of the frame in its episode.
+            weight: (B,) float32 in (0, 1], lower for a fast camera (Whelan et al., section 3).
+            mask: (B,) int32, 0 leaves an env's map as it is.
+        """
+        self._renderer.cull(self.surfels, poses, self._visible, margin_px=0.0)
+        self._covered.zero_()
+        shared = [poses, self._camera, mask, time, weight, self._fusion, self._workers]
+        images = [live.vertices, live.normals, live.color, self._covered]
+        dim = (self.batch, self._workers)
+        wp.launch(
+            update_surfels,
+            dim=dim,
+            inputs=[self.surfels, self._visible, *shared, *images],
+            device=self.device,
+        )
+        wp.launch(
+            add_surfels,
+            dim=dim,
+            inputs=[self.surfels, self.config.max_surfels, *shared, *images],
+            device=self.device,
+        )
+        wp.launch(
+            clamp_count,
+            dim=self.batch,
+            inputs=[self.surfels.count, self.config.max_surfels],
+            device=self.device,
+        )
+        self._compact(time, mask)
+
+    def _compact(self, time: wp.array, mask: wp.array) -> None:
+        """Remove dead and unstable surfels of the envs whose turn it is."""
+        self._kept.zero_()
+        dim = (self.batch, self._workers)
+        wp.launch(
+            list_survivors,
+            dim=dim,
+            inputs=[
+                self.surfels,
+                self.config.max_surfels,
+                mask,
+                time,
+                self.config.compaction_interval,
+                self.config.confidence_threshold,
+                self.config.unstable_window,
+                self._workers,
+                self._survivors,
+                self._kept,
+            ],
+            device=self.device,
+        )
+        wp.launch(
+            gather,
+            dim=dim,
+            inputs=[self.surfels, self._spare, self._survivors, self._kept, self._workers],
+            device=self.device,
+        )
+        wp.launch(
+            put_back,
+            dim=dim,
+            inputs=[self._spare, self.surfels, self._kept, self._workers],
+            device=self.device,
+        )
+
+    def render_model(self, poses: wp.array) -> ModelView:
+        """Render every env's map from its pose (B,) mat44 T_world_camera.
+
+        The images are overwritten by the next call.
+        """
+        self._renderer.cull(self.surfels, poses, self._visible)
+        self._renderer.splat(self.surfels, self._visible, self._view)
+        return self._view
+
+    def predict_device(
+        self, poses: ArrayLike, scale: float = 1.0, first_env: int = 0
+    ) -> DeviceViews:
+        """Predict views of the maps, left on the device.
+
+        Args:
+            poses: (E, N, 4, 4) T_world_camera of N views for each of E envs.
+            scale: of the predicted images relative to the live ones.
+            first_env: the E envs are those from this one on.
+
+        Returns:
+            Images (E * N, h, w), overwritten by the next call.
+        """
+        return self._predictor.predict(
+            self.surfels, self._visible, np.asarray(poses, dtype=np.float64), scale, first_env
+        )
+
+    def predict(self, poses: ArrayLike, scale: float = 1.0, env: int = 0) -> Views:
+        """Predict views (N) of one env's map from ``poses`` (N, 4, 4) T_world_camera."""
+        stack = np.asarray(poses, dtype=np.float64).reshape(1, -1, 4, 4)
+        views = self.predict_device(stack, scale, env)
+        return Views(
+            intensity=views.intensity.numpy().copy(),
+            depth=views.depth.numpy().copy(),
+            normals=views.normals.numpy().copy(),
+            intrinsics=views.intrinsics,
+        )
+
+    def count(self, env: int = 0) -> int:
+        """Living surfels of one env."""
+        return int(self.surfels.count.numpy()[env] - self.surfels.dead.numpy()[env])
+
+    def dropped(self, env: int = 0) -> int:
+        """Surfels that found no room in one env's map since it was cleared."""
+        return int(self.surfels.dropped.numpy()[env])
+
+    def points(self, env: int = 0, stable: bool = True) -> Float64:
+        """Positions (M, 3) of the living surfels, world frame; only stable ones if asked."""
+        return self._living("position", env, stable).astype(np.float64)
+
+    def colors(self, env: int = 0, stable: bool = True) -> NDArray[np.uint8]:
+        """Colours (M, 3) RGB of ``points``, in the same order."""
+        return np.clip(np.rint(self._living("color", env, stable)), 0, 255).astype(np.uint8)
+
+    def _living(self, name: str, env: int, stable: bool) -> NDArray[np.float32]:
+        used = int(self.surfels.count.numpy()[env])
+        confidence = self.surfels.confidence[env, :used].numpy()
+        keep = confidence > 0
+        if stable:
+            keep &= confidence >= self.config.confidence_threshold
+        return getattr(self.surfels, name)[env, :used].numpy()[keep]
+
+    def get_state(self) -> dict[str, Any]:
+        """Everything needed to go on bit-exactly: per env, the used part of every array."""
+        counters = {name: getattr(self.surfels, name).numpy().copy() for name in COUNTERS}
+        used = counters["count"]
+        return {
+            "counters": counters,
+            "surfels": [
+                {
+                    name: getattr(self.surfels, name)[env, : int(used[env])].numpy().copy()
+                    for name in ATTRIBUTES
+                }
+                for env in range(self.batch)
+            ],
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state that ``get_state`` of a map of this size returned."""
+        for name in COUNTERS:
+            getattr(self.surfels, name).assign(state["counters"][name])
+        for env, arrays in enumerate(state["surfels"]):
+            for name in ATTRIBUTES:
+                used = len(arrays[name])
+                if used:
+                    getattr(self.surfels, name)[env, :used].assign(arrays[name])
