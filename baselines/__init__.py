@@ -1,0 +1,8 @@
+"""Planners that choose camera motions without learning, one file each."""
+
+from ms_slam_baselines.greedy import GreedyDivergence
+from ms_slam_baselines.max_information import MaxInformation
+from ms_slam_baselines.random_walk import RandomWalk
+from ms_slam_baselines.stationary import Stationary
+
+__all__ = ["GreedyDivergence", "MaxInformation", "RandomWalk", "Stationary"]

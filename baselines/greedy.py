@@ -1,0 +1,72 @@
+"""Greedy divergence: Algorithm 1 of Saeedi et al., ICRA 2017."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.env.config import TargetConfig
+from ms_slam_env.env.planner import Planner
+
+if TYPE_CHECKING:
+    from ms_slam_env.env.active_slam import ActiveSlamEnv
+
+Float64 = NDArray[np.float64]
+
+
+class GreedyDivergence(Planner):
+    """Takes the motion whose predicted divergences come closest to their targets.
+
+    With targets of zero it stands still, as the paper says of rho = 0: no view diverges less from
+    the current one than the current one. Exploration comes from targets above zero alone.
+
+    Args:
+        env: the unwrapped environment; its configured targets are the defaults below.
+        seed: unused, the planner draws nothing at random.
+        rho_I: share of M_I to aim at, in [0, 1].
+        rho_D: share of M_D to aim at, in [0, 1].
+        depth_weight: lambda, significance of depth over intensity.
+
+    Raises:
+        InputError: an option out of its range.
+    """
+
+    def __init__(
+        self,
+        env: ActiveSlamEnv,
+        seed: int = 0,
+        rho_I: float | None = None,
+        rho_D: float | None = None,
+        depth_weight: float | None = None,
+    ) -> None:
+        super().__init__(env, seed)
+        options = {"rho_I": rho_I, "rho_D": rho_D, "depth_weight": depth_weight}
+        given: dict[str, Any] = {k: _number(v) for k, v in options.items() if v is not None}
+        self.targets = replace(env.config.targets, **given)
+
+    def act(self, observation: Any, info: dict[str, Any]) -> int:
+        """Algorithm 1; the loop over candidates, lines 3 to 8, is one batch."""
+        T = np.flatnonzero(self.env.action_masks())  # line 2: motions within reach
+        delta_I, delta_D = self.env.lookahead()[T].T  # lines 1 and 3 to 8: predict and compare
+        i_star = np.argmin(distance_to_targets(delta_I, delta_D, self.targets))  # line 9
+        return int(T[i_star])  # lines 10 and 11
+
+
+def distance_to_targets(delta_I: Float64, delta_D: Float64, targets: TargetConfig) -> Float64:
+    """Criterion of line 9: |Delta_I - rho_I M_I| + lambda |Delta_D - rho_D M_D|, (n,) nats.
+
+    ``argmin`` of it breaks ties by the lowest action.
+    """
+    target_I, target_D = targets.divergence
+    return np.abs(delta_I - target_I) + targets.depth_weight * np.abs(delta_D - target_D)
+
+
+def _number(value: float | str) -> float | str:
+    """Turn text from the command line into a number; what is none is for the config to refuse."""
+    try:
+        return float(value)
+    except ValueError:
+        return value

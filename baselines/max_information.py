@@ -1,0 +1,25 @@
+"""Maximum information: go where the map is emptiest."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ms_slam_env.env.planner import Planner
+
+
+class MaxInformation(Planner):
+    """Takes the motion whose view is predicted to show most surface that is not mapped yet.
+
+    The classical contrast to a divergence planner: next best view by expected gain, without regard
+    to whether SLAM can follow. The gain of a view is its number of pixels at which the map
+    predicts no depth: there lies surface not yet seen, or nothing within the sensor's range.
+    """
+
+    def act(self, observation: Any, info: dict[str, Any]) -> int:
+        """Choose the unmasked action with the largest gain, ties drawn at random."""
+        depth = self.env.predict_candidates().depth  # (n, h, w) metres, 0 = the map is empty
+        unseen = np.count_nonzero(depth == 0, axis=(1, 2))  # (n,) pixels
+        unseen[~self.env.action_masks()] = -1
+        return int(self.rng.choice(np.flatnonzero(unseen == unseen.max())))

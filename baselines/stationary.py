@@ -1,0 +1,19 @@
+"""Standing still: the smallest trajectory error of all planners, and nothing to show for it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ms_slam_env.env.planner import Planner
+
+
+class Stationary(Planner):
+    """Never moves.
+
+    It belongs in every comparison because its trajectory error is the lowest of all: a measure
+    that ranks it first does not measure active SLAM.
+    """
+
+    def act(self, observation: Any, info: dict[str, Any]) -> int:
+        """Return action 0, neither translation nor rotation."""
+        return 0
