@@ -1,1 +1,1 @@
-"""Training scripts, one readable file each; installed as `ms_slam_agents`."""
+"""Training scripts, one readable file each, and the planner that runs what they trained."""

@@ -1,0 +1,98 @@
+"""Play fixed validation episodes with a policy, and with reference planners."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from ms_slam_baselines.greedy import distance_to_targets
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+
+Actions = NDArray[np.int64]
+Choose = Callable[[NDArray[Any], NDArray[np.bool_]], Actions]  # observations, masks -> actions
+
+
+class FixedEpisodes(gym.Wrapper[Any, Any, Any, Any]):
+    """Plays the same seeded episodes each time round; ``restart`` goes back to the first."""
+
+    def __init__(self, env: gym.Env[Any, Any], seeds: Sequence[int]) -> None:
+        super().__init__(env)
+        self.seeds = list(seeds)
+        self._next = 0
+
+    def restart(self) -> None:
+        """Let the next reset play the first episode."""
+        self._next = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start the next episode of the list, whatever ``seed`` says."""
+        seed = self.seeds[self._next % len(self.seeds)]
+        self._next += 1
+        return self.env.reset(seed=seed, options=options)
+
+
+def evaluate(venv: VecEnv, num_episodes: int, choose: Choose) -> dict[str, float]:
+    """Play every validation episode once; means over episodes, ``return_sem`` the standard error.
+
+    Args:
+        venv: of ``FixedEpisodes``.
+        num_episodes: in all environments together.
+        choose: maps observations (B, k) and masks (B, n) to actions (B,).
+    """
+    venv.env_method("restart")
+    observations = np.asarray(venv.reset())
+    to_play = np.array([len(seeds) for seeds in venv.get_attr("seeds")])
+    returns, steps, tracked = np.zeros((3, venv.num_envs))
+    episodes: list[dict[str, float]] = []
+    while len(episodes) < num_episodes:
+        masks = np.stack(venv.env_method("action_masks"))
+        observations, rewards, dones, infos = venv.step(choose(observations, masks))  # type: ignore[assignment]
+        returns += rewards
+        steps += 1
+        tracked += [info["tracking_ok"] for info in infos]
+        for i in np.flatnonzero(dones & (to_play > 0)):
+            episodes.append(
+                {
+                    "return": returns[i],
+                    "steps": steps[i],
+                    "mapped_area_m2": infos[i]["mapped_area"],
+                    "ate_m": infos[i]["ate"],
+                    "tracked_share": tracked[i] / steps[i],
+                    "lost_share": float(not infos[i]["TimeLimit.truncated"]),
+                }
+            )
+        to_play[dones] -= 1
+        returns[dones] = steps[dones] = tracked[dones] = 0
+    means = {name: float(np.mean([e[name] for e in episodes])) for name in episodes[0]}
+    spread = float(np.std([e["return"] for e in episodes]))
+    return means | {"return_sem": spread / max(1, num_episodes - 1) ** 0.5}
+
+
+def sample(probabilities: NDArray[Any], rng: np.random.Generator) -> Actions:
+    """Draw one action a row of ``probabilities`` (B, n)."""
+    return np.array([rng.choice(len(row), p=row) for row in probabilities])
+
+
+def references(venv: VecEnv, num_episodes: int, seed: int) -> dict[str, dict[str, float]]:
+    """What random walk, standing still and the greedy planner reach on the same episodes."""
+    rng = np.random.default_rng(seed)
+    targets = venv.get_attr("config")[0].targets
+
+    def random_walk(_: NDArray[Any], masks: NDArray[np.bool_]) -> Actions:
+        return sample(masks / masks.sum(axis=1, keepdims=True), rng)
+
+    def stationary(_: NDArray[Any], masks: NDArray[np.bool_]) -> Actions:
+        return np.zeros(len(masks), dtype=np.int64)
+
+    def greedy(_: NDArray[Any], masks: NDArray[np.bool_]) -> Actions:
+        delta_I, delta_D = np.moveaxis(np.stack(venv.env_method("lookahead")), -1, 0)
+        distance = np.where(masks, distance_to_targets(delta_I, delta_D, targets), np.inf)
+        return np.argmin(distance, axis=1)
+
+    planners = {"random walk": random_walk, "stationary": stationary, "greedy": greedy}
+    return {name: evaluate(venv, num_episodes, choose) for name, choose in planners.items()}
