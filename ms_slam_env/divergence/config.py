@@ -28,7 +28,7 @@ class DivergenceConfig:
             the pixels without depth are holes, whose intensity (0) is not that of any surface.
         inclinations: N of equation (6).
         alpha_deg: influence angle alpha of equation (8), degrees.
-        normal_radius: reach of the differences that give a pixel's normal, pixels.
+        normal_radius: distance to the pixels whose inverse depths give a pixel's normal, pixels.
         edge_threshold: relative second difference of inverse depth above which two pixels are
             taken to lie on different surfaces, so that no normal is computed across.
         windows: rows and columns of spatial windows (``windowed-kl`` only).

@@ -13,10 +13,11 @@ from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.divergence import kernels
 from ms_slam_env.divergence.config import DivergenceConfig
-from ms_slam_env.divergence.sphere import TABLE_SIZE, WEIGHT_SCALE, WeightTable, weight_table
+from ms_slam_env.divergence.sphere import TABLE_SIZE, cell_weights
 from ms_slam_env.errors import InputError
 
 Float64 = NDArray[np.float64]
+Int32 = NDArray[np.int32]
 
 
 @dataclass(frozen=True)
@@ -74,16 +75,16 @@ class HistogramCounter:
     """Counts the pixels of batches of frames on one device."""
 
     def __init__(self, config: DivergenceConfig, intrinsics: Intrinsics, device: str) -> None:
-        """Upload the weight table for ``config`` to ``device`` (``cpu`` or ``cuda``)."""
+        """Prepare for frames of ``intrinsics`` on ``device`` (``cpu`` or ``cuda``)."""
         self._config = config
         self._intrinsics = intrinsics
         self._device = device
-        self._windows = config.windows if config.measure == "windowed-kl" else (1, 1)
-        self._table: WeightTable = weight_table(config.inclinations, float(config.alpha_deg))
-        self._starts: Any = wp.array(self._table.starts, dtype=wp.int32, device=device)
-        self._bins: Any = wp.array(self._table.bins, dtype=wp.int32, device=device)
-        self._weights: Any = wp.array(self._table.weights, dtype=wp.int32, device=device)
-        self._counts: dict[int, tuple[Any, Any]] = {}  # batch size -> buffers, allocated once
+        rows, columns = config.windows if config.measure == "windowed-kl" else (1, 1)
+        self._grid = wp.vec2i(rows, columns)
+        self._windows = rows * columns
+        self._cell_weights = cell_weights(config.inclinations, float(config.alpha_deg))
+        self._grouping = grouping_matrix(config.bins, float(config.smoothing))
+        self._buffers: dict[int, tuple[Any, Any, Any]] = {}  # by batch size
 
     def histograms(self, intensity: Any, depth: Any, normals: Any | None = None) -> Histograms:
         """Histograms of B frames.
@@ -103,23 +104,23 @@ class HistogramCounter:
         if depth_wp.shape != shape:
             raise InputError(f"depth {depth_wp.shape} and intensity {shape} differ in shape")
         if normals is None:
-            normals_wp = wp.empty((1, 1, 1), dtype=wp.vec3, device=self._device)
+            counts = self._count(intensity_wp, depth_wp, None)
         else:
             normals_wp = self._upload(normals, wp.vec3, "normals")
             if normals_wp.shape != shape:
                 raise InputError(f"normals {normals_wp.shape} and intensity {shape} do not fit")
-        return self._normalised(
-            *self._count(intensity_wp, depth_wp, normals_wp, normals is not None)
-        )
+            counts = self._count(intensity_wp, depth_wp, normals_wp)
+        return self._normalised(*counts)
 
     def normals(self, depth: Any) -> NDArray[np.float32]:
         """Unit normals (B, h, w, 3) towards the camera of depth (B, h, w), 0 where none."""
         depth_wp = self._upload(depth, wp.float32, "depth")
+        inverse = self._inverse(depth_wp, wp.empty_like(depth_wp))
         result = wp.empty(depth_wp.shape, dtype=wp.vec3, device=self._device)
         wp.launch(
             kernels.compute_normals,
             dim=depth_wp.shape,
-            inputs=[depth_wp, *self._camera(), result],
+            inputs=[inverse, *self._camera(), result],
             device=self._device,
         )
         return result.numpy()
@@ -151,59 +152,58 @@ class HistogramCounter:
             config.edge_threshold,
         ]
 
-    def _buffers(self, batch: int) -> tuple[Any, Any]:
-        """Zeroed counters for ``batch`` frames."""
-        if batch not in self._counts:
-            windows = self._windows[0] * self._windows[1]
-            self._counts[batch] = (
-                wp.zeros((batch, windows * 256), dtype=wp.int32, device=self._device),
-                wp.zeros(
-                    (batch, windows * self._table.num_bins), dtype=wp.int32, device=self._device
-                ),
+    def _buffer(self, batch: int) -> tuple[Any, Any, Any]:
+        """Return counters of grey levels and cells, set to zero, and room for inverse depth."""
+        if batch not in self._buffers:
+            levels_shape = (batch, self._windows * 256)
+            cells_shape = (batch, self._windows * TABLE_SIZE**2)
+            images_shape = (batch, *self._intrinsics.shape)
+            self._buffers[batch] = (
+                wp.zeros(levels_shape, dtype=wp.int32, device=self._device),
+                wp.zeros(cells_shape, dtype=wp.int32, device=self._device),
+                wp.empty(images_shape, dtype=wp.float32, device=self._device),
+            )
+        levels, cells, inverse = self._buffers[batch]
+        levels.zero_()
+        cells.zero_()
+        return levels, cells, inverse
+
+    def _inverse(self, depth: Any, out: Any) -> Any:
+        """Inverse depth (B, h, w), written to ``out``."""
+        self._launch(kernels.invert_depth, [depth, out])
+        return out
+
+    def _launch(self, kernel: Any, inputs: list[Any]) -> None:
+        """Run a kernel with one thread per row of the images ``inputs[0]``."""
+        wp.launch(kernel, dim=inputs[0].shape[:2], inputs=inputs, device=self._device)
+
+    def _count(self, intensity: Any, depth: Any, normals: Any | None) -> tuple[Int32, Int32]:
+        """Counts (B, W, 256) of grey levels and (B, W, TABLE_SIZE ** 2) of directions."""
+        batch = intensity.shape[0]
+        levels, cells, inverse = self._buffer(batch)
+        only_with_depth = int(self._config.intensity_pixels == "with-depth")
+        self._launch(
+            kernels.count_intensity, [intensity, depth, only_with_depth, self._grid, levels]
+        )
+        if normals is None:
+            self._launch(
+                kernels.count_depth_normals,
+                [self._inverse(depth, inverse), *self._camera(), self._grid, TABLE_SIZE, cells],
             )
         else:
-            for buffer in self._counts[batch]:
-                buffer.zero_()
-        return self._counts[batch]
-
-    def _count(
-        self, intensity: Any, depth: Any, normals: Any, use_normals: bool
-    ) -> tuple[Float64, Float64]:
-        """Counts (B, W, 256) of grey levels and (B, W, L) of normals."""
-        batch = intensity.shape[0]
-        intensity_counts, normal_counts = self._buffers(batch)
-        wp.launch(
-            kernels.count_frames,
-            dim=intensity.shape,
-            inputs=[
-                intensity,
-                depth,
-                normals,
-                int(use_normals),
-                int(self._config.intensity_pixels == "with-depth"),
-                *self._camera(),
-                wp.vec2i(*self._windows),
-                TABLE_SIZE,
-                self._starts,
-                self._bins,
-                self._weights,
-                self._table.num_bins,
-                intensity_counts,
-                normal_counts,
-            ],
-            device=self._device,
-        )
-        windows = self._windows[0] * self._windows[1]
+            self._launch(kernels.count_given_normals, [normals, self._grid, TABLE_SIZE, cells])
         return (
-            intensity_counts.numpy().reshape(batch, windows, 256).astype(np.float64),
-            normal_counts.numpy().reshape(batch, windows, -1) / WEIGHT_SCALE,
+            levels.numpy().reshape(batch, self._windows, 256),
+            cells.numpy().reshape(batch, self._windows, TABLE_SIZE**2),
         )
 
-    def _normalised(self, levels: Float64, normals: Float64) -> Histograms:
-        """Histograms of raw counts."""
-        config = self._config
-        grouped = levels @ grouping_matrix(config.bins, float(config.smoothing))
+    def _normalised(self, levels: Int32, cells: Int32) -> Histograms:
+        """Histograms of raw counts, the sums of equation (9) by one matrix product."""
+        pseudo_count = self._config.pseudo_count
+        batch, windows = levels.shape[:2]
+        sums = cells.reshape(batch * windows, -1).astype(np.float32) @ self._cell_weights
+        normals = sums.reshape(batch, windows, -1).astype(np.float64)
         return Histograms(
-            intensity=normalise(grouped, config.pseudo_count),
-            normals=normalise(normals, config.pseudo_count),
+            intensity=normalise(levels @ self._grouping, pseudo_count),
+            normals=normalise(normals, pseudo_count),
         )

@@ -1,57 +1,35 @@
-# mypy: ignore-errors  (Warp annotations are values, not types)
+# Warp annotations are values, not types.
+# mypy: ignore-errors
 """Counting kernels: one pass over the pixels of a batch of frames.
 
-Counts are integers, so the result does not depend on the order in which a GPU adds them.
+Counts are integers, so the result does not depend on the order in which a GPU adds them. One
+thread takes one image row: on the CPU, where threads run one after the other, the call of a
+thread costs more than a pixel does.
 """
 
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
 
+DITHER_U = wp.constant(0.7548776662466927)
+DITHER_V = wp.constant(0.5698402909980532)
+"""Steps of the two-dimensional low-discrepancy sequence R2 (Roberts, 2018)."""
 
-@wp.func
-def slope(
+
+@wp.kernel
+def invert_depth(
     depth: wp.array3d(dtype=wp.float32),
-    b: int,
-    v: int,
-    u: int,
-    dv: int,
-    du: int,
-    radius: int,
-    w: float,
-    max_bend: float,
+    inverse: wp.array3d(dtype=wp.float32),
 ):
-    """Slope of inverse depth at (v, u) along (dv, du), per pixel; NaN if there is none.
-
-    Least squares over the pairs at distance 1 to ``radius`` whose second difference shows no
-    edge. A plane has a linear inverse depth however it is tilted, so the second difference is 0.
-    """
-    height = depth.shape[1]
-    width = depth.shape[2]
-    numerator = wp.float32(0.0)  # a loop variable, not a constant
-    denominator = wp.float32(0.0)  # a loop variable, not a constant
-    for k in range(1, radius + 1):
-        v0 = v - k * dv
-        u0 = u - k * du
-        v1 = v + k * dv
-        u1 = u + k * du
-        if v0 >= 0 and u0 >= 0 and v1 < height and u1 < width:
-            z0 = depth[b, v0, u0]
-            z1 = depth[b, v1, u1]
-            if z0 > 0.0 and z1 > 0.0:
-                w0 = 1.0 / z0
-                w1 = 1.0 / z1
-                if wp.abs(w0 + w1 - 2.0 * w) < max_bend:
-                    numerator += float(k) * (w1 - w0)
-                    denominator += 2.0 * float(k * k)
-    if denominator == 0.0:
-        return wp.nan
-    return numerator / denominator
+    """Inverse depth in 1/m; where there is no reading, a number too large to be one."""
+    b, v = wp.tid()
+    for u in range(depth.shape[2]):
+        inverse[b, v, u] = 1.0 / wp.max(depth[b, v, u], 1.0e-20)
 
 
 @wp.func
 def depth_normal(
-    depth: wp.array3d(dtype=wp.float32),
+    inverse: wp.array3d(dtype=wp.float32),
     b: int,
     v: int,
     u: int,
@@ -60,105 +38,137 @@ def depth_normal(
     radius: int,
     edge_threshold: float,
 ):
-    """Normal towards the camera, not of unit length; zero if there is none.
+    """Normal towards the camera, of any length; zero if there is none.
 
     On the plane n . p = d the inverse depth is n . ray / d, linear in the pixel coordinates, so
-    its slopes give n / d exactly; d < 0 for a normal towards the camera.
+    its slopes give n / d exactly; d < 0 for a normal towards the camera. The slopes are central
+    differences over ``radius`` pixels to both sides. The second difference is zero on a plane
+    however tilted, so a large one shows an edge.
     """
-    z = depth[b, v, u]
-    if z <= 0.0:
-        return wp.vec3(0.0, 0.0, 0.0)
-    w = 1.0 / z
-    max_bend = edge_threshold * w
-    slope_u = slope(depth, b, v, u, 0, 1, radius, w, max_bend)
-    slope_v = slope(depth, b, v, u, 1, 0, radius, w, max_bend)
-    if wp.isnan(slope_u) or wp.isnan(slope_v):
-        return wp.vec3(0.0, 0.0, 0.0)
-    return wp.vec3(
-        -focal[0] * slope_u,
-        -focal[1] * slope_v,
-        slope_u * (float(u) - centre[0]) + slope_v * (float(v) - centre[1]) - w,
-    )
+    n = wp.vec3(0.0, 0.0, 0.0)
+    if (
+        u >= radius
+        and v >= radius
+        and u + radius < inverse.shape[2]
+        and v + radius < inverse.shape[1]
+    ):
+        w = inverse[b, v, u]
+        left = inverse[b, v, u - radius]
+        right = inverse[b, v, u + radius]
+        above = inverse[b, v - radius, u]
+        below = inverse[b, v + radius, u]
+        max_bend = edge_threshold * w
+        if (
+            w < 1.0e10
+            and wp.abs(left + right - 2.0 * w) < max_bend
+            and wp.abs(above + below - 2.0 * w) < max_bend
+        ):
+            scale = 0.5 / float(radius)
+            slope_u = (right - left) * scale
+            slope_v = (below - above) * scale
+            n = wp.vec3(
+                -focal[0] * slope_u,
+                -focal[1] * slope_v,
+                slope_u * (float(u) - centre[0]) + slope_v * (float(v) - centre[1]) - w,
+            )
+    return n
 
 
 @wp.func
-def octahedral_cell(n: wp.vec3, size: int):
-    """Cell of direction ``n`` (any length but 0) in the octahedral map of side ``size``."""
+def direction_cell(n: wp.vec3, dither: wp.vec2, size: int):
+    """Cell of direction ``n`` (any length but 0) in an octahedral map with -z at its centre.
+
+    The direction lies between four cell centres. ``dither`` in [0, 1)^2 picks one of them with
+    the frequency of its weight in bilinear interpolation.
+    """
     scale = 1.0 / (wp.abs(n[0]) + wp.abs(n[1]) + wp.abs(n[2]))
     x = n[0] * scale
     y = n[1] * scale
-    if n[2] < 0.0:
+    if n[2] > 0.0:
         folded_x = (1.0 - wp.abs(y)) * wp.sign(x)
-        folded_y = (1.0 - wp.abs(x)) * wp.sign(y)
+        y = (1.0 - wp.abs(x)) * wp.sign(y)
         x = folded_x
-        y = folded_y
-    column = wp.clamp(int((x + 1.0) * 0.5 * float(size)), 0, size - 1)
-    row = wp.clamp(int((y + 1.0) * 0.5 * float(size)), 0, size - 1)
-    return row * size + column
+    half = 0.5 * float(size)
+    # Adding 1 before truncation and taking it off after keeps truncation a floor below 0.
+    column = int((x + 1.0) * half + dither[0] + 0.5) - 1
+    row = int((y + 1.0) * half + dither[1] + 0.5) - 1
+    return wp.clamp(row, 0, size - 1) * size + wp.clamp(column, 0, size - 1)
 
 
 @wp.func
-def add_normal(
-    n: wp.vec3,
-    b: int,
-    offset: int,
-    size: int,
-    starts: wp.array(dtype=wp.int32),
-    bins: wp.array(dtype=wp.int32),
-    weights: wp.array(dtype=wp.int32),
-    counts: wp.array2d(dtype=wp.int32),
-):
-    """Equations (8) and (9) for one normal, by the weight table."""
-    cell = octahedral_cell(n, size)
-    for entry in range(starts[cell], starts[cell + 1]):
-        wp.atomic_add(counts, b, offset + bins[entry], weights[entry])
+def dither_of(v: int, u: int):
+    """Offset in [0, 1)^2 of a pixel: evenly spread over any patch of the image."""
+    index_u = float(u)
+    index_v = float(v)
+    x = index_u * DITHER_U + index_v * DITHER_V
+    y = index_u * DITHER_V + index_v * (1.0 - DITHER_U)
+    return wp.vec2(x - float(int(x)), y - float(int(y)))
 
 
 @wp.kernel
-def count_frames(
+def count_intensity(
     intensity: wp.array3d(dtype=wp.float32),
     depth: wp.array3d(dtype=wp.float32),
-    given_normals: wp.array3d(dtype=wp.vec3),
-    use_given_normals: int,
     only_with_depth: int,
+    windows: wp.vec2i,
+    counts: wp.array2d(dtype=wp.int32),
+):
+    """Add a row of pixels to the grey levels (B, windows * 256) of its frame."""
+    b, v = wp.tid()
+    width = intensity.shape[2]
+    window_row = v * windows[0] / intensity.shape[1] * windows[1]
+    for u in range(width):
+        if only_with_depth == 0 or depth[b, v, u] > 0.0:
+            level = wp.clamp(int(intensity[b, v, u] + 0.5), 0, 255)
+            window = window_row + u * windows[1] / width
+            wp.atomic_add(counts, b, window * 256 + level, 1)
+
+
+@wp.kernel
+def count_depth_normals(
+    inverse: wp.array3d(dtype=wp.float32),
     focal: wp.vec2,
     centre: wp.vec2,
     radius: int,
     edge_threshold: float,
     windows: wp.vec2i,
     size: int,
-    starts: wp.array(dtype=wp.int32),
-    bins: wp.array(dtype=wp.int32),
-    weights: wp.array(dtype=wp.int32),
-    num_normal_bins: int,
-    intensity_counts: wp.array2d(dtype=wp.int32),
-    normal_counts: wp.array2d(dtype=wp.int32),
+    counts: wp.array2d(dtype=wp.int32),
 ):
-    """Add one pixel to the histograms of its frame and window.
+    """Add the normals of a row of pixels to the cells (B, windows * size^2) of its frame."""
+    b, v = wp.tid()
+    width = inverse.shape[2]
+    window_row = v * windows[0] / inverse.shape[1] * windows[1]
+    for u in range(width):
+        n = depth_normal(inverse, b, v, u, focal, centre, radius, edge_threshold)
+        if wp.dot(n, n) > 0.0:
+            window = window_row + u * windows[1] / width
+            cell = direction_cell(n, dither_of(v, u), size)
+            wp.atomic_add(counts, b, window * size * size + cell, 1)
 
-    Counts: (B, windows * 256) grey levels and (B, windows * L) weights of normals.
-    """
-    b, v, u = wp.tid()
-    height = intensity.shape[1]
-    width = intensity.shape[2]
-    window = (v * windows[0] / height) * windows[1] + u * windows[1] / width
 
-    if only_with_depth == 0 or depth[b, v, u] > 0.0:
-        level = wp.clamp(int(intensity[b, v, u] + 0.5), 0, 255)
-        wp.atomic_add(intensity_counts, b, window * 256 + level, 1)
-
-    n = wp.vec3(0.0, 0.0, 0.0)
-    if use_given_normals != 0:
-        n = given_normals[b, v, u]
-    else:
-        n = depth_normal(depth, b, v, u, focal, centre, radius, edge_threshold)
-    if n[0] != 0.0 or n[1] != 0.0 or n[2] != 0.0:
-        add_normal(n, b, window * num_normal_bins, size, starts, bins, weights, normal_counts)
+@wp.kernel
+def count_given_normals(
+    normals: wp.array3d(dtype=wp.vec3),
+    windows: wp.vec2i,
+    size: int,
+    counts: wp.array2d(dtype=wp.int32),
+):
+    """Add given normals of a row of pixels to the cells (B, windows * size^2) of its frame."""
+    b, v = wp.tid()
+    width = normals.shape[2]
+    window_row = v * windows[0] / normals.shape[1] * windows[1]
+    for u in range(width):
+        n = normals[b, v, u]
+        if wp.dot(n, n) > 0.0:
+            window = window_row + u * windows[1] / width
+            cell = direction_cell(n, dither_of(v, u), size)
+            wp.atomic_add(counts, b, window * size * size + cell, 1)
 
 
 @wp.kernel
 def compute_normals(
-    depth: wp.array3d(dtype=wp.float32),
+    inverse: wp.array3d(dtype=wp.float32),
     focal: wp.vec2,
     centre: wp.vec2,
     radius: int,
@@ -168,5 +178,5 @@ def compute_normals(
     """Unit normals of every pixel, zero where there is none."""
     b, v, u = wp.tid()
     normals[b, v, u] = wp.normalize(
-        depth_normal(depth, b, v, u, focal, centre, radius, edge_threshold)
+        depth_normal(inverse, b, v, u, focal, centre, radius, edge_threshold)
     )

@@ -67,7 +67,7 @@ def depth_divergence(
         inclinations: N of equation (6).
         alpha_deg: influence angle alpha of equation (8), degrees.
         pseudo_count: normals added to every bin before normalising.
-        normal_radius: reach of the differences that give a pixel's normal, pixels.
+        normal_radius: distance to the pixels that give a pixel's normal, pixels.
         edge_threshold: see ``DivergenceConfig``.
 
     Raises:

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Float64 = NDArray[np.float64]
-Int32 = NDArray[np.int32]
+Float32 = NDArray[np.float32]
 
-TABLE_SIZE = 192
-"""Cells along one side of the octahedral map behind the weight table."""
-
-WEIGHT_SCALE = 4096
-"""Weights are summed as integers in units of 1 / WEIGHT_SCALE: the order of summation, which a
-GPU does not fix, then does not matter. 640 x 480 pixels of weight 1 still fit into 31 bits."""
+TABLE_SIZE = 80
+"""Cells along one side of the octahedral map of directions."""
 
 
 @lru_cache(maxsize=32)
@@ -53,45 +48,25 @@ def bin_weights(normals: ArrayLike, directions: ArrayLike, alpha_rad: float) -> 
     return np.maximum(cosine - np.cos(alpha_rad), 0.0) / (1.0 - np.cos(alpha_rad))
 
 
-@dataclass(frozen=True)
-class WeightTable:
-    """Weights of (8) for directions on an octahedral grid, as compressed rows.
+def cell_directions() -> Float64:
+    """Unit vectors (TABLE_SIZE ** 2, 3) at the cell centres of the octahedral map.
 
-    Cell c holds the entries ``starts[c]`` to ``starts[c + 1]`` of ``bins`` and ``weights``.
-
-    Attributes:
-        starts: (TABLE_SIZE ** 2 + 1,) int32.
-        bins: (E,) int32 bin index.
-        weights: (E,) int32, weight times WEIGHT_SCALE.
-        num_bins: L.
+    The map has -z at its centre, where the normals that a camera sees are (z forward).
     """
-
-    starts: Int32
-    bins: Int32
-    weights: Int32
-    num_bins: int
-
-
-def _cell_directions() -> Float64:
-    """Unit vectors (TABLE_SIZE ** 2, 3) at the cell centres of the octahedral map."""
     axis = (np.arange(TABLE_SIZE) + 0.5) * 2 / TABLE_SIZE - 1
     y, x = np.meshgrid(axis, axis, indexing="ij")
-    z = 1 - np.abs(x) - np.abs(y)
-    # The outer four triangles of the square are the folded lower half (z < 0).
-    fold = np.maximum(-z, 0)
-    x = x - np.sign(x) * fold
-    y = y - np.sign(y) * fold
-    directions = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    z = np.abs(x) + np.abs(y) - 1
+    fold = np.maximum(z, 0)  # the outer four triangles of the square are the folded half z > 0
+    directions = np.stack([x - np.sign(x) * fold, y - np.sign(y) * fold, z], axis=-1)
+    directions = directions.reshape(-1, 3)
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
 @lru_cache(maxsize=16)
-def weight_table(inclinations: int, alpha_deg: float) -> WeightTable:
-    """Tabulate (8) for ``inclinations`` N and the influence angle ``alpha_deg``."""
-    directions = bin_directions(inclinations)
-    weights = bin_weights(_cell_directions(), directions, np.deg2rad(alpha_deg))
-    units = np.rint(weights * WEIGHT_SCALE).astype(np.int32)
-    cells, bins = np.nonzero(units)
-    starts = np.zeros(len(units) + 1, dtype=np.int32)
-    np.cumsum(np.bincount(cells, minlength=len(units)), out=starts[1:])
-    return WeightTable(starts, bins.astype(np.int32), units[cells, bins], len(directions))
+def cell_weights(inclinations: int, alpha_deg: float) -> Float32:
+    """Weights (TABLE_SIZE ** 2, L) of (8) at the cell centres, for N and alpha."""
+    weights = bin_weights(
+        cell_directions(), bin_directions(inclinations), float(np.deg2rad(alpha_deg))
+    ).astype(np.float32)
+    weights.flags.writeable = False
+    return weights
