@@ -39,10 +39,10 @@ class CoverageGrid:
         flat = np.ravel_multi_index(tuple(cells[inside].T), tuple(self._shape))
         self._seen[flat] = True
         error = np.linalg.norm(points_estimated - points_true, axis=1)[inside]
-        correct = np.unique(flat[error < self.voxel_m])
-        new = int(np.count_nonzero(~self._mapped[correct]))
-        self._mapped[correct] = True
-        return new * self.voxel_m**2
+        correct = flat[error < self.voxel_m]
+        new = np.unique(correct[~self._mapped[correct]])
+        self._mapped[new] = True
+        return len(new) * self.voxel_m**2
 
     @property
     def mapped_area(self) -> float:

@@ -31,11 +31,13 @@ class FreeCamera(Embodiment):
         self.scene = scene
         self.step_m = step_m
         self._motions = decompose(step_m, step_rad)
+        self._masks: NDArray[np.bool_] | None = None  # of the current pose
         self.T_world_camera = np.eye(4)
 
     def reset(self, T_world_camera: Float64, rng: np.random.Generator) -> None:
         """Put the camera at a start pose (4, 4)."""
         self.T_world_camera = np.array(T_world_camera, dtype=np.float64)
+        self._masks = None
 
     def candidate_motions(self) -> Float64:
         """The 49 motions ``T_camera_next`` (49, 4, 4), the same everywhere."""
@@ -43,19 +45,22 @@ class FreeCamera(Embodiment):
 
     def action_masks(self) -> NDArray[np.bool_]:
         """(49,) whether the camera's ball reaches each target; depends on the translation only."""
-        R, position = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
-        ends = position + self.step_m * TRANSLATION_DIRECTIONS @ R.T
-        free = [
-            index == 0 or self.scene.segment_is_free(position, end, CAMERA_RADIUS_M)
-            for index, end in enumerate(ends)
-        ]
-        return np.repeat(np.array(free), NUM_ROTATIONS)
+        if self._masks is None:
+            R, position = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
+            ends = position + self.step_m * TRANSLATION_DIRECTIONS @ R.T
+            free = [
+                index == 0 or self.scene.segment_is_free(position, end, CAMERA_RADIUS_M)
+                for index, end in enumerate(ends)
+            ]
+            self._masks = np.repeat(np.array(free), NUM_ROTATIONS)
+        return self._masks.copy()
 
     def move(self, action: int) -> bool:
         """Make motion ``action`` if nothing blocks it; return whether it was made."""
         if not self.action_masks()[action]:
             return False
         self.T_world_camera = self.T_world_camera @ self._motions[action]
+        self._masks = None
         return True
 
     def get_state(self) -> dict[str, Any]:
@@ -65,6 +70,7 @@ class FreeCamera(Embodiment):
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state that ``get_state`` returned."""
         self.T_world_camera = state["T_world_camera"].copy()
+        self._masks = None
 
 
 class FixedTranslation(Embodiment):

@@ -28,6 +28,10 @@ def assert_same(a, b, where="value"):
         assert a.keys() == b.keys(), where
         for key in a:
             assert_same(a[key], b[key], f"{where}[{key!r}]")
+    elif isinstance(a, tuple):
+        assert len(a) == len(b), where
+        for index, (left, right) in enumerate(zip(a, b, strict=True)):
+            assert_same(left, right, f"{where}[{index}]")
     elif isinstance(a, np.ndarray):
         np.testing.assert_array_equal(a, b, where)
     else:
