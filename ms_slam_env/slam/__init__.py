@@ -1,1 +1,42 @@
-"""SLAM backends."""
+"""SLAM backends, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.config import from_dict
+from ms_slam_env.errors import unknown
+from ms_slam_env.slam.base import SlamBackend, TrackResult, Views
+
+
+def _surfel(intrinsics: Intrinsics, device: str = "cpu", **params: Any) -> SlamBackend:
+    # Imported here: loading the kernels takes a while, and a backend's extra may be missing.
+    from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
+
+    return SurfelSlam(intrinsics, from_dict(SurfelConfig, params, "slam"), device)
+
+
+BACKENDS: dict[str, Callable[..., SlamBackend]] = {"surfel": _surfel}
+"""Name to maker; a maker takes the intrinsics and the backend's parameters."""
+
+
+def make(name: str, intrinsics: Intrinsics, **params: Any) -> SlamBackend:
+    """Make the SLAM backend ``name`` for a camera.
+
+    Args:
+        name: one of ``BACKENDS``.
+        intrinsics: of every frame.
+        params: of the backend, such as the fields of ``SurfelConfig``; ``device`` = "cpu" or
+            "cuda" where the backend has a choice.
+
+    Raises:
+        InputError: unknown backend, unknown parameter or value out of range.
+    """
+    if name not in BACKENDS:
+        raise unknown("SLAM backend", name, BACKENDS)
+    return BACKENDS[name](intrinsics, **params)
+
+
+__all__ = ["BACKENDS", "SlamBackend", "TrackResult", "Views", "make"]

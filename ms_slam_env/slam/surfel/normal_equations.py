@@ -1,0 +1,207 @@
+"""One fused pass of joint geometric and photometric alignment: normal equations and statistics.
+
+ElasticFusion section IV: E = E_icp + w_rgb E_rgb, linearised at the current estimate. The pass
+runs over the points p of the *model* (denoised by fusion) and looks them up in the live frame:
+
+    q     = T^-1 p                 in the live camera, T = T_model_live; n_q = R^T n
+    r_icp = n_q . (v - q)          metres; v is the live vertex in the pixel that q falls into
+    r_rgb = I_live(pi(q)) - I_p    grey levels; I_live is interpolated bilinearly
+
+With the right perturbation T <- T exp(xi), xi = (rho, phi):
+
+    d r_icp / d xi = (n_q, v x n_q)
+    d r_rgb / d xi = -(g, q x g)       g = grad I_live . d pi / d q
+
+and the cost is, with w = icp_rgb_weight and s(z) = depth_noise_m z^2, the sensor's axial noise,
+
+    E = (1 - w) sum rho(r_icp / s(z); c_icp) + w sum rho(r_rgb / 1 grey level; c_rgb)
+
+where rho(r; c) = c^2/2 log(1 + (r/c)^2) is Cauchy's loss: w = 0 is geometry alone, w = 1
+photometry alone, and the default 0.1 trusts one grey level as much as three sigmas of depth.
+"""
+
+from __future__ import annotations
+
+from ms_slam_env._warp import wp
+
+NUM_SUMS = 36
+"""Sums of a pass: 21 of H (upper triangle by rows), 6 of g = J^T W r, then the statistics."""
+SUM_COST = 27  # truncated robust cost of the visible points, in [0, 3] each
+SUM_POINTS = 28  # model points looked at
+SUM_VISIBLE = 29  # of those, inside the live image
+SUM_MATCHED = 30  # of those, with a live vertex
+SUM_INLIERS = 31  # of those, within the gates and a few sigmas of the model's plane
+SUM_SQUARED_M2 = 32  # squared point-to-plane residuals of the inliers, m^2
+SUM_TEXTURED = 33  # visible, with a marked intensity gradient
+SUM_ALIKE = 34  # of those, with a small photometric residual
+SUM_APART = 35  # matched, but the live surface is clearly nearer or farther than the model's
+
+
+@wp.struct
+class Weights:
+    """Scales of the residuals; see the module's text. Reciprocals save divisions per pixel."""
+
+    icp: wp.float32
+    rgb: wp.float32
+    per_depth_noise: wp.float32  # 1 / depth_noise_m
+    per_cauchy_icp: wp.float32  # 1 / sigmas
+    per_cauchy_rgb: wp.float32  # 1 / grey levels
+    distance_m: wp.float32
+    cos_angle: wp.float32
+    inlier_sigmas: wp.float32
+    texture: wp.float32  # grey levels per pixel
+    alike: wp.float32  # grey levels
+
+
+@wp.kernel
+def accumulate(
+    model_vertices: wp.array3d(dtype=wp.vec3),
+    model_normals: wp.array3d(dtype=wp.vec3),
+    model_intensity: wp.array3d(dtype=wp.float32),
+    live_vertices: wp.array3d(dtype=wp.vec3),
+    live_normals: wp.array3d(dtype=wp.vec3),
+    live_gradient: wp.array3d(dtype=wp.vec3),
+    focal: wp.vec2,
+    centre: wp.vec2,
+    weights: Weights,
+    stride: wp.int32,
+    columns: wp.int32,  # of the image, per thread
+    pose: wp.array2d(dtype=wp.mat44d),  # T_model_live (B, K)
+    active: wp.array2d(dtype=wp.int32),
+    partial: wp.array4d(dtype=wp.float32),  # (B, K, rows * pieces, NUM_SUMS)
+):
+    b, k, row_index, piece = wp.tid()
+    if active[b, k] == 0:
+        return
+    width = model_vertices.shape[2]
+    height = model_vertices.shape[1]
+    T = pose[b, k]
+    R_inverse = wp.mat33(
+        float(T[0, 0]), float(T[1, 0]), float(T[2, 0]),
+        float(T[0, 1]), float(T[1, 1]), float(T[2, 1]),
+        float(T[0, 2]), float(T[1, 2]), float(T[2, 2]),
+    )  # fmt: skip
+    t_inverse = -(R_inverse * wp.vec3(float(T[0, 3]), float(T[1, 3]), float(T[2, 3])))
+    u_limit = float(width - 1)
+    v_limit = float(height - 1)
+    h0 = wp.spatial_vector()
+    h1 = wp.spatial_vector()
+    h2 = wp.spatial_vector()
+    h3 = wp.spatial_vector()
+    h4 = wp.spatial_vector()
+    h5 = wp.spatial_vector()
+    gradient = wp.spatial_vector()
+    cost = float(0.0)
+    points = float(0.0)
+    visible = float(0.0)
+    matched = float(0.0)
+    inliers = float(0.0)
+    squared = float(0.0)
+    textured = float(0.0)
+    alike = float(0.0)
+    apart = float(0.0)
+    v = row_index * stride
+    # Neighbouring rows sample different columns, like a chessboard.
+    start = piece * columns + (row_index % 2) * (stride // 2)
+    for u in range(start, wp.min((piece + 1) * columns, width), stride):
+        p = model_vertices[b, v, u]
+        if p[2] <= 0.0:
+            continue
+        points += 1.0
+        q = R_inverse * p + t_inverse
+        if q[2] <= 0.05:
+            continue
+        per_z = 1.0 / q[2]
+        x = focal[0] * q[0] * per_z + centre[0]
+        y = focal[1] * q[1] * per_z + centre[1]
+        if x < 0.0 or y < 0.0 or x >= u_limit or y >= v_limit:
+            continue
+        visible += 1.0
+        column = int(x)
+        row = int(y)
+        right = x - float(column)
+        down = y - float(row)
+        live = live_vertices[b, int(y + 0.5), int(x + 0.5)]
+        if live[2] > 0.0:
+            matched += 1.0
+            per_sigma = weights.per_depth_noise * per_z * per_z
+            gap = wp.abs(live[2] - q[2])
+            if gap * per_sigma > 8.0:
+                apart += 1.0
+            if gap > weights.distance_m:
+                cost += 3.0
+                continue  # another surface: neither its depth nor its colour is the model's
+            n = R_inverse * model_normals[b, v, u]
+            if wp.dot(n, live_normals[b, int(y + 0.5), int(x + 0.5)]) > weights.cos_angle:
+                residual = wp.dot(n, live - q)
+                normalised = residual * per_sigma
+                ratio = normalised * weights.per_cauchy_icp
+                robust = 1.0 / (1.0 + ratio * ratio)
+                cost += 1.0 - robust
+                if wp.abs(normalised) < weights.inlier_sigmas:
+                    inliers += 1.0
+                    squared += residual * residual
+                turn = wp.cross(live, n)
+                jacobian = wp.spatial_vector(n, turn)
+                scaled = (weights.icp * robust * per_sigma * per_sigma) * jacobian
+                h0 += scaled * jacobian[0]
+                h1 += scaled * jacobian[1]
+                h2 += scaled * jacobian[2]
+                h3 += scaled * jacobian[3]
+                h4 += scaled * jacobian[4]
+                h5 += scaled * jacobian[5]
+                gradient += scaled * residual
+            else:
+                cost += 1.0
+        else:
+            cost += 0.5
+        top_left = live_gradient[b, row, column]
+        top_right = live_gradient[b, row, column + 1]
+        low_left = live_gradient[b, row + 1, column]
+        low_right = live_gradient[b, row + 1, column + 1]
+        top = top_left + right * (top_right - top_left)
+        low = low_left + right * (low_right - low_left)
+        seen = top + down * (low - top)  # (I, dI/du, dI/dv)
+        residual = seen[0] - model_intensity[b, v, u]
+        ratio = residual * weights.per_cauchy_rgb
+        robust = 1.0 / (1.0 + ratio * ratio)
+        cost += 2.0 * (1.0 - robust)
+        if wp.abs(seen[1]) + wp.abs(seen[2]) > weights.texture:
+            textured += 1.0
+            if wp.abs(residual) < weights.alike:
+                alike += 1.0
+            gx = seen[1] * focal[0] * per_z
+            gy = seen[2] * focal[1] * per_z
+            g = -wp.vec3(gx, gy, -(gx * q[0] + gy * q[1]) * per_z)
+            turn = wp.cross(q, g)
+            jacobian = wp.spatial_vector(g, turn)
+            scaled = (weights.rgb * robust) * jacobian
+            h0 += scaled * jacobian[0]
+            h1 += scaled * jacobian[1]
+            h2 += scaled * jacobian[2]
+            h3 += scaled * jacobian[3]
+            h4 += scaled * jacobian[4]
+            h5 += scaled * jacobian[5]
+            gradient += scaled * residual
+    slot = row_index * ((width + columns - 1) // columns) + piece
+    for j in range(6):
+        partial[b, k, slot, j] = h0[j]
+        partial[b, k, slot, 21 + j] = gradient[j]
+    for j in range(1, 6):
+        partial[b, k, slot, 5 + j] = h1[j]
+    for j in range(2, 6):
+        partial[b, k, slot, 9 + j] = h2[j]
+    for j in range(3, 6):
+        partial[b, k, slot, 12 + j] = h3[j]
+    for j in range(4, 6):
+        partial[b, k, slot, 14 + j] = h4[j]
+    partial[b, k, slot, 20] = h5[5]
+    partial[b, k, slot, 27] = cost
+    partial[b, k, slot, 28] = points
+    partial[b, k, slot, 29] = visible
+    partial[b, k, slot, 30] = matched
+    partial[b, k, slot, 31] = inliers
+    partial[b, k, slot, 32] = squared
+    partial[b, k, slot, 33] = textured
+    partial[b, k, slot, 34] = alike
+    partial[b, k, slot, 35] = apart

@@ -1,0 +1,138 @@
+"""Coarser levels of vertices, normals and intensity in which invalid pixels leave no trace.
+
+Averaging over an invalid pixel, or over a depth edge, makes points and grey values that exist
+nowhere; they break tracking at the coarse levels. A coarse pixel is the mean of those pixels of
+its 2x2 block that are valid and lie near the front-most of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ms_slam_env._warp import wp
+
+EDGE_FRACTION = 0.03  # pixels of a block further behind the front one than this are another surface
+
+
+@wp.kernel
+def _downsample(
+    vertices: wp.array3d(dtype=wp.vec3),
+    normals: wp.array3d(dtype=wp.vec3),
+    intensity: wp.array3d(dtype=wp.float32),
+    edge_fraction: wp.float32,
+    coarse_vertices: wp.array3d(dtype=wp.vec3),
+    coarse_normals: wp.array3d(dtype=wp.vec3),
+    coarse_intensity: wp.array3d(dtype=wp.float32),
+):
+    b, v, u = wp.tid()
+    front = float(1.0e9)
+    for row in range(2 * v, 2 * v + 2):
+        for column in range(2 * u, 2 * u + 2):
+            z = vertices[b, row, column][2]
+            if z > 0.0:
+                front = wp.min(front, z)
+    limit = front * (1.0 + edge_fraction)
+    vertex = wp.vec3(0.0, 0.0, 0.0)
+    normal = wp.vec3(0.0, 0.0, 0.0)
+    grey = float(0.0)
+    count = float(0.0)
+    grey_any = float(0.0)
+    for row in range(2 * v, 2 * v + 2):
+        for column in range(2 * u, 2 * u + 2):
+            p = vertices[b, row, column]
+            value = intensity[b, row, column]
+            grey_any += value
+            if p[2] > 0.0 and p[2] <= limit:
+                vertex += p
+                normal += normals[b, row, column]
+                grey += value
+                count += 1.0
+    if count > 0.0:
+        coarse_vertices[b, v, u] = vertex / count
+        coarse_normals[b, v, u] = wp.normalize(normal)  # 0 stays 0
+        coarse_intensity[b, v, u] = grey / count
+    else:
+        coarse_vertices[b, v, u] = wp.vec3(0.0, 0.0, 0.0)
+        coarse_normals[b, v, u] = wp.vec3(0.0, 0.0, 0.0)
+        # The sensor's grey value is good where its depth is missing.
+        coarse_intensity[b, v, u] = 0.25 * grey_any
+
+
+@wp.kernel
+def _intensity_gradient(
+    intensity: wp.array3d(dtype=wp.float32), gradient: wp.array3d(dtype=wp.vec3)
+):
+    """Write (intensity, d/du, d/dv) by central differences, one-sided at the border."""
+    b, v, u = wp.tid()
+    left = wp.max(u - 1, 0)
+    right = wp.min(u + 1, intensity.shape[2] - 1)
+    above = wp.max(v - 1, 0)
+    below = wp.min(v + 1, intensity.shape[1] - 1)
+    gradient[b, v, u] = wp.vec3(
+        intensity[b, v, u],
+        (intensity[b, v, right] - intensity[b, v, left]) / float(wp.max(right - left, 1)),
+        (intensity[b, below, u] - intensity[b, above, u]) / float(wp.max(below - above, 1)),
+    )
+
+
+@dataclass(frozen=True)
+class Level:
+    """One pyramid level; arrays (B, h, w). ``gradient`` holds (I, dI/du, dI/dv)."""
+
+    vertices: wp.array
+    normals: wp.array
+    intensity: wp.array
+    gradient: wp.array | None
+
+
+class Pyramid:
+    """Buffers of the coarse levels; level 0 is the caller's own images."""
+
+    def __init__(
+        self,
+        batch: int,
+        shape: tuple[int, int],
+        num_levels: int,
+        with_gradient: bool,
+        device: str = "cpu",
+    ) -> None:
+        """Allocate ``num_levels`` levels of images (B, H, W) with (H, W) = ``shape``."""
+        self.device = device
+        self._with_gradient = with_gradient
+        self._coarse: list[Level] = []
+        size = (batch, *shape)
+        self._gradient = wp.zeros(size, dtype=wp.vec3, device=device) if with_gradient else None
+        for _ in range(1, num_levels):
+            size = (batch, size[1] // 2, size[2] // 2)
+            self._coarse.append(
+                Level(
+                    vertices=wp.zeros(size, dtype=wp.vec3, device=device),
+                    normals=wp.zeros(size, dtype=wp.vec3, device=device),
+                    intensity=wp.zeros(size, dtype=wp.float32, device=device),
+                    gradient=wp.zeros(size, dtype=wp.vec3, device=device)
+                    if with_gradient
+                    else None,
+                )
+            )
+
+    def build(self, vertices: wp.array, normals: wp.array, intensity: wp.array) -> list[Level]:
+        """All levels, finest first, of images (B, H, W); the coarse ones overwrite the last."""
+        levels = [Level(vertices, normals, intensity, self._gradient), *self._coarse]
+        for fine, coarse in zip(levels[:-1], levels[1:], strict=True):
+            wp.launch(
+                _downsample,
+                dim=coarse.vertices.shape,
+                inputs=[fine.vertices, fine.normals, fine.intensity, EDGE_FRACTION],
+                outputs=[coarse.vertices, coarse.normals, coarse.intensity],
+                device=self.device,
+            )
+        if self._with_gradient:
+            for level in levels:
+                wp.launch(
+                    _intensity_gradient,
+                    dim=level.vertices.shape,
+                    inputs=[level.intensity],
+                    outputs=[level.gradient],
+                    device=self.device,
+                )
+        return levels

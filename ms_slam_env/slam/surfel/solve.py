@@ -1,0 +1,175 @@
+"""Sums of a pass to a pose: reduction, 6x6 Cholesky solve and SE(3) update, on the device.
+
+One thread per env and hypothesis, in float64. Source of the exponential: Sola et al., "A micro
+Lie theory" (2018), equations (172) and (174).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ms_slam_env._warp import wp
+from ms_slam_env.slam.surfel.normal_equations import NUM_SUMS
+
+mat66d = wp.types.matrix(shape=(6, 6), dtype=wp.float64)
+vec6d = wp.types.vector(length=6, dtype=wp.float64)
+
+
+@wp.kernel
+def reduce_sums(
+    partial: wp.array4d(dtype=wp.float32),
+    slots: wp.int32,
+    active: wp.array2d(dtype=wp.int32),
+    sums: wp.array3d(dtype=wp.float64),  # (B, K, NUM_SUMS)
+):
+    b, k, i = wp.tid()
+    if active[b, k] == 0:
+        return
+    total = wp.float64(0.0)
+    for slot in range(slots):
+        total += wp.float64(partial[b, k, slot, i])
+    sums[b, k, i] = total
+
+
+@wp.func
+def load_hessian(sums: wp.array3d(dtype=wp.float64), b: int, k: int):
+    """Symmetric H of the 21 sums."""
+    H = mat66d()
+    index = int(0)
+    for i in range(6):
+        for j in range(6):
+            if j >= i:
+                H[i, j] = sums[b, k, index]
+                H[j, i] = sums[b, k, index]
+                index += 1
+    return H
+
+
+@wp.func
+def cholesky(H: mat66d):
+    """Lower factor L of H = L L^T; L[0, 0] = 0 if H is not positive definite."""
+    L = mat66d()
+    for i in range(6):
+        for j in range(6):
+            if j <= i:
+                rest = H[i, j]
+                for m in range(6):
+                    if m < j:
+                        rest -= L[i, m] * L[j, m]
+                if i == j:
+                    # Relative to the diagonal: a pivot lost to cancellation is no pivot.
+                    if rest <= H[i, i] * wp.float64(1.0e-9):
+                        return mat66d()
+                    L[i, j] = wp.sqrt(rest)
+                else:
+                    L[i, j] = rest / L[j, j]
+    return L
+
+
+@wp.func
+def cholesky_solve(L: mat66d, right: vec6d):
+    """Solution x of L L^T x = right."""
+    y = vec6d()
+    for i in range(6):
+        rest = right[i]
+        for m in range(6):
+            if m < i:
+                rest -= L[i, m] * y[m]
+        y[i] = rest / L[i, i]
+    x = vec6d()
+    for n in range(6):
+        i = 5 - n
+        rest = y[i]
+        for m in range(6):
+            if m > i:
+                rest -= L[m, i] * x[m]
+        x[i] = rest / L[i, i]
+    return x
+
+
+@wp.func
+def se3_exp(xi: vec6d):
+    """Rigid motion of the twist (rho in metres, phi in radians)."""
+    one = wp.float64(1.0)
+    x = xi[3]
+    y = xi[4]
+    z = xi[5]
+    squared = x * x + y * y + z * z
+    angle = wp.sqrt(squared)
+    a = one - squared / wp.float64(6.0)  # sin / angle
+    b = wp.float64(0.5) - squared / wp.float64(24.0)  # (1 - cos) / angle^2
+    c = one / wp.float64(6.0) - squared / wp.float64(120.0)  # (angle - sin) / angle^3
+    if angle > wp.float64(1.0e-4):
+        a = wp.sin(angle) / angle
+        b = (one - wp.cos(angle)) / squared
+        c = (angle - wp.sin(angle)) / (squared * angle)
+    zero = wp.float64(0.0)
+    skew = wp.mat33d(zero, -z, y, z, zero, -x, -y, x, zero)
+    skew2 = skew * skew
+    unit = wp.mat33d(one, zero, zero, zero, one, zero, zero, zero, one)
+    R = unit + a * skew + b * skew2
+    t = (unit + b * skew + c * skew2) * wp.vec3d(xi[0], xi[1], xi[2])
+    return wp.mat44d(
+        R[0, 0], R[0, 1], R[0, 2], t[0],
+        R[1, 0], R[1, 1], R[1, 2], t[1],
+        R[2, 0], R[2, 1], R[2, 2], t[2],
+        zero, zero, zero, one,
+    )  # fmt: skip
+
+
+@wp.func
+def orthonormalise(T: wp.mat44d):
+    """Rigid motion nearest to a product of rigid motions, by Gram-Schmidt on its columns."""
+    x = wp.normalize(wp.vec3d(T[0, 0], T[1, 0], T[2, 0]))
+    y = wp.vec3d(T[0, 1], T[1, 1], T[2, 1])
+    y = wp.normalize(y - wp.dot(x, y) * x)
+    z = wp.cross(x, y)
+    zero = wp.float64(0.0)
+    return wp.mat44d(
+        x[0], y[0], z[0], T[0, 3],
+        x[1], y[1], z[1], T[1, 3],
+        x[2], y[2], z[2], T[2, 3],
+        zero, zero, zero, wp.float64(1.0),
+    )  # fmt: skip
+
+
+@wp.kernel
+def gauss_newton_step(
+    sums: wp.array3d(dtype=wp.float64),
+    damping: wp.float64,
+    smallest_step: wp.float64,  # metres and radians; below it the level has converged
+    last: wp.int32,  # 1: last iteration of its level, so the next level may go on
+    pose: wp.array2d(dtype=wp.mat44d),
+    active: wp.array2d(dtype=wp.int32),
+):
+    b, k = wp.tid()
+    if active[b, k] != 0:
+        H = load_hessian(sums, b, k)
+        right = vec6d()
+        for i in range(6):
+            right[i] = -sums[b, k, 21 + i]
+            H[i, i] = H[i, i] * (wp.float64(1.0) + damping)
+        L = cholesky(H)
+        if L[0, 0] > wp.float64(0.0):
+            xi = cholesky_solve(L, right)
+            size = wp.float64(0.0)
+            for i in range(6):
+                size = wp.max(size, wp.abs(xi[i]))
+            pose[b, k] = orthonormalise(pose[b, k] * se3_exp(xi))
+            if size < smallest_step:
+                active[b, k] = 0
+        else:
+            active[b, k] = 0
+    if last != 0:
+        active[b, k] = 1
+
+
+def reduce(partial: wp.array, slots: int, active: wp.array, sums: wp.array, device: Any) -> None:
+    """Add up the partial sums (B, K, slots, NUM_SUMS) in float64 and in fixed order."""
+    wp.launch(
+        reduce_sums,
+        dim=(*sums.shape[:2], NUM_SUMS),
+        inputs=[partial, slots, active],
+        outputs=[sums],
+        device=device,
+    )

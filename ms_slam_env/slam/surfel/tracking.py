@@ -1,0 +1,214 @@
+"""Frame-to-model tracking: the pose of the live frame relative to the rendered map.
+
+ElasticFusion section IV, coarse to fine. In place of the paper's SO(3) pre-alignment, which finds
+rotations only, several starting poses are aligned at the coarsest level with few points, and the
+one that explains the frame best goes on. Nothing waits for the device before the verdict.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env._warp import wp
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.normal_equations import NUM_SUMS, Weights, accumulate
+from ms_slam_env.slam.surfel.pyramid import Level, Pyramid
+from ms_slam_env.slam.surfel.solve import gauss_newton_step, reduce
+from ms_slam_env.slam.surfel.types import LiveFrame, ModelView
+from ms_slam_env.slam.surfel.verdict import NUM_STATS, Limits, choose, judge
+
+Float64 = NDArray[np.float64]
+
+SEARCH_POINTS = 400
+SEARCH_ITERATIONS = 5
+SMALLEST_STEP = (2.0e-5, 1.0e-4, 5.0e-4)  # metres and radians, per level, finest first
+DAMPING = 1.0e-6
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """What ``Tracker.align`` found for B envs.
+
+    Attributes:
+        T_world_live: (B, 4, 4) pose after alignment, good or not.
+        T_model_live: (B, 4, 4) the same, relative to the pose of the model view.
+        verdict: (B,) codes of ``verdict.REASONS``; 0 = tracked.
+        stats: (B, NUM_STATS) figures behind the verdict.
+    """
+
+    T_world_live: Float64
+    T_model_live: Float64
+    verdict: NDArray[np.int32]
+    stats: Float64
+
+
+class Tracker:
+    """Aligns live frames with model views for B envs; owns the device buffers."""
+
+    def __init__(
+        self,
+        batch: int,
+        num_seeds: int,
+        intrinsics: Intrinsics,
+        config: SurfelConfig,
+        device: str = "cpu",
+    ) -> None:
+        """Allocate for ``batch`` envs that each try ``num_seeds`` starting poses a frame."""
+        self.config = config
+        self.device = device
+        self.batch = batch
+        num_levels = len(config.iterations)
+        self._cameras = [intrinsics.scaled(0.5**level) for level in range(num_levels)]
+        self._live = Pyramid(batch, intrinsics.shape, num_levels, True, device)
+        self._model = Pyramid(batch, intrinsics.shape, num_levels, False, device)
+        # The CPU runs one thread after another: whole rows. A GPU wants many threads.
+        self._columns = 32 if wp.get_device(device).is_cuda else 1 << 20
+        slots = max(self._slots(level, self._stride(level)) for level in range(num_levels))
+        slots = max(slots, self._slots(num_levels - 1, self._search_stride()))
+
+        def buffers(k: int) -> dict[str, wp.array]:
+            return {
+                "pose": wp.zeros((batch, k), dtype=wp.mat44d, device=device),
+                "active": wp.zeros((batch, k), dtype=wp.int32, device=device),
+                "sums": wp.zeros((batch, k, NUM_SUMS), dtype=wp.float64, device=device),
+                "partial": wp.zeros((batch, k, slots, NUM_SUMS), dtype=wp.float32, device=device),
+            }
+
+        self._many = buffers(num_seeds)
+        self._one = buffers(1)
+        self._all_active = np.ones((batch, num_seeds), dtype=np.int32)
+        self._limits = wp.zeros(batch, dtype=Limits, device=device)
+        self._T_world_model = wp.zeros(batch, dtype=wp.mat44d, device=device)
+        self._T_world_live = wp.zeros(batch, dtype=wp.mat44d, device=device)
+        self.verdict = wp.zeros(batch, dtype=wp.int32, device=device)
+        self._stats = wp.zeros((batch, NUM_STATS), dtype=wp.float64, device=device)
+        self._live_levels: list[Level] = []
+        self._weights = _weights(config)
+
+    def _stride(self, level: int) -> int:
+        camera = self._cameras[level]
+        pixels = camera.width * camera.height
+        return max(1, round((pixels / self.config.points_per_level) ** 0.5))
+
+    def _search_stride(self) -> int:
+        camera = self._cameras[-1]
+        return max(1, round((camera.width * camera.height / SEARCH_POINTS) ** 0.5))
+
+    def _slots(self, level: int, stride: int) -> int:
+        camera = self._cameras[level]
+        pieces = -(-camera.width // min(self._columns, camera.width))
+        return -(-camera.height // stride) * pieces
+
+    def set_frame(self, live: LiveFrame) -> None:
+        """Build the pyramid of the live frames; ``align`` may then be called several times."""
+        self._live_levels = self._live.build(live.vertices, live.normals, live.intensity)
+
+    def align(
+        self, model: ModelView, T_world_model: Float64, seeds: Float64, limits: np.ndarray
+    ) -> Alignment:
+        """Align the frames set before with ``model``.
+
+        Args:
+            model: rendered at ``T_world_model``.
+            T_world_model: (B, 4, 4).
+            seeds: (B, K, 4, 4) starting poses T_model_live.
+            limits: (B,) structured array of ``verdict.Limits``.
+        """
+        levels = self._model.build(model.vertices, model.normals, model.intensity)
+        many, one = self._many, self._one
+        many["pose"].assign(seeds)
+        many["active"].assign(self._all_active)
+        self._T_world_model.assign(T_world_model)
+        self._limits.assign(limits)
+        coarsest = len(levels) - 1
+        for _ in range(SEARCH_ITERATIONS):
+            self._pass(levels, coarsest, self._search_stride(), many)
+            self._step(coarsest, many, last=True)
+        self._pass(levels, coarsest, self._search_stride(), many)
+        wp.launch(
+            choose,
+            dim=self.batch,
+            inputs=[many["sums"], many["pose"]],
+            outputs=[one["pose"], one["active"]],
+            device=self.device,
+        )
+        for level in range(coarsest, -1, -1):
+            count = self.config.iterations[level]
+            for iteration in range(count):
+                self._pass(levels, level, self._stride(level), one)
+                self._step(level, one, last=iteration == count - 1)
+        self._pass(levels, 0, self._stride(0), one)
+        wp.launch(
+            judge,
+            dim=self.batch,
+            inputs=[one["sums"], one["pose"], self._limits, self._T_world_model],
+            outputs=[self._T_world_live, self.verdict, self._stats],
+            device=self.device,
+        )
+        return Alignment(
+            T_world_live=self._T_world_live.numpy().copy(),
+            T_model_live=one["pose"].numpy()[:, 0].copy(),
+            verdict=self.verdict.numpy().copy(),
+            stats=self._stats.numpy().copy(),
+        )
+
+    def _pass(
+        self, levels: list[Level], level: int, stride: int, state: dict[str, wp.array]
+    ) -> None:
+        """Accumulate and reduce the sums of every active hypothesis at one level."""
+        camera, model, live = self._cameras[level], levels[level], self._live_levels[level]
+        slots = self._slots(level, stride)
+        columns = min(self._columns, camera.width)
+        rows = -(-camera.height // stride)
+        wp.launch(
+            accumulate,
+            dim=(*state["pose"].shape, rows, slots // rows),
+            inputs=[
+                model.vertices,
+                model.normals,
+                model.intensity,
+                live.vertices,
+                live.normals,
+                live.gradient,
+                wp.vec2(camera.fx, camera.fy),
+                wp.vec2(camera.cx, camera.cy),
+                self._weights,
+                stride,
+                columns,
+                state["pose"],
+                state["active"],
+            ],
+            outputs=[state["partial"]],
+            device=self.device,
+        )
+        reduce(state["partial"], slots, state["active"], state["sums"], self.device)
+
+    def _step(self, level: int, state: dict[str, wp.array], last: bool) -> None:
+        """Move every active hypothesis by one Gauss-Newton step."""
+        smallest = SMALLEST_STEP[min(level, len(SMALLEST_STEP) - 1)]
+        wp.launch(
+            gauss_newton_step,
+            dim=state["pose"].shape,
+            inputs=[state["sums"], DAMPING, smallest, int(last)],
+            outputs=[state["pose"], state["active"]],
+            device=self.device,
+        )
+
+
+def _weights(config: SurfelConfig) -> Weights:
+    weights = Weights()
+    weights.icp = 1.0 - config.icp_rgb_weight
+    weights.rgb = config.icp_rgb_weight
+    weights.per_depth_noise = 1.0 / config.depth_noise_m
+    weights.per_cauchy_icp = 1.0 / config.cauchy_icp
+    weights.per_cauchy_rgb = 1.0 / config.cauchy_rgb
+    weights.distance_m = config.icp_distance_m
+    weights.cos_angle = float(np.cos(np.radians(config.icp_angle_deg)))
+    weights.inlier_sigmas = 4.0
+    weights.texture = 4.0
+    weights.alike = 20.0
+    return weights

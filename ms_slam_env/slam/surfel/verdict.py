@@ -1,0 +1,162 @@
+"""Choosing between hypotheses, and judging whether a frame was tracked: on the device."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env._warp import wp
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.slam.surfel.solve import (
+    cholesky,
+    cholesky_solve,
+    load_hessian,
+    orthonormalise,
+    vec6d,
+)
+
+OK = 0
+FEW_POINTS = 1
+LITTLE_OVERLAP = 2
+UNCONSTRAINED = 3
+GEOMETRY = 4
+APPEARANCE = 5
+IMPLAUSIBLE = 6
+REASONS = {
+    OK: "",
+    FEW_POINTS: "too few points of the map or of the frame to align",
+    LITTLE_OVERLAP: "the frame hardly overlaps the map's view",
+    UNCONSTRAINED: "the view does not constrain the pose",
+    GEOMETRY: "the frame's depth does not fit the map",
+    APPEARANCE: "the frame's intensity does not fit the map",
+    IMPLAUSIBLE: "the motion is implausibly large",
+}
+
+STAT_INLIER_FRACTION = 0
+STAT_RESIDUAL_M = 1
+STAT_OVERLAP = 2
+STAT_ALIKE_FRACTION = 3
+STAT_APART_FRACTION = 4
+STAT_SIGMA = 5  # standard deviation of the worst translation or rotation component
+STAT_COST = 6
+NUM_STATS = 8
+
+
+@wp.struct
+class Limits:
+    """What a tracked frame must satisfy."""
+
+    points: wp.float64  # least number of matched points
+    overlap: wp.float64
+    inliers: wp.float64
+    alike: wp.float64
+    apart: wp.float64
+    sigma: wp.float64
+    motion_m: wp.float64
+    motion_cos: wp.float64
+
+
+@wp.func
+def _score(sums: wp.array3d(dtype=wp.float64), b: int, k: int):
+    """Mean truncated cost per model point; a point out of view costs a fixed share."""
+    points = sums[b, k, 28]
+    visible = sums[b, k, 29]
+    if points < wp.float64(1.0):
+        return wp.float64(1.0e9)
+    return (sums[b, k, 27] + wp.float64(0.8) * (points - visible)) / points
+
+
+@wp.kernel
+def choose(
+    sums: wp.array3d(dtype=wp.float64),
+    candidates: wp.array2d(dtype=wp.mat44d),
+    pose: wp.array2d(dtype=wp.mat44d),  # (B, 1)
+    active: wp.array2d(dtype=wp.int32),  # (B, 1)
+):
+    b = wp.tid()
+    best = int(0)
+    best_score = _score(sums, b, 0)
+    for k in range(1, candidates.shape[1]):
+        score = _score(sums, b, k)
+        if score < best_score:
+            best_score = score
+            best = k
+    pose[b, 0] = candidates[b, best]
+    active[b, 0] = 1
+
+
+@wp.kernel
+def judge(
+    sums: wp.array3d(dtype=wp.float64),
+    T_model_live: wp.array2d(dtype=wp.mat44d),
+    limits: wp.array(dtype=Limits),  # (B,)
+    T_world_model: wp.array(dtype=wp.mat44d),  # in: pose of the model view
+    T_world_live: wp.array(dtype=wp.mat44d),  # out
+    verdict: wp.array(dtype=wp.int32),
+    stats: wp.array2d(dtype=wp.float64),
+):
+    b = wp.tid()
+    limit = limits[b]
+    one = wp.float64(1.0)
+    points = sums[b, 0, 28]
+    visible = sums[b, 0, 29]
+    matched = sums[b, 0, 30]
+    textured = sums[b, 0, 33]
+    inlier_fraction = sums[b, 0, 31] / wp.max(matched, one)
+    alike_fraction = one
+    if textured > wp.float64(50.0):
+        alike_fraction = sums[b, 0, 34] / textured
+    apart_fraction = sums[b, 0, 35] / wp.max(matched, one)
+    overlap = visible / wp.max(points, one)
+
+    sigma = wp.float64(1.0e9)
+    L = cholesky(load_hessian(sums, b, 0))
+    if L[0, 0] > wp.float64(0.0):
+        sigma = wp.float64(0.0)
+        for i in range(6):
+            unit = vec6d()
+            unit[i] = one
+            column = cholesky_solve(L, unit)
+            sigma = wp.max(sigma, wp.sqrt(column[i]))
+
+    T = T_model_live[b, 0]
+    distance = wp.sqrt(T[0, 3] * T[0, 3] + T[1, 3] * T[1, 3] + T[2, 3] * T[2, 3])
+    cosine = wp.float64(0.5) * (T[0, 0] + T[1, 1] + T[2, 2] - one)
+
+    code = int(0)
+    if matched < limit.points:
+        code = 1
+    elif overlap < limit.overlap:
+        code = 2
+    elif sigma > limit.sigma:
+        code = 3
+    elif inlier_fraction < limit.inliers or apart_fraction > limit.apart:
+        code = 4
+    elif alike_fraction < limit.alike:
+        code = 5
+    elif distance > limit.motion_m or cosine < limit.motion_cos:
+        code = 6
+    verdict[b] = code
+    T_world_live[b] = orthonormalise(T_world_model[b] * T)
+    stats[b, 0] = inlier_fraction
+    stats[b, 1] = wp.sqrt(sums[b, 0, 32] / wp.max(sums[b, 0, 31], one))
+    stats[b, 2] = overlap
+    stats[b, 3] = alike_fraction
+    stats[b, 4] = apart_fraction
+    stats[b, 5] = sigma
+    stats[b, 6] = _score(sums, b, 0)
+    stats[b, 7] = textured
+
+
+def make_limits(strict: NDArray[np.bool_], intrinsics: Intrinsics) -> NDArray[np.void]:
+    """Limits (B,) of ordinary tracking, or ``strict`` ones for accepting a relocalisation."""
+    limits = np.zeros(len(strict), dtype=Limits.numpy_dtype())
+    limits["points"] = 100.0
+    limits["overlap"] = np.where(strict, 0.4, 0.25)
+    limits["inliers"] = np.where(strict, 0.6, 0.5)
+    limits["alike"] = np.where(strict, 0.7, 0.5)
+    limits["apart"] = np.where(strict, 0.2, 0.3)
+    limits["sigma"] = 0.02
+    limits["motion_m"] = np.where(strict, 1.0, 0.3)
+    limits["motion_cos"] = np.where(strict, np.cos(np.radians(60)), np.cos(np.radians(30)))
+    return limits
