@@ -148,6 +148,7 @@ def make_env(args: Args, split: str, seeds: Sequence[int]) -> gym.Env[Any, Any]:
     env = gym.make(
         args.env_id,
         max_episode_steps=args.episode_steps,
+        disable_env_checker=True,
         scene=args.scenes,
         split=split,
         num_scene_seeds=args.scene_seeds,
@@ -378,6 +379,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("interrupted; what was trained before the last update is saved", file=sys.stderr)
+        return 130
 
 
 if __name__ == "__main__":
