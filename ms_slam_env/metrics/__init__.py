@@ -1,0 +1,47 @@
+"""Errors of trajectories and maps."""
+
+from ms_slam_env.metrics.alignment import umeyama
+from ms_slam_env.metrics.reconstruction import (
+    MapMetrics,
+    f_score,
+    icp,
+    map_metrics,
+    nearest_distances,
+    precision,
+    rcm,
+    recall,
+    rer,
+    voxel_thin,
+)
+from ms_slam_env.metrics.trajectory import (
+    ErrorStatistics,
+    absolute_errors,
+    ate_rmse,
+    ate_statistics,
+    path_length,
+    relative_errors,
+    rpe_rmse,
+    rpe_statistics,
+)
+
+__all__ = [
+    "ErrorStatistics",
+    "MapMetrics",
+    "absolute_errors",
+    "ate_rmse",
+    "ate_statistics",
+    "f_score",
+    "icp",
+    "map_metrics",
+    "nearest_distances",
+    "path_length",
+    "precision",
+    "rcm",
+    "recall",
+    "relative_errors",
+    "rer",
+    "rpe_rmse",
+    "rpe_statistics",
+    "umeyama",
+    "voxel_thin",
+]
