@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -94,7 +94,10 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
         InputError: an unknown option or choice, or a value out of range.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
+    metadata = {  # noqa: RUF012 -- Gymnasium declares it as an instance variable
+        "render_modes": ["rgb_array"],
+        "render_fps": 10,
+    }
 
     def __init__(
         self, embodiment: str = "free", render_mode: str | None = None, **options: Any
@@ -179,7 +182,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
         reward = float(sum(episode.reward_terms.values()))
         return self._build_observation(), reward, lost_for_good, False, self._info()
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """One picture that explains the moment, (480, 1120, 3) uint8; None without render mode."""
         if self.render_mode is None:
             return None

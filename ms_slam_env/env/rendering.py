@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -42,7 +42,7 @@ class Renderer:
         return np.hstack([left, self._map(env), right])
 
     def _color(self, env: ActiveSlamEnv) -> Image:
-        image = cv2.resize(env.last_frame.color, _PANEL[::-1], interpolation=cv2.INTER_LINEAR)
+        image = cv2.resize(env.last_frame.color, _PANEL[::-1])
         return _caption(image, f"{env.scene.name}, step {len(env.trajectory_truth) - 1}")
 
     def _depth(self, env: ActiveSlamEnv) -> Image:
@@ -151,14 +151,14 @@ def _plot(values: Float64, target: float | None, top: float, title: str) -> Imag
         y = round(row(target))
         for x in range(margin, width - margin, 10):
             cv2.line(canvas, (x, y), (x + 5, y), _TARGET_COLOR, 1)
-    x = np.linspace(margin, width - margin, max(2, len(values)))[: len(values)]
-    y = np.array([row(float(value)) for value in values])
-    line = np.rint(np.stack([x, y], axis=1)).astype(np.int32)
+    columns = np.linspace(margin, width - margin, max(2, len(values)))[: len(values)]
+    rows = np.array([row(float(value)) for value in values])
+    line = np.rint(np.stack([columns, rows], axis=1)).astype(np.int32)
     cv2.polylines(canvas, [line], False, _ESTIMATE_COLOR, 1, cv2.LINE_AA)
     return _caption(canvas, f"{title}: {values[-1]:.4f}", dark=True)
 
 
-def _caption(image: Image, text: str, bottom: bool = False, dark: bool = False) -> Image:
+def _caption(image: Any, text: str, bottom: bool = False, dark: bool = False) -> Image:
     """Write one line on ``image`` in place and return it."""
     y = image.shape[0] - 4 if bottom else 14
     if not dark:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.env.observations.base import Observation, RobotKnowledge
 from ms_slam_env.env.observations.features import FeaturesObservation
@@ -9,7 +11,7 @@ from ms_slam_env.env.observations.lookahead import LookaheadObservation
 from ms_slam_env.env.observations.rgbd import RGBDObservation
 from ms_slam_env.errors import unknown
 
-OBSERVATIONS = {
+OBSERVATIONS: dict[str, Callable[[Intrinsics, int], Observation]] = {
     "rgbd": RGBDObservation,
     "features": FeaturesObservation,
     "lookahead": LookaheadObservation,
