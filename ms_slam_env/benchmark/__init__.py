@@ -1,0 +1,1 @@
+"""Experiments: planners, their maps and trajectories, judged under one protocol."""

@@ -1,0 +1,136 @@
+"""Figures of the planner benchmark."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ms_slam_env.benchmark.planner_report import Column, finished, summarise
+from ms_slam_env.benchmark.records import Row
+
+PANELS = (
+    Column("f_score_5cm", "F-score at 5 cm [%]", 100),
+    Column("rcm", "completeness at 5 cm [%]", 100),
+    Column("ate_m", "ATE [mm]", 1000),
+    Column("path_length_m", "path length [m]"),
+)
+_FLOOR_MM = 0.05  # errors below are drawn here on logarithmic axes
+
+
+def save_planner_figures(rows: Sequence[Row], out: Path) -> list[Path]:
+    """Draw every figure into folder ``out``; return their paths."""
+    out.mkdir(parents=True, exist_ok=True)
+    done = finished(rows)
+    if not done:
+        return []
+    figures = {
+        "planners.png": planners_figure(done),
+        "f_score_ate.png": scatter_figure(done),
+        "ate_over_time.png": ate_over_time_figure(done),
+    }
+    return [save(figure, out / name) for name, figure in figures.items()]
+
+
+def new_figure(columns: int = 1, width: float = 3.4, height: float = 3.2) -> Figure:
+    """An empty figure for ``columns`` panels; needs no display."""
+    return Figure(figsize=(width * columns, height), layout="constrained")
+
+
+def save(figure: Figure, path: Path) -> Path:
+    """Write a figure as PNG."""
+    figure.savefig(path, dpi=120)
+    return path
+
+
+def colour(index: int) -> str:
+    """One colour a planner, distinguishable with common colour-vision deficiencies."""
+    palette = matplotlib.color_sequences["petroff10"]
+    return matplotlib.colors.to_hex(palette[index % len(palette)])
+
+
+def planners_figure(rows: Sequence[Row]) -> Figure:
+    """Every episode as a dot, the median with its 95 % interval beside them."""
+    summary = summarise(rows)
+    rng = np.random.default_rng(0)
+    figure = new_figure(len(PANELS), height=1.2 + 0.5 * len(summary))
+    axes = figure.subplots(1, len(PANELS), sharey=True)
+    for ax, panel in zip(axes, PANELS, strict=True):
+        for index, (planner, metrics) in enumerate(summary.items()):
+            values = panel.scale * _values(rows, planner, panel.metric)
+            height = index + rng.uniform(-0.15, 0.15, len(values))
+            ax.plot(values, height, ".", color=colour(index), alpha=0.35, markersize=5)
+            interval = metrics[panel.metric]
+            value, low, high = (
+                panel.scale * x for x in (interval.value, interval.low, interval.high)
+            )
+            ax.errorbar(
+                value,
+                index,
+                xerr=[[max(0.0, value - low)], [max(0.0, high - value)]],
+                fmt="o",
+                color=colour(index),
+                capsize=4,
+                markeredgecolor="black",
+            )
+        ax.set_xlabel(panel.heading)
+        ax.grid(axis="x", alpha=0.3)
+    axes[PANELS.index(next(p for p in PANELS if p.metric == "ate_m"))].set_xscale("log")
+    axes[0].set_yticks(range(len(summary)), list(summary))
+    axes[0].invert_yaxis()
+    return figure
+
+
+def scatter_figure(rows: Sequence[Row]) -> Figure:
+    """F-score against ATE: the good corner is the upper left one."""
+    figure = new_figure(width=5.0, height=3.8)
+    ax = figure.subplots()
+    for index, planner in enumerate(summarise(rows)):
+        ate = np.maximum(1000 * _values(rows, planner, "ate_m"), _FLOOR_MM)
+        f_score = 100 * _values(rows, planner, "f_score_5cm")
+        lost = _values(rows, planner, "lost").astype(bool)
+        ax.plot(ate[~lost], f_score[~lost], "o", color=colour(index), label=planner, alpha=0.7)
+        ax.plot(ate[lost], f_score[lost], "x", color=colour(index), alpha=0.7)
+    ax.set_xscale("log")
+    ax.set_xlabel("ATE [mm] (x: tracking was lost)")
+    ax.set_ylabel("F-score at 5 cm [%]")
+    ax.grid(alpha=0.3)
+    ax.legend()
+    return figure
+
+
+def ate_over_time_figure(rows: Sequence[Row]) -> Figure:
+    """Running trajectory error: median over episodes, band between the quartiles."""
+    figure = new_figure(width=5.0, height=3.8)
+    ax = figure.subplots()
+    for index, planner in enumerate(summarise(rows)):
+        series = [
+            row["result"]["ate_over_time"] for row in rows if row["spec"]["planner"] == planner
+        ]
+        draw_band(ax, series, planner, colour(index))
+    ax.set_yscale("log")
+    ax.set_xlabel("step")
+    ax.set_ylabel("running ATE, no alignment [mm]")
+    ax.grid(alpha=0.3)
+    ax.legend()
+    return figure
+
+
+def draw_band(ax: Axes, series: Sequence[Sequence[float]], label: str, color: str) -> None:
+    """Median and quartiles of series in metres; a series that ends early keeps its last value."""
+    length = max(map(len, series))
+    padded = np.array([[*s, *[s[-1]] * (length - len(s))] for s in series])
+    low, middle, high = np.percentile(np.maximum(1000 * padded, _FLOOR_MM), [25, 50, 75], axis=0)
+    steps = np.arange(1, length + 1)
+    ax.plot(steps, middle, color=color, label=label)
+    ax.fill_between(steps, low, high, color=color, alpha=0.15, linewidth=0)
+
+
+def _values(rows: Sequence[Row], planner: str, metric: str) -> np.ndarray:
+    return np.array(
+        [row["result"][metric] for row in rows if row["spec"]["planner"] == planner], dtype=float
+    )

@@ -1,0 +1,94 @@
+"""Planners by name: entry points of group ``ms_slam_env.planners``, or ``module:Class``."""
+
+from __future__ import annotations
+
+import inspect
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+import yaml
+
+from ms_slam_env.env.planner import Planner
+from ms_slam_env.errors import InputError, unknown
+
+GROUP = "ms_slam_env.planners"
+
+
+def planner_names() -> tuple[str, ...]:
+    """Names of the installed planners, sorted."""
+    return tuple(sorted({entry.name for entry in entry_points(group=GROUP)}))
+
+
+def parse_planner(text: str) -> tuple[str, dict[str, Any]]:
+    """Split ``NAME,option=value,...`` into the name and the options; values are YAML scalars.
+
+    Raises:
+        InputError: an option without ``=``.
+    """
+    name, *parts = text.split(",")
+    options = {}
+    for part in parts:
+        option, equals, value = part.partition("=")
+        if not equals or not option.isidentifier():
+            raise InputError(f"planner {text!r}: {part!r} is not option=value")
+        options[option] = yaml.safe_load(value)
+    return name, options
+
+
+def planner_class(name: str) -> type[Planner]:
+    """The class behind a name.
+
+    Raises:
+        InputError: an unknown name (the message lists the installed planners), a ``module:Class``
+            that cannot be imported, or a class that is no ``Planner``.
+    """
+    if ":" in name:
+        entry = EntryPoint(name=name, value=name, group=GROUP)
+    else:
+        found = [entry for entry in entry_points(group=GROUP) if entry.name == name]
+        if not found:
+            raise unknown("planner", name, (*planner_names(), "module:Class"))
+        entry = found[0]
+    module_name, _, class_name = entry.value.partition(":")
+    try:
+        cls = getattr(import_module(module_name), class_name)
+    except (ImportError, AttributeError) as error:
+        raise InputError(f"planner {name!r} cannot be loaded: {error}") from error
+    if not (inspect.isclass(cls) and issubclass(cls, Planner)):
+        raise InputError(f"planner {name!r} is not a subclass of ms_slam_env.env.Planner")
+    return cls
+
+
+def make_planner(text: str, env: Any, seed: int = 0) -> Planner:
+    """Build the planner that ``NAME,option=value,...`` describes for the unwrapped ``env``.
+
+    Raises:
+        InputError: an unknown planner or option, or a value that the planner refuses.
+    """
+    name, options = parse_planner(text)
+    cls = planner_class(name)
+    check_options(name, cls, options)
+    return cls(env, seed=seed, **options)
+
+
+def check_planner(text: str) -> None:
+    """Refuse what ``make_planner`` would refuse, without an environment.
+
+    Raises:
+        InputError: an unknown planner or option.
+    """
+    name, options = parse_planner(text)
+    check_options(name, planner_class(name), options)
+
+
+def check_options(name: str, cls: type[Planner], options: dict[str, Any]) -> None:
+    """Refuse options that the class does not take.
+
+    Raises:
+        InputError: naming the option and listing the valid ones.
+    """
+    taken = [p for p in inspect.signature(cls).parameters if p not in ("env", "seed")]
+    for option in options:
+        if option not in taken:
+            raise unknown(f"option of planner {name}", option, taken or ("(none)",))

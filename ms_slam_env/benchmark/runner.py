@@ -1,0 +1,144 @@
+"""Runs many independent pieces of work in parallel processes and resumes after an interrupt."""
+
+from __future__ import annotations
+
+import dataclasses
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from ms_slam_env.benchmark.records import RecordFile, Row, spec_key
+from ms_slam_env.errors import InputError
+
+RECORDS = "episodes.jsonl"
+_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+
+
+def available_cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def run_all(
+    specs: Sequence[Any],
+    run: Callable[[Any], dict[str, Any]],
+    out: Path,
+    workers: int | None = None,
+    description: str = "episodes",
+) -> list[Row]:
+    """Run every spec once, in parallel, and return one row for each, in the order of ``specs``.
+
+    Rows that an earlier call left in ``out`` are taken from there, except failed ones, which are
+    tried again. A row has ``key``, ``spec``, ``result`` (what ``run`` returned, None if it
+    raised), ``error`` (None or the message) and ``elapsed_s``.
+
+    Args:
+        specs: dataclasses; the key of the work is made of all their fields.
+        run: a function that a new process can import.
+        out: folder of the results.
+        workers: processes, each of one thread; None for one a core.
+        description: shown at the progress bar.
+
+    Raises:
+        InputError: fewer than one worker, or a file of results that cannot be read.
+        RuntimeError: a process was killed; what was finished is kept.
+    """
+    workers = available_cores() if workers is None else workers
+    if workers < 1:
+        raise InputError(f"workers = {workers} must be at least 1")
+    records = RecordFile(out / RECORDS)
+    keys = [spec_key(spec) for spec in specs]
+    rows = {key: row for key, row in records.load().items() if row["error"] is None}
+    todo = {key: spec for key, spec in zip(keys, specs, strict=True) if key not in rows}
+    done = len(set(keys)) - len(todo)
+    if done:
+        print(f"{description}: {done} of {len(set(keys))} already in {out}", file=sys.stderr)
+    if todo:
+        with tqdm(total=len(set(keys)), initial=done, desc=description, unit="") as bar:
+            _run_missing(todo, run, workers, lambda row: _finish(row, rows, records, bar))
+    return [rows[key] for key in keys]
+
+
+def failures(rows: Sequence[Row]) -> list[str]:
+    """The errors among ``rows``, one line each."""
+    return [f"{row['key']}: {row['error']}" for row in rows if row["error"] is not None]
+
+
+def _finish(row: Row, rows: dict[str, Row], records: RecordFile, bar: Any) -> None:
+    records.append(row)
+    rows[row["key"]] = row
+    bar.update()
+    if row["error"] is not None:
+        bar.write(f"failed: {row['error']}", file=sys.stderr)
+
+
+def _run_missing(
+    todo: dict[str, Any],
+    run: Callable[[Any], dict[str, Any]],
+    workers: int,
+    finish: Callable[[Row], None],
+) -> None:
+    for name in _ONE_THREAD:  # inherited by the workers, which read it at import
+        os.environ.setdefault(name, "1")
+    pool = ProcessPoolExecutor(
+        min(workers, len(todo)),
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=_prepare_worker,
+    )
+    try:
+        futures: list[Future[Row]] = [
+            pool.submit(_run_one, run, key, spec) for key, spec in todo.items()
+        ]
+        for future in as_completed(futures):
+            finish(future.result())
+    except BrokenProcessPool as error:
+        raise RuntimeError(
+            "a worker process was killed (out of memory?); finished work is kept, "
+            "the same command goes on from there"
+        ) from error
+    finally:
+        # What runs at this moment is lost and done again by the next call.
+        processes = list((pool._processes or {}).values())
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in processes:
+            process.terminate()
+        for process in processes:
+            process.join()
+
+
+def _prepare_worker() -> None:
+    """Leave Ctrl-C to the parent, and end when the parent is gone, even if it was killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _run_one(run: Callable[[Any], dict[str, Any]], key: str, spec: Any) -> Row:
+    start = time.perf_counter()
+    row: Row = {"key": key, "spec": dataclasses.asdict(spec), "result": None, "error": None}
+    try:
+        row["result"] = run(spec)
+    except Exception as error:
+        row["error"] = f"{type(error).__name__}: {error}".splitlines()[0]
+        row["traceback"] = traceback.format_exc()
+    row["elapsed_s"] = round(time.perf_counter() - start, 3)
+    return row

@@ -1,0 +1,137 @@
+"""Medians with bootstrap intervals, and rliable's aggregates across scenes."""
+
+from __future__ import annotations
+
+import importlib.util
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import stats
+
+Float64 = NDArray[np.float64]
+
+CONFIDENCE = 0.95
+_RESAMPLES = 2000
+
+
+@dataclass(frozen=True)
+class Interval:
+    """An estimate with its 95 % confidence interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+def median_interval(values: ArrayLike) -> Interval:
+    """Median and its percentile-bootstrap interval; NaN without values.
+
+    Args:
+        values: (n,) one an episode; with n = 1 the interval is the value itself.
+    """
+    return bootstrap_interval((values,), lambda x, axis: np.median(x, axis=axis))
+
+
+def relative_cut(values: ArrayLike, baseline: ArrayLike) -> Interval:
+    """Cut of the median against a baseline: 1 - median(values) / median(baseline).
+
+    Episodes of one scene and seed are resampled together.
+
+    Args:
+        values: (n,) one an episode.
+        baseline: (n,) the baseline's, of the same episodes in the same order.
+    """
+
+    def cut(x: Float64, y: Float64, axis: int) -> Float64:
+        return 1 - np.median(x, axis=axis) / np.median(y, axis=axis)
+
+    return bootstrap_interval((values, baseline), cut)
+
+
+def bootstrap_interval(
+    samples: tuple[ArrayLike, ...], statistic: Callable[..., Float64]
+) -> Interval:
+    """Percentile bootstrap of ``statistic(*samples, axis=...)``, the samples paired."""
+    arrays = [np.asarray(sample, dtype=np.float64) for sample in samples]
+    if arrays[0].size == 0:
+        return Interval(np.nan, np.nan, np.nan)
+    value = float(statistic(*arrays, axis=-1))
+    if arrays[0].size == 1:
+        return Interval(value, value, value)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", stats.DegenerateDataWarning)
+        result = stats.bootstrap(
+            arrays,
+            statistic,
+            paired=True,
+            vectorized=True,
+            n_resamples=_RESAMPLES,
+            confidence_level=CONFIDENCE,
+            method="percentile",
+            rng=np.random.default_rng(0),
+        ).confidence_interval
+    return Interval(value, float(result.low), float(result.high))
+
+
+def share_interval(flags: ArrayLike) -> Interval:
+    """Share of true flags (n,) with its Wilson interval; NaN without flags."""
+    array = np.asarray(flags, dtype=bool)
+    if array.size == 0:
+        return Interval(np.nan, np.nan, np.nan)
+    test = stats.binomtest(int(array.sum()), array.size)
+    interval = test.proportion_ci(CONFIDENCE, method="wilson")
+    return Interval(float(array.mean()), float(interval.low), float(interval.high))
+
+
+def has_rliable() -> bool:
+    """Whether the extra ``statistics`` is installed."""
+    return importlib.util.find_spec("rliable") is not None
+
+
+def interquartile_means(scores: dict[str, Float64]) -> dict[str, Interval]:
+    """Interquartile mean across scenes and its stratified-bootstrap interval, by planner.
+
+    Args:
+        scores: planner to (episodes, scenes).
+    """
+    from rliable import library, metrics
+
+    values, intervals = library.get_interval_estimates(
+        scores,
+        lambda x: np.array([metrics.aggregate_iqm(x)]),
+        reps=_RESAMPLES,
+        random_state=_random_state(),
+    )
+    return {
+        name: Interval(float(values[name][0]), *map(float, intervals[name][:, 0]))
+        for name in scores
+    }
+
+
+def improvement_probabilities(scores: dict[str, Float64], baseline: str) -> dict[str, Interval]:
+    """P(planner scores higher than ``baseline``), averaged across scenes, for the others.
+
+    Args:
+        scores: planner to (episodes, scenes).
+        baseline: one of the planners.
+    """
+    from rliable import library, metrics
+
+    pairs = {name: [score, scores[baseline]] for name, score in scores.items() if name != baseline}
+    values, intervals = library.get_interval_estimates(
+        pairs,
+        lambda x, y: np.array([metrics.probability_of_improvement(x, y)]),
+        reps=_RESAMPLES // 4,  # each resample is a Mann-Whitney test a scene
+        random_state=_random_state(),
+    )
+    return {
+        name: Interval(float(values[name][0]), *map(float, intervals[name][:, 0])) for name in pairs
+    }
+
+
+def _random_state() -> Any:
+    return np.random.RandomState(0)  # the only generator that rliable takes

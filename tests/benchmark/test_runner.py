@@ -1,0 +1,160 @@
+"""Parallel runs lose and repeat nothing, whenever they are interrupted."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import fake_work
+import pytest
+from fake_work import Square, square
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ms_slam_env.benchmark.records import RecordFile, spec_key, write_json
+from ms_slam_env.benchmark.runner import RECORDS, failures, run_all
+from ms_slam_env.errors import InputError
+
+
+def test_rows_come_in_the_order_of_the_specs(tmp_path: Path) -> None:
+    specs = [Square(3, 0.2), Square(1), Square(2)]
+    rows = run_all(specs, square, tmp_path, workers=2)
+    assert [row["result"]["square"] for row in rows] == [9, 1, 4]
+    assert [row["spec"]["number"] for row in rows] == [3, 1, 2]
+    assert {row["result"]["threads"] for row in rows} == {"1"}
+
+
+def test_finished_work_is_not_done_again(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    specs = [Square(i, log=str(log)) for i in range(4)]
+    run_all(specs[:2], square, tmp_path / "out", workers=1)
+    rows = run_all(specs, square, tmp_path / "out", workers=1)
+    assert sorted(log.read_text().split()) == ["0", "1", "2", "3"]
+    assert [row["result"]["square"] for row in rows] == [0, 1, 4, 9]
+
+
+def test_a_changed_spec_is_other_work(tmp_path: Path) -> None:
+    run_all([Square(2)], square, tmp_path, workers=1)
+    rows = run_all([Square(2, seconds=0.001)], square, tmp_path, workers=1)
+    assert len((tmp_path / RECORDS).read_text().splitlines()) == 2
+    assert rows[0]["spec"]["seconds"] == 0.001
+
+
+def test_failures_are_rows_and_are_tried_again(tmp_path: Path) -> None:
+    rows = run_all([Square(-1), Square(2)], square, tmp_path, workers=1)
+    assert rows[0]["error"] == "ValueError: no square of -1"
+    assert rows[0]["result"] is None
+    assert "fake_work.py" in rows[0]["traceback"]
+    assert rows[1]["result"]["square"] == 4
+    assert len(failures(rows)) == 1
+    run_all([Square(-1), Square(2)], square, tmp_path, workers=1)
+    lines = [json.loads(line) for line in (tmp_path / RECORDS).read_text().splitlines()]
+    assert [line["spec"]["number"] for line in lines].count(-1) == 2
+    assert [line["spec"]["number"] for line in lines].count(2) == 1
+
+
+def test_a_killed_worker_is_reported_and_the_rest_kept(tmp_path: Path) -> None:
+    specs = [Square(1), Square(1313)]
+    with pytest.raises(RuntimeError, match="finished work is kept"):
+        run_all(specs, square, tmp_path, workers=1)
+    assert [row["result"]["square"] for row in RecordFile(tmp_path / RECORDS).load().values()] == [
+        1
+    ]
+
+
+@pytest.mark.parametrize("workers", [0, -1])
+def test_workers_must_be_positive(tmp_path: Path, workers: int) -> None:
+    with pytest.raises(InputError, match="workers"):
+        run_all([Square(1)], square, tmp_path, workers=workers)
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_interruption_loses_and_repeats_nothing(tmp_path: Path, how: signal.Signals) -> None:
+    out, log, count = tmp_path / "out", tmp_path / "log", 24
+    command = [sys.executable, fake_work.__file__, str(out), str(count), "0.05", str(log)]
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, start_new_session=True)
+    while not (out / RECORDS).exists() and process.poll() is None:
+        time.sleep(0.01)
+    time.sleep(random.Random().uniform(0, 0.4))
+    process.send_signal(how)
+    process.wait()
+    kept = RecordFile(out / RECORDS).load()
+    assert 0 < len(kept) < count, "the interruption came too early or too late to test anything"
+    _wait_for_workers_to_end(process.pid)
+    ran_before = log.read_text().split()
+
+    subprocess.run(command, check=True, stderr=subprocess.DEVNULL)
+    lines = [json.loads(line) for line in (out / RECORDS).read_text().splitlines()]
+    assert sorted(line["spec"]["number"] for line in lines) == list(range(count))
+    assert all(line["result"]["square"] == line["spec"]["number"] ** 2 for line in lines)
+    # Only what was on its way at the interruption (at most one piece a worker) ran twice.
+    assert len(log.read_text().split()) <= count + 2
+    assert len(ran_before) - len(kept) <= 2
+
+
+def _wait_for_workers_to_end(session: int) -> None:
+    """The workers of a killed parent end by themselves; fail if they do not."""
+    for _ in range(200):
+        if not [pid for pid in _processes() if _session(pid) == session]:
+            return
+        time.sleep(0.05)
+    pytest.fail("workers outlived their parent")
+
+
+def _processes() -> list[int]:
+    return [int(path.name) for path in Path("/proc").iterdir() if path.name.isdigit()]
+
+
+def _session(pid: int) -> int | None:
+    try:
+        return os.getsid(pid)
+    except ProcessLookupError:
+        return None
+
+
+@given(st.binary(min_size=1, max_size=40).filter(lambda data: b"\n" not in data))
+def test_a_line_cut_short_is_dropped(tmp_path_factory: pytest.TempPathFactory, tail: bytes) -> None:
+    path = tmp_path_factory.mktemp("records") / "a.jsonl"
+    records = RecordFile(path)
+    records.append({"key": "a", "value": 1})
+    with path.open("ab") as file:
+        file.write(tail)
+    assert list(records.load()) == ["a"]
+    records.append({"key": "b", "value": 2})
+    assert [row["value"] for row in records.load().values()] == [1, 2]
+
+
+def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.jsonl"
+    path.write_text('{"key": "a"}\nnot json\n')
+    with pytest.raises(InputError, match="line 2"):
+        RecordFile(path).load()
+
+
+def test_the_last_row_of_a_key_counts(tmp_path: Path) -> None:
+    records = RecordFile(tmp_path / "a.jsonl")
+    for value in (1, 2):
+        records.append({"key": "a", "value": value})
+    assert records.load()["a"]["value"] == 2
+
+
+def test_every_field_is_in_the_key() -> None:
+    spec = Square(1)
+    others = [replace(spec, number=2), replace(spec, seconds=1.0), replace(spec, log="x")]
+    assert len({spec_key(s) for s in [spec, *others]}) == 4
+    assert spec_key(Square(1)) == spec_key(spec)
+
+
+def test_write_json_replaces_as_a_whole(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "a.json"
+    write_json(path, {"a": 1})
+    with pytest.raises(TypeError):
+        write_json(path, {"a": object()})
+    assert json.loads(path.read_text()) == {"a": 1}

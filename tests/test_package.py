@@ -1,0 +1,104 @@
+"""What is installed: names, entry points, constraints and the wheel's contents."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import zipfile
+from importlib.metadata import distribution, entry_points
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
+    """The wheel built from the tracked sources, without the network."""
+    source = tmp_path_factory.mktemp("source")
+    out = tmp_path_factory.mktemp("wheel")
+    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
+        (source / name).write_bytes((ROOT / name).read_bytes())
+    for folder in ("ms_slam_env", "agents", "baselines"):
+        for path in (ROOT / folder).rglob("*"):
+            if path.suffix in (".py", ".typed"):
+                target = source / path.relative_to(ROOT)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.write_bytes(path.read_bytes())
+    code = f"from setuptools import build_meta; build_meta.build_wheel({str(out)!r})"
+    subprocess.run([sys.executable, "-c", code], cwd=source, check=True, capture_output=True)
+    return zipfile.ZipFile(next(out.glob("*.whl")))
+
+
+def test_wheel_has_every_module_under_its_name(wheel: zipfile.ZipFile) -> None:
+    expected = {str(path.relative_to(ROOT)) for path in (ROOT / "ms_slam_env").rglob("*.py")} | {
+        "ms_slam_env/py.typed"
+    }
+    for folder in ("agents", "baselines"):
+        expected |= {f"ms_slam_{folder}/{path.name}" for path in (ROOT / folder).glob("*.py")}
+    content = {name for name in wheel.namelist() if ".dist-info/" not in name}
+    assert content == expected
+
+
+def test_wheel_takes_no_general_names(wheel: zipfile.ZipFile) -> None:
+    top = {name.split("/")[0] for name in wheel.namelist()}
+    assert {name for name in top if not name.endswith(".dist-info")} == {
+        "ms_slam_agents",
+        "ms_slam_baselines",
+        "ms_slam_env",
+    }
+
+
+def test_wheel_has_the_entry_points(wheel: zipfile.ZipFile) -> None:
+    name = next(n for n in wheel.namelist() if n.endswith("entry_points.txt"))
+    text = wheel.read(name).decode()
+    for line in ("ms-slam = ", "greedy = ms_slam_baselines.", "sb3 = ms_slam_agents."):
+        assert line in text
+
+
+@pytest.mark.parametrize("group", ["ms_slam_env.planners", "ms_slam_env.trainers"])
+def test_entry_points_name_files_that_exist(group: str) -> None:
+    entries = [e for e in entry_points(group=group) if e.value.startswith("ms_slam_")]
+    assert entries
+    for entry in entries:
+        module, _, attribute = entry.value.partition(":")
+        folder, *parts = module.removeprefix("ms_slam_").split(".")
+        path = ROOT.joinpath(folder, *parts).with_suffix(".py")
+        assert re.search(rf"^(class|def) {attribute}\b", path.read_text(), re.MULTILINE)
+
+
+def test_base_install_needs_neither_torch_nor_open3d() -> None:
+    requirements = [Requirement(text) for text in distribution("ms-slam-env").requires or ()]
+    base = {r.name.lower() for r in requirements if not (r.marker and "extra" in str(r.marker))}
+    assert base.isdisjoint({"torch", "open3d", "stable-baselines3", "sb3-contrib", "evo"})
+    assert {"numpy", "gymnasium", "warp-lang", "embreex", "trimesh"} <= base
+
+
+def test_constraints_are_versions_only() -> None:
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    wrong = [line for line in lines if not re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.]+", line)]
+    assert wrong == []
+    assert "torch==2.13.0" in lines
+
+
+def test_constraints_cover_every_declared_dependency() -> None:
+    def normal(name: str) -> str:
+        return re.sub(r"[-_.]+", "-", name).lower()
+
+    pinned = {
+        normal(line.split("==")[0]): line.split("==")[1]
+        for line in (ROOT / "constraints.txt").read_text().splitlines()
+    }
+    for text in distribution("ms-slam-env").requires or ():
+        requirement = Requirement(text)
+        assert normal(requirement.name) in pinned
+        assert requirement.specifier.contains(pinned[normal(requirement.name)])
+
+
+def test_ci_runs_the_tests() -> None:
+    script = ROOT / ".ci" / "run"
+    assert script.stat().st_mode & 0o111
+    assert re.search(r"^exec make .*test$", script.read_text(), re.MULTILINE)
