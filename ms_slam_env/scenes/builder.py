@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from ms_slam_env.scenes.base import Float32, Float64, Int32
 
@@ -22,10 +25,12 @@ class Material:
         texture: index of the image among the builder's textures.
         tile_m: (width, height) in metres that the image covers; None stretches the image over
             the whole patch, as for a picture.
+        region: (left, top, right, bottom) part of the image in [0, 1] that is stretched.
     """
 
     texture: int
     tile_m: tuple[float, float] | None = None
+    region: tuple[float, float, float, float] = (0.001, 0.001, 0.999, 0.999)
 
 
 @dataclass(frozen=True)
@@ -102,11 +107,15 @@ class MeshBuilder:
         self._label = previous
 
     @contextmanager
-    def frame(self, origin: ArrayLike, yaw: float = 0.0) -> Iterator[None]:
-        """Add patches in a frame at ``origin`` (3,), turned by ``yaw`` radians about z."""
+    def frame(self, origin: ArrayLike, yaw: float = 0.0, pitch: float = 0.0) -> Iterator[None]:
+        """Add patches in a frame at ``origin`` (3,).
+
+        The frame is turned by ``yaw`` radians about z, then by ``pitch`` about its own x axis
+        (positive: the front, low y, goes down).
+        """
         previous = self._pose
         local = np.eye(4)
-        local[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+        local[:3, :3] = Rotation.from_euler("ZX", [yaw, pitch]).as_matrix()
         local[:3, 3] = np.asarray(origin, dtype=np.float64)
         self._pose = previous @ local
         yield
@@ -125,10 +134,14 @@ class MeshBuilder:
             inset: gather the light of border vertices a little inside the patch.
         """
         grid = np.asarray(points, dtype=np.float64)
-        n, m = grid.shape[:2]
         if uv is None:
-            uv = _arc_length_uv(grid, material.tile_m)
-        normals = _grid_normals(grid)
+            uv = _arc_length_uv(grid, material)
+        self._add(grid, _grid_normals(grid), uv, material, inset)
+
+    def _add(
+        self, grid: Float64, normals: Float64, uv: Float64, material: Material, inset: bool
+    ) -> None:
+        n, m = grid.shape[:2]
         gather = grid.copy()
         if inset:
             gather[[0, -1]] = 0.8 * gather[[0, -1]] + 0.2 * grid[[min(1, n - 1), max(n - 2, 0)]]
@@ -136,14 +149,7 @@ class MeshBuilder:
                 0.8 * gather[:, [0, -1]] + 0.2 * gather[:, [min(1, m - 1), max(m - 2, 0)]]
             )
         gather = gather + 0.006 * normals
-        index = np.arange(n * m).reshape(n, m)
-        a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
-        faces = np.stack([np.stack([a, b, c], -1), np.stack([a, c, d], -1)], 2).reshape(-1, 3)
-        corners = grid.reshape(-1, 3)[faces]
-        area = np.linalg.norm(
-            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-        )
-        faces = faces[area > 1e-10]  # the poles of a sphere
+        faces = _grid_faces(n, m)
         R, t = self._pose[:3, :3], self._pose[:3, 3]
         self._vertices.append(grid.reshape(-1, 3) @ R.T + t)
         self._normals.append(normals.reshape(-1, 3) @ R.T)
@@ -155,13 +161,35 @@ class MeshBuilder:
         self._count += n * m
 
     def quad(
-        self, origin: ArrayLike, edge_u: ArrayLike, edge_v: ArrayLike, material: Material
+        self,
+        origin: ArrayLike,
+        edge_u: ArrayLike,
+        edge_v: ArrayLike,
+        material: Material,
+        uv_offset: tuple[float, float] = (0.0, 0.0),
     ) -> None:
-        """Add the parallelogram origin + [0,1] edge_u + [0,1] edge_v, outside = edge_u x edge_v."""
+        """Add the parallelogram origin + [0,1] edge_u + [0,1] edge_v.
+
+        The outside is edge_u x edge_v. ``uv_offset`` (metres along u, v) makes the tiles of
+        neighbouring pieces of one wall line up.
+        """
         o, u, v = (np.asarray(x, dtype=np.float64) for x in (origin, edge_u, edge_v))
-        s = np.linspace(0, 1, self._cuts(np.linalg.norm(u)) + 1)
-        t = np.linspace(0, 1, self._cuts(np.linalg.norm(v)) + 1)
-        self.patch(o + s[None, :, None] * u + t[:, None, None] * v, material)
+        length_u, length_v = math.sqrt(u @ u), math.sqrt(v @ v)
+        s = np.linspace(0, 1, self._cuts(length_u) + 1)[None, :, None]
+        t = np.linspace(0, 1, self._cuts(length_v) + 1)[:, None, None]
+        grid = o + s * u + t * v
+        if material.tile_m is None:
+            left, top, right, bottom = material.region
+            uv = [left, bottom] + s * [right - left, 0.0] + t * [0.0, top - bottom]
+        else:
+            w, h = material.tile_m
+            uv = [uv_offset[0] / w, 1.0 - uv_offset[1] / h] + s * [length_u / w, 0.0]
+            uv = uv - t * [0.0, length_v / h]
+        normal = np.array(
+            [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
+        )
+        normals = np.broadcast_to(normal / math.sqrt(normal @ normal), grid.shape)
+        self._add(grid, normals, uv, material, inset=True)
 
     def box(
         self,
@@ -220,36 +248,84 @@ class MeshBuilder:
         )
         self.patch(grid + np.asarray(centre, dtype=np.float64), material, inset=False)
 
+    def pillow(
+        self, low: ArrayLike, high: ArrayLike, material: Material, roundness: float = 0.4
+    ) -> None:
+        """Add a rounded box: a superellipsoid that fills [low, high]; roundness 1 is an ellipsoid.
+
+        Reference: Barr, IEEE CG&A 1(1), 1981.
+        """
+        lo, hi = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+        latitude = np.linspace(-np.pi / 2, np.pi / 2, 13)[:, None]
+        longitude = np.linspace(0, 2 * np.pi, 25)[None, :]
+
+        def power(x: Float64) -> Float64:
+            return np.sign(x) * np.abs(x) ** roundness
+
+        ring = power(np.cos(latitude))
+        x, y = ring * power(np.cos(longitude)), ring * power(np.sin(longitude))
+        z = np.broadcast_to(power(np.sin(latitude)), x.shape)
+        grid = (lo + hi) / 2 + np.stack([x, y, z], -1) * (hi - lo) / 2
+        grid[:, -1] = grid[:, 0]
+        tile = material.tile_m or (1.0, 1.0)
+        across = hi - lo
+        # Seen from above and from the front alike: u along x + y, v along z + y.
+        u = (grid[..., 0] + 0.6 * grid[..., 1]) / tile[0]
+        v = -(grid[..., 2] + 0.6 * grid[..., 1]) / tile[1]
+        if material.tile_m is None:
+            u, v = (grid[..., 0] - lo[0]) / across[0], (hi[2] - grid[..., 2]) / across[2]
+        self.patch(grid, material, np.stack([u, v], -1), inset=False)
+
+    def sheet(self, points: ArrayLike, material: Material, thickness_m: float = 0.002) -> None:
+        """Add a thin surface seen from both sides, from a grid of points (n, m, 3)."""
+        grid = np.asarray(points, dtype=np.float64)
+        normals = _grid_normals(grid)
+        self.patch(grid + 0.5 * thickness_m * normals, material)
+        self.patch((grid - 0.5 * thickness_m * normals)[:, ::-1], material)
+
     def _cuts(self, length: float) -> int:
         return max(1, int(np.ceil(length / self.cell_m)))
 
     def build(self) -> Geometry:
         """Return everything added so far."""
+        vertices, faces = np.concatenate(self._vertices), np.concatenate(self._faces)
+        corners = vertices[faces]
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        keep = np.einsum("ij,ij->i", cross, cross) > 1e-18  # a lathe's pole has empty cells
         return Geometry(
-            vertices=np.concatenate(self._vertices),
+            vertices=vertices,
             normals=np.concatenate(self._normals),
             light_points=np.concatenate(self._light_points),
-            faces=np.concatenate(self._faces).astype(np.int32),
-            uv=np.concatenate(self._uv).astype(np.float32),
-            face_texture=np.concatenate(self._face_texture).astype(np.int32),
-            face_label=np.concatenate(self._face_label).astype(np.int32),
+            faces=faces[keep].astype(np.int32),
+            uv=np.concatenate(self._uv)[keep].astype(np.float32),
+            face_texture=np.concatenate(self._face_texture)[keep].astype(np.int32),
+            face_label=np.concatenate(self._face_label)[keep].astype(np.int32),
             textures=tuple(self._textures),
             labels=tuple(self._labels),
         )
 
 
-def _arc_length_uv(grid: Float64, tile_m: tuple[float, float] | None) -> Float64:
+@lru_cache(maxsize=256)
+def _grid_faces(n: int, m: int) -> NDArray[np.int64]:
+    """Two triangles for each cell of an (n, m) grid of vertices."""
+    index = np.arange(n * m).reshape(n, m)
+    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
+    return np.stack([np.stack([a, b, c], -1), np.stack([a, c, d], -1)], 2).reshape(-1, 3)
+
+
+def _arc_length_uv(grid: Float64, material: Material) -> Float64:
     """Texture coordinates (n, m, 2) proportional to the longest row's and column's length."""
     n, m = grid.shape[:2]
     along_m = np.linalg.norm(np.diff(grid, axis=1), axis=-1)  # (n, m-1)
     along_n = np.linalg.norm(np.diff(grid, axis=0), axis=-1)  # (n-1, m)
     u = np.concatenate([[0.0], np.cumsum(along_m[np.argmax(along_m.sum(1))])])
     v = np.concatenate([[0.0], np.cumsum(along_n[:, np.argmax(along_n.sum(0))])])
-    if tile_m is None:
-        u, v = u / u[-1] * 0.998 + 0.001, v / v[-1] * 0.998 + 0.001
+    if material.tile_m is None:
+        left, top, right, bottom = material.region
+        u, v = left + u / u[-1] * (right - left), bottom + v / v[-1] * (top - bottom)
     else:
-        u, v = u / tile_m[0], v / tile_m[1]
-    return np.stack(np.broadcast_arrays(u[None, :], 1.0 - v[:, None]), -1).reshape(n, m, 2)
+        u, v = u / material.tile_m[0], 1.0 - v / material.tile_m[1]
+    return np.stack(np.broadcast_arrays(u[None, :], v[:, None]), -1).reshape(n, m, 2)
 
 
 def _grid_normals(grid: Float64) -> Float64:

@@ -6,9 +6,21 @@ from pathlib import Path
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.scenes.base import Scene
+from ms_slam_env.scenes.corridor import corridor
 from ms_slam_env.scenes.living_room import living_room
+from ms_slam_env.scenes.tabletop_carpet import carpet
+from ms_slam_env.scenes.tabletop_table import table
+from ms_slam_env.scenes.tabletop_wall import wall
+from ms_slam_env.scenes.tabletop_window import window
 
-_MAKERS = {"living_room": living_room}
+_MAKERS = {
+    "living_room": living_room,
+    "corridor": corridor,
+    "window": window,
+    "table": table,
+    "wall": wall,
+    "carpet": carpet,
+}
 
 SCENES: tuple[str, ...] = tuple(_MAKERS)
 """Names of the procedural scenes; the first is the default."""

@@ -1,0 +1,181 @@
+"""Small things that stand on tables and shelves."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ms_slam_env.scenes.builder import MeshBuilder
+from ms_slam_env.scenes.textures import masonry, printed
+from ms_slam_env.scenes.textures.noise import hsv, noise, shade
+from ms_slam_env.scenes.textures.pictures import picture
+
+
+def glaze(build: MeshBuilder, rng: np.random.Generator, banded: bool = True):  # noqa: ANN201
+    """Ceramic: one colour with painted bands around, and fine speckles."""
+    h, w = 128, 256
+    base = hsv(rng.random(), rng.uniform(0.05, 0.7), rng.uniform(0.5, 0.95))
+    image = np.broadcast_to(base, (h, w, 3)).astype(np.float32).copy()
+    if banded:
+        accent = hsv(rng.random(), 0.6, rng.uniform(0.2, 0.8))
+        for _ in range(int(rng.integers(1, 4))):
+            y = int(rng.uniform(0.1, 0.85) * h)
+            image[y : y + int(rng.uniform(3, 14))] = accent
+        if rng.random() < 0.6:
+            y, step = int(rng.uniform(0.3, 0.6) * h), int(rng.integers(12, 32))
+            for x in range(0, w, step):
+                image[y : y + step // 2, x : x + step // 2] = accent
+    return build.material(shade(image, (0.04, noise(rng, (h, w), 0.6))))
+
+
+def cup(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
+    """Mug with a handle and coffee, standing at the origin."""
+    r, h = rng.uniform(0.035, 0.045), rng.uniform(0.08, 0.11)
+    outside = [(0.85 * r, 0), (r, 0.02), (r, 0.6 * h), (r, h), (r, h)]
+    inside = [(0.88 * r, h), (0.88 * r, h), (0.88 * r, 0.7 * h)]
+    with build.object(name):
+        material = glaze(build, rng)
+        build.lathe(outside + inside, material)
+        build.lathe([(0.88 * r, 0.7 * h), (0, 0.7 * h)], build.plain((58, 36, 24)), 16)
+        angle = np.linspace(-1.4, 1.4, 9)
+        path = np.stack([r + 0.026 * np.cos(angle), 0 * angle, 0.5 * h + 0.03 * np.sin(angle)], -1)
+        around = np.linspace(0, 2 * np.pi, 9)
+        radial = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], -1)
+        side = np.array([0.0, 1.0, 0.0])
+        tube = path[:, None] + 0.006 * (
+            np.cos(around)[None, :, None] * radial[:, None] + np.sin(around)[None, :, None] * side
+        )
+        build.patch(tube, material, inset=False)
+
+
+def plate(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
+    """Plate with a decorated rim; sometimes fruit on it."""
+    r = rng.uniform(0.1, 0.14)
+    with build.object(name):
+        profile = [(0.6 * r, 0), (r, 0.02), (r, 0.024), (0.66 * r, 0.012), (0, 0.012)]
+        build.lathe(profile, glaze(build, rng), 32)
+    if rng.random() < 0.6:
+        fruit(build, rng, f"{name} fruit", 0.012)
+
+
+def fruit(build: MeshBuilder, rng: np.random.Generator, name: str, z: float) -> None:
+    """A few apples or oranges."""
+    size = (64, 64)
+    with build.object(name):
+        for k in range(int(rng.integers(2, 5))):
+            colour = hsv(rng.choice([0.0, 0.07, 0.14, 0.25]), rng.uniform(0.65, 0.9), 0.8)
+            skin = build.material(shade(colour, (0.09, noise(rng, size, 1.2))), (0.1, 0.1))
+            angle, r = 2.1 * k + rng.uniform(0, 0.3), rng.uniform(0.03, 0.038)
+            x, y = 0.045 * np.cos(angle), 0.045 * np.sin(angle)
+            build.pillow((x - r, y - r, z), (x + r, y + r, z + 1.9 * r), skin, 1.0)
+
+
+def bowl(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
+    """Bowl full of fruit."""
+    r = rng.uniform(0.11, 0.15)
+    outside = [(0.45 * r, 0), (0.8 * r, 0.035), (r, 0.085), (r, 0.085)]
+    inside = [(0.95 * r, 0.085), (0.95 * r, 0.085), (0.75 * r, 0.045), (0, 0.035)]
+    with build.object(name):
+        build.lathe(outside + inside, glaze(build, rng), 28)
+    fruit(build, rng, f"{name} fruit", 0.05)
+
+
+def bottle(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
+    """Wine bottle or jar with a printed label."""
+    r, h = rng.uniform(0.033, 0.042), rng.uniform(0.24, 0.31)
+    glass = build.plain(hsv(rng.choice([0.3, 0.1, 0.55]), 0.6, rng.uniform(0.15, 0.4)))
+    with build.object(name):
+        build.lathe(
+            [
+                (0, 0),
+                (r, 0),
+                (r, 0),
+                (r, 0.6 * h),
+                (0.75 * r, 0.68 * h),
+                (0.36 * r, 0.75 * h),
+                (0.36 * r, h),
+                (0.36 * r, h),
+                (0, h),
+            ],
+            glass,
+            18,
+        )
+        printed_label = build.material(printed.cover(rng, 128, 256))
+        build.lathe([(1.02 * r, 0.15 * h), (1.02 * r, 0.45 * h)], printed_label, 18)
+
+
+def vase(build: MeshBuilder, rng: np.random.Generator, height_m: float, name: str) -> None:
+    """Turned vase of random outline."""
+    t = np.linspace(0, 1, 9)
+    wave = rng.uniform(0.6, 1.0) + 0.35 * np.sin(rng.uniform(2.5, 4.5) * t + rng.uniform(0, 2))
+    r = height_m * 0.32 * np.clip(wave, 0.3, 1.2)
+    outside = np.stack([r, t * height_m], -1)
+    inside = [(0.8 * r[-1], height_m), (0.8 * r[-1], 0.8 * height_m), (0, 0.75 * height_m)]
+    with build.object(name):
+        build.lathe(np.concatenate([outside, inside]), glaze(build, rng), 22)
+
+
+def ornament(
+    build: MeshBuilder, rng: np.random.Generator, height_m: float, half_width_m: float, name: str
+) -> None:
+    """A vase, a framed photograph or a ball, within the given size, in front of y = 0."""
+    kind = rng.integers(3)
+    size = float(min(height_m, 2.4 * half_width_m))
+    if kind == 0:
+        with build.frame((0, -0.13, 0)):
+            vase(build, rng, size, name)
+    elif kind == 1:
+        w, h = min(half_width_m * 1.7, 0.2), size
+        with build.object(name), build.frame((0, -0.06, 0), pitch=-0.2):
+            border = build.plain(hsv(rng.random(), 0.3, rng.uniform(0.1, 0.9)))
+            build.box((-w / 2, 0, 0), (w / 2, 0.015, h), border)
+            b = 0.1 * w
+            photo = build.material(picture(rng, 128, 128))
+            build.quad((-w / 2 + b, -0.001, b), (w - 2 * b, 0, 0), (0, 0, h - 2 * b), photo)
+    else:
+        r = 0.4 * size
+        with build.object(name):
+            marble = masonry.tiles(rng, hsv(rng.random(), 0.3, 0.8), 2, 128)
+            build.pillow(
+                (-r, -0.13 - r, 0), (r, -0.13 + r, 2 * r), build.material(marble, (0.2, 0.2)), 1.0
+            )
+
+
+def lying_book(build: MeshBuilder, rng: np.random.Generator, name: str, thick_m: float) -> None:
+    """Book or magazine lying on its back, cover up, centred on the origin."""
+    w, h = rng.uniform(0.13, 0.22), rng.uniform(0.19, 0.29)
+    cover = build.material(printed.cover(rng, 256, 256))
+    pages = build.plain((228, 222, 205))
+    with build.object(name), build.frame((0, 0, 0), yaw=rng.uniform(-np.pi, np.pi)):
+        build.box((-w / 2, -h / 2, 0), (w / 2, h / 2, thick_m), pages, "z", top=cover)
+
+
+def paper(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
+    """Printed sheet of paper, centred on the origin."""
+    sheet = build.material(printed.page(rng, 256, 192))
+    with build.object(name), build.frame((0, 0, 0.0015), yaw=rng.uniform(-0.5, 0.5)):
+        build.quad((-0.105, -0.148, 0), (0.21, 0, 0), (0, 0.297, 0), sheet)
+
+
+def pen_pot(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
+    """Pot with pens and brushes."""
+    with build.object(name):
+        build.lathe(
+            [
+                (0.04, 0),
+                (0.04, 0.1),
+                (0.04, 0.1),
+                (0.036, 0.1),
+                (0.036, 0.1),
+                (0.036, 0.03),
+                (0, 0.03),
+            ],
+            glaze(build, rng),
+            18,
+        )
+        for k in range(int(rng.integers(4, 9))):
+            ink = build.plain(hsv(rng.random(), 0.8, 0.7))
+            angle, lean = 2.4 * k, rng.uniform(0.05, 0.25)
+            with build.frame(
+                (0.02 * np.cos(angle), 0.02 * np.sin(angle), 0.03), yaw=angle - 1.57, pitch=-lean
+            ):
+                build.lathe([(0.004, 0), (0.004, 0.15), (0.0, 0.162)], ink, 6)

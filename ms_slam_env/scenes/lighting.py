@@ -1,0 +1,271 @@
+"""Light baked into the mesh: lamps, windows and sun with shadows, and one bounce off surfaces.
+
+Irradiance is in units in which 1.0 makes a white diffuse surface leave the radiance 1.0, so it is
+the physical irradiance divided by pi.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import qmc
+
+from ms_slam_env.scenes.base import Float32, Float64, TexturedMesh
+from ms_slam_env.scenes.builder import Geometry
+from ms_slam_env.scenes.rays import RayCaster
+
+_FAR_M = 100.0
+_SHADOW_END = 0.999  # a shadow ray stops just before the light, which may be a surface itself
+
+
+class Light(ABC):
+    """Something that shines."""
+
+    @abstractmethod
+    def irradiance(self, points: Float64, normals: Float64, rays: RayCaster) -> Float32:
+        """Light (N, 3) arriving at points (N, 3) with unit normals (N, 3), shadows included."""
+
+
+@dataclass(frozen=True)
+class Lamp(Light):
+    """A small glowing ball.
+
+    Attributes:
+        position: (3,) metres.
+        intensity: (3,) linear RGB; arrives as intensity * cos / r^2.
+        radius_m: of the ball, which softens shadows; 0 is a point.
+        samples: shadow rays a point.
+    """
+
+    position: tuple[float, float, float]
+    intensity: tuple[float, float, float]
+    radius_m: float = 0.0
+    samples: int = 1
+
+    def irradiance(self, points: Float64, normals: Float64, rays: RayCaster) -> Float32:
+        """See the base class."""
+        total = np.zeros(len(points), np.float32)
+        for offset in _ball(self.samples):
+            source = np.asarray(self.position) + self.radius_m * offset
+            total += _point_light(points, normals, source, rays)
+        return _tint(total / self.samples, self.intensity)
+
+
+@dataclass(frozen=True)
+class Panel(Light):
+    """A parallelogram that shines diffusely from its front, as a window or a ceiling panel.
+
+    Attributes:
+        origin: (3,) a corner, metres.
+        edge_u: (3,) side; the front is edge_u x edge_v.
+        edge_v: (3,) other side.
+        radiance: (3,) linear RGB.
+        grid: samples along edge_u and edge_v.
+    """
+
+    origin: tuple[float, float, float]
+    edge_u: tuple[float, float, float]
+    edge_v: tuple[float, float, float]
+    radiance: tuple[float, float, float]
+    grid: tuple[int, int] = (2, 2)
+
+    def irradiance(self, points: Float64, normals: Float64, rays: RayCaster) -> Float32:
+        """See the base class: 1/pi times the integral of L cos cos' / r^2 over the panel."""
+        o, u, v = (np.asarray(x) for x in (self.origin, self.edge_u, self.edge_v))
+        front = np.cross(u, v)
+        area = float(np.linalg.norm(front))
+        front = front / area
+        total = np.zeros(len(points), np.float32)
+        nu, nv = self.grid
+        for i in range(nu):
+            for j in range(nv):
+                source = o + (i + 0.5) / nu * u + (j + 0.5) / nv * v
+                total += _point_light(points, normals, source, rays, front)
+        return _tint(total * (area / (nu * nv) / np.pi), self.radiance)
+
+
+@dataclass(frozen=True)
+class Sun(Light):
+    """Parallel light.
+
+    Attributes:
+        towards_sun: (3,) direction from the scene to the sun.
+        strength: (3,) linear RGB irradiance on a surface that faces it.
+    """
+
+    towards_sun: tuple[float, float, float]
+    strength: tuple[float, float, float]
+
+    def irradiance(self, points: Float64, normals: Float64, rays: RayCaster) -> Float32:
+        """See the base class."""
+        direction = np.asarray(self.towards_sun) / np.linalg.norm(self.towards_sun)
+        cosine = normals @ direction
+        total = np.zeros(len(points), np.float32)
+        lit = np.flatnonzero(cosine > 0)
+        distance, _ = rays.first_hit(
+            points[lit], np.broadcast_to(direction * _FAR_M, (len(lit), 3))
+        )
+        total[lit] = cosine[lit] * (distance > 1.0)
+        return _tint(total, self.strength)
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """All light of a scene.
+
+    Attributes:
+        lights: the sources.
+        glow: label -> (3,) irradiance of surfaces that shine by themselves (window panes, lamp
+            shades, screens); light passes through the labels listed in ``clear``.
+        clear: labels that cast no shadow.
+        ambient: (3,) linear RGB light from everywhere that no source accounts for.
+        bounce_rays: directions in which each point gathers light off other surfaces.
+        bounce_gain: factor on the one bounce, for the further ones.
+    """
+
+    lights: tuple[Light, ...]
+    glow: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    clear: frozenset[str] = frozenset()
+    ambient: tuple[float, float, float] = (0.1, 0.1, 0.1)
+    bounce_rays: int = 24
+    bounce_gain: float = 2.2
+
+
+def light_mesh(geometry: Geometry, lighting: Lighting) -> TexturedMesh:
+    """Bake ``lighting`` into the irradiance of every face corner."""
+    g = geometry
+    blocks = np.array([name not in lighting.clear for name in g.labels])[g.face_label]
+    rays = RayCaster(g.vertices, g.faces[blocks])
+    direct = np.zeros((len(g.vertices), 3), np.float32)
+    for light in lighting.lights:
+        direct += light.irradiance(g.light_points, g.normals, rays)
+    light = direct + _bounce(g, direct, lighting)
+    corner = light[g.faces]  # (F, 3, 3)
+    for name, value in lighting.glow.items():
+        if name in g.labels:
+            corner[g.face_label == g.labels.index(name)] = value
+    return TexturedMesh(
+        vertices=g.vertices.astype(np.float32),
+        faces=g.faces,
+        uv=g.uv,
+        face_texture=g.face_texture,
+        face_label=g.face_label,
+        irradiance=corner.astype(np.float32),
+        textures=g.textures,
+        labels=g.labels,
+    )
+
+
+def _bounce(g: Geometry, direct: Float32, lighting: Lighting) -> Float32:
+    """Light (V, 3) that arrives by one reflection, and the ambient where the way is open.
+
+    All points use the same directions in their own tangent frame, so that the error of the few
+    rays varies smoothly over a surface instead of speckling it.
+    """
+    rays = RayCaster(g.vertices, g.faces)
+    albedo = mean_albedo(g.textures)[g.face_texture]  # (F, 3)
+    leaving = albedo * direct[g.faces].mean(1)
+    for name, value in lighting.glow.items():
+        if name in g.labels:
+            of = g.face_label == g.labels.index(name)
+            # The lights already stand for what glows; only its looks are not theirs.
+            leaving[of] = 0.0 if name in lighting.clear else 0.2 * albedo[of] * np.array(value)
+    leaving = np.concatenate([leaving, np.zeros((1, 3))]).astype(np.float32)  # miss: nothing
+    helper = np.where(np.abs(g.normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+    tangent = np.cross(helper, g.normals)
+    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
+    bitangent = np.cross(g.normals, tangent)
+    gathered = np.zeros((len(g.vertices), 3), np.float32)
+    openness = np.zeros(len(g.vertices), np.float32)
+    for x, y, z in _cosine_directions(lighting.bounce_rays):
+        distance, face = rays.first_hit(g.light_points, x * tangent + y * bitangent + z * g.normals)
+        gathered += leaving[face]
+        openness += np.minimum(distance, 0.8) / 0.8
+    gathered *= lighting.bounce_gain / lighting.bounce_rays
+    openness /= lighting.bounce_rays
+    return gathered + openness[:, None] * np.asarray(lighting.ambient, np.float32)
+
+
+def mean_albedo(textures: tuple[NDArray[np.uint8], ...]) -> Float32:
+    """Mean linear albedo (T, 3) of each texture, from a sparse grid of its texels."""
+    table = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
+    return np.stack(
+        [
+            table[t[:: max(1, t.shape[0] // 32), :: max(1, t.shape[1] // 32)]].mean((0, 1))
+            for t in textures
+        ]
+    )
+
+
+def srgb_to_linear(value: Float64) -> Float64:
+    """Linear light of sRGB values in [0, 1] (IEC 61966-2-1)."""
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def auto_exposure(mesh: TexturedMesh, points: Float64, key: float, skip: frozenset[str]) -> float:
+    """Exposure that maps the median radiance to ``key``.
+
+    Args:
+        mesh: lit mesh.
+        points: (K, 3) where cameras look: faces are weighted by area and nearness to these.
+        key: linear sensor value of the median, 0.18 for mid grey.
+        skip: labels to leave out, as panes and lamps.
+    """
+    corners = mesh.vertices[mesh.faces]
+    area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
+    centre = corners.mean(1)
+    nearest = np.min(np.linalg.norm(centre[:, None] - points[None], axis=2), axis=1)
+    weight = area * np.exp(-((nearest / 2.0) ** 2))
+    weight[np.isin(mesh.face_label, [k for k, n in enumerate(mesh.labels) if n in skip])] = 0.0
+    radiance = (mean_albedo(mesh.textures)[mesh.face_texture] * mesh.irradiance.mean(1)).mean(1)
+    weight[radiance < 0.05 * radiance.mean()] = 0.0  # backs and insides that no camera sees
+    order = np.argsort(radiance)
+    middle = np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())
+    return float(key / radiance[order[middle]])
+
+
+def _point_light(
+    points: Float64,
+    normals: Float64,
+    source: Float64,
+    rays: RayCaster,
+    front: Float64 | None = None,
+) -> Float32:
+    """Return cos / r^2 (N,), times cos' if the source has a ``front``, 0 in shadow."""
+    to_light = source - points
+    square = np.einsum("ij,ij->i", to_light, to_light)
+    cosine = np.einsum("ij,ij->i", to_light, normals) / np.sqrt(square)
+    value = np.maximum(cosine, 0.0) / np.maximum(square, 0.01)
+    if front is not None:
+        value *= np.maximum(-(to_light @ front) / np.sqrt(square), 0.0)
+    lit = np.flatnonzero(value > 1e-5)
+    distance, _ = rays.first_hit(points[lit], to_light[lit])
+    result = np.zeros(len(points), np.float32)
+    result[lit] = value[lit] * (distance > _SHADOW_END)
+    return result
+
+
+def _tint(value: NDArray[np.float32], rgb: tuple[float, float, float]) -> Float32:
+    return value[:, None] * np.asarray(rgb, np.float32)
+
+
+def _ball(n: int) -> Float64:
+    """Points (n, 3) spread over the unit sphere; one point is its centre."""
+    if n == 1:
+        return np.zeros((1, 3))
+    k = np.arange(n) + 0.5
+    z, angle = 1 - 2 * k / n, np.pi * (1 + 5**0.5) * k
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(angle), r * np.sin(angle), z], -1)
+
+
+def _cosine_directions(n: int) -> Float64:
+    """Directions (n, 3) of the upper half sphere, density proportional to the cosine."""
+    u = qmc.Halton(2, scramble=False).random(n + 1)[1:]
+    r, angle = np.sqrt(u[:, 0]), 2 * np.pi * u[:, 1]
+    return np.stack([r * np.cos(angle), r * np.sin(angle), np.sqrt(1 - u[:, 0])], -1)

@@ -1,0 +1,134 @@
+"""The shell of a room: floor, ceiling, four walls with or without a window, skirting."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+
+import numpy as np
+
+from ms_slam_env.scenes.base import Float64
+from ms_slam_env.scenes.builder import Material, MeshBuilder
+
+PANE = "window pane"
+_REVEAL_M = 0.18
+
+
+@dataclass(frozen=True)
+class Window:
+    """A window in a wall.
+
+    Attributes:
+        along: middle along the wall, metres from the wall's middle, to the right seen from inside.
+        sill: height of its lower edge, metres.
+        width: metres.
+        height: metres.
+    """
+
+    along: float
+    sill: float
+    width: float
+    height: float
+
+
+@dataclass(frozen=True)
+class Room:
+    """A box-shaped room with a corner at the origin.
+
+    Wall 0 lies at y = depth, wall 1 at x = width, wall 2 at y = 0, wall 3 at x = 0.
+
+    Attributes:
+        size: width (x), depth (y) and height (z), metres.
+    """
+
+    size: tuple[float, float, float]
+
+    def length(self, wall: int) -> float:
+        """Length of a wall, metres."""
+        return self.size[wall % 2]
+
+    def at_wall(
+        self, build: MeshBuilder, wall: int, along: float = 0.0, z: float = 0.0, gap: float = 0.0
+    ) -> AbstractContextManager[None]:
+        """Frame on a wall: x along it to the right seen from inside, the room at -y."""
+        origin, yaw = self.wall_frame(wall)
+        c, s = np.cos(yaw), np.sin(yaw)
+        return build.frame(origin + [along * c + gap * s, along * s - gap * c, z], yaw)
+
+    def wall_frame(self, wall: int) -> tuple[Float64, float]:
+        """Middle of a wall's lower edge (3,), and the turn of its frame about z."""
+        w, d, _ = self.size
+        origin = [(w / 2, d, 0), (w, d / 2, 0), (w / 2, 0, 0), (0, d / 2, 0)][wall]
+        return np.array(origin, dtype=np.float64), (0.0, -np.pi / 2, np.pi, np.pi / 2)[wall]
+
+    def to_world(self, wall: int, point: tuple[float, float, float]) -> Float64:
+        """World coordinates (3,) of a point given in a wall's frame."""
+        origin, yaw = self.wall_frame(wall)
+        c, s = np.cos(yaw), np.sin(yaw)
+        x, y, z = point
+        return origin + [x * c - y * s, x * s + y * c, z]
+
+    def shell(
+        self,
+        build: MeshBuilder,
+        floor: Material,
+        walls: tuple[Material, Material, Material, Material],
+        ceiling: Material,
+        windows: dict[int, Window] | None = None,
+        skirting: Material | None = None,
+    ) -> None:
+        """Add floor, ceiling, walls ("wall 0" to "wall 3"), windows and skirting boards."""
+        w, d, h = self.size
+        with build.object("floor"):
+            build.quad((0, 0, 0), (w, 0, 0), (0, d, 0), floor)
+        with build.object("ceiling"):
+            build.quad((0, d, h), (w, 0, 0), (0, -d, 0), ceiling)
+        for wall in range(4):
+            window = (windows or {}).get(wall)
+            with self.at_wall(build, wall):
+                with build.object(f"wall {wall}"):
+                    self._wall(build, self.length(wall), walls[wall], window)
+                if window is not None:
+                    add_window(build, window)
+                if skirting is not None:
+                    half = self.length(wall) / 2
+                    with build.object(f"skirting {wall}"):
+                        build.box((-half, -0.015, 0), (half, 0, 0.08), skirting, "xXYz")
+
+    def _wall(
+        self, build: MeshBuilder, length: float, material: Material, window: Window | None
+    ) -> None:
+        half, h = length / 2, self.size[2]
+        if window is None:
+            pieces = [(-half, half, 0.0, h)]
+        else:
+            a, b = window.along - window.width / 2, window.along + window.width / 2
+            low, high = window.sill, window.sill + window.height
+            pieces = [(-half, a, 0.0, h), (b, half, 0.0, h), (a, b, 0.0, low), (a, b, high, h)]
+        for a, b, low, high in pieces:
+            build.quad((a, 0, low), (b - a, 0, 0), (0, 0, high - low), material, (a, low))
+
+
+def add_window(build: MeshBuilder, window: Window) -> None:
+    """Add reveal, sill, frame with a cross bar, and the bright pane, in a wall's frame."""
+    paint = build.plain((238, 236, 230))
+    a, b = window.along - window.width / 2, window.along + window.width / 2
+    low, high, deep = window.sill, window.sill + window.height, _REVEAL_M
+    with build.object("window frame"):
+        build.quad((a, 0, low), (0, deep, 0), (0, 0, high - low), paint)
+        build.quad((b, deep, low), (0, -deep, 0), (0, 0, high - low), paint)
+        build.quad((a, deep, high), (b - a, 0, 0), (0, -deep, 0), paint)
+        build.quad((a, 0, low), (b - a, 0, 0), (0, deep, 0), paint)
+        f, y = 0.06, deep - 0.05
+        middle = (a + b) / 2
+        for x in (a, middle - f / 2, b - f):
+            build.box((x, y, low), (x + f, deep, high), paint, "YzZ")
+        third = low + 0.68 * (high - low)
+        for z in (low, third, high - f):
+            build.box((a, y, z), (b, deep, z + f), paint, "YxX")
+    with build.object("window sill"):
+        build.box((a - 0.04, -0.12, low - 0.03), (b + 0.04, 0.0, low), paint, "Y")
+    with build.object(PANE):
+        build.quad(
+            (a, deep - 0.02, low), (b - a, 0, 0), (0, 0, high - low), build.plain((255,) * 3)
+        )
