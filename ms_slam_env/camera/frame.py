@@ -39,6 +39,8 @@ class RGBDFrame:
             raise InputError(
                 f"depth must have the shape of color {self.color.shape[:2]}, got {self.depth.shape}"
             )
+        if not np.issubdtype(self.depth.dtype, np.floating):
+            raise InputError(f"depth must be float metres, got {self.depth.dtype}")
         if not np.isfinite(self.depth).all():
             raise InputError("depth holds NaN or infinite values; 0 means no reading")
         if (self.depth < 0).any():

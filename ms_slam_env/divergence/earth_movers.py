@@ -12,8 +12,9 @@ from ms_slam_env.divergence.sphere import bin_directions
 
 Float64 = NDArray[np.float64]
 
-REGULARISATION_RAD = 0.1
-ITERATIONS = 100
+REGULARISATION_RAD = 0.03
+ITERATIONS = 200
+SELF_ITERATIONS = 40  # the symmetric problem converges much faster
 
 
 def earth_movers_1d(p: Float64, q: Float64) -> Float64:
@@ -29,7 +30,9 @@ class SphereTransport:
 
     The exact distance is a linear program of L^2 variables. This is Sinkhorn's entropic
     approximation with its bias removed (Cuturi, NeurIPS 2013; Feydy et al., AISTATS 2019,
-    equation (3)): S(p, q) = OT(p, q) - OT(p, p) / 2 - OT(q, q) / 2.
+    equation (3)): S(p, q) = OT(p, q) - OT(p, p) / 2 - OT(q, q) / 2. It keeps the order of
+    distances but is too small: a test holds it between 0.6 and 1 times the exact distance for
+    rotations of 5 to 20 degrees, the larger the closer; at 1 degree it can be a fifth.
     """
 
     def __init__(self, directions: Float64) -> None:
@@ -39,19 +42,24 @@ class SphereTransport:
 
     def distance(self, p: Float64, q: Float64) -> Float64:
         """Distance (B,) in radians between positive distributions (B, L) and (1 or B, L)."""
-        q = np.broadcast_to(q, p.shape)
-        return np.maximum(
-            self._entropic(p, q) - (self._entropic(p, p) + self._entropic(q, q)) / 2, 0.0
-        )
+        self_cost = (self._self_transport(p) + self._self_transport(q)) / 2
+        return np.maximum(self._transport(p, q) - self_cost, 0.0)
 
-    def _entropic(self, p: Float64, q: Float64) -> Float64:
-        """Dual value (B,) of the entropic transport of p (B, L) onto q (B, L)."""
+    def _transport(self, p: Float64, q: Float64) -> Float64:
+        """Dual value (B,) of the entropic transport of p (B, L) onto q (1 or B, L)."""
         left = np.ones_like(p)
         for _ in range(ITERATIONS):
             right = q / (left @ self._kernel)
             left = p / (right @ self._kernel)
         dual = (p * np.log(left)).sum(axis=1) + (q * np.log(right)).sum(axis=1)
         return REGULARISATION_RAD * dual
+
+    def _self_transport(self, p: Float64) -> Float64:
+        """Dual value (B,) of the entropic transport of p (B, L) onto itself."""
+        scaling = np.ones_like(p)
+        for _ in range(SELF_ITERATIONS):
+            scaling = np.sqrt(scaling * p / (scaling @ self._kernel))
+        return 2 * REGULARISATION_RAD * (p * np.log(scaling)).sum(axis=1)
 
 
 class EarthMoversDivergence(Divergence):

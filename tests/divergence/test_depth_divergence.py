@@ -1,0 +1,186 @@
+"""Equations (6) to (10) against a direct loop, and the computation of normals."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import entropy
+
+from ms_slam_env.camera import RGBDFrame, xtion
+from ms_slam_env.divergence import DivergenceConfig, depth_divergence, make_divergence
+from ms_slam_env.divergence.sphere import bin_directions, bin_weights
+from ms_slam_env.errors import InputError
+
+CAMERA = xtion("80x60")
+
+
+def plane_depth(normal, distance=2.0):
+    """Depth of the plane n . p = -distance with n towards the camera."""
+    n = np.asarray(normal, dtype=float) / np.linalg.norm(normal)
+    return (-distance / (CAMERA.rays() @ n)).astype(np.float32)
+
+
+def room_depth(seed, noise=0.002):
+    """A corner of three planes with noise in inverse depth."""
+    rng = np.random.default_rng(seed)
+    planes = [
+        [rng.uniform(-0.2, 0.2), rng.uniform(-0.2, 0.2), -1.0],
+        [-1.0, rng.uniform(-0.2, 0.2), rng.uniform(-0.8, -0.4)],
+        [rng.uniform(-0.2, 0.2), -1.0, rng.uniform(-0.8, -0.4)],
+    ]
+    depths = np.stack([plane_depth(n, 1.5) for n in planes])
+    inverse = 1 / np.where(depths > 0, depths, np.inf).min(axis=0)
+    return (1 / (inverse + rng.normal(0, noise, inverse.shape))).astype(np.float32)
+
+
+def loop_histogram(normals, N, alpha, pseudo_count):
+    """Equations (6) to (9) as printed, one normal and one bin at a time."""
+    bins = []
+    for i in range(1, N + 1):
+        theta = math.pi * i / N
+        M = math.floor(2 * N * math.sin(theta) + 1e-9) + 1
+        for j in range(1, M + 1):
+            phi = 2 * math.pi * j / M
+            v = (
+                math.sin(theta) * math.cos(phi),
+                math.sin(theta) * math.sin(phi),
+                math.cos(theta),
+            )
+            total = pseudo_count
+            for n in normals:
+                cosine = sum(a * b for a, b in zip(n, v, strict=True))
+                if math.acos(min(1.0, max(-1.0, cosine))) <= alpha:
+                    total += (cosine - math.cos(alpha)) / (1 - math.cos(alpha))
+            bins.append(total)
+    return np.array(bins) / sum(bins)
+
+
+@pytest.mark.parametrize(("N", "alpha_deg"), [(4, 45.0), (6, 30.0)])
+def test_weights_equal_the_loop(N, alpha_deg):
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(40, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    alpha = math.radians(alpha_deg)
+    fast = bin_weights(normals, bin_directions(N), alpha).sum(axis=0) + 0.5
+    np.testing.assert_allclose(
+        fast / fast.sum(), loop_histogram(normals, N, alpha, 0.5), atol=1e-12
+    )
+
+
+def test_number_of_bins_follows_equation_7():
+    # N = 4: inclinations 45, 90, 135, 180 degrees, M = floor(8 sin) + 1 = 6, 9, 6, 1.
+    assert len(bin_directions(4)) == 6 + 9 + 6 + 1
+    np.testing.assert_allclose(np.linalg.norm(bin_directions(4), axis=1), 1)
+
+
+def exact_divergence(current, previous, config=None):
+    """(10) from the normals of the library and exact weights."""
+    config = config or DivergenceConfig.paper()
+    normals = make_divergence(config, CAMERA).normals(np.stack([current, previous]))
+    histograms = []
+    for frame in normals.astype(float):
+        valid = frame[np.linalg.norm(frame, axis=2) > 0]
+        weights = bin_weights(
+            valid, bin_directions(config.inclinations), np.deg2rad(config.alpha_deg)
+        )
+        histograms.append(weights.sum(axis=0) + config.pseudo_count)
+    return entropy(*histograms)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_grid_of_directions_is_close_to_exact_weights(seed):
+    current, previous = room_depth(seed), room_depth(seed + 100)
+    exact = exact_divergence(current, previous)
+    assert exact > 0.01
+    assert depth_divergence(current, previous, CAMERA) == pytest.approx(exact, rel=0.02, abs=1e-3)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.floats(-0.9, 0.9), st.floats(-0.9, 0.9), st.floats(0.5, 4))
+def test_normals_of_a_plane_are_exact(x, y, distance):
+    normal = np.array([x, y, -1.0]) / math.sqrt(x * x + y * y + 1)
+    depth = plane_depth(normal, distance)
+    depth[(depth < 0) | (depth > 50)] = 0  # behind the camera, or near the plane's horizon
+    normals = make_divergence(DivergenceConfig(), CAMERA).normals(depth[None])[0]
+    found = np.linalg.norm(normals, axis=2) > 0
+    assert found.sum() > 100
+    np.testing.assert_allclose(normals[found], np.broadcast_to(normal, (found.sum(), 3)), atol=2e-3)
+
+
+def test_normals_are_not_computed_across_an_edge():
+    depth = np.full(CAMERA.shape, 2.0, dtype=np.float32)
+    depth[:, 40:] = 1.0
+    normals = make_divergence(DivergenceConfig(normal_radius=1), CAMERA).normals(depth[None])[0]
+    assert not normals[30, [39, 40]].any()
+    np.testing.assert_allclose(normals[30, [20, 60]], [[0, 0, -1], [0, 0, -1]], atol=1e-6)
+
+
+def test_holes_have_no_normal_and_are_left_out():
+    depth = plane_depth([0.2, 0.1, -1])
+    holed = depth.copy()
+    holed[20:30, 20:30] = 0
+    assert depth_divergence(holed, depth, CAMERA) < 1e-3
+    normals = make_divergence(DivergenceConfig(), CAMERA).normals(holed[None])[0]
+    assert not normals[20:30, 20:30].any()
+
+
+def test_no_valid_pixel_is_the_uniform_distribution():
+    empty = np.zeros(CAMERA.shape, dtype=np.float32)
+    assert depth_divergence(empty, empty, CAMERA) == 0
+    plane = plane_depth([0, 0, -1])
+    config = DivergenceConfig.paper()
+    histogram = make_divergence(config, CAMERA).histograms(plane[None], plane[None]).normals[0, 0]
+    uniform = np.ones_like(histogram)
+    assert depth_divergence(plane, empty, CAMERA) == pytest.approx(entropy(histogram, uniform))
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 50), st.integers(0, 50))
+def test_is_non_negative_and_zero_for_the_same_frame(a, b):
+    current, previous = room_depth(a), room_depth(b)
+    divergence = depth_divergence(current, previous, CAMERA)
+    assert 0 <= divergence < np.inf
+    assert (divergence == 0) == (a == b)
+
+
+def test_grows_with_the_angle():
+    start = plane_depth([0, 0, -1])
+    angles = np.deg2rad([2, 5, 10, 20])
+    divergences = [
+        depth_divergence(plane_depth([math.sin(a), 0, -math.cos(a)]), start, CAMERA) for a in angles
+    ]
+    assert divergences == sorted(divergences)
+
+
+def test_frames_are_accepted():
+    depth, other = room_depth(0), room_depth(1)
+    color = np.zeros((*depth.shape, 3), dtype=np.uint8)
+    frames = RGBDFrame(color, depth), RGBDFrame(color, other)
+    assert depth_divergence(*frames, CAMERA) == depth_divergence(depth, other, CAMERA)
+
+
+def with_pixel(value):
+    depth = room_depth(0)
+    depth[3, 4] = value
+    return depth
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        with_pixel(np.nan),
+        with_pixel(np.inf),
+        with_pixel(-1.0),
+        np.zeros((120, 160), dtype=np.float32),
+        np.zeros(CAMERA.shape, dtype=np.uint16),
+        np.zeros((60, 80, 1), dtype=np.float32),
+        np.zeros(60, dtype=np.float32),
+    ],
+)
+def test_bad_depth_is_refused(bad):
+    with pytest.raises(InputError, match="depth"):
+        depth_divergence(bad, room_depth(1), CAMERA)
+    with pytest.raises(InputError, match="depth"):
+        depth_divergence(room_depth(1), bad, CAMERA)

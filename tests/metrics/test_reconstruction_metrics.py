@@ -1,0 +1,144 @@
+"""Map measures against Open3D's nearest neighbours and against closed forms."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import se3_exp, transform_points
+from ms_slam_env.metrics import (
+    f_score,
+    icp,
+    map_metrics,
+    nearest_distances,
+    precision,
+    rcm,
+    recall,
+    rer,
+    voxel_thin,
+)
+
+
+def grid(nx, ny, spacing=0.05, z=0.0):
+    x, y = np.meshgrid(np.arange(nx), np.arange(ny), indexing="ij")
+    return np.stack([x * spacing, y * spacing, np.full_like(x, 1, dtype=float) * z], -1).reshape(
+        -1, 3
+    )
+
+
+def box(seed, count=4000):
+    """Points on the faces of a box."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(0, 1, (count, 3)) * [2.0, 1.5, 1.0]
+    face = rng.integers(0, 3, count)
+    points[np.arange(count), face] = np.where(
+        rng.random(count) < 0.5, 0.0, np.array([2.0, 1.5, 1.0])[face]
+    )
+    return points
+
+
+def test_distances_equal_open3d():
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        pytest.skip(f"Open3D does not import here: {error}")
+    points, truth = box(0), box(1, 3000)
+    clouds = [
+        open3d.geometry.PointCloud(open3d.utility.Vector3dVector(cloud))
+        for cloud in (points, truth)
+    ]
+    to_truth = np.asarray(clouds[0].compute_point_cloud_distance(clouds[1]))
+    to_map = np.asarray(clouds[1].compute_point_cloud_distance(clouds[0]))
+    np.testing.assert_allclose(nearest_distances(points, truth), to_truth, atol=1e-12)
+    threshold = 0.03
+    p, r = (to_truth < threshold).mean(), (to_map < threshold).mean()
+    assert precision(points, truth, threshold) == p
+    assert recall(points, truth, threshold) == r
+    assert rcm(points, truth, threshold) == r
+    assert f_score(points, truth, threshold) == pytest.approx(2 * p * r / (p + r))
+    assert rer(points, truth, "none") == pytest.approx(np.sqrt((to_truth**2).mean()))
+
+
+def test_half_a_plane_at_a_distance():
+    truth, points = grid(20, 20), grid(10, 20, z=0.03)
+    assert precision(points, truth, 0.031) == 1
+    assert precision(points, truth, 0.029) == 0
+    assert recall(points, truth, 0.031) == 0.5
+    assert f_score(points, truth, 0.031) == pytest.approx(2 / 3)
+    assert f_score(points, truth, 0.029) == 0
+    assert rer(points, truth, "none") == pytest.approx(0.03)
+
+
+def test_icp_undoes_a_small_motion():
+    truth = box(0)
+    T = se3_exp([0.02, -0.01, 0.015, 0.02, -0.01, 0.015])
+    moved = transform_points(np.linalg.inv(T), truth)
+    np.testing.assert_allclose(icp(moved, truth), T, atol=2e-3)
+    assert rer(moved, truth, "icp") < 0.2 * rer(moved, truth, "none")
+
+
+def test_map_metrics_equal_the_single_measures():
+    points, truth = box(0) + np.array([0.0, 0.0, 0.01]), box(1)
+    thinned, thinned_truth = voxel_thin(points, 0.02), voxel_thin(truth, 0.02)
+    for registration in ("none", "icp"):
+        found = map_metrics(points, truth, (0.02, 0.05), 0.04, registration, voxel_m=0.02)
+        for threshold in (0.02, 0.05):
+            pair = thinned, thinned_truth, threshold
+            assert found.precision[threshold] == precision(*pair)
+            assert found.recall[threshold] == recall(*pair)
+            assert found.f_score[threshold] == f_score(*pair)
+        assert found.rcm == rcm(thinned, thinned_truth, 0.04)
+        assert found.rer_m == pytest.approx(rer(thinned, thinned_truth, registration), abs=1e-6)
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 100), st.floats(0.02, 0.5))
+def test_thinning_leaves_one_point_of_the_input_in_each_voxel(seed, voxel_m):
+    points = box(seed, 300) - 0.7
+    thinned = voxel_thin(points, voxel_m)
+    cells = {tuple(cell) for cell in np.floor(points / voxel_m).astype(int)}
+    assert len(thinned) == len(cells)
+    assert {tuple(cell) for cell in np.floor(thinned / voxel_m).astype(int)} == cells
+    assert {tuple(p) for p in thinned} <= {tuple(p) for p in points}
+
+
+def test_a_map_equal_to_the_truth_is_perfect():
+    truth = box(0)
+    found = map_metrics(truth, truth)
+    assert (found.f_score, found.rcm) == ({0.02: 1.0, 0.05: 1.0}, 1.0)
+    assert found.rer_m == pytest.approx(0, abs=1e-9)
+
+
+GOOD = box(0, 50)
+
+
+@pytest.mark.parametrize(
+    ("bad", "match"),
+    [
+        (np.zeros((0, 3)), "empty"),
+        (np.zeros((4, 2)), r"\(4, 2\)"),
+        (np.zeros(3), r"\(3,\)"),
+        (np.full((4, 3), np.nan), "finite"),
+    ],
+)
+def test_bad_points_are_refused(bad, match):
+    for pair in ((bad, GOOD), (GOOD, bad)):
+        with pytest.raises(InputError, match=match):
+            map_metrics(*pair)
+        with pytest.raises(InputError, match=match):
+            nearest_distances(*pair)
+        with pytest.raises(InputError, match=match):
+            rer(*pair)
+
+
+def test_bad_options_are_refused():
+    with pytest.raises(InputError, match="icp"):
+        rer(GOOD, GOOD, "gicp")
+    for threshold in (0.0, -1.0, np.nan):
+        with pytest.raises(InputError, match="threshold"):
+            f_score(GOOD, GOOD, threshold)
+        with pytest.raises(InputError, match="threshold"):
+            map_metrics(GOOD, GOOD, (threshold,))
+    with pytest.raises(InputError, match="voxel_m"):
+        voxel_thin(GOOD, 0.0)
