@@ -11,6 +11,7 @@ mapped point, seen again with noise or from between the old pixels, makes no sec
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
+from ms_slam_env.slam.surfel.splat import SplatCamera, floor_int
 from ms_slam_env.slam.surfel.surfel_arrays import Surfels, VisibleList, depth_tolerance
 
 COARSER = wp.constant(1.5)  # a reading with a radius this much larger refines nothing (Keller)
@@ -58,7 +59,7 @@ def update_surfels(
     surfels: Surfels,
     visible: VisibleList,
     poses: wp.array(dtype=wp.mat44),
-    camera: wp.vec4,
+    camera: SplatCamera,
     mask: wp.array(dtype=wp.int32),
     time: wp.array(dtype=wp.int32),
     weight: wp.array(dtype=wp.float32),
@@ -83,10 +84,10 @@ def update_surfels(
     for j in range(worker, visible.count[b], workers):
         p = visible.position[b, j]
         n = visible.normal[b, j]
-        u = camera[0] * p[0] / p[2] + camera[2]
-        v = camera[1] * p[1] / p[2] + camera[3]
-        u0 = int(wp.floor(u))
-        v0 = int(wp.floor(v))
+        u = camera.focal[0] * p[0] / p[2] + camera.centre[0]
+        v = camera.focal[1] * p[1] / p[2] + camera.centre[1]
+        u0 = floor_int(u)
+        v0 = floor_int(v)
         tolerance = depth_tolerance(parameters.distance_m, p[2])
         total = float(0.0)
         shift = float(0.0)
@@ -116,15 +117,17 @@ def update_surfels(
         if behind == 4:
             confidence = 0.5 * confidence - 0.5
         elif total > 0.25:
-            x = wp.clamp(int(wp.floor(u + 0.5)), 0, width - 1)
-            y = wp.clamp(int(wp.floor(v + 0.5)), 0, height - 1)
+            x = wp.clamp(floor_int(u + 0.5), 0, width - 1)
+            y = wp.clamp(floor_int(v + 0.5), 0, height - 1)
             live_normal = live_normals[b, y, x]
             agreement = wp.dot(live_normal, n)
             alpha = weight[b] * radial_weight(u, v, width, height)
             surfels.seen[b, i] = time[b]
             if agreement > parameters.min_cosine:
                 radius = surfels.radius[b, i]
-                live_radius = reading_radius(p[2], live_normal, p, camera[0], parameters.radius_px)
+                live_radius = reading_radius(
+                    p[2], live_normal, p, camera.focal[0], parameters.radius_px
+                )
                 if live_radius < COARSER * radius:
                     keep = confidence / (confidence + alpha)
                     take = 1.0 - keep
@@ -148,7 +151,7 @@ def add_surfels(
     surfels: Surfels,
     capacity: int,
     poses: wp.array(dtype=wp.mat44),
-    camera: wp.vec4,
+    camera: SplatCamera,
     mask: wp.array(dtype=wp.int32),
     time: wp.array(dtype=wp.int32),
     weight: wp.array(dtype=wp.float32),
@@ -179,7 +182,7 @@ def add_surfels(
                     surfels.normal[b, slot] = wp.transform_vector(T, n)
                     surfels.color[b, slot] = live_color[b, v, u]
                     surfels.radius[b, slot] = reading_radius(
-                        p[2], n, p, camera[0], parameters.radius_px
+                        p[2], n, p, camera.focal[0], parameters.radius_px
                     )
                     surfels.confidence[b, slot] = weight[b] * radial_weight(
                         float(u), float(v), width, height

@@ -20,8 +20,8 @@ from ms_slam_env.slam.surfel.prediction_kernels import (
     resolve_views,
     scatter_points,
 )
-from ms_slam_env.slam.surfel.splat_renderer import SplatParameters, SplatRenderer, camera_vector
-from ms_slam_env.slam.surfel.surfel_arrays import Surfels, VisibleList
+from ms_slam_env.slam.surfel.splat_renderer import SplatParameters, SplatRenderer, splat_camera
+from ms_slam_env.slam.surfel.surfel_arrays import Surfels, VisibleList, allocate_visible
 from ms_slam_env.slam.surfel.types import ModelView
 
 Float64 = NDArray[np.float64]
@@ -92,36 +92,24 @@ def wide_intrinsics(intrinsics: Intrinsics, motions: Float64) -> Intrinsics | No
 class _Reference:
     """Two rendered layers of E maps at one image size, and the points in them."""
 
-    def __init__(
-        self,
-        envs: int,
-        intrinsics: Intrinsics,
-        parameters: SplatParameters,
-        workers: int,
-        device: str,
-    ) -> None:
-        self.renderer = SplatRenderer(envs, intrinsics, parameters, workers, device)
-        self.layer = self.renderer.new_view()
-        self.front_depth = wp.zeros((envs, *intrinsics.shape), dtype=wp.float32, device=device)
-        capacity = 2 * intrinsics.width * intrinsics.height
+    def __init__(self, renderer: SplatRenderer, hidden: VisibleList) -> None:
+        self.renderer = renderer
+        self.hidden = hidden
+        envs, capacity = renderer.envs, 2 * renderer.intrinsics.width * renderer.intrinsics.height
+        device = renderer.device
         self.points = PointCloud()
         self.points.position = wp.zeros((envs, capacity), dtype=wp.vec3, device=device)
         self.points.normal = wp.zeros((envs, capacity), dtype=wp.vec3, device=device)
         self.points.intensity = wp.zeros((envs, capacity), dtype=wp.float32, device=device)
         self.points.count = wp.zeros(envs, dtype=wp.int32, device=device)
 
-    def render(
-        self, surfels: Surfels, visible: VisibleList, poses: wp.array, first_env: int
-    ) -> None:
+    def render(self, poses: wp.array, first_env: int) -> None:
         """Fill ``points`` from the front surface and the one behind it."""
-        renderer = self.renderer
         self.points.count.zero_()
-        renderer.cull(surfels, poses, visible, first_env)
-        renderer.splat(surfels, visible, self.layer, first_env)
-        self._collect(self.layer)
-        wp.copy(self.front_depth, renderer.z_buffer)
-        renderer.splat(surfels, visible, self.layer, first_env, behind=self.front_depth)
-        self._collect(self.layer)
+        self.renderer.cull(poses, first_env)
+        self._collect(self.renderer.splat(first_env))
+        self.renderer.list_hidden(self.hidden)
+        self._collect(self.renderer.splat(first_env, self.hidden))
 
     def _collect(self, layer: ModelView) -> None:
         wp.launch(
@@ -136,6 +124,8 @@ class ViewPredictor:
     """Predicts views near each other by warping one reference view; far ones one by one.
 
     Args:
+        surfels: the maps.
+        visible: working list shared with the map's other renderers.
         intrinsics: of the live camera.
         parameters: how discs are drawn.
         workers: threads per env or view.
@@ -143,24 +133,27 @@ class ViewPredictor:
     """
 
     def __init__(
-        self, intrinsics: Intrinsics, parameters: SplatParameters, workers: int, device: str
+        self,
+        surfels: Surfels,
+        visible: VisibleList,
+        intrinsics: Intrinsics,
+        parameters: SplatParameters,
+        workers: int,
+        device: str,
     ) -> None:
+        self.surfels = surfels
+        self.visible = visible
         self.intrinsics = intrinsics
         self.parameters = parameters
         self.workers = workers
         self.device = device
+        batch, capacity = visible.index.shape
+        self._hidden = allocate_visible(batch, capacity, device)
         self._references: dict[tuple[int, Intrinsics], _Reference] = {}
-        self._single: dict[tuple[int, Intrinsics], tuple[SplatRenderer, ModelView]] = {}
+        self._single: dict[tuple[int, Intrinsics], SplatRenderer] = {}
         self._outputs: dict[tuple[int, Intrinsics], tuple[wp.array, DeviceViews]] = {}
 
-    def predict(
-        self,
-        surfels: Surfels,
-        visible: VisibleList,
-        poses: Float64,
-        scale: float,
-        first_env: int,
-    ) -> DeviceViews:
+    def predict(self, poses: Float64, scale: float, first_env: int) -> DeviceViews:
         """Images (E * N, h, w) from ``poses`` (E, N, 4, 4) of the envs from ``first_env`` on.
 
         Raises:
@@ -179,10 +172,10 @@ class ViewPredictor:
         motions = invert(references)[:, None] @ poses
         wide = wide_intrinsics(intrinsics, motions.reshape(-1, 4, 4))
         if wide is None:
-            self._predict_singly(surfels, visible, poses, views, first_env)
+            self._predict_singly(poses, views, first_env)
             return views
         reference = self._reference(envs, wide)
-        reference.render(surfels, visible, self._upload(references), first_env)
+        reference.render(self._upload(references), first_env)
         self._warp(reference.points, count, self._upload(invert(motions)), keys, views)
         return views
 
@@ -190,58 +183,41 @@ class ViewPredictor:
         self, points: PointCloud, count: int, motions: wp.array, keys: wp.array, views: DeviceViews
     ) -> None:
         """Scatter the points into all views and fill in the images."""
-        camera = camera_vector(views.intrinsics)
+        camera = splat_camera(views.intrinsics, self.parameters)
+        total = views.depth.shape[0]
         keys.fill_(int(EMPTY))
         wp.launch(
             scatter_points,
-            dim=(keys.shape[0], self.workers),
-            inputs=[
-                points,
-                count,
-                motions,
-                camera,
-                self.parameters.z_near,
-                self.workers,
-                keys,
-            ],
+            dim=(total, self.workers),
+            inputs=[points, count, motions, camera, self.workers, keys],
             device=self.device,
         )
         wp.launch(
             resolve_views,
-            dim=keys.shape[:2],
+            dim=(total, views.intrinsics.height),
             inputs=[
                 points,
                 count,
                 motions,
                 camera,
                 keys,
-                views.intensity,
-                views.depth,
-                views.normals,
+                views.intensity.flatten(),
+                views.depth.flatten(),
+                views.normals.flatten(),
             ],
             device=self.device,
         )
 
-    def _predict_singly(
-        self,
-        surfels: Surfels,
-        visible: VisibleList,
-        poses: Float64,
-        views: DeviceViews,
-        first_env: int,
-    ) -> None:
+    def _predict_singly(self, poses: Float64, views: DeviceViews, first_env: int) -> None:
         """Splat the surfels themselves into every view, one view per env at a time."""
         envs, count = poses.shape[:2]
         key = (envs, views.intrinsics)
         if key not in self._single:
-            renderer = SplatRenderer(
-                envs, views.intrinsics, self.parameters, self.workers, self.device
-            )
-            self._single[key] = (renderer, renderer.new_view())
-        renderer, image = self._single[key]
+            self._single[key] = self._renderer(envs, views.intrinsics)
+        renderer = self._single[key]
         for n in range(count):
-            renderer.cull(surfels, self._upload(poses[:, n]), visible, first_env)
-            renderer.splat(surfels, visible, image, first_env)
+            renderer.cull(self._upload(poses[:, n]), first_env)
+            image = renderer.splat(first_env)
             wp.launch(
                 copy_view,
                 dim=(envs, *views.intrinsics.shape),
@@ -263,12 +239,21 @@ class ViewPredictor:
         flat = np.ascontiguousarray(poses.reshape(-1, 4, 4), dtype=np.float32)
         return wp.array(flat, dtype=wp.mat44, device=self.device)
 
+    def _renderer(self, envs: int, intrinsics: Intrinsics) -> SplatRenderer:
+        return SplatRenderer(
+            self.surfels,
+            self.visible,
+            envs,
+            intrinsics,
+            self.parameters,
+            self.workers,
+            self.device,
+        )
+
     def _reference(self, envs: int, intrinsics: Intrinsics) -> _Reference:
         key = (envs, intrinsics)
         if key not in self._references:
-            self._references[key] = _Reference(
-                envs, intrinsics, self.parameters, self.workers, self.device
-            )
+            self._references[key] = _Reference(self._renderer(envs, intrinsics), self._hidden)
         return self._references[key]
 
     def _buffers(self, count: int, intrinsics: Intrinsics) -> tuple[wp.array, DeviceViews]:
@@ -281,5 +266,6 @@ class ViewPredictor:
                 normals=wp.zeros(shape, dtype=wp.vec3, device=self.device),
                 intrinsics=intrinsics,
             )
-            self._outputs[key] = (wp.zeros(shape, dtype=wp.int64, device=self.device), views)
+            keys = wp.zeros(math.prod(shape), dtype=wp.int64, device=self.device)
+            self._outputs[key] = (keys, views)
         return self._outputs[key]

@@ -9,6 +9,7 @@ surfels into every view.
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
+from ms_slam_env.slam.surfel.splat import SplatCamera, floor_int
 from ms_slam_env.slam.surfel.surfel_arrays import rotation_of, translation_of
 
 EMPTY = wp.constant(wp.int64(0x7FFFFFFFFFFFFFFF))
@@ -32,7 +33,7 @@ def collect_points(
     normals: wp.array3d(dtype=wp.vec3),
     intensity: wp.array3d(dtype=wp.float32),
     points: PointCloud,
-):
+) -> None:
     """Append the surface points of one layer."""
     e, v = wp.tid()
     for u in range(vertices.shape[2]):
@@ -44,74 +45,86 @@ def collect_points(
             points.intensity[e, slot] = intensity[e, v, u]
 
 
-@wp.func
-def plane_depth(p: wp.vec3, n: wp.vec3, u: float, v: float, camera: wp.vec4):
-    """Depth at pixel (u, v) of the plane through p, kept within a tenth of the depth of p."""
-    ray = wp.vec3((u - camera[2]) / camera[0], (v - camera[3]) / camera[1], 1.0)
-    slope = wp.min(wp.dot(n, ray), -1.0e-6)
-    return wp.clamp(wp.dot(n, p) / slope, 0.9 * p[2], 1.1 * p[2])
-
-
 @wp.kernel
 def scatter_points(
     points: PointCloud,
     views_per_env: int,
     motions: wp.array(dtype=wp.mat44),
-    camera: wp.vec4,
-    z_near: float,
+    camera: SplatCamera,
     workers: int,
-    keys: wp.array3d(dtype=wp.int64),
-):
+    keys: wp.array(dtype=wp.int64),
+) -> None:
     """Z-buffer of the points: per pixel the smallest key of the points within a pixel of it.
 
     A key is (depth bin, squared distance to the pixel, point), so among the points of one surface
-    the one nearest to the pixel wins. ``motions[v]`` is T_view_reference.
+    the one nearest to the pixel wins. ``motions[v]`` is T_view_reference; keys (V * h * w).
     """
     view, worker = wp.tid()
     e = view / views_per_env
-    height = keys.shape[1]
-    width = keys.shape[2]
-    R = rotation_of(motions[view])
-    t = translation_of(motions[view])
+    height = camera.height
+    width = camera.width
+    image = view * height * width
+    K = wp.mat33(
+        camera.focal[0],
+        0.0,
+        camera.centre[0],
+        0.0,
+        camera.focal[1],
+        camera.centre[1],
+        0.0,
+        0.0,
+        1.0,
+    )
+    R = K * rotation_of(motions[view])
+    t = K * translation_of(motions[view])
     right = float(width)
     bottom = float(height)
     for j in range(worker, points.count[e], workers):
         p = R * points.position[e, j] + t
-        if p[2] > z_near:
-            inverse = 1.0 / p[2]
-            u = camera[0] * p[0] * inverse + camera[2]
-            v = camera[1] * p[1] * inverse + camera[3]
-            if u > -1.0 and u < right and v > -1.0 and v < bottom:
-                if wp.dot(R * points.normal[e, j], p) < 0.0:
-                    u0 = int(wp.floor(u))
-                    v0 = int(wp.floor(v))
-                    near = wp.int64(int(p[2] * DEPTH_BINS_PER_M)) << wp.int64(40)
-                    du = u - float(u0)
-                    dv = v - float(v0)
-                    for corner in range(4):
-                        x = corner % 2
-                        y = corner / 2
-                        if u0 + x >= 0 and u0 + x < width and v0 + y >= 0 and v0 + y < height:
-                            a = float(x) - du
-                            b = float(y) - dv
-                            off = wp.int64(int((a * a + b * b) * 127.0)) << wp.int64(32)
-                            wp.atomic_min(keys, view, v0 + y, u0 + x, near + off + wp.int64(j))
+        z = p[2]
+        if z > camera.z_near and p[0] > -z and p[0] < right * z and p[1] > -z and p[1] < bottom * z:
+            inverse = 1.0 / z
+            u = p[0] * inverse
+            v = p[1] * inverse
+            u0 = int(u + 1.0) - 1
+            v0 = int(v + 1.0) - 1
+            du = u - float(u0)
+            dv = v - float(v0)
+            eu = 1.0 - du
+            ev = 1.0 - dv
+            key = (wp.int64(int(z * DEPTH_BINS_PER_M)) << wp.int64(40)) + wp.int64(j)
+            left_in = u0 >= 0
+            right_in = u0 + 1 < width
+            pixel = image + v0 * width + u0
+            if v0 >= 0:
+                if left_in:
+                    off = wp.int64(int((du * du + dv * dv) * 127.0)) << wp.int64(32)
+                    wp.atomic_min(keys, pixel, key + off)
+                if right_in:
+                    off = wp.int64(int((eu * eu + dv * dv) * 127.0)) << wp.int64(32)
+                    wp.atomic_min(keys, pixel + 1, key + off)
+            if v0 + 1 < height:
+                if left_in:
+                    off = wp.int64(int((du * du + ev * ev) * 127.0)) << wp.int64(32)
+                    wp.atomic_min(keys, pixel + width, key + off)
+                if right_in:
+                    off = wp.int64(int((eu * eu + ev * ev) * 127.0)) << wp.int64(32)
+                    wp.atomic_min(keys, pixel + width + 1, key + off)
 
 
 @wp.func
-def gap_key(keys: wp.array3d(dtype=wp.int64), view: int, v: int, u: int):
-    """Key of the farthest neighbour of an empty pixel that most neighbours surround."""
+def gap_key(
+    keys: wp.array(dtype=wp.int64), image: int, v: int, u: int, height: int, width: int
+) -> wp.int64:
+    """Key of the farthest neighbour of an empty pixel that enough neighbours surround."""
     found = int(0)
     farthest = wp.int64(-1)
-    for dv in range(-1, 2):
-        for du in range(-1, 2):
-            x = u + du
-            y = v + dv
-            if x >= 0 and x < keys.shape[2] and y >= 0 and y < keys.shape[1]:
-                key = keys[view, y, x]
-                if key != EMPTY:
-                    found += 1
-                    farthest = wp.max(farthest, key)
+    for y in range(wp.max(v - 1, 0), wp.min(v + 2, height)):
+        for x in range(wp.max(u - 1, 0), wp.min(u + 2, width)):
+            key = keys[image + y * width + x]
+            if key != EMPTY:
+                found += 1
+                farthest = wp.max(farthest, key)
     if found < CLOSE_GAP:
         return EMPTY
     return farthest
@@ -122,32 +135,44 @@ def resolve_views(
     points: PointCloud,
     views_per_env: int,
     motions: wp.array(dtype=wp.mat44),
-    camera: wp.vec4,
-    keys: wp.array3d(dtype=wp.int64),
-    intensity: wp.array3d(dtype=wp.float32),
-    depth: wp.array3d(dtype=wp.float32),
-    normals: wp.array3d(dtype=wp.vec3),
-):
-    """Images of the winning points; small gaps take the farthest neighbour, the rest is 0."""
+    camera: SplatCamera,
+    keys: wp.array(dtype=wp.int64),
+    intensity: wp.array(dtype=wp.float32),
+    depth: wp.array(dtype=wp.float32),
+    normals: wp.array(dtype=wp.vec3),
+) -> None:
+    """Images of the winning points; small gaps take the farthest neighbour, the rest is 0.
+
+    The depth at a pixel is that of the winner's plane, within a tenth of the winner's own depth.
+    """
     view, v = wp.tid()
     e = view / views_per_env
     R = rotation_of(motions[view])
     t = translation_of(motions[view])
-    for u in range(keys.shape[2]):
-        key = keys[view, v, u]
+    height = camera.height
+    width = camera.width
+    image = view * height * width
+    row = image + v * width
+    y = (float(v) - camera.centre[1]) / camera.focal[1]
+    per_column = 1.0 / camera.focal[0]
+    for u in range(width):
+        key = keys[row + u]
         if key == EMPTY:
-            key = gap_key(keys, view, v, u)
-        if key == EMPTY:
-            intensity[view, v, u] = 0.0
-            depth[view, v, u] = 0.0
-            normals[view, v, u] = wp.vec3(0.0, 0.0, 0.0)
-        else:
+            key = gap_key(keys, image, v, u, height, width)
+        grey = float(0.0)
+        z = float(0.0)
+        n = wp.vec3(0.0, 0.0, 0.0)
+        if key != EMPTY:
             j = int(key & wp.int64(0xFFFFFFFF))
             p = R * points.position[e, j] + t
             n = R * points.normal[e, j]
-            intensity[view, v, u] = points.intensity[e, j]
-            depth[view, v, u] = plane_depth(p, n, float(u), float(v), camera)
-            normals[view, v, u] = n
+            x = (float(u) - camera.centre[0]) * per_column
+            slope = wp.min(n[0] * x + n[1] * y + n[2], -1.0e-6)
+            z = wp.clamp(wp.dot(n, p) / slope, 0.9 * p[2], 1.1 * p[2])
+            grey = points.intensity[e, j]
+        intensity[row + u] = grey
+        depth[row + u] = z
+        normals[row + u] = n
 
 
 @wp.kernel
@@ -160,7 +185,7 @@ def copy_view(
     intensity: wp.array3d(dtype=wp.float32),
     depth: wp.array3d(dtype=wp.float32),
     normals: wp.array3d(dtype=wp.vec3),
-):
+) -> None:
     """Copy the n-th rendered view of every env to its place among the predicted ones."""
     e, v, u = wp.tid()
     view = e * views_per_env + n

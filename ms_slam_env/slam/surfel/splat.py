@@ -1,10 +1,14 @@
 """Kernels that render surfels: cull, z-buffer of discs, average of the front surface, resolve.
 
-Two passes over the visible discs: the first finds the nearest depth of every pixel, the second
+Two passes over the visible discs: the first finds the nearest surface of every pixel, the second
 averages all discs within the depth tolerance behind it (the visibility splatting of Botsch et al.,
-"High-quality surface splatting on today's GPUs", 2005). The depth of a disc at a pixel is that of
-the viewing ray's intersection with its plane. Launches are (envs, workers); the workers of an env
-share its list, so the CPU's single worker keeps everything in registers.
+"High-quality surface splatting on today's GPUs", 2005). The inverse depth of a disc's plane is
+linear in the image, so the depth at a pixel is that of the viewing ray's intersection with the
+plane, at the cost of two multiplications; z-buffers hold inverse depth, 0 where empty.
+
+Launches are (envs, workers): the workers of an env share its list, and the CPU's single worker
+keeps the camera in registers. Image buffers are flat, which saves most of their address
+arithmetic.
 """
 
 from __future__ import annotations
@@ -18,7 +22,66 @@ from ms_slam_env.slam.surfel.surfel_arrays import (
     translation_of,
 )
 
-FAR = wp.constant(1.0e10)
+Sums = wp.types.vector(length=8, dtype=wp.float32)
+"""Weighted sums of a pixel: normal (3), weight, colour (3), depth."""
+
+
+@wp.struct
+class SplatCamera:
+    """Image size, focal lengths (px), principal point (px), and how discs are drawn.
+
+    Attributes:
+        width: columns.
+        height: rows.
+        focal: (fx, fy).
+        centre: (cx, cy).
+        z_near: nearest depth drawn, metres.
+        z_far: farthest depth drawn, metres.
+        tolerance_m: discs this far behind the nearest one belong to the same surface (at 1 m).
+        min_px: smallest drawn radius.
+        max_px: largest drawn radius.
+        max_weight: confidence above which a disc weighs no more.
+    """
+
+    width: int
+    height: int
+    focal: wp.vec2
+    centre: wp.vec2
+    z_near: float
+    z_far: float
+    tolerance_m: float
+    min_px: float
+    max_px: float
+    max_weight: float
+
+
+@wp.struct
+class Disc:
+    """A surfel in the image.
+
+    Attributes:
+        u: column of its centre.
+        v: row of its centre.
+        z: depth of its centre.
+        inverse: inverse depth of its centre.
+        slope_u: change of inverse depth per column.
+        slope_v: change of inverse depth per row.
+        rim: squared radius, square metres.
+        pixel: side of a pixel at its depth, metres (columns, rows).
+        low: first column and row that it may cover.
+        high: last column and row that it may cover.
+    """
+
+    u: float
+    v: float
+    z: float
+    inverse: float
+    slope_u: float
+    slope_v: float
+    rim: float
+    pixel: wp.vec2
+    low: wp.vec2i
+    high: wp.vec2i
 
 
 @wp.kernel
@@ -26,36 +89,34 @@ def cull(
     surfels: Surfels,
     first_env: int,
     poses: wp.array(dtype=wp.mat44),
-    camera: wp.vec4,
-    width: int,
-    height: int,
-    z_near: float,
-    z_far: float,
+    camera: SplatCamera,
     margin_px: float,
     workers: int,
     visible: VisibleList,
-):
+) -> None:
     """List the living surfels in front of the camera, facing it, within its frustum.
 
-    ``camera`` is (fx, fy, cx, cy); ``poses[k]`` is T_world_camera of env ``first_env + k``.
+    ``poses[k]`` is T_world_camera of env ``first_env + k``.
     """
     k, worker = wp.tid()
     b = first_env + k
     R = wp.transpose(rotation_of(poses[k]))
     t = -(R * translation_of(poses[k]))
-    low_u = (-0.5 - margin_px - camera[2]) / camera[0]
-    high_u = (float(width) - 0.5 + margin_px - camera[2]) / camera[0]
-    low_v = (-0.5 - margin_px - camera[3]) / camera[1]
-    high_v = (float(height) - 0.5 + margin_px - camera[3]) / camera[1]
+    low_u = (-0.5 - margin_px - camera.centre[0]) / camera.focal[0]
+    high_u = (float(camera.width) - 0.5 + margin_px - camera.centre[0]) / camera.focal[0]
+    low_v = (-0.5 - margin_px - camera.centre[1]) / camera.focal[1]
+    high_v = (float(camera.height) - 0.5 + margin_px - camera.centre[1]) / camera.focal[1]
+    z_near = camera.z_near
+    z_far = camera.z_far
     forward = wp.vec3(R[2, 0], R[2, 1], R[2, 2])
     for i in range(worker, surfels.count[b], workers):
         world = surfels.position[b, i]
         z = wp.dot(forward, world) + t[2]
-        if z > z_near and z < z_far and surfels.confidence[b, i] > 0.0:
+        if z > z_near and z < z_far:
             p = R * world + t
             if p[0] > low_u * z and p[0] < high_u * z and p[1] > low_v * z and p[1] < high_v * z:
                 n = R * surfels.normal[b, i]
-                if wp.dot(n, p) < 0.0:
+                if wp.dot(n, p) < 0.0 and surfels.confidence[b, i] > 0.0:
                     slot = wp.atomic_add(visible.count, k, 1)
                     visible.index[k, slot] = i
                     visible.position[k, slot] = p
@@ -63,26 +124,52 @@ def cull(
 
 
 @wp.func
-def pixel_box(p: wp.vec3, radius: float, camera: wp.vec4, width: int, height: int):
-    """Pixels (u_low, u_high, v_low, v_high), inclusive, that a ball about p can cover."""
-    scale = 1.0 / p[2]
-    u = camera[0] * p[0] * scale + camera[2]
-    v = camera[1] * p[1] * scale + camera[3]
-    reach_u = radius * camera[0] * scale
-    reach_v = radius * camera[1] * scale
-    return wp.vec4i(
-        wp.max(int(wp.ceil(u - reach_u)), 0),
-        wp.min(int(wp.floor(u + reach_u)), width - 1),
-        wp.max(int(wp.ceil(v - reach_v)), 0),
-        wp.min(int(wp.floor(v + reach_v)), height - 1),
-    )
+def floor_int(x: float) -> int:
+    """Largest integer not above x >= -100; truncation is much faster than ``wp.floor``."""
+    return int(x + 100.0) - 100
 
 
 @wp.func
-def disc_radius(radius: float, z: float, camera: wp.vec4, min_px: float, max_px: float):
-    """Radius in metres, at least and at most so many pixels of this camera."""
-    pixel = z / camera[0]
-    return wp.clamp(radius, min_px * pixel, max_px * pixel)
+def project_disc(p: wp.vec3, n: wp.vec3, radius: float, camera: SplatCamera) -> Disc:
+    """Footprint of a surfel at p (camera frame) with normal n."""
+    disc = Disc()
+    inverse = 1.0 / p[2]
+    pixel = wp.vec2(p[2] / camera.focal[0], p[2] / camera.focal[1])
+    drawn = wp.clamp(radius, camera.min_px * pixel[0], camera.max_px * pixel[0])
+    reach_u = drawn / pixel[0]
+    reach_v = drawn / pixel[1]
+    u = camera.focal[0] * p[0] * inverse + camera.centre[0]
+    v = camera.focal[1] * p[1] * inverse + camera.centre[1]
+    # n . ray = (n . p) / z for rays with z = 1, so the inverse depth is (n / (n . p)) . ray.
+    plane = 1.0 / wp.min(wp.dot(n, p), -1.0e-6)
+    disc.u = u
+    disc.v = v
+    disc.z = p[2]
+    disc.inverse = inverse
+    disc.slope_u = n[0] * plane / camera.focal[0]
+    disc.slope_v = n[1] * plane / camera.focal[1]
+    disc.rim = drawn * drawn
+    disc.pixel = pixel
+    disc.low = wp.vec2i(
+        wp.max(floor_int(u - reach_u) + 1, 0), wp.max(floor_int(v - reach_v) + 1, 0)
+    )
+    disc.high = wp.vec2i(
+        wp.min(floor_int(u + reach_u), camera.width - 1),
+        wp.min(floor_int(v + reach_v), camera.height - 1),
+    )
+    return disc
+
+
+@wp.func
+def squared_offset(disc: Disc, du: float, dv: float, inverse: float) -> float:
+    """Squared distance (m2) from the disc's centre of its plane's point at pixel (u+du, v+dv).
+
+    To first order in the offset: only the disc's rim moves, by less than its perspective.
+    """
+    x = du * disc.pixel[0]
+    y = dv * disc.pixel[1]
+    z = disc.z * disc.z * (inverse - disc.inverse)
+    return x * x + y * y + z * z
 
 
 @wp.kernel
@@ -90,41 +177,30 @@ def splat_depth(
     surfels: Surfels,
     visible: VisibleList,
     first_env: int,
-    camera: wp.vec4,
-    min_px: float,
-    max_px: float,
+    camera: SplatCamera,
     workers: int,
-    behind: wp.array3d(dtype=wp.float32),
-    tolerance_m: float,
-    z_buffer: wp.array3d(dtype=wp.float32),
-):
-    """Nearest disc depth (E, H, W) of every pixel, beyond the layer ``behind`` (0: any depth).
-
-    A depth counts as beyond when it exceeds twice the tolerance.
-    """
+    z_buffer: wp.array(dtype=wp.float32),
+) -> None:
+    """Inverse depth (E * H * W) of the nearest disc at every pixel."""
     k, worker = wp.tid()
     b = first_env + k
-    height = z_buffer.shape[1]
-    width = z_buffer.shape[2]
+    width = camera.width
+    image = k * camera.height * width
     for j in range(worker, visible.count[k], workers):
-        p = visible.position[k, j]
-        n = visible.normal[k, j]
-        radius = disc_radius(surfels.radius[b, visible.index[k, j]], p[2], camera, min_px, max_px)
-        box = pixel_box(p, radius, camera, width, height)
-        plane = wp.dot(n, p)
-        for v in range(box[2], box[3] + 1):
-            for u in range(box[0], box[1] + 1):
-                ray = wp.vec3(
-                    (float(u) - camera[2]) / camera[0], (float(v) - camera[3]) / camera[1], 1.0
-                )
-                slope = wp.dot(n, ray)
-                if slope < 0.0:
-                    z = plane / slope
-                    offset = z * ray - p
-                    if wp.dot(offset, offset) <= radius * radius:
-                        front = behind[k, v, u]
-                        if front == 0.0 or z > front + 2.0 * depth_tolerance(tolerance_m, front):
-                            wp.atomic_min(z_buffer, k, v, u, z)
+        disc = project_disc(
+            visible.position[k, j],
+            visible.normal[k, j],
+            surfels.radius[b, visible.index[k, j]],
+            camera,
+        )
+        for v in range(disc.low[1], disc.high[1] + 1):
+            dv = float(v) - disc.v
+            row = image + v * width
+            for u in range(disc.low[0], disc.high[0] + 1):
+                du = float(u) - disc.u
+                inverse = disc.inverse + du * disc.slope_u + dv * disc.slope_v
+                if squared_offset(disc, du, dv, inverse) <= disc.rim:
+                    wp.atomic_max(z_buffer, row + u, inverse)
 
 
 @wp.kernel
@@ -132,92 +208,111 @@ def splat_attributes(
     surfels: Surfels,
     visible: VisibleList,
     first_env: int,
-    camera: wp.vec4,
-    min_px: float,
-    max_px: float,
-    max_weight: float,
+    camera: SplatCamera,
     workers: int,
-    tolerance_m: float,
-    z_buffer: wp.array3d(dtype=wp.float32),
-    normal_sum: wp.array3d(dtype=wp.vec4),
-    color_sum: wp.array3d(dtype=wp.vec4),
-):
-    """Sum the discs of the front surface: (weight * normal, weight), weight * (colour, depth).
+    z_buffer: wp.array(dtype=wp.float32),
+    sums: wp.array(dtype=Sums),
+) -> None:
+    """Sum the discs of the front surface at every pixel.
 
     The weight is the confidence, at most ``max_weight``, falling off towards the disc's rim.
     """
     k, worker = wp.tid()
     b = first_env + k
-    height = z_buffer.shape[1]
-    width = z_buffer.shape[2]
+    width = camera.width
+    image = k * camera.height * width
     for j in range(worker, visible.count[k], workers):
-        p = visible.position[k, j]
         n = visible.normal[k, j]
         i = visible.index[k, j]
-        radius = disc_radius(surfels.radius[b, i], p[2], camera, min_px, max_px)
-        box = pixel_box(p, radius, camera, width, height)
-        plane = wp.dot(n, p)
+        disc = project_disc(visible.position[k, j], n, surfels.radius[b, i], camera)
         color = surfels.color[b, i]
-        confidence = wp.min(surfels.confidence[b, i], max_weight)
-        for v in range(box[2], box[3] + 1):
-            for u in range(box[0], box[1] + 1):
-                ray = wp.vec3(
-                    (float(u) - camera[2]) / camera[0], (float(v) - camera[3]) / camera[1], 1.0
-                )
-                slope = wp.dot(n, ray)
-                if slope < 0.0:
-                    z = plane / slope
-                    offset = z * ray - p
-                    share = wp.dot(offset, offset) / (radius * radius)
-                    front = z_buffer[k, v, u]
-                    if (
-                        share <= 1.0
-                        and z >= front
-                        and z <= front + depth_tolerance(tolerance_m, front)
-                    ):
-                        w = confidence * (1.05 - share)
-                        wp.atomic_add(normal_sum, k, v, u, wp.vec4(w * n[0], w * n[1], w * n[2], w))
-                        wp.atomic_add(
-                            color_sum,
-                            k,
-                            v,
-                            u,
-                            wp.vec4(w * color[0], w * color[1], w * color[2], w * z),
-                        )
+        confidence = wp.min(surfels.confidence[b, i], camera.max_weight)
+        inverse_rim = 1.0 / disc.rim
+        # Same surface: z < front + tolerance. To first order in inverse depth.
+        reach = depth_tolerance(camera.tolerance_m, disc.z) * disc.inverse * disc.inverse
+        for v in range(disc.low[1], disc.high[1] + 1):
+            dv = float(v) - disc.v
+            row = image + v * width
+            for u in range(disc.low[0], disc.high[0] + 1):
+                du = float(u) - disc.u
+                inverse = disc.inverse + du * disc.slope_u + dv * disc.slope_v
+                share = squared_offset(disc, du, dv, inverse) * inverse_rim
+                if share <= 1.0 and inverse >= z_buffer[row + u] - reach:
+                    w = confidence * (1.05 - share)
+                    wp.atomic_add(
+                        sums,
+                        row + u,
+                        Sums(
+                            w * n[0],
+                            w * n[1],
+                            w * n[2],
+                            w,
+                            w * color[0],
+                            w * color[1],
+                            w * color[2],
+                            w / inverse,
+                        ),
+                    )
+
+
+@wp.kernel
+def list_hidden(
+    visible: VisibleList,
+    camera: SplatCamera,
+    workers: int,
+    z_buffer: wp.array(dtype=wp.float32),
+    hidden: VisibleList,
+) -> None:
+    """List the visible surfels well behind the front surface at their own pixel."""
+    k, worker = wp.tid()
+    image = k * camera.height * camera.width
+    for j in range(worker, visible.count[k], workers):
+        p = visible.position[k, j]
+        u = floor_int(camera.focal[0] * p[0] / p[2] + camera.centre[0] + 0.5)
+        v = floor_int(camera.focal[1] * p[1] / p[2] + camera.centre[1] + 0.5)
+        if u >= 0 and u < camera.width and v >= 0 and v < camera.height:
+            inverse = z_buffer[image + v * camera.width + u]
+            if inverse > 0.0:
+                front = 1.0 / inverse
+                if p[2] > front + 2.0 * depth_tolerance(camera.tolerance_m, front):
+                    slot = wp.atomic_add(hidden.count, k, 1)
+                    hidden.index[k, slot] = visible.index[k, j]
+                    hidden.position[k, slot] = p
+                    hidden.normal[k, slot] = visible.normal[k, j]
 
 
 @wp.func
-def luma(color: wp.vec3):
+def luma(color: wp.vec3) -> float:
     """ITU-R BT.601 luma."""
     return 0.299 * color[0] + 0.587 * color[1] + 0.114 * color[2]
 
 
 @wp.kernel
 def resolve(
-    normal_sum: wp.array3d(dtype=wp.vec4),
-    color_sum: wp.array3d(dtype=wp.vec4),
-    camera: wp.vec4,
-    vertices: wp.array3d(dtype=wp.vec3),
-    normals: wp.array3d(dtype=wp.vec3),
-    intensity: wp.array3d(dtype=wp.float32),
-    color: wp.array3d(dtype=wp.vec3),
-):
+    sums: wp.array(dtype=Sums),
+    camera: SplatCamera,
+    vertices: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    intensity: wp.array(dtype=wp.float32),
+    color: wp.array(dtype=wp.vec3),
+) -> None:
     """Divide the sums by their weights; pixels that no disc covers become 0."""
     k, v = wp.tid()
-    for u in range(vertices.shape[2]):
-        a = normal_sum[k, v, u]
+    row = (k * camera.height + v) * camera.width
+    y = (float(v) - camera.centre[1]) / camera.focal[1]
+    per_column = 1.0 / camera.focal[0]
+    for u in range(camera.width):
+        s = sums[row + u]
         vertex = wp.vec3(0.0, 0.0, 0.0)
         normal = wp.vec3(0.0, 0.0, 0.0)
         mean = wp.vec3(0.0, 0.0, 0.0)
-        if a[3] > 0.0:
-            c = color_sum[k, v, u]
-            z = c[3] / a[3]
-            vertex = wp.vec3(
-                z * (float(u) - camera[2]) / camera[0], z * (float(v) - camera[3]) / camera[1], z
-            )
-            normal = wp.normalize(wp.vec3(a[0], a[1], a[2]))
-            mean = wp.vec3(c[0], c[1], c[2]) / a[3]
-        vertices[k, v, u] = vertex
-        normals[k, v, u] = normal
-        color[k, v, u] = mean
-        intensity[k, v, u] = luma(mean)
+        if s[3] > 0.0:
+            scale = 1.0 / s[3]
+            z = s[7] * scale
+            vertex = wp.vec3(z * (float(u) - camera.centre[0]) * per_column, z * y, z)
+            normal = wp.normalize(wp.vec3(s[0], s[1], s[2]))
+            mean = wp.vec3(s[4], s[5], s[6]) * scale
+        vertices[row + u] = vertex
+        normals[row + u] = normal
+        color[row + u] = mean
+        intensity[row + u] = luma(mean)

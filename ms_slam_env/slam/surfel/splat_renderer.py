@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.surfel.splat import (
-    FAR,
+    SplatCamera,
+    Sums,
     cull,
+    list_hidden,
     resolve,
     splat_attributes,
     splat_depth,
@@ -19,16 +21,7 @@ from ms_slam_env.slam.surfel.types import ModelView
 
 @dataclass(frozen=True)
 class SplatParameters:
-    """How discs are drawn.
-
-    Attributes:
-        tolerance_m: discs this far behind the nearest one are averaged with it (at 1 m).
-        z_near: nearest depth drawn, metres.
-        z_far: farthest depth drawn, metres.
-        min_px: smallest drawn radius of a disc, pixels.
-        max_px: largest drawn radius of a disc, pixels.
-        max_weight: confidence above which a disc weighs no more.
-    """
+    """How discs are drawn; see ``SplatCamera``."""
 
     tolerance_m: float
     z_near: float = 0.05
@@ -38,24 +31,41 @@ class SplatParameters:
     max_weight: float = 20.0
 
 
-def camera_vector(intrinsics: Intrinsics) -> wp.vec4:
-    """(fx, fy, cx, cy) as the kernels take it."""
-    return wp.vec4(intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy)
+def splat_camera(intrinsics: Intrinsics, parameters: SplatParameters) -> SplatCamera:
+    """The camera as the kernels take it."""
+    camera = SplatCamera()
+    camera.width, camera.height = intrinsics.width, intrinsics.height
+    camera.focal = wp.vec2(intrinsics.fx, intrinsics.fy)
+    camera.centre = wp.vec2(intrinsics.cx, intrinsics.cy)
+    camera.z_near, camera.z_far = parameters.z_near, parameters.z_far
+    camera.tolerance_m = parameters.tolerance_m
+    camera.min_px, camera.max_px = parameters.min_px, parameters.max_px
+    camera.max_weight = parameters.max_weight
+    return camera
 
 
 class SplatRenderer:
-    """Renders ``envs`` maps, one pose each, at one image size.
+    """Renders ``envs`` of the maps in ``surfels``, one pose each, at one image size.
+
+    The launches are recorded once: a recorded one costs a fifth of packing its arguments anew.
 
     Args:
+        surfels: the maps.
+        visible: working list of the surfels in view, shared by all renderers of a map.
         envs: number of images rendered at once.
         intrinsics: of the images.
         parameters: how discs are drawn.
         workers: threads per env; 1 on the CPU, where they would run one after the other.
         device: Warp device.
+
+    Attributes:
+        view: the images, overwritten by every call of ``splat``.
     """
 
     def __init__(
         self,
+        surfels: Surfels,
+        visible: VisibleList,
         envs: int,
         intrinsics: Intrinsics,
         parameters: SplatParameters,
@@ -64,18 +74,47 @@ class SplatRenderer:
     ) -> None:
         self.envs = envs
         self.intrinsics = intrinsics
-        self.parameters = parameters
-        self.workers = workers
         self.device = device
-        self._camera = camera_vector(intrinsics)
-        shape = (envs, *intrinsics.shape)
-        self.z_buffer = wp.zeros(shape, dtype=wp.float32, device=device)
-        self._no_layer = wp.zeros(shape, dtype=wp.float32, device=device)
-        self._normal_sum = wp.zeros(shape, dtype=wp.vec4, device=device)
-        self._color_sum = wp.zeros(shape, dtype=wp.vec4, device=device)
+        self.workers = workers
+        self.camera = splat_camera(intrinsics, parameters)
+        self.view = self._new_view()
+        self._visible = visible
+        pixels = envs * intrinsics.width * intrinsics.height
+        self._z_buffer = wp.zeros(pixels, dtype=wp.float32, device=device)
+        self._sums = wp.zeros(pixels, dtype=Sums, device=device)
+        self._cull = wp.launch(
+            cull,
+            dim=(envs, workers),
+            inputs=[
+                surfels,
+                0,
+                wp.zeros(envs, dtype=wp.mat44, device=device),
+                self.camera,
+                0.0,
+                workers,
+                visible,
+            ],
+            device=device,
+            record_cmd=True,
+        )
+        self._splats = {id(visible): self._record_splats(surfels, visible)}
+        self._surfels = surfels
+        self._resolve = wp.launch(
+            resolve,
+            dim=(envs, intrinsics.height),
+            inputs=[
+                self._sums,
+                self.camera,
+                self.view.vertices.flatten(),
+                self.view.normals.flatten(),
+                self.view.intensity.flatten(),
+                self.view.color.flatten(),
+            ],
+            device=device,
+            record_cmd=True,
+        )
 
-    def new_view(self) -> ModelView:
-        """Allocate the images that ``render`` fills."""
+    def _new_view(self) -> ModelView:
         shape = (self.envs, *self.intrinsics.shape)
         return ModelView(
             vertices=wp.zeros(shape, dtype=wp.vec3, device=self.device),
@@ -84,96 +123,47 @@ class SplatRenderer:
             color=wp.zeros(shape, dtype=wp.vec3, device=self.device),
         )
 
-    def cull(
-        self,
-        surfels: Surfels,
-        poses: wp.array,
-        visible: VisibleList,
-        first_env: int = 0,
-        margin_px: float = 1.0,
-    ) -> None:
-        """List in ``visible`` the surfels that the cameras at ``poses`` (envs,) can see."""
-        visible.count.zero_()
-        wp.launch(
-            cull,
-            dim=(self.envs, self.workers),
-            inputs=[
-                surfels,
-                first_env,
-                poses,
-                self._camera,
-                self.intrinsics.width,
-                self.intrinsics.height,
-                self.parameters.z_near,
-                self.parameters.z_far,
-                margin_px,
-                self.workers,
-                visible,
-            ],
-            device=self.device,
-        )
-
-    def splat(
-        self,
-        surfels: Surfels,
-        visible: VisibleList,
-        view: ModelView,
-        first_env: int = 0,
-        behind: wp.array | None = None,
-    ) -> None:
-        """Draw the listed surfels into ``view``, or only the surface behind depth ``behind``."""
-        p = self.parameters
-        z_buffer = self.z_buffer
-        z_buffer.fill_(float(FAR))
-        self._normal_sum.zero_()
-        self._color_sum.zero_()
-        wp.launch(
-            splat_depth,
-            dim=(self.envs, self.workers),
-            inputs=[
-                surfels,
-                visible,
-                first_env,
-                self._camera,
-                p.min_px,
-                p.max_px,
-                self.workers,
-                self._no_layer if behind is None else behind,
-                p.tolerance_m,
-                z_buffer,
-            ],
-            device=self.device,
-        )
-        wp.launch(
+    def _record_splats(self, surfels: Surfels, listed: VisibleList) -> tuple[wp.Launch, wp.Launch]:
+        """The two passes over the surfels of a list."""
+        dim = (self.envs, self.workers)
+        shared = [surfels, listed, 0, self.camera, self.workers, self._z_buffer]
+        depth = wp.launch(splat_depth, dim=dim, inputs=shared, device=self.device, record_cmd=True)
+        attributes = wp.launch(
             splat_attributes,
-            dim=(self.envs, self.workers),
-            inputs=[
-                surfels,
-                visible,
-                first_env,
-                self._camera,
-                p.min_px,
-                p.max_px,
-                p.max_weight,
-                self.workers,
-                p.tolerance_m,
-                z_buffer,
-                self._normal_sum,
-                self._color_sum,
-            ],
+            dim=dim,
+            inputs=[*shared, self._sums],
             device=self.device,
+            record_cmd=True,
         )
+        return depth, attributes
+
+    def cull(self, poses: wp.array, first_env: int = 0, margin_px: float = 1.0) -> None:
+        """List the surfels that the cameras at ``poses`` (envs,) T_world_camera can see."""
+        self._visible.count.zero_()
+        self._cull.set_param_at_index(1, first_env)
+        self._cull.set_param_at_index(2, poses)
+        self._cull.set_param_at_index(4, margin_px)
+        self._cull.launch()
+
+    def splat(self, first_env: int = 0, listed: VisibleList | None = None) -> ModelView:
+        """Draw the surfels that ``cull`` listed, or those of another list."""
+        listed = self._visible if listed is None else listed
+        if id(listed) not in self._splats:
+            self._splats[id(listed)] = self._record_splats(self._surfels, listed)
+        self._z_buffer.zero_()
+        self._sums.zero_()
+        for command in self._splats[id(listed)]:
+            command.set_param_at_index(2, first_env)
+            command.launch()
+        self._resolve.launch()
+        return self.view
+
+    def list_hidden(self, hidden: VisibleList) -> None:
+        """List the culled surfels that lie well behind the surface that ``splat`` just drew."""
+        hidden.count.zero_()
         wp.launch(
-            resolve,
-            dim=(self.envs, self.intrinsics.height),
-            inputs=[
-                self._normal_sum,
-                self._color_sum,
-                self._camera,
-                view.vertices,
-                view.normals,
-                view.intensity,
-                view.color,
-            ],
+            list_hidden,
+            dim=(self.envs, self.workers),
+            inputs=[self._visible, self.camera, self.workers, self._z_buffer, hidden],
             device=self.device,
         )

@@ -20,7 +20,7 @@ from ms_slam_env.slam.surfel.fusion import (
 )
 from ms_slam_env.slam.surfel.prediction import DeviceViews, ViewPredictor
 from ms_slam_env.slam.surfel.removal import gather, list_survivors, put_back
-from ms_slam_env.slam.surfel.splat_renderer import SplatParameters, SplatRenderer, camera_vector
+from ms_slam_env.slam.surfel.splat_renderer import SplatParameters, SplatRenderer
 from ms_slam_env.slam.surfel.surfel_arrays import (
     ATTRIBUTES,
     COUNTERS,
@@ -62,7 +62,6 @@ class SurfelMap:
         self._survivors = wp.zeros((batch, capacity), dtype=wp.int32, device=device)
         self._kept = wp.zeros(batch, dtype=wp.int32, device=device)
         self._covered = wp.zeros((batch, *intrinsics.shape), dtype=wp.int32, device=device)
-        self._camera = camera_vector(intrinsics)
         self._fusion = FusionParameters()
         self._fusion.distance_m = config.fusion_distance_m
         self._fusion.min_cosine = math.cos(math.radians(config.fusion_angle_deg))
@@ -70,9 +69,12 @@ class SurfelMap:
         self._fusion.radius_px = config.surfel_radius_px
         self._fusion.max_confidence = config.max_confidence
         parameters = SplatParameters(tolerance_m=config.fusion_distance_m)
-        self._renderer = SplatRenderer(batch, intrinsics, parameters, self._workers, device)
-        self._view = self._renderer.new_view()
-        self._predictor = ViewPredictor(intrinsics, parameters, self._workers, device)
+        self._renderer = SplatRenderer(
+            self.surfels, self._visible, batch, intrinsics, parameters, self._workers, device
+        )
+        self._predictor = ViewPredictor(
+            self.surfels, self._visible, intrinsics, parameters, self._workers, device
+        )
 
     def clear(self, env: int | None = None) -> None:
         """Forget the map of one env, or of all."""
@@ -100,9 +102,9 @@ class SurfelMap:
             weight: (B,) float32 in (0, 1], lower for a fast camera (Whelan et al., section 3).
             mask: (B,) int32, 0 leaves an env's map as it is.
         """
-        self._renderer.cull(self.surfels, poses, self._visible, margin_px=0.0)
+        self._renderer.cull(poses, margin_px=0.0)
         self._covered.zero_()
-        shared = [poses, self._camera, mask, time, weight, self._fusion, self._workers]
+        shared = [poses, self._renderer.camera, mask, time, weight, self._fusion, self._workers]
         images = [live.vertices, live.normals, live.color, self._covered]
         dim = (self.batch, self._workers)
         wp.launch(
@@ -164,9 +166,8 @@ class SurfelMap:
 
         The images are overwritten by the next call.
         """
-        self._renderer.cull(self.surfels, poses, self._visible)
-        self._renderer.splat(self.surfels, self._visible, self._view)
-        return self._view
+        self._renderer.cull(poses)
+        return self._renderer.splat()
 
     def predict_device(
         self, poses: ArrayLike, scale: float = 1.0, first_env: int = 0
@@ -181,9 +182,7 @@ class SurfelMap:
         Returns:
             Images (E * N, h, w), overwritten by the next call.
         """
-        return self._predictor.predict(
-            self.surfels, self._visible, np.asarray(poses, dtype=np.float64), scale, first_env
-        )
+        return self._predictor.predict(np.asarray(poses, dtype=np.float64), scale, first_env)
 
     def predict(self, poses: ArrayLike, scale: float = 1.0, env: int = 0) -> Views:
         """Predict views (N) of one env's map from ``poses`` (N, 4, 4) T_world_camera."""
