@@ -9,7 +9,7 @@ from ms_slam_env.scenes.builder import MeshBuilder
 from ms_slam_env.scenes.finishes import floor_material, wall_colour
 from ms_slam_env.scenes.furniture import decor, seating, storage, tableware
 from ms_slam_env.scenes.lighting import Light, Lighting, Panel, auto_exposure, light_mesh
-from ms_slam_env.scenes.mesh_scene import MeshScene
+from ms_slam_env.scenes.mesh_scene import MeshScene, free_space_around
 from ms_slam_env.scenes.room import Room
 from ms_slam_env.scenes.textures import masonry
 from ms_slam_env.scenes.textures.noise import hsv
@@ -53,7 +53,7 @@ def corridor(seed: int) -> MeshScene:
         side = d if draw.random() < 0.5 else 0.0
         return eye, np.array([np.clip(eye[0] + ahead, 0.1, w - 0.1), side, draw.uniform(0.7, 1.4)])
 
-    return MeshScene("corridor", seed, mesh, line, start, exposure)
+    return MeshScene("corridor", seed, mesh, free_space_around(mesh, line), start, exposure)
 
 
 def _walls(build: MeshBuilder, rng: np.random.Generator, room: Room, lower, trim) -> None:  # noqa: ANN001

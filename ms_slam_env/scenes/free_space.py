@@ -2,13 +2,43 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from ms_slam_env.scenes.base import Float32, Float64
 
+VOXEL_M = 0.05
 _MAX_CELLS = 6_000_000
+
+
+class ComponentRule(Protocol):
+    """Decides which empty voxels are the free space."""
+
+    def __call__(
+        self, empty: NDArray[np.bool_], origin: Float64, voxel_m: float
+    ) -> NDArray[np.bool_]:
+        """Mask (nx, ny, nz) of the free voxels among the ``empty`` ones."""
+
+
+@dataclass(frozen=True)
+class Holding:
+    """The connected components of empty voxels that hold the points ``inside`` (K, 3)."""
+
+    inside: Float64
+
+    def __call__(
+        self, empty: NDArray[np.bool_], origin: Float64, voxel_m: float
+    ) -> NDArray[np.bool_]:
+        """See ``ComponentRule``."""
+        component, _ = ndimage.label(empty)
+        seeds = np.rint((np.atleast_2d(self.inside) - origin) / voxel_m).astype(int)
+        seeds = np.clip(seeds, 0, np.array(empty.shape) - 1)
+        wanted = np.unique(component[tuple(seeds.T)])
+        return np.isin(component, wanted[wanted > 0])
 
 
 class FreeSpace:
@@ -21,13 +51,12 @@ class FreeSpace:
             voxel is not in the free component.
     """
 
-    def __init__(self, points: Float64, inside: Float64, voxel_m: float = 0.05) -> None:
+    def __init__(self, points: Float64, rule: ComponentRule, voxel_m: float = VOXEL_M) -> None:
         """Build the grid.
 
         Args:
             points: (N, 3) samples of the surface, closer together than ``voxel_m``.
-            inside: (K, 3) points in free space; the connected components of empty voxels that
-                hold them are the free space.
+            rule: which of the empty voxels are the free space.
             voxel_m: edge of a voxel; made larger where the scene is so big that the grid would
                 not fit in memory.
         """
@@ -57,21 +86,14 @@ class FreeSpace:
             (surface[..., k] - np.expand_dims(axes[k], [j for j in range(3) if j != k])) ** 2
             for k in range(3)
         )
-        free = self._component(empty, inside)
+        free = rule(empty, self.origin, self.voxel_m)
         self.distance: Float32 = np.where(free, np.sqrt(square), 0.0).astype(np.float32)
-        nx, ny, nz = shape
+        _, ny, nz = shape
         self._limit = np.array(shape) - 1.001
         corner = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
         self._corner_offset = corner @ np.array([ny * nz, nz, 1])
         self._stride = np.array([ny * nz, nz, 1])
         self._flat = self.distance.ravel()
-
-    def _component(self, empty: NDArray[np.bool_], inside: Float64) -> NDArray[np.bool_]:
-        component, _ = ndimage.label(empty)
-        seeds = np.rint((np.atleast_2d(inside) - self.origin) / self.voxel_m).astype(int)
-        seeds = np.clip(seeds, 0, np.array(empty.shape) - 1)
-        wanted = np.unique(component[tuple(seeds.T)])
-        return np.isin(component, wanted[wanted > 0])
 
     def clearance(self, points: Float64) -> Float64:
         """Distance (N,) from points (N, 3) to the nearest surface, 0 inside objects or outside."""

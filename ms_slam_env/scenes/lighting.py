@@ -168,6 +168,8 @@ def _bounce(g: Geometry, direct: Float32, lighting: Lighting) -> Float32:
     rays = RayCaster(g.vertices, g.faces)
     albedo = mean_albedo(g.textures)[g.face_texture]  # (F, 3)
     leaving = albedo * direct[g.faces].mean(1)
+    # A few rays sample small bright patches of sun badly: limit what one ray can bring.
+    leaving = np.minimum(leaving, 4.0 * leaving.mean(0))
     for name, value in lighting.glow.items():
         if name in g.labels:
             of = g.face_label == g.labels.index(name)

@@ -9,7 +9,7 @@ from ms_slam_env.scenes.builder import MeshBuilder
 from ms_slam_env.scenes.finishes import floor_material, wall_colour, wall_material
 from ms_slam_env.scenes.furniture import decor, electronics, seating, storage, tables, tableware
 from ms_slam_env.scenes.lighting import Lamp, Lighting, Panel, Sun, auto_exposure, light_mesh
-from ms_slam_env.scenes.mesh_scene import MeshScene
+from ms_slam_env.scenes.mesh_scene import MeshScene, free_space_around
 from ms_slam_env.scenes.room import PANE, Room, Window
 from ms_slam_env.scenes.textures import masonry, wood
 
@@ -192,4 +192,6 @@ def _lit(
         target = np.array([*draw.uniform(0.2, [w - 0.2, d - 0.2]), draw.uniform(0.5, 1.1)])
         return eye, target
 
-    return MeshScene("living_room", seed, mesh, centre[None] + [0, 0, 0.3], start, exposure)
+    return MeshScene(
+        "living_room", seed, mesh, free_space_around(mesh, centre + [0, 0, 0.3]), start, exposure
+    )

@@ -8,7 +8,7 @@ import numpy as np
 
 from ms_slam_env.geometry import look_at, so3_exp
 from ms_slam_env.scenes.base import Float64, Int32, Scene, TexturedMesh
-from ms_slam_env.scenes.free_space import FreeSpace
+from ms_slam_env.scenes.free_space import VOXEL_M, FreeSpace, Holding
 from ms_slam_env.scenes.rays import RayCaster
 from ms_slam_env.scenes.sampling import sample_surface
 
@@ -30,19 +30,29 @@ class MeshScene(Scene):
         name: str,
         seed: int,
         mesh: TexturedMesh,
-        inside: Float64,
+        free_space: FreeSpace,
         start_rule: StartRule,
         exposure: float = 1.0,
-        voxel_m: float = 0.05,
+        start_objects: int = 2,
     ) -> None:
-        """Build the free space around the points ``inside`` (K, 3)."""
+        """Put the parts together.
+
+        Args:
+            name: by which ``make`` builds the scene again.
+            seed: likewise.
+            mesh: textured and lit.
+            free_space: of the same mesh.
+            start_rule: candidates of start poses.
+            exposure: see ``Scene``.
+            start_objects: labels that a start pose must have in view.
+        """
         self.name = name
         self.seed = seed
         self.mesh = mesh
         self.exposure = exposure
         self._start_rule = start_rule
-        points, _ = sample_surface(mesh.vertices, mesh.faces, 0.4 * voxel_m)
-        self.free_space = FreeSpace(points, np.asarray(inside, dtype=np.float64), voxel_m)
+        self.free_space = free_space
+        self._start_objects = start_objects
         self._rays = RayCaster(mesh.vertices, mesh.faces)
 
     def clearance(self, points: Float64) -> Float64:
@@ -64,10 +74,10 @@ class MeshScene(Scene):
             T = look_at(eye, target)
             T[:3, :3] = T[:3, :3] @ so3_exp(np.array([0.0, 0.0, rng.normal(0.0, 0.02)]))
             share, objects = self._view_quality(T)
-            if share >= MIN_START_SHARE and objects >= 2:
+            if share >= MIN_START_SHARE and objects >= self._start_objects:
                 return T
-            if share + 0.1 * min(objects, 2) > best_score:
-                best, best_score = T, share + 0.1 * min(objects, 2)
+            if share + 0.1 * min(objects, self._start_objects) > best_score:
+                best, best_score = T, share + 0.1 * min(objects, self._start_objects)
         return best
 
     def _view_quality(self, T_world_camera: Float64) -> tuple[float, int]:
@@ -92,11 +102,14 @@ class MeshScene(Scene):
         visible = self.clearance(points + _FACING_M * normal[face]) > 0.0
         return points[visible], self.mesh.face_label[face[visible]]
 
-    def __getstate__(self) -> dict[str, object]:
-        """Leave the ray caster out: it is rebuilt."""
-        return {key: value for key, value in self.__dict__.items() if key != "_rays"}
+    def __reduce__(self) -> tuple[object, tuple[str, int]]:
+        """Pickle as the recipe: a scene is rebuilt from its name and seed, bit for bit."""
+        from ms_slam_env.scenes.registry import make
 
-    def __setstate__(self, state: dict[str, object]) -> None:
-        """Rebuild the ray caster."""
-        self.__dict__.update(state)
-        self._rays = RayCaster(self.mesh.vertices, self.mesh.faces)
+        return make, (self.name, self.seed)
+
+
+def free_space_around(mesh: TexturedMesh, inside: Float64) -> FreeSpace:
+    """Free space of a closed room that holds the points ``inside`` (K, 3)."""
+    points, _ = sample_surface(mesh.vertices, mesh.faces, 0.4 * VOXEL_M)
+    return FreeSpace(points, Holding(np.asarray(inside, dtype=np.float64)))

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from ms_slam_env.errors import InputError
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.corridor import corridor
 from ms_slam_env.scenes.living_room import living_room
+from ms_slam_env.scenes.mesh_file import from_file
 from ms_slam_env.scenes.tabletop_carpet import carpet
 from ms_slam_env.scenes.tabletop_table import table
 from ms_slam_env.scenes.tabletop_wall import wall
@@ -25,6 +28,9 @@ _MAKERS = {
 SCENES: tuple[str, ...] = tuple(_MAKERS)
 """Names of the procedural scenes; the first is the default."""
 
+MESH_SUFFIXES: tuple[str, ...] = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
+"""File formats of meshes."""
+
 SEED_SPLITS: dict[str, range] = {
     "train": range(0, 1000),
     "validation": range(1000, 1100),
@@ -39,19 +45,27 @@ def split_of(seed: int) -> str | None:
 
 
 def make(name: str | Path = "living_room", seed: int = 0) -> Scene:
-    """Build a scene.
+    """Build a scene; the same name and seed give the same scene, bit for bit.
 
     Args:
-        name: one of ``SCENES``.
-        seed: varies layout, sizes, colours, textures and lights of a procedural scene.
+        name: one of ``SCENES``, or the path of a mesh file (z up, metres).
+        seed: varies layout, sizes, colours, textures and lights of a procedural scene, and the
+            lamps of a mesh file; not negative.
 
     Raises:
-        InputError: an unknown name.
+        InputError: an unknown name, a bad seed, a mesh file that is missing, unreadable, without
+            triangles or without free space.
     """
-    if str(name) in _MAKERS:
-        return _MAKERS[str(name)](seed)
-    valid = ", ".join(SCENES)
+    if not isinstance(seed, (int, np.integer)) or isinstance(seed, bool) or seed < 0:
+        raise InputError(f"scene seed {seed!r} must be an integer >= 0")
+    key = str(name)
+    if key in _MAKERS:
+        return _MAKERS[key](int(seed))
+    path = Path(key)
+    if path.suffix.lower() in MESH_SUFFIXES:
+        return from_file(path, int(seed))
+    formats = ", ".join(MESH_SUFFIXES)
     raise InputError(
-        f"unknown scene {str(name)!r}; valid choices: {valid}, or the path of a mesh file "
-        "(.glb, .obj, .ply)"
+        f"unknown scene {key!r}; valid choices: {', '.join(SCENES)}, or the path of a mesh file "
+        f"({formats})"
     )

@@ -12,7 +12,7 @@ from ms_slam_env.scenes.builder import Material, MeshBuilder
 from ms_slam_env.scenes.finishes import floor_material, wall_colour
 from ms_slam_env.scenes.furniture import decor
 from ms_slam_env.scenes.lighting import Light, Lighting, Panel, auto_exposure, light_mesh
-from ms_slam_env.scenes.mesh_scene import MeshScene, StartRule
+from ms_slam_env.scenes.mesh_scene import MeshScene, StartRule, free_space_around
 from ms_slam_env.scenes.room import Room, Window
 from ms_slam_env.scenes.textures import masonry
 
@@ -73,6 +73,7 @@ def finish(
     target: ArrayLike,
     start: StartRule,
     key: float = 0.2,
+    start_objects: int = 2,
 ) -> MeshScene:
     """Bake the light, expose for what lies around ``target`` (3,), and return the scene."""
     lighting = Lighting(lights, glow, clear)
@@ -81,7 +82,8 @@ def finish(
     exposure = auto_exposure(mesh, focus, key, frozenset(glow))
     w, d, h = setting.room.size
     inside = np.array([[w / 2, d / 2, 0.75 * h]])
-    return MeshScene(name, seed, mesh, inside, start, exposure)
+    free_space = free_space_around(mesh, inside)
+    return MeshScene(name, seed, mesh, free_space, start, exposure, start_objects)
 
 
 def orbit(

@@ -44,5 +44,14 @@ def carpet(seed: int) -> MeshScene:
     )
     glow = {"ceiling lamp": (4.0, 3.8, 3.4)}
     return tabletop.finish(
-        setting, "carpet", seed, (lamp,), glow, frozenset(glow), target, start, key=0.22
+        setting,
+        "carpet",
+        seed,
+        (lamp,),
+        glow,
+        frozenset(glow),
+        target,
+        start,
+        key=0.22,
+        start_objects=1,
     )

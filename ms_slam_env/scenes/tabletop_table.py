@@ -48,26 +48,29 @@ def clutter(build: MeshBuilder, rng: np.random.Generator, width: float, depth: f
     """Put things on the rectangle [-width/2, width/2] x [-depth, 0] at z = 0."""
     with build.frame((rng.uniform(-0.2, 0.2), -0.3 * depth, 0), yaw=rng.uniform(-0.25, 0.25)):
         electronics.laptop(build, rng, "laptop")
-    # The laptop's square is taken: things go to its left, its right and its front.
     makers = {
-        "plate": (tableware.plate, 0.15),
+        "plate": (tableware.plate, 0.14),
         "bowl": (tableware.bowl, 0.15),
-        "book": (partial(tableware.lying_book, thick_m=0.03), 0.16),
-        "cup": (tableware.cup, 0.06),
-        "bottle": (tableware.bottle, 0.05),
-        "pens": (tableware.pen_pot, 0.05),
-        "paper": (tableware.paper, 0.16),
-        "vase": (partial(tableware.vase, height_m=0.22), 0.08),
-        "magazine": (partial(tableware.lying_book, thick_m=0.008), 0.16),
+        "book": (partial(tableware.lying_book, thick_m=0.03), 0.14),
+        "cup": (tableware.cup, 0.05),
+        "bottle": (tableware.bottle, 0.045),
+        "pens": (tableware.pen_pot, 0.045),
+        "paper": (tableware.paper, 0.14),
+        "vase": (partial(tableware.vase, height_m=0.22), 0.07),
+        "magazine": (partial(tableware.lying_book, thick_m=0.008), 0.14),
+        "second cup": (tableware.cup, 0.05),
     }
     names = list(makers)
-    for side in (-1, 1):
-        low, high = sorted((side * 0.28, side * (width / 2 - 0.02)))
+    front = -0.3 * depth - 0.27  # the laptop stands behind this line, in the middle
+    regions = {
+        "left": ((-width / 2, -depth), (-0.2, 0.0)),
+        "right": ((0.2, -depth), (width / 2, 0.0)),
+        "front": ((-0.2, -depth), (0.2, front)),
+    }
+    for side, (low, high) in regions.items():
         order = [names[k] for k in rng.permutation(len(names))]
-        spots = tables.place(
-            rng, (low, -depth + 0.02), (high, -0.02), [makers[n][1] for n in order]
-        )
+        spots = tables.place(rng, low, high, [makers[n][1] for n in order])
         for name, spot in zip(order, spots, strict=True):
             if spot is not None:
                 with build.frame((*spot, 0.0), yaw=rng.uniform(-np.pi, np.pi)):
-                    makers[name][0](build, rng, name=f"{name} {'left' if side < 0 else 'right'}")
+                    makers[name][0](build, rng, name=f"{name} {side}")

@@ -45,5 +45,14 @@ def wall(seed: int) -> MeshScene:
 
     glow = {"ceiling lamp": (4.0, 3.8, 3.4)}
     return tabletop.finish(
-        setting, "wall", seed, (lamp,), glow, frozenset(glow), target, on_wall, key=0.3
+        setting,
+        "wall",
+        seed,
+        (lamp,),
+        glow,
+        frozenset(glow),
+        target,
+        on_wall,
+        key=0.3,
+        start_objects=1,
     )
