@@ -108,14 +108,14 @@ def seed_list(split: str, count: int) -> list[int]:
 
 def run_planner_benchmark(
     config: PlannerBenchmark, out: Path, workers: int | None = None
-) -> tuple[str, int]:
+) -> tuple[str, list[str]]:
     """Run what is missing, then write ``results.json``, ``table.md`` and the figures to ``out``.
 
     Returns:
-        the Markdown table and the number of failed episodes.
+        the Markdown table and the errors of failed episodes.
     """
     rows = run_all(config.specs(), run_episode, out, workers)
-    return write_report(config, rows, out), len(failures(rows))
+    return write_report(config, rows, out), failures(rows)
 
 
 def write_report(config: PlannerBenchmark, rows: Sequence[Row], out: Path) -> str:

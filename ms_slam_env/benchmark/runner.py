@@ -11,8 +11,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +42,7 @@ def run_all(
 
     Rows that an earlier call left in ``out`` are taken from there, except failed ones, which are
     tried again. A row has ``key``, ``spec``, ``result`` (what ``run`` returned, None if it
-    raised), ``error`` (None or the message) and ``elapsed_s``.
+    raised or its process died), ``error`` (None or the message) and ``elapsed_s``.
 
     Args:
         specs: dataclasses; the key of the work is made of all their fields.
@@ -54,7 +53,6 @@ def run_all(
 
     Raises:
         InputError: fewer than one worker, or a file of results that cannot be read.
-        RuntimeError: a process was killed; what was finished is kept.
     """
     workers = available_cores() if workers is None else workers
     if workers < 1:
@@ -93,30 +91,74 @@ def _run_missing(
 ) -> None:
     for name in _ONE_THREAD:  # inherited by the workers, which read it at import
         os.environ.setdefault(name, "1")
-    pool = ProcessPoolExecutor(
-        min(workers, len(todo)),
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=_prepare_worker,
-    )
+    waiting = list(todo.items())[::-1]
+    busy = {}
     try:
-        futures: list[Future[Row]] = [
-            pool.submit(_run_one, run, key, spec) for key, spec in todo.items()
-        ]
-        for future in as_completed(futures):
-            finish(future.result())
-    except BrokenProcessPool as error:
-        raise RuntimeError(
-            "a worker process was killed (out of memory?); finished work is kept, "
-            "the same command goes on from there"
-        ) from error
+        for _ in range(min(workers, len(waiting))):
+            worker = _Worker(run)
+            busy[worker.pipe] = worker
+            worker.give(*waiting.pop())
+        while busy:
+            answered = wait(list(busy))
+            for pipe in [pipe for pipe in busy if pipe in answered]:
+                worker = busy.pop(pipe)
+                finish(worker.take())
+                if not worker.alive:
+                    worker = _Worker(run)
+                if waiting:
+                    busy[worker.pipe] = worker
+                    worker.give(*waiting.pop())
+                else:
+                    worker.stop()
     finally:
-        # What runs at this moment is lost and done again by the next call.
-        processes = list((pool._processes or {}).values())
-        pool.shutdown(wait=False, cancel_futures=True)
-        for process in processes:
-            process.terminate()
-        for process in processes:
-            process.join()
+        # After an interrupt, what runs at this moment is lost and done again by the next call.
+        for worker in busy.values():
+            worker.stop()
+
+
+class _Worker:
+    """A process that runs one spec after another; its death costs only the spec in its hands."""
+
+    def __init__(self, run: Callable[[Any], dict[str, Any]]) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.pipe, theirs = context.Pipe()
+        self._process = context.Process(target=_serve, args=(theirs, run), daemon=True)
+        self._process.start()
+        theirs.close()  # so that reading ends when the process does
+        self.alive = True
+
+    def give(self, key: str, spec: Any) -> None:
+        """Let the process run a spec."""
+        self._key, self._spec, self._start = key, spec, time.perf_counter()
+        self.pipe.send((key, spec))
+
+    def take(self) -> Row:
+        """Its row; a row with an error if the process died on it."""
+        try:
+            return self.pipe.recv()
+        except (EOFError, ConnectionResetError):
+            self.alive = False
+            self._process.join()
+            row = _empty_row(self._key, self._spec)
+            row["error"] = f"the process died, exit code {self._process.exitcode}"
+            row["elapsed_s"] = round(time.perf_counter() - self._start, 3)
+            return row
+
+    def stop(self) -> None:
+        """End the process."""
+        self._process.terminate()
+        self._process.join()
+        self.pipe.close()
+
+
+def _serve(pipe: Connection, run: Callable[[Any], dict[str, Any]]) -> None:
+    _prepare_worker()
+    while True:
+        try:
+            key, spec = pipe.recv()
+        except EOFError:
+            return
+        pipe.send(_run_one(run, key, spec))
 
 
 def _prepare_worker() -> None:
@@ -134,7 +176,7 @@ def _prepare_worker() -> None:
 
 def _run_one(run: Callable[[Any], dict[str, Any]], key: str, spec: Any) -> Row:
     start = time.perf_counter()
-    row: Row = {"key": key, "spec": dataclasses.asdict(spec), "result": None, "error": None}
+    row = _empty_row(key, spec)
     try:
         row["result"] = run(spec)
     except Exception as error:
@@ -142,3 +184,7 @@ def _run_one(run: Callable[[Any], dict[str, Any]], key: str, spec: Any) -> Row:
         row["traceback"] = traceback.format_exc()
     row["elapsed_s"] = round(time.perf_counter() - start, 3)
     return row
+
+
+def _empty_row(key: str, spec: Any) -> Row:
+    return {"key": key, "spec": dataclasses.asdict(spec), "result": None, "error": None}

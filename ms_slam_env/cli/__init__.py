@@ -6,8 +6,6 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
-from ms_slam_env.errors import InputError
-
 COMMANDS = {
     "benchmark": "run planners on scenes with SLAM in the loop and compare them",
     "evaluate": "compare an estimated trajectory with the truth (TUM files)",
@@ -28,17 +26,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     command, *rest = arguments
     if command not in COMMANDS:
-        return _refuse(f"unknown command {command!r}; valid choices: {', '.join(COMMANDS)}")
-    try:
-        return int(import_module(f"ms_slam_env.cli.{command}").main(rest))
-    except InputError as error:
-        return _refuse(str(error))
-    except RuntimeError as error:
-        print(f"ms-slam: error: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("ms-slam: interrupted; finished work is kept", file=sys.stderr)
-        return 130
+        valid = ", ".join(COMMANDS)
+        print(
+            f"ms-slam: error: unknown command {command!r}; valid choices: {valid}", file=sys.stderr
+        )
+        return 2
+    from ms_slam_env.benchmark.command_line import exit_code
+
+    return exit_code(lambda: import_module(f"ms_slam_env.cli.{command}").main(rest))
 
 
 def _usage() -> str:
@@ -51,8 +46,3 @@ def _usage() -> str:
             *lines,
         ]
     )
-
-
-def _refuse(message: str) -> int:
-    print(f"ms-slam: error: {message}", file=sys.stderr)
-    return 2

@@ -10,6 +10,7 @@ from typing import Annotated
 
 import tyro
 
+from ms_slam_env.benchmark.command_line import parse, report_failures
 from ms_slam_env.benchmark.episode import DEFAULT_STEP_DEG, DEFAULT_STEP_M
 from ms_slam_env.benchmark.planner_benchmark import (
     DEFAULT_PLANNERS,
@@ -17,7 +18,6 @@ from ms_slam_env.benchmark.planner_benchmark import (
     PlannerBenchmark,
     run_planner_benchmark,
 )
-from ms_slam_env.cli.parsing import parse
 
 
 @dataclass(frozen=True)
@@ -65,6 +65,4 @@ def main(arguments: Sequence[str]) -> int:
     table, failed = run_planner_benchmark(config, args.out, args.workers)
     print(table)
     print(f"written: {args.out}/results.json, table.md and figures", file=sys.stderr)
-    if failed:
-        print(f"ms-slam: error: {failed} episodes failed", file=sys.stderr)
-    return 1 if failed else 0
+    return report_failures(failed)

@@ -60,13 +60,10 @@ def test_failures_are_rows_and_are_tried_again(tmp_path: Path) -> None:
     assert [line["spec"]["number"] for line in lines].count(2) == 1
 
 
-def test_a_killed_worker_is_reported_and_the_rest_kept(tmp_path: Path) -> None:
-    specs = [Square(1), Square(1313)]
-    with pytest.raises(RuntimeError, match="finished work is kept"):
-        run_all(specs, square, tmp_path, workers=1)
-    assert [row["result"]["square"] for row in RecordFile(tmp_path / RECORDS).load().values()] == [
-        1
-    ]
+def test_a_worker_that_dies_costs_only_its_own_work(tmp_path: Path) -> None:
+    rows = run_all([Square(1), Square(1313), Square(2)], square, tmp_path, workers=1)
+    assert rows[1]["error"] == "the process died, exit code 3"
+    assert [rows[i]["result"]["square"] for i in (0, 2)] == [1, 4]
 
 
 @pytest.mark.parametrize("workers", [0, -1])
