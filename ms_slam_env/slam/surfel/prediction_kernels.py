@@ -93,10 +93,11 @@ def scatter_points(
             eu = 1.0 - du
             ev = 1.0 - dv
             key = (wp.int64(int(z * DEPTH_BINS_PER_M)) << wp.int64(40)) + wp.int64(j)
-            left_in = u0 >= 0
+            # the division may round up to the border itself: u0 = width or v0 = height
+            left_in = u0 >= 0 and u0 < width
             right_in = u0 + 1 < width
             pixel = image + v0 * width + u0
-            if v0 >= 0:
+            if v0 >= 0 and v0 < height:
                 if left_in:
                     off = wp.int64(int((du * du + dv * dv) * 127.0)) << wp.int64(32)
                     wp.atomic_min(keys, pixel, key + off)
