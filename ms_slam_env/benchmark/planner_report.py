@@ -32,6 +32,7 @@ COLUMNS = (
     Column("f_score_5cm", "F-score 5 cm %", 100),
     Column("f_score_2cm", "F-score 2 cm %", 100),
     Column("rcm", "RCM %", 100),
+    Column("mapped_area_m2", "mapped m²"),
     Column("rer_m", "RER mm", 1000),
     Column("ate_m", "ATE mm", 1000),
     Column("ate_max_m", "ATE max mm", 1000),

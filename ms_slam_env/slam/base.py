@@ -83,6 +83,13 @@ class SlamBackend(ABC):
     def surface_colors(self) -> NDArray[np.uint8]:
         """Colours (M, 3) RGB of ``surface_points``, in the same order."""
 
+    def map_points(self) -> Float64:
+        """Every point (M, 3) of the map, metres: also those that later frames must confirm.
+
+        A backend that confirms nothing has no others than ``surface_points``.
+        """
+        return self.surface_points()
+
     @abstractmethod
     def get_state(self) -> dict[str, Any]:
         """Everything needed to go on bit-exactly, as NumPy arrays and plain values."""

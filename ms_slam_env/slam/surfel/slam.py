@@ -219,6 +219,10 @@ class SurfelSlam(SlamBackend):
         """Stable surfels (M, 3); those of every age while none is stable yet."""
         return self.map.points(stable=self._any_stable())
 
+    def map_points(self) -> Float64:
+        """Surfels of every age (M, 3)."""
+        return self.map.points(stable=False)
+
     def surface_colors(self) -> NDArray[np.uint8]:
         """Colours (M, 3) RGB of ``surface_points``."""
         return self.map.colors(stable=self._any_stable())
