@@ -84,22 +84,21 @@ def accumulate(
     t_inverse = -(R_inverse * wp.vec3(float(T[0, 3]), float(T[1, 3]), float(T[2, 3])))
     u_limit = float(width - 1)
     v_limit = float(height - 1)
-    h0 = wp.spatial_vector()
-    h1 = wp.spatial_vector()
-    h2 = wp.spatial_vector()
-    h3 = wp.spatial_vector()
-    h4 = wp.spatial_vector()
-    h5 = wp.spatial_vector()
-    gradient = wp.spatial_vector()
-    cost = float(0.0)
-    points = float(0.0)
-    visible = float(0.0)
-    matched = float(0.0)
-    inliers = float(0.0)
-    squared = float(0.0)
-    textured = float(0.0)
-    alike = float(0.0)
-    apart = float(0.0)
+    zero = wp.mat33(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    H_tt = wp.mat33(zero)  # blocks of H: translation, translation-rotation, rotation
+    H_tr = wp.mat33(zero)
+    H_rr = wp.mat33(zero)
+    g_t = wp.vec3(0.0, 0.0, 0.0)
+    g_r = wp.vec3(0.0, 0.0, 0.0)
+    cost = wp.float32(0.0)
+    points = wp.float32(0.0)
+    visible = wp.float32(0.0)
+    matched = wp.float32(0.0)
+    inliers = wp.float32(0.0)
+    squared = wp.float32(0.0)
+    textured = wp.float32(0.0)
+    alike = wp.float32(0.0)
+    apart = wp.float32(0.0)
     v = row_index * stride
     # Neighbouring rows sample different columns, like a chessboard.
     start = piece * columns + (row_index % 2) * (stride // 2)
@@ -142,15 +141,13 @@ def accumulate(
                     inliers += 1.0
                     squared += residual * residual
                 turn = wp.cross(live, n)
-                jacobian = wp.spatial_vector(n, turn)
-                scaled = (weights.icp * robust * per_sigma * per_sigma) * jacobian
-                h0 += scaled * jacobian[0]
-                h1 += scaled * jacobian[1]
-                h2 += scaled * jacobian[2]
-                h3 += scaled * jacobian[3]
-                h4 += scaled * jacobian[4]
-                h5 += scaled * jacobian[5]
-                gradient += scaled * residual
+                weight = weights.icp * robust * per_sigma * per_sigma
+                scaled = weight * n
+                H_tt += wp.outer(scaled, n)
+                H_tr += wp.outer(scaled, turn)
+                H_rr += wp.outer(weight * turn, turn)
+                g_t += residual * scaled
+                g_r += (weight * residual) * turn
             else:
                 cost += 1.0
         else:
@@ -174,28 +171,22 @@ def accumulate(
             gy = seen[2] * focal[1] * per_z
             g = -wp.vec3(gx, gy, -(gx * q[0] + gy * q[1]) * per_z)
             turn = wp.cross(q, g)
-            jacobian = wp.spatial_vector(g, turn)
-            scaled = (weights.rgb * robust) * jacobian
-            h0 += scaled * jacobian[0]
-            h1 += scaled * jacobian[1]
-            h2 += scaled * jacobian[2]
-            h3 += scaled * jacobian[3]
-            h4 += scaled * jacobian[4]
-            h5 += scaled * jacobian[5]
-            gradient += scaled * residual
+            weight = weights.rgb * robust
+            scaled = weight * g
+            H_tt += wp.outer(scaled, g)
+            H_tr += wp.outer(scaled, turn)
+            H_rr += wp.outer(weight * turn, turn)
+            g_t += residual * scaled
+            g_r += (weight * residual) * turn
     slot = row_index * ((width + columns - 1) // columns) + piece
-    for j in range(6):
-        partial[b, k, slot, j] = h0[j]
-        partial[b, k, slot, 21 + j] = gradient[j]
-    for j in range(1, 6):
-        partial[b, k, slot, 5 + j] = h1[j]
-    for j in range(2, 6):
-        partial[b, k, slot, 9 + j] = h2[j]
-    for j in range(3, 6):
-        partial[b, k, slot, 12 + j] = h3[j]
-    for j in range(4, 6):
-        partial[b, k, slot, 14 + j] = h4[j]
-    partial[b, k, slot, 20] = h5[5]
+    for i in range(3):
+        for j in range(3):
+            if j >= i:  # upper triangle by rows of six, five, four, ...
+                partial[b, k, slot, i * (11 - i) / 2 + j] = H_tt[i, j]
+                partial[b, k, slot, (i + 3) * (8 - i) / 2 + j + 3] = H_rr[i, j]
+            partial[b, k, slot, i * (11 - i) / 2 + j + 3] = H_tr[i, j]
+        partial[b, k, slot, 21 + i] = g_t[i]
+        partial[b, k, slot, 24 + i] = g_r[i]
     partial[b, k, slot, 27] = cost
     partial[b, k, slot, 28] = points
     partial[b, k, slot, 29] = visible

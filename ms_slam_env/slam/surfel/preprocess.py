@@ -1,11 +1,13 @@
 """From sensor images to filtered depth, vertices, normals and intensity, for B envs at once.
 
 ElasticFusion (Whelan et al., RSS 2015) section III: depth is filtered bilaterally. Here the
-filter works on inverse depth, because the inverse depth of a plane is linear in the image (so a
+filter runs along columns, then rows (Pham and van Vliet, ICME 2005), and on inverse depth, because the inverse depth of a plane is linear in the image (so a
 symmetric window keeps planes) and the noise of a structured-light sensor is uniform in it.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,124 +19,144 @@ from ms_slam_env.slam.surfel.types import LiveFrame
 
 
 @wp.kernel
-def _filter_depth(
+def _convert(
     raw_depth: wp.array3d(dtype=wp.float32),
     raw_color: wp.array4d(dtype=wp.uint8),
-    spatial_weights: wp.array2d(dtype=wp.float32),
     cutoff_m: wp.float32,
-    range_cutoff: wp.float32,  # per metre; differences of inverse depth beyond it weigh nothing
-    radius: wp.int32,
-    focal: wp.vec2,
-    centre: wp.vec2,
-    depth: wp.array3d(dtype=wp.float32),
-    vertices: wp.array3d(dtype=wp.vec3),
+    columns: wp.int32,  # per thread
+    inverse_depth: wp.array3d(dtype=wp.float32),
     color: wp.array3d(dtype=wp.vec3),
     intensity: wp.array3d(dtype=wp.float32),
 ):
-    b, v, u = wp.tid()
-    height = raw_depth.shape[1]
-    width = raw_depth.shape[2]
-    rgb = wp.vec3(
-        wp.float32(raw_color[b, v, u, 0]),
-        wp.float32(raw_color[b, v, u, 1]),
-        wp.float32(raw_color[b, v, u, 2]),
-    )
-    color[b, v, u] = rgb
-    intensity[b, v, u] = 0.299 * rgb[0] + 0.587 * rgb[1] + 0.114 * rgb[2]
-    z = raw_depth[b, v, u]
-    if z <= 0.0 or z > cutoff_m:
-        depth[b, v, u] = 0.0
-        vertices[b, v, u] = wp.vec3(0.0, 0.0, 0.0)
-        return
-    inverse = 1.0 / z
-    scale = 1.0 / (range_cutoff * range_cutoff)
-    weight_sum = float(0.0)
-    difference_sum = float(0.0)
-    for row in range(wp.max(v - radius, 0), wp.min(v + radius + 1, height)):
-        for column in range(wp.max(u - radius, 0), wp.min(u + radius + 1, width)):
-            z_near = raw_depth[b, row, column]
-            if z_near > 0.0 and z_near <= cutoff_m:
-                difference = 1.0 / z_near - inverse
-                # Tukey's bisquare has the curvature of the Gaussian at 0 and needs no exp().
-                closeness = 1.0 - difference * difference * scale
-                if closeness > 0.0:
-                    weight = (
-                        spatial_weights[row - v + radius, column - u + radius]
-                        * closeness
-                        * closeness
-                    )
-                    weight_sum += weight
-                    difference_sum += weight * difference
-    filtered = 1.0 / (inverse + difference_sum / weight_sum)
-    depth[b, v, u] = filtered
-    vertices[b, v, u] = wp.vec3(
-        (float(u) - centre[0]) / focal[0] * filtered,
-        (float(v) - centre[1]) / focal[1] * filtered,
-        filtered,
-    )
-
-
-@wp.func
-def _slope(before: float, here: float, after: float, step: float, largest: float):
-    """Derivative of inverse depth from valid neighbours; (slope, 1) or (0, 0) without any.
-
-    Inputs are depths, 0 where invalid. A side that jumps by more than ``largest`` is an edge.
-    """
-    total = float(0.0)
-    count = float(0.0)
-    if after > 0.0:
-        forward = 1.0 / after - 1.0 / here
-        if wp.abs(forward) <= largest:
-            total += forward
-            count += 1.0
-    if before > 0.0:
-        backward = 1.0 / here - 1.0 / before
-        if wp.abs(backward) <= largest:
-            total += backward
-            count += 1.0
-    if count == 0.0:
-        return wp.vec2(0.0, 0.0)
-    return wp.vec2(total / (count * step), 1.0)
+    """Inverse depth (0 for no reading or one beyond the cutoff), colour and its BT.601 luma."""
+    b, v, piece = wp.tid()
+    for u in range(piece * columns, wp.min((piece + 1) * columns, raw_depth.shape[2])):
+        z = raw_depth[b, v, u]
+        inverse = wp.float32(0.0)
+        if z > 0.0 and z <= cutoff_m:
+            inverse = 1.0 / z
+        inverse_depth[b, v, u] = inverse
+        red = wp.float32(raw_color[b, v, u, 0])
+        green = wp.float32(raw_color[b, v, u, 1])
+        blue = wp.float32(raw_color[b, v, u, 2])
+        color[b, v, u] = wp.vec3(red, green, blue)
+        intensity[b, v, u] = 0.299 * red + 0.587 * green + 0.114 * blue
 
 
 @wp.kernel
-def _normals_from_depth(
-    depth: wp.array3d(dtype=wp.float32),
+def _filter(
+    inverse_depth: wp.array3d(dtype=wp.float32),
+    spatial_weights: wp.array(dtype=wp.float32),  # (radius + 1,)
+    per_cutoff_squared: wp.float32,  # 1 / (difference of inverse depth that weighs nothing)^2
+    along_rows: wp.int32,
+    columns: wp.int32,
+    filtered: wp.array3d(dtype=wp.float32),
+):
+    """Bilateral filter along the rows or the columns of the image."""
+    b, v, piece = wp.tid()
+    height = inverse_depth.shape[1]
+    width = inverse_depth.shape[2]
+    radius = spatial_weights.shape[0] - 1
+    for u in range(piece * columns, wp.min((piece + 1) * columns, width)):
+        centre = inverse_depth[b, v, u]
+        if centre == 0.0:
+            filtered[b, v, u] = 0.0
+            continue
+        here = v
+        size = height
+        if along_rows != 0:
+            here = u
+            size = width
+        weight_sum = spatial_weights[0]
+        difference_sum = wp.float32(0.0)
+        for offset in range(wp.max(-radius, -here), wp.min(radius, size - 1 - here) + 1):
+            near = wp.float32(0.0)
+            if along_rows != 0:
+                near = inverse_depth[b, v, u + offset]
+            else:
+                near = inverse_depth[b, v + offset, u]
+            if near > 0.0 and offset != 0:
+                difference = near - centre
+                # Tukey's bisquare has the curvature of the Gaussian at 0 and needs no exp().
+                closeness = 1.0 - difference * difference * per_cutoff_squared
+                if closeness > 0.0:
+                    weight = spatial_weights[wp.abs(offset)] * closeness * closeness
+                    weight_sum += weight
+                    difference_sum += weight * difference
+        filtered[b, v, u] = centre + difference_sum / weight_sum
+
+
+@wp.func
+def _slope(before: float, here: float, after: float, largest: float):
+    """Difference per step of inverse depth to valid neighbours; (slope, 1), or (0, 0) if none.
+
+    Inputs are inverse depths, 0 where invalid. A side that jumps by more than ``largest`` is an
+    edge.
+    """
+    total = wp.float32(0.0)
+    count = wp.float32(0.0)
+    if after > 0.0 and wp.abs(after - here) <= largest:
+        total += after - here
+        count += 1.0
+    if before > 0.0 and wp.abs(here - before) <= largest:
+        total += here - before
+        count += 1.0
+    if count == 0.0:
+        return wp.vec2(0.0, 0.0)
+    return wp.vec2(total / count, 1.0)
+
+
+@wp.kernel
+def _surface(
+    inverse_depth: wp.array3d(dtype=wp.float32),
     step: wp.int32,
     largest: wp.float32,
     focal: wp.vec2,
     centre: wp.vec2,
+    columns: wp.int32,
+    depth: wp.array3d(dtype=wp.float32),
+    vertices: wp.array3d(dtype=wp.vec3),
     normals: wp.array3d(dtype=wp.vec3),
 ):
-    b, v, u = wp.tid()
-    height = depth.shape[1]
-    width = depth.shape[2]
-    z = depth[b, v, u]
-    normal = wp.vec3(0.0, 0.0, 0.0)
-    if z > 0.0:
-        left = float(0.0)
-        right = float(0.0)
-        above = float(0.0)
-        below = float(0.0)
+    """Depth, vertices and normals of filtered inverse depth."""
+    b, v, piece = wp.tid()
+    height = inverse_depth.shape[1]
+    width = inverse_depth.shape[2]
+    for u in range(piece * columns, wp.min((piece + 1) * columns, width)):
+        inverse = inverse_depth[b, v, u]
+        if inverse == 0.0:
+            depth[b, v, u] = 0.0
+            vertices[b, v, u] = wp.vec3(0.0, 0.0, 0.0)
+            normals[b, v, u] = wp.vec3(0.0, 0.0, 0.0)
+            continue
+        z = 1.0 / inverse
+        ray = wp.vec3(
+            (wp.float32(u) - centre[0]) / focal[0], (wp.float32(v) - centre[1]) / focal[1], 1.0
+        )
+        depth[b, v, u] = z
+        vertices[b, v, u] = z * ray
+        left = wp.float32(0.0)
+        right = wp.float32(0.0)
+        above = wp.float32(0.0)
+        below = wp.float32(0.0)
         if u >= step:
-            left = depth[b, v, u - step]
+            left = inverse_depth[b, v, u - step]
         if u + step < width:
-            right = depth[b, v, u + step]
+            right = inverse_depth[b, v, u + step]
         if v >= step:
-            above = depth[b, v - step, u]
+            above = inverse_depth[b, v - step, u]
         if v + step < height:
-            below = depth[b, v + step, u]
-        slope_u = _slope(left, z, right, float(step), largest)
-        slope_v = _slope(above, z, below, float(step), largest)
+            below = inverse_depth[b, v + step, u]
+        slope_u = _slope(left, inverse, right, largest)
+        slope_v = _slope(above, inverse, below, largest)
+        normal = wp.vec3(0.0, 0.0, 0.0)
         if slope_u[1] > 0.0 and slope_v[1] > 0.0:
-            # n . (x', y', 1) = d / z on a plane n . p = d, with x' = (u - cx) / fx: the gradient
-            # of inverse depth in normalised coordinates is the normal up to scale.
-            a = slope_u[0] * focal[0]
-            c = slope_v[0] * focal[1]
-            rest = 1.0 / z - a * (float(u) - centre[0]) / focal[0]
-            rest -= c * (float(v) - centre[1]) / focal[1]
-            normal = -wp.normalize(wp.vec3(a, c, rest))
-    normals[b, v, u] = normal
+            # On a plane n . p = d, inverse depth is n . ray / d, linear in the ray's x and y:
+            # its gradient there, and its value at ray (0, 0, 1), are the normal up to scale.
+            a = slope_u[0] * focal[0] / wp.float32(step)
+            c = slope_v[0] * focal[1] / wp.float32(step)
+            normal = -wp.normalize(wp.vec3(a, c, inverse - a * ray[0] - c * ray[1]))
+        normals[b, v, u] = normal
 
 
 class Preprocessor:
@@ -149,6 +171,7 @@ class Preprocessor:
         self.device = device
         shape = (batch, *intrinsics.shape)
         self._raw_color = wp.zeros((*shape, 3), dtype=wp.uint8, device=device)
+        self._inverse_depth = wp.zeros(shape, dtype=wp.float32, device=device)
         self.frame = LiveFrame(
             raw_depth=wp.zeros(shape, dtype=wp.float32, device=device),
             depth=wp.zeros(shape, dtype=wp.float32, device=device),
@@ -157,13 +180,15 @@ class Preprocessor:
             color=wp.zeros(shape, dtype=wp.vec3, device=device),
             intensity=wp.zeros(shape, dtype=wp.float32, device=device),
         )
-        radius = config.bilateral_radius_px
-        offsets = np.arange(-radius, radius + 1, dtype=np.float32)
-        squared = offsets[:, None] ** 2 + offsets[None, :] ** 2
-        weights = np.exp(-squared / (2 * config.bilateral_sigma_px**2)).astype(np.float32)
+        self._filtered = [wp.zeros_like(self._inverse_depth) for _ in range(2)]
+        offsets = np.arange(config.bilateral_radius_px + 1, dtype=np.float32)
+        weights = np.exp(-(offsets**2) / (2 * config.bilateral_sigma_px**2))
         self._spatial_weights = wp.array(weights, dtype=wp.float32, device=device)
         # A finer image has noisier slopes over one pixel; keep the baseline of 160 columns.
         self._normal_step = max(1, intrinsics.width // 160)
+        # The CPU runs one thread after another: whole rows. A GPU wants many threads.
+        self._columns = 1 if wp.get_device(device).is_cuda else intrinsics.width
+        self._dim = (batch, intrinsics.height, -(-intrinsics.width // self._columns))
 
     def __call__(self, color: NDArray[np.uint8], depth: NDArray[np.float32]) -> LiveFrame:
         """Preprocess colour (B, H, W, 3) uint8 and depth (B, H, W) float32 m into one LiveFrame.
@@ -173,34 +198,28 @@ class Preprocessor:
         frame, config, camera = self.frame, self.config, self.intrinsics
         self._raw_color.assign(color)
         frame.raw_depth.assign(depth)
-        focal, centre = wp.vec2(camera.fx, camera.fy), wp.vec2(camera.cx, camera.cy)
-        wp.launch(
-            _filter_depth,
-            dim=frame.depth.shape,
-            inputs=[
-                frame.raw_depth,
-                self._raw_color,
-                self._spatial_weights,
-                config.depth_cutoff_m,
-                2.0 * config.bilateral_sigma_m,
-                config.bilateral_radius_px,
-                focal,
-                centre,
-            ],
-            outputs=[frame.depth, frame.vertices, frame.color, frame.intensity],
-            device=self.device,
+        self._launch(
+            _convert,
+            [frame.raw_depth, self._raw_color, config.depth_cutoff_m, self._columns],
+            [self._inverse_depth, frame.color, frame.intensity],
         )
-        wp.launch(
-            _normals_from_depth,
-            dim=frame.depth.shape,
-            inputs=[
-                frame.depth,
-                self._normal_step,
-                config.normal_edge_per_m * self._normal_step * 160 / camera.width,
-                focal,
-                centre,
-            ],
-            outputs=[frame.normals],
-            device=self.device,
+        per_cutoff_squared = 1.0 / (2.0 * config.bilateral_sigma_m) ** 2
+        source = self._inverse_depth
+        for along_rows, target in enumerate(self._filtered):
+            self._launch(
+                _filter,
+                [source, self._spatial_weights, per_cutoff_squared, along_rows, self._columns],
+                [target],
+            )
+            source = target
+        edge = config.normal_edge_per_m * self._normal_step * 160 / camera.width
+        focal, centre = wp.vec2(camera.fx, camera.fy), wp.vec2(camera.cx, camera.cy)
+        self._launch(
+            _surface,
+            [source, self._normal_step, edge, focal, centre, self._columns],
+            [frame.depth, frame.vertices, frame.normals],
         )
         return frame
+
+    def _launch(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
+        wp.launch(kernel, dim=self._dim, inputs=inputs, outputs=outputs, device=self.device)

@@ -25,7 +25,7 @@ def _downsample(
     coarse_intensity: wp.array3d(dtype=wp.float32),
 ):
     b, v, u = wp.tid()
-    front = float(1.0e9)
+    front = wp.float32(1.0e9)
     for row in range(2 * v, 2 * v + 2):
         for column in range(2 * u, 2 * u + 2):
             z = vertices[b, row, column][2]
@@ -34,9 +34,9 @@ def _downsample(
     limit = front * (1.0 + edge_fraction)
     vertex = wp.vec3(0.0, 0.0, 0.0)
     normal = wp.vec3(0.0, 0.0, 0.0)
-    grey = float(0.0)
-    count = float(0.0)
-    grey_any = float(0.0)
+    grey = wp.float32(0.0)
+    count = wp.float32(0.0)
+    grey_any = wp.float32(0.0)
     for row in range(2 * v, 2 * v + 2):
         for column in range(2 * u, 2 * u + 2):
             p = vertices[b, row, column]

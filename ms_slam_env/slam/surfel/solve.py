@@ -35,7 +35,7 @@ def reduce_sums(
 def load_hessian(sums: wp.array3d(dtype=wp.float64), b: int, k: int):
     """Symmetric H of the 21 sums."""
     H = mat66d()
-    index = int(0)
+    index = wp.int32(0)
     for i in range(6):
         for j in range(6):
             if j >= i:

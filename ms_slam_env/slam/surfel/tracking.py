@@ -27,6 +27,7 @@ SEARCH_POINTS = 400
 SEARCH_ITERATIONS = 5
 SMALLEST_STEP = (2.0e-5, 1.0e-4, 5.0e-4)  # metres and radians, per level, finest first
 DAMPING = 1.0e-6
+COARSE_TOLERANCE = 2.5
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ class Tracker:
         self.verdict = wp.zeros(batch, dtype=wp.int32, device=device)
         self._stats = wp.zeros((batch, NUM_STATS), dtype=wp.float64, device=device)
         self._live_levels: list[Level] = []
-        self._weights = _weights(config)
+        self._weights = [_weights(config, level) for level in range(num_levels)]
 
     def _stride(self, level: int) -> int:
         camera = self._cameras[level]
@@ -176,7 +177,7 @@ class Tracker:
                 live.gradient,
                 wp.vec2(camera.fx, camera.fy),
                 wp.vec2(camera.cx, camera.cy),
-                self._weights,
+                self._weights[level],
                 stride,
                 columns,
                 state["pose"],
@@ -199,13 +200,15 @@ class Tracker:
         )
 
 
-def _weights(config: SurfelConfig) -> Weights:
+def _weights(config: SurfelConfig, level: int) -> Weights:
+    # Far from the solution large residuals carry the information: coarse levels are tolerant.
+    widening = COARSE_TOLERANCE**level
     weights = Weights()
     weights.icp = 1.0 - config.icp_rgb_weight
     weights.rgb = config.icp_rgb_weight
     weights.per_depth_noise = 1.0 / config.depth_noise_m
-    weights.per_cauchy_icp = 1.0 / config.cauchy_icp
-    weights.per_cauchy_rgb = 1.0 / config.cauchy_rgb
+    weights.per_cauchy_icp = 1.0 / (config.cauchy_icp * widening)
+    weights.per_cauchy_rgb = 1.0 / (config.cauchy_rgb * widening)
     weights.distance_m = config.icp_distance_m
     weights.cos_angle = float(np.cos(np.radians(config.icp_angle_deg)))
     weights.inlier_sigmas = 4.0

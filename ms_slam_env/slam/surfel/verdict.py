@@ -74,7 +74,7 @@ def choose(
     active: wp.array2d(dtype=wp.int32),  # (B, 1)
 ):
     b = wp.tid()
-    best = int(0)
+    best = wp.int32(0)
     best_score = _score(sums, b, 0)
     for k in range(1, candidates.shape[1]):
         score = _score(sums, b, k)
@@ -123,7 +123,7 @@ def judge(
     distance = wp.sqrt(T[0, 3] * T[0, 3] + T[1, 3] * T[1, 3] + T[2, 3] * T[2, 3])
     cosine = wp.float64(0.5) * (T[0, 0] + T[1, 1] + T[2, 2] - one)
 
-    code = int(0)
+    code = wp.int32(0)
     if matched < limit.points:
         code = 1
     elif overlap < limit.overlap:
