@@ -1,0 +1,80 @@
+"""Ray casting: both casters against each other and against closed forms."""
+
+import numpy as np
+import pytest
+from box_scene import ROOM_HIGH, ROOM_LOW, BoxScene
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ms_slam_env.camera import xtion
+from ms_slam_env.geometry import look_at
+from ms_slam_env.sensor import EmbreeRayCaster, RGBDSensor, WarpRayCaster
+
+SMALL = xtion("80x60")
+
+
+@pytest.fixture(scope="module")
+def sensors(box_scene: BoxScene) -> tuple[RGBDSensor, RGBDSensor]:
+    return (
+        RGBDSensor(box_scene, SMALL, noise="none", caster=EmbreeRayCaster(box_scene.mesh)),
+        RGBDSensor(box_scene, SMALL, noise="none", caster=WarpRayCaster(box_scene.mesh, "cpu")),
+    )
+
+
+def analytic_depth(T: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Depth of the empty room, by the slab method: the nearest of the six planes ahead."""
+    directions = rays @ T[:3, :3].T
+    with np.errstate(divide="ignore"):
+        exits = np.maximum((ROOM_LOW - T[:3, 3]) / directions, (ROOM_HIGH - T[:3, 3]) / directions)
+    return exits.min(axis=-1)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    eye=st.tuples(st.floats(-1.5, -0.5), st.floats(-1.5, 0.5), st.floats(0.5, 2.0)),
+    yaw=st.floats(0, 6.28),
+    pitch=st.floats(-1.2, 1.2),
+)
+def test_depth_of_the_walls_is_that_of_a_box(sensors, eye, yaw, pitch) -> None:
+    direction = [np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)]
+    T = look_at(eye, np.add(eye, direction))
+    view = sensors[0].ground_truth(T)
+    walls = view.labels == 0
+    np.testing.assert_allclose(
+        view.depth[walls], analytic_depth(T, SMALL.rays())[walls], rtol=1e-5, atol=1e-5
+    )
+    # Boxes only come nearer.
+    assert (view.depth[~walls] < analytic_depth(T, SMALL.rays())[~walls]).all()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_casters_agree(sensors, box_scene: BoxScene, seed: int) -> None:
+    T = box_scene.sample_start(np.random.default_rng(seed))
+    embree, warp = (sensor.ground_truth(T) for sensor in sensors)
+    same = embree.labels == warp.labels
+    assert same.mean() > 0.995  # a ray along an edge may take either side
+    np.testing.assert_allclose(embree.depth[same], warp.depth[same], rtol=1e-4)
+    difference = np.abs(embree.color[same].astype(int) - warp.color[same])
+    assert np.percentile(difference, 99) <= 1
+
+
+def test_truth_is_consistent(sensors, box_scene: BoxScene) -> None:
+    T = box_scene.sample_start(np.random.default_rng(3))
+    view = sensors[0].ground_truth(T)
+    in_camera = (view.points - T[:3, 3]) @ T[:3, :3]
+    np.testing.assert_allclose(in_camera[..., 2], view.depth, atol=1e-5)
+    v, u = np.mgrid[: SMALL.height, : SMALL.width]
+    np.testing.assert_allclose(SMALL.project(in_camera), np.stack([u, v], -1), atol=1e-3)
+    np.testing.assert_allclose(np.linalg.norm(view.normals, axis=-1), 1.0, atol=1e-5)
+    assert (np.einsum("hwd,hwd->hw", view.normals, in_camera) < 0).all()  # towards the camera
+    assert set(np.unique(view.labels)) <= {0, 1, 2}
+
+
+def test_a_ray_that_meets_nothing_has_no_reading(box_scene: BoxScene) -> None:
+    sensor = RGBDSensor(box_scene, SMALL, noise="none")
+    T = look_at([10.0, 0.0, 1.0], [20.0, 0.0, 1.0])
+    view = sensor.ground_truth(T)
+    assert (view.labels == -1).all()
+    assert not view.depth.any()
+    assert not view.color.any()
+    assert not sensor.capture(T, 0).depth.any()

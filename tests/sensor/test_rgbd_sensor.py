@@ -1,0 +1,99 @@
+"""The sensor as a whole: determinism, batches, bad input."""
+
+import numpy as np
+import pytest
+from box_scene import BoxScene
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ms_slam_env.camera import xtion
+from ms_slam_env.errors import InputError
+from ms_slam_env.sensor import RGBDSensor
+
+K = xtion("80x60")
+
+
+@pytest.fixture(scope="module")
+def pose(box_scene: BoxScene) -> np.ndarray:
+    return box_scene.sample_start(np.random.default_rng(0))
+
+
+def same(a, b) -> bool:
+    return np.array_equal(a.color, b.color) and np.array_equal(a.depth, b.depth)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 2**40), index=st.integers(0, 2**31))
+def test_noise_is_a_function_of_seed_and_index(box_scene, pose, sensor, seed, index) -> None:
+    first = sensor.capture(pose, index, seed=seed)
+    other = sensor.capture(pose, index + 1, seed=seed)
+    reseeded = sensor.capture(pose, index, seed=seed + 1)
+    again = RGBDSensor(box_scene, K, seed=seed).capture(pose, index)
+    assert same(first, again)
+    for different in (other, reseeded):
+        assert not np.array_equal(first.color, different.color)
+        assert not np.array_equal(first.depth, different.depth)
+
+
+@pytest.fixture(scope="module")
+def sensor(box_scene: BoxScene) -> RGBDSensor:
+    return RGBDSensor(box_scene, K)
+
+
+def test_noise_of_successive_frames_is_uncorrelated(sensor: RGBDSensor, pose) -> None:
+    frames = [sensor.capture(pose, index).color.astype(float) for index in range(8)]
+    truth = np.mean(frames, axis=0)
+    noise = [(frame - truth).ravel() for frame in frames]
+    # Taking the mean of n frames off leaves a correlation of -1 / (n - 1).
+    correlations = np.corrcoef(noise)[np.triu_indices(8, 1)]
+    assert np.abs(correlations + 1 / 7).max() < 0.05
+    shifted = [np.corrcoef(noise[0][:-lag], noise[1][lag:])[0, 1] for lag in (3, 6, 240)]
+    assert np.abs(shifted).max() < 0.06
+
+
+def test_a_batch_equals_its_single_frames(sensor: RGBDSensor, box_scene: BoxScene) -> None:
+    rng = np.random.default_rng(1)
+    poses = np.stack([box_scene.sample_start(rng) for _ in range(3)])
+    batch = sensor.capture_batch(poses, [4, 9, 2])
+    singles = [sensor.capture(T, index) for T, index in zip(poses, (4, 9, 2), strict=True)]
+    assert all(same(a, b) for a, b in zip(batch, singles, strict=True))
+
+
+def test_frames_do_not_share_memory(sensor: RGBDSensor, pose) -> None:
+    first = sensor.capture(pose, 0)
+    color, depth = first.color.copy(), first.depth.copy()
+    sensor.capture(pose, 1)
+    sensor.ground_truth(pose)
+    assert np.array_equal(first.color, color)
+    assert np.array_equal(first.depth, depth)
+
+
+def test_time_stamps(sensor: RGBDSensor, pose) -> None:
+    assert sensor.capture(pose, 15).timestamp == pytest.approx(0.5)
+    assert sensor.capture(pose, 15, timestamp=2.0).timestamp == 2.0
+
+
+def test_unknown_noise_is_refused(box_scene: BoxScene) -> None:
+    with pytest.raises(InputError, match=r"unknown noise model 'gauss'; valid choices: kinect"):
+        RGBDSensor(box_scene, K, noise="gauss")
+
+
+@pytest.mark.parametrize(
+    "bad", [np.full((4, 4), np.nan), np.eye(3), 2 * np.eye(4), np.zeros((4, 4))]
+)
+def test_bad_poses_are_refused(sensor: RGBDSensor, bad: np.ndarray) -> None:
+    with pytest.raises(InputError, match="T_world_camera"):
+        sensor.capture(bad, 0)
+    with pytest.raises(InputError, match="T_world_camera"):
+        sensor.ground_truth(bad)
+
+
+@pytest.mark.parametrize(("seed", "index"), [(-1, 0), (0, -1), (0, 1.5), (True, 0)])
+def test_bad_seeds_and_indices_are_refused(sensor: RGBDSensor, pose, seed, index) -> None:
+    with pytest.raises(InputError, match="integer >= 0"):
+        sensor.capture(pose, index, seed=seed)
+
+
+def test_a_batch_needs_one_index_a_pose(sensor: RGBDSensor, pose) -> None:
+    with pytest.raises(InputError, match="2 frame indices"):
+        sensor.capture_batch(pose[None], [0, 1])
