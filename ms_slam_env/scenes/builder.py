@@ -289,9 +289,9 @@ class MeshBuilder:
     def build(self) -> Geometry:
         """Return everything added so far."""
         vertices, faces = np.concatenate(self._vertices), np.concatenate(self._faces)
-        corners = vertices[faces]
+        corners = vertices.astype(np.float32).astype(np.float64)[faces]
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        keep = np.einsum("ij,ij->i", cross, cross) > 1e-18  # a lathe's pole has empty cells
+        keep = np.einsum("ij,ij->i", cross, cross) > 1e-14  # a lathe's pole has empty cells
         return Geometry(
             vertices=vertices,
             normals=np.concatenate(self._normals),

@@ -47,6 +47,8 @@ class Enclosed:
             distance, _ = self.rays.first_hit(centres, np.broadcast_to(direction, centres.shape))
             hits += np.isfinite(distance)
         coarse = (hits >= _SHARE * len(directions)).reshape(index.shape[:3])
+        # A coarse cell at a wall may have its centre beyond it; walls themselves still separate.
+        coarse = ndimage.binary_dilation(coarse, iterations=1)
         nearest = [
             np.minimum(np.arange(n) // step, m - 1)
             for n, m in zip(empty.shape, coarse.shape, strict=True)

@@ -12,6 +12,7 @@ from scipy import ndimage
 from ms_slam_env.scenes.base import Float32, Float64
 
 VOXEL_M = 0.05
+_GRID_ERROR = 0.4  # of a voxel
 _MAX_CELLS = 6_000_000
 
 
@@ -43,6 +44,9 @@ class Holding:
 
 class FreeSpace:
     """Distance to the nearest surface on a voxel grid, looked up trilinearly.
+
+    The surface in a voxel is taken at the mean of its samples, so a distance may err by somewhat
+    less than a voxel where the surface in the nearest voxel bends.
 
     Attributes:
         origin: (3,) centre of the first voxel, metres.
@@ -114,11 +118,12 @@ class FreeSpace:
         """Whether a ball moves from ``start`` to ``end`` untouched.
 
         The distance to the surface changes by at most the distance walked, so samples ``step``
-        apart need a clearance of ``radius_m`` + step / 2: the answer errs to "no".
+        apart need a clearance of ``radius_m`` + step / 2, and a part of a voxel more for the
+        error of the grid: the answer errs to "no".
         """
         a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
         length = float(np.linalg.norm(b - a))
         steps = max(1, int(np.ceil(length / (0.4 * self.voxel_m))))
         t = np.linspace(0.0, 1.0, steps + 1)[:, None]
-        slack = 0.5 * length / steps
+        slack = 0.5 * length / steps + _GRID_ERROR * self.voxel_m
         return bool((self.clearance(a + t * (b - a)) > radius_m + slack).all())

@@ -20,6 +20,7 @@ START_DEPTH_M = (0.5, 3.5)
 MIN_START_SHARE = 0.8
 _TRIES = 2000
 _FACING_M = 0.06
+_ASIDE_M = 0.04
 
 
 class MeshScene(Scene):
@@ -97,9 +98,16 @@ class MeshScene(Scene):
         """
         points, face = sample_surface(self.mesh.vertices, self.mesh.faces, spacing_m)
         corners = self.mesh.vertices[self.mesh.faces].astype(np.float64)
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-        visible = self.clearance(points + _FACING_M * normal[face]) > 0.0
+        tangent = corners[:, 1] - corners[:, 0]
+        normal = _unit(np.cross(tangent, corners[:, 2] - corners[:, 0]))
+        tangent = _unit(tangent)
+        bitangent = np.cross(normal, tangent)
+        before = points + _FACING_M * normal[face]
+        visible = self.clearance(before) > 0.0
+        # In an inner corner the place in front is taken by the neighbour: look beside it too.
+        for aside in (tangent, -tangent, bitangent, -bitangent):
+            rest = np.flatnonzero(~visible)
+            visible[rest] = self.clearance(before[rest] + _ASIDE_M * aside[face[rest]]) > 0.0
         return points[visible], self.mesh.face_label[face[visible]]
 
     def __reduce__(self) -> tuple[object, tuple[str, int]]:
@@ -113,3 +121,7 @@ def free_space_around(mesh: TexturedMesh, inside: Float64) -> FreeSpace:
     """Free space of a closed room that holds the points ``inside`` (K, 3)."""
     points, _ = sample_surface(mesh.vertices, mesh.faces, 0.4 * VOXEL_M)
     return FreeSpace(points, Holding(np.asarray(inside, dtype=np.float64)))
+
+
+def _unit(vectors: Float64) -> Float64:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)

@@ -130,17 +130,25 @@ def _appearance(part: trimesh.Trimesh) -> tuple[Float64, NDArray[np.uint8]]:
 
 
 def _material(material: Any) -> tuple[NDArray[np.uint8] | None, Float64]:
-    """Image (h, w, 3) or None, and colour factor (3,) in [0, 255], of a file's material."""
+    """Image (h, w, 3) or None, and sRGB colour (3,) in [0, 255], of a file's material.
+
+    The image is multiplied by the colour; glTF gives the colour in linear light and multiplies
+    there, which is nearly the same as multiplying the sRGB values, for the curve is close to a power.
+    """
     if isinstance(material, trimesh.visual.material.PBRMaterial):
         image, factor = material.baseColorTexture, material.baseColorFactor
-        default = np.full(3, 255) if image is not None else _GREY
+        if factor is not None:
+            linear = np.asarray(factor, dtype=np.float64)[:3] / 255.0
+            factor = 255.0 * np.where(
+                linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055
+            )
     else:
         image = getattr(material, "image", None)
         factor = None if image is not None else getattr(material, "main_color", None)
-        default = np.full(3, 255) if image is not None else _GREY
-    colour = np.asarray(default if factor is None else factor, dtype=np.float64)[:3]
+    if factor is None:
+        factor = _GREY if image is None else np.full(3, 255)
     pixels = None if image is None else np.asarray(image.convert("RGB"))
-    return pixels, colour
+    return pixels, np.asarray(factor, dtype=np.float64)[:3]
 
 
 def _colour_atlas(colours: NDArray[np.float32]) -> tuple[Float64, NDArray[np.uint8]]:

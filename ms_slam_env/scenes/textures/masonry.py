@@ -29,16 +29,16 @@ def wallpaper(
             mask[:, x : x + int(step * rng.uniform(0.15, 0.5))] = 255
     else:
         n = int(rng.integers(3, 6))
-        cell = size // n
+        cell = size / n
         petals = int(rng.integers(4, 8))
-        for row in range(2 * n):
-            for column in range(n + 1):
+        for row in range(-1, 2 * n + 2):
+            for column in range(-1, n + 1):
                 centre = (int((column + 0.5 * (row % 2)) * cell), int(row * cell / 2))
                 for k in range(petals):
                     cv2.ellipse(
                         mask,
                         centre,
-                        (cell // 5, cell // 14),
+                        (int(cell / 5), int(cell / 14)),
                         360.0 * k / petals,
                         -30,
                         200,
@@ -46,7 +46,7 @@ def wallpaper(
                         -1,
                         cv2.LINE_AA,
                     )
-                cv2.circle(mask, centre, cell // 12, 0, -1, cv2.LINE_AA)
+                cv2.circle(mask, centre, int(cell / 12), 0, -1, cv2.LINE_AA)
     alpha = (0.65 * mask.astype(np.float32) / 255)[..., None]
     colour = (1 - alpha) * np.asarray(rgb, np.float32) + alpha * np.asarray(accent, np.float32)
     shape = (size, size)
