@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -82,6 +83,8 @@ class HistogramCounter:
         rows, columns = config.windows if config.measure == "windowed-kl" else (1, 1)
         self._grid = wp.vec2i(rows, columns)
         self._windows = rows * columns
+        reach_px = math.tan(math.radians(config.normal_reach_deg)) * intrinsics.fx
+        self._radius = max(1, round(reach_px))
         self._cell_weights = cell_weights(config.inclinations, float(config.alpha_deg))
         self._grouping = grouping_matrix(config.bins, float(config.smoothing))
         self._buffers: dict[int, tuple[Any, Any, Any]] = {}  # by batch size
@@ -148,7 +151,7 @@ class HistogramCounter:
         return [
             wp.vec2(camera.fx, camera.fy),
             wp.vec2(camera.cx, camera.cy),
-            config.normal_radius,
+            self._radius,
             config.edge_threshold,
         ]
 

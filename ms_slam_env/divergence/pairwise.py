@@ -52,7 +52,7 @@ def depth_divergence(
     inclinations: int = _PAPER.inclinations,
     alpha_deg: float = _PAPER.alpha_deg,
     pseudo_count: float = _PAPER.pseudo_count,
-    normal_radius: int = _PAPER.normal_radius,
+    normal_reach_deg: float = _PAPER.normal_reach_deg,
     edge_threshold: float = _PAPER.edge_threshold,
 ) -> float:
     """Depth divergence KL(D_t || D_t-1) in nats, equations (6) to (10).
@@ -67,7 +67,7 @@ def depth_divergence(
         inclinations: N of equation (6).
         alpha_deg: influence angle alpha of equation (8), degrees.
         pseudo_count: normals added to every bin before normalising.
-        normal_radius: distance to the pixels that give a pixel's normal, pixels.
+        normal_reach_deg: see ``DivergenceConfig``.
         edge_threshold: see ``DivergenceConfig``.
 
     Raises:
@@ -78,7 +78,7 @@ def depth_divergence(
         inclinations=inclinations,
         alpha_deg=alpha_deg,
         pseudo_count=pseudo_count,
-        normal_radius=normal_radius,
+        normal_reach_deg=normal_reach_deg,
         edge_threshold=edge_threshold,
     )
     pair = np.stack([_depth_image(image, intrinsics) for image in (current, previous)])

@@ -104,7 +104,9 @@ def test_given_normals_count_as_computed_ones():
 def test_windows_are_counted_apart():
     intensity, depth = frames(2)
     windows = (3, 4)
-    config = DivergenceConfig(measure="windowed-kl", windows=windows, bins=256)
+    config = DivergenceConfig(
+        measure="windowed-kl", windows=windows, bins=256, smoothing=0.0, intensity_pixels="all"
+    )
     histograms = make_divergence(config, CAMERA).histograms(intensity, depth)
     assert histograms.intensity.shape == (2, 12, 256)
     patch = intensity[1, 20:40, 60:80]  # row 1, column 3
@@ -114,6 +116,7 @@ def test_windows_are_counted_apart():
 
 def test_windows_see_content_that_moved():
     intensity, depth = frames(1)
+    depth[:] = 2
     mirrored = np.ascontiguousarray(intensity[:, :, ::-1] + 0)
     intensity[:, :, :40] = 20
     mirrored[:, :, :40], mirrored[:, :, 40:] = intensity[:, :, 40:], 20
@@ -128,7 +131,7 @@ def test_windows_see_content_that_moved():
 
 def test_intensity_can_be_restricted_to_pixels_with_depth():
     intensity, depth = frames(1)
-    config = DivergenceConfig(intensity_pixels="with-depth", bins=256)
+    config = DivergenceConfig(intensity_pixels="with-depth", bins=256, smoothing=0.0)
     histogram = make_divergence(config, CAMERA).histograms(intensity, depth).intensity[0, 0]
     kept = intensity[0][depth[0] > 0].astype(int)
     expected = np.bincount(kept, minlength=256) + 0.5

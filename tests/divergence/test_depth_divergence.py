@@ -112,7 +112,9 @@ def test_normals_of_a_plane_are_exact(x, y, distance):
 def test_normals_are_not_computed_across_an_edge():
     depth = np.full(CAMERA.shape, 2.0, dtype=np.float32)
     depth[:, 40:] = 1.0
-    normals = make_divergence(DivergenceConfig(normal_radius=1), CAMERA).normals(depth[None])[0]
+    normals = make_divergence(DivergenceConfig(normal_reach_deg=0.0), CAMERA).normals(depth[None])[
+        0
+    ]
     assert not normals[30, [39, 40]].any()
     np.testing.assert_allclose(normals[30, [20, 60]], [[0, 0, -1], [0, 0, -1]], atol=1e-6)
 
