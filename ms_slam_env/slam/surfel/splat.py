@@ -199,8 +199,8 @@ def splat_depth(
             for u in range(disc.low[0], disc.high[0] + 1):
                 du = float(u) - disc.u
                 inverse = disc.inverse + du * disc.slope_u + dv * disc.slope_v
-                if squared_offset(disc, du, dv, inverse) <= disc.rim:
-                    wp.atomic_max(z_buffer, row + u, inverse)
+                inside = squared_offset(disc, du, dv, inverse) <= disc.rim
+                wp.atomic_max(z_buffer, row + u, wp.where(inside, inverse, 0.0))
 
 
 @wp.kernel
@@ -239,20 +239,10 @@ def splat_attributes(
                 share = squared_offset(disc, du, dv, inverse) * inverse_rim
                 if share <= 1.0 and inverse >= z_buffer[row + u] - reach:
                     w = confidence * (1.05 - share)
-                    wp.atomic_add(
-                        sums,
-                        row + u,
-                        Sums(
-                            w * n[0],
-                            w * n[1],
-                            w * n[2],
-                            w,
-                            w * color[0],
-                            w * color[1],
-                            w * color[2],
-                            w / inverse,
-                        ),
+                    sample = Sums(
+                        n[0], n[1], n[2], 1.0, color[0], color[1], color[2], 1.0 / inverse
                     )
+                    wp.atomic_add(sums, row + u, w * sample)
 
 
 @wp.kernel
