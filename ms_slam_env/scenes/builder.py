@@ -1,4 +1,4 @@
-"""Assembles a scene's triangles from parametric patches, in local frames, with texture in metres."""
+"""Assembles a scene's triangles from parametric patches in local frames, texture in metres."""
 
 from __future__ import annotations
 

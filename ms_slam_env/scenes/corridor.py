@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ms_slam_env.scenes.base import Float64
-from ms_slam_env.scenes.builder import MeshBuilder
+from ms_slam_env.scenes.builder import Material, MeshBuilder
 from ms_slam_env.scenes.finishes import floor_material, wall_colour
 from ms_slam_env.scenes.furniture import decor, seating, storage, tableware
 from ms_slam_env.scenes.lighting import Light, Lighting, Panel, auto_exposure, light_mesh
@@ -56,7 +56,9 @@ def corridor(seed: int) -> MeshScene:
     return MeshScene("corridor", seed, mesh, free_space_around(mesh, line), start, exposure)
 
 
-def _walls(build: MeshBuilder, rng: np.random.Generator, room: Room, lower, trim) -> None:  # noqa: ANN001
+def _walls(
+    build: MeshBuilder, rng: np.random.Generator, room: Room, lower: Material, trim: Material
+) -> None:
     """Doors on both long walls and at one end; pictures, notices and furniture between them."""
     length = room.size[0]
     door_paint = hsv(rng.choice([0.08, 0.1, 0.55]), rng.uniform(0.05, 0.5), rng.uniform(0.5, 0.85))
@@ -88,7 +90,9 @@ def _walls(build: MeshBuilder, rng: np.random.Generator, room: Room, lower, trim
         decor.plant(build, rng, 1.0, "plant")
 
 
-def _dado(build: MeshBuilder, room: Room, wall: int, doors: Float64, lower, trim) -> None:  # noqa: ANN001
+def _dado(
+    build: MeshBuilder, room: Room, wall: int, doors: Float64, lower: Material, trim: Material
+) -> None:
     """Darker paint up to a rail at 1 m, interrupted by the doors."""
     half = room.size[0] / 2
     edges = [-half, *np.sort(np.concatenate([doors - 0.52, doors + 0.52])), half]

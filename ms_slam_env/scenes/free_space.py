@@ -75,10 +75,10 @@ class FreeSpace:
         count = np.bincount(flat, minlength=int(np.prod(shape)))
         occupied = count > 0
         cells = np.flatnonzero(occupied)
-        mean = np.stack(
+        total = np.stack(
             [np.bincount(flat, points[:, k], minlength=len(count))[cells] for k in range(3)], -1
         )
-        mean /= count[cells, None]
+        mean = total / count[cells, None]
         slot = np.zeros(len(count), dtype=np.int32)
         slot[cells] = np.arange(len(cells))
         empty = ~occupied.reshape(shape)

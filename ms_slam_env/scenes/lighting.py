@@ -51,7 +51,7 @@ class Lamp(Light):
         for offset in _ball(self.samples):
             source = np.asarray(self.position) + self.radius_m * offset
             total += _point_light(points, normals, source, rays)
-        return _tint(total / self.samples, self.intensity)
+        return _tint((total / self.samples).astype(np.float32), self.intensity)
 
 
 @dataclass(frozen=True)
@@ -142,8 +142,8 @@ def light_mesh(geometry: Geometry, lighting: Lighting) -> TexturedMesh:
     direct = np.zeros((len(g.vertices), 3), np.float32)
     for light in lighting.lights:
         direct += light.irradiance(g.light_points, g.normals, rays)
-    light = direct + _bounce(g, direct, lighting)
-    corner = light[g.faces]  # (F, 3, 3)
+    total = direct + _bounce(g, direct, lighting)
+    corner = total[g.faces]  # (F, 3, 3)
     for name, value in lighting.glow.items():
         if name in g.labels:
             corner[g.face_label == g.labels.index(name)] = value

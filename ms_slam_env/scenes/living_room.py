@@ -28,13 +28,10 @@ def living_room(seed: int) -> MeshScene:
     shelf_wall = int(rng.choice([1, 3]))
     window_wall = 4 - shelf_wall
     window = Window(rng.uniform(-0.4, 0.4), 0.85, rng.uniform(1.4, 1.9), 1.35)
-    walls = [plain] * 4
-    walls[0] = special
+    walls = (special, plain, plain, plain)
     ceiling = build.material(masonry.plaster(rng, (238, 236, 230), 0.7), (2.0, 2.0))
     skirting = build.plain((232, 228, 218))
-    room.shell(
-        build, floor_material(build, rng), tuple(walls), ceiling, {window_wall: window}, skirting
-    )
+    room.shell(build, floor_material(build, rng), walls, ceiling, {window_wall: window}, skirting)
     _seating_side(build, rng, room)
     bulb = _television_side(build, rng, room)
     _shelf_side(build, rng, room, shelf_wall)
@@ -134,9 +131,9 @@ def _window_side(
     with room.at_wall(build, wall, window.along, z=top), build.object("curtain rod"):
         half = window.width / 2 + 0.45
         build.box((-half, -0.11, 0), (half, -0.09, 0.02), build.plain((70, 58, 48)))
-    with room.at_wall(build, wall, window.along + rng.uniform(-0.4, 0.4), z=window.sill):
-        with build.frame((0, 0.02, 0)):
-            decor.plant(build, rng, 0.38, "sill plant")
+    along = window.along + rng.uniform(-0.4, 0.4)
+    with room.at_wall(build, wall, along, z=window.sill, gap=-0.02):
+        decor.plant(build, rng, 0.38, "sill plant")
     with room.at_wall(build, wall, rng.uniform(-0.5, 0.2), gap=0.45):
         seating.sofa(build, rng, 0.85, 1, "armchair")
 
@@ -193,5 +190,10 @@ def _lit(
         return eye, target
 
     return MeshScene(
-        "living_room", seed, mesh, free_space_around(mesh, centre + [0, 0, 0.3]), start, exposure
+        "living_room",
+        seed,
+        mesh,
+        free_space_around(mesh, centre + np.array([0.0, 0.0, 0.3])),
+        start,
+        exposure,
     )

@@ -59,7 +59,7 @@ def from_file(path: Path, seed: int = 0) -> MeshScene:
     def start(draw: np.random.Generator) -> tuple[Float64, Float64]:
         eye = eyes[draw.integers(len(eyes))] + draw.uniform(-0.4, 0.4, 3) * free.voxel_m
         angle, drop = draw.uniform(-np.pi, np.pi), draw.uniform(0.0, 0.4)
-        return eye, eye + [np.cos(angle), np.sin(angle), -drop]
+        return eye, eye + np.array([np.cos(angle), np.sin(angle), -drop])
 
     return MeshScene(str(path), seed, mesh, free, start, exposure)
 

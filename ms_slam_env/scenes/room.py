@@ -53,7 +53,7 @@ class Room:
         """Frame on a wall: x along it to the right seen from inside, the room at -y."""
         origin, yaw = self.wall_frame(wall)
         c, s = np.cos(yaw), np.sin(yaw)
-        return build.frame(origin + [along * c + gap * s, along * s - gap * c, z], yaw)
+        return build.frame(origin + np.array([along * c + gap * s, along * s - gap * c, z]), yaw)
 
     def wall_frame(self, wall: int) -> tuple[Float64, float]:
         """Middle of a wall's lower edge (3,), and the turn of its frame about z."""
@@ -66,7 +66,7 @@ class Room:
         origin, yaw = self.wall_frame(wall)
         c, s = np.cos(yaw), np.sin(yaw)
         x, y, z = point
-        return origin + [x * c - y * s, x * s + y * c, z]
+        return origin + np.array([x * c - y * s, x * s + y * c, z])
 
     def shell(
         self,

@@ -35,7 +35,9 @@ def carpet(seed: int) -> MeshScene:
     with room.at_wall(build, 1, 0.0, z=1.5):
         decor.picture_frame(build, rng, 0.7, 0.5, "picture")
     target = np.array([w / 2, 0.42 * d, 0.0])
-    where = target + [rng.uniform(0.55, 0.75) * rng.choice([-1, 1]), rng.uniform(-0.3, 0.3), 0.0]
+    where = target + np.array(
+        [rng.uniform(0.55, 0.75) * rng.choice([-1, 1]), rng.uniform(-0.3, 0.3), 0.0]
+    )
     with build.frame(where):
         tableware.lying_book(build, rng, "magazine", 0.01)
     lamp = tabletop.ceiling_light(setting, rng, w / 2, d / 2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -48,7 +49,7 @@ def clutter(build: MeshBuilder, rng: np.random.Generator, width: float, depth: f
     """Put things on the rectangle [-width/2, width/2] x [-depth, 0] at z = 0."""
     with build.frame((rng.uniform(-0.2, 0.2), -0.3 * depth, 0), yaw=rng.uniform(-0.25, 0.25)):
         electronics.laptop(build, rng, "laptop")
-    makers = {
+    makers: dict[str, tuple[Callable[..., None], float]] = {
         "plate": (tableware.plate, 0.14),
         "bowl": (tableware.bowl, 0.15),
         "book": (partial(tableware.lying_book, thick_m=0.03), 0.14),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ms_slam_env.scenes import tabletop
+from ms_slam_env.scenes.base import Float64
 from ms_slam_env.scenes.furniture import decor, storage
 from ms_slam_env.scenes.mesh_scene import MeshScene
 
@@ -38,7 +39,7 @@ def wall(seed: int) -> MeshScene:
         target, (0, -1), (0.55, 0.9), elevation=(-0.15, 0.25), azimuth=0.35, jitter_m=0.4
     )
 
-    def on_wall(draw: np.random.Generator):  # noqa: ANN202
+    def on_wall(draw: np.random.Generator) -> tuple[Float64, Float64]:
         eye, look = start(draw)
         look[1] = d
         return eye, look

@@ -52,7 +52,9 @@ def load_soup(path: Path) -> Soup:
     except Exception as error:  # the loaders of the many formats raise anything
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"mesh file {str(path)!r} cannot be read: {reason}") from error
-    corners, uvs, texture, label, images, labels = [], [], [], [], [], []
+    corners, uvs, texture, label = [], [], [], []
+    images: list[NDArray[np.uint8]] = []
+    labels: list[str] = []
     for k, part in enumerate(parts):
         if not isinstance(part, trimesh.Trimesh) or len(part.faces) == 0:
             continue
@@ -132,8 +134,8 @@ def _appearance(part: trimesh.Trimesh) -> tuple[Float64, NDArray[np.uint8]]:
 def _material(material: Any) -> tuple[NDArray[np.uint8] | None, Float64]:
     """Image (h, w, 3) or None, and sRGB colour (3,) in [0, 255], of a file's material.
 
-    The image is multiplied by the colour; glTF gives the colour in linear light and multiplies
-    there, which is nearly the same as multiplying the sRGB values, for the curve is close to a power.
+    The image is multiplied by the colour. glTF gives it in linear light and multiplies there,
+    nearly the same as multiplying the sRGB values, for the curve is close to a power.
     """
     if isinstance(material, trimesh.visual.material.PBRMaterial):
         image, factor = material.baseColorTexture, material.baseColorFactor

@@ -1,4 +1,5 @@
 import pickle
+from functools import cache
 
 import numpy as np
 import pytest
@@ -12,7 +13,12 @@ from ms_slam_env.scenes.rays import RayCaster
 
 @pytest.fixture(scope="module", params=scenes.SCENES)
 def scene(request: pytest.FixtureRequest) -> base.Scene:
-    return scenes.make(request.param, 2)
+    return _cached(request.param)
+
+
+@cache
+def _cached(name: str) -> base.Scene:
+    return scenes.make(name, 2)
 
 
 def _normals(mesh: base.TexturedMesh) -> np.ndarray:
@@ -111,7 +117,7 @@ def test_segments_are_refused_at_walls_and_free_in_the_open(scene):
     eye = scene.sample_start(np.random.default_rng(5))[:3, 3]
     radius = 0.1
     assert scene.segment_is_free(eye, eye + 1e-3, radius)
-    beyond = eye + [0.0, 0.0, 10.0]
+    beyond = eye + np.array([0.0, 0.0, 10.0])
     assert not scene.segment_is_free(eye, beyond, radius)
     clear = float(scene.clearance(eye[None])[0])
     assert not scene.segment_is_free(eye, eye, clear + 0.01)
@@ -146,13 +152,13 @@ def test_hard_scenes_are_hard():
     """The bare wall and the carpet lack what the table has: texture, and relief."""
 
     def contrast(name: str) -> float:
-        mesh = scenes.make(name, 2).mesh
+        mesh = _cached(name).mesh
         floor = mesh.labels.index("wall 0")
         texture = mesh.textures[mesh.face_texture[mesh.face_label == floor][0]]
         return float(texture.mean(2).std() / texture.mean())
 
     assert contrast("wall") < 0.5 * contrast("table")
-    x = scenes.make("carpet", 2)
+    x = _cached("carpet")
     points, labels = x.surface_points(0.03)
     centre = x.mesh.vertices[:, :2].max(0) * [0.5, 0.42]
     middle = np.abs(points[:, :2] - centre).max(1) < 0.6

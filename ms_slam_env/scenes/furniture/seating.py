@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from ms_slam_env.scenes.builder import Material, MeshBuilder
@@ -42,7 +44,7 @@ def sofa(
             build.pillow((low, -depth, 0.14), (high, 0, 0.62), cloth, 0.25)
         build.pillow((-half + 0.02, -0.24, 0.14), (half - 0.02, 0, back), cloth, 0.25)
         edges = np.linspace(-half + arm, half - arm, seats + 1)
-        for low, high in zip(edges[:-1], edges[1:], strict=True):
+        for low, high in pairwise(edges):
             build.pillow((low, -depth - 0.02, 0.24), (high, -0.18, seat + 0.03), cloth, 0.28)
             build.pillow((low, -0.42, seat - 0.02), (high, -0.16, back + 0.06), cloth, 0.4)
     for k in range(min(seats, int(rng.integers(1, 4)))):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from ms_slam_env.scenes.builder import MeshBuilder
+from ms_slam_env.scenes.builder import Material, MeshBuilder
 from ms_slam_env.scenes.textures import masonry, printed
 from ms_slam_env.scenes.textures.noise import hsv, noise, shade
 from ms_slam_env.scenes.textures.pictures import picture
 
 
-def glaze(build: MeshBuilder, rng: np.random.Generator, banded: bool = True):  # noqa: ANN201
+def glaze(build: MeshBuilder, rng: np.random.Generator, banded: bool = True) -> Material:
     """Ceramic: one colour with painted bands around, and fine speckles."""
     h, w = 128, 256
     base = hsv(rng.random(), rng.uniform(0.05, 0.7), rng.uniform(0.5, 0.95))

@@ -54,7 +54,7 @@ def noise(
 
 def shade(rgb: ArrayLike, *variations: tuple[float, Field]) -> Image:
     """Colour(s) ``rgb`` (3,) or (h, w, 3) in [0, 255], made lighter and darker by the fields."""
-    factor = np.float32(1.0)
+    factor: Field = np.ones((), np.float32)
     for amount, field in variations:
         factor = factor + np.float32(amount) * field
     image = np.asarray(rgb, dtype=np.float32) * np.asarray(factor)[..., None]

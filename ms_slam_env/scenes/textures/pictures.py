@@ -69,7 +69,7 @@ def _abstract(rng: np.random.Generator, h: int, w: int) -> _Canvas:
             box = cv2.boxPoints(((x, y), (3.0 * r, 0.6 * r), float(rng.uniform(0, 180))))
             cv2.fillPoly(overlay, [box.astype(np.int32)], colour, cv2.LINE_AA)
         elif kind == 2:
-            corners = rng.uniform(-1.5 * r, 1.5 * r, (3, 2)) + [x, y]
+            corners = rng.uniform(-1.5 * r, 1.5 * r, (3, 2)) + np.array([x, y])
             cv2.fillPoly(overlay, [corners.astype(np.int32)], colour, cv2.LINE_AA)
         else:
             cv2.circle(overlay, (x, y), r, (30, 28, 32), max(2, r // 10), cv2.LINE_AA)
