@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import matplotlib
@@ -47,6 +47,11 @@ def save(figure: Figure, path: Path) -> Path:
     return path
 
 
+def colours(planners: Iterable[str]) -> dict[str, str]:
+    """A colour for each planner that does not depend on who came first."""
+    return {planner: colour(index) for index, planner in enumerate(sorted(planners))}
+
+
 def colour(index: int) -> str:
     """One colour a planner, distinguishable with common colour-vision deficiencies."""
     palette = matplotlib.color_sequences["petroff10"]
@@ -56,6 +61,7 @@ def colour(index: int) -> str:
 def planners_figure(rows: Sequence[Row]) -> Figure:
     """Every episode as a dot, the median with its 95 % interval beside them."""
     summary = summarise(rows)
+    colour_of = colours(summary)
     rng = np.random.default_rng(0)
     figure = new_figure(len(PANELS), height=1.2 + 0.5 * len(summary))
     axes = figure.subplots(1, len(PANELS), sharey=True)
@@ -63,7 +69,7 @@ def planners_figure(rows: Sequence[Row]) -> Figure:
         for index, (planner, metrics) in enumerate(summary.items()):
             values = panel.scale * _values(rows, planner, panel.metric)
             height = index + rng.uniform(-0.15, 0.15, len(values))
-            ax.plot(values, height, ".", color=colour(index), alpha=0.35, markersize=5)
+            ax.plot(values, height, ".", color=colour_of[planner], alpha=0.35, markersize=5)
             interval = metrics[panel.metric]
             value, low, high = (
                 panel.scale * x for x in (interval.value, interval.low, interval.high)
@@ -73,7 +79,7 @@ def planners_figure(rows: Sequence[Row]) -> Figure:
                 index,
                 xerr=[[max(0.0, value - low)], [max(0.0, high - value)]],
                 fmt="o",
-                color=colour(index),
+                color=colour_of[planner],
                 capsize=4,
                 markeredgecolor="black",
             )
@@ -89,12 +95,14 @@ def scatter_figure(rows: Sequence[Row]) -> Figure:
     """F-score against ATE: the good corner is the upper left one."""
     figure = new_figure(width=5.0, height=3.8)
     ax = figure.subplots()
-    for index, planner in enumerate(summarise(rows)):
+    planners = list(summarise(rows))
+    colour_of = colours(planners)
+    for planner in planners:
         ate = np.maximum(1000 * _values(rows, planner, "ate_m"), _FLOOR_MM)
         f_score = 100 * _values(rows, planner, "f_score_5cm")
         lost = _values(rows, planner, "lost").astype(bool)
-        ax.plot(ate[~lost], f_score[~lost], "o", color=colour(index), label=planner, alpha=0.7)
-        ax.plot(ate[lost], f_score[lost], "x", color=colour(index), alpha=0.7)
+        ax.plot(ate[~lost], f_score[~lost], "o", color=colour_of[planner], label=planner, alpha=0.7)
+        ax.plot(ate[lost], f_score[lost], "x", color=colour_of[planner], alpha=0.7)
     ax.set_xscale("log")
     ax.set_xlabel("ATE [mm] (x: tracking was lost)")
     ax.set_ylabel("F-score at 5 cm [%]")
@@ -107,11 +115,13 @@ def ate_over_time_figure(rows: Sequence[Row]) -> Figure:
     """Running trajectory error: median over episodes, band between the quartiles."""
     figure = new_figure(width=5.0, height=3.8)
     ax = figure.subplots()
-    for index, planner in enumerate(summarise(rows)):
+    planners = list(summarise(rows))
+    colour_of = colours(planners)
+    for planner in planners:
         series = [
             row["result"]["ate_over_time"] for row in rows if row["spec"]["planner"] == planner
         ]
-        draw_band(ax, series, planner, colour(index))
+        draw_band(ax, series, planner, colour_of[planner])
     ax.set_yscale("log")
     ax.set_xlabel("step")
     ax.set_ylabel("running ATE, no alignment [mm]")

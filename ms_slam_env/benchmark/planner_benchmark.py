@@ -125,6 +125,7 @@ def write_report(config: PlannerBenchmark, rows: Sequence[Row], out: Path) -> st
     made_by = provenance()
     aggregates = planner_report.aggregate(rows)
     summary = planner_report.summarise(rows)
+    commits = sorted({str(row["commit"]) for row in rows})
     content: dict[str, Any] = {
         "provenance": made_by,
         "config": asdict(config),
@@ -149,7 +150,7 @@ def write_report(config: PlannerBenchmark, rows: Sequence[Row], out: Path) -> st
     else:
         parts.append("\n### Across scenes\n\n" + planner_report.aggregate_table(aggregates))
     parts.append(
-        f"\nMade by `{made_by['command']}` at commit {made_by['commit']}, "
+        f"\nMade by `{made_by['command']}` at commit {', '.join(commits)}, "
         f"version {made_by['versions']['ms-slam-env']}, on {made_by['cpu']}.\n"
     )
     table = "".join(parts)

@@ -28,20 +28,23 @@ class Column:
     scale: float = 1.0
 
 
-COLUMNS = (
+HEADLINE = (
     Column("f_score_5cm", "F-score 5 cm %", 100),
     Column("f_score_2cm", "F-score 2 cm %", 100),
     Column("rcm", "RCM %", 100),
-    Column("mapped_area_m2", "mapped m²"),
-    Column("rer_m", "RER mm", 1000),
     Column("ate_m", "ATE mm", 1000),
-    Column("ate_max_m", "ATE max mm", 1000),
-    Column("rpe_m", "RPE mm", 1000),
     Column("lost", "lost % of episodes", 100),
     Column("path_length_m", "path m"),
+    Column("decision_ms", "decision ms"),
+)
+DETAILS = (
+    Column("ate_max_m", "ATE max mm", 1000),
+    Column("rpe_m", "RPE mm", 1000),
+    Column("rer_m", "RER mm", 1000),
+    Column("mapped_area_m2", "mapped m²"),
     Column("M_I", "M_I"),
     Column("M_D", "M_D"),
-    Column("decision_ms", "decision ms"),
+    Column("return", "return"),
 )
 
 
@@ -60,7 +63,7 @@ def _rank(metrics: dict[str, Interval]) -> float:
 def _summarise_planner(rows: Sequence[Row], planner: str) -> dict[str, Interval]:
     results = [row["result"] for row in finished(rows) if row["spec"]["planner"] == planner]
     summary = {}
-    for column in COLUMNS:
+    for column in (*HEADLINE, *DETAILS):
         values = [result[column.metric] for result in results]
         values = [value for value in values if not math.isnan(value)]  # RER of an empty map
         measure = (
@@ -76,23 +79,23 @@ def finished(rows: Sequence[Row]) -> list[Row]:
 
 
 def planner_table(rows: Sequence[Row]) -> str:
-    """Markdown table over all scenes and, if there are several, one for each scene."""
+    """Markdown tables over all scenes and, if there are several, one for each scene."""
     scenes = list(dict.fromkeys(row["spec"]["scene"] for row in rows))
-    parts = [_one_table(rows)]
+    parts = [_one_table(rows, HEADLINE), "\n", _one_table(rows, DETAILS)]
     if len(scenes) > 1:
         for scene in scenes:
             of_scene = [row for row in rows if row["spec"]["scene"] == scene]
-            parts.append(f"\n### {scene}\n\n{_one_table(of_scene)}")
+            parts.append(f"\n### {scene}\n\n{_one_table(of_scene, HEADLINE)}")
     return "".join(parts)
 
 
-def _one_table(rows: Sequence[Row]) -> str:
+def _one_table(rows: Sequence[Row], columns: Sequence[Column]) -> str:
     body = []
     for planner, metrics in summarise(rows).items():
         count = sum(row["spec"]["planner"] == planner for row in finished(rows))
-        cells = [format_interval(metrics[c.metric], c.scale) for c in COLUMNS]
+        cells = [format_interval(metrics[c.metric], c.scale) for c in columns]
         body.append([planner, str(count), *cells])
-    return markdown_table(["planner", "episodes", *(c.heading for c in COLUMNS)], body)
+    return markdown_table(["planner", "episodes", *(c.heading for c in columns)], body)
 
 
 def score_matrices(rows: Sequence[Row], metric: str = RANKED_BY) -> dict[str, NDArray[np.float64]]:

@@ -17,6 +17,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from ms_slam_env.benchmark.provenance import git_commit
 from ms_slam_env.benchmark.records import RecordFile, Row, spec_key
 from ms_slam_env.errors import InputError
 
@@ -42,7 +43,8 @@ def run_all(
 
     Rows that an earlier call left in ``out`` are taken from there, except failed ones, which are
     tried again. A row has ``key``, ``spec``, ``result`` (what ``run`` returned, None if it
-    raised or its process died), ``error`` (None or the message) and ``elapsed_s``.
+    raised or its process died), ``error`` (None or the message), ``elapsed_s`` and ``commit``
+    (of the code that made it).
 
     Args:
         specs: dataclasses; the key of the work is made of all their fields.
@@ -66,21 +68,23 @@ def run_all(
         print(f"{description}: {done} of {len(set(keys))} already in {out}", file=sys.stderr)
     if todo:
         with tqdm(total=len(set(keys)), initial=done, desc=description, unit="") as bar:
-            _run_missing(todo, run, workers, lambda row: _finish(row, rows, records, bar))
+            commit = git_commit()
+
+            def finish(row: Row) -> None:
+                row["commit"] = commit
+                records.append(row)
+                rows[row["key"]] = row
+                bar.update()
+                if row["error"] is not None:
+                    bar.write(f"failed: {row['error']}", file=sys.stderr)
+
+            _run_missing(todo, run, workers, finish)
     return [rows[key] for key in keys]
 
 
 def failures(rows: Sequence[Row]) -> list[str]:
     """The errors among ``rows``, one line each."""
     return [f"{row['key']}: {row['error']}" for row in rows if row["error"] is not None]
-
-
-def _finish(row: Row, rows: dict[str, Row], records: RecordFile, bar: Any) -> None:
-    records.append(row)
-    rows[row["key"]] = row
-    bar.update()
-    if row["error"] is not None:
-        bar.write(f"failed: {row['error']}", file=sys.stderr)
 
 
 def _run_missing(

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -98,18 +97,11 @@ def interquartile_means(scores: dict[str, Float64]) -> dict[str, Interval]:
     Args:
         scores: planner to (episodes, scenes).
     """
-    from rliable import library, metrics
+    from rliable import metrics
 
-    values, intervals = library.get_interval_estimates(
-        scores,
-        lambda x: np.array([metrics.aggregate_iqm(x)]),
-        reps=_RESAMPLES,
-        random_state=_random_state(),
+    return _rliable_intervals(
+        scores, lambda x: np.array([metrics.aggregate_iqm(x)]), resamples=_RESAMPLES
     )
-    return {
-        name: Interval(float(values[name][0]), *map(float, intervals[name][:, 0]))
-        for name in scores
-    }
 
 
 def improvement_probabilities(scores: dict[str, Float64], baseline: str) -> dict[str, Interval]:
@@ -119,19 +111,30 @@ def improvement_probabilities(scores: dict[str, Float64], baseline: str) -> dict
         scores: planner to (episodes, scenes).
         baseline: one of the planners.
     """
-    from rliable import library, metrics
+    from rliable import metrics
 
     pairs = {name: [score, scores[baseline]] for name, score in scores.items() if name != baseline}
-    values, intervals = library.get_interval_estimates(
+    return _rliable_intervals(
         pairs,
         lambda x, y: np.array([metrics.probability_of_improvement(x, y)]),
-        reps=_RESAMPLES // 4,  # each resample is a Mann-Whitney test a scene
-        random_state=_random_state(),
+        resamples=_RESAMPLES // 4,  # each is a Mann-Whitney test a scene
     )
+
+
+def _rliable_intervals(
+    scores: Mapping[str, Float64 | list[Float64]],
+    aggregate: Callable[..., Float64],
+    resamples: int,
+) -> dict[str, Interval]:
+    from rliable import library
+
+    with warnings.catch_warnings():
+        # The generator that rliable passes on is one that the library below wants to drop.
+        warnings.simplefilter("ignore", FutureWarning)
+        values, intervals = library.get_interval_estimates(
+            scores, aggregate, reps=resamples, random_state=np.random.RandomState(0)
+        )
     return {
-        name: Interval(float(values[name][0]), *map(float, intervals[name][:, 0])) for name in pairs
+        name: Interval(float(values[name][0]), *map(float, intervals[name][:, 0]))
+        for name in scores
     }
-
-
-def _random_state() -> Any:
-    return np.random.RandomState(0)  # the only generator that rliable takes

@@ -1,0 +1,87 @@
+"""Statistics against closed forms and direct computation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from ms_slam_env.benchmark import statistics
+from ms_slam_env.benchmark.statistics import Interval
+
+
+def test_median_interval_has_the_coverage_of_order_statistics() -> None:
+    """The exact interval of the median of 25 values is between the 8th and the 18th."""
+    values = np.arange(25.0)
+    interval = statistics.median_interval(values)
+    low, high = stats.binom.ppf([0.025, 0.975], 25, 0.5)
+    assert interval.value == 12
+    assert interval.low == pytest.approx(values[int(low)], abs=1)
+    assert interval.high == pytest.approx(values[int(high) - 1], abs=1)
+
+
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=12))
+def test_interval_holds_the_median_and_lies_in_the_range(values: list[float]) -> None:
+    interval = statistics.median_interval(values)
+    assert interval.value == np.median(values)
+    assert min(values) <= interval.low <= interval.value <= interval.high <= max(values)
+
+
+def test_one_value_is_its_own_interval() -> None:
+    assert statistics.median_interval([3.0]) == Interval(3.0, 3.0, 3.0)
+
+
+def test_equal_values_have_no_spread() -> None:
+    assert statistics.median_interval([2.0] * 8) == Interval(2.0, 2.0, 2.0)
+
+
+def test_no_values_give_nan() -> None:
+    assert np.isnan(statistics.median_interval([]).value)
+    assert np.isnan(statistics.share_interval([]).value)
+
+
+def test_same_values_same_interval() -> None:
+    values = np.random.default_rng(3).normal(size=20)
+    assert statistics.median_interval(values) == statistics.median_interval(values)
+
+
+def test_share_interval_is_wilsons() -> None:
+    k, n, z = 3, 20, stats.norm.ppf(0.975)
+    p = k / n
+    centre = (p + z**2 / (2 * n)) / (1 + z**2 / n)
+    half = z / (1 + z**2 / n) * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
+    interval = statistics.share_interval([True] * k + [False] * (n - k))
+    assert interval.value == p
+    assert (interval.low, interval.high) == pytest.approx((centre - half, centre + half))
+
+
+def test_cut_of_a_constant_factor_has_no_uncertainty() -> None:
+    """Resampled in pairs, values that are 0.6 times the baseline are cut by 0.4, always."""
+    baseline = np.random.default_rng(0).lognormal(size=15)
+    cut = statistics.relative_cut(0.6 * baseline, baseline)
+    assert (cut.value, cut.low, cut.high) == pytest.approx((0.4, 0.4, 0.4))
+
+
+def test_cut_is_negative_where_the_error_grew() -> None:
+    cut = statistics.relative_cut([2.0, 2.0, 2.0], [1.0, 1.0, 1.0])
+    assert cut.value == -1
+
+
+def test_interquartile_mean_is_the_mean_of_the_middle_half() -> None:
+    pytest.importorskip("rliable")
+    scores = np.random.default_rng(0).permutation(np.arange(16.0)).reshape(8, 2)
+    interval = statistics.interquartile_means({"a": scores})["a"]
+    assert interval.value == np.arange(4, 12).mean()
+    assert interval.low < interval.value < interval.high
+
+
+def test_improvement_probability_counts_pairs() -> None:
+    pytest.importorskip("rliable")
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(0.3, 1, (6, 3)), rng.normal(0, 1, (5, 3))
+    expected = np.mean([(a[:, None, k] > b[None, :, k]).mean() for k in range(3)])
+    result = statistics.improvement_probabilities({"a": a, "b": b}, "b")
+    assert list(result) == ["a"]
+    assert result["a"].value == pytest.approx(expected)
