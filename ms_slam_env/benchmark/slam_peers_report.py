@@ -16,7 +16,9 @@ def markdown_report(report: dict[str, Any]) -> str:
     parts += [f"- {name} did not run: {why}" for name, why in report["missing"].items()]
     for size in dict.fromkeys(result["size"] for result in report["results"]):
         results = [result for result in report["results"] if result["size"] == size]
-        parts.append(f"\n### {size}\n\nATE RMSE in mm, not aligned (SE(3)-aligned), ms a frame.\n")
+        parts.append(
+            f"\n### {size}\n\nATE RMSE in mm, not aligned (SE(3)-aligned), and processor time a frame.\n"
+        )
         parts.append(_error_table(results))
     if report["growth"]:
         parts.append("\n### Map growth over the second pass of a repeated path\n")
@@ -54,7 +56,7 @@ def _cell(results: list[dict[str, Any]]) -> str:
     """Median error and time of some results, as text."""
     raw, aligned, time = (
         float(np.median([result[key] for result in results]))
-        for key in ("ate_rmse_m", "ate_rmse_aligned_m", "frame_ms")
+        for key in ("ate_rmse_m", "ate_rmse_aligned_m", "frame_cpu_ms")
     )
     return (
         f"{format_number(raw * 1e3, 3)} ({format_number(aligned * 1e3, 3)}), "
