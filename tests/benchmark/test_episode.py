@@ -1,0 +1,99 @@
+"""Real episodes, short ones."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ms_slam_env.benchmark import planner_report
+from ms_slam_env.benchmark.episode import EpisodeSpec, run_episode
+from ms_slam_env.benchmark.frame_skipping import (
+    Arguments,
+    SkippingSpec,
+    run_sequence,
+    suggest_targets,
+)
+from ms_slam_env.benchmark.planners import make_planner, parse_planner, planner_names
+from ms_slam_env.benchmark.statistics import Interval
+from ms_slam_env.errors import InputError
+
+SPEC = EpisodeSpec("random", "table", seed=2000, steps=4)
+CLOCKS = ("decision_ms",)
+
+
+@pytest.fixture(scope="module")
+def result() -> dict[str, Any]:
+    return run_episode(SPEC)
+
+
+def test_result_has_every_reported_metric(result: dict[str, Any]) -> None:
+    for column in (*planner_report.HEADLINE, *planner_report.DETAILS):
+        assert np.isfinite(result[column.metric])
+    assert result["steps"] == len(result["ate_over_time"]) == 4
+    assert result["rcm"] == result["recall_5cm"]
+
+
+def test_same_spec_same_result(result: dict[str, Any]) -> None:
+    again = run_episode(SPEC)
+    assert {k: v for k, v in again.items() if k not in CLOCKS} == {
+        k: v for k, v in result.items() if k not in CLOCKS
+    }
+
+
+def test_stationary_does_not_move_and_maps_less(result: dict[str, Any]) -> None:
+    still = run_episode(EpisodeSpec("stationary", "table", seed=2000, steps=4))
+    assert still["path_length_m"] == 0
+    assert still["rcm"] < result["rcm"]
+    assert still["M_I"] < result["M_I"]
+
+
+@pytest.mark.parametrize("name", ["random", "stationary", "greedy", "max-information"])
+def test_planners_are_installed(name: str) -> None:
+    assert name in planner_names()
+
+
+def test_planner_by_module_and_class_takes_options() -> None:
+    from ms_slam_env.env.config import EnvConfig
+
+    class World:
+        config = EnvConfig()
+
+    text = "ms_slam_baselines.greedy:GreedyDivergence,rho_I=0.25,depth_weight=2"
+    planner: Any = make_planner(text, World())
+    assert (planner.targets.rho_I, planner.targets.depth_weight) == (0.25, 2.0)
+    assert parse_planner("policy,path=runs/a.zip,deterministic=true")[1] == {
+        "path": "runs/a.zip",
+        "deterministic": True,
+    }
+
+
+def test_skipping_frames_raises_divergence() -> None:
+    every = run_sequence(SkippingSpec("table", 1000, 1, 9, "80x60"))
+    third = run_sequence(SkippingSpec("table", 1000, 3, 9, "80x60"))
+    assert (every["kept_frames"], third["kept_frames"]) == (9, 3)
+    assert third["mean_D"] > every["mean_D"]
+    assert 0 < every["ate_m"] < 0.05
+
+
+def cell(ate_m: float, lost: float, M: float) -> dict[str, Interval]:
+    values = {"ate_m": ate_m, "lost": lost, "M_I": M, "M_D": 2 * M, "mean_I": M / 2, "mean_D": M}
+    return {name: Interval(value, value, value) for name, value in values.items()}
+
+
+def test_targets_are_read_at_the_last_interval_that_suffices() -> None:
+    summary = {1: cell(0.002, 0, 0.01), 2: cell(0.008, 0.4, 0.02), 4: cell(0.02, 0, 0.04)}
+    summary[8] = cell(0.001, 0, 0.08)  # luck beyond the first failure does not count
+    targets = suggest_targets(summary, 0.01)
+    assert targets is not None
+    assert (targets["interval"], targets["M_I"], targets["M_D"]) == (2, 0.02, 0.04)
+    assert suggest_targets(summary, 0.001) is None
+
+
+@pytest.mark.parametrize(
+    "options", [{"intervals": (0,)}, {"intervals": (81,)}, {"desired_ate_m": 0}]
+)
+def test_bad_skipping_options_are_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(InputError):
+        Arguments(**options)

@@ -1,0 +1,172 @@
+"""Exit codes and messages of ``ms-slam``."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ms_slam_env.benchmark import planner_benchmark, runner
+from ms_slam_env.benchmark.trajectory_evaluation import associate
+from ms_slam_env.cli import COMMANDS, main
+from ms_slam_env.geometry import make_pose, so3_exp
+from ms_slam_env.sequences import write_trajectory
+
+
+def one_line(text: str) -> str:
+    lines = text.strip().splitlines()
+    assert len(lines) == 1, text
+    return lines[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["fly"], "unknown command 'fly'; valid choices: benchmark, evaluate, train"),
+        (["benchmark", "--planners", "nonsense"], "unknown planner 'nonsense'; valid choices:"),
+        (["benchmark", "--scenes", "mars"], "unknown scene 'mars'; valid choices: living_room"),
+        (["benchmark", "--stps", "3"], "Unrecognized options: --stps"),
+        (["benchmark", "--steps", "three"], "--steps"),
+        (["benchmark", "--seeds", "exam"], "valid choices: train, validation, test"),
+        (["benchmark", "--env-id", "CartPole-v1"], "valid choices: MSActiveSLAM-v0"),
+        (["benchmark", "--workers", "0", "--planners", "random"], "workers = 0"),
+        (["evaluate"], "Missing"),
+        (["evaluate", "missing.txt", "missing.txt"], "cannot read trajectory missing.txt"),
+        (["train", "nonsense"], "unknown trainer 'nonsense'; valid choices: sb3"),
+    ],
+)
+def test_bad_input_is_one_line_and_code_2(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    if arguments[0] == "benchmark":
+        arguments = [*arguments, "--out", str(tmp_path)]
+    assert main(arguments) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert message in one_line(captured.err)
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["-h"], ["--version"]])
+def test_help_is_code_0(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(arguments) == 0
+    assert capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["benchmark", "evaluate"])
+def test_help_of_commands(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main([command, "--help"])
+    assert stop.value.code == 0
+    assert "--out" in capsys.readouterr().out
+
+
+def test_no_command_is_code_2(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 2
+    usage = capsys.readouterr().err
+    assert all(name in usage for name in COMMANDS)
+
+
+def test_the_installed_command_says_one_line(tmp_path: Path) -> None:
+    command = [
+        sys.executable,
+        "-c",
+        "import sys; from ms_slam_env.cli import main; sys.exit(main())",
+    ]
+    done = subprocess.run(
+        [*command, "benchmark", "--planners", "nonsense"], capture_output=True, text=True
+    )
+    assert done.returncode == 2
+    assert "unknown planner" in one_line(done.stderr)
+
+
+def test_failed_episodes_are_code_1_and_stay_in_the_results(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(planner_benchmark, "run_all", fail_all)
+    arguments = ["benchmark", "--planners", "random", "--scenes", "table", "--episodes", "2"]
+    assert main([*arguments, "--out", str(tmp_path)]) == 1
+    assert "2 failed, the first: k0: boom" in capsys.readouterr().err
+    content = json.loads((tmp_path / "results.json").read_text())
+    assert [row["error"] for row in content["episodes"]] == ["boom", "boom"]
+
+
+def fail_all(specs: list, run: object, out: Path, workers: int | None) -> list[runner.Row]:
+    return [
+        {"key": f"k{i}", "spec": vars(s), "result": None, "error": "boom", "commit": "c"}
+        for i, s in enumerate(specs)
+    ]
+
+
+def write_pair(folder: Path, shift_s: float = 0.0) -> tuple[Path, Path]:
+    """A wavy trajectory, and the same moved rigidly with one position off by 3 cm."""
+    t = np.linspace(0, 3, 31)
+    truth = np.stack([make_pose(so3_exp([0, 0, 0.3 * x]), [x, np.sin(x), 0.1 * x**2]) for x in t])
+    moved = make_pose(so3_exp([0.1, 0.2, 0.3]), [1, 2, 3]) @ truth
+    moved[10, :3, 3] += [0.03, 0, 0]
+    estimate, groundtruth = folder / "estimate.txt", folder / "truth.txt"
+    write_trajectory(estimate, t + shift_s, moved)
+    write_trajectory(groundtruth, t, truth)
+    return estimate, groundtruth
+
+
+def test_evaluate_agrees_with_evo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    metrics = pytest.importorskip("evo.core.metrics")
+    from evo.core import sync
+    from evo.tools import file_interface
+
+    estimate, truth = write_pair(tmp_path, shift_s=0.004)
+    assert main(["evaluate", str(estimate), str(truth), "--out", str(tmp_path)]) == 0
+    result = json.loads((tmp_path / "evaluation.json").read_text())
+    assert result["poses"] == 31
+    assert f"{result['ate_m']['rmse']:.6f}" in capsys.readouterr().out
+
+    reference, other = sync.associate_trajectories(
+        file_interface.read_tum_trajectory_file(str(truth)),
+        file_interface.read_tum_trajectory_file(str(estimate)),
+        max_diff=0.02,
+    )
+    rpe = metrics.RPE(metrics.PoseRelation.translation_part, 1, metrics.Unit.frames)
+    rpe.process_data((reference, other))
+    other.align(reference)
+    ape = metrics.APE(metrics.PoseRelation.translation_part)
+    ape.process_data((reference, other))
+    for name in ("rmse", "mean", "median", "max"):
+        statistic = metrics.StatisticsType(name)
+        assert result["ate_m"][name] == pytest.approx(ape.get_statistic(statistic), abs=1e-9)
+        assert result["rpe_m"][name] == pytest.approx(rpe.get_statistic(statistic), abs=1e-9)
+
+
+def test_evaluate_refuses_trajectories_of_other_times(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    estimate, truth = write_pair(tmp_path, shift_s=100)
+    assert main(["evaluate", str(estimate), str(truth)]) == 2
+    assert "0 timestamps in common" in one_line(capsys.readouterr().err)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("--align", "affine"), ("--delta", "0"), ("--max-difference-s", "-1")]
+)
+def test_evaluate_refuses_bad_options(
+    tmp_path: Path, option: str, value: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    estimate, truth = write_pair(tmp_path)
+    assert main(["evaluate", str(estimate), str(truth), option, value]) == 2
+    one_line(capsys.readouterr().err)
+
+
+def test_association_is_mutual_and_within_the_limit() -> None:
+    first, second = associate(
+        np.array([0.0, 1.0, 1.01, 2.0, 5.0]), np.array([0.015, 1.004, 2.5]), 0.02
+    )
+    np.testing.assert_array_equal(first, [0, 1])
+    np.testing.assert_array_equal(second, [0, 1])
+
+
+def test_association_of_single_timestamps() -> None:
+    first, second = associate(np.array([1.0]), np.array([1.0]), 0.0)
+    assert (list(first), list(second)) == ([0], [0])
