@@ -14,8 +14,8 @@ class SurfelConfig:
 
     Attributes:
         depth_cutoff_m: readings beyond are ignored, [0, 10].
-        icp_rgb_weight: relative weight w of the geometric and photometric terms, [0, 1]; see
-            ``tracking`` for its exact meaning.
+        icp_rgb_weight: weight w of the photometric term against the geometric one, [0, 1]: 0 is
+            geometry alone, 1 photometry alone; ``normal_equations`` has the exact cost.
         confidence_threshold: observations after which a surfel is stable, [0, 12].
         iterations: Gauss-Newton iterations per pyramid level, finest first.
         max_surfels: capacity of the map, per env.
@@ -39,7 +39,9 @@ class SurfelConfig:
         depth_noise_m: axial noise of depth at 1 m, grows with depth squared; the unit of
             geometric residuals.
         cauchy_icp: scale of Cauchy's loss on geometric residuals, in units of that noise.
-        cauchy_rgb: scale of Cauchy's loss on photometric residuals, grey levels.
+        cauchy_rgb: the same for photometric residuals.
+        intensity_noise: standard deviation of a grey value, grey levels.
+        lateral_noise_px: standard deviation of the place at which it was sampled, pixels.
         points_per_level: tracking looks at about this many pixels of a pyramid level.
 
     Raises:
@@ -55,7 +57,7 @@ class SurfelConfig:
     surfel_radius_px: float = 0.9
     max_confidence: float = 50.0
     compaction_interval: int = 10
-    unstable_window: int = 20
+    unstable_window: int = 200
     fusion_distance_m: float = 0.02
     fusion_angle_deg: float = 45.0
     bilateral_sigma_px: float = 1.5
@@ -66,7 +68,9 @@ class SurfelConfig:
     icp_angle_deg: float = 40.0
     depth_noise_m: float = 0.003
     cauchy_icp: float = 2.0
-    cauchy_rgb: float = 10.0
+    cauchy_rgb: float = 1.0
+    intensity_noise: float = 0.5
+    lateral_noise_px: float = 0.3
     points_per_level: int = 5000
 
     def __post_init__(self) -> None:
@@ -98,4 +102,6 @@ class SurfelConfig:
         check_range(self, "depth_noise_m", 0.00001, 1.0)
         check_range(self, "cauchy_icp", 0.01, 1000.0)
         check_range(self, "cauchy_rgb", 0.01, 1000.0)
+        check_range(self, "intensity_noise", 0.01, 255.0)
+        check_range(self, "lateral_noise_px", 0.0, 100.0)
         check_range(self, "points_per_level", 100, 10_000_000)

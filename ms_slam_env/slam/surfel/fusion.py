@@ -1,3 +1,6 @@
+# mypy: ignore-errors
+# ruff: noqa: UP018, RUF046
+# Warp code: annotations are Warp types, and float(0.0) declares a variable that changes.
 """Kernels that fuse a live frame into the map.
 
 Association is projective (Keller et al., 3DV 2013, section 4), but from the surfel to the image:
@@ -69,7 +72,7 @@ def update_surfels(
     live_normals: wp.array3d(dtype=wp.vec3),
     live_color: wp.array3d(dtype=wp.vec3),
     covered: wp.array3d(dtype=wp.int32),
-):
+) -> None:
     """Average each visible surfel with the readings about its projection; mark covered pixels.
 
     A surfel in front of all four readings contradicts free space; one whose normal disagrees
@@ -161,8 +164,11 @@ def add_surfels(
     live_normals: wp.array3d(dtype=wp.vec3),
     live_color: wp.array3d(dtype=wp.vec3),
     covered: wp.array3d(dtype=wp.int32),
-):
-    """Start a surfel at every uncovered reading with a normal; a full map drops it."""
+) -> None:
+    """Start a surfel at every uncovered reading with a normal; a full map drops it.
+
+    ``count`` runs past the capacity when surfels are dropped; ``put_back`` sets it right.
+    """
     b, worker = wp.tid()
     if mask[b] == 0:
         return
@@ -191,10 +197,3 @@ def add_surfels(
                     surfels.seen[b, slot] = time[b]
                 else:
                     wp.atomic_add(surfels.dropped, b, 1)
-
-
-@wp.kernel
-def clamp_count(count: wp.array(dtype=wp.int32), capacity: int):
-    """Undo the counting of surfels that a full map dropped."""
-    b = wp.tid()
-    count[b] = wp.min(count[b], capacity)

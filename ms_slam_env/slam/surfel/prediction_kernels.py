@@ -1,3 +1,6 @@
+# mypy: ignore-errors
+# ruff: noqa: UP018, RUF046
+# Warp code: annotations are Warp types, and float(0.0) declares a variable that changes.
 """Kernels of the candidates' views: warp the points of a layered depth image into many cameras.
 
 The front surface and the surface behind it, rendered from one reference pose with a wider field of
@@ -9,7 +12,7 @@ surfels into every view.
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
-from ms_slam_env.slam.surfel.splat import SplatCamera, floor_int
+from ms_slam_env.slam.surfel.splat import SplatCamera
 from ms_slam_env.slam.surfel.surfel_arrays import rotation_of, translation_of
 
 EMPTY = wp.constant(wp.int64(0x7FFFFFFFFFFFFFFF))

@@ -1,3 +1,5 @@
+# mypy: ignore-errors
+# Warp code: the annotations are Warp types, which mypy cannot read.
 """Kernels that remove surfels and close the gaps they leave."""
 
 from __future__ import annotations
@@ -18,14 +20,14 @@ def list_survivors(
     workers: int,
     survivors: wp.array2d(dtype=wp.int32),
     kept: wp.array(dtype=wp.int32),
-):
+) -> None:
     """List the slots to keep of every env whose compaction is due; ``kept`` -1: not due.
 
     Compaction is due every ``interval`` frames, and at once when nine tenths of the slots are
     taken; then every surfel that is unstable and not in view goes, whatever its age.
     """
     b, worker = wp.tid()
-    count = surfels.count[b]
+    count = wp.min(surfels.count[b], capacity)
     crowded = count > capacity - capacity / 10
     if mask[b] == 0 or (time[b] % interval != 0 and not crowded):
         kept[b] = -1
@@ -48,7 +50,7 @@ def gather(
     survivors: wp.array2d(dtype=wp.int32),
     kept: wp.array(dtype=wp.int32),
     workers: int,
-):
+) -> None:
     """Copy the survivors to the front of ``target``."""
     b, worker = wp.tid()
     for j in range(worker, kept[b], workers):
@@ -63,7 +65,13 @@ def gather(
 
 
 @wp.kernel
-def put_back(source: Surfels, target: Surfels, kept: wp.array(dtype=wp.int32), workers: int):
+def put_back(
+    source: Surfels,
+    target: Surfels,
+    kept: wp.array(dtype=wp.int32),
+    capacity: int,
+    workers: int,
+) -> None:
     """Copy the gathered survivors back and set the counters."""
     b, worker = wp.tid()
     for j in range(worker, kept[b], workers):
@@ -74,6 +82,8 @@ def put_back(source: Surfels, target: Surfels, kept: wp.array(dtype=wp.int32), w
         target.confidence[b, j] = source.confidence[b, j]
         target.created[b, j] = source.created[b, j]
         target.seen[b, j] = source.seen[b, j]
-    if worker == 0 and kept[b] >= 0:
-        target.count[b] = kept[b]
-        target.dead[b] = 0
+    if worker == 0:
+        target.count[b] = wp.min(target.count[b], capacity)
+        if kept[b] >= 0:
+            target.count[b] = kept[b]
+            target.dead[b] = 0

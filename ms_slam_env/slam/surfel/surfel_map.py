@@ -15,7 +15,6 @@ from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.fusion import (
     FusionParameters,
     add_surfels,
-    clamp_count,
     update_surfels,
 )
 from ms_slam_env.slam.surfel.prediction import DeviceViews, ViewPredictor
@@ -32,6 +31,7 @@ from ms_slam_env.slam.surfel.types import LiveFrame, ModelView
 Float64 = NDArray[np.float64]
 
 GPU_WORKERS = 8192  # threads that share one env's surfels
+_CHANGING = ("poses", "mask", "time", "weight", "live_vertices", "live_normals", "live_color")
 
 
 class SurfelMap:
@@ -75,6 +75,7 @@ class SurfelMap:
         self._predictor = ViewPredictor(
             self.surfels, self._visible, intrinsics, parameters, self._workers, device
         )
+        self._record_launches()
 
     def clear(self, env: int | None = None) -> None:
         """Forget the map of one env, or of all."""
@@ -104,61 +105,54 @@ class SurfelMap:
         """
         self._renderer.cull(poses, margin_px=0.0)
         self._covered.zero_()
-        shared = [poses, self._renderer.camera, mask, time, weight, self._fusion, self._workers]
-        images = [live.vertices, live.normals, live.color, self._covered]
-        dim = (self.batch, self._workers)
-        wp.launch(
-            update_surfels,
-            dim=dim,
-            inputs=[self.surfels, self._visible, *shared, *images],
-            device=self.device,
-        )
-        wp.launch(
-            add_surfels,
-            dim=dim,
-            inputs=[self.surfels, self.config.max_surfels, *shared, *images],
-            device=self.device,
-        )
-        wp.launch(
-            clamp_count,
-            dim=self.batch,
-            inputs=[self.surfels.count, self.config.max_surfels],
-            device=self.device,
-        )
-        self._compact(time, mask)
-
-    def _compact(self, time: wp.array, mask: wp.array) -> None:
-        """Remove dead and unstable surfels of the envs whose turn it is."""
         self._kept.zero_()
-        dim = (self.batch, self._workers)
-        wp.launch(
+        changing = (poses, mask, time, weight, live.vertices, live.normals, live.color)
+        for command in (self._update, self._add):
+            for name, value in zip(_CHANGING, changing, strict=True):
+                command.set_param_by_name(name, value)
+            command.launch()
+        self._list_survivors.set_param_by_name("mask", mask)
+        self._list_survivors.set_param_by_name("time", time)
+        self._list_survivors.launch()
+        self._gather.launch()
+        self._put_back.launch()
+
+    def _record_launches(self) -> None:
+        """Record the launches of ``fuse``; what changes with the frame is set there."""
+        capacity, workers, config = self.config.max_surfels, self._workers, self.config
+        dim = (self.batch, workers)
+        poses = wp.zeros(self.batch, dtype=wp.mat44, device=self.device)
+        integers = wp.zeros(self.batch, dtype=wp.int32, device=self.device)
+        floats = wp.zeros(self.batch, dtype=wp.float32, device=self.device)
+        image = wp.zeros((self.batch, *self.intrinsics.shape), dtype=wp.vec3, device=self.device)
+        frame = [poses, self._renderer.camera, integers, integers, floats, self._fusion, workers]
+        frame += [image, image, image, self._covered]
+
+        def record(kernel: Any, inputs: list[Any]) -> Any:
+            return wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, record_cmd=True)
+
+        self._update = record(update_surfels, [self.surfels, self._visible, *frame])
+        self._add = record(add_surfels, [self.surfels, capacity, *frame])
+        self._list_survivors = record(
             list_survivors,
-            dim=dim,
-            inputs=[
+            [
                 self.surfels,
-                self.config.max_surfels,
-                mask,
-                time,
-                self.config.compaction_interval,
-                self.config.confidence_threshold,
-                self.config.unstable_window,
-                self._workers,
+                capacity,
+                integers,
+                integers,
+                config.compaction_interval,
+                config.confidence_threshold,
+                config.unstable_window,
+                workers,
                 self._survivors,
                 self._kept,
             ],
-            device=self.device,
         )
-        wp.launch(
-            gather,
-            dim=dim,
-            inputs=[self.surfels, self._spare, self._survivors, self._kept, self._workers],
-            device=self.device,
+        self._gather = record(
+            gather, [self.surfels, self._spare, self._survivors, self._kept, workers]
         )
-        wp.launch(
-            put_back,
-            dim=dim,
-            inputs=[self._spare, self.surfels, self._kept, self._workers],
-            device=self.device,
+        self._put_back = record(
+            put_back, [self._spare, self.surfels, self._kept, capacity, workers]
         )
 
     def render_model(self, poses: wp.array) -> ModelView:
