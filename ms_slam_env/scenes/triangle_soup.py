@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from ms_slam_env.scenes.base import Float64
 
 _GREY = np.array([190, 190, 190], np.uint8)
 _MAX_TRIANGLES = 900_000
+_MAX_TEXTURE = 1024  # larger images are shrunk to this side
 _BLOCK = 4  # texels a side for a triangle with a colour at each corner
 
 
@@ -119,7 +121,7 @@ def _appearance(part: trimesh.Trimesh) -> tuple[Float64, NDArray[np.uint8]]:
         uv = np.asarray(visual.uv, dtype=np.float64)[part.faces][..., :2]
         uv = np.nan_to_num(uv)
         uv[..., 1] = 1.0 - uv[..., 1]  # the loader has v pointing up
-        return uv, np.clip(image * (factor / 255.0), 0, 255).astype(np.uint8)
+        return uv, _tinted(image, factor)
     if visual is None or not visual.defined:
         return np.full((count, 3, 2), 0.5), _plain(_GREY)
     if visual.kind == "face":
@@ -151,6 +153,17 @@ def _material(material: Any) -> tuple[NDArray[np.uint8] | None, Float64]:
         factor = _GREY if image is None else np.full(3, 255)
     pixels = None if image is None else np.asarray(image.convert("RGB"))
     return pixels, np.asarray(factor, dtype=np.float64)[:3]
+
+
+def _tinted(image: NDArray[np.uint8], factor: Float64) -> NDArray[np.uint8]:
+    """Image of bounded size, multiplied by a colour (3,) in [0, 255]."""
+    shrink = _MAX_TEXTURE / max(image.shape[:2])
+    result: Any = image
+    if shrink < 1.0:
+        result = cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    if (factor < 255.0).any():
+        result = np.rint(result * (factor / 255.0)).astype(np.uint8)
+    return result
 
 
 def _colour_atlas(colours: NDArray[np.float32]) -> tuple[Float64, NDArray[np.uint8]]:
