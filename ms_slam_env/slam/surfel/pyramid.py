@@ -7,6 +7,7 @@ its 2x2 block that are valid and lie near the front-most of them.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 from ms_slam_env._warp import wp
@@ -118,7 +119,7 @@ class Pyramid:
     def build(self, vertices: wp.array, normals: wp.array, intensity: wp.array) -> list[Level]:
         """All levels, finest first, of images (B, H, W); the coarse ones overwrite the last."""
         levels = [Level(vertices, normals, intensity, self._gradient), *self._coarse]
-        for fine, coarse in zip(levels[:-1], levels[1:], strict=True):
+        for fine, coarse in itertools.pairwise(levels):
             wp.launch(
                 _downsample,
                 dim=coarse.vertices.shape,

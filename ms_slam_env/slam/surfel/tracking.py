@@ -28,6 +28,7 @@ SEARCH_ITERATIONS = 5
 SMALLEST_STEP = (2.0e-5, 1.0e-4, 5.0e-4)  # metres and radians, per level, finest first
 DAMPING = 1.0e-6
 COARSE_TOLERANCE = 2.5
+DEPTH_REDUNDANCY = 50.0  # see normal_equations
 
 
 @dataclass(frozen=True)
@@ -204,11 +205,13 @@ def _weights(config: SurfelConfig, level: int) -> Weights:
     # Far from the solution large residuals carry the information: coarse levels are tolerant.
     widening = COARSE_TOLERANCE**level
     weights = Weights()
-    weights.icp = 1.0 - config.icp_rgb_weight
+    weights.icp = (1.0 - config.icp_rgb_weight) / DEPTH_REDUNDANCY
     weights.rgb = config.icp_rgb_weight
     weights.per_depth_noise = 1.0 / config.depth_noise_m
     weights.per_cauchy_icp = 1.0 / (config.cauchy_icp * widening)
     weights.per_cauchy_rgb = 1.0 / (config.cauchy_rgb * widening)
+    weights.grey_variance = config.intensity_noise**2
+    weights.pixel_variance = config.lateral_noise_px**2
     weights.distance_m = config.icp_distance_m
     weights.cos_angle = float(np.cos(np.radians(config.icp_angle_deg)))
     weights.inlier_sigmas = 4.0
