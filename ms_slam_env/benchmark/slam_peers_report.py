@@ -17,7 +17,7 @@ def markdown_report(report: dict[str, Any]) -> str:
     for size in dict.fromkeys(result["size"] for result in report["results"]):
         results = [result for result in report["results"] if result["size"] == size]
         parts.append(
-            f"\n### {size}\n\nATE RMSE in mm, not aligned (SE(3)-aligned), and processor time a frame.\n"
+            f"\n### {size}\n\nATE RMSE in mm, not aligned (SE(3)-aligned); processor time.\n"
         )
         parts.append(_error_table(results))
     if report["growth"]:
