@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import inspect
+import os
+import sys
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
@@ -44,6 +46,8 @@ def planner_class(name: str) -> type[Planner]:
             that cannot be imported, or a class that is no ``Planner``.
     """
     if ":" in name:
+        if os.getcwd() not in sys.path:  # a console script, unlike ``python -m``, leaves it out
+            sys.path.insert(0, os.getcwd())
         entry = EntryPoint(name=name, value=name, group=GROUP)
     else:
         found = [entry for entry in entry_points(group=GROUP) if entry.name == name]

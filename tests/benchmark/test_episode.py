@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +17,12 @@ from ms_slam_env.benchmark.frame_skipping import (
     run_sequence,
     suggest_targets,
 )
-from ms_slam_env.benchmark.planners import make_planner, parse_planner, planner_names
+from ms_slam_env.benchmark.planners import (
+    make_planner,
+    parse_planner,
+    planner_class,
+    planner_names,
+)
 from ms_slam_env.benchmark.statistics import Interval
 from ms_slam_env.errors import InputError
 
@@ -52,6 +59,17 @@ def test_stationary_does_not_move_and_maps_less(result: dict[str, Any]) -> None:
 @pytest.mark.parametrize("name", ["random", "stationary", "greedy", "max-information"])
 def test_planners_are_installed(name: str) -> None:
     assert name in planner_names()
+
+
+def test_planner_is_found_in_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "my_planners_of_a_test.py").write_text(
+        "from ms_slam_baselines import RandomWalk\n\nclass Mine(RandomWalk):\n    pass\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
+    assert planner_class("my_planners_of_a_test:Mine").__name__ == "Mine"
 
 
 def test_planner_by_module_and_class_takes_options() -> None:
