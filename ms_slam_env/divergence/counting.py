@@ -14,7 +14,7 @@ from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.divergence import kernels
 from ms_slam_env.divergence.config import DivergenceConfig
-from ms_slam_env.divergence.sphere import TABLE_SIZE, cell_weights
+from ms_slam_env.divergence.sphere import TABLE_SIZE, cell_weights, dither_offsets
 from ms_slam_env.errors import InputError
 
 Float64 = NDArray[np.float64]
@@ -81,12 +81,22 @@ class HistogramCounter:
         self._intrinsics = intrinsics
         self._device = device
         rows, columns = config.windows if config.measure == "windowed-kl" else (1, 1)
-        self._grid = wp.vec2i(rows, columns)
         self._windows = rows * columns
+        height, width = intrinsics.shape
+        self._grid: list[Any] = [
+            wp.array(index.astype(np.int32), dtype=wp.int32, device=device)
+            for index in (
+                np.arange(height) * rows // height * columns,
+                np.arange(width) * columns // width,
+            )
+        ]
         reach_px = math.tan(math.radians(config.normal_reach_deg)) * intrinsics.fx
         self._radius = max(1, round(reach_px))
         self._cell_weights = cell_weights(config.inclinations, float(config.alpha_deg))
         self._grouping = grouping_matrix(config.bins, float(config.smoothing))
+        self._dither: Any = wp.array(
+            dither_offsets(*intrinsics.shape), dtype=wp.vec2, device=device
+        )
         self._buffers: dict[int, tuple[Any, Any, Any]] = {}  # by batch size
 
     def histograms(self, intensity: Any, depth: Any, normals: Any | None = None) -> Histograms:
@@ -120,12 +130,7 @@ class HistogramCounter:
         depth_wp = self._upload(depth, wp.float32, "depth")
         inverse = self._inverse(depth_wp, wp.empty_like(depth_wp))
         result = wp.empty(depth_wp.shape, dtype=wp.vec3, device=self._device)
-        wp.launch(
-            kernels.compute_normals,
-            dim=depth_wp.shape,
-            inputs=[inverse, *self._camera(), result],
-            device=self._device,
-        )
+        self._launch(kernels.compute_normals, [inverse, *self._camera(), result])
         return result.numpy()
 
     def _upload(self, array: Any, dtype: Any, name: str) -> Any:
@@ -186,15 +191,14 @@ class HistogramCounter:
         levels, cells, inverse = self._buffer(batch)
         only_with_depth = int(self._config.intensity_pixels == "with-depth")
         self._launch(
-            kernels.count_intensity, [intensity, depth, only_with_depth, self._grid, levels]
+            kernels.count_intensity, [intensity, depth, only_with_depth, *self._grid, levels]
         )
+        tail = [self._dither, *self._grid, TABLE_SIZE, cells]
         if normals is None:
-            self._launch(
-                kernels.count_depth_normals,
-                [self._inverse(depth, inverse), *self._camera(), self._grid, TABLE_SIZE, cells],
-            )
+            inverse = self._inverse(depth, inverse)
+            self._launch(kernels.count_depth_normals, [inverse, *self._camera(), *tail])
         else:
-            self._launch(kernels.count_given_normals, [normals, self._grid, TABLE_SIZE, cells])
+            self._launch(kernels.count_given_normals, [normals, *tail])
         return (
             levels.numpy().reshape(batch, self._windows, 256),
             cells.numpy().reshape(batch, self._windows, TABLE_SIZE**2),

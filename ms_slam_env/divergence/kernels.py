@@ -4,16 +4,13 @@
 
 Counts are integers, so the result does not depend on the order in which a GPU adds them. One
 thread takes one image row: on the CPU, where threads run one after the other, the call of a
-thread costs more than a pixel does.
+thread costs more than a pixel does. The spatial window of pixel (v, u) is ``row_window[v] +
+column_window[u]``.
 """
 
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
-
-DITHER_U = wp.constant(0.7548776662466927)
-DITHER_V = wp.constant(0.5698402909980532)
-"""Steps of the two-dimensional low-discrepancy sequence R2 (Roberts, 2018)."""
 
 
 @wp.kernel
@@ -28,49 +25,40 @@ def invert_depth(
 
 
 @wp.func
-def depth_normal(
-    inverse: wp.array3d(dtype=wp.float32),
-    b: int,
-    v: int,
-    u: int,
-    focal: wp.vec2,
-    centre: wp.vec2,
-    radius: int,
+def plane_normal(
+    w: float,
+    left: float,
+    right: float,
+    above: float,
+    below: float,
     edge_threshold: float,
+    focal: wp.vec2,
+    offset: wp.vec2,
+    per_pixel: float,
 ):
     """Normal towards the camera, of any length; zero if there is none.
 
     On the plane n . p = d the inverse depth is n . ray / d, linear in the pixel coordinates, so
     its slopes give n / d exactly; d < 0 for a normal towards the camera. The slopes are central
-    differences over ``radius`` pixels to both sides. The second difference is zero on a plane
-    however tilted, so a large one shows an edge.
+    differences of the inverse depths to both sides of ``w``. The second difference is zero on a
+    plane however tilted, so a large one shows an edge.
+
+    ``offset`` is the pixel minus the centre, ``per_pixel`` 1 / the distance of the neighbours.
     """
     n = wp.vec3(0.0, 0.0, 0.0)
+    max_bend = edge_threshold * w
     if (
-        u >= radius
-        and v >= radius
-        and u + radius < inverse.shape[2]
-        and v + radius < inverse.shape[1]
+        w < 1.0e10
+        and wp.abs(left + right - 2.0 * w) < max_bend
+        and wp.abs(above + below - 2.0 * w) < max_bend
     ):
-        w = inverse[b, v, u]
-        left = inverse[b, v, u - radius]
-        right = inverse[b, v, u + radius]
-        above = inverse[b, v - radius, u]
-        below = inverse[b, v + radius, u]
-        max_bend = edge_threshold * w
-        if (
-            w < 1.0e10
-            and wp.abs(left + right - 2.0 * w) < max_bend
-            and wp.abs(above + below - 2.0 * w) < max_bend
-        ):
-            scale = 0.5 / float(radius)
-            slope_u = (right - left) * scale
-            slope_v = (below - above) * scale
-            n = wp.vec3(
-                -focal[0] * slope_u,
-                -focal[1] * slope_v,
-                slope_u * (float(u) - centre[0]) + slope_v * (float(v) - centre[1]) - w,
-            )
+        slope_u = (right - left) * per_pixel
+        slope_v = (below - above) * per_pixel
+        n = wp.vec3(
+            -focal[0] * slope_u,
+            -focal[1] * slope_v,
+            slope_u * offset[0] + slope_v * offset[1] - w,
+        )
     return n
 
 
@@ -81,28 +69,19 @@ def direction_cell(n: wp.vec3, dither: wp.vec2, size: int):
     The direction lies between four cell centres. ``dither`` in [0, 1)^2 picks one of them with
     the frequency of its weight in bilinear interpolation.
     """
-    scale = 1.0 / (wp.abs(n[0]) + wp.abs(n[1]) + wp.abs(n[2]))
+    half = 0.5 * float(size)
+    scale = half / (wp.abs(n[0]) + wp.abs(n[1]) + wp.abs(n[2]))
     x = n[0] * scale
     y = n[1] * scale
     if n[2] > 0.0:
-        folded_x = (1.0 - wp.abs(y)) * wp.sign(x)
-        y = (1.0 - wp.abs(x)) * wp.sign(y)
+        folded_x = (half - wp.abs(y)) * wp.sign(x)
+        y = (half - wp.abs(x)) * wp.sign(y)
         x = folded_x
-    half = 0.5 * float(size)
-    # Adding 1 before truncation and taking it off after keeps truncation a floor below 0.
-    column = int((x + 1.0) * half + dither[0] + 0.5) - 1
-    row = int((y + 1.0) * half + dither[1] + 0.5) - 1
+    # Cell k has its centre at k + 0.5. Adding 1 before truncation and taking it off after keeps
+    # truncation a floor down to -1.
+    column = int(x + half + dither[0] + 0.5) - 1
+    row = int(y + half + dither[1] + 0.5) - 1
     return wp.clamp(row, 0, size - 1) * size + wp.clamp(column, 0, size - 1)
-
-
-@wp.func
-def dither_of(v: int, u: int):
-    """Offset in [0, 1)^2 of a pixel: evenly spread over any patch of the image."""
-    index_u = float(u)
-    index_v = float(v)
-    x = index_u * DITHER_U + index_v * DITHER_V
-    y = index_u * DITHER_V + index_v * (1.0 - DITHER_U)
-    return wp.vec2(x - float(int(x)), y - float(int(y)))
 
 
 @wp.kernel
@@ -110,17 +89,18 @@ def count_intensity(
     intensity: wp.array3d(dtype=wp.float32),
     depth: wp.array3d(dtype=wp.float32),
     only_with_depth: int,
-    windows: wp.vec2i,
+    row_window: wp.array(dtype=wp.int32),
+    column_window: wp.array(dtype=wp.int32),
     counts: wp.array2d(dtype=wp.int32),
 ):
     """Add a row of pixels to the grey levels (B, windows * 256) of its frame."""
     b, v = wp.tid()
     width = intensity.shape[2]
-    window_row = v * windows[0] / intensity.shape[1] * windows[1]
+    window_row = row_window[v]
     for u in range(width):
         if only_with_depth == 0 or depth[b, v, u] > 0.0:
             level = wp.clamp(int(intensity[b, v, u] + 0.5), 0, 255)
-            window = window_row + u * windows[1] / width
+            window = window_row + column_window[u]
             wp.atomic_add(counts, b, window * 256 + level, 1)
 
 
@@ -131,38 +111,56 @@ def count_depth_normals(
     centre: wp.vec2,
     radius: int,
     edge_threshold: float,
-    windows: wp.vec2i,
+    dither: wp.array2d(dtype=wp.vec2),
+    row_window: wp.array(dtype=wp.int32),
+    column_window: wp.array(dtype=wp.int32),
     size: int,
     counts: wp.array2d(dtype=wp.int32),
 ):
     """Add the normals of a row of pixels to the cells (B, windows * size^2) of its frame."""
     b, v = wp.tid()
+    height = inverse.shape[1]
     width = inverse.shape[2]
-    window_row = v * windows[0] / inverse.shape[1] * windows[1]
-    for u in range(width):
-        n = depth_normal(inverse, b, v, u, focal, centre, radius, edge_threshold)
+    if v < radius or v >= height - radius:
+        return
+    window_row = row_window[v]
+    per_pixel = 0.5 / float(radius)
+    for u in range(radius, width - radius):
+        n = plane_normal(
+            inverse[b, v, u],
+            inverse[b, v, u - radius],
+            inverse[b, v, u + radius],
+            inverse[b, v - radius, u],
+            inverse[b, v + radius, u],
+            edge_threshold,
+            focal,
+            wp.vec2(float(u) - centre[0], float(v) - centre[1]),
+            per_pixel,
+        )
         if wp.dot(n, n) > 0.0:
-            window = window_row + u * windows[1] / width
-            cell = direction_cell(n, dither_of(v, u), size)
+            window = window_row + column_window[u]
+            cell = direction_cell(n, dither[v, u], size)
             wp.atomic_add(counts, b, window * size * size + cell, 1)
 
 
 @wp.kernel
 def count_given_normals(
     normals: wp.array3d(dtype=wp.vec3),
-    windows: wp.vec2i,
+    dither: wp.array2d(dtype=wp.vec2),
+    row_window: wp.array(dtype=wp.int32),
+    column_window: wp.array(dtype=wp.int32),
     size: int,
     counts: wp.array2d(dtype=wp.int32),
 ):
     """Add given normals of a row of pixels to the cells (B, windows * size^2) of its frame."""
     b, v = wp.tid()
     width = normals.shape[2]
-    window_row = v * windows[0] / normals.shape[1] * windows[1]
+    window_row = row_window[v]
     for u in range(width):
         n = normals[b, v, u]
         if wp.dot(n, n) > 0.0:
-            window = window_row + u * windows[1] / width
-            cell = direction_cell(n, dither_of(v, u), size)
+            window = window_row + column_window[u]
+            cell = direction_cell(n, dither[v, u], size)
             wp.atomic_add(counts, b, window * size * size + cell, 1)
 
 
@@ -175,8 +173,23 @@ def compute_normals(
     edge_threshold: float,
     normals: wp.array3d(dtype=wp.vec3),
 ):
-    """Unit normals of every pixel, zero where there is none."""
-    b, v, u = wp.tid()
-    normals[b, v, u] = wp.normalize(
-        depth_normal(inverse, b, v, u, focal, centre, radius, edge_threshold)
-    )
+    """Unit normals of a row of pixels, zero where there is none."""
+    b, v = wp.tid()
+    height = inverse.shape[1]
+    width = inverse.shape[2]
+    per_pixel = 0.5 / float(radius)
+    for u in range(width):
+        n = wp.vec3(0.0, 0.0, 0.0)
+        if v >= radius and v < height - radius and u >= radius and u < width - radius:
+            n = plane_normal(
+                inverse[b, v, u],
+                inverse[b, v, u - radius],
+                inverse[b, v, u + radius],
+                inverse[b, v - radius, u],
+                inverse[b, v + radius, u],
+                edge_threshold,
+                focal,
+                wp.vec2(float(u) - centre[0], float(v) - centre[1]),
+                per_pixel,
+            )
+        normals[b, v, u] = wp.normalize(n)

@@ -70,3 +70,15 @@ def cell_weights(inclinations: int, alpha_deg: float) -> Float32:
     ).astype(np.float32)
     weights.flags.writeable = False
     return weights
+
+
+def dither_offsets(height: int, width: int) -> Float32:
+    """Offsets (height, width, 2) in [0, 1), evenly spread over any patch of the image.
+
+    Source: the two-dimensional low-discrepancy sequence R2 (Roberts, "The unreasonable
+    effectiveness of quasirandom sequences", 2018), its two steps along rows and columns.
+    """
+    v, u = np.mgrid[:height, :width].astype(np.float64)
+    a, b = 0.7548776662466927, 0.5698402909980532
+    offsets = np.stack([u * a + v * b, u * b + v * (1 - a)], axis=-1) % 1.0
+    return np.minimum(offsets, 0.999999).astype(np.float32)  # float32 could round up to 1
