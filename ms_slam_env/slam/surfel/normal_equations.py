@@ -81,6 +81,7 @@ def accumulate(
     active: wp.array2d(dtype=wp.int32),
     partial: wp.array4d(dtype=wp.float32),  # (B, K, rows * pieces, NUM_SUMS)
 ):
+    """Sum the terms of one piece of a row of model points, for every active hypothesis."""
     b, k, row_index, piece = wp.tid()
     if active[b, k] == 0:
         return

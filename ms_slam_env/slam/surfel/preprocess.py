@@ -1,8 +1,9 @@
 """From sensor images to filtered depth, vertices, normals and intensity, for B envs at once.
 
 ElasticFusion (Whelan et al., RSS 2015) section III: depth is filtered bilaterally. Here the
-filter runs along columns, then rows (Pham and van Vliet, ICME 2005), and on inverse depth, because the inverse depth of a plane is linear in the image (so a
-symmetric window keeps planes) and the noise of a structured-light sensor is uniform in it.
+filter runs along columns, then rows (Pham and van Vliet, ICME 2005), and on inverse depth, because
+the inverse depth of a plane is linear in the image (so a symmetric window keeps planes) and the
+noise of a structured-light sensor is uniform in it.
 """
 
 from __future__ import annotations

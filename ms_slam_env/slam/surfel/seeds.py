@@ -40,13 +40,11 @@ def tracking_seeds(last_motion: Float64) -> Float64:
 def relocalisation_seeds(attempt: int) -> Float64:
     """Starts (NUM_SEEDS, 4, 4) of one attempt; successive attempts search wider and wider.
 
-    Attempt 0 is the tracking set at rest; later ones combine a pan, a tilt and a step along the
-    axis of view, drawn from a fixed sequence (the same in every run).
+    Each holds the pose of the model view and turns with steps drawn from a fixed sequence, the
+    same in every run.
     """
-    if attempt == 0:
-        return tracking_seeds(np.eye(4))
     rng = np.random.default_rng(attempt)
-    reach = min(1.0, 0.3 + 0.1 * attempt)
+    reach = min(1.0, 0.4 + 0.05 * attempt)
     seeds = [np.eye(4)]
     for _ in range(NUM_SEEDS - 1):
         turn = rng.uniform(-1, 1, 3) * np.radians([25.0, 35.0, 15.0]) * reach

@@ -29,6 +29,7 @@ from ms_slam_env.slam.surfel.verdict import (
     make_limits,
 )
 
+RETRIES = 2  # further searches within a frame whose tracking failed
 FEWEST_READINGS = 0.05  # share of the first frame's pixels that must have depth
 
 
@@ -88,12 +89,28 @@ class BatchedSurfelSlam:
                 for env in range(self.batch)
             ]
         )
-        limits = make_limits(lost, self.intrinsics)
+        limits = make_limits(lost)
         alignment = self.tracker.align(self._view, self.poses, seeds, limits)
+        alignment = self._search_again(alignment)
         return [
             self._accept(env, alignment) if self._started[env] else self._start(env, live)
             for env in range(self.batch)
         ]
+
+    def _search_again(self, alignment: Alignment) -> Alignment:
+        """Give the envs that failed more starting poses, under stricter limits."""
+        for attempt in range(1, 1 + RETRIES):
+            failed = self._started & (alignment.verdict != 0)
+            if not failed.any():
+                break
+            seeds = np.stack(
+                [relocalisation_seeds(attempt + RETRIES * int(lost)) for lost in self._lost]
+            )
+            again = self.tracker.align(
+                self._view, self.poses, seeds, make_limits(np.ones(self.batch, dtype=bool))
+            )
+            alignment = alignment.replace(failed & (again.verdict == 0), again)
+        return alignment
 
     def _start(self, env: int, live: LiveFrame) -> TrackResult:
         """Take the first frame at the given pose, if there is something in it to map."""

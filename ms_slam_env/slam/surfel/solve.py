@@ -22,6 +22,7 @@ def reduce_sums(
     active: wp.array2d(dtype=wp.int32),
     sums: wp.array3d(dtype=wp.float64),  # (B, K, NUM_SUMS)
 ):
+    """Add up the partial sums of every active hypothesis, always in the same order."""
     b, k, i = wp.tid()
     if active[b, k] == 0:
         return
@@ -142,6 +143,7 @@ def gauss_newton_step(
     pose: wp.array2d(dtype=wp.mat44d),
     active: wp.array2d(dtype=wp.int32),
 ):
+    """Move every active hypothesis by the solution of H xi = -g; stop those that converged."""
     b, k = wp.tid()
     if active[b, k] != 0:
         H = load_hessian(sums, b, k)

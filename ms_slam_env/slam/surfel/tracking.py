@@ -47,6 +47,15 @@ class Alignment:
     verdict: NDArray[np.int32]
     stats: Float64
 
+    def replace(self, where: NDArray[np.bool_], other: Alignment) -> Alignment:
+        """Take the envs ``where`` (B,) from ``other``."""
+        return Alignment(
+            T_world_live=np.where(where[:, None, None], other.T_world_live, self.T_world_live),
+            T_model_live=np.where(where[:, None, None], other.T_model_live, self.T_model_live),
+            verdict=np.where(where, other.verdict, self.verdict),
+            stats=np.where(where[:, None], other.stats, self.stats),
+        )
+
 
 class Tracker:
     """Aligns live frames with model views for B envs; owns the device buffers."""
@@ -110,7 +119,7 @@ class Tracker:
         self._live_levels = self._live.build(live.vertices, live.normals, live.intensity)
 
     def align(
-        self, model: ModelView, T_world_model: Float64, seeds: Float64, limits: np.ndarray
+        self, model: ModelView, T_world_model: Float64, seeds: Float64, limits: NDArray[np.void]
     ) -> Alignment:
         """Align the frames set before with ``model``.
 

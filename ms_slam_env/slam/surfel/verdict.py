@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env._warp import wp
-from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.surfel.solve import (
     cholesky,
     cholesky_solve,
@@ -38,8 +37,8 @@ STAT_OVERLAP = 2
 STAT_ALIKE_FRACTION = 3
 STAT_APART_FRACTION = 4
 STAT_SIGMA = 5  # standard deviation of the worst translation or rotation component
-STAT_COST = 6
-NUM_STATS = 8
+STAT_COST = 6  # mean truncated cost of the visible points, in [0, 3]
+NUM_STATS = 7
 
 
 @wp.struct
@@ -51,6 +50,7 @@ class Limits:
     inliers: wp.float64
     alike: wp.float64
     apart: wp.float64
+    cost: wp.float64
     sigma: wp.float64
     motion_m: wp.float64
     motion_cos: wp.float64
@@ -73,6 +73,7 @@ def choose(
     pose: wp.array2d(dtype=wp.mat44d),  # (B, 1)
     active: wp.array2d(dtype=wp.int32),  # (B, 1)
 ):
+    """Go on with the candidate whose points fit best; it becomes the one hypothesis."""
     b = wp.tid()
     best = wp.int32(0)
     best_score = _score(sums, b, 0)
@@ -95,6 +96,7 @@ def judge(
     verdict: wp.array(dtype=wp.int32),
     stats: wp.array2d(dtype=wp.float64),
 ):
+    """Compare what the alignment explained with the limits; write verdict, figures and pose."""
     b = wp.tid()
     limit = limits[b]
     one = wp.float64(1.0)
@@ -108,6 +110,7 @@ def judge(
         alike_fraction = sums[b, 0, 34] / textured
     apart_fraction = sums[b, 0, 35] / wp.max(matched, one)
     overlap = visible / wp.max(points, one)
+    cost = sums[b, 0, 27] / wp.max(visible, one)
 
     sigma = wp.float64(1.0e9)
     L = cholesky(load_hessian(sums, b, 0))
@@ -132,7 +135,7 @@ def judge(
         code = 3
     elif inlier_fraction < limit.inliers or apart_fraction > limit.apart:
         code = 4
-    elif alike_fraction < limit.alike:
+    elif alike_fraction < limit.alike or cost > limit.cost:
         code = 5
     elif distance > limit.motion_m or cosine < limit.motion_cos:
         code = 6
@@ -144,18 +147,23 @@ def judge(
     stats[b, 3] = alike_fraction
     stats[b, 4] = apart_fraction
     stats[b, 5] = sigma
-    stats[b, 6] = _score(sums, b, 0)
-    stats[b, 7] = textured
+    stats[b, 6] = cost
 
 
-def make_limits(strict: NDArray[np.bool_], intrinsics: Intrinsics) -> NDArray[np.void]:
-    """Limits (B,) of ordinary tracking, or ``strict`` ones for accepting a relocalisation."""
+def make_limits(strict: NDArray[np.bool_]) -> NDArray[np.void]:
+    """Limits (B,) of ordinary tracking, or ``strict`` ones where a wide search found the pose.
+
+    Chosen on 800 good and 80 wrong alignments of random walks with steps of 3, 6 and 10 cm and
+    degrees in six scenes at 160x120: they refuse 0.3 % of the good ones. The self-similar carpet
+    fits itself at wrong places but for its cost, which is 1.5 there and below 1.3 at right ones.
+    """
     limits = np.zeros(len(strict), dtype=Limits.numpy_dtype())
     limits["points"] = 100.0
-    limits["overlap"] = np.where(strict, 0.4, 0.25)
-    limits["inliers"] = np.where(strict, 0.6, 0.5)
-    limits["alike"] = np.where(strict, 0.7, 0.5)
-    limits["apart"] = np.where(strict, 0.2, 0.3)
+    limits["overlap"] = np.where(strict, 0.4, 0.3)
+    limits["inliers"] = np.where(strict, 0.7, 0.65)
+    limits["alike"] = np.where(strict, 0.75, 0.7)
+    limits["apart"] = np.where(strict, 0.12, 0.15)
+    limits["cost"] = np.where(strict, 1.3, 1.4)
     limits["sigma"] = 0.02
     limits["motion_m"] = np.where(strict, 1.0, 0.3)
     limits["motion_cos"] = np.where(strict, np.cos(np.radians(60)), np.cos(np.radians(30)))
