@@ -20,7 +20,7 @@ BOX_HALF = 0.15
 def texture(points: np.ndarray) -> np.ndarray:
     """Smooth RGB (..., 3) in [0, 255] of world points (..., 3)."""
     x, y, z = np.moveaxis(points, -1, 0)
-    waves = [np.sin(5 * x + 1), np.sin(4 * y + 2 * x), np.sin(6 * (x + y) + z)]
+    waves = [np.sin(2.5 * x + 1), np.sin(2 * y + x), np.sin(3 * (x + y) + z)]
     return 128 + 80 * np.stack(waves, -1)
 
 

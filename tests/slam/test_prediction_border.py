@@ -28,6 +28,7 @@ def test_nothing_is_written_behind_the_last_view():
     cloud.normal = wp.zeros((1, len(points)), dtype=wp.vec3)
     cloud.intensity = wp.zeros((1, len(points)), dtype=wp.float32)
     cloud.count = wp.array([len(points)], dtype=wp.int32)
+    cloud.front_count = wp.array([len(points)], dtype=wp.int32)
     camera = SplatCamera()
     camera.focal = wp.vec2(CAMERA.fx, CAMERA.fy)
     camera.centre = wp.vec2(CAMERA.cx, CAMERA.cy)

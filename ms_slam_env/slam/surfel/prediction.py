@@ -102,12 +102,14 @@ class _Reference:
         self.points.normal = wp.zeros((envs, capacity), dtype=wp.vec3, device=device)
         self.points.intensity = wp.zeros((envs, capacity), dtype=wp.float32, device=device)
         self.points.count = wp.zeros(envs, dtype=wp.int32, device=device)
+        self.points.front_count = wp.zeros(envs, dtype=wp.int32, device=device)
 
     def render(self, poses: wp.array, first_env: int) -> None:
         """Fill ``points`` from the front surface and the one behind it."""
         self.points.count.zero_()
         self.renderer.cull(poses, first_env)
         self._collect(self.renderer.splat(first_env))
+        wp.copy(self.points.front_count, self.points.count)
         self.renderer.list_hidden(self.hidden)
         self._collect(self.renderer.splat(first_env, self.hidden))
 

@@ -16,18 +16,23 @@ from ms_slam_env.slam.surfel.splat import SplatCamera
 from ms_slam_env.slam.surfel.surfel_arrays import rotation_of, translation_of
 
 EMPTY = wp.constant(wp.int64(0x7FFFFFFFFFFFFFFF))
-DEPTH_BINS_PER_M = wp.constant(40.0)  # points in one depth bin compete by distance to the pixel
+DEPTH_BINS_PER_M = wp.constant(10.0)  # points in one depth bin compete by distance to the pixel
+HIDDEN = wp.constant(wp.int64(1 << 39))  # key bit of points of the second layer
 CLOSE_GAP = wp.constant(4)  # an empty pixel with at least so many neighbours is a gap to close
 
 
 @wp.struct
 class PointCloud:
-    """Points of E reference views, in the reference camera's frame; ``count`` (E,)."""
+    """Points of E reference views, in the reference camera's frame.
+
+    The first ``front_count`` (E,) of ``count`` (E,) points are on the front surface.
+    """
 
     position: wp.array2d(dtype=wp.vec3)
     normal: wp.array2d(dtype=wp.vec3)
     intensity: wp.array2d(dtype=wp.float32)
     count: wp.array(dtype=wp.int32)
+    front_count: wp.array(dtype=wp.int32)
 
 
 @wp.kernel
@@ -59,8 +64,8 @@ def scatter_points(
 ) -> None:
     """Z-buffer of the points: per pixel the smallest key of the points within a pixel of it.
 
-    A key is (depth bin, squared distance to the pixel, point), so among the points of one surface
-    the one nearest to the pixel wins. ``motions[v]`` is T_view_reference; keys (V * h * w).
+    A key is (depth bin, layer, squared distance to the pixel, point), so among the points of one
+    surface the one nearest to the pixel wins, and what the reference view hides stays hidden. ``motions[v]`` is T_view_reference; keys (V * h * w).
     """
     view, worker = wp.tid()
     e = view / views_per_env
@@ -82,6 +87,7 @@ def scatter_points(
     t = K * translation_of(motions[view])
     right = float(width)
     bottom = float(height)
+    front_count = points.front_count[e]
     for j in range(worker, points.count[e], workers):
         p = R * points.position[e, j] + t
         z = p[2]
@@ -96,6 +102,8 @@ def scatter_points(
             eu = 1.0 - du
             ev = 1.0 - dv
             key = (wp.int64(int(z * DEPTH_BINS_PER_M)) << wp.int64(40)) + wp.int64(j)
+            if j >= front_count:
+                key += HIDDEN
             # the division may round up to the border itself: u0 = width or v0 = height
             left_in = u0 >= 0 and u0 < width
             right_in = u0 + 1 < width

@@ -1,0 +1,142 @@
+"""Predicted views against closed forms and direct splatting."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import maximum_filter, minimum_filter
+from surfel_scenes import SMALL, build_map, device_poses, ray_cast
+
+from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import make_pose, so3_exp
+from ms_slam_env.robot.motions import decompose
+from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.prediction import mean_pose, wide_intrinsics
+from ms_slam_env.slam.surfel.surfel_map import SurfelMap
+
+LUMA = np.array([0.299, 0.587, 0.114])
+WIDE_PATH = np.stack(
+    [
+        make_pose(so3_exp([x, y, 0.0]), [0.1 * y, -0.1 * x, 0.0])
+        for x in (-0.2, 0.0, 0.2)
+        for y in (-0.25, 0.0, 0.25)
+    ]
+)
+CANDIDATES = decompose(0.05, np.radians(5.0))
+
+
+@pytest.fixture(scope="module")
+def wide_map() -> SurfelMap:
+    """A clean map that reaches beyond the view of the identity pose on all sides."""
+    return build_map(WIDE_PATH)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+def test_the_49_views_are_the_scene(wide_map: SurfelMap, scale: float) -> None:
+    views = wide_map.predict(CANDIDATES, scale)
+    camera = SMALL.scaled(scale)
+    assert views.intrinsics == camera
+    assert views.depth.shape == (49, *camera.shape)
+    for pose, depth, normals, intensity in zip(
+        CANDIDATES, views.depth, views.normals, views.intensity, strict=True
+    ):
+        true_depth, true_normals, color = ray_cast(pose, camera)
+        assert (depth > 0).mean() > 0.97
+        same_surface = np.abs(depth - true_depth) < 0.02
+        assert same_surface.mean() > 0.9  # but the rim of the box
+        assert np.median(np.abs(depth - true_depth)[same_surface]) < 2e-4
+        np.testing.assert_allclose(
+            np.median(normals[same_surface & (true_depth > 1.5)], axis=0),
+            np.median(true_normals[true_depth > 1.5], axis=0),
+            atol=1e-3,
+        )
+        # Each pixel shows a point within a pixel of it.
+        grey = color @ LUMA
+        within = (intensity > minimum_filter(grey, 3) - 3) & (
+            intensity < maximum_filter(grey, 3) + 3
+        )
+        assert within[same_surface].mean() > 0.97
+
+
+def test_warped_views_agree_with_direct_splatting(wide_map: SurfelMap) -> None:
+    views = wide_map.predict(CANDIDATES)
+    for pose, depth, intensity in zip(CANDIDATES, views.depth, views.intensity, strict=True):
+        direct = wide_map.render_model(device_poses(pose[None]))
+        direct_depth = direct.vertices.numpy()[0, ..., 2]
+        agree = (np.abs(depth - direct_depth) < 0.01) & (depth > 0)
+        assert agree.mean() > 0.93
+        difference = intensity - direct.intensity.numpy()[0]
+        assert np.abs(difference)[agree].mean() < 5.0
+        assert abs(difference[agree].mean()) < 1.0  # all pixels may be off by the same half pixel
+
+
+def test_surface_hidden_from_the_reference_is_predicted() -> None:
+    surfel_map = build_map(WIDE_PATH)
+    aside = make_pose(np.eye(3), [0.12, 0.0, 0.0])  # looks past the box at what it hid
+    poses = np.stack([np.eye(4), aside, make_pose(np.eye(3), [-0.12, 0.0, 0.0])])
+    views = surfel_map.predict(poses)
+    true_depth = ray_cast(aside, SMALL)[0]
+    error = np.abs(views.depth[1] - true_depth)
+    assert (error < 0.02).mean() > 0.95
+
+
+def test_views_far_apart_are_splatted_one_by_one(wide_map: SurfelMap) -> None:
+    turned = make_pose(so3_exp([0.0, 2.5, 0.0]), [0.0, 0.0, 0.0])
+    poses = np.stack([np.eye(4), turned, np.eye(4)])
+    views = wide_map.predict(poses)
+    direct = wide_map.render_model(device_poses(np.eye(4)[None]))
+    np.testing.assert_array_equal(views.depth[0], direct.vertices.numpy()[0, ..., 2])
+    np.testing.assert_array_equal(views.intensity[0], direct.intensity.numpy()[0])
+    np.testing.assert_array_equal(views.depth[0], views.depth[2])
+    assert (views.depth[1] == 0).all()
+
+
+def test_an_empty_map_predicts_nothing() -> None:
+    views = SurfelMap(1, SMALL, SurfelConfig(max_surfels=1000)).predict(CANDIDATES, 0.5)
+    assert (views.depth == 0).all()
+    assert (views.intensity == 0).all()
+    assert (views.normals == 0).all()
+
+
+def test_prediction_repeats_bit_exactly_and_leaves_the_map_alone(wide_map: SurfelMap) -> None:
+    before = wide_map.get_state()["surfels"][0]
+    first, second = wide_map.predict(CANDIDATES, 0.5), wide_map.predict(CANDIDATES, 0.5)
+    np.testing.assert_array_equal(first.depth, second.depth)
+    np.testing.assert_array_equal(first.intensity, second.intensity)
+    for name, values in wide_map.get_state()["surfels"][0].items():
+        np.testing.assert_array_equal(values, before[name])
+
+
+def test_the_reference_view_contains_all_views() -> None:
+    wide = wide_intrinsics(SMALL, CANDIDATES)
+    assert wide is not None
+    rng = np.random.default_rng(0)
+    corners = np.array([[u, v] for u in (-0.5, 39.5) for v in (-0.5, 29.5)])
+    rays = np.stack([(corners[:, 0] - 19.3) / 40.0, (corners[:, 1] - 14.8) / 42.0, np.ones(4)], 1)
+    for motion in CANDIDATES:
+        points = rays * rng.uniform(0.6, 4.0, (4, 1)) @ motion[:3, :3].T + motion[:3, 3]
+        pixels = wide.project(points)
+        assert (pixels >= -0.5).all()
+        assert (pixels <= [wide.width - 0.5, wide.height - 0.5]).all()
+
+
+def test_the_mean_of_symmetric_motions_is_the_middle() -> None:
+    middle = make_pose(so3_exp([0.3, -0.4, 0.9]), [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(mean_pose(middle @ CANDIDATES), middle, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("poses", "scale"),
+    [
+        (np.zeros((1, 0, 4, 4)), 1.0),
+        (np.eye(4), 1.0),
+        (np.full((1, 2, 4, 4), np.nan), 1.0),
+        (np.eye(4)[None, None], 0.0),
+        (np.eye(4)[None, None], float("nan")),
+    ],
+)
+def test_bad_poses_and_scales_are_refused(
+    wide_map: SurfelMap, poses: np.ndarray, scale: float
+) -> None:
+    with pytest.raises(InputError):
+        wide_map.predict_device(poses, scale)
