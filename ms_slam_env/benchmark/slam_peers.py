@@ -30,6 +30,7 @@ from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
 from ms_slam_env.config import check_range
 from ms_slam_env.errors import InputError
 from ms_slam_env.metrics import ate_rmse, path_length
+from ms_slam_env.scenes import Scene
 from ms_slam_env.sequences import (
     Sequence,
     handheld_trajectory,
@@ -245,36 +246,44 @@ def available_peers(
 
 
 def run(config: SlamPeersConfig) -> PeersReport:
-    """Run every system on every sequence.
+    """Run every system on every sequence, writing the report anew after each scene.
 
     Raises:
         InputError: unknown scene, size, noise or backend.
     """
     limit_threads(config.threads)
     report = PeersReport(provenance(), {k: str(v) for k, v in asdict(config).items()})
-    cells = [(name, size) for name in config.sequences for size in config.sizes]
-    for text, size in tqdm(cells, desc="sequences", file=sys.stderr):
+    for text in tqdm(config.sequences, desc="sequences", file=sys.stderr):
         scene_name, seed = parse_sequence(text)
-        intrinsics = xtion(size)
         scene = scenes.make(scene_name, seed)
-        poses = handheld_trajectory(scene, config.frames, seed, config.speed_m, config.rot_deg)
-        sequence = render_sequence(scene, poses, intrinsics, config.noise, seed, name=text)
-        peers = available_peers(config.backend, intrinsics, report.missing)
-        for peer in peers:
-            report.settings[peer.name] = peer.settings
-            report.results.append(run_peer(peer, sequence, size))
-    if config.growth_frames:
-        for text in config.sequences:
-            scene_name, seed = parse_sequence(text)
-            scene = scenes.make(scene_name, seed)
-            poses = repeated_trajectory(
-                scene, config.growth_frames, seed, 2, config.speed_m, config.rot_deg
-            )
-            intrinsics = xtion(config.sizes[0])
-            sequence = render_sequence(scene, poses, intrinsics, config.noise, seed, name=text)
-            ours = OurSlam(config.backend, intrinsics)
-            report.growth.append(map_growth(ours, sequence, config.growth_frames))
+        for size in config.sizes:
+            _compare(config, report, scene, seed, text, size)
+        if config.growth_frames:
+            report.growth.append(_grow(config, scene, seed, text))
+        write_report(report, config.out)
     return report
+
+
+def _compare(
+    config: SlamPeersConfig, report: PeersReport, scene: Scene, seed: int, name: str, size: str
+) -> None:
+    """Run every system on one sequence."""
+    intrinsics = xtion(size)
+    poses = handheld_trajectory(scene, config.frames, seed, config.speed_m, config.rot_deg)
+    sequence = render_sequence(scene, poses, intrinsics, config.noise, seed, name)
+    for peer in available_peers(config.backend, intrinsics, report.missing):
+        report.settings[peer.name] = peer.settings
+        report.results.append(run_peer(peer, sequence, size))
+
+
+def _grow(config: SlamPeersConfig, scene: Scene, seed: int, name: str) -> dict[str, Any]:
+    """Map growth of our SLAM in one scene, at the first size."""
+    intrinsics = xtion(config.sizes[0])
+    poses = repeated_trajectory(
+        scene, config.growth_frames, seed, 2, config.speed_m, config.rot_deg
+    )
+    sequence = render_sequence(scene, poses, intrinsics, config.noise, seed, name)
+    return map_growth(OurSlam(config.backend, intrinsics), sequence, config.growth_frames)
 
 
 def write_report(report: PeersReport, out: Path) -> None:
@@ -289,11 +298,10 @@ def main(arguments: list[str] | None = None) -> int:
     """Command line; 0 on success, 2 on bad input with one line that says what is wrong."""
     try:
         config = tyro.cli(SlamPeersConfig, args=arguments, description=__doc__)
-        report = run(config)
+        run(config)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    write_report(report, config.out)
     print((config.out / "slam_peers.md").read_text(encoding="utf-8"))
     return 0
 

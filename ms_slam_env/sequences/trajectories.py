@@ -34,7 +34,7 @@ class _Wanderer:
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         self.scene = scene
         self.rng = rng
-        self.surface = scene.surface_points(0.1)[0]
+        self.surface, self.labels = scene.surface_points(0.1)
         start = scene.sample_start(rng)
         self.height = start[2, 3]
         self.eyes = [start[:3, 3]]
@@ -70,8 +70,13 @@ class _Wanderer:
             & (turn > np.cos(_MAX_TURN_RAD))
             & (slope < 0.8)
         )
-        for index in self.rng.permutation(suitable)[:10]:
-            target = self.surface[index]
+        if not len(suitable):
+            return None
+        # Every object is as likely as a whole wall: people look at things.
+        weights = 1.0 / np.bincount(self.labels[suitable])[self.labels[suitable]]
+        count = min(10, len(suitable))
+        drawn = self.rng.choice(suitable, count, replace=False, p=weights / weights.sum())
+        for target in self.surface[drawn]:
             short = target - 0.05 * _unit(target - eye)
             if self.scene.segment_is_free(eye, short, 0.01):
                 return target
