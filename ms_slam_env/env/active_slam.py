@@ -340,9 +340,11 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
     def _cover(self, frame: RGBDFrame, T_world_camera: Float64, result: TrackResult) -> float:
         if not result.tracking_ok:
             return 0.0
-        depth = frame.depth[::_COVERAGE_STRIDE, ::_COVERAGE_STRIDE].reshape(-1, 1)
-        valid = depth[:, 0] > 0
-        points = (depth * self._rays)[valid]
+        # true depth where the sensor had a reading: noise in depth would spread one surface over
+        # ever more voxels, and a camera at rest would be paid for it
+        depth = np.where(frame.depth > 0, self.sensor.last_true_depth(), 0)
+        depth = depth[::_COVERAGE_STRIDE, ::_COVERAGE_STRIDE].reshape(-1, 1)
+        points = (depth * self._rays)[depth[:, 0] > 0]
         true = transform_points(T_world_camera, points)
         return self.coverage.add(true, transform_points(result.T_world_camera, points))
 

@@ -178,6 +178,20 @@ class RGBDSensor:
             for b, index in enumerate(indices)
         ]
 
+    def last_true_depth(self) -> NDArray[np.float32]:
+        """True depth (H, W) of the frame that ``capture`` took last, metres; 0 = no surface.
+
+        Costs no second ray cast. Other users of the same sensor overwrite it.
+
+        Raises:
+            InputError: nothing was captured yet.
+        """
+        if 1 not in self._buffers:
+            raise InputError("the sensor has captured no frame yet")
+        hits = self._buffers[1].hits
+        depth = np.where(hits.face.numpy() >= 0, hits.t.numpy(), np.float32(0))
+        return depth.reshape(self.intrinsics.shape)
+
     def ground_truth(self, T_world_camera: ArrayLike) -> TrueView:
         """Noise-free view from pose ``T_world_camera`` (4, 4).
 
