@@ -125,7 +125,7 @@ def write_report(config: PlannerBenchmark, rows: Sequence[Row], out: Path) -> st
     made_by = provenance()
     aggregates = planner_report.aggregate(rows)
     summary = planner_report.summarise(rows)
-    commits = sorted({str(row["commit"]) for row in rows})
+    commits = sorted({row["commit"] for row in rows if row["commit"]})
     content: dict[str, Any] = {
         "provenance": made_by,
         "config": asdict(config),
@@ -150,8 +150,8 @@ def write_report(config: PlannerBenchmark, rows: Sequence[Row], out: Path) -> st
     else:
         parts.append("\n### Across scenes\n\n" + planner_report.aggregate_table(aggregates))
     parts.append(
-        f"\nMade by `{made_by['command']}` at commit {', '.join(commits)}, "
-        f"version {made_by['versions']['ms-slam-env']}, on {made_by['cpu']}.\n"
+        f"\nMade by `{made_by['command']}`, version {made_by['versions']['ms-slam-env']}"
+        f"{''.join(f', commit {commit}' for commit in commits)}, on {made_by['cpu']}.\n"
     )
     table = "".join(parts)
     (out / "table.md").write_text(table)
