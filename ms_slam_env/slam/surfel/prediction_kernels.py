@@ -65,7 +65,8 @@ def scatter_points(
     """Z-buffer of the points: per pixel the smallest key of the points within a pixel of it.
 
     A key is (depth bin, layer, squared distance to the pixel, point), so among the points of one
-    surface the one nearest to the pixel wins, and what the reference view hides stays hidden. ``motions[v]`` is T_view_reference; keys (V * h * w).
+    surface the one nearest to the pixel wins, and what the reference view hides stays hidden.
+    ``motions[v]`` is T_view_reference; keys are (V * h * w).
     """
     view, worker = wp.tid()
     e = view / views_per_env
