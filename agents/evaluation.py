@@ -36,8 +36,8 @@ class FixedEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         return self.env.reset(seed=seed, options=options)
 
 
-def evaluate(venv: VecEnv, num_episodes: int, choose: Choose) -> dict[str, float]:
-    """Play every validation episode once; means over episodes, ``return_sem`` the standard error.
+def evaluate(venv: VecEnv, num_episodes: int, choose: Choose) -> dict[str, Any]:
+    """Play every validation episode once; means over episodes, and ``returns`` one by one.
 
     Args:
         venv: of ``FixedEpisodes``.
@@ -48,29 +48,39 @@ def evaluate(venv: VecEnv, num_episodes: int, choose: Choose) -> dict[str, float
     observations = np.asarray(venv.reset())
     to_play = np.array([len(seeds) for seeds in venv.get_attr("seeds")])
     returns, steps, tracked = np.zeros((3, venv.num_envs))
-    episodes: list[dict[str, float]] = []
+    episodes: dict[int, dict[str, float]] = {}  # by place in the list of seeds
+    played = np.zeros(venv.num_envs, dtype=int)
     while len(episodes) < num_episodes:
         masks = np.stack(venv.env_method("action_masks"))
         observations, rewards, dones, infos = venv.step(choose(observations, masks))  # type: ignore[assignment]
         returns += rewards
         steps += 1
         tracked += [info["tracking_ok"] for info in infos]
-        for i in np.flatnonzero(dones & (to_play > 0)):
-            episodes.append(
-                {
-                    "return": returns[i],
-                    "steps": steps[i],
-                    "mapped_area_m2": infos[i]["mapped_area"],
-                    "ate_m": infos[i]["ate"],
-                    "tracked_share": tracked[i] / steps[i],
-                    "lost_share": float(not infos[i]["TimeLimit.truncated"]),
-                }
-            )
-        to_play[dones] -= 1
+        for i in np.flatnonzero(dones & (played < to_play)):
+            episodes[int(i + played[i] * venv.num_envs)] = {
+                "return": returns[i],
+                "steps": steps[i],
+                "mapped_area_m2": infos[i]["mapped_area"],
+                "ate_m": infos[i]["ate"],
+                "tracked_share": tracked[i] / steps[i],
+                "lost_share": float(not infos[i]["TimeLimit.truncated"]),
+            }
+        played[dones] += 1
         returns[dones] = steps[dones] = tracked[dones] = 0
-    means = {name: float(np.mean([e[name] for e in episodes])) for name in episodes[0]}
-    spread = float(np.std([e["return"] for e in episodes]))
-    return means | {"return_sem": spread / max(1, num_episodes - 1) ** 0.5}
+    ordered = [episodes[place] for place in range(num_episodes)]
+    means = {name: float(np.mean([e[name] for e in ordered])) for name in ordered[0]}
+    return means | {"returns": [float(e["return"]) for e in ordered]}
+
+
+def paired_gain(returns: Sequence[float], reference: Sequence[float]) -> dict[str, float]:
+    """Mean gain over a reference on the same episodes, and its standard error.
+
+    Episodes differ far more among themselves than planners do on one of them: the pairs tell
+    sooner whether a policy is better.
+    """
+    gain = np.subtract(returns, reference)
+    error = float(np.std(gain)) / max(1, len(gain) - 1) ** 0.5
+    return {"gain": float(np.mean(gain)), "gain_sem": error}
 
 
 def sample(probabilities: NDArray[Any], rng: np.random.Generator) -> Actions:
@@ -78,7 +88,7 @@ def sample(probabilities: NDArray[Any], rng: np.random.Generator) -> Actions:
     return np.array([rng.choice(len(row), p=row) for row in probabilities])
 
 
-def references(venv: VecEnv, num_episodes: int, seed: int) -> dict[str, dict[str, float]]:
+def references(venv: VecEnv, num_episodes: int, seed: int) -> dict[str, dict[str, Any]]:
     """What random walk, standing still and the greedy planner reach on the same episodes."""
     rng = np.random.default_rng(seed)
     targets = venv.get_attr("config")[0].targets

@@ -47,10 +47,12 @@ def _draw(curve: dict[str, Any]) -> bytes:
         axis.set(xlabel="training steps", ylabel=label)
         axis.grid(alpha=0.3)
     mean = np.array([point["return"] for point in points])
-    error = np.array([point["return_sem"] for point in points])
+    error = np.array([point["gain_sem"] for point in points])
     axes[0].fill_between(timesteps, mean - error, mean + error, alpha=0.2, lw=0)
     axes[0].legend(fontsize="small")
-    figure.suptitle(f"mean of {curve['eval_episodes']} episodes, band: standard error")
+    figure.suptitle(
+        f"mean of {curve['eval_episodes']} episodes; band: standard error of the paired difference to random walk"
+    )
     picture = io.BytesIO()
     figure.savefig(picture, format="png", dpi=110)
     return picture.getvalue()

@@ -28,7 +28,14 @@ import numpy as np
 import torch
 import tyro
 from ms_slam_agents import artefact
-from ms_slam_agents.evaluation import Actions, FixedEpisodes, evaluate, references, sample
+from ms_slam_agents.evaluation import (
+    Actions,
+    FixedEpisodes,
+    evaluate,
+    paired_gain,
+    references,
+    sample,
+)
 from ms_slam_agents.learning_curve import write_curve
 from numpy.typing import NDArray
 from sb3_contrib import MaskablePPO
@@ -263,6 +270,8 @@ class Supervisor(BaseCallback):
             return sample(probabilities, rng)
 
         result = evaluate(self.validation, self.args.eval_episodes, choose)
+        random_walk = self.curve["references"]["random walk"]
+        result |= paired_gain(result.pop("returns"), random_walk["returns"])
         best = max((point["return"] for point in self.curve["points"]), default=-np.inf)
         if result["return"] > best:
             self.save("best.zip")
@@ -273,10 +282,10 @@ class Supervisor(BaseCallback):
         write_curve(self.args.out, self.curve)
         for name, value in result.items():
             self.logger.record(f"validation/{name}", value)
-        reference = self.curve["references"]["random walk"]["return"]
         self._bar.write(
             f"{self.num_timesteps} steps, {minutes:.1f} min: validation return "
-            f"{result['return']:.2f} ± {result['return_sem']:.2f} (random walk {reference:.2f}), "
+            f"{result['return']:.2f}, {result['gain']:+.2f} ± {result['gain_sem']:.2f} over random "
+            f"walk's {random_walk['return']:.2f}; "
             f"mapped {result['mapped_area_m2']:.1f} m2, lost {result['lost_share']:.0%}"
         )
 

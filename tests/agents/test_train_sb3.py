@@ -13,8 +13,10 @@ import pytest
 
 pytest.importorskip("sb3_contrib")
 
-from ms_slam_agents import artefact, train_sb3
+from ms_slam_agents import artefact, evaluation, train_sb3
 from ms_slam_agents.policy_planner import TrainedFeaturesPolicy, TrainedPolicy
+from scipy.stats import sem
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from ms_slam_env.env.config import TargetConfig
 from ms_slam_env.errors import InputError
@@ -135,7 +137,37 @@ def test_learning_curve_is_well_formed(run):
     references = curve["references"]
     assert references["greedy"]["return"] == 10  # the fake's lookahead gives the answer away
     assert 0 < references["random walk"]["return"] < 10
+    for point in curve["points"]:
+        gain = point["return"] - references["random walk"]["return"]
+        assert point["gain"] == pytest.approx(gain)
     assert all(point["steps"] == 10 and point["lost_share"] == 0 for point in curve["points"])
+
+
+def test_paired_gain_against_scipy():
+    returns, reference = np.random.default_rng(0).normal(size=(2, 9))
+    gain = evaluation.paired_gain(list(returns), list(reference))
+    assert gain["gain"] == pytest.approx(np.mean(returns - reference))
+    assert gain["gain_sem"] == pytest.approx(sem(returns - reference))
+
+
+@pytest.mark.parametrize("num_envs", [1, 2, 3])
+def test_returns_come_in_the_order_of_the_seeds(num_envs):
+    """However the episodes are dealt out: standing still, against playing one by one."""
+    args = train_sb3.Args(env_id=ENV_ID, episode_steps=10, num_envs=1)
+    seeds = [5, 6, 7, 8, 9]
+    shares = [seeds[rank::num_envs] for rank in range(num_envs)]
+    makers = [lambda share=share: train_sb3.make_env(args, "validation", share) for share in shares]
+
+    def stay(_, masks):
+        return np.zeros(len(masks), dtype=np.int64)
+
+    result = evaluation.evaluate(DummyVecEnv(makers), len(seeds), stay)
+    expected = []
+    for seed in seeds:
+        env = LearnableFake(None, None, None, None)
+        env.reset(seed=seed)
+        expected.append(sum(env.step(0)[1] for _ in range(10)))
+    assert result["returns"] == expected
 
 
 def test_same_seed_same_training(run, tmp_path):

@@ -1,0 +1,44 @@
+"""Training in the real environment with two processes, and its policy in an episode."""
+
+import gymnasium as gym
+import pytest
+
+pytest.importorskip("sb3_contrib")
+
+from ms_slam_agents import artefact, train_sb3
+from ms_slam_agents.policy_planner import TrainedPolicy
+
+import ms_slam_env  # noqa: F401 -- registers the environments
+
+
+@pytest.mark.slow
+def test_two_processes_train_a_policy_that_plans(tmp_path):
+    options = {
+        "out": tmp_path / "run",
+        "scenes": "table",
+        "scene-seeds": 1,
+        "episode-steps": 4,
+        "total-timesteps": 16,
+        "num-envs": 2,
+        "n-steps": 8,
+        "batch-size": 8,
+        "n-epochs": 1,
+        "eval-episodes": 2,
+        "eval-every": 0,
+    }
+    words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
+    assert train_sb3.main(words) == 0
+    path = tmp_path / "run" / "latest.zip"
+    metadata = artefact.load_metadata(path)
+    assert (metadata.timesteps, metadata.observation) == (16, "lookahead")
+
+    env = gym.make(
+        metadata.env_id, scene="table", scene_seed=1000, observation=TrainedPolicy.observation
+    )
+    observation, info = env.reset(seed=0)
+    planner = TrainedPolicy(env.unwrapped, path=str(path))
+    for _ in range(3):
+        action = planner.act(observation, info)
+        assert info["action_mask"][action]
+        observation, _, _, _, info = env.step(action)
+    env.close()

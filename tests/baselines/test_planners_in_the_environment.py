@@ -1,0 +1,65 @@
+"""The planners in the real environment: valid motions, the criterion met, reproducible."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from ms_slam_baselines import GreedyDivergence, MaxInformation, RandomWalk, Stationary
+
+import ms_slam_env  # noqa: F401 -- registers the environments
+
+PLANNERS = (GreedyDivergence, MaxInformation, RandomWalk, Stationary)
+IDS = ("MSActiveSLAM-FreeCamera-v0", "MSActiveSLAM-FixedTranslation-v0")
+
+
+@pytest.fixture(scope="module", params=IDS)
+def env(request):
+    env = gym.make(request.param, scene_seed=1000)
+    yield env
+    env.close()
+
+
+def play(env, planner_class, steps=4, seed=5):
+    observation, info = env.reset(seed=seed)
+    planner = planner_class(env.unwrapped, seed)
+    planner.reset()
+    actions = []
+    for _ in range(steps):
+        action = planner.act(observation, info)
+        assert info["action_mask"][action]
+        observation, _, _, _, info = env.step(action)
+        actions.append(action)
+    return actions
+
+
+@pytest.mark.parametrize("planner_class", PLANNERS)
+def test_motions_are_free_and_reproducible(env, planner_class):
+    assert play(env, planner_class) == play(env, planner_class)
+
+
+def test_greedy_takes_the_smallest_distance_to_the_targets(env):
+    observation, info = env.reset(seed=1)
+    world = env.unwrapped
+    action = GreedyDivergence(world).act(observation, info)
+    (target_I, target_D), weight = world.divergence_targets, world.depth_weight
+    distances = {
+        i: abs(delta_I - target_I) + weight * abs(delta_D - target_D)
+        for i, (delta_I, delta_D) in enumerate(world.lookahead())
+        if info["action_mask"][i]
+    }
+    assert action == min(distances, key=distances.get)
+
+
+def test_greedy_with_targets_of_zero_stands_still():
+    """With the map's own view as reference, only standing still has no divergence at all."""
+    env = gym.make(IDS[0], scene_seed=1000, lookahead={"reference": "predicted"})
+    observation, info = env.reset(seed=1)
+    planner = GreedyDivergence(env.unwrapped, rho_I=0, rho_D=0)
+    np.testing.assert_allclose(env.unwrapped.lookahead()[0], 0, atol=1e-9)
+    assert planner.act(observation, info) == 0
+
+
+def test_max_information_takes_the_emptiest_free_view(env):
+    observation, info = env.reset(seed=1)
+    action = MaxInformation(env.unwrapped).act(observation, info)
+    empty = (env.unwrapped.predict_candidates().depth == 0).sum(axis=(1, 2))
+    assert empty[action] == empty[info["action_mask"]].max()
