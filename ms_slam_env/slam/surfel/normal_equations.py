@@ -46,6 +46,11 @@ SUM_ALIKE = 34  # of those, with a small photometric residual
 SUM_APART = 35  # matched, but the live surface is clearly nearer or farther than the model's
 
 
+OFF = wp.constant(0)  # states of a hypothesis, in ``active``: takes no part
+RUNNING = wp.constant(1)
+RESTING = wp.constant(2)  # converged at its level, wakes at the next
+
+
 @wp.struct
 class Weights:
     """Scales of the residuals; see the module's text. Reciprocals save divisions per pixel."""
@@ -83,7 +88,7 @@ def accumulate(
 ):
     """Sum the terms of one piece of a row of model points, for every active hypothesis."""
     b, k, row_index, piece = wp.tid()
-    if active[b, k] == 0:
+    if active[b, k] != RUNNING:
         return
     width = model_vertices.shape[2]
     height = model_vertices.shape[1]

@@ -89,7 +89,7 @@ class BatchedSurfelSlam:
                 for env in range(self.batch)
             ]
         )
-        limits = make_limits(lost)
+        limits = make_limits(lost, self._lost)
         alignment = self.tracker.align(self._view, self.poses, seeds, limits)
         alignment = self._search_again(alignment)
         return [
@@ -99,6 +99,7 @@ class BatchedSurfelSlam:
 
     def _search_again(self, alignment: Alignment) -> Alignment:
         """Give the envs that failed more starting poses, under stricter limits."""
+        strict = np.ones(self.batch, dtype=bool)
         for attempt in range(1, 1 + RETRIES):
             failed = self._started & (alignment.verdict != 0)
             if not failed.any():
@@ -107,7 +108,7 @@ class BatchedSurfelSlam:
                 [relocalisation_seeds(attempt + RETRIES * int(lost)) for lost in self._lost]
             )
             again = self.tracker.align(
-                self._view, self.poses, seeds, make_limits(np.ones(self.batch, dtype=bool))
+                self._view, self.poses, seeds, make_limits(strict, self._lost)
             )
             alignment = alignment.replace(failed & (again.verdict == 0), again)
         return alignment

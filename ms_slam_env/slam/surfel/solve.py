@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from ms_slam_env._warp import wp
-from ms_slam_env.slam.surfel.normal_equations import NUM_SUMS
+from ms_slam_env.slam.surfel.normal_equations import NUM_SUMS, RESTING, RUNNING
 
 mat66d = wp.types.matrix(shape=(6, 6), dtype=wp.float64)
 vec6d = wp.types.vector(length=6, dtype=wp.float64)
@@ -24,7 +24,7 @@ def reduce_sums(
 ):
     """Add up the partial sums of every active hypothesis, always in the same order."""
     b, k, i = wp.tid()
-    if active[b, k] == 0:
+    if active[b, k] != RUNNING:
         return
     total = wp.float64(0.0)
     for slot in range(slots):
@@ -145,7 +145,7 @@ def gauss_newton_step(
 ):
     """Move every active hypothesis by the solution of H xi = -g; stop those that converged."""
     b, k = wp.tid()
-    if active[b, k] != 0:
+    if active[b, k] == RUNNING:
         H = load_hessian(sums, b, k)
         right = vec6d()
         for i in range(6):
@@ -159,11 +159,11 @@ def gauss_newton_step(
                 size = wp.max(size, wp.abs(xi[i]))
             pose[b, k] = orthonormalise(pose[b, k] * se3_exp(xi))
             if size < smallest_step:
-                active[b, k] = 0
+                active[b, k] = RESTING
         else:
-            active[b, k] = 0
-    if last != 0:
-        active[b, k] = 1
+            active[b, k] = RESTING
+    if last != 0 and active[b, k] == RESTING:
+        active[b, k] = RUNNING
 
 
 def reduce(partial: wp.array, slots: int, active: wp.array, sums: wp.array, device: Any) -> None:

@@ -15,16 +15,24 @@ from numpy.typing import NDArray
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.surfel.config import SurfelConfig
-from ms_slam_env.slam.surfel.normal_equations import NUM_SUMS, Weights, accumulate
+from ms_slam_env.slam.surfel.normal_equations import NUM_SUMS, RUNNING, Weights, accumulate
 from ms_slam_env.slam.surfel.pyramid import Level, Pyramid
 from ms_slam_env.slam.surfel.solve import gauss_newton_step, reduce
 from ms_slam_env.slam.surfel.types import LiveFrame, ModelView
-from ms_slam_env.slam.surfel.verdict import NUM_STATS, Limits, choose, judge
+from ms_slam_env.slam.surfel.verdict import (
+    NUM_STATS,
+    Limits,
+    choose,
+    judge,
+    widen_search,
+)
 
 Float64 = NDArray[np.float64]
 
 SEARCH_POINTS = 400
 SEARCH_ITERATIONS = 5
+NUM_FIRST = 2  # seeds tried first: at rest and at constant velocity
+GOOD_SCORE = 0.4  # of a first seed, which makes the other seeds needless
 SMALLEST_STEP = (2.0e-5, 1.0e-4, 5.0e-4)  # metres and radians, per level, finest first
 DAMPING = 1.0e-6
 COARSE_TOLERANCE = 2.5
@@ -89,9 +97,10 @@ class Tracker:
                 "partial": wp.zeros((batch, k, slots, NUM_SUMS), dtype=wp.float32, device=device),
             }
 
-        self._many = buffers(num_seeds)
+        self._first = buffers(NUM_FIRST)
+        self._more = buffers(num_seeds - NUM_FIRST)
         self._one = buffers(1)
-        self._all_active = np.ones((batch, num_seeds), dtype=np.int32)
+        self.good_score = GOOD_SCORE
         self._limits = wp.zeros(batch, dtype=Limits, device=device)
         self._T_world_model = wp.zeros(batch, dtype=wp.mat44d, device=device)
         self._T_world_live = wp.zeros(batch, dtype=wp.mat44d, device=device)
@@ -130,23 +139,14 @@ class Tracker:
             limits: (B,) structured array of ``verdict.Limits``.
         """
         levels = self._model.build(model.vertices, model.normals, model.intensity)
-        many, one = self._many, self._one
-        many["pose"].assign(seeds)
-        many["active"].assign(self._all_active)
+        one = self._one
+        self._first["pose"].assign(seeds[:, :NUM_FIRST])
+        self._more["pose"].assign(seeds[:, NUM_FIRST:])
+        self._first["active"].fill_(RUNNING)
         self._T_world_model.assign(T_world_model)
         self._limits.assign(limits)
         coarsest = len(levels) - 1
-        for _ in range(SEARCH_ITERATIONS):
-            self._pass(levels, coarsest, self._search_stride(), many)
-            self._step(coarsest, many, last=True)
-        self._pass(levels, coarsest, self._search_stride(), many)
-        wp.launch(
-            choose,
-            dim=self.batch,
-            inputs=[many["sums"], many["pose"]],
-            outputs=[one["pose"], one["active"]],
-            device=self.device,
-        )
+        self._search(levels, coarsest)
         for level in range(coarsest, -1, -1):
             count = self.config.iterations[level]
             for iteration in range(count):
@@ -166,6 +166,36 @@ class Tracker:
             verdict=self.verdict.numpy().copy(),
             stats=self._stats.numpy().copy(),
         )
+
+    def _search(self, levels: list[Level], coarsest: int) -> None:
+        """Align seeds at the coarsest level on few points; the best one goes on.
+
+        Most frames need the first seeds only; the others run where those fit badly.
+        """
+        first, more, one = self._first, self._more, self._one
+        self._settle(levels, coarsest, first)
+        wp.launch(
+            widen_search,
+            dim=self.batch,
+            inputs=[first["sums"], self.good_score],
+            outputs=[more["sums"], more["active"]],
+            device=self.device,
+        )
+        self._settle(levels, coarsest, more)
+        wp.launch(
+            choose,
+            dim=self.batch,
+            inputs=[first["sums"], first["pose"], more["sums"], more["pose"]],
+            outputs=[one["pose"], one["active"]],
+            device=self.device,
+        )
+
+    def _settle(self, levels: list[Level], coarsest: int, state: dict[str, wp.array]) -> None:
+        """A few steps for every active seed, and the sums at the pose they lead to."""
+        for iteration in range(SEARCH_ITERATIONS):
+            self._pass(levels, coarsest, self._search_stride(), state)
+            self._step(coarsest, state, last=iteration == SEARCH_ITERATIONS - 1)
+        self._pass(levels, coarsest, self._search_stride(), state)
 
     def _pass(
         self, levels: list[Level], level: int, stride: int, state: dict[str, wp.array]
