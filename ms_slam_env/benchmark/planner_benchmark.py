@@ -15,6 +15,7 @@ from ms_slam_env.benchmark.episode import (
     EpisodeSpec,
     run_episode,
 )
+from ms_slam_env.benchmark.options import parse_options
 from ms_slam_env.benchmark.planners import check_planner
 from ms_slam_env.benchmark.provenance import provenance
 from ms_slam_env.benchmark.records import Row, write_json
@@ -39,6 +40,7 @@ class PlannerBenchmark:
         step_deg: rotation of a motion, degrees.
         env_id: environment.
         seeds: split that the seeds come from: train, validation or test.
+        options: of the environment, as in ``lookahead.reference=live``.
     """
 
     planners: tuple[str, ...] = DEFAULT_PLANNERS
@@ -49,6 +51,7 @@ class PlannerBenchmark:
     step_deg: float = DEFAULT_STEP_DEG
     env_id: str = "MSActiveSLAM-FreeCamera-v0"
     seeds: str = "test"
+    options: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse bad values before anything runs."""
@@ -67,6 +70,7 @@ class PlannerBenchmark:
                 steps=self.steps,
                 step_m=self.step_m,
                 step_deg=self.step_deg,
+                options=parse_options(self.options),
             )
             for scene in self.scenes
             for seed in seed_list(self.seeds, self.episodes)

@@ -16,6 +16,7 @@ from ms_slam_env.benchmark import statistics
 from ms_slam_env.benchmark.command_line import exit_code, parse, report_failures
 from ms_slam_env.benchmark.episode import EpisodeSpec, run_episode
 from ms_slam_env.benchmark.figures import colour, new_figure, save
+from ms_slam_env.benchmark.options import parse_options
 from ms_slam_env.benchmark.planner_benchmark import DEFAULT_PLANNERS, check_names, seed_list
 from ms_slam_env.benchmark.planner_report import Column, finished
 from ms_slam_env.benchmark.provenance import provenance
@@ -49,6 +50,8 @@ class Arguments:
     """Length of an episode."""
     seeds: str = "validation"
     """Split that the seeds come from; a default read from them may not use the test seeds."""
+    options: tuple[str, ...] = ()
+    """Options of the environment, as in targets.M_I=0.05."""
     workers: int | None = None
     """Parallel processes; None for one a core."""
     out: Path = Path("results/step_size")
@@ -57,7 +60,15 @@ class Arguments:
     def specs(self) -> list[EpisodeSpec]:
         """Every episode."""
         return [
-            EpisodeSpec(planner, scene, seed, steps=self.steps, step_m=size / 100, step_deg=size)
+            EpisodeSpec(
+                planner,
+                scene,
+                seed,
+                steps=self.steps,
+                step_m=size / 100,
+                step_deg=size,
+                options=parse_options(self.options),
+            )
             for scene in self.scenes
             for seed in seed_list(self.seeds, self.episodes)
             for size in self.sizes

@@ -22,6 +22,7 @@ from ms_slam_env.benchmark.episode import (
     run_episode,
 )
 from ms_slam_env.benchmark.figures import colour, new_figure, save
+from ms_slam_env.benchmark.options import parse_options
 from ms_slam_env.benchmark.planner_benchmark import check_names, seed_list
 from ms_slam_env.benchmark.planner_report import Column, finished
 from ms_slam_env.benchmark.provenance import provenance
@@ -69,6 +70,8 @@ class Arguments:
     """Rotation of a motion, degrees."""
     seeds: str = "test"
     """Split that the seeds come from."""
+    options: tuple[str, ...] = ()
+    """Options of the environment, as in targets.M_I=0.05."""
     workers: int | None = None
     """Parallel processes; None for one a core."""
     out: Path = Path("results/table_two")
@@ -85,6 +88,7 @@ class Arguments:
                 steps=self.steps,
                 step_m=self.step_m,
                 step_deg=self.step_deg,
+                options=parse_options(self.options),
             )
             for scene in self.scenes
             for seed in seed_list(self.seeds, self.episodes)

@@ -43,6 +43,8 @@ class Arguments:
     """Environment."""
     seeds: str = "test"
     """Split that the seeds come from: train, validation or test."""
+    options: tuple[str, ...] = ()
+    """Options of the environment, as in lookahead.reference=live targets.M_I=0.05."""
     workers: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(one a core)")] = None
     """Parallel processes, each of one thread."""
     out: Path = Path("results/benchmark")
@@ -61,6 +63,7 @@ def main(arguments: Sequence[str]) -> int:
         step_deg=args.step_deg,
         env_id=args.env_id,
         seeds=args.seeds,
+        options=args.options,
     )
     table, failed = run_planner_benchmark(config, args.out, args.workers)
     print(table)

@@ -121,6 +121,11 @@ def test_every_planner_starts_from_the_same_seeds() -> None:
         ({"episodes": 0}, "episodes = 0"),
         ({"episodes": 101}, "outside \\[1, 100\\]"),
         ({"env_id": "CartPole-v1"}, "valid choices: MSActiveSLAM"),
+        ({"options": ("lookahead",)}, "not name=value"),
+        ({"options": ("lookahed.reference=live",)}, "lookahed'; valid choices: .*lookahead"),
+        ({"options": ("lookahead.reference=dead",)}, "valid choices: live, predicted"),
+        ({"options": ("scene=table",)}, "the benchmark sets it"),
+        ({"options": ("step_m=1",)}, "the benchmark sets it"),
         ({"steps": 0}, "steps"),
         ({"step_m": float("nan")}, "step_m"),
     ],
@@ -179,6 +184,13 @@ def test_table_two_compares_pairs(tmp_path: Path) -> None:
     assert "| free motion | 40 [40, 40] | 34 | 40 [40, 40] | 33 |" in text
     assert "| fixed translation | 40 [40, 40] | 32 | 40 [40, 40] | 10 |" in text
     table_two.save_figure(rows, ("random", "greedy"), tmp_path / "a.png")
+
+
+def test_options_reach_the_episodes() -> None:
+    texts = ("lookahead.reference=live", "lookahead.scale=1.0", "lost_patience=3")
+    spec = PlannerBenchmark(options=texts).specs()[0]
+    assert spec.options == {"lookahead": {"reference": "live", "scale": 1.0}, "lost_patience": 3}
+    assert spec_key(spec) != spec_key(PlannerBenchmark().specs()[0])
 
 
 def test_seed_list_is_the_start_of_the_split() -> None:

@@ -1,0 +1,40 @@
+"""Options of the environment as text: ``lookahead.reference=live``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import yaml
+
+from ms_slam_env.config import from_dict
+from ms_slam_env.env import EnvConfig
+from ms_slam_env.errors import InputError
+
+OWN_OPTIONS = ("scene", "scene_seed", "split", "observation", "step_m", "step_rad")
+"""Fields of ``EnvConfig`` that an episode has other options for, or that its planner decides."""
+
+
+def parse_options(texts: Sequence[str]) -> dict[str, Any]:
+    """Nested mapping of ``EnvConfig`` from texts ``name.name=value``; values are YAML.
+
+    Raises:
+        InputError: no ``=``, an unknown name (the message lists the valid ones), a value out of
+            range, or a name that the benchmark sets itself.
+    """
+    result: dict[str, Any] = {}
+    for text in texts:
+        path, equals, value = text.partition("=")
+        *parents, name = path.split(".")
+        if not equals:
+            raise InputError(f"option {text!r} is not name=value")
+        if (parents or [name])[0] in OWN_OPTIONS:
+            raise InputError(f"option {path!r} is not free: the benchmark sets it")
+        inner = result
+        for parent in parents:
+            inner = inner.setdefault(parent, {})
+            if not isinstance(inner, dict):
+                raise InputError(f"option {path!r}: {parent} already has a value")
+        inner[name] = yaml.safe_load(value)
+    from_dict(EnvConfig, result)
+    return result
