@@ -51,7 +51,8 @@ def _draw(curve: dict[str, Any]) -> bytes:
     axes[0].fill_between(timesteps, mean - error, mean + error, alpha=0.2, lw=0)
     axes[0].legend(fontsize="small")
     figure.suptitle(
-        f"mean of {curve['eval_episodes']} episodes; band: standard error of the paired difference to random walk"
+        f"mean of {curve['eval_episodes']} episodes; "
+        "band: standard error of the paired difference to random walk"
     )
     picture = io.BytesIO()
     figure.savefig(picture, format="png", dpi=110)
