@@ -166,26 +166,35 @@ def resolve_views(
     width = camera.width
     image = view * height * width
     row = image + v * width
-    y = (float(v) - camera.centre[1]) / camera.focal[1]
-    per_column = 1.0 / camera.focal[0]
+    # Planes are met in the reference frame, where the points are: n . (p + shift) = z n . ray.
+    R_back = wp.transpose(R)
+    shift = R_back * t
+    across = wp.vec3(R_back[0, 0], R_back[1, 0], R_back[2, 0]) / camera.focal[0]
+    first_ray = R_back * wp.vec3(
+        -camera.centre[0] / camera.focal[0],
+        (float(v) - camera.centre[1]) / camera.focal[1],
+        1.0,
+    )
+    forward = wp.vec3(R[2, 0], R[2, 1], R[2, 2])
     for u in range(width):
         key = keys[row + u]
         if key == EMPTY:
             key = gap_key(keys, image, v, u, height, width)
         grey = float(0.0)
         z = float(0.0)
-        n = wp.vec3(0.0, 0.0, 0.0)
+        normal = wp.vec3(0.0, 0.0, 0.0)
         if key != EMPTY:
             j = int(key & wp.int64(0xFFFFFFFF))
-            p = R * points.position[e, j] + t
-            n = R * points.normal[e, j]
-            x = (float(u) - camera.centre[0]) * per_column
-            slope = wp.min(n[0] * x + n[1] * y + n[2], -1.0e-6)
-            z = wp.clamp(wp.dot(n, p) / slope, 0.9 * p[2], 1.1 * p[2])
+            p = points.position[e, j] + shift
+            n = points.normal[e, j]
+            slope = wp.min(wp.dot(n, first_ray + float(u) * across), -1.0e-6)
+            centre_z = wp.dot(forward, p)
+            z = wp.clamp(wp.dot(n, p) / slope, 0.9 * centre_z, 1.1 * centre_z)
             grey = points.intensity[e, j]
+            normal = R * n
         intensity[row + u] = grey
         depth[row + u] = z
-        normals[row + u] = n
+        normals[row + u] = normal
 
 
 @wp.kernel
