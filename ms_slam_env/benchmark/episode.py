@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import ms_slam_env
 from ms_slam_env import metrics
-from ms_slam_env.benchmark.map_truth import reference_surface, true_surface
+from ms_slam_env.benchmark.map_truth import reference_of, true_surface
 from ms_slam_env.benchmark.planners import make_planner, parse_planner, planner_class
 from ms_slam_env.config import check_choice, check_range
 from ms_slam_env.env import ActiveSlamEnv, Planner
@@ -151,9 +151,9 @@ def measure_map(world: ActiveSlamEnv, spec: EpisodeSpec) -> dict[str, float]:
     Judged is the whole map. Surfels that SLAM calls stable were seen in some ten frames: counting
     only those would reward looking at one place for long.
     """
-    start = world.trajectory_truth[0][:3, 3]
+    x, y, z = map(float, world.trajectory_truth[0][:3, 3])
     surface = true_surface(spec.scene, spec.seed)
-    reference = reference_surface(world.scene, start)
+    reference = reference_of(spec.scene, spec.seed, (x, y, z))
     area = {"mapped_area_m2": world.coverage.mapped_area}
     return {**judge_map(world.slam.map_points(), surface, reference), **area}
 

@@ -35,6 +35,12 @@ def true_surface(scene: str, scene_seed: int) -> Float64:
     return get_scene(scene, scene_seed).surface_points(SURFACE_SPACING_M)[0]
 
 
+@lru_cache(maxsize=2)
+def reference_of(scene: str, scene_seed: int, start: tuple[float, float, float]) -> Float64:
+    """The reference of a scene by name; planners of one episode follow each other."""
+    return reference_surface(get_scene(scene, scene_seed), np.array(start))
+
+
 def reference_surface(scene: Scene, start: Float64) -> Float64:
     """Points (N, 3) of true surface that a planner starting at ``start`` (3,) could map."""
     points = scene.surface_points(REFERENCE_SPACING_M)[0]
