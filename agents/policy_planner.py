@@ -57,7 +57,7 @@ class TrainedPolicy(Planner):
                 f"policies trained on {self.observation!r}: use {right.get(trained_on)}"
             )
         self.policy = artefact.Policy.load(path)
-        num_actions = len(env.action_masks())
+        num_actions = int(env.action_space.n)  # type: ignore[attr-defined]
         if self.policy.num_actions != num_actions:
             raise InputError(
                 f"{path!r} chooses among {self.policy.num_actions} actions, "

@@ -35,8 +35,8 @@ def test_two_processes_train_a_policy_that_plans(tmp_path):
     env = gym.make(
         metadata.env_id, scene="table", scene_seed=1000, observation=TrainedPolicy.observation
     )
+    planner = TrainedPolicy(env.unwrapped, path=str(path))  # before the first reset
     observation, info = env.reset(seed=0)
-    planner = TrainedPolicy(env.unwrapped, path=str(path))
     for _ in range(3):
         action = planner.act(observation, info)
         assert info["action_mask"][action]
