@@ -40,7 +40,7 @@ class Lookahead:
         """Predicted divergences (n, 2) of the candidates at ``poses`` (n, 4, 4), lines 6 and 7."""
         if self.config.reference == "predicted":
             views = self.predict(slam, np.concatenate([poses, current_pose[None]]))
-            both = self.measure.histograms(views.intensity, views.depth)
+            both = self.measure.histograms(views.intensity, views.depth, views.normals)
             candidates = Histograms(both.intensity[:-1], both.normals[:-1])
             current = Histograms(both.intensity[-1:], both.normals[-1:])
             return self.measure.divergence(candidates, current)
