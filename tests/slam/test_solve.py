@@ -1,0 +1,78 @@
+"""The device's 6x6 solve and pose update against NumPy and SciPy."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ms_slam_env._warp import wp
+from ms_slam_env.geometry import se3_exp
+from ms_slam_env.slam.surfel.normal_equations import NUM_SUMS, OFF, RESTING, RUNNING
+from ms_slam_env.slam.surfel.solve import gauss_newton_step, reduce
+
+
+def _sums(H: np.ndarray, g: np.ndarray) -> np.ndarray:
+    sums = np.zeros(NUM_SUMS)
+    sums[:21] = H[np.triu_indices(6)]
+    sums[21:27] = g
+    return sums
+
+
+def _step(H, g, T, state=RUNNING, last=0, smallest=1e-9, damping=0.0):
+    pose = wp.array(T[None, None], dtype=wp.mat44d)
+    active = wp.array([[state]], dtype=wp.int32)
+    sums = wp.array(_sums(H, g)[None, None], dtype=wp.float64)
+    wp.launch(
+        gauss_newton_step, dim=(1, 1), inputs=[sums, damping, smallest, last],
+        outputs=[pose, active],
+    )  # fmt: skip
+    return pose.numpy()[0, 0], int(active.numpy()[0, 0])
+
+
+@given(seed=st.integers(0, 10_000), size=st.sampled_from([1e-9, 1e-5, 1e-2, 0.5]))
+@settings(max_examples=60, deadline=None)
+def test_step_solves_and_applies_the_exponential(seed, size):
+    rng = np.random.default_rng(seed)
+    J = rng.normal(size=(30, 6)) * np.array([1, 2, 5, 10, 20, 0.1])
+    H = J.T @ J
+    xi = rng.normal(size=6)
+    xi *= size / np.abs(xi).max()
+    T = se3_exp(rng.normal(size=6))
+    result, _ = _step(H, -H @ xi, T)
+    np.testing.assert_allclose(result, T @ se3_exp(np.linalg.solve(H, H @ xi)), atol=1e-9)
+    np.testing.assert_allclose(result[:3, :3] @ result[:3, :3].T, np.eye(3), atol=1e-12)
+
+
+def test_a_singular_system_moves_nothing_and_rests():
+    H = np.diag([1.0, 1, 1, 1, 1, 0])
+    T = se3_exp([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
+    result, state = _step(H, np.ones(6), T)
+    np.testing.assert_array_equal(result, T)
+    assert state == RESTING
+
+
+def test_convergence_rests_until_the_level_ends():
+    H, g = np.eye(6), np.full(6, 1e-6)
+    assert _step(H, g, np.eye(4), smallest=1e-3)[1] == RESTING
+    assert _step(H, g, np.eye(4), smallest=1e-3, last=1)[1] == RUNNING
+    assert _step(H, g, np.eye(4), state=RESTING, last=1)[1] == RUNNING
+
+
+def test_resting_and_switched_off_hypotheses_keep_their_pose():
+    T = se3_exp([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
+    for state in (OFF, RESTING):
+        result, _ = _step(np.eye(6), np.ones(6), T, state=state)
+        np.testing.assert_array_equal(result, T)
+    assert _step(np.eye(6), np.ones(6), T, state=OFF, last=1)[1] == OFF
+
+
+def test_reduction_adds_the_slots_of_running_hypotheses():
+    rng = np.random.default_rng(0)
+    partial = rng.normal(size=(2, 3, 7, NUM_SUMS)).astype(np.float32)
+    states = np.array([[RUNNING, OFF, RUNNING], [RESTING, RUNNING, RUNNING]])
+    sums = wp.zeros((2, 3, NUM_SUMS), dtype=wp.float64)
+    active = wp.array(states, dtype=wp.int32)
+    reduce(wp.array(partial, dtype=wp.float32), 5, active, sums, "cpu")
+    expected = partial[:, :, :5].astype(np.float64).sum(2) * (states == RUNNING)[..., None]
+    np.testing.assert_allclose(sums.numpy(), expected, atol=1e-12)

@@ -1,0 +1,274 @@
+"""The fused pass against a per-point loop and finite differences; known motions are recovered."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from box_scene import BoxScene
+
+from ms_slam_env._warp import wp
+from ms_slam_env.camera import Intrinsics, xtion
+from ms_slam_env.geometry import invert, look_at, relative_angle, se3_exp
+from ms_slam_env.sensor import RGBDSensor
+from ms_slam_env.slam.surfel import normal_equations as ne
+from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.preprocess import Preprocessor
+from ms_slam_env.slam.surfel.seeds import NUM_SEEDS, tracking_seeds
+from ms_slam_env.slam.surfel.solve import reduce
+from ms_slam_env.slam.surfel.tracking import Tracker
+from ms_slam_env.slam.surfel.types import LiveFrame, ModelView
+from ms_slam_env.slam.surfel.verdict import (
+    APPEARANCE,
+    FEW_POINTS,
+    REASONS,
+    UNCONSTRAINED,
+    make_limits,
+)
+
+SMALL = Intrinsics(fx=24.0, fy=24.0, cx=15.5, cy=11.5, width=32, height=24)
+T_WORLD_MODEL = look_at([-0.8, -0.8, 1.2], [1.2, 0.1, 0.5])
+
+
+def _weights(icp: float = 1.0, rgb: float = 1.0) -> ne.Weights:
+    weights = ne.Weights()
+    weights.icp, weights.rgb = icp, rgb
+    weights.per_depth_noise = 1 / 0.003
+    weights.per_cauchy_icp, weights.per_cauchy_rgb = 0.5, 1.0
+    weights.grey_variance, weights.pixel_variance = 0.25, 0.09
+    weights.distance_m, weights.cos_angle = 0.1, 0.7
+    weights.inlier_sigmas, weights.texture, weights.alike = 4.0, 4.0, 20.0
+    return weights
+
+
+def _synthetic(seed: int = 0) -> dict[str, np.ndarray]:
+    """A wavy surface seen twice, with holes; smooth grey values."""
+    rng = np.random.default_rng(seed)
+    v, u = np.mgrid[: SMALL.height, : SMALL.width].astype(float)
+    depth = 1.5 + 0.1 * np.sin(u / 7) + 0.05 * np.cos(v / 5)
+    grey = 120 + 60 * np.sin(u / 3.1 + 0.4) + 40 * np.cos(v / 2.7)
+    vertices = SMALL.rays() * depth[..., None]
+    normal = np.cross(np.gradient(vertices, axis=1), np.gradient(vertices, axis=0))
+    normal /= -np.linalg.norm(normal, axis=-1, keepdims=True)
+    normal *= -np.sign((normal * vertices).sum(-1, keepdims=True))
+    live = vertices + 0.002 * rng.normal(size=vertices.shape[:2] + (1,)) * SMALL.rays()
+    live[rng.random(depth.shape) < 0.1] = 0
+    model = vertices.copy()
+    model[rng.random(depth.shape) < 0.1] = 0
+    gy, gx = np.gradient(grey)
+    return {
+        "model_vertices": model, "model_normals": normal, "model_intensity": grey + 3.0,
+        "live_vertices": live, "live_normals": normal, "live_gradient": np.stack([grey, gx, gy], -1),
+    }  # fmt: skip
+
+
+def _device_sums(data, T, weights, stride=1, columns=1 << 20):
+    kinds = [wp.vec3, wp.vec3, wp.float32, wp.vec3, wp.vec3, wp.vec3]
+    images = [
+        wp.array(a[None].astype(np.float32), dtype=k)
+        for a, k in zip(data.values(), kinds, strict=True)
+    ]
+    columns = min(columns, SMALL.width)
+    rows, pieces = -(-SMALL.height // stride), -(-SMALL.width // columns)
+    partial = wp.zeros((1, 1, rows * pieces, ne.NUM_SUMS), dtype=wp.float32)
+    sums = wp.zeros((1, 1, ne.NUM_SUMS), dtype=wp.float64)
+    active = wp.array([[ne.RUNNING]], dtype=wp.int32)
+    wp.launch(
+        ne.accumulate,
+        dim=(1, 1, rows, pieces),
+        inputs=[
+            *images, wp.vec2(SMALL.fx, SMALL.fy), wp.vec2(SMALL.cx, SMALL.cy), weights, stride,
+            columns, wp.array(T[None, None], dtype=wp.mat44d), active,
+        ],
+        outputs=[partial],
+    )  # fmt: skip
+    reduce(partial, rows * pieces, active, sums, "cpu")
+    return sums.numpy()[0, 0]
+
+
+def _bilinear(image, x, y):
+    u, v = int(x), int(y)
+    a, b = x - u, y - v
+    return (1 - b) * ((1 - a) * image[v, u] + a * image[v, u + 1]) + b * (
+        (1 - a) * image[v + 1, u] + a * image[v + 1, u + 1]
+    )
+
+
+def _residuals(data, T, weights):
+    """Residuals (r_icp, sigma) and (r_rgb, sigma) of every model point, one after another."""
+    inverse = invert(T)
+    icp, rgb = [], []
+    for v, u in np.ndindex(SMALL.shape):
+        p = data["model_vertices"][v, u]
+        if p[2] <= 0:
+            continue
+        q = inverse[:3, :3] @ p + inverse[:3, 3]
+        x, y = SMALL.project(q)
+        if not (0 <= x < SMALL.width - 1 and 0 <= y < SMALL.height - 1):
+            continue
+        near = int(y + 0.5), int(x + 0.5)
+        live = data["live_vertices"][near]
+        if live[2] > 0:
+            if abs(live[2] - q[2]) > weights.distance_m:
+                continue
+            n = inverse[:3, :3] @ data["model_normals"][v, u]
+            if n @ data["live_normals"][near] > weights.cos_angle:
+                icp.append((n @ (live - q), 0.003 * q[2] ** 2, near, (v, u)))
+        seen = _bilinear(data["live_gradient"], x, y)
+        if abs(seen[1]) + abs(seen[2]) > weights.texture:
+            sigma = np.sqrt(0.25 + 0.09 * (seen[1] ** 2 + seen[2] ** 2))
+            rgb.append((seen[0] - data["model_intensity"][v, u], sigma, seen, (v, u)))
+    return icp, rgb
+
+
+def _expected_system(data, T, weights):
+    """H and g with the Jacobians of the module's text."""
+    inverse = invert(T)
+    H, g = np.zeros((6, 6)), np.zeros(6)
+    icp, rgb = _residuals(data, T, weights)
+    for r, sigma, near, pixel in icp:
+        n = inverse[:3, :3] @ data["model_normals"][pixel]
+        J = np.concatenate([n, np.cross(data["live_vertices"][near], n)])
+        w = weights.icp / sigma**2 / (1 + (r / sigma / 2) ** 2)
+        H, g = H + w * np.outer(J, J), g + w * J * r
+    for r, sigma, seen, pixel in rgb:
+        q = inverse[:3, :3] @ data["model_vertices"][pixel] + inverse[:3, 3]
+        to_q = np.array(
+            [[SMALL.fx / q[2], 0, -SMALL.fx * q[0] / q[2] ** 2],
+             [0, SMALL.fy / q[2], -SMALL.fy * q[1] / q[2] ** 2]]
+        )  # fmt: skip
+        slope = -seen[1:] @ to_q
+        J = np.concatenate([slope, np.cross(q, slope)])
+        w = weights.rgb / sigma**2 / (1 + (r / sigma) ** 2)
+        H, g = H + w * np.outer(J, J), g + w * J * r
+    return H, g, len(icp), len(rgb)
+
+
+@pytest.mark.parametrize("columns", [1 << 20, 7])
+def test_normal_equations_equal_the_loop_over_points(columns):
+    data, weights = _synthetic(), _weights()
+    T = se3_exp([0.01, -0.02, 0.015, 0.01, 0.02, -0.015])
+    sums = _device_sums(data, T, weights, columns=columns)
+    H, g, num_icp, num_rgb = _expected_system(data, T, weights)
+    assert num_icp > 300
+    assert num_rgb == sums[ne.SUM_TEXTURED]
+    scale = np.sqrt(np.diag(H))
+    actual = np.zeros((6, 6))
+    actual[np.triu_indices(6)] = sums[:21]
+    actual = np.triu(actual) + np.triu(actual, 1).T
+    np.testing.assert_allclose(
+        actual / np.outer(scale, scale), H / np.outer(scale, scale), atol=2e-4
+    )
+    np.testing.assert_allclose(sums[21:27] / scale, g / scale, atol=2e-3 * np.abs(g / scale).max())
+
+
+@pytest.mark.parametrize("term", ["icp", "rgb"])
+def test_jacobians_agree_with_finite_differences(term):
+    """A residual's change under T <- T exp(xi) is J xi, while its pixel stays the same."""
+    data, weights = _synthetic(), _weights()
+    # A grey value linear in the image makes the interpolated gradient exact everywhere.
+    v, u = np.mgrid[: SMALL.height, : SMALL.width].astype(float)
+    data["live_gradient"] = np.stack([3 * u + 2 * v, np.full_like(u, 3), np.full_like(u, 2)], -1)
+    T = se3_exp([0.01, -0.02, 0.015, 0.01, 0.02, -0.015])
+    index = 0 if term == "icp" else 1
+    before = {r[3]: r for r in _residuals(data, T, weights)[index]}
+    inverse = invert(T)
+    checked = 0
+    for axis in range(6):
+        xi = np.zeros(6)
+        xi[axis] = 1e-6
+        after = {r[3]: r for r in _residuals(data, T @ se3_exp(xi), weights)[index]}
+        for pixel, (r, _, where, _) in before.items():
+            if pixel not in after or (term == "icp" and after[pixel][2] != where):
+                continue
+            if term == "icp":
+                n = inverse[:3, :3] @ data["model_normals"][pixel]
+                J = np.concatenate([n, np.cross(data["live_vertices"][where], n)])
+            else:
+                q = inverse[:3, :3] @ data["model_vertices"][pixel] + inverse[:3, 3]
+                g = np.array([3 * SMALL.fx, 2 * SMALL.fy, 0]) / q[2]
+                g[2] = -(g[0] * q[0] + g[1] * q[1]) / q[2]
+                J = -np.concatenate([g, np.cross(q, g)])
+            assert (after[pixel][0] - r) / 1e-6 == pytest.approx(J[axis], rel=1e-3, abs=1e-2)
+            checked += 1
+    assert checked > 1000
+
+
+def test_stride_looks_at_a_chessboard_of_points():
+    data, weights = _synthetic(), _weights()
+    rows = np.arange(0, SMALL.height, 2)
+    columns = [np.arange(i % 2, SMALL.width, 2) for i in range(len(rows))]
+    expected = sum(
+        (data["model_vertices"][v, c, 2] > 0).sum() for v, c in zip(rows, columns, strict=True)
+    )
+    assert _device_sums(data, np.eye(4), weights, stride=2)[ne.SUM_POINTS] == expected
+
+
+class _Pair:
+    """A tracker, and the scene's sensor without noise."""
+
+    def __init__(self, noise: str = "none") -> None:
+        self.camera = xtion("160x120")
+        self.sensor = RGBDSensor(BoxScene(), self.camera, noise=noise)
+        config = SurfelConfig(depth_cutoff_m=5.0)
+        self.preprocessors = [Preprocessor(1, self.camera, config) for _ in range(2)]
+        self.tracker = Tracker(1, NUM_SEEDS, self.camera, config)
+
+    def live(self, which: int, pose: np.ndarray) -> LiveFrame:
+        frame = self.sensor.capture(pose, which)
+        return self.preprocessors[which](frame.color[None], frame.depth[None])
+
+    def align(self, model: LiveFrame, live: LiveFrame):
+        view = ModelView(model.vertices, model.normals, model.intensity, model.color)
+        self.tracker.set_frame(live)
+        limits = make_limits(np.zeros(1, dtype=bool), np.zeros(1, dtype=np.int32))
+        seeds = tracking_seeds(np.eye(4))[None]
+        return self.tracker.align(view, T_WORLD_MODEL[None], seeds, limits)
+
+
+@pytest.fixture(scope="module")
+def pair() -> _Pair:
+    return _Pair()
+
+
+@pytest.mark.parametrize(
+    "twist",
+    [
+        np.zeros(6),
+        [0.01, 0, 0, 0, 0.01, 0],
+        [0.06, 0, 0, 0, 0, np.radians(6)],
+        [0, 0, 0.06, np.radians(-6), 0, 0],
+        [0, 0.1, 0, 0, np.radians(10), 0],
+        [-0.1, 0, 0, 0, 0, np.radians(-10)],
+    ],
+)
+def test_known_motions_are_recovered(pair, twist):
+    truth = T_WORLD_MODEL @ se3_exp(twist)
+    alignment = pair.align(pair.live(0, T_WORLD_MODEL), pair.live(1, truth))
+    assert REASONS[int(alignment.verdict[0])] == ""
+    estimate = alignment.T_world_live[0]
+    assert np.linalg.norm(estimate[:3, 3] - truth[:3, 3]) < 0.006
+    assert relative_angle(estimate[:3, :3], truth[:3, :3]) < np.radians(0.3)
+    np.testing.assert_allclose(T_WORLD_MODEL @ alignment.T_model_live[0], estimate, atol=1e-12)
+
+
+def test_a_frame_without_depth_has_too_few_points(pair):
+    model = pair.live(0, T_WORLD_MODEL)
+    black = np.zeros((1, *pair.camera.shape, 3), dtype=np.uint8)
+    live = pair.preprocessors[1](black, np.zeros((1, *pair.camera.shape), dtype=np.float32))
+    assert pair.align(model, live).verdict[0] == FEW_POINTS
+
+
+def test_a_blank_wall_does_not_constrain_the_pose(pair):
+    blank = np.full((1, *pair.camera.shape, 3), 128, dtype=np.uint8)
+    wall = np.full((1, *pair.camera.shape), 1.5, dtype=np.float32)
+    model = pair.preprocessors[0](blank, wall)
+    live = pair.preprocessors[1](blank, wall)
+    assert pair.align(model, live).verdict[0] == UNCONSTRAINED
+
+
+def test_foreign_colours_do_not_fit(pair):
+    model = pair.live(0, T_WORLD_MODEL)
+    frame = pair.sensor.capture(T_WORLD_MODEL, 1)
+    noise = np.random.default_rng(0).integers(0, 256, (1, *pair.camera.shape, 3), dtype=np.uint8)
+    live = pair.preprocessors[1](noise, frame.depth[None])
+    assert pair.align(model, live).verdict[0] == APPEARANCE
