@@ -32,7 +32,10 @@ class Open3DSlam:
         truncation_voxels: float = 8.0,
         block_count: int = 40_000,
     ) -> None:
-        """Set the camera and the parameters: the example's, but for voxel size and depth range."""
+        """Set the camera and the parameters: the example's, but for voxel size and depth range.
+
+        More iterations, a narrower truncation or association do not lower the error with noise.
+        """
         import open3d
 
         open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)

@@ -29,14 +29,14 @@ def sequence(box_scene: BoxScene) -> Sequence:
     return render_sequence(box_scene, poses, K, noise="none")
 
 
-@pytest.mark.parametrize("maker", [OpenCVOdometry, Open3DSlam])
-def test_peers_track_a_clean_sequence(sequence: Sequence, maker) -> None:
+@pytest.mark.parametrize(("maker", "limit_m"), [(OpenCVOdometry, 0.005), (Open3DSlam, 0.03)])
+def test_peers_track_a_clean_sequence(sequence: Sequence, maker, limit_m: float) -> None:
     try:
         peer = maker(K)
     except (ImportError, OSError) as error:
         pytest.skip(f"{maker.name} cannot run here: {error}")
     first = run_peer(peer, sequence, "160x120")
-    assert first.ate_rmse_m < 0.01
+    assert first.ate_rmse_m < limit_m
     assert first.path_m > 0.05
     assert run_peer(peer, sequence, "160x120").ate_rmse_m == pytest.approx(
         first.ate_rmse_m, abs=1e-3

@@ -97,3 +97,11 @@ def test_bad_seeds_and_indices_are_refused(sensor: RGBDSensor, pose, seed, index
 def test_a_batch_needs_one_index_a_pose(sensor: RGBDSensor, pose) -> None:
     with pytest.raises(InputError, match="2 frame indices"):
         sensor.capture_batch(pose[None], [0, 1])
+
+
+def test_true_depth_of_the_last_frame(box_scene: BoxScene, pose) -> None:
+    sensor = RGBDSensor(box_scene, K)
+    with pytest.raises(InputError, match="captured no frame"):
+        sensor.last_true_depth()
+    sensor.capture(pose, 0)
+    assert np.array_equal(sensor.last_true_depth(), sensor.ground_truth(pose).depth)
