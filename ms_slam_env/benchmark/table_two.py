@@ -206,7 +206,8 @@ def save_figure(rows: Sequence[Row], planners: Sequence[str], path: Path) -> Non
                 jitter = np.random.default_rng(0).uniform(-0.15, 0.15, len(values))
                 ax.plot(index + jitter, values, ".", color=colour(index), alpha=0.6)
             ax.set_xticks(range(len(planners)), planners)
-            ax.set_yscale("log")
+            if column.metric == "ate_m":
+                ax.set_yscale("log")
             ax.set_ylabel(column.heading)
             ax.set_title(name)
     save(figure, path)
