@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from ms_slam_env._warp import wp
 from ms_slam_env.geometry import se3_exp
 from ms_slam_env.slam.surfel.normal_equations import NUM_SUMS, OFF, RESTING, RUNNING
-from ms_slam_env.slam.surfel.solve import gauss_newton_step, reduce
+from ms_slam_env.slam.surfel.solve import gauss_newton_step, reduce_sums
 
 
 def _sums(H: np.ndarray, g: np.ndarray) -> np.ndarray:
@@ -73,6 +73,7 @@ def test_reduction_adds_the_slots_of_running_hypotheses():
     states = np.array([[RUNNING, OFF, RUNNING], [RESTING, RUNNING, RUNNING]])
     sums = wp.zeros((2, 3, NUM_SUMS), dtype=wp.float64)
     active = wp.array(states, dtype=wp.int32)
-    reduce(wp.array(partial, dtype=wp.float32), 5, active, sums, "cpu")
+    inputs = [wp.array(partial, dtype=wp.float32), 5, active]
+    wp.launch(reduce_sums, dim=sums.shape, inputs=inputs, outputs=[sums])
     expected = partial[:, :, :5].astype(np.float64).sum(2) * (states == RUNNING)[..., None]
     np.testing.assert_allclose(sums.numpy(), expected, atol=1e-12)

@@ -14,7 +14,7 @@ from ms_slam_env.slam.surfel import normal_equations as ne
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.preprocess import Preprocessor
 from ms_slam_env.slam.surfel.seeds import NUM_SEEDS, tracking_seeds
-from ms_slam_env.slam.surfel.solve import reduce
+from ms_slam_env.slam.surfel.solve import reduce_sums
 from ms_slam_env.slam.surfel.tracking import Tracker
 from ms_slam_env.slam.surfel.types import LiveFrame, ModelView
 from ms_slam_env.slam.surfel.verdict import (
@@ -50,14 +50,15 @@ def _synthetic(seed: int = 0) -> dict[str, np.ndarray]:
     normal = np.cross(np.gradient(vertices, axis=1), np.gradient(vertices, axis=0))
     normal /= -np.linalg.norm(normal, axis=-1, keepdims=True)
     normal *= -np.sign((normal * vertices).sum(-1, keepdims=True))
-    live = vertices + 0.002 * rng.normal(size=vertices.shape[:2] + (1,)) * SMALL.rays()
+    live = vertices + 0.002 * rng.normal(size=(*vertices.shape[:2], 1)) * SMALL.rays()
     live[rng.random(depth.shape) < 0.1] = 0
     model = vertices.copy()
     model[rng.random(depth.shape) < 0.1] = 0
     gy, gx = np.gradient(grey)
     return {
         "model_vertices": model, "model_normals": normal, "model_intensity": grey + 3.0,
-        "live_vertices": live, "live_normals": normal, "live_gradient": np.stack([grey, gx, gy], -1),
+        "live_vertices": live, "live_normals": normal,
+        "live_gradient": np.stack([grey, gx, gy], -1),
     }  # fmt: skip
 
 
@@ -81,7 +82,8 @@ def _device_sums(data, T, weights, stride=1, columns=1 << 20):
         ],
         outputs=[partial],
     )  # fmt: skip
-    reduce(partial, rows * pieces, active, sums, "cpu")
+    inputs = [partial, rows * pieces, active]
+    wp.launch(reduce_sums, dim=sums.shape, inputs=inputs, outputs=[sums])
     return sums.numpy()[0, 0]
 
 

@@ -52,7 +52,7 @@ class SurfelConfig:
     icp_rgb_weight: float = 0.1
     confidence_threshold: float = 10.0
     iterations: tuple[int, ...] = (4, 5, 10)
-    max_surfels: int = 200_000
+    max_surfels: int = 400_000
     coverage_px: float = 0.85
     surfel_radius_px: float = 0.9
     max_confidence: float = 50.0

@@ -6,10 +6,8 @@ Lie theory" (2018), equations (172) and (174).
 
 from __future__ import annotations
 
-from typing import Any
-
 from ms_slam_env._warp import wp
-from ms_slam_env.slam.surfel.normal_equations import NUM_SUMS, RESTING, RUNNING
+from ms_slam_env.slam.surfel.normal_equations import RESTING, RUNNING
 
 mat66d = wp.types.matrix(shape=(6, 6), dtype=wp.float64)
 vec6d = wp.types.vector(length=6, dtype=wp.float64)
@@ -164,14 +162,3 @@ def gauss_newton_step(
             active[b, k] = RESTING
     if last != 0 and active[b, k] == RESTING:
         active[b, k] = RUNNING
-
-
-def reduce(partial: wp.array, slots: int, active: wp.array, sums: wp.array, device: Any) -> None:
-    """Add up the partial sums (B, K, slots, NUM_SUMS) in float64 and in fixed order."""
-    wp.launch(
-        reduce_sums,
-        dim=(*sums.shape[:2], NUM_SUMS),
-        inputs=[partial, slots, active],
-        outputs=[sums],
-        device=device,
-    )

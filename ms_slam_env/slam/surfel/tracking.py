@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.launches import Launches
 from ms_slam_env.slam.surfel.normal_equations import NUM_SUMS, RUNNING, Weights, accumulate
 from ms_slam_env.slam.surfel.pyramid import Level, Pyramid
-from ms_slam_env.slam.surfel.solve import gauss_newton_step, reduce
+from ms_slam_env.slam.surfel.solve import gauss_newton_step, reduce_sums
 from ms_slam_env.slam.surfel.types import LiveFrame, ModelView
 from ms_slam_env.slam.surfel.verdict import (
     NUM_STATS,
@@ -65,6 +66,16 @@ class Alignment:
         )
 
 
+class _Hypotheses:
+    """Device buffers of K poses per env: pose, state, sums and partial sums."""
+
+    def __init__(self, batch: int, k: int, slots: int, device: str) -> None:
+        self.pose = wp.zeros((batch, k), dtype=wp.mat44d, device=device)
+        self.active = wp.zeros((batch, k), dtype=wp.int32, device=device)
+        self.sums = wp.zeros((batch, k, NUM_SUMS), dtype=wp.float64, device=device)
+        self.partial = wp.zeros((batch, k, slots, NUM_SUMS), dtype=wp.float32, device=device)
+
+
 class Tracker:
     """Aligns live frames with model views for B envs; owns the device buffers."""
 
@@ -89,17 +100,11 @@ class Tracker:
         slots = max(self._slots(level, self._stride(level)) for level in range(num_levels))
         slots = max(slots, self._slots(num_levels - 1, self._search_stride()))
 
-        def buffers(k: int) -> dict[str, wp.array]:
-            return {
-                "pose": wp.zeros((batch, k), dtype=wp.mat44d, device=device),
-                "active": wp.zeros((batch, k), dtype=wp.int32, device=device),
-                "sums": wp.zeros((batch, k, NUM_SUMS), dtype=wp.float64, device=device),
-                "partial": wp.zeros((batch, k, slots, NUM_SUMS), dtype=wp.float32, device=device),
-            }
-
-        self._first = buffers(NUM_FIRST)
-        self._more = buffers(num_seeds - NUM_FIRST)
-        self._one = buffers(1)
+        self._first = _Hypotheses(batch, NUM_FIRST, slots, device)
+        self._more = _Hypotheses(batch, num_seeds - NUM_FIRST, slots, device)
+        self._one = _Hypotheses(batch, 1, slots, device)
+        self._launches = Launches(device)
+        self._seen: tuple[LiveFrame | None, ModelView | None] = (None, None)
         self.good_score = GOOD_SCORE
         self._limits = wp.zeros(batch, dtype=Limits, device=device)
         self._T_world_model = wp.zeros(batch, dtype=wp.mat44d, device=device)
@@ -125,6 +130,7 @@ class Tracker:
 
     def set_frame(self, live: LiveFrame) -> None:
         """Build the pyramid of the live frames; ``align`` may then be called several times."""
+        self._expect(live, self._seen[1])
         self._live_levels = self._live.build(live.vertices, live.normals, live.intensity)
 
     def align(
@@ -138,11 +144,12 @@ class Tracker:
             seeds: (B, K, 4, 4) starting poses T_model_live.
             limits: (B,) structured array of ``verdict.Limits``.
         """
+        self._expect(self._seen[0], model)
         levels = self._model.build(model.vertices, model.normals, model.intensity)
         one = self._one
-        self._first["pose"].assign(seeds[:, :NUM_FIRST])
-        self._more["pose"].assign(seeds[:, NUM_FIRST:])
-        self._first["active"].fill_(RUNNING)
+        self._first.pose.assign(seeds[:, :NUM_FIRST])
+        self._more.pose.assign(seeds[:, NUM_FIRST:])
+        self._first.active.fill_(RUNNING)
         self._T_world_model.assign(T_world_model)
         self._limits.assign(limits)
         coarsest = len(levels) - 1
@@ -153,19 +160,26 @@ class Tracker:
                 self._pass(levels, level, self._stride(level), one)
                 self._step(level, one, last=iteration == count - 1)
         self._pass(levels, 0, self._stride(0), one)
-        wp.launch(
-            judge,
-            dim=self.batch,
-            inputs=[one["sums"], one["pose"], self._limits, self._T_world_model],
-            outputs=[self._T_world_live, self.verdict, self._stats],
-            device=self.device,
-        )
+        if not self._launches.replay("judge"):
+            self._launches.record(
+                "judge",
+                judge,
+                self.batch,
+                [one.sums, one.pose, self._limits, self._T_world_model],
+                [self._T_world_live, self.verdict, self._stats],
+            )
         return Alignment(
             T_world_live=self._T_world_live.numpy().copy(),
-            T_model_live=one["pose"].numpy()[:, 0].copy(),
+            T_model_live=one.pose.numpy()[:, 0].copy(),
             verdict=self.verdict.numpy().copy(),
             stats=self._stats.numpy().copy(),
         )
+
+    def _expect(self, live: LiveFrame | None, model: ModelView | None) -> None:
+        """Forget the recorded launches if these are not the images that they were made for."""
+        if self._seen[0] is not live or self._seen[1] is not model:
+            self._launches.clear()
+            self._seen = (live, model)
 
     def _search(self, levels: list[Level], coarsest: int) -> None:
         """Align seeds at the coarsest level on few points; the best one goes on.
@@ -174,41 +188,45 @@ class Tracker:
         """
         first, more, one = self._first, self._more, self._one
         self._settle(levels, coarsest, first)
-        wp.launch(
-            widen_search,
-            dim=self.batch,
-            inputs=[first["sums"], self.good_score],
-            outputs=[more["sums"], more["active"]],
-            device=self.device,
-        )
+        if not self._launches.replay("widen"):
+            self._launches.record(
+                "widen",
+                widen_search,
+                self.batch,
+                [first.sums, self.good_score],
+                [more.sums, more.active],
+            )
         self._settle(levels, coarsest, more)
-        wp.launch(
-            choose,
-            dim=self.batch,
-            inputs=[first["sums"], first["pose"], more["sums"], more["pose"]],
-            outputs=[one["pose"], one["active"]],
-            device=self.device,
-        )
+        if not self._launches.replay("choose"):
+            self._launches.record(
+                "choose",
+                choose,
+                self.batch,
+                [first.sums, first.pose, more.sums, more.pose],
+                [one.pose, one.active],
+            )
 
-    def _settle(self, levels: list[Level], coarsest: int, state: dict[str, wp.array]) -> None:
+    def _settle(self, levels: list[Level], coarsest: int, state: _Hypotheses) -> None:
         """A few steps for every active seed, and the sums at the pose they lead to."""
         for iteration in range(SEARCH_ITERATIONS):
             self._pass(levels, coarsest, self._search_stride(), state)
             self._step(coarsest, state, last=iteration == SEARCH_ITERATIONS - 1)
         self._pass(levels, coarsest, self._search_stride(), state)
 
-    def _pass(
-        self, levels: list[Level], level: int, stride: int, state: dict[str, wp.array]
-    ) -> None:
+    def _pass(self, levels: list[Level], level: int, stride: int, state: _Hypotheses) -> None:
         """Accumulate and reduce the sums of every active hypothesis at one level."""
+        key = (level, stride, id(state))
+        if self._launches.replay(("accumulate", key)):
+            self._launches.replay(("reduce", key))
+            return
         camera, model, live = self._cameras[level], levels[level], self._live_levels[level]
         slots = self._slots(level, stride)
-        columns = min(self._columns, camera.width)
         rows = -(-camera.height // stride)
-        wp.launch(
+        self._launches.record(
+            ("accumulate", key),
             accumulate,
-            dim=(*state["pose"].shape, rows, slots // rows),
-            inputs=[
+            (*state.pose.shape, rows, slots // rows),
+            [
                 model.vertices,
                 model.normals,
                 model.intensity,
@@ -219,25 +237,32 @@ class Tracker:
                 wp.vec2(camera.cx, camera.cy),
                 self._weights[level],
                 stride,
-                columns,
-                state["pose"],
-                state["active"],
+                min(self._columns, camera.width),
+                state.pose,
+                state.active,
             ],
-            outputs=[state["partial"]],
-            device=self.device,
+            [state.partial],
         )
-        reduce(state["partial"], slots, state["active"], state["sums"], self.device)
+        self._launches.record(
+            ("reduce", key),
+            reduce_sums,
+            state.sums.shape,
+            [state.partial, slots, state.active],
+            [state.sums],
+        )
 
-    def _step(self, level: int, state: dict[str, wp.array], last: bool) -> None:
+    def _step(self, level: int, state: _Hypotheses, last: bool) -> None:
         """Move every active hypothesis by one Gauss-Newton step."""
-        smallest = SMALLEST_STEP[min(level, len(SMALLEST_STEP) - 1)]
-        wp.launch(
-            gauss_newton_step,
-            dim=state["pose"].shape,
-            inputs=[state["sums"], DAMPING, smallest, int(last)],
-            outputs=[state["pose"], state["active"]],
-            device=self.device,
-        )
+        key = ("step", level, last, id(state))
+        if not self._launches.replay(key):
+            smallest = SMALLEST_STEP[min(level, len(SMALLEST_STEP) - 1)]
+            self._launches.record(
+                key,
+                gauss_newton_step,
+                state.pose.shape,
+                [state.sums, DAMPING, smallest, int(last)],
+                [state.pose, state.active],
+            )
 
 
 def _weights(config: SurfelConfig, level: int) -> Weights:
