@@ -8,14 +8,13 @@ noise of a structured-light sensor is uniform in it.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.launches import Launches
 from ms_slam_env.slam.surfel.types import LiveFrame
 
 
@@ -189,6 +188,7 @@ class Preprocessor:
         self._normal_step = max(1, intrinsics.width // 160)
         # The CPU runs one thread after another: whole rows. A GPU wants many threads.
         self._columns = 1 if wp.get_device(device).is_cuda else intrinsics.width
+        self._launches = Launches(device)
         self._dim = (batch, intrinsics.height, -(-intrinsics.width // self._columns))
 
     def __call__(self, color: NDArray[np.uint8], depth: NDArray[np.float32]) -> LiveFrame:
@@ -196,31 +196,45 @@ class Preprocessor:
 
         The frame's buffers are those of the last call.
         """
-        frame, config, camera = self.frame, self.config, self.intrinsics
+        frame = self.frame
         self._raw_color.assign(color)
         frame.raw_depth.assign(depth)
-        self._launch(
+        if not self._launches.replay("convert"):
+            self._record()
+            return frame
+        for stage in ("filter columns", "filter rows", "surface"):
+            self._launches.replay(stage)
+        return frame
+
+    def _record(self) -> None:
+        """Run the stages for the first time and keep their launches: all buffers stay."""
+        frame, config, camera, dim = self.frame, self.config, self.intrinsics, self._dim
+        self._launches.record(
+            "convert",
             _convert,
+            dim,
             [frame.raw_depth, self._raw_color, config.depth_cutoff_m, self._columns],
             [self._inverse_depth, frame.color, frame.intensity],
         )
         per_cutoff_squared = 1.0 / (2.0 * config.bilateral_sigma_m) ** 2
         source = self._inverse_depth
-        for along_rows, target in enumerate(self._filtered):
-            self._launch(
+        for along_rows, (name, target) in enumerate(
+            zip(("filter columns", "filter rows"), self._filtered, strict=True)
+        ):
+            self._launches.record(
+                name,
                 _filter,
+                dim,
                 [source, self._spatial_weights, per_cutoff_squared, along_rows, self._columns],
                 [target],
             )
             source = target
         edge = config.normal_edge_per_m * self._normal_step * 160 / camera.width
         focal, centre = wp.vec2(camera.fx, camera.fy), wp.vec2(camera.cx, camera.cy)
-        self._launch(
+        self._launches.record(
+            "surface",
             _surface,
+            dim,
             [source, self._normal_step, edge, focal, centre, self._columns],
             [frame.depth, frame.vertices, frame.normals],
         )
-        return frame
-
-    def _launch(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
-        wp.launch(kernel, dim=self._dim, inputs=inputs, outputs=outputs, device=self.device)

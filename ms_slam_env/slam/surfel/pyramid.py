@@ -11,6 +11,7 @@ import itertools
 from dataclasses import dataclass
 
 from ms_slam_env._warp import wp
+from ms_slam_env.slam.surfel.launches import Launches
 
 EDGE_FRACTION = 0.03  # pixels of a block further behind the front one than this are another surface
 
@@ -98,7 +99,8 @@ class Pyramid:
         device: str = "cpu",
     ) -> None:
         """Allocate ``num_levels`` levels of images (B, H, W) with (H, W) = ``shape``."""
-        self.device = device
+        self._launches = Launches(device)
+        self._levels: list[Level] = []
         self._with_gradient = with_gradient
         self._coarse: list[Level] = []
         size = (batch, *shape)
@@ -118,22 +120,27 @@ class Pyramid:
 
     def build(self, vertices: wp.array, normals: wp.array, intensity: wp.array) -> list[Level]:
         """All levels, finest first, of images (B, H, W); the coarse ones overwrite the last."""
-        levels = [Level(vertices, normals, intensity, self._gradient), *self._coarse]
-        for fine, coarse in itertools.pairwise(levels):
-            wp.launch(
-                _downsample,
-                dim=coarse.vertices.shape,
-                inputs=[fine.vertices, fine.normals, fine.intensity, EDGE_FRACTION],
-                outputs=[coarse.vertices, coarse.normals, coarse.intensity],
-                device=self.device,
-            )
-        if self._with_gradient:
-            for level in levels:
-                wp.launch(
-                    _intensity_gradient,
-                    dim=level.vertices.shape,
-                    inputs=[level.intensity],
-                    outputs=[level.gradient],
-                    device=self.device,
+        if not self._levels or self._levels[0].vertices is not vertices:
+            self._launches.clear()
+            self._levels = [Level(vertices, normals, intensity, self._gradient), *self._coarse]
+        for index, (fine, coarse) in enumerate(itertools.pairwise(self._levels)):
+            key = ("downsample", index)
+            if not self._launches.replay(key):
+                self._launches.record(
+                    key,
+                    _downsample,
+                    coarse.vertices.shape,
+                    [fine.vertices, fine.normals, fine.intensity, EDGE_FRACTION],
+                    [coarse.vertices, coarse.normals, coarse.intensity],
                 )
-        return levels
+        for index, level in enumerate(self._levels if self._with_gradient else ()):
+            key = ("gradient", index)
+            if not self._launches.replay(key):
+                self._launches.record(
+                    key,
+                    _intensity_gradient,
+                    level.vertices.shape,
+                    [level.intensity],
+                    [level.gradient],
+                )
+        return self._levels
