@@ -2,6 +2,8 @@
 
 ElasticFusion (Whelan et al., RSS 2015, figure 2) without loop closure. While tracking is lost the
 pose is held, nothing is fused, and every frame is tried against the map around the last good pose.
+The view that frames are tracked against shows living surfels of every age: with steps of
+centimetres a view seldom lasts until its surfels are stable.
 """
 
 from __future__ import annotations
@@ -234,8 +236,12 @@ class SurfelSlam(SlamBackend):
         return self.map.predict(stack, scale)
 
     def surface_points(self) -> Float64:
-        """Stable surfels (M, 3); those of every age while none is stable yet."""
-        return self.map.points(stable=self._any_stable())
+        """All living surfels (M, 3): the stable ones and the young ones seen of late.
+
+        Episodes are too short for most surfels to become stable, and the map itself removes
+        those that stay unconfirmed.
+        """
+        return self.map.points(stable=False)
 
     def map_points(self) -> Float64:
         """Surfels of every age (M, 3)."""
@@ -243,10 +249,7 @@ class SurfelSlam(SlamBackend):
 
     def surface_colors(self) -> NDArray[np.uint8]:
         """Colours (M, 3) RGB of ``surface_points``."""
-        return self.map.colors(stable=self._any_stable())
-
-    def _any_stable(self) -> bool:
-        return len(self.map.points(stable=True)) > 0
+        return self.map.colors(stable=False)
 
     def get_state(self) -> dict[str, Any]:
         """Everything needed to go on bit-exactly, as NumPy arrays."""
