@@ -1,5 +1,3 @@
-# Warp annotations are values, not types.
-# mypy: ignore-errors
 """Counting kernels: one pass over the pixels of a batch of frames.
 
 Counts are integers, so the result does not depend on the order in which a GPU adds them. One

@@ -1,5 +1,3 @@
-# mypy: ignore-errors
-# Warp code: the annotations are Warp types, which mypy cannot read.
 """Depth as a structured-light sensor measures it."""
 
 from __future__ import annotations

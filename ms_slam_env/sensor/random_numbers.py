@@ -1,5 +1,3 @@
-# mypy: ignore-errors
-# Warp code: the annotations are Warp types, which mypy cannot read.
 """Counter-based random numbers: a function of (seed, frame index, pixel), of nothing else."""
 
 from __future__ import annotations
@@ -29,7 +27,7 @@ def frame_key(seed: int, index: int) -> NDArray[np.uint32]:
     for name, value in (("seed", seed), ("index", index)):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
             raise InputError(f"sensor {name} must be an integer >= 0, got {value!r}")
-    return np.random.SeedSequence([int(seed), int(index)]).generate_state(2)
+    return np.random.SeedSequence([int(seed), int(index)]).generate_state(2).astype(np.uint32)
 
 
 _PCG_INCREMENT = wp.constant(wp.uint32(2891336453))

@@ -1,5 +1,5 @@
-# mypy: ignore-errors
-# Warp code: the annotations are Warp types, which mypy cannot read.
+# mypy: disable-error-code="attr-defined"
+# Warp's stubs do not name the fields of a ray query.
 """Kernels that make viewing rays and cast them, and the pinhole camera as a Warp struct."""
 
 from __future__ import annotations

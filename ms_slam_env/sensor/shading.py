@@ -1,5 +1,3 @@
-# mypy: ignore-errors
-# Warp code: the annotations are Warp types, which mypy cannot read.
 """Colour of what each ray hits: texture, baked light, exposure, intensity noise, sRGB."""
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
-# mypy: ignore-errors
 # ruff: noqa: UP018, RUF046
-# Warp code: annotations are Warp types, and float(0.0) declares a variable that changes.
+# Warp code: float(0.0) declares a variable that changes.
 """Kernels that fuse a live frame into the map.
 
 Association is projective (Keller et al., 3DV 2013, section 4), but from the surfel to the image:

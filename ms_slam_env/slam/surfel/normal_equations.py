@@ -55,18 +55,18 @@ RESTING = wp.constant(2)  # converged at its level, wakes at the next
 class Weights:
     """Scales of the residuals; see the module's text. Reciprocals save divisions per pixel."""
 
-    icp: wp.float32
-    rgb: wp.float32
-    per_depth_noise: wp.float32  # 1 / depth_noise_m
-    per_cauchy_icp: wp.float32  # 1 / sigmas
-    per_cauchy_rgb: wp.float32  # 1 / sigmas
-    grey_variance: wp.float32  # of the intensity, grey levels^2
-    pixel_variance: wp.float32  # of the place in the image, pixels^2
-    distance_m: wp.float32
-    cos_angle: wp.float32
-    inlier_sigmas: wp.float32
-    texture: wp.float32  # grey levels per pixel
-    alike: wp.float32  # grey levels
+    icp: float
+    rgb: float
+    per_depth_noise: float  # 1 / depth_noise_m
+    per_cauchy_icp: float  # 1 / sigmas
+    per_cauchy_rgb: float  # 1 / sigmas
+    grey_variance: float  # of the intensity, grey levels^2
+    pixel_variance: float  # of the place in the image, pixels^2
+    distance_m: float
+    cos_angle: float
+    inlier_sigmas: float
+    texture: float  # grey levels per pixel
+    alike: float  # grey levels
 
 
 @wp.kernel

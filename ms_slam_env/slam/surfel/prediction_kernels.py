@@ -1,6 +1,5 @@
-# mypy: ignore-errors
 # ruff: noqa: UP018, RUF046
-# Warp code: annotations are Warp types, and float(0.0) declares a variable that changes.
+# Warp code: float(0.0) declares a variable that changes.
 """Kernels of the candidates' views: warp the points of a layered depth image into many cameras.
 
 The front surface and the surface behind it, rendered from one reference pose with a wider field of

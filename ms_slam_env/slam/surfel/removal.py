@@ -1,5 +1,3 @@
-# mypy: ignore-errors
-# Warp code: the annotations are Warp types, which mypy cannot read.
 """Kernels that remove surfels and close the gaps they leave."""
 
 from __future__ import annotations

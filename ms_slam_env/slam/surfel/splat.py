@@ -1,5 +1,3 @@
-# mypy: ignore-errors
-# Warp code: the annotations are Warp types, which mypy cannot read.
 """Kernels that render surfels: cull, z-buffer of discs, average of the front surface, resolve.
 
 Two passes over the visible discs: the first finds the nearest surface of every pixel, the second

@@ -1,5 +1,3 @@
-# mypy: ignore-errors
-# Warp code: the annotations are Warp types, which mypy cannot read.
 """The surfels of B maps as structure of arrays, and the small functions that kernels share."""
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -178,7 +180,7 @@ def judge(
     stats[b, 6] = cost
 
 
-def make_limits(strict: NDArray[np.bool_], lost: NDArray[np.int32]) -> NDArray[np.void]:
+def make_limits(strict: NDArray[np.bool_], lost: NDArray[np.int32]) -> NDArray[Any]:
     """Limits (B,) of ordinary tracking, or ``strict`` ones where a wide search found the pose.
 
     The motion may be larger the longer, in frames, tracking has been ``lost``.
@@ -187,7 +189,7 @@ def make_limits(strict: NDArray[np.bool_], lost: NDArray[np.int32]) -> NDArray[n
     degrees in six scenes at 160x120: they refuse 0.3 % of the good ones. The self-similar carpet
     fits itself at wrong places but for its cost, which is 1.5 there and below 1.3 at right ones.
     """
-    limits = np.zeros(len(strict), dtype=Limits.numpy_dtype())
+    limits = np.zeros(len(strict), dtype=Limits.numpy_dtype())  # type: ignore[attr-defined]
     limits["points"] = 100.0
     limits["overlap"] = np.where(strict, 0.4, 0.3)
     limits["inliers"] = np.where(strict, 0.7, 0.65)
