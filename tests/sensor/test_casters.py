@@ -43,8 +43,8 @@ def test_depth_of_the_walls_is_that_of_a_box(sensors, eye, yaw, pitch) -> None:
     np.testing.assert_allclose(
         view.depth[walls], analytic_depth(T, SMALL.rays())[walls], rtol=1e-5, atol=1e-5
     )
-    # Boxes only come nearer.
-    assert (view.depth[~walls] < analytic_depth(T, SMALL.rays())[~walls]).all()
+    # Boxes only come nearer; where one meets the wall, both are equally near.
+    assert (view.depth[~walls] < analytic_depth(T, SMALL.rays())[~walls] * (1 + 1e-5)).all()
 
 
 @pytest.mark.parametrize("seed", range(5))
