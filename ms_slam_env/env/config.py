@@ -20,6 +20,11 @@ from ms_slam_env.scenes import SCENES, SEED_SPLITS
 class TargetConfig:
     """Motion-and-structure parameters and thresholds of the paper's Algorithm 1, line 9.
 
+    M_I and M_D are the maxima of hand-held sequences of which every fourth frame was kept, the
+    sparsest that SLAM tracked without a loss (``python -m ms_slam_env.benchmark.frame_skipping``).
+    The thresholds and lambda were chosen on validation seeds: with larger ones the greedy planner
+    loses track as random walk does, with smaller ones it maps little (BENCHMARK.md).
+
     Attributes:
         M_I: permitted maximum of the intensity divergence, equation (11), nats.
         M_D: permitted maximum of the depth divergence, equation (12), nats.
@@ -28,11 +33,11 @@ class TargetConfig:
         depth_weight: lambda, significance of depth over intensity.
     """
 
-    M_I: float = 0.02
-    M_D: float = 0.02
-    rho_I: float = 0.5
-    rho_D: float = 0.5
-    depth_weight: float = 1.0
+    M_I: float = 0.03
+    M_D: float = 0.06
+    rho_I: float = 0.35
+    rho_D: float = 1.0
+    depth_weight: float = 0.1
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
@@ -69,11 +74,11 @@ class RewardConfig:
 
     intensity_divergence: float = 0.1
     depth_divergence: float = 0.1
-    trajectory_error: float = 5.0
-    new_surface: float = 5.0
+    trajectory_error: float = 10.0
+    new_surface: float = 1.0
     lost: float = 0.5
-    lost_for_good: float = 5.0
-    blocked: float = 0.2
+    lost_for_good: float = 10.0
+    blocked: float = 0.1
 
     def __post_init__(self) -> None:
         """Refuse negative weights."""
@@ -133,8 +138,8 @@ class EnvConfig:
     slam: str = "surfel"
     slam_config: dict[str, object] = field(default_factory=dict)
     observation: str = "features"
-    step_m: float = 0.06
-    step_rad: float = math.radians(6)
+    step_m: float = 0.1
+    step_rad: float = math.radians(10)
     lost_patience: int = 10
     divergence: DivergenceConfig = field(default_factory=DivergenceConfig)
     lookahead: LookaheadConfig = field(default_factory=LookaheadConfig)

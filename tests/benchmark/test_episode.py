@@ -101,7 +101,7 @@ def cell(ate_m: float, lost: float, M: float) -> dict[str, Interval]:
 
 
 def test_targets_are_read_at_the_last_interval_that_suffices() -> None:
-    summary = {1: cell(0.002, 0, 0.01), 2: cell(0.008, 0.4, 0.02), 4: cell(0.02, 0, 0.04)}
+    summary = {1: cell(0.002, 0, 0.01), 2: cell(0.008, 0, 0.02), 4: cell(0.003, 0.1, 0.04)}
     summary[8] = cell(0.001, 0, 0.08)  # luck beyond the first failure does not count
     targets = suggest_targets(summary, 0.01)
     assert targets is not None
