@@ -22,59 +22,61 @@ def _downsample(
     normals: wp.array3d(dtype=wp.vec3),
     intensity: wp.array3d(dtype=wp.float32),
     edge_fraction: wp.float32,
+    columns: wp.int32,  # per thread
     coarse_vertices: wp.array3d(dtype=wp.vec3),
     coarse_normals: wp.array3d(dtype=wp.vec3),
     coarse_intensity: wp.array3d(dtype=wp.float32),
 ):
-    b, v, u = wp.tid()
-    front = wp.float32(1.0e9)
-    for row in range(2 * v, 2 * v + 2):
-        for column in range(2 * u, 2 * u + 2):
-            z = vertices[b, row, column][2]
-            if z > 0.0:
-                front = wp.min(front, z)
-    limit = front * (1.0 + edge_fraction)
-    vertex = wp.vec3(0.0, 0.0, 0.0)
-    normal = wp.vec3(0.0, 0.0, 0.0)
-    grey = wp.float32(0.0)
-    count = wp.float32(0.0)
-    grey_any = wp.float32(0.0)
-    for row in range(2 * v, 2 * v + 2):
-        for column in range(2 * u, 2 * u + 2):
-            p = vertices[b, row, column]
-            value = intensity[b, row, column]
+    b, v, piece = wp.tid()
+    width = coarse_vertices.shape[2]
+    for u in range(piece * columns, wp.min((piece + 1) * columns, width)):
+        front = wp.float32(1.0e9)
+        for i in range(4):
+            z = vertices[b, 2 * v + i / 2, 2 * u + i % 2][2]
+            front = wp.min(front, wp.where(z > 0.0, z, 1.0e9))
+        limit = front * (1.0 + edge_fraction)
+        vertex = wp.vec3(0.0, 0.0, 0.0)
+        normal = wp.vec3(0.0, 0.0, 0.0)
+        grey = wp.float32(0.0)
+        count = wp.float32(0.0)
+        grey_any = wp.float32(0.0)
+        for i in range(4):
+            p = vertices[b, 2 * v + i / 2, 2 * u + i % 2]
+            value = intensity[b, 2 * v + i / 2, 2 * u + i % 2]
+            share = wp.where(p[2] > 0.0 and p[2] <= limit, 1.0, 0.0)
+            vertex += share * p
+            normal += share * normals[b, 2 * v + i / 2, 2 * u + i % 2]
+            grey += share * value
+            count += share
             grey_any += value
-            if p[2] > 0.0 and p[2] <= limit:
-                vertex += p
-                normal += normals[b, row, column]
-                grey += value
-                count += 1.0
-    if count > 0.0:
-        coarse_vertices[b, v, u] = vertex / count
+        per_count = 1.0 / wp.max(count, 1.0)
+        coarse_vertices[b, v, u] = vertex * per_count
         coarse_normals[b, v, u] = wp.normalize(normal)  # 0 stays 0
-        coarse_intensity[b, v, u] = grey / count
-    else:
-        coarse_vertices[b, v, u] = wp.vec3(0.0, 0.0, 0.0)
-        coarse_normals[b, v, u] = wp.vec3(0.0, 0.0, 0.0)
         # The sensor's grey value is good where its depth is missing.
-        coarse_intensity[b, v, u] = 0.25 * grey_any
+        coarse_intensity[b, v, u] = wp.where(count > 0.0, grey * per_count, 0.25 * grey_any)
 
 
 @wp.kernel
 def _intensity_gradient(
-    intensity: wp.array3d(dtype=wp.float32), gradient: wp.array3d(dtype=wp.vec3)
+    intensity: wp.array3d(dtype=wp.float32),
+    columns: wp.int32,
+    gradient: wp.array3d(dtype=wp.vec3),
 ):
     """Write (intensity, d/du, d/dv) by central differences, one-sided at the border."""
-    b, v, u = wp.tid()
-    left = wp.max(u - 1, 0)
-    right = wp.min(u + 1, intensity.shape[2] - 1)
+    b, v, piece = wp.tid()
+    last = intensity.shape[2] - 1
     above = wp.max(v - 1, 0)
     below = wp.min(v + 1, intensity.shape[1] - 1)
-    gradient[b, v, u] = wp.vec3(
-        intensity[b, v, u],
-        (intensity[b, v, right] - intensity[b, v, left]) / float(wp.max(right - left, 1)),
-        (intensity[b, below, u] - intensity[b, above, u]) / float(wp.max(below - above, 1)),
-    )
+    per_height = 1.0 / float(wp.max(below - above, 1))
+    for u in range(piece * columns, wp.min((piece + 1) * columns, last + 1)):
+        left = wp.max(u - 1, 0)
+        right = wp.min(u + 1, last)
+        per_width = wp.where(right - left == 2, 0.5, 1.0)
+        gradient[b, v, u] = wp.vec3(
+            intensity[b, v, u],
+            (intensity[b, v, right] - intensity[b, v, left]) * per_width,
+            (intensity[b, below, u] - intensity[b, above, u]) * per_height,
+        )
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,8 @@ class Pyramid:
     ) -> None:
         """Allocate ``num_levels`` levels of images (B, H, W) with (H, W) = ``shape``."""
         self._launches = Launches(device)
+        # The CPU runs one thread after another: whole rows. A GPU wants many threads.
+        self._columns = 1 if wp.get_device(device).is_cuda else shape[1]
         self._levels: list[Level] = []
         self._with_gradient = with_gradient
         self._coarse: list[Level] = []
@@ -129,8 +133,8 @@ class Pyramid:
                 self._launches.record(
                     key,
                     _downsample,
-                    coarse.vertices.shape,
-                    [fine.vertices, fine.normals, fine.intensity, EDGE_FRACTION],
+                    self._dim(coarse),
+                    [fine.vertices, fine.normals, fine.intensity, EDGE_FRACTION, self._columns],
                     [coarse.vertices, coarse.normals, coarse.intensity],
                 )
         for index, level in enumerate(self._levels if self._with_gradient else ()):
@@ -139,8 +143,13 @@ class Pyramid:
                 self._launches.record(
                     key,
                     _intensity_gradient,
-                    level.vertices.shape,
-                    [level.intensity],
+                    self._dim(level),
+                    [level.intensity, self._columns],
                     [level.gradient],
                 )
         return self._levels
+
+    def _dim(self, level: Level) -> tuple[int, int, int]:
+        """Threads of a kernel that writes ``level``: a piece of a row each."""
+        batch, height, width = level.vertices.shape
+        return batch, height, -(-width // self._columns)
