@@ -42,7 +42,8 @@ class SurfelConfig:
         cauchy_rgb: the same for photometric residuals.
         intensity_noise: standard deviation of a grey value, grey levels.
         lateral_noise_px: standard deviation of the place at which it was sampled, pixels.
-        points_per_level: tracking looks at about this many pixels of a pyramid level.
+        points_per_level: the last iteration of tracking looks at about this many pixels; the
+            others at three tenths of that.
 
     Raises:
         InputError: a value outside its range.

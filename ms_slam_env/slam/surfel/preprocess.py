@@ -176,7 +176,7 @@ def _surface(
 
 def copy_in(target: wp.array, values: NDArray[Any]) -> None:
     """Copy values of the same shape into an array; ``assign`` costs four times as much on a CPU."""
-    if target.device.is_cpu:
+    if target.device is not None and target.device.is_cpu:
         np.copyto(target.numpy(), values)
     else:
         target.assign(values)

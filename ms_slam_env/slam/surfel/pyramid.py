@@ -33,7 +33,8 @@ def _downsample(
         front = wp.float32(1.0e9)
         for i in range(4):
             z = vertices[b, 2 * v + i / 2, 2 * u + i % 2][2]
-            front = wp.min(front, wp.where(z > 0.0, z, 1.0e9))
+            if z > 0.0:
+                front = wp.min(front, z)
         limit = front * (1.0 + edge_fraction)
         vertex = wp.vec3(0.0, 0.0, 0.0)
         normal = wp.vec3(0.0, 0.0, 0.0)
@@ -43,13 +44,17 @@ def _downsample(
         for i in range(4):
             p = vertices[b, 2 * v + i / 2, 2 * u + i % 2]
             value = intensity[b, 2 * v + i / 2, 2 * u + i % 2]
-            share = wp.where(p[2] > 0.0 and p[2] <= limit, 1.0, 0.0)
+            share = wp.float32(0.0)
+            if p[2] > 0.0 and p[2] <= limit:
+                share = 1.0
             vertex += share * p
             normal += share * normals[b, 2 * v + i / 2, 2 * u + i % 2]
             grey += share * value
             count += share
             grey_any += value
-        per_count = 1.0 / wp.max(count, 1.0)
+        per_count = wp.float32(1.0)
+        if count > 1.0:
+            per_count = 1.0 / count
         coarse_vertices[b, v, u] = vertex * per_count
         coarse_normals[b, v, u] = wp.normalize(normal)  # 0 stays 0
         # The sensor's grey value is good where its depth is missing.

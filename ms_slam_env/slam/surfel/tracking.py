@@ -34,7 +34,8 @@ SEARCH_POINTS = 400
 SEARCH_ITERATIONS = 5
 NUM_FIRST = 2  # seeds tried first: at rest and at constant velocity
 GOOD_SCORE = 0.4  # of a first seed, which makes the other seeds needless
-SMALLEST_STEP = (1.0e-4, 2.0e-4, 5.0e-4)  # metres and radians, per level, finest first
+SPARSE = 0.3  # share of the points that all iterations but the last look at
+SMALLEST_STEP = (2.0e-4, 4.0e-4, 1.0e-3)  # metres and radians, per level, finest first
 DAMPING = 1.0e-6
 COARSE_TOLERANCE = 2.5
 DEPTH_REDUNDANCY = 50.0  # see normal_equations
@@ -114,10 +115,10 @@ class Tracker:
         self._live_levels: list[Level] = []
         self._weights = [_weights(config, level) for level in range(num_levels)]
 
-    def _stride(self, level: int) -> int:
+    def _stride(self, level: int, share: float = 1.0) -> int:
         camera = self._cameras[level]
         pixels = camera.width * camera.height
-        return max(1, round((pixels / self.config.points_per_level) ** 0.5))
+        return max(1, round((pixels / (share * self.config.points_per_level)) ** 0.5))
 
     def _search_stride(self) -> int:
         camera = self._cameras[-1]
@@ -155,11 +156,15 @@ class Tracker:
         coarsest = len(levels) - 1
         self._search(levels, coarsest)
         for level in range(coarsest, -1, -1):
-            count = self.config.iterations[level]
+            last = int(level == 0)  # the last iteration sees more points than the others
+            count = self.config.iterations[level] - last
             for iteration in range(count):
-                self._pass(levels, level, self._stride(level), one)
+                self._pass(levels, level, self._stride(level, SPARSE), one)
                 self._step(level, one, last=iteration == count - 1)
+        # The verdict is on what the last step starts from, which has all but converged.
         self._pass(levels, 0, self._stride(0), one)
+        if self.config.iterations[0]:
+            self._step(0, one, last=True)
         if not self._launches.replay("judge"):
             self._launches.record(
                 "judge",
