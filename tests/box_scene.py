@@ -23,8 +23,8 @@ def _texture(rng: np.random.Generator, base: np.ndarray) -> np.ndarray:
     """Octaves of smooth noise with a few hard-edged patches, (512, 512, 3) uint8."""
     image = np.zeros((TEXTURE_SIZE, TEXTURE_SIZE, 3))
     for cells, amplitude in ((4, 30.0), (16, 25.0), (64, 20.0), (256, 10.0)):
-        coarse = rng.normal(0.0, amplitude, (cells, cells, 1)) * (1 + rng.normal(0, 0.2, 3))
-        image += zoom(coarse, (TEXTURE_SIZE // cells, TEXTURE_SIZE // cells, 1), order=1)
+        coarse, tint = rng.normal(0.0, amplitude, (cells, cells)), 1 + rng.normal(0, 0.2, 3)
+        image += zoom(coarse, TEXTURE_SIZE // cells, order=1)[..., None] * tint
     for _ in range(12):
         low = rng.integers(0, TEXTURE_SIZE - 40, 2)
         size = rng.integers(20, 120, 2)

@@ -4,7 +4,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from box_scene import BoxScene
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -63,8 +62,8 @@ def wall(count=40, spacing=0.05):
     return np.stack([np.full(a.size, 1.0), a.ravel() - 1, b.ravel() + 0.01], axis=1)
 
 
-def test_area_of_a_wall_counts_once():
-    grid = CoverageGrid(BoxScene())
+def test_area_of_a_wall_counts_once(box_scene):
+    grid = CoverageGrid(box_scene)
     points = wall()
     assert grid.add(points, points) == pytest.approx((40 * 0.05) ** 2)
     assert grid.add(points, points) == 0
@@ -72,8 +71,8 @@ def test_area_of_a_wall_counts_once():
     assert len(grid.seen_points()) == 1600
 
 
-def test_surface_mapped_in_the_wrong_place_counts_as_seen_only():
-    grid = CoverageGrid(BoxScene())
+def test_surface_mapped_in_the_wrong_place_counts_as_seen_only(box_scene):
+    grid = CoverageGrid(box_scene)
     points = wall()
     assert grid.add(points, points + np.array([0.06, 0, 0])) == 0
     assert grid.mapped_area == 0
@@ -82,9 +81,8 @@ def test_surface_mapped_in_the_wrong_place_counts_as_seen_only():
     assert centre_error.max() <= 0.05
 
 
-def test_state_round_trip():
-    scene = BoxScene()
-    grid, twin = CoverageGrid(scene), CoverageGrid(scene)
+def test_state_round_trip(box_scene):
+    grid, twin = CoverageGrid(box_scene), CoverageGrid(box_scene)
     grid.add(wall(), wall())
     twin.set_state(grid.get_state())
     assert twin.mapped_area == grid.mapped_area

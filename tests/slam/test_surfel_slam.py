@@ -29,8 +29,8 @@ def _path(count: int) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def frames() -> list[RGBDFrame]:
-    sensor = RGBDSensor(BoxScene(), CAMERA, noise="kinect", seed=0)
+def frames(box_scene: BoxScene) -> list[RGBDFrame]:
+    sensor = RGBDSensor(box_scene, CAMERA, noise="kinect", seed=0)
     return [sensor.capture(pose, index) for index, pose in enumerate(_path(16))]
 
 
@@ -46,7 +46,7 @@ def _black() -> RGBDFrame:
     )
 
 
-def test_a_noisy_path_is_tracked_to_millimetres(frames):
+def test_a_noisy_path_is_tracked_to_millimetres(frames, box_scene):
     backend = _new()
     for frame, truth in zip(frames, _path(16), strict=True):
         result = backend.track(frame)
@@ -54,7 +54,7 @@ def test_a_noisy_path_is_tracked_to_millimetres(frames):
         assert np.linalg.norm(result.T_world_camera[:3, 3] - truth[:3, 3]) < 0.008
     assert result.inlier_fraction > 0.8
     assert 0 < result.residual_m < 0.01
-    points, _ = BoxScene().surface_points(0.02)
+    points, _ = box_scene.surface_points(0.02)
     estimated = backend.surface_points()
     assert backend.surface_colors().shape == estimated.shape
     distance, _ = cKDTree(points).query(estimated)
@@ -84,12 +84,12 @@ def test_lost_frames_hold_the_pose_and_the_map_until_relocalised(frames):
     assert not backend.track(frames[9]).relocalised
 
 
-def test_relocalises_after_a_jump(frames):
+def test_relocalises_after_a_jump(frames, box_scene):
     backend = _new()
     for frame in frames[:6]:
         backend.track(frame)
     jump = START @ make_pose(so3_exp([np.radians(5), np.radians(14), 0]), [0.1, 0.0, 0.05])
-    frame = RGBDSensor(BoxScene(), CAMERA, noise="kinect", seed=1).capture(jump, 0)
+    frame = RGBDSensor(box_scene, CAMERA, noise="kinect", seed=1).capture(jump, 0)
     results = [backend.track(frame) for _ in range(12)]
     good = [result for result in results if result.tracking_ok]
     assert good
@@ -97,12 +97,12 @@ def test_relocalises_after_a_jump(frames):
         assert np.linalg.norm(result.T_world_camera[:3, 3] - jump[:3, 3]) < 0.02
 
 
-def test_a_frame_from_elsewhere_is_not_called_tracked(frames):
+def test_a_frame_from_elsewhere_is_not_called_tracked(frames, box_scene):
     backend = _new()
     for frame in frames[:4]:
         backend.track(frame)
     elsewhere = look_at([-0.5, 0.5, 1.2], [-1.5, -1.5, 0.6])
-    frame = RGBDSensor(BoxScene(), CAMERA, noise="kinect", seed=1).capture(elsewhere, 0)
+    frame = RGBDSensor(box_scene, CAMERA, noise="kinect", seed=1).capture(elsewhere, 0)
     assert not any(backend.track(frame).tracking_ok for _ in range(5))
 
 
