@@ -83,6 +83,7 @@ def update_surfels(
     height = live_vertices.shape[1]
     width = live_vertices.shape[2]
     T = poses[b]
+    coverage_squared = parameters.coverage_px * parameters.coverage_px
     for j in range(worker, visible.count[b], workers):
         p = visible.position[b, j]
         n = visible.normal[b, j]
@@ -95,25 +96,26 @@ def update_surfels(
         shift = float(0.0)
         mean_color = wp.vec3(0.0, 0.0, 0.0)
         behind = int(0)
-        for corner in range(4):
+        for corner in range(4):  # without branches, which noise would make guesses
             x = u0 + corner % 2
             y = v0 + corner / 2
-            if x >= 0 and x < width and y >= 0 and y < height:
-                q = live_vertices[b, y, x]
-                if q[2] > 0.0:
-                    difference = q - p
-                    distance = wp.dot(n, difference)
-                    if wp.abs(distance) < tolerance and wp.abs(difference[2]) < 3.0 * tolerance:
-                        du = wp.abs(float(x) - u)
-                        dv = wp.abs(float(y) - v)
-                        w = (1.0 - du) * (1.0 - dv)
-                        total += w
-                        shift += w * distance
-                        mean_color += w * live_color[b, y, x]
-                        if du * du + dv * dv < parameters.coverage_px * parameters.coverage_px:
-                            covered[b, y, x] = 1
-                    elif difference[2] > 3.0 * tolerance:
-                        behind += 1
+            inside = x >= 0 and x < width and y >= 0 and y < height
+            x = wp.clamp(x, 0, width - 1)
+            y = wp.clamp(y, 0, height - 1)
+            q = live_vertices[b, y, x]
+            difference = q - p
+            distance = wp.dot(n, difference)
+            valid = inside and q[2] > 0.0
+            near = wp.abs(distance) < tolerance and wp.abs(difference[2]) < 3.0 * tolerance
+            du = wp.abs(float(x) - u)
+            dv = wp.abs(float(y) - v)
+            w = wp.where(valid and near, (1.0 - du) * (1.0 - dv), 0.0)
+            total += w
+            shift += w * distance
+            mean_color += w * live_color[b, y, x]
+            covers = valid and near and du * du + dv * dv < coverage_squared
+            wp.atomic_max(covered, b, y, x, wp.where(covers, 1, 0))
+            behind += wp.where(valid and not near and difference[2] > 3.0 * tolerance, 1, 0)
         i = visible.index[b, j]
         confidence = surfels.confidence[b, i]
         if behind == 4:

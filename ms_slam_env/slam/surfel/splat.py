@@ -136,10 +136,16 @@ def project_disc(p: wp.vec3, n: wp.vec3, radius: float, camera: SplatCamera) -> 
     inverse = 1.0 / p[2]
     pixel = wp.vec2(p[2] / camera.focal[0], p[2] / camera.focal[1])
     drawn = wp.clamp(radius, camera.min_px * pixel[0], camera.max_px * pixel[0])
-    reach_u = drawn / pixel[0]
-    reach_v = drawn / pixel[1]
-    u = camera.focal[0] * p[0] * inverse + camera.centre[0]
-    v = camera.focal[1] * p[1] * inverse + camera.centre[1]
+    # A tilted disc is an ellipse: an offset d in its plane moves the column by (f / z) a . d with
+    # a = (1, 0, -x / z), at most |d| times a's part in the plane. The rest allows for perspective.
+    x = p[0] * inverse
+    y = p[1] * inverse
+    part_u = n[0] - x * n[2]
+    part_v = n[1] - y * n[2]
+    reach_u = 1.05 * (drawn / pixel[0]) * wp.sqrt(1.0 + x * x - part_u * part_u)
+    reach_v = 1.05 * (drawn / pixel[1]) * wp.sqrt(1.0 + y * y - part_v * part_v)
+    u = camera.focal[0] * x + camera.centre[0]
+    v = camera.focal[1] * y + camera.centre[1]
     # n . ray = (n . p) / z for rays with z = 1, so the inverse depth is (n / (n . p)) . ray.
     plane = 1.0 / wp.min(wp.dot(n, p), -1.0e-6)
     disc.u = u
