@@ -17,6 +17,7 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.launches import Launches
 from ms_slam_env.slam.surfel.normal_equations import NUM_SUMS, RUNNING, Weights, accumulate
+from ms_slam_env.slam.surfel.preprocess import copy_in
 from ms_slam_env.slam.surfel.pyramid import Level, Pyramid
 from ms_slam_env.slam.surfel.solve import gauss_newton_step, reduce_sums
 from ms_slam_env.slam.surfel.types import LiveFrame, ModelView
@@ -75,6 +76,12 @@ class _Hypotheses:
         self.active = wp.zeros((batch, k), dtype=wp.int32, device=device)
         self.sums = wp.zeros((batch, k, NUM_SUMS), dtype=wp.float64, device=device)
         self.partial = wp.zeros((batch, k, slots, NUM_SUMS), dtype=wp.float32, device=device)
+        is_cpu = wp.get_device(device).is_cpu
+        self._active_on_host = self.active.numpy() if is_cpu else None  # shares the memory
+
+    def running(self) -> bool:
+        """Whether a hypothesis may still move; on a GPU always True: asking would mean waiting."""
+        return self._active_on_host is None or bool((self._active_on_host == RUNNING).any())
 
 
 class Tracker:
@@ -148,19 +155,17 @@ class Tracker:
         self._expect(self._seen[0], model)
         levels = self._model.build(model.vertices, model.normals, model.intensity)
         one = self._one
-        self._first.pose.assign(seeds[:, :NUM_FIRST])
-        self._more.pose.assign(seeds[:, NUM_FIRST:])
+        copy_in(self._first.pose, seeds[:, :NUM_FIRST])
+        copy_in(self._more.pose, seeds[:, NUM_FIRST:])
         self._first.active.fill_(RUNNING)
-        self._T_world_model.assign(T_world_model)
+        copy_in(self._T_world_model, T_world_model)
         self._limits.assign(limits)
         coarsest = len(levels) - 1
         self._search(levels, coarsest)
         for level in range(coarsest, -1, -1):
             last = int(level == 0)  # the last iteration sees more points than the others
             count = self.config.iterations[level] - last
-            for iteration in range(count):
-                self._pass(levels, level, self._stride(level, SPARSE), one)
-                self._step(level, one, last=iteration == count - 1)
+            self._iterate(levels, level, self._stride(level, SPARSE), one, count)
         # The verdict is on what the last step starts from, which has all but converged.
         self._pass(levels, 0, self._stride(0), one)
         if self.config.iterations[0]:
@@ -201,7 +206,8 @@ class Tracker:
                 [first.sums, self.good_score],
                 [more.sums, more.active],
             )
-        self._settle(levels, coarsest, more)
+        if more.running():
+            self._settle(levels, coarsest, more)
         if not self._launches.replay("choose"):
             self._launches.record(
                 "choose",
@@ -213,10 +219,21 @@ class Tracker:
 
     def _settle(self, levels: list[Level], coarsest: int, state: _Hypotheses) -> None:
         """A few steps for every active seed, and the sums at the pose they lead to."""
-        for iteration in range(SEARCH_ITERATIONS):
-            self._pass(levels, coarsest, self._search_stride(), state)
-            self._step(coarsest, state, last=iteration == SEARCH_ITERATIONS - 1)
-        self._pass(levels, coarsest, self._search_stride(), state)
+        stride = self._search_stride()
+        self._iterate(levels, coarsest, stride, state, SEARCH_ITERATIONS)
+        self._pass(levels, coarsest, stride, state)
+
+    def _iterate(
+        self, levels: list[Level], level: int, stride: int, state: _Hypotheses, count: int
+    ) -> None:
+        """At most ``count`` Gauss-Newton iterations at one level; all resting ones wake after."""
+        for iteration in range(count):
+            running = state.running()
+            if running:
+                self._pass(levels, level, stride, state)
+            self._step(level, state, last=not running or iteration == count - 1)
+            if not running:
+                break
 
     def _pass(self, levels: list[Level], level: int, stride: int, state: _Hypotheses) -> None:
         """Accumulate and reduce the sums of every active hypothesis at one level."""
