@@ -20,8 +20,8 @@ from ms_slam_env.env import ActiveSlamEnv, Planner
 
 Float64 = NDArray[np.float64]
 
-DEFAULT_STEP_M = 0.1
-DEFAULT_STEP_DEG = 10.0
+DEFAULT_STEP_M = 0.12
+DEFAULT_STEP_DEG = 12.0
 LOST_ERROR_M = 0.3  # an estimate this far off is lost even where SLAM does not say so
 THRESHOLDS_M = (0.02, 0.05)
 MAP_VOXEL_M = 0.01  # a surface counts by its area, not by how often it was seen

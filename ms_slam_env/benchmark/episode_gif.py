@@ -25,8 +25,8 @@ class Args:
     scene_seed: int = 2000
     seed: int = 2000
     steps: int = 60
-    step_m: float = 0.1
-    step_deg: float = 10.0
+    step_m: float = 0.12
+    step_deg: float = 12.0
     width: int = 840
 
 

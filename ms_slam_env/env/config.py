@@ -138,8 +138,8 @@ class EnvConfig:
     slam: str = "surfel"
     slam_config: dict[str, object] = field(default_factory=dict)
     observation: str = "features"
-    step_m: float = 0.1
-    step_rad: float = math.radians(10)
+    step_m: float = 0.12
+    step_rad: float = math.radians(12)
     lost_patience: int = 10
     divergence: DivergenceConfig = field(default_factory=DivergenceConfig)
     lookahead: LookaheadConfig = field(default_factory=LookaheadConfig)
