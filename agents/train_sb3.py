@@ -351,6 +351,10 @@ def train(args: Args) -> int:
     torch.set_num_threads(1)
     if not args.resume and (args.out / "latest.zip").exists():
         raise InputError(f"{args.out} holds a training run already: add --resume, or change --out")
+    try:
+        make_env(args, "train", ()).close()  # bad options fail here, not in a worker process
+    except gym.error.Error as error:
+        raise InputError(f"environment {args.env_id!r} cannot be made: {error}") from None
     args.out.mkdir(parents=True, exist_ok=True)
     seeds = range(VALIDATION_SEED, VALIDATION_SEED + args.eval_episodes)
     validation = make_venv(args, "validation", seeds)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, TypeVar, get_origin, get_type_hints
 
 from ms_slam_env.errors import InputError, unknown
 
@@ -21,7 +21,7 @@ def from_dict(cls: type[T], values: Mapping[str, Any], path: str = "") -> T:
 
     Raises:
         InputError: an unknown key at any depth (the message lists the valid ones), or a value
-            that the dataclass itself refuses.
+            that the dataclass itself refuses or that is not a mapping where one belongs.
     """
     fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
     hints = get_type_hints(cls)
@@ -31,8 +31,13 @@ def from_dict(cls: type[T], values: Mapping[str, Any], path: str = "") -> T:
         if key not in fields:
             raise unknown(f"option of {cls.__name__}", where, fields)
         hint = hints[key]
-        if dataclasses.is_dataclass(hint) and isinstance(value, Mapping):
-            value = from_dict(hint, value, where)  # type: ignore[arg-type]
+        nested = isinstance(hint, type) and dataclasses.is_dataclass(hint)
+        if nested and isinstance(value, Mapping):
+            value = from_dict(hint, value, where)
+        elif (nested and not isinstance(value, hint)) or (
+            get_origin(hint) is dict and not isinstance(value, Mapping)
+        ):
+            raise InputError(f"{where} = {value!r} must be a mapping of options")
         arguments[key] = value
     return cls(**arguments)
 

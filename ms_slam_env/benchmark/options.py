@@ -9,7 +9,8 @@ import yaml
 
 from ms_slam_env.config import from_dict
 from ms_slam_env.env import EnvConfig
-from ms_slam_env.errors import InputError
+from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.slam import BACKENDS
 
 OWN_OPTIONS = ("scene", "scene_seed", "split", "observation", "step_m", "step_rad")
 """Fields of ``EnvConfig`` that an episode has other options for, or that its planner decides."""
@@ -36,5 +37,7 @@ def parse_options(texts: Sequence[str]) -> dict[str, Any]:
             if not isinstance(inner, dict):
                 raise InputError(f"option {path!r}: {parent} already has a value")
         inner[name] = yaml.safe_load(value)
-    from_dict(EnvConfig, result)
+    backend = from_dict(EnvConfig, result).slam
+    if backend not in BACKENDS:
+        raise unknown("SLAM backend", backend, BACKENDS)
     return result

@@ -109,10 +109,13 @@ class HistogramCounter:
                 vec3 of shape (B, h, w)); computed from depth if None.
 
         Raises:
-            InputError: shapes that do not fit each other or the intrinsics.
+            InputError: shapes that do not fit each other or the intrinsics; NaN, infinite or
+                negative depth in a NumPy array.
         """
         intensity_wp = self._upload(intensity, wp.float32, "intensity")
         depth_wp = self._upload(depth, wp.float32, "depth")
+        if isinstance(depth, np.ndarray) and not (depth.min() >= 0 and depth.max() < np.inf):
+            raise InputError("depth holds NaN, infinite or negative values; 0 means no reading")
         shape = intensity_wp.shape
         if depth_wp.shape != shape:
             raise InputError(f"depth {depth_wp.shape} and intensity {shape} differ in shape")

@@ -42,3 +42,19 @@ def test_two_processes_train_a_policy_that_plans(tmp_path):
         assert info["action_mask"][action]
         observation, _, _, _, info = env.step(action)
     env.close()
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        (("--scenes", "mars"), "unknown scene 'mars'; valid choices: living_room"),
+        (("--env-id", "Mars-v0"), "environment 'Mars-v0' cannot be made"),
+        (("--step-m", "7"), "EnvConfig.step_m = 7.0 is outside"),
+    ],
+)
+def test_bad_options_of_the_environment_give_one_line(tmp_path, capsys, option, message):
+    assert train_sb3.main(["--out", str(tmp_path / "run"), *option]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert len(error.strip().splitlines()) == 1
+    assert not (tmp_path / "run").exists()

@@ -209,6 +209,9 @@ def test_sizes_that_do_not_fit_are_refused():
         divergence.histograms(intensity[:1], depth)
     with pytest.raises(InputError, match="batch"):
         divergence.histograms(intensity[0], depth[0])
+    for bad in (np.nan, np.inf, -1.0):
+        with pytest.raises(InputError, match="depth holds"):
+            divergence.histograms(intensity, np.where(depth == depth.max(), bad, depth))
     with pytest.raises(InputError, match="normals"):
         divergence.histograms(intensity, depth, np.zeros((1, 60, 80, 3)))
 

@@ -235,6 +235,20 @@ def test_bad_action_names_the_range(env, action):
         env.unwrapped.step(action)
 
 
+@pytest.mark.parametrize("action", [7, -1, "left", 2.5, np.nan])
+def test_bad_action_of_fewer_motions_names_their_range(action):
+    env = gym.make("MSActiveSLAM-FixedTranslation-v0", scene="carpet", scene_seed=0)
+    env.reset(seed=0)
+    with pytest.raises(InputError, match=r"not an integer in \[0, 6\]"):
+        env.step(action)
+
+
+def test_step_before_reset_of_a_made_env_says_so():
+    env = gym.make("MSActiveSLAM-FreeCamera-v0", **OPTIONS)
+    with pytest.raises(gym.error.ResetNeeded, match="reset"):
+        env.step(0)
+
+
 def test_use_before_reset_says_so():
     env = ActiveSlamEnv(**OPTIONS)
     for use in (lambda: env.step(0), env.lookahead, env.save_state, env.action_masks):
@@ -252,6 +266,10 @@ def test_use_before_reset_says_so():
         ({"targets": {"M_X": 1}}, "unknown option of TargetConfig 'targets.M_X'"),
         ({"reward": {"lost": -1}}, r"RewardConfig.lost = -1 is outside \[0"),
         ({"slam_config": {"depth": 1}}, "depth_cutoff_m"),
+        ({"slam_config": 3}, "slam_config = 3 must be a mapping"),
+        ({"reward": 3}, "reward = 3 must be a mapping"),
+        ({"lookahead": {"view": 1}}, "'lookahead.view'; valid choices: reference, scale"),
+        ({"scene_seed": -1}, "scene seed -1 must be an integer >= 0"),
         ({"slam_config": {"depth_cutoff_m": 11}}, r"outside \[0, 10\]"),
         ({"image_size": "1x1"}, "valid choices: 80x60"),
         ({"noise": "lots"}, "valid choices: kinect, none"),

@@ -193,6 +193,14 @@ def test_bad_input_is_refused(frames):
     small = RGBDFrame(np.zeros((60, 80, 3), dtype=np.uint8), np.zeros((60, 80), dtype=np.float32))
     with pytest.raises(InputError, match="80x60"):
         backend.track(small)
+    batched = BatchedSurfelSlam(1, CAMERA, CONFIG)
+    color, depth = frames[0].color[None], frames[0].depth[None]
+    for bad in (np.nan, np.inf, -1.0):
+        with pytest.raises(InputError, match="depth holds"):
+            batched.track(color, np.where(depth == depth.max(), np.float32(bad), depth))
+    for images in ((color[:, 1:], depth[:, 1:]), (color, depth[:, 1:]), (color[0], depth[0])):
+        with pytest.raises(InputError, match=r"must be \(1, 120, 160, 3\)"):
+            batched.track(*images)
     with pytest.raises(InputError, match="T_world_camera"):
         backend.reset(np.full((4, 4), np.nan))
     with pytest.raises(InputError, match="poses"):

@@ -70,7 +70,18 @@ class BatchedSurfelSlam:
         self.map.clear(env)
 
     def track(self, color: NDArray[np.uint8], depth: NDArray[np.float32]) -> list[TrackResult]:
-        """Track and fuse one frame per env: colour (B, H, W, 3) uint8, depth (B, H, W) metres."""
+        """Track and fuse one frame per env: colour (B, H, W, 3) uint8, depth (B, H, W) metres.
+
+        Raises:
+            InputError: another batch or image size; NaN, infinite or negative depth.
+        """
+        size = (self.batch, *self.intrinsics.shape)
+        if color.shape != (*size, 3) or depth.shape != size:
+            raise InputError(
+                f"colour {color.shape} and depth {depth.shape} must be {(*size, 3)} and {size}"
+            )
+        if not (depth.min() >= 0 and depth.max() < np.inf):
+            raise InputError("depth holds NaN, infinite or negative values; 0 means no reading")
         live = self.preprocess(color, depth)
         results = self._locate(live)
         good = np.array([result.tracking_ok for result in results])
