@@ -61,6 +61,31 @@ def plane_normal(
 
 
 @wp.func
+def normal_at(
+    inverse: wp.array3d(dtype=wp.float32),
+    b: int,
+    v: int,
+    u: int,
+    radius: int,
+    edge_threshold: float,
+    focal: wp.vec2,
+    centre: wp.vec2,
+):
+    """Normal of pixel (v, u) of image ``b`` by its four neighbours ``radius`` pixels away."""
+    return plane_normal(
+        inverse[b, v, u],
+        inverse[b, v, u - radius],
+        inverse[b, v, u + radius],
+        inverse[b, v - radius, u],
+        inverse[b, v + radius, u],
+        edge_threshold,
+        focal,
+        wp.vec2(float(u) - centre[0], float(v) - centre[1]),
+        0.5 / float(radius),
+    )
+
+
+@wp.func
 def direction_cell(n: wp.vec3, dither: wp.vec2, size: int):
     """Cell of direction ``n`` (any length but 0) in an octahedral map with -z at its centre.
 
@@ -122,19 +147,8 @@ def count_depth_normals(
     if v < radius or v >= height - radius:
         return
     window_row = row_window[v]
-    per_pixel = 0.5 / float(radius)
     for u in range(radius, width - radius):
-        n = plane_normal(
-            inverse[b, v, u],
-            inverse[b, v, u - radius],
-            inverse[b, v, u + radius],
-            inverse[b, v - radius, u],
-            inverse[b, v + radius, u],
-            edge_threshold,
-            focal,
-            wp.vec2(float(u) - centre[0], float(v) - centre[1]),
-            per_pixel,
-        )
+        n = normal_at(inverse, b, v, u, radius, edge_threshold, focal, centre)
         if wp.dot(n, n) > 0.0:
             window = window_row + column_window[u]
             cell = direction_cell(n, dither[v, u], size)
@@ -175,19 +189,8 @@ def compute_normals(
     b, v = wp.tid()
     height = inverse.shape[1]
     width = inverse.shape[2]
-    per_pixel = 0.5 / float(radius)
     for u in range(width):
         n = wp.vec3(0.0, 0.0, 0.0)
         if v >= radius and v < height - radius and u >= radius and u < width - radius:
-            n = plane_normal(
-                inverse[b, v, u],
-                inverse[b, v, u - radius],
-                inverse[b, v, u + radius],
-                inverse[b, v - radius, u],
-                inverse[b, v + radius, u],
-                edge_threshold,
-                focal,
-                wp.vec2(float(u) - centre[0], float(v) - centre[1]),
-                per_pixel,
-            )
+            n = normal_at(inverse, b, v, u, radius, edge_threshold, focal, centre)
         normals[b, v, u] = wp.normalize(n)
