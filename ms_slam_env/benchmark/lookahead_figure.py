@@ -55,8 +55,8 @@ def main(args: Args) -> None:
             axis.set_ylabel(TRANSLATIONS[translation])
         if translation == NUM_TRANSLATIONS - 1:
             axis.set_xlabel(ROTATIONS[rotation])
-    figure.tight_layout(rect=(0, 0, 0.93, 1), pad=0.4)
-    bar = figure.add_axes((0.945, 0.1, 0.015, 0.8))
+    figure.tight_layout(rect=(0, 0, 0.92, 1), pad=0.4)
+    bar = figure.add_axes((0.93, 0.1, 0.015, 0.8))
     figure.colorbar(
         plt.cm.ScalarMappable(scale, "plasma"), bar, label="intensity divergence (nats)"
     )

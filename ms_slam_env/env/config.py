@@ -162,8 +162,9 @@ class EnvConfig:
             raise InputError(
                 f"EnvConfig.scene_seed = {self.scene_seed!r} must be an integer or None"
             )
-        if not self.scenes:
-            raise InputError("EnvConfig.scene names no scene")
+        is_names = isinstance(self.scene, (str, tuple, list)) and len(self.scene) > 0
+        if not is_names or not all(isinstance(name, str) for name in self.scenes):
+            raise InputError(f"EnvConfig.scene = {self.scene!r} must be a name or several")
         for name in self.scenes:
             if name not in SCENES and "." not in name:
                 raise unknown("scene", name, (*SCENES, "or the path of a .glb, .obj or .ply mesh"))

@@ -260,6 +260,8 @@ def test_use_before_reset_says_so():
     ("options", "message"),
     [
         ({"scene": "kitchen"}, "valid choices: living_room"),
+        ({"scene": None}, "scene = None must be a name or several"),
+        ({"scene": ()}, "must be a name or several"),
         ({"slam": "orb"}, "valid choices: .*surfel"),
         ({"observation": "pixels"}, "valid choices: rgbd, features, lookahead"),
         ({"steps": 3}, "unknown option of EnvConfig 'steps'; valid choices: scene"),
