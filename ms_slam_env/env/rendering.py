@@ -60,8 +60,9 @@ class Renderer:
         canvas = np.full((*_MAP, 3), _BACKGROUND, np.uint8)
         points, colors = env.slam.surface_points(), env.slam.surface_colors()
         _splat(canvas, camera, T_world_outside, points, colors)
-        _draw_path(canvas, camera, T_world_outside, truth, _TRUE_COLOR)
-        _draw_path(canvas, camera, T_world_outside, env.trajectory_estimate, _ESTIMATE_COLOR)
+        estimate = env.trajectory_estimate
+        _draw_path(canvas, camera, T_world_outside, truth, _TRUE_COLOR, width=4)
+        _draw_path(canvas, camera, T_world_outside, estimate, _ESTIMATE_COLOR, width=1)
         return _caption(canvas, f"map: {len(points)} points; path: true green, estimated red")
 
     def _plots(self, env: ActiveSlamEnv) -> list[Image]:
@@ -130,11 +131,12 @@ def _draw_path(
     T_world_camera: Float64,
     poses: Float64,
     color: tuple[int, int, int],
+    width: int,
 ) -> None:
     pixels, _ = _project(camera, T_world_camera, poses[:, :3, 3])
     line = np.rint(pixels).astype(np.int32)
-    cv2.polylines(canvas, [line], False, color, 2, cv2.LINE_AA)
-    cv2.circle(canvas, (int(line[-1, 0]), int(line[-1, 1])), 4, color, -1, cv2.LINE_AA)
+    cv2.polylines(canvas, [line], False, color, width, cv2.LINE_AA)
+    cv2.circle(canvas, (int(line[-1, 0]), int(line[-1, 1])), 2 + width, color, -1, cv2.LINE_AA)
 
 
 def _plot(values: Float64, target: float | None, top: float, title: str) -> Image:
