@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import numbers
 from collections.abc import Mapping
 from typing import Any, TypeVar, get_origin, get_type_hints
 
@@ -45,15 +46,21 @@ def from_dict(cls: type[T], values: Mapping[str, Any], path: str = "") -> T:
 def check_range(owner: object, name: str, low: float, high: float) -> None:
     """Refuse ``owner.name`` outside [low, high]; NaN is outside every range.
 
+    A field declared ``int`` takes no fractions.
+
     Raises:
         InputError: naming the class, the field, its value and the permitted range.
     """
     value = getattr(owner, name)
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
     if not is_number or not low <= value <= high:
         raise InputError(
             f"{type(owner).__name__}.{name} = {value!r} is outside [{low:g}, {high:g}]"
         )
+    field = getattr(owner, "__dataclass_fields__", {}).get(name)
+    declared_int = field is not None and field.type in (int, "int")
+    if declared_int and not isinstance(value, numbers.Integral):
+        raise InputError(f"{type(owner).__name__}.{name} = {value!r} must be an integer")
 
 
 def check_choice(owner: object, name: str, choices: tuple[str, ...]) -> None:

@@ -64,16 +64,12 @@ class DivergenceConfig:
         check_range(self, "alpha_deg", 1, 90)
         check_range(self, "normal_reach_deg", 0, 10)
         check_range(self, "edge_threshold", 1e-4, 1)
-        for name in ("bins", "inclinations"):
-            if not isinstance(getattr(self, name), int):
-                raise InputError(f"DivergenceConfig.{name} must be an integer")
-        windows = tuple(self.windows)
-        object.__setattr__(self, "windows", windows)  # lists come from YAML
-        is_grid = len(windows) == 2 and all(isinstance(n, int) and 1 <= n <= 16 for n in windows)
-        if not is_grid:
+        is_grid = isinstance(self.windows, (tuple, list)) and len(self.windows) == 2
+        if not is_grid or not all(isinstance(n, int) and 1 <= n <= 16 for n in self.windows):
             raise InputError(
-                f"DivergenceConfig.windows = {windows!r} must be two integers in [1, 16]"
+                f"DivergenceConfig.windows = {self.windows!r} must be two integers in [1, 16]"
             )
+        object.__setattr__(self, "windows", tuple(self.windows))  # lists come from YAML
 
     @classmethod
     def paper(cls) -> DivergenceConfig:

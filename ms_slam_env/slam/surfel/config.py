@@ -79,13 +79,14 @@ class SurfelConfig:
         check_range(self, "depth_cutoff_m", 0.0, 10.0)
         check_range(self, "icp_rgb_weight", 0.0, 1.0)
         check_range(self, "confidence_threshold", 0.0, 12.0)
-        object.__setattr__(self, "iterations", tuple(self.iterations))
-        if not 1 <= len(self.iterations) <= 5 or any(
-            not isinstance(count, int) or not 0 <= count <= 100 for count in self.iterations
-        ):
+        are_counts = isinstance(self.iterations, (tuple, list)) and all(
+            isinstance(count, int) and 0 <= count <= 100 for count in self.iterations
+        )
+        if not are_counts or not 1 <= len(self.iterations) <= 5:
             raise InputError(
                 f"SurfelConfig.iterations = {self.iterations!r} must be 1 to 5 integers in [0, 100]"
             )
+        object.__setattr__(self, "iterations", tuple(self.iterations))  # lists come from YAML
         check_range(self, "max_surfels", 1000, 50_000_000)
         check_range(self, "coverage_px", 0.5, 1.0)
         check_range(self, "surfel_radius_px", 0.5, 3.0)

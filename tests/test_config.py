@@ -1,0 +1,63 @@
+"""Configuration: what a field refuses, in one clear line."""
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ms_slam_env.config import check_range
+from ms_slam_env.divergence import DivergenceConfig
+from ms_slam_env.errors import InputError
+from ms_slam_env.slam.surfel import SurfelConfig
+
+
+@dataclass(frozen=True)
+class Options:
+    count: int = 2
+    length_m: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_range(self, "count", 0, 5)
+        check_range(self, "length_m", 0, 5)
+
+
+@pytest.mark.parametrize("value", [0, 5, np.int64(3)])
+def test_an_integer_in_range_passes(value: Any) -> None:
+    Options(count=value, length_m=value)
+
+
+@pytest.mark.parametrize("value", [-1, 6, float("nan"), "2", None, True, [1]])
+@pytest.mark.parametrize("name", ["count", "length_m"])
+def test_what_is_no_number_in_range_is_refused(name: str, value: Any) -> None:
+    with pytest.raises(InputError, match=rf"Options.{name} = .* is outside \[0, 5\]"):
+        Options(**{name: value})
+
+
+def test_a_fraction_is_no_integer() -> None:
+    Options(length_m=2.5)
+    with pytest.raises(InputError, match=r"Options.count = 2.5 must be an integer"):
+        Options(count=2.5)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("owner", "options", "message"),
+    [
+        (DivergenceConfig, {"bins": 2.5}, "bins = 2.5 must be an integer"),
+        (DivergenceConfig, {"windows": 3}, "windows = 3 must be two integers in [1, 16]"),
+        (DivergenceConfig, {"windows": (2, 0)}, "windows = (2, 0) must be two integers"),
+        (SurfelConfig, {"max_surfels": 5000.5}, "max_surfels = 5000.5 must be an integer"),
+        (SurfelConfig, {"iterations": 3}, "iterations = 3 must be 1 to 5 integers"),
+        (SurfelConfig, {"iterations": ()}, "iterations = () must be 1 to 5 integers"),
+        (SurfelConfig, {"iterations": "444"}, "iterations = '444' must be 1 to 5 integers"),
+    ],
+)
+def test_a_wrong_kind_of_value_is_named(owner: type, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=re.escape(message)):
+        owner(**options)
+
+
+def test_lists_become_tuples_as_configurations_are_compared_and_hashed() -> None:
+    assert DivergenceConfig(windows=[2, 3]) == DivergenceConfig(windows=(2, 3))  # type: ignore[arg-type]
+    assert SurfelConfig(iterations=[1, 2]) == SurfelConfig(iterations=(1, 2))  # type: ignore[arg-type]
