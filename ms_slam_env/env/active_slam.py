@@ -23,7 +23,7 @@ from ms_slam_env.env.reward import Outcome, reward_terms
 from ms_slam_env.env.state import EpisodeState
 from ms_slam_env.env.timings import Timings
 from ms_slam_env.env.worlds import get_scene, get_sensor
-from ms_slam_env.errors import InputError
+from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.geometry import check_pose, invert, transform_points
 from ms_slam_env.robot import CAMERA_RADIUS_M, Embodiment, FixedTranslation, FreeCamera
 from ms_slam_env.scenes import SEED_SPLITS
@@ -104,6 +104,8 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise InputError(f"unknown render_mode {render_mode!r}; valid choices: None, rgb_array")
+        if embodiment not in EMBODIMENTS:
+            raise unknown("embodiment", embodiment, EMBODIMENTS)
         self._options = {"embodiment": embodiment, "render_mode": render_mode, **options}
         self.config = from_dict(EnvConfig, options)
         self.render_mode = render_mode
@@ -133,8 +135,12 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
         Args:
             seed: seeds the environment's generator.
             options: ``T_world_camera`` (4, 4) to start from instead of a drawn pose.
+
+        Raises:
+            InputError: a bad option; the environment must then be reset again before it is used.
         """
         super().reset(seed=seed)
+        self._episode = None  # the world of the old episode may be gone before this one begins
         unknown_options = set(options or {}) - {"T_world_camera"}
         if unknown_options:
             raise InputError(

@@ -13,8 +13,12 @@ from ms_slam_env.slam.base import SlamBackend, TrackResult, Views
 
 def _surfel(intrinsics: Intrinsics, device: str = "cpu", **params: Any) -> SlamBackend:
     # Imported here: loading the kernels takes a while, and a backend's extra may be missing.
+    from ms_slam_env._warp import wp
     from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
 
+    devices = [found.alias for found in wp.get_devices()]
+    if device not in (*devices, "cuda") or (device == "cuda" and not wp.is_cuda_available()):
+        raise unknown("device", device, devices)
     return SurfelSlam(intrinsics, from_dict(SurfelConfig, params, "slam"), device)
 
 
@@ -34,7 +38,7 @@ def make(name: str, intrinsics: Intrinsics, **params: Any) -> SlamBackend:
     Raises:
         InputError: unknown backend, unknown parameter or value out of range.
     """
-    if name not in BACKENDS:
+    if not isinstance(name, str) or name not in BACKENDS:
         raise unknown("SLAM backend", name, BACKENDS)
     return BACKENDS[name](intrinsics, **params)
 

@@ -278,6 +278,9 @@ def test_use_before_reset_says_so():
         ({"split": "exam"}, "valid choices: train, validation, test"),
         ({"step_m": float("nan")}, "step_m = nan is outside"),
         ({"render_mode": "human"}, "valid choices: None, rgb_array"),
+        ({"embodiment": "boat"}, "unknown embodiment 'boat'; valid choices: free, fixed-trans"),
+        ({"slam": ["surfel"]}, "valid choices: .*surfel"),
+        ({"slam_config": {"device": "tpu"}}, "unknown device 'tpu'; valid choices: cpu"),
         ({"scene": "missing.glb"}, "missing.glb"),
     ],
 )
@@ -295,3 +298,12 @@ def test_bad_reset_options(env):
     inside_wall = look_at([100.0, 0, 0], [0.0, 0, 0])
     with pytest.raises(InputError, match="free"):
         env.reset(options={"T_world_camera": inside_wall})
+
+
+def test_a_refused_reset_leaves_no_mixture_of_episodes():
+    env = ActiveSlamEnv(**OPTIONS)
+    env.reset(seed=0)
+    with pytest.raises(InputError, match="finite"):
+        env.reset(options={"T_world_camera": np.full((4, 4), np.nan)})
+    with pytest.raises(InputError, match="must be reset"):
+        env.step(0)
