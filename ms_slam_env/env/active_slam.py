@@ -33,7 +33,6 @@ from ms_slam_env.slam.base import SlamBackend, TrackResult, Views
 
 Float64 = NDArray[np.float64]
 
-FRAME_PERIOD_S = 1 / 30
 _COVERAGE_STRIDE = 2  # every second pixel in each direction marks coverage
 
 EMBODIMENTS: dict[str, Callable[[Scene, float, float], Embodiment]] = {
@@ -322,7 +321,6 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
             frame = self.sensor.capture(
                 T_world_camera,
                 index=episode.frame_index,
-                timestamp=episode.frame_index * FRAME_PERIOD_S,
                 seed=episode.noise_seed,
             )
         with self.timings.stage("slam"):

@@ -9,7 +9,10 @@ from contextlib import contextmanager
 
 
 class Timings:
-    """Seconds spent in each stage: in the last step, and in total with the number of calls."""
+    """Seconds spent in each stage: in its last call, and in total with the number of calls.
+
+    Stages nest: ``observation`` contains the ``lookahead`` that the variant of that name asks for.
+    """
 
     def __init__(self) -> None:
         self.total: dict[str, float] = defaultdict(float)

@@ -31,6 +31,7 @@ class FreeCamera(Embodiment):
         self.scene = scene
         self.step_m = step_m
         self._motions = decompose(step_m, step_rad)
+        self._motions.flags.writeable = False
         self._masks: NDArray[np.bool_] | None = None  # of the current pose
         self.T_world_camera = np.eye(4)
 

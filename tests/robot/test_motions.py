@@ -5,6 +5,7 @@ import pytest
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose, look_at, relative_angle
+from ms_slam_env.robot import FreeCamera
 from ms_slam_env.robot.motions import (
     NUM_MOTIONS,
     NUM_ROTATIONS,
@@ -86,3 +87,9 @@ def test_action_is_7_translation_plus_rotation():
 def test_bad_steps_are_refused(steps):
     with pytest.raises(InputError, match="steps"):
         decompose(*steps)
+
+
+def test_the_motions_of_a_camera_cannot_be_changed_from_outside():
+    motions = FreeCamera(None, 0.1, 0.1).candidate_motions()
+    with pytest.raises(ValueError, match="read-only"):
+        motions[0, 0, 3] = 1.0

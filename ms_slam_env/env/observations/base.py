@@ -33,7 +33,8 @@ class RobotKnowledge:
         tracking_ok: SLAM's own word on its last frame.
         inlier_fraction: share of pixels that the alignment explained.
         lost_share: consecutive steps lost, as a share of the patience.
-        motion: the 49-decomposition index of the last motion made; 0 before the first.
+        motion: the last action as an index of the 49 motions, of the 7 rotations alone where the
+            translation is fixed, also where it was blocked; 0 before the first.
         action_mask: (n,) which actions are possible now.
         lookahead: predicts the divergences (n, 2) of the candidates, in units of (M_I, M_D).
     """
