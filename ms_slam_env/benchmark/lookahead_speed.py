@@ -22,7 +22,7 @@ from ms_slam_env.benchmark.provenance import provenance
 from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.config import check_range
 from ms_slam_env.divergence import DivergenceConfig
-from ms_slam_env.env.config import LookaheadConfig
+from ms_slam_env.env.config import EnvConfig, LookaheadConfig
 from ms_slam_env.env.lookahead import Lookahead
 from ms_slam_env.errors import InputError
 from ms_slam_env.robot.motions import NUM_MOTIONS, decompose
@@ -67,8 +67,8 @@ class LookaheadSpeedConfig:
     size: str = "160x120"
     surfels: int = 50_000
     scale: float = LookaheadConfig().scale
-    step_m: float = 0.05
-    step_deg: float = 5.0
+    step_m: float = EnvConfig.step_m
+    step_deg: float = round(float(np.degrees(EnvConfig.step_rad)), 6)
     repeats: int = 30
 
     def __post_init__(self) -> None:

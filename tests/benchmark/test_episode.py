@@ -115,3 +115,11 @@ def test_targets_are_read_at_the_last_interval_that_suffices() -> None:
 def test_bad_skipping_options_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(InputError):
         Arguments(**options)
+
+
+def test_an_episode_moves_as_the_environment_does_by_default() -> None:
+    from ms_slam_env.env.config import EnvConfig
+
+    assert SPEC.step_m == EnvConfig().step_m
+    assert np.radians(SPEC.step_deg) == pytest.approx(EnvConfig().step_rad, abs=1e-12)
+    assert EpisodeSpec("random").scene == EnvConfig().scene
