@@ -17,11 +17,11 @@ from typing import Any, Protocol
 
 import cv2
 import numpy as np
-import tyro
 from numpy.typing import NDArray
 from tqdm import tqdm
 
 from ms_slam_env import scenes, slam
+from ms_slam_env.benchmark.command_line import exit_code, parse
 from ms_slam_env.benchmark.provenance import provenance
 from ms_slam_env.benchmark.slam_peers_open3d import Open3DSlam
 from ms_slam_env.benchmark.slam_peers_opencv import OpenCVOdometry
@@ -40,6 +40,7 @@ from ms_slam_env.sequences import (
 
 Float64 = NDArray[np.float64]
 
+PROGRAM = "python -m ms_slam_env.benchmark.slam_peers"
 _WARM_UP = 5  # frames left out of the timing: buffers grow, caches fill
 DEFAULT_SEQUENCES = (
     "living_room:2000",
@@ -54,7 +55,7 @@ DEFAULT_SEQUENCES = (
 
 @dataclass(frozen=True)
 class SlamPeersConfig:
-    """Options of the comparison.
+    """Our SLAM beside Open3D's and OpenCV's, on the same rendered noisy sequences.
 
     Attributes:
         out: folder for the results.
@@ -295,16 +296,12 @@ def write_report(report: PeersReport, out: Path) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Command line; 0 on success, 2 on bad input with one line that says what is wrong."""
-    try:
-        config = tyro.cli(SlamPeersConfig, args=arguments, description=__doc__)
-        run(config)
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    """Run the comparison and print its tables; return the exit code."""
+    config = parse(SlamPeersConfig, arguments, PROGRAM)
+    run(config)
     print((config.out / "slam_peers.md").read_text(encoding="utf-8"))
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_code(main, PROGRAM))

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 from box_scene import BoxScene
 
@@ -90,10 +89,16 @@ def test_a_malformed_sequence_is_refused(text: str) -> None:
         parse_sequence(text)
 
 
-def test_bad_input_exits_with_2_and_one_line(tmp_path: Path, monkeypatch, capsys) -> None:
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--sequences", "attic:0", "--sizes", "80x60"), "unknown scene 'attic'"),
+        (("--frames", "3"), r"SlamPeersConfig.frames = 3 is outside \[10, 100000\]"),
+        (("--frame", "30"), "--frame"),
+    ],
+)
+def test_bad_input_is_one_line(arguments, message: str, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("ms_slam_env.benchmark.slam_peers.limit_threads", lambda _: None)
-    arguments = ["--out", str(tmp_path), "--sequences", "attic:0", "--sizes", "80x60"]
-    assert main(arguments) == 2
-    error = capsys.readouterr().err
-    assert "error: unknown scene 'attic'" in error
-    assert np.all([not line.startswith("Traceback") for line in error.splitlines()])
+    with pytest.raises(InputError, match=message) as caught:
+        main(["--out", str(tmp_path), *arguments])
+    assert "\n" not in str(caught.value)
