@@ -16,6 +16,18 @@ OWN_OPTIONS = ("scene", "scene_seed", "split", "observation", "step_m", "step_ra
 """Fields of ``EnvConfig`` that an episode has other options for, or that its planner decides."""
 
 
+def parse_value(text: str, name: str) -> Any:
+    """The YAML value of option ``name``.
+
+    Raises:
+        InputError: text that is not YAML.
+    """
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise InputError(f"option {name!r}: {text!r} is not a YAML value") from None
+
+
 def parse_options(texts: Sequence[str]) -> dict[str, Any]:
     """Nested mapping of ``EnvConfig`` from texts ``name.name=value``; values are YAML.
 
@@ -36,7 +48,7 @@ def parse_options(texts: Sequence[str]) -> dict[str, Any]:
             inner = inner.setdefault(parent, {})
             if not isinstance(inner, dict):
                 raise InputError(f"option {path!r}: {parent} already has a value")
-        inner[name] = yaml.safe_load(value)
+        inner[name] = parse_value(value, path)
     backend = from_dict(EnvConfig, result).slam
     if backend not in BACKENDS:
         raise unknown("SLAM backend", backend, BACKENDS)

@@ -9,8 +9,7 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-import yaml
-
+from ms_slam_env.benchmark.options import parse_value
 from ms_slam_env.env.planner import Planner
 from ms_slam_env.errors import InputError, unknown
 
@@ -26,7 +25,7 @@ def parse_planner(text: str) -> tuple[str, dict[str, Any]]:
     """Split ``NAME,option=value,...`` into the name and the options; values are YAML scalars.
 
     Raises:
-        InputError: an option without ``=``.
+        InputError: an option without ``=``, or a value that is not YAML.
     """
     name, *parts = text.split(",")
     options = {}
@@ -34,7 +33,7 @@ def parse_planner(text: str) -> tuple[str, dict[str, Any]]:
         option, equals, value = part.partition("=")
         if not equals or not option.isidentifier():
             raise InputError(f"planner {text!r}: {part!r} is not option=value")
-        options[option] = yaml.safe_load(value)
+        options[option] = parse_value(value, option)
     return name, options
 
 
@@ -57,7 +56,7 @@ def planner_class(name: str) -> type[Planner]:
     module_name, _, class_name = entry.value.partition(":")
     try:
         cls = getattr(import_module(module_name), class_name)
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, ValueError) as error:  # ValueError: no module named
         raise InputError(f"planner {name!r} cannot be loaded: {error}") from error
     if not (inspect.isclass(cls) and issubclass(cls, Planner)):
         raise InputError(f"planner {name!r} is not a subclass of ms_slam_env.env.Planner")

@@ -54,11 +54,16 @@ def run_all(
         description: shown at the progress bar.
 
     Raises:
-        InputError: fewer than one worker, or a file of results that cannot be read.
+        InputError: fewer than one worker, a folder that cannot be made, or a file of results
+            that cannot be read.
     """
     workers = available_cores() if workers is None else workers
     if workers < 1:
         raise InputError(f"workers = {workers} must be at least 1")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"no results can be written to {out}: {error.strerror}") from None
     records = RecordFile(out / RECORDS)
     keys = [spec_key(spec) for spec in specs]
     rows = {key: row for key, row in records.load().items() if row["error"] is None}

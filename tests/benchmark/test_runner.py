@@ -66,6 +66,13 @@ def test_a_worker_that_dies_costs_only_its_own_work(tmp_path: Path) -> None:
     assert [rows[i]["result"]["square"] for i in (0, 2)] == [1, 4]
 
 
+def test_a_folder_that_cannot_be_made_is_refused_before_any_work(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for out in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(InputError, match="no results can be written to"):
+            run_all([Square(1)], square, out, workers=1)
+
+
 @pytest.mark.parametrize("workers", [0, -1])
 def test_workers_must_be_positive(tmp_path: Path, workers: int) -> None:
     with pytest.raises(InputError, match="workers"):
