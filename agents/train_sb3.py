@@ -26,7 +26,6 @@ from typing import Any, Literal
 import gymnasium as gym
 import numpy as np
 import torch
-import tyro
 from ms_slam_agents import artefact
 from ms_slam_agents.evaluation import (
     Actions,
@@ -50,6 +49,7 @@ from stable_baselines3.common.vec_env import (
 )
 from tqdm import tqdm
 
+from ms_slam_env.benchmark.command_line import parse
 from ms_slam_env.config import check_range
 from ms_slam_env.errors import InputError
 
@@ -61,7 +61,7 @@ VALIDATION_SEED = 1_000_000  # of the first validation episode; training draws f
 
 @dataclass(frozen=True)
 class Args:
-    """Options of the training run; this dataclass is the command line.
+    """Train a camera-motion policy with PPO; these options are the command line.
 
     Attributes:
         out: folder for everything the run writes.
@@ -388,7 +388,7 @@ def train(args: Args) -> int:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status: 0, 2 on bad input, 130 after an interrupt."""
     try:
-        return train(tyro.cli(Args, args=argv, description=__doc__))
+        return train(parse(Args, argv, "ms-slam train"))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
