@@ -10,17 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.scenes.base import TexturedMesh
+from ms_slam_env.scenes.lighting import srgb_to_linear
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
 ENCODE_STEPS = 4096
 """Intervals of the linear-to-sRGB table."""
-
-
-def srgb_to_linear(value: Float64) -> Float64:
-    """Linear intensity in [0, 1] of sRGB values in [0, 1] (IEC 61966-2-1)."""
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
 
 def linear_to_srgb(value: Float64) -> Float64:
