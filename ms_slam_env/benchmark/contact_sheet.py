@@ -6,20 +6,22 @@ sees them from the scene's own start poses.
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import matplotlib
 import numpy as np
-import tyro
 from numpy.typing import NDArray
 
 from ms_slam_env import scenes
+from ms_slam_env.benchmark.command_line import exit_code, parse
 from ms_slam_env.camera import Intrinsics, xtion
 from ms_slam_env.scenes import Scene
 from ms_slam_env.sensor import RGBDSensor
 
+PROGRAM = "python -m ms_slam_env.benchmark.contact_sheet"
 _ROWS: tuple[tuple[str, int], ...] = (
     ("living_room", 0),
     ("living_room", 1),
@@ -92,13 +94,14 @@ def contact_sheet(width: int) -> Image:
     return np.concatenate(pairs, 0)
 
 
-def main() -> None:
-    """Write the sheet."""
-    options = tyro.cli(Options)
+def main() -> int:
+    """Write the sheet; return the exit code."""
+    options = parse(Options, None, PROGRAM)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     sheet = contact_sheet(options.width)
     cv2.imwrite(str(options.out), sheet[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code(main, PROGRAM))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,15 +10,18 @@ import cv2
 import gymnasium
 import imageio.v3 as iio
 import numpy as np
-import tyro
 from tqdm import tqdm
 
+from ms_slam_env.benchmark.command_line import exit_code, parse
+from ms_slam_env.benchmark.episode import DEFAULT_STEP_DEG, DEFAULT_STEP_M
 from ms_slam_env.benchmark.planners import make_planner
+
+PROGRAM = "python -m ms_slam_env.benchmark.episode_gif"
 
 
 @dataclass(frozen=True)
 class Args:
-    """What to show."""
+    """Show an episode of a planner as a GIF."""
 
     out: Path = Path("docs/pictures/greedy.gif")
     planner: str = "greedy"
@@ -25,13 +29,14 @@ class Args:
     scene_seed: int = 2003
     seed: int = 2003
     steps: int = 40
-    step_m: float = 0.12
-    step_deg: float = 12.0
+    step_m: float = DEFAULT_STEP_M
+    step_deg: float = DEFAULT_STEP_DEG
     width: int = 640
 
 
-def main(args: Args) -> None:
-    """Run the episode and write one picture a step."""
+def main() -> int:
+    """Run the episode and write one picture a step; return the exit code."""
+    args = parse(Args, None, PROGRAM)
     env = gymnasium.make(
         "MSActiveSLAM-v0",
         scene=args.scene,
@@ -54,7 +59,8 @@ def main(args: Args) -> None:
     args.out.parent.mkdir(parents=True, exist_ok=True)
     iio.imwrite(args.out, np.stack(pictures), duration=150, loop=0, plugin="pillow")
     print(f"{args.out}: {len(pictures)} steps, ATE {1e3 * info['ate']:.1f} mm")
+    return 0
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    sys.exit(exit_code(main, PROGRAM))

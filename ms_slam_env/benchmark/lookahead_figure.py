@@ -5,6 +5,7 @@ The 49 predicted images of one moment with their divergences from the reference.
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,16 +15,18 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-import tyro
 from matplotlib.colors import Normalize
 from matplotlib.patches import Rectangle
 
+from ms_slam_env.benchmark.command_line import exit_code, parse
 from ms_slam_env.robot import NUM_ROTATIONS, NUM_TRANSLATIONS, ROTATIONS, TRANSLATIONS
+
+PROGRAM = "python -m ms_slam_env.benchmark.lookahead_figure"
 
 
 @dataclass(frozen=True)
 class Args:
-    """Which moment to show."""
+    """Draw the 49 predicted images of one moment with their divergences."""
 
     out: Path = Path("docs/pictures/lookahead.png")
     scene: str = "living_room"
@@ -32,8 +35,9 @@ class Args:
     steps_before: int = 20
 
 
-def main(args: Args) -> None:
-    """Move at random for a while, predict the 49 candidates and draw them."""
+def main() -> int:
+    """Move at random for a while, predict the 49 candidates and draw them; return the exit code."""
+    args = parse(Args, None, PROGRAM)
     env = gymnasium.make("MSActiveSLAM-v0", scene=args.scene, scene_seed=args.scene_seed)
     _, info = env.reset(seed=args.seed)
     rng = np.random.default_rng(args.seed)
@@ -63,7 +67,8 @@ def main(args: Args) -> None:
     args.out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(args.out, dpi=80)
     print(f"{args.out}: {args.scene} seed {args.scene_seed} after {args.steps_before} steps")
+    return 0
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    sys.exit(exit_code(main, PROGRAM))
