@@ -334,10 +334,19 @@ def make_model(args: Args, venv: VecEnv) -> PPO | MaskablePPO:
 
 
 def load_curve(args: Args, validation: VecEnv) -> dict[str, Any]:
-    """Return the learning curve so far: that of the run to resume, or references and no points."""
+    """Return the learning curve so far: that of the run to resume, or references and no points.
+
+    Raises:
+        InputError: the run to resume was evaluated on another number of episodes.
+    """
     path = args.out / "learning_curve.json"
     if args.resume and path.is_file():
         curve: dict[str, Any] = json.loads(path.read_text())
+        if curve["eval_episodes"] != args.eval_episodes:
+            raise InputError(
+                f"{path} has points of eval_episodes = {curve['eval_episodes']} each, "
+                f"not {args.eval_episodes}"
+            )
         return curve
     return {
         "eval_episodes": args.eval_episodes,

@@ -290,6 +290,9 @@ def test_resume_needs_a_run_with_the_same_options(run, tmp_path, capsys):
     more = arguments(run.out, "--resume", "--observation", "lookahead", algorithm=run.algorithm)
     assert train_sb3.main(more) == 2
     assert "'features', not 'lookahead'" in capsys.readouterr().err
+    other = arguments(run.out, "--resume", "--eval-episodes", "5", algorithm=run.algorithm)
+    assert train_sb3.main(other) == 2
+    assert "eval_episodes = " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("option", ["num-envs", "n-steps", "gamma", "minutes"])
