@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 import os
 from pathlib import Path
 from typing import Any
@@ -72,8 +73,22 @@ class RecordFile:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write ``content``; an interrupt leaves the old file or the new one, never half of one."""
+    """Write ``content``; an interrupt leaves the old file or the new one, never half of one.
+
+    NaN and infinity, which JSON does not have, become null.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
-    partial.write_text(json.dumps(content, indent=1) + "\n")
+    partial.write_text(json.dumps(_finite(content), indent=1, allow_nan=False) + "\n")
     os.replace(partial, path)
+
+
+def _finite(content: Any) -> Any:
+    """``content`` with None in place of every number that is not finite."""
+    if isinstance(content, dict):
+        return {key: _finite(value) for key, value in content.items()}
+    if isinstance(content, (list, tuple)):
+        return [_finite(value) for value in content]
+    if isinstance(content, float) and not math.isfinite(content):
+        return None
+    return content

@@ -162,3 +162,14 @@ def test_write_json_replaces_as_a_whole(tmp_path: Path) -> None:
     with pytest.raises(TypeError):
         write_json(path, {"a": object()})
     assert json.loads(path.read_text()) == {"a": 1}
+
+
+def test_write_json_writes_json(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    write_json(path, {"a": [float("nan"), 1.5], "b": ({"c": float("inf")}, "NaN", None, True)})
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is not JSON")
+
+    content = json.loads(path.read_text(), parse_constant=refuse)
+    assert content == {"a": [None, 1.5], "b": [{"c": None}, "NaN", None, True]}
