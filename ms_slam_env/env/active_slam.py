@@ -33,6 +33,7 @@ from ms_slam_env.slam.base import SlamBackend, TrackResult, Views
 
 Float64 = NDArray[np.float64]
 
+_START_TRIES = 10  # a drawn start sees surface in most of its view: one try is nearly always enough
 _COVERAGE_STRIDE = 2  # every second pixel in each direction marks coverage
 
 EMBODIMENTS: dict[str, Callable[[Scene, float, float], Embodiment]] = {
@@ -136,7 +137,8 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
             options: ``T_world_camera`` (4, 4) to start from instead of a drawn pose.
 
         Raises:
-            InputError: a bad option; the environment must then be reset again before it is used.
+            InputError: a bad option, or a start from where there is nothing to map; the
+                environment must then be reset again before it is used.
         """
         super().reset(seed=seed)
         self._episode = None  # the world of the old episode may be gone before this one begins
@@ -147,19 +149,18 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
             )
         name, scene_seed = self._draw_scene()
         self._enter_scene(name, scene_seed)
-        start = self.scene.sample_start(self.np_random)
-        if options and "T_world_camera" in options:
-            start = self._check_start(options["T_world_camera"])
-        self.embodiment.reset(start, self.np_random)
-        self._episode = EpisodeState(
-            scene=name,
-            scene_seed=scene_seed,
-            noise_seed=int(self.np_random.integers(2**31)),
+        given = self._check_start(options["T_world_camera"]) if options else None
+        for _ in range(_START_TRIES):
+            drawn = self.scene.sample_start(self.np_random)
+            self._begin_episode(name, scene_seed, drawn if given is None else given)
+            if self.tracking_ok:
+                return self._build_observation(), self._info()
+            if given is not None:
+                break
+        self._episode = None
+        raise InputError(
+            f"too few depth readings at the start pose in scene {name}: SLAM has nothing to map"
         )
-        self.slam.reset(start)
-        self._observe_world()
-        self._episode.reward_terms = {}
-        return self._build_observation(), self._info()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Make one motion and track the frame that follows.
@@ -269,10 +270,6 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
         """The last action; 0 before the first."""
         return self._current().action
 
-    def visible_truth(self) -> Float64:
-        """(K, 3) voxel centres (5 cm) of the true surface seen so far."""
-        return self.coverage.seen_points()
-
     def save_state(self) -> dict[str, Any]:
         """Everything needed to go on bit-exactly (the time limit's counter excepted)."""
         return {
@@ -312,6 +309,17 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
             self.scene, self.config.step_m, self.config.step_rad
         )
         self.coverage = CoverageGrid(self.scene)
+
+    def _begin_episode(self, name: str, scene_seed: int, start: Float64) -> None:
+        self.embodiment.reset(start, self.np_random)
+        self._episode = EpisodeState(
+            scene=name,
+            scene_seed=scene_seed,
+            noise_seed=int(self.np_random.integers(2**31)),
+        )
+        self.coverage = CoverageGrid(self.scene)
+        self.slam.reset(start)
+        self._observe_world()
 
     def _observe_world(self) -> float:
         """Render, measure, track and judge one frame; return the newly mapped area, m2."""

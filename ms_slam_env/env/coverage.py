@@ -13,7 +13,7 @@ Float64 = NDArray[np.float64]
 
 
 class CoverageGrid:
-    """Voxels of true surface that were seen, and those that were mapped in their true place.
+    """Voxels of true surface that were mapped in their true place.
 
     A point counts as mapped when the estimated pose puts it less than one voxel from where it is:
     neither a camera that stands still nor one that is lost gathers more.
@@ -30,14 +30,12 @@ class CoverageGrid:
         extent = scene.mesh.vertices.max(axis=0) + margin - self._origin
         self._shape = np.ceil(extent / voxel_m).astype(np.int64) + 1
         self._mapped = np.zeros(int(np.prod(self._shape)), dtype=bool)
-        self._seen = np.zeros_like(self._mapped)
 
     def add(self, points_true: Float64, points_estimated: Float64) -> float:
         """Mark points (N, 3); return the area newly mapped in its true place, square metres."""
         cells = np.floor((points_true - self._origin) / self.voxel_m).astype(np.int64)
         inside = ((cells >= 0) & (cells < self._shape)).all(axis=1)
         flat = np.ravel_multi_index(tuple(cells[inside].T), tuple(self._shape))
-        self._seen[flat] = True
         error = np.linalg.norm(points_estimated - points_true, axis=1)[inside]
         correct = flat[error < self.voxel_m]
         new = np.unique(correct[~self._mapped[correct]])
@@ -49,17 +47,11 @@ class CoverageGrid:
         """Area mapped in its true place so far, square metres (one voxel face a voxel)."""
         return int(self._mapped.sum()) * self.voxel_m**2
 
-    def seen_points(self) -> Float64:
-        """Centres (K, 3) of the voxels of true surface seen so far, world frame."""
-        cells = np.stack(np.unravel_index(np.flatnonzero(self._seen), tuple(self._shape)), axis=1)
-        return self._origin + (cells + 0.5) * self.voxel_m
-
     def get_state(self) -> dict[str, Any]:
         """The marked voxels, packed."""
-        return {"mapped": np.packbits(self._mapped), "seen": np.packbits(self._seen)}
+        return {"mapped": np.packbits(self._mapped)}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state that ``get_state`` returned."""
         size = self._mapped.size
         self._mapped = np.unpackbits(state["mapped"], count=size).astype(bool)
-        self._seen = np.unpackbits(state["seen"], count=size).astype(bool)

@@ -153,15 +153,27 @@ def test_blocked_motion_is_masked_and_does_nothing(env):
     env.reset(seed=0)
     scene = env.unwrapped.scene
     pose = scene.sample_start(np.random.default_rng(0))
-    while scene.segment_is_free(pose[:3, 3], pose[:3, 3] + 0.06 * pose[:3, 2], 0.1):
-        pose[:3, 3] += 0.02 * pose[:3, 2]
+    while scene.segment_is_free(pose[:3, 3], pose[:3, 3] - 0.06 * pose[:3, 2], 0.1):
+        pose[:3, 3] -= 0.02 * pose[:3, 2]
     _, info = env.reset(seed=0, options={"T_world_camera": pose})
-    forward = 7 * 5
-    assert not info["action_mask"][forward]
+    backward = 7 * 6
+    assert not info["action_mask"][backward]
     assert info["action_mask"][:7].all()
-    _, _, _, _, info = env.step(forward)
+    _, _, _, _, info = env.step(backward)
     np.testing.assert_array_equal(info["T_world_camera"], pose)
     assert info["reward_terms"]["blocked"] < 0
+
+
+def test_blind_start_is_refused(env):
+    env.reset(seed=0)
+    scene = env.unwrapped.scene
+    pose = scene.sample_start(np.random.default_rng(0))
+    while scene.segment_is_free(pose[:3, 3], pose[:3, 3] + 0.06 * pose[:3, 2], 0.1):
+        pose[:3, 3] += 0.02 * pose[:3, 2]
+    with pytest.raises(InputError, match="too few depth readings"):
+        env.reset(seed=0, options={"T_world_camera": pose})
+    with pytest.raises(InputError, match="reset"):
+        env.unwrapped.step(0)
 
 
 def test_motion_is_the_papers_decomposition(env):

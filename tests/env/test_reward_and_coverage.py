@@ -68,17 +68,13 @@ def test_area_of_a_wall_counts_once(box_scene):
     assert grid.add(points, points) == pytest.approx((40 * 0.05) ** 2)
     assert grid.add(points, points) == 0
     assert grid.mapped_area == pytest.approx(4.0)
-    assert len(grid.seen_points()) == 1600
 
 
-def test_surface_mapped_in_the_wrong_place_counts_as_seen_only(box_scene):
+def test_surface_mapped_in_the_wrong_place_does_not_count(box_scene):
     grid = CoverageGrid(box_scene)
     points = wall()
     assert grid.add(points, points + np.array([0.06, 0, 0])) == 0
     assert grid.mapped_area == 0
-    assert len(grid.seen_points()) == 1600
-    centre_error = np.abs(grid.seen_points()[:, 0] - 1.0)
-    assert centre_error.max() <= 0.05
 
 
 def test_state_round_trip(box_scene):
