@@ -28,7 +28,7 @@ class Args:
     scene: str = "living_room"
     scene_seed: int = 2003
     seed: int = 2003
-    steps: int = 40
+    steps: int = 36
     step_m: float = DEFAULT_STEP_M
     step_deg: float = DEFAULT_STEP_DEG
     width: int = 640

@@ -28,7 +28,7 @@ _BACKGROUND = 250
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _MAX_DEPTH_M = 5.0
 _OUTSIDE_PITCH = 0.9  # radians below the horizon
-_ERROR_AXIS_M = 0.05
+_ERROR_AXIS_M = 0.01
 _DIVERGENCE_AXIS = 2.0  # the plots end at this many times M
 
 
@@ -43,7 +43,9 @@ class Renderer:
 
     def _color(self, env: ActiveSlamEnv) -> Image:
         image = cv2.resize(env.last_frame.color, _PANEL[::-1])
-        return _caption(image, f"{env.scene.name}, step {len(env.trajectory_truth) - 1}")
+        step = len(env.trajectory_truth) - 1
+        state = "" if env.tracking_ok else ", TRACKING LOST"
+        return _caption(image, f"{env.scene.name} {step}: {describe(env.last_motion)}{state}")
 
     def _depth(self, env: ActiveSlamEnv) -> Image:
         depth = env.last_frame.depth
@@ -69,7 +71,6 @@ class Renderer:
         divergences = env.divergences
         targets = env.config.targets
         errors = np.asarray(env.pose_errors)
-        state = "tracking" if env.tracking_ok else "LOST"
         rows = [
             (
                 divergences[:, 0],
@@ -83,11 +84,9 @@ class Renderer:
                 _DIVERGENCE_AXIS * targets.M_D,
                 "depth divergence",
             ),
-            (errors, None, max(_ERROR_AXIS_M, errors.max()), f"pose error (m), {state}"),
+            (errors, None, max(_ERROR_AXIS_M, errors.max()), "pose error (m)"),
         ]
-        plots = [_plot(*row) for row in rows]
-        _caption(plots[-1], describe(env.last_motion), bottom=True)
-        return plots
+        return [_plot(*row) for row in rows]
 
 
 def _outside_pose(env: ActiveSlamEnv) -> Float64:
@@ -157,15 +156,14 @@ def _plot(values: Float64, target: float | None, top: float, title: str) -> Imag
     rows = np.array([row(float(value)) for value in values])
     line = np.rint(np.stack([columns, rows], axis=1)).astype(np.int32)
     cv2.polylines(canvas, [line], False, _ESTIMATE_COLOR, 1, cv2.LINE_AA)
-    return _caption(canvas, f"{title}: {values[-1]:.4f}", dark=True)
+    return _caption(canvas, f"{title} {values[-1]:.4f}, axis to {top:.3g}", dark=True)
 
 
-def _caption(image: Any, text: str, bottom: bool = False, dark: bool = False) -> Image:
+def _caption(image: Any, text: str, dark: bool = False) -> Image:
     """Write one line on ``image`` in place and return it."""
-    y = image.shape[0] - 4 if bottom else 14
+    y = 14
     if not dark:
-        band = slice(y - 14, y + 6) if not bottom else slice(y - 14, y + 4)
-        image[band] = image[band] // 3
+        image[: y + 6] = image[: y + 6] // 3
     color = (20, 20, 20) if dark else (255, 255, 255)
     cv2.putText(image, text, (6, y), _FONT, 0.42, color, 1, cv2.LINE_AA)
     return image
