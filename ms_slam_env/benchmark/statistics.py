@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -128,7 +129,7 @@ def _rliable_intervals(
 ) -> dict[str, Interval]:
     from rliable import library
 
-    with warnings.catch_warnings():
+    with _global_numpy_seed(0), warnings.catch_warnings():
         # The generator that rliable passes on is one that the library below wants to drop.
         warnings.simplefilter("ignore", FutureWarning)
         values, intervals = library.get_interval_estimates(
@@ -138,3 +139,17 @@ def _rliable_intervals(
         name: Interval(float(values[name][0]), *map(float, intervals[name][:, 0]))
         for name in scores
     }
+
+
+@contextmanager
+def _global_numpy_seed(seed: int) -> Iterator[None]:
+    """Seed NumPy's global generator, and put its former state back at the end.
+
+    rliable 1.2.0 draws the strata's resamples from it, whatever ``random_state`` it is given.
+    """
+    before = np.random.get_state()  # noqa: NPY002
+    np.random.seed(seed)  # noqa: NPY002
+    try:
+        yield
+    finally:
+        np.random.set_state(before)  # noqa: NPY002

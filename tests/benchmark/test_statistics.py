@@ -85,3 +85,22 @@ def test_improvement_probability_counts_pairs() -> None:
     result = statistics.improvement_probabilities({"a": a, "b": b}, "b")
     assert list(result) == ["a"]
     assert result["a"].value == pytest.approx(expected)
+
+
+def test_rliables_intervals_are_the_same_twice_and_leave_the_global_generator_alone() -> None:
+    pytest.importorskip("rliable")
+    rng = np.random.default_rng(1)
+    scores = {name: rng.normal(size=(7, 3)) for name in ("a", "b")}
+    before = np.random.get_state()  # noqa: NPY002
+    first, second = (
+        (
+            statistics.interquartile_means(scores),
+            statistics.improvement_probabilities(scores, "b"),
+        )
+        for _ in range(2)
+    )
+    after = np.random.get_state()  # noqa: NPY002
+    assert first == second
+    assert before[0] == after[0]
+    np.testing.assert_array_equal(before[1], after[1])
+    assert before[2:] == after[2:]
