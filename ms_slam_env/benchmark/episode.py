@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, cast
 
@@ -17,6 +18,7 @@ from ms_slam_env.benchmark.map_truth import reference_of, true_surface
 from ms_slam_env.benchmark.planners import make_planner, parse_planner, planner_class
 from ms_slam_env.config import check_choice, check_range
 from ms_slam_env.env import ActiveSlamEnv, Planner
+from ms_slam_env.errors import InputError
 
 Float64 = NDArray[np.float64]
 
@@ -67,8 +69,47 @@ def run_episode(spec: EpisodeSpec) -> dict[str, Any]:
         ``steps``, ``return``, ``decision_ms`` (mean time of a decision) and ``ate_over_time``
         (running RMSE after each step, unaligned, metres).
     """
+    env = _make_env(spec)
+    try:
+        world = cast(ActiveSlamEnv, env.unwrapped)
+        planner = make_planner(spec.planner, world, spec.seed)
+        progress = _play(env, planner, spec.seed)
+        trajectory = measure_trajectory(world)
+        trajectory["lost"] |= progress["lost_steps_share"] > 0
+        return {**progress, **trajectory, **measure_map(world, spec)}
+    finally:
+        env.close()
+
+
+def check_episodes(specs: Sequence[EpisodeSpec]) -> None:
+    """Refuse now what would make episodes fail at their start, by starting one of each planner.
+
+    Scenes are not built.
+
+    Raises:
+        InputError: options that the environment, SLAM or a planner refuses, or a planner that
+            fails as it is made.
+    """
+    different = {
+        (spec.planner, spec.env_id, spec.step_m, spec.step_deg, str(spec.options)): spec
+        for spec in specs
+    }
+    for spec in different.values():
+        env = _make_env(spec)
+        try:
+            make_planner(spec.planner, env.unwrapped, spec.seed)
+        except InputError:
+            raise
+        except Exception as error:  # a planner of somebody else may raise anything
+            reason = f"{type(error).__name__}: {error}".splitlines()[0]
+            raise InputError(f"planner {spec.planner!r} cannot be made: {reason}") from error
+        finally:
+            env.close()
+
+
+def _make_env(spec: EpisodeSpec) -> gym.Env[Any, Any]:
     planner_type = planner_class(parse_planner(spec.planner)[0])
-    env = gym.make(
+    return gym.make(
         spec.env_id,
         max_episode_steps=spec.steps,
         disable_env_checker=True,
@@ -81,15 +122,6 @@ def run_episode(spec: EpisodeSpec) -> dict[str, Any]:
             **spec.options,
         },
     )
-    try:
-        world = cast(ActiveSlamEnv, env.unwrapped)
-        planner = make_planner(spec.planner, world, spec.seed)
-        progress = _play(env, planner, spec.seed)
-        trajectory = measure_trajectory(world)
-        trajectory["lost"] |= progress["lost_steps_share"] > 0
-        return {**progress, **trajectory, **measure_map(world, spec)}
-    finally:
-        env.close()
 
 
 def _play(env: gym.Env[Any, Any], planner: Planner, seed: int) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from ms_slam_env.benchmark.planner_benchmark import check_names, seed_list
 from ms_slam_env.benchmark.planner_report import finished
 from ms_slam_env.benchmark.provenance import provenance
 from ms_slam_env.benchmark.records import write_json
-from ms_slam_env.benchmark.runner import failures, run_all
+from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
 from ms_slam_env.camera import RGBDFrame, intensity_image, xtion
 from ms_slam_env.divergence import Divergence, DivergenceConfig, Histograms, make_divergence
 from ms_slam_env.env.config import EnvConfig, LookaheadConfig
@@ -158,6 +158,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if args.states < 1:
         raise InputError(f"states = {args.states} must be at least 1")
     rows = run_all(args.specs(), run_path, args.out, args.workers, "paths")
+    check_any_finished(rows)
     summary = summarise(list(SETTINGS), [row["result"] for row in finished(rows)])
     write_json(
         args.out / "results.json",

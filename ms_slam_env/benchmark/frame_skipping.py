@@ -24,7 +24,7 @@ from ms_slam_env.benchmark.planner_benchmark import check_names, seed_list
 from ms_slam_env.benchmark.planner_report import Column, finished
 from ms_slam_env.benchmark.provenance import provenance
 from ms_slam_env.benchmark.records import Row, write_json
-from ms_slam_env.benchmark.runner import failures, run_all
+from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
 from ms_slam_env.benchmark.statistics import Interval
 from ms_slam_env.benchmark.table import format_interval, format_number, markdown_table
 from ms_slam_env.camera import intensity_image, xtion
@@ -107,6 +107,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parse(Arguments, arguments, PROGRAM)
     check_names(("random",), args.scenes)
     rows = run_all(args.specs(), run_sequence, args.out, args.workers, "sequences")
+    check_any_finished(rows)
     summary = summarise(rows)
     targets = suggest_targets(summary, args.desired_ate_m)
     write_json(

@@ -13,15 +13,18 @@ from ms_slam_env.benchmark.episode import (
     DEFAULT_STEP_DEG,
     DEFAULT_STEP_M,
     EpisodeSpec,
+    check_episodes,
     run_episode,
 )
 from ms_slam_env.benchmark.options import parse_options
 from ms_slam_env.benchmark.planners import check_planner
 from ms_slam_env.benchmark.provenance import provenance
 from ms_slam_env.benchmark.records import Row, write_json
-from ms_slam_env.benchmark.runner import failures, run_all
+from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.scenes import SCENES, SEED_SPLITS
+from ms_slam_env.scenes.registry import MESH_SUFFIXES
+from ms_slam_env.scenes.triangle_soup import load_soup
 
 DEFAULT_PLANNERS = ("random", "stationary", "greedy", "max-information")
 DEFAULT_SCENES = ("living_room", "corridor", "table", "wall")
@@ -79,10 +82,10 @@ class PlannerBenchmark:
 
 
 def check_names(planners: Sequence[str], scenes: Sequence[str]) -> None:
-    """Refuse unknown planners and scenes.
+    """Refuse unknown planners and scenes, and mesh files that cannot be read.
 
     Raises:
-        InputError: naming the valid choices.
+        InputError: naming the valid choices, or what is wrong with the file.
     """
     for kind, names in (("planner", planners), ("scene", scenes)):
         if not names:
@@ -92,8 +95,12 @@ def check_names(planners: Sequence[str], scenes: Sequence[str]) -> None:
     for planner in planners:
         check_planner(planner)
     for scene in scenes:
-        if scene not in SCENES and not Path(scene).is_file():
-            raise unknown("scene", scene, (*SCENES, "path of a .glb, .obj or .ply file"))
+        if scene in SCENES:
+            continue
+        if Path(scene).suffix.lower() not in MESH_SUFFIXES:
+            formats = ", ".join(MESH_SUFFIXES)
+            raise unknown("scene", scene, (*SCENES, f"the path of a mesh file ({formats})"))
+        load_soup(Path(scene))
 
 
 def seed_list(split: str, count: int) -> list[int]:
@@ -117,8 +124,14 @@ def run_planner_benchmark(
 
     Returns:
         the Markdown table and the errors of failed episodes.
+
+    Raises:
+        InputError: what no episode could start with.
+        RuntimeError: every episode failed; the files of an earlier run are left as they are.
     """
+    check_episodes(config.specs())
     rows = run_all(config.specs(), run_episode, out, workers)
+    check_any_finished(rows)
     return write_report(config, rows, out), failures(rows)
 
 

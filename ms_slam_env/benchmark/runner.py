@@ -92,6 +92,17 @@ def failures(rows: Sequence[Row]) -> list[str]:
     return [f"{row['key']}: {row['error']}" for row in rows if row["error"] is not None]
 
 
+def check_any_finished(rows: Sequence[Row]) -> None:
+    """Refuse to go on where all work failed, so that no good report is overwritten by an empty one.
+
+    Raises:
+        RuntimeError: with the first error.
+    """
+    errors = failures(rows)
+    if rows and len(errors) == len(rows):
+        raise RuntimeError(f"all {len(rows)} failed, the first: {errors[0]}; no report is written")
+
+
 def _run_missing(
     todo: dict[str, Any],
     run: Callable[[Any], dict[str, Any]],

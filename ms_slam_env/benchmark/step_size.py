@@ -14,14 +14,14 @@ from typing import Any
 
 from ms_slam_env.benchmark import statistics
 from ms_slam_env.benchmark.command_line import exit_code, parse, report_failures
-from ms_slam_env.benchmark.episode import EpisodeSpec, run_episode
+from ms_slam_env.benchmark.episode import EpisodeSpec, check_episodes, run_episode
 from ms_slam_env.benchmark.figures import colour, new_figure, save
 from ms_slam_env.benchmark.options import parse_options
 from ms_slam_env.benchmark.planner_benchmark import DEFAULT_PLANNERS, check_names, seed_list
 from ms_slam_env.benchmark.planner_report import Column, finished
 from ms_slam_env.benchmark.provenance import provenance
 from ms_slam_env.benchmark.records import Row, write_json
-from ms_slam_env.benchmark.runner import failures, run_all
+from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
 from ms_slam_env.benchmark.statistics import Interval
 from ms_slam_env.benchmark.table import format_interval, markdown_table
 
@@ -80,7 +80,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the experiment; return the exit code."""
     args = parse(Arguments, arguments, PROGRAM)
     check_names(args.planners, args.scenes)
+    check_episodes(args.specs())
     rows = run_all(args.specs(), run_episode, args.out, args.workers)
+    check_any_finished(rows)
     summary = summarise(rows)
     write_json(
         args.out / "results.json",

@@ -19,6 +19,7 @@ from ms_slam_env.benchmark.episode import (
     DEFAULT_STEP_DEG,
     DEFAULT_STEP_M,
     EpisodeSpec,
+    check_episodes,
     run_episode,
 )
 from ms_slam_env.benchmark.figures import colour, new_figure, save
@@ -27,7 +28,7 @@ from ms_slam_env.benchmark.planner_benchmark import check_names, seed_list
 from ms_slam_env.benchmark.planner_report import Column, finished
 from ms_slam_env.benchmark.provenance import provenance
 from ms_slam_env.benchmark.records import Row, write_json
-from ms_slam_env.benchmark.runner import failures, run_all
+from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
 from ms_slam_env.benchmark.statistics import Interval
 from ms_slam_env.benchmark.table import format_interval, markdown_table
 
@@ -101,7 +102,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the experiment; return the exit code."""
     args = parse(Arguments, arguments, PROGRAM)
     check_names((args.baseline, args.active), args.scenes)
+    check_episodes(args.specs())
     rows = run_all(args.specs(), run_episode, args.out, args.workers)
+    check_any_finished(rows)
     experiments = {
         name: compare(rows, env_id, args.baseline, args.active)
         for name, env_id in EXPERIMENTS.items()

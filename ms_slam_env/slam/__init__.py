@@ -19,7 +19,7 @@ def _surfel(intrinsics: Intrinsics, device: str = "cpu", **params: Any) -> SlamB
     devices = [found.alias for found in wp.get_devices()]
     if device not in (*devices, "cuda") or (device == "cuda" and not wp.is_cuda_available()):
         raise unknown("device", device, devices)
-    return SurfelSlam(intrinsics, from_dict(SurfelConfig, params, "slam"), device)
+    return SurfelSlam(intrinsics, from_dict(SurfelConfig, params, "slam_config"), device)
 
 
 BACKENDS: dict[str, Callable[..., SlamBackend]] = {"surfel": _surfel}

@@ -5,12 +5,16 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from ms_slam_env.benchmark import planner_benchmark, runner
+from ms_slam_env.benchmark import planner_benchmark
+from ms_slam_env.benchmark.planner_report import DETAILS, HEADLINE
+from ms_slam_env.benchmark.records import Row
 from ms_slam_env.benchmark.trajectory_evaluation import associate
 from ms_slam_env.cli import COMMANDS, main
 from ms_slam_env.geometry import make_pose, so3_exp
@@ -29,9 +33,12 @@ def one_line(text: str) -> str:
         (["fly"], "unknown command 'fly'; valid choices: benchmark, evaluate, train"),
         (["benchmark", "--planners", "nonsense"], "unknown planner 'nonsense'; valid choices:"),
         (["benchmark", "--scenes", "mars"], "unknown scene 'mars'; valid choices: living_room"),
-        (["benchmark", "--scenes", "missing.glb"], "missing.glb"),
+        (["benchmark", "--scenes", "missing.glb"], "mesh file 'missing.glb' does not exist"),
         (["benchmark", "--options", "slam=orb"], "unknown SLAM backend 'orb'; valid choices:"),
         (["benchmark", "--options", "foo=1"], "unknown option of EnvConfig 'foo'"),
+        (["benchmark", "--options", "slam_config.foo=1"], "SurfelConfig 'slam_config.foo'; valid"),
+        (["benchmark", "--planners", "policy,path=none.zip"], "no policy file 'none.zip'"),
+        (["benchmark", "--planners", "greedy,rho_I=x"], "rho_I = 'x' is outside"),
         (["benchmark", "--planners", "greedy,foo=1"], "'foo'; valid choices: rho_I"),
         (["benchmark", "--planners", ":Greedy"], "planner ':Greedy' cannot be loaded"),
         (["benchmark", "--planners", "greedy,rho_I=["], "'[' is not a YAML value"),
@@ -55,6 +62,18 @@ def test_bad_input_is_one_line_and_code_2(
     captured = capsys.readouterr()
     assert captured.out == ""
     assert message in one_line(captured.err)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_unreadable_mesh_is_refused_before_any_episode(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    junk = tmp_path / "junk.glb"
+    junk.write_text("junk")
+    out = tmp_path / "out"
+    assert main(["benchmark", "--scenes", str(junk), "--out", str(out)]) == 2
+    assert f"mesh file '{junk}' cannot be read" in one_line(capsys.readouterr().err)
+    assert not out.exists()
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["-h"], ["--version"]])
@@ -93,19 +112,43 @@ def test_the_installed_command_says_one_line(tmp_path: Path) -> None:
 def test_failed_episodes_are_code_1_and_stay_in_the_results(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(planner_benchmark, "run_all", fail_all)
-    arguments = ["benchmark", "--planners", "random", "--scenes", "table", "--episodes", "2"]
-    assert main([*arguments, "--out", str(tmp_path)]) == 1
-    assert "2 failed, the first: k0: boom" in capsys.readouterr().err
+    result = {column.metric: 0.5 for column in (*HEADLINE, *DETAILS)}
+    finished = {"result": {**result, "ate_over_time": [0.1]}, "error": None}
+    monkeypatch.setattr(planner_benchmark, "run_all", made_up_rows(failed(), finished))
+    assert main([*TWO_EPISODES, "--out", str(tmp_path)]) == 1
+    assert "1 failed, the first: k0: boom" in capsys.readouterr().err
     content = json.loads((tmp_path / "results.json").read_text())
-    assert [row["error"] for row in content["episodes"]] == ["boom", "boom"]
+    assert [row["error"] for row in content["episodes"]] == ["boom", None]
 
 
-def fail_all(specs: list, run: object, out: Path, workers: int | None) -> list[runner.Row]:
-    return [
-        {"key": f"k{i}", "spec": vars(s), "result": None, "error": "boom", "commit": "c"}
-        for i, s in enumerate(specs)
-    ]
+def test_where_every_episode_failed_the_old_report_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "table.md").write_text("good")
+    monkeypatch.setattr(planner_benchmark, "run_all", made_up_rows(failed(), failed()))
+    assert main([*TWO_EPISODES, "--out", str(tmp_path)]) == 1
+    assert "all 2 failed, the first: k0: boom" in one_line(capsys.readouterr().err)
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("table.md", "good")]
+
+
+TWO_EPISODES = ["benchmark", "--planners", "random", "--scenes", "table", "--episodes", "2"]
+
+
+def failed() -> dict[str, Any]:
+    return {"result": None, "error": "boom"}
+
+
+def made_up_rows(first: dict[str, Any], last: dict[str, Any]) -> Callable[..., list[Row]]:
+    """A ``run_all`` that runs nothing."""
+
+    def run_all(specs: list[Any], run: object, out: Path, workers: int | None) -> list[Row]:
+        outcomes = [*[first] * (len(specs) - 1), last]
+        return [
+            {"key": f"k{i}", "spec": vars(spec), "commit": "c", **outcome}
+            for i, (spec, outcome) in enumerate(zip(specs, outcomes, strict=True))
+        ]
+
+    return run_all
 
 
 def write_pair(folder: Path, shift_s: float = 0.0) -> tuple[Path, Path]:
