@@ -15,7 +15,8 @@ from ms_slam_env.errors import InputError
 
 T = TypeVar("T")
 
-_FRAME = re.compile(r"[╭╮╰╯│─]+")
+_FRAME = re.compile(r"[╭╮╰╯│─]+|-{4,}")  # dashes where the terminal is not UTF-8
+_PROPOSAL = re.compile(r"^[│ ] +(--[a-z][\w-]*)", re.MULTILINE)
 
 
 def parse(cls: type[T], arguments: Sequence[str] | None, prog: str) -> T:
@@ -42,6 +43,11 @@ def exit_code(run: Callable[[], int], name: str = "ms-slam") -> int:
     except InputError as error:
         print(f"{name}: error: {error}", file=sys.stderr)
         return 2
+    except OSError as error:
+        if error.filename is None:
+            raise  # not about a file that the user named
+        print(f"{name}: error: {error.filename}: {error.strerror}", file=sys.stderr)
+        return 2
     except RuntimeError as error:
         print(f"{name}: error: {error}", file=sys.stderr)
         return 1
@@ -58,11 +64,18 @@ def report_failures(errors: Sequence[str], name: str = "ms-slam") -> int:
 
 
 def _one_line(box: str) -> str:
-    """The message of tyro's box: its lines up to the first rule, or its title without any."""
+    """The message of tyro's box: its lines up to the first rule, or its title without any.
+
+    The options that tyro finds similar follow the message.
+    """
     title, *lines = box.splitlines() or [""]
+    _, _, proposals = box.partition("Perhaps you meant")
+    similar = ", ".join(dict.fromkeys(_PROPOSAL.findall(proposals)))
+    hint = f"; perhaps you meant {similar}" if similar else ""
     message: list[str] = []
     for line in lines:
-        if message and _FRAME.sub("", line).strip() == "":
+        if any(message) and _FRAME.sub("", line).strip() == "":
             break
         message.append(_FRAME.sub("", line).strip())
-    return " ".join(filter(None, message)) or _FRAME.sub("", title).strip() or "bad arguments"
+    text = " ".join(filter(None, message)) or _FRAME.sub("", title).strip() or "bad arguments"
+    return text + hint

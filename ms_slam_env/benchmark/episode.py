@@ -55,10 +55,14 @@ class EpisodeSpec:
 
     def __post_init__(self) -> None:
         """Refuse unknown choices and values out of range."""
-        check_choice(self, "env_id", ms_slam_env.ENV_IDS)
-        check_range(self, "steps", 1, 1_000_000)
-        check_range(self, "step_m", 0, 1)
-        check_range(self, "step_deg", 0, 90)
+        try:
+            check_choice(self, "env_id", ms_slam_env.ENV_IDS)
+            check_range(self, "steps", 1, 1_000_000)
+            check_range(self, "step_m", 0, 1)
+            check_range(self, "step_deg", 0, 90)
+        except InputError as error:
+            # Users know the fields as options of a command, not this class.
+            raise InputError(str(error).replace("EpisodeSpec.", "")) from None
 
 
 def run_episode(spec: EpisodeSpec) -> dict[str, Any]:

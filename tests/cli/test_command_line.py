@@ -44,9 +44,12 @@ def one_line(text: str) -> str:
         (["benchmark", "--planners", "greedy,rho_I=["], "'[' is not a YAML value"),
         (["benchmark", "--options", "steps=["], "'[' is not a YAML value"),
         (["benchmark", "--stps", "3"], "Unrecognized options: --stps"),
+        (["benchmark", "--planner", "greedy"], "perhaps you meant --planners"),
+        (["benchmark", "--steps", "0"], "error: steps = 0 is outside"),
+        (["benchmark", "--step-m", "-1"], "error: step_m = -1.0 is outside"),
         (["benchmark", "--steps", "three"], "--steps"),
         (["benchmark", "--seeds", "exam"], "valid choices: train, validation, test"),
-        (["benchmark", "--env-id", "CartPole-v1"], "valid choices: MSActiveSLAM-v0"),
+        (["benchmark", "--env-id", "CartPole-v1"], "unknown env_id 'CartPole-v1'; valid"),
         (["benchmark", "--workers", "0", "--planners", "random"], "workers = 0"),
         (["evaluate"], "Missing"),
         (["evaluate", "missing.txt", "missing.txt"], "cannot read trajectory missing.txt"),
@@ -74,6 +77,17 @@ def test_an_unreadable_mesh_is_refused_before_any_episode(
     assert main(["benchmark", "--scenes", str(junk), "--out", str(out)]) == 2
     assert f"mesh file '{junk}' cannot be read" in one_line(capsys.readouterr().err)
     assert not out.exists()
+
+
+def test_a_folder_that_cannot_be_made_is_one_line_and_code_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    out = ["--out", str(tmp_path / "file" / "below")]
+    estimate, truth = write_pair(tmp_path)
+    for command in (TWO_EPISODES, ["evaluate", str(estimate), str(truth)]):
+        assert main([*command, *out]) == 2
+        assert "Not a directory" in one_line(capsys.readouterr().err)
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["-h"], ["--version"]])
