@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ms_slam_env.benchmark.figures import colour, new_figure, save
+from ms_slam_env.benchmark.figures import caption, colour, new_figure, save
 from ms_slam_env.benchmark.statistics import Interval, median_interval
 from ms_slam_env.benchmark.table import format_interval, format_number, markdown_table
 
@@ -94,4 +94,5 @@ def save_figure(lines: Sequence[Line], path: Path) -> None:
         panel.set_xlim(0, 1)
         panel.grid(alpha=0.3)
     panels[0].set_yticks(rows, [line.setting for line in lines])
+    caption(figure, "Dot and bar: median over states and its 95 % interval; dashed: the aim.")
     save(figure, path)

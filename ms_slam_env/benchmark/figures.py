@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -20,6 +22,7 @@ PANELS = (
     Column("path_length_m", "path length [m]"),
 )
 _FLOOR_MM = 0.05  # errors below are drawn here on logarithmic axes
+_OWN_COLOURS = ("greedy", "random", "max-information", "stationary", "policy", "policy-features")
 
 
 def save_planner_figures(rows: Sequence[Row], out: Path) -> list[Path]:
@@ -41,6 +44,16 @@ def new_figure(columns: int = 1, width: float = 3.4, height: float = 3.2) -> Fig
     return Figure(figsize=(width * columns, height), layout="constrained")
 
 
+def caption(figure: Figure, text: str) -> None:
+    """Say above the panels what the marks are."""
+    figure.suptitle(text, x=0.01, horizontalalignment="left", fontsize="small")
+
+
+def legend_beside(figure: Figure, ax: Axes) -> None:
+    """Put the legend of ``ax`` to the right of every panel, where it hides no data."""
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside right upper", fontsize="small")
+
+
 def save(figure: Figure, path: Path) -> Path:
     """Write a figure as PNG."""
     figure.savefig(path, dpi=120)
@@ -48,12 +61,44 @@ def save(figure: Figure, path: Path) -> Path:
 
 
 def colours(planners: Iterable[str]) -> dict[str, str]:
-    """A colour for each planner that does not depend on who came first."""
-    return {planner: colour(index) for index, planner in enumerate(sorted(planners))}
+    """A colour for each planner; the planners of this project have the same in every figure.
+
+    Of several that differ in their options only, the first in the alphabet has it.
+    """
+    result: dict[str, str] = {}
+    others = len(_OWN_COLOURS)
+    taken = set()
+    for planner in sorted(planners):
+        name = planner.partition(",")[0]
+        if name in _OWN_COLOURS and name not in taken:
+            taken.add(name)
+            result[planner] = colour(_OWN_COLOURS.index(name))
+        else:
+            result[planner] = colour(others)
+            others += 1
+    return result
+
+
+def labels(planners: Iterable[str]) -> dict[str, str]:
+    """A short text for each planner: its name, with options only where names are the same.
+
+    Options are then one a line, paths among them without their folders.
+    """
+    names = {planner: planner.split(",") for planner in planners}
+    count = Counter(name for name, *_ in names.values())
+    return {
+        planner: name if count[name] == 1 else "\n".join([name, *map(_without_folders, options)])
+        for planner, (name, *options) in names.items()
+    }
+
+
+def _without_folders(option: str) -> str:
+    name, equals, value = option.partition("=")
+    return name + equals + value.rpartition("/")[2]
 
 
 def colour(index: int) -> str:
-    """One colour a planner, distinguishable with common colour-vision deficiencies."""
+    """One colour a series, distinguishable with common colour-vision deficiencies."""
     palette = matplotlib.color_sequences["petroff10"]
     return matplotlib.colors.to_hex(palette[index % len(palette)])
 
@@ -86,47 +131,51 @@ def planners_figure(rows: Sequence[Row]) -> Figure:
         ax.set_xlabel(panel.heading)
         ax.grid(axis="x", alpha=0.3)
     axes[PANELS.index(next(p for p in PANELS if p.metric == "ate_m"))].set_xscale("log")
-    axes[0].set_yticks(range(len(summary)), list(summary))
+    axes[0].set_yticks(range(len(summary)), labels(summary).values())
     axes[0].invert_yaxis()
+    caption(figure, "Small dots: episodes. Circle and bar: median and its 95 % interval.")
     return figure
 
 
 def scatter_figure(rows: Sequence[Row]) -> Figure:
     """F-score against ATE: the good corner is the upper left one."""
-    figure = new_figure(width=5.0, height=3.8)
+    figure = new_figure(width=6.4, height=3.8)
     ax = figure.subplots()
     planners = list(summarise(rows))
-    colour_of = colours(planners)
+    colour_of, label_of = colours(planners), labels(planners)
     for planner in planners:
         ate = np.maximum(1000 * _values(rows, planner, "ate_m"), _FLOOR_MM)
         f_score = 100 * _values(rows, planner, "f_score_5cm")
         lost = _values(rows, planner, "lost").astype(bool)
-        ax.plot(ate[~lost], f_score[~lost], "o", color=colour_of[planner], label=planner, alpha=0.7)
-        ax.plot(ate[lost], f_score[lost], "x", color=colour_of[planner], alpha=0.7)
+        look: dict[str, Any] = {"color": colour_of[planner], "alpha": 0.7}
+        ax.plot(ate[~lost], f_score[~lost], "o", label=label_of[planner], **look)
+        ax.plot(ate[lost], f_score[lost], "x", **look)
     ax.set_xscale("log")
-    ax.set_xlabel("ATE [mm] (x: tracking was lost)")
+    ax.set_xlabel("ATE [mm]")
     ax.set_ylabel("F-score at 5 cm [%]")
     ax.grid(alpha=0.3)
-    ax.legend()
+    legend_beside(figure, ax)
+    caption(figure, "One mark an episode; cross: tracking was lost.")
     return figure
 
 
 def ate_over_time_figure(rows: Sequence[Row]) -> Figure:
     """Running trajectory error: median over episodes, band between the quartiles."""
-    figure = new_figure(width=5.0, height=3.8)
+    figure = new_figure(width=6.4, height=3.8)
     ax = figure.subplots()
     planners = list(summarise(rows))
-    colour_of = colours(planners)
+    colour_of, label_of = colours(planners), labels(planners)
     for planner in planners:
         series = [
             row["result"]["ate_over_time"] for row in rows if row["spec"]["planner"] == planner
         ]
-        draw_band(ax, series, planner, colour_of[planner])
+        draw_band(ax, series, label_of[planner], colour_of[planner])
     ax.set_yscale("log")
     ax.set_xlabel("step")
     ax.set_ylabel("running ATE, no alignment [mm]")
     ax.grid(alpha=0.3)
-    ax.legend()
+    legend_beside(figure, ax)
+    caption(figure, "Line: median over episodes; band: between their quartiles.")
     return figure
 
 

@@ -19,7 +19,7 @@ from ms_slam_env import metrics, slam
 from ms_slam_env.benchmark import statistics
 from ms_slam_env.benchmark.command_line import exit_code, parse, report_failures
 from ms_slam_env.benchmark.episode import LOST_ERROR_M
-from ms_slam_env.benchmark.figures import new_figure, save
+from ms_slam_env.benchmark.figures import caption, new_figure, save
 from ms_slam_env.benchmark.planner_benchmark import check_names, seed_list
 from ms_slam_env.benchmark.planner_report import Column, finished
 from ms_slam_env.benchmark.provenance import provenance
@@ -242,6 +242,7 @@ def save_figure(rows: Sequence[Row], path: Path) -> None:
         ax.grid(alpha=0.3)
     panels[0].set_ylabel("ATE [mm]")
     figure.colorbar(dots, ax=panels[-1], label="every n-th frame")
+    caption(figure, "One dot a sequence.")
     save(figure, path)
 
 

@@ -15,7 +15,7 @@ from typing import Any
 from ms_slam_env.benchmark import statistics
 from ms_slam_env.benchmark.command_line import exit_code, parse, report_failures
 from ms_slam_env.benchmark.episode import EpisodeSpec, check_episodes, run_episode
-from ms_slam_env.benchmark.figures import colour, new_figure, save
+from ms_slam_env.benchmark.figures import caption, colours, labels, legend_beside, new_figure, save
 from ms_slam_env.benchmark.options import parse_options
 from ms_slam_env.benchmark.planner_benchmark import DEFAULT_PLANNERS, check_names, seed_list
 from ms_slam_env.benchmark.planner_report import Column, finished
@@ -136,21 +136,25 @@ def save_figure(summary: dict[tuple[str, float], dict[str, Interval]], path: Pat
     """Draw one panel a metric, one line a planner, the band its 95 % interval."""
     figure = new_figure(len(COLUMNS))
     panels = figure.subplots(1, len(COLUMNS))
+    planners = list(dict.fromkeys(name for name, _ in summary))
+    colour_of, label_of = colours(planners), labels(planners)
     for ax, column in zip(panels, COLUMNS, strict=True):
-        for index, planner in enumerate(dict.fromkeys(name for name, _ in summary)):
+        for planner in planners:
             sizes = [size for name, size in summary if name == planner]
             cells = [summary[planner, size][column.metric] for size in sizes]
             low, value, high = (
                 [column.scale * getattr(cell, part) for cell in cells]
                 for part in ("low", "value", "high")
             )
-            ax.plot(sizes, value, "o-", color=colour(index), label=planner, markersize=4)
-            ax.fill_between(sizes, low, high, color=colour(index), alpha=0.15, linewidth=0)
+            look = {"color": colour_of[planner]}
+            ax.plot(sizes, value, "o-", label=label_of[planner], markersize=4, **look)
+            ax.fill_between(sizes, low, high, alpha=0.15, linewidth=0, **look)
         ax.set_xlabel("step [cm and deg]")
         ax.set_ylabel(column.heading)
         ax.grid(alpha=0.3)
     panels[1].set_yscale("log")
-    panels[0].legend()
+    legend_beside(figure, panels[0])
+    caption(figure, "Dot: median over episodes (lost: their share); band: its 95 % interval.")
     save(figure, path)
 
 

@@ -22,7 +22,7 @@ from ms_slam_env.benchmark.episode import (
     check_episodes,
     run_episode,
 )
-from ms_slam_env.benchmark.figures import colour, new_figure, save
+from ms_slam_env.benchmark.figures import caption, colours, labels, new_figure, save
 from ms_slam_env.benchmark.options import parse_options
 from ms_slam_env.benchmark.planner_benchmark import check_names, seed_list
 from ms_slam_env.benchmark.planner_report import Column, finished
@@ -193,6 +193,7 @@ def as_table(experiments: dict[str, dict[str, Any]]) -> str:
 def save_figure(rows: Sequence[Row], planners: Sequence[str], path: Path) -> None:
     """Draw the distribution of ATE and RER over episodes, by experiment and planner."""
     figure = new_figure(len(EXPERIMENTS) * 2)
+    colour_of, label_of = colours(planners), labels(planners)
     panels = iter(figure.subplots(1, len(EXPERIMENTS) * 2))
     for name, env_id in EXPERIMENTS.items():
         for column in COLUMNS[:2]:
@@ -205,14 +206,23 @@ def save_figure(rows: Sequence[Row], planners: Sequence[str], path: Path) -> Non
                         if (row["spec"]["env_id"], row["spec"]["planner"]) == (env_id, planner)
                     ]
                 )
-                ax.boxplot(values, positions=[index], widths=0.5, showfliers=False)
+                ax.boxplot(
+                    values,
+                    positions=[index],
+                    widths=0.5,
+                    showfliers=False,
+                    medianprops={"color": "black", "linewidth": 2},
+                )
                 jitter = np.random.default_rng(0).uniform(-0.15, 0.15, len(values))
-                ax.plot(index + jitter, values, ".", color=colour(index), alpha=0.6)
-            ax.set_xticks(range(len(planners)), planners)
+                ax.plot(index + jitter, values, ".", color=colour_of[planner], alpha=0.6)
+            ax.set_xticks(range(len(planners)), [label_of[planner] for planner in planners])
             if column.metric == "ate_m":
                 ax.set_yscale("log")
             ax.set_ylabel(column.heading)
             ax.set_title(name)
+    caption(
+        figure, "Dots: episodes. Box: quartiles, median thick; whiskers: up to 1.5 box lengths."
+    )
     save(figure, path)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ms_slam_env.benchmark import planner_benchmark, planner_report, step_size, table_two
-from ms_slam_env.benchmark.figures import save_planner_figures
+from ms_slam_env.benchmark.figures import colours, labels, save_planner_figures
 from ms_slam_env.benchmark.planner_benchmark import PlannerBenchmark, write_report
 from ms_slam_env.benchmark.records import Row, spec_key
 from ms_slam_env.benchmark.statistics import Interval
@@ -90,6 +90,25 @@ def test_without_rliable_the_rest_is_reported(
     table = write_report(CONFIG, rows_of(CONFIG), tmp_path)
     assert "Across scenes" not in table
     assert "ms-slam-env[statistics]" in capsys.readouterr().err
+
+
+def test_a_planner_has_the_same_colour_in_every_company() -> None:
+    every = ["policy-features,path=a.zip", "mine:Planner", *planner_benchmark.DEFAULT_PLANNERS]
+    together = colours(every)
+    assert len(set(together.values())) == len(every)
+    for planner in (every[0], *planner_benchmark.DEFAULT_PLANNERS):
+        assert colours([planner])[planner] == together[planner]
+    variants = colours(["greedy", "greedy,rho_I=0.3"])
+    assert variants["greedy"] == together["greedy"] != variants["greedy,rho_I=0.3"]
+
+
+def test_labels_are_as_long_as_it_takes_to_tell_planners_apart() -> None:
+    path = "policy-features,path=docs/results/train/policy.zip"
+    assert labels(["random", path]) == {"random": "random", path: "policy-features"}
+    assert labels(["greedy", "greedy,rho_I=0.3,file=a/b"]) == {
+        "greedy": "greedy",
+        "greedy,rho_I=0.3,file=a/b": "greedy\nrho_I=0.3\nfile=b",
+    }
 
 
 def test_no_finished_episode_no_figure(tmp_path: Path) -> None:
