@@ -79,11 +79,21 @@ def test_workers_must_be_positive(tmp_path: Path, workers: int) -> None:
         run_all([Square(1)], square, tmp_path, workers=workers)
 
 
+def heed_interrupts() -> None:
+    """Undo what a shell does to its background jobs: a child inherits that SIGINT is ignored."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
 def test_interruption_loses_and_repeats_nothing(tmp_path: Path, how: signal.Signals) -> None:
     out, log, count = tmp_path / "out", tmp_path / "log", 24
-    command = [sys.executable, fake_work.__file__, str(out), str(count), "0.05", str(log)]
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, start_new_session=True)
+    command = [sys.executable, fake_work.__file__, str(out), str(count), "0.1", str(log)]
+    process = subprocess.Popen(
+        command,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+        preexec_fn=heed_interrupts,
+    )
     while not (out / RECORDS).exists() and process.poll() is None:
         time.sleep(0.01)
     time.sleep(random.Random().uniform(0, 0.4))
