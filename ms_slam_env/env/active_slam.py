@@ -223,16 +223,6 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
                 )
         return episode.predicted_divergences.copy()
 
-    @property
-    def divergence_targets(self) -> Float64:
-        """(2,) the divergences to aim at: rho_I M_I and rho_D M_D."""
-        return self.config.targets.divergence
-
-    @property
-    def depth_weight(self) -> float:
-        """Lambda of Algorithm 1, line 9."""
-        return self.config.targets.depth_weight
-
     # -- What evaluation uses ----------------------------------------------------------------
 
     @property

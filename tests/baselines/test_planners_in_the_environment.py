@@ -40,7 +40,8 @@ def test_greedy_takes_the_smallest_distance_to_the_targets(env):
     observation, info = env.reset(seed=1)
     world = env.unwrapped
     action = GreedyDivergence(world).act(observation, info)
-    (target_I, target_D), weight = world.divergence_targets, world.depth_weight
+    targets = world.config.targets
+    (target_I, target_D), weight = targets.divergence, targets.depth_weight
     distances = {
         i: abs(delta_I - target_I) + weight * abs(delta_D - target_D)
         for i, (delta_I, delta_D) in enumerate(world.lookahead())

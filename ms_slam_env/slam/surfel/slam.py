@@ -254,10 +254,6 @@ class SurfelSlam(SlamBackend):
         """
         return self.map.points(stable=False)
 
-    def map_points(self) -> Float64:
-        """Surfels of every age (M, 3)."""
-        return self.map.points(stable=False)
-
     def surface_colors(self) -> NDArray[np.uint8]:
         """Colours (M, 3) RGB of ``surface_points``."""
         return self.map.colors(stable=False)
