@@ -9,6 +9,10 @@ class InputError(ValueError):
     """A value given by the user is wrong; the message is one line fit to be shown as it is."""
 
 
+class UnreachableError(InputError):
+    """The camera cannot be held at a pose."""
+
+
 def unknown(kind: str, name: object, choices: Iterable[object]) -> InputError:
     """Return the error for an unknown ``name`` of some ``kind``, listing the valid ``choices``."""
     valid = ", ".join(str(choice) for choice in choices)

@@ -17,7 +17,7 @@ FLOW = (
     " -> env -> exploration -> benchmark -> cli"
 )
 LEVEL = {name: level for level, name in enumerate(re.split(r" -> |, ", FLOW))}
-BELOW_ALL = {"errors", "config", "_warp"}
+BELOW_ALL = {"errors", "config", "timings", "_warp"}
 ABOVE_ALL = {"registration", ""}  # "" is ms_slam_env/__init__.py
 NEVER = {"baselines", "agents", "ms_slam_baselines", "ms_slam_agents", "evo"}
 ONLY_INSIDE_FUNCTIONS = {

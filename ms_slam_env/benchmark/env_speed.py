@@ -21,7 +21,6 @@ from ms_slam_env.benchmark.table import markdown_table
 from ms_slam_env.config import check_range
 from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.env.observations import OBSERVATIONS
-from ms_slam_env.env.timings import Timings
 
 PROGRAM = "python -m ms_slam_env.benchmark.env_speed"
 WARM_UP_STEPS = 20  # the first steps compile or load kernels and build the scene
@@ -63,7 +62,7 @@ def measure(args: Arguments, observation: str) -> dict[str, Any]:
     for _ in range(WARM_UP_STEPS):
         env.step(env.action_space.sample())
     world = cast(ActiveSlamEnv, env.unwrapped)
-    world.timings = Timings()
+    world.timings.clear()
     steps_per_s = benchmark_step(env, args.seconds, seed=0)
     return {"steps_per_s": steps_per_s, "stages_ms": world.timings.mean_ms()}
 

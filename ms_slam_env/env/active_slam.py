@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
@@ -13,33 +13,30 @@ from numpy.typing import NDArray
 from ms_slam_env import slam as slam_backends
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image, xtion
 from ms_slam_env.config import from_dict
-from ms_slam_env.divergence import make_divergence
+from ms_slam_env.divergence import Histograms, make_divergence
 from ms_slam_env.env.config import EnvConfig
 from ms_slam_env.env.coverage import CoverageGrid
+from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.env.lookahead import Lookahead
 from ms_slam_env.env.observations import RobotKnowledge, make_observation
+from ms_slam_env.env.pose_sources import POSE_SOURCES, Sighting, relative_motion
 from ms_slam_env.env.rendering import Renderer
 from ms_slam_env.env.reward import Outcome, reward_terms
 from ms_slam_env.env.state import EpisodeState
-from ms_slam_env.env.timings import Timings
 from ms_slam_env.env.worlds import get_scene, get_sensor
-from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.errors import InputError, UnreachableError, unknown
 from ms_slam_env.geometry import check_pose, invert, transform_points
-from ms_slam_env.robot import CAMERA_RADIUS_M, Embodiment, FixedTranslation, FreeCamera
+from ms_slam_env.robot import Movement
 from ms_slam_env.scenes import SEED_SPLITS
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.base import SlamBackend, TrackResult, Views
+from ms_slam_env.timings import Timings
 
 Float64 = NDArray[np.float64]
 
 _START_TRIES = 10  # a drawn start sees surface in most of its view: one try is nearly always enough
 _COVERAGE_STRIDE = 2  # every second pixel in each direction marks coverage
-
-EMBODIMENTS: dict[str, Callable[[Scene, float, float], Embodiment]] = {
-    "free": FreeCamera,
-    "fixed-translation": FixedTranslation,
-}
 
 
 class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
@@ -73,9 +70,10 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
 
     ## Info
     ``T_world_camera``, ``T_world_camera_estimate`` (4, 4); ``pose_error`` m; ``ate`` running RMSE
-    of the pose error, m, no alignment; ``divergence`` (2,) intensity and depth, nats;
-    ``tracking_ok``; ``reward_terms``; ``action_mask`` (n,) bool; ``mapped_area`` m2; ``scene``,
-    ``scene_seed``.
+    of the pose error over all frames, m, no alignment; ``divergence`` (2,) intensity and depth
+    between the last frames of this step and the one before, nats; ``tracking_ok``;
+    ``reward_terms``; ``action_mask`` (n,) bool; ``mapped_area`` m2; ``time`` simulated seconds;
+    ``energy`` mechanical work of the motion so far, J; ``scene``, ``scene_seed``.
     No clock: timings are in ``env.unwrapped.timings``.
 
     ## Arguments
@@ -114,10 +112,11 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
         self.slam: SlamBackend = slam_backends.make(
             self.config.slam, self.intrinsics, **self.config.slam_config
         )
-        self._make_embodiment = EMBODIMENTS[embodiment]
+        self._embodiment_type = EMBODIMENTS[embodiment]
+        self._pose_source = POSE_SOURCES[self.config.pose]()
         self._measure = make_divergence(self.config.divergence, self.intrinsics)
         self._lookahead = Lookahead(self.config.lookahead, self.config.divergence, self.intrinsics)
-        num_actions = EMBODIMENTS[embodiment].num_actions  # type: ignore[attr-defined]
+        num_actions = self._embodiment_type.num_actions
         self.action_space = spaces.Discrete(num_actions)
         self._observation = make_observation(self.config.observation, self.intrinsics, num_actions)
         self.observation_space = self._observation.space
@@ -149,18 +148,21 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
             )
         name, scene_seed = self._draw_scene()
         self._enter_scene(name, scene_seed)
-        given = self._check_start(options["T_world_camera"]) if options else None
-        for _ in range(_START_TRIES):
-            drawn = self.scene.sample_start(self.np_random)
-            self._begin_episode(name, scene_seed, drawn if given is None else given)
-            if self.tracking_ok:
-                return self._build_observation(), self._info()
-            if given is not None:
-                break
-        self._episode = None
-        raise InputError(
-            f"too few depth readings at the start pose in scene {name}: SLAM has nothing to map"
-        )
+        given = options["T_world_camera"] if options else None
+        if given is not None:
+            start = check_pose(given, "reset option T_world_camera")
+            why = self._begin_episode(name, scene_seed, start)
+        else:
+            for _ in range(_START_TRIES):
+                drawn = self.scene.sample_start(self.np_random)
+                why = self._begin_episode(name, scene_seed, drawn)
+                if not why:
+                    break
+        if why:
+            self._episode = None
+            where = "drawn start poses" if given is None else "reset option T_world_camera"
+            raise InputError(f"{where}: {why}")
+        return self._build_observation(), self._info()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Make one motion and track the frame that follows.
@@ -172,9 +174,9 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
         episode = self._current()
         episode.action = chosen
         with self.timings.stage("move"):
-            moved = self.embodiment.move(chosen)
+            movement = self.embodiment.move(chosen)
         error_before = episode.pose_error
-        new_surface = self._observe_world()
+        new_surface = self._observe_world(movement)
         lost_for_good = episode.steps_lost >= self.config.lost_patience
         outcome = Outcome(
             divergence=episode.divergence,
@@ -182,7 +184,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
             new_surface_m2=new_surface,
             tracking_ok=episode.tracking_ok,
             lost_for_good=lost_for_good,
-            blocked=not moved,
+            blocked=not movement.made,
         )
         episode.reward_terms = reward_terms(outcome, self.config.reward, self.config.targets)
         reward = float(sum(episode.reward_terms.values()))
@@ -236,9 +238,19 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
         return np.stack(self._current().estimates)
 
     @property
+    def trajectory_kinematics(self) -> Float64:
+        """(N, 4, 4) poses by forward kinematics, tied to the truth at the first."""
+        return np.stack(self._current().kinematics)
+
+    @property
+    def timestamps(self) -> Float64:
+        """(N,) simulated seconds since the start of the episode, of each frame."""
+        return np.array(self._current().times)
+
+    @property
     def divergences(self) -> Float64:
         """(N, 2) divergence of each frame from the one before; zero for the first."""
-        return np.stack(self._current().divergences)
+        return np.stack(self._current().frame_divergences)
 
     @property
     def pose_errors(self) -> Float64:
@@ -267,6 +279,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
             "slam": self.slam.get_state(),
             "embodiment": self.embodiment.get_state(),
             "coverage": self.coverage.get_state(),
+            "T_world_kinematic": self._T_world_kinematic.copy(),
             "random": self.np_random.bit_generator.state,
         }
 
@@ -278,6 +291,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
         self.slam.set_state(state["slam"])
         self.embodiment.set_state(state["embodiment"])
         self.coverage.set_state(state["coverage"])
+        self._T_world_kinematic = state["T_world_kinematic"].copy()
         self.np_random.bit_generator.state = state["random"]
 
     # -- The world ---------------------------------------------------------------------------
@@ -295,49 +309,88 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
         self.sensor: RGBDSensor = get_sensor(
             name, scene_seed, self.config.image_size, self.config.noise
         )
-        self.embodiment = self._make_embodiment(
-            self.scene, self.config.step_m, self.config.step_rad
-        )
+        self.embodiment = self._embodiment_type.build(self.scene, self.config, self.timings)
         self.coverage = CoverageGrid(self.scene)
 
-    def _begin_episode(self, name: str, scene_seed: int, start: Float64) -> None:
-        self.embodiment.reset(start, self.np_random)
+    def _begin_episode(self, name: str, scene_seed: int, start: Float64) -> str:
+        """Put the camera at ``start`` and take the first frame; return why not, or nothing."""
+        try:
+            self.embodiment.reset(start, self.np_random)
+        except UnreachableError as error:
+            return str(error)
         self._episode = EpisodeState(
             scene=name,
             scene_seed=scene_seed,
             noise_seed=int(self.np_random.integers(2**31)),
         )
         self.coverage = CoverageGrid(self.scene)
-        self.slam.reset(start)
-        self._observe_world()
+        here = self.embodiment.T_world_camera
+        self.slam.reset(here)
+        self._observe(here, here, timestamp=0.0)
+        self._current().end_step(np.zeros(2), 0.0)
+        self._T_world_kinematic = here @ invert(self.embodiment.T_world_camera_kinematic)
+        if self.tracking_ok:
+            return ""
+        return f"too few depth readings there in scene {name}: SLAM has nothing to map"
 
-    def _observe_world(self) -> float:
-        """Render, measure, track and judge one frame; return the newly mapped area, m2."""
+    def _observe_world(self, movement: Movement) -> float:
+        """Take and track the frames of a motion; return the newly mapped area, m2."""
         episode = self._current()
-        T_world_camera = self.embodiment.T_world_camera
-        with self.timings.stage("render"):
-            frame = self.sensor.capture(
-                T_world_camera,
-                index=episode.frame_index,
-                seed=episode.noise_seed,
-            )
-        with self.timings.stage("slam"):
-            result = self.slam.track(frame)
+        begin = episode.time_s
+        area = 0.0
+        for T_true, T_kinematic, after in zip(
+            movement.T_world_camera,
+            movement.T_world_camera_kinematic,
+            movement.times_s,
+            strict=True,
+        ):
+            area += self._observe(T_true, self._T_world_kinematic @ T_kinematic, begin + after)
         with self.timings.stage("divergence"):
-            divergence = self._frame_divergence(frame)
-        with self.timings.stage("coverage"):
-            area = self._cover(frame, T_world_camera, result)
-        episode.record(frame, T_world_camera, result, divergence)
+            if len(movement.times_s) == 1:
+                divergence = episode.frame_divergences[-1]
+            else:
+                divergence = self._divergence_from(episode.step_histograms)
+        episode.end_step(divergence, movement.energy_j)
         return area
 
-    def _frame_divergence(self, frame: RGBDFrame) -> Float64:
+    def _observe(self, T_true: Float64, T_kinematic: Float64, timestamp: float) -> float:
+        """Render, track, measure and judge one frame; return the newly mapped area, m2."""
         episode = self._current()
-        grey = intensity_image(frame.color)[None].astype(np.float32)
-        histograms = self._measure.histograms(grey, frame.depth[None])
-        previous, episode.histograms = episode.histograms, histograms
-        if previous is None:
+        with self.timings.stage("render"):
+            frame = self.sensor.capture(
+                T_true, index=episode.frame_index, timestamp=timestamp, seed=episode.noise_seed
+            )
+        first = not episode.truth
+        sighting = Sighting(
+            frame=frame,
+            T_world_camera=T_true,
+            T_world_camera_kinematic=T_kinematic,
+            T_previous_camera_kinematic=relative_motion(
+                T_kinematic if first else episode.kinematics[-1], T_kinematic
+            ),
+            T_world_previous_estimate=T_true if first else episode.estimates[-1],
+        )
+        with self.timings.stage("slam"):
+            if first:
+                result = self.slam.track(frame)
+            else:
+                result = self._pose_source.locate(self.slam, sighting)
+        with self.timings.stage("divergence"):
+            grey = intensity_image(frame.color)[None].astype(np.float32)
+            before = episode.histograms
+            episode.histograms = self._measure.histograms(grey, frame.depth[None])
+            divergence = self._divergence_from(before)
+        with self.timings.stage("coverage"):
+            area = self._cover(frame, T_true, result)
+        episode.record(sighting, result, divergence)
+        return area
+
+    def _divergence_from(self, before: Histograms | None) -> Float64:
+        """(2,) divergence of the last frame from an earlier one; zero from none."""
+        histograms = self._current().histograms
+        if before is None or histograms is None:
             return np.zeros(2)
-        return self._measure.divergence(histograms, previous)[0]
+        return self._measure.divergence(histograms, before)[0]
 
     def _cover(self, frame: RGBDFrame, T_world_camera: Float64, result: TrackResult) -> float:
         if not result.tracking_ok:
@@ -367,15 +420,6 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
         if self._episode is None:
             raise InputError("the environment must be reset before it is used: call env.reset()")
         return self._episode
-
-    def _check_start(self, T_world_camera: Any) -> Float64:
-        start = check_pose(T_world_camera, "reset option T_world_camera")
-        if self.scene.clearance(start[None, :3, 3])[0] < CAMERA_RADIUS_M:
-            raise InputError(
-                f"reset option T_world_camera: no free space of {CAMERA_RADIUS_M} m around "
-                f"{np.round(start[:3, 3], 3).tolist()} in scene {self.scene.name}"
-            )
-        return start
 
     def _check_action(self, action: Any) -> int:
         self._current()
@@ -415,6 +459,8 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
             "reward_terms": dict(episode.reward_terms),
             "action_mask": self.action_masks(),
             "mapped_area": self.coverage.mapped_area,
+            "time": episode.time_s,
+            "energy": episode.energy_j,
             "scene": episode.scene,
             "scene_seed": episode.scene_seed,
         }

@@ -12,7 +12,9 @@ from ms_slam_env.camera import XTION_SIZES
 from ms_slam_env.config import check_choice, check_range
 from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.env.observations import OBSERVATIONS
+from ms_slam_env.env.pose_sources import POSE_SOURCES
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.robot.arm import ArmConfig
 from ms_slam_env.scenes import SCENES, SEED_SPLITS
 
 
@@ -117,6 +119,10 @@ class EnvConfig:
             a small pool is kept in memory.
         image_size: of the camera, width x height.
         noise: sensor noise, ``kinect`` or ``none``.
+        arm: the arm, where the embodiment is one.
+        pose: where the estimated pose comes from: ``slam``, ``slam-kinematics`` (SLAM that starts
+            its search from the arm's forward kinematics), ``kinematics`` (noisy forward kinematics
+            alone; SLAM only maps) or ``ground_truth``. A free camera's kinematics are exact.
         slam: SLAM backend.
         slam_config: options of the backend.
         observation: ``rgbd``, ``features`` or ``lookahead``.
@@ -135,6 +141,8 @@ class EnvConfig:
     num_scene_seeds: int = 4
     image_size: str = "160x120"
     noise: str = "kinect"
+    arm: ArmConfig = field(default_factory=ArmConfig)
+    pose: str = "slam"
     slam: str = "surfel"
     slam_config: dict[str, object] = field(default_factory=dict)
     observation: str = "features"
@@ -151,6 +159,7 @@ class EnvConfig:
         check_choice(self, "split", tuple(SEED_SPLITS))
         check_choice(self, "image_size", tuple(XTION_SIZES))
         check_choice(self, "noise", ("kinect", "none"))
+        check_choice(self, "pose", tuple(POSE_SOURCES))
         check_choice(self, "observation", tuple(OBSERVATIONS))
         check_range(self, "num_scene_seeds", 1, len(SEED_SPLITS[self.split]))
         check_range(self, "step_m", 0, 1)

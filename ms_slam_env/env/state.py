@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.divergence import Histograms
+from ms_slam_env.env.pose_sources import Sighting
 from ms_slam_env.slam.base import TrackResult
 
 Float64 = NDArray[np.float64]
@@ -17,53 +18,67 @@ Float64 = NDArray[np.float64]
 
 @dataclass
 class EpisodeState:
-    """Trajectories, last frame and running measures of one episode."""
+    """Trajectories, last frame and running measures of one episode.
+
+    One step brings one frame or several. ``truth``, ``kinematics``, ``estimates``, ``times``,
+    ``errors`` and ``frame_divergences`` (from the frame before) have an entry a frame; the
+    step's ``divergence`` compares its last frame with the last one of the step before.
+    """
 
     scene: str
     scene_seed: int
     noise_seed: int
     frame_index: int = 0
+    time_s: float = 0.0
+    energy_j: float = 0.0
     action: int = 0
     steps_lost: int = 0
     tracking_ok: bool = True
     inlier_fraction: float = 1.0
     squared_error_sum: float = 0.0
     truth: list[Float64] = field(default_factory=list)
+    kinematics: list[Float64] = field(default_factory=list)
     estimates: list[Float64] = field(default_factory=list)
-    divergences: list[Float64] = field(default_factory=list)
+    times: list[float] = field(default_factory=list)
+    frame_divergences: list[Float64] = field(default_factory=list)
+    divergence: Float64 = field(default_factory=lambda: np.zeros(2))
     errors: list[float] = field(default_factory=list)
     reward_terms: dict[str, float] = field(default_factory=dict)
     histograms: Histograms | None = None
+    step_histograms: Histograms | None = None
     frame: RGBDFrame | None = None
     predicted_divergences: Float64 | None = None
 
-    def record(
-        self, frame: RGBDFrame, T_world_camera: Float64, result: TrackResult, divergence: Float64
-    ) -> None:
-        """Append what one frame brought."""
+    def record(self, sighting: Sighting, result: TrackResult, divergence: Float64) -> None:
+        """Append what one frame brought; ``divergence`` (2,) is from the frame before."""
+        frame = sighting.frame
         self.frame = frame
         self.frame_index += 1
+        self.time_s = frame.timestamp
         self.tracking_ok = result.tracking_ok
         self.inlier_fraction = result.inlier_fraction
-        self.steps_lost = 0 if result.tracking_ok else self.steps_lost + 1
-        self.truth.append(T_world_camera.copy())
+        self.truth.append(sighting.T_world_camera.copy())
+        self.kinematics.append(sighting.T_world_camera_kinematic.copy())
         self.estimates.append(result.T_world_camera.copy())
-        self.divergences.append(divergence)
-        error = float(np.linalg.norm(result.T_world_camera[:3, 3] - T_world_camera[:3, 3]))
+        self.times.append(frame.timestamp)
+        self.frame_divergences.append(divergence)
+        error = float(np.linalg.norm(result.T_world_camera[:3, 3] - sighting.T_world_camera[:3, 3]))
         self.errors.append(error)
         self.squared_error_sum += error**2
         self.predicted_divergences = None
+
+    def end_step(self, divergence: Float64, energy_j: float) -> None:
+        """Close a step after its last frame; ``divergence`` (2,) is from the step before."""
+        self.divergence = divergence
+        self.step_histograms = self.histograms
+        self.energy_j += energy_j
+        self.steps_lost = 0 if self.tracking_ok else self.steps_lost + 1
 
     @property
     def last_frame(self) -> RGBDFrame:
         """The last live frame."""
         assert self.frame is not None  # reset records a frame before anyone can ask
         return self.frame
-
-    @property
-    def divergence(self) -> Float64:
-        """(2,) divergence between the last two live frames; zero after one frame."""
-        return self.divergences[-1]
 
     @property
     def T_world_camera_estimate(self) -> Float64:

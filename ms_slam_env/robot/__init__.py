@@ -1,6 +1,6 @@
 """Motions and embodiments of the camera."""
 
-from ms_slam_env.robot.base import Embodiment
+from ms_slam_env.robot.base import Embodiment, Movement
 from ms_slam_env.robot.free_camera import CAMERA_RADIUS_M, FixedTranslation, FreeCamera
 from ms_slam_env.robot.motions import (
     NUM_MOTIONS,
@@ -22,6 +22,7 @@ __all__ = [
     "Embodiment",
     "FixedTranslation",
     "FreeCamera",
+    "Movement",
     "decompose",
     "describe",
 ]

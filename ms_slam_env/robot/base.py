@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,16 +11,59 @@ from numpy.typing import NDArray
 
 Float64 = NDArray[np.float64]
 
+FRAME_PERIOD_S = 1 / 30
+"""Time between frames of a camera whose carrier has no clock of its own."""
+
+
+@dataclass(frozen=True)
+class Movement:
+    """What one action brought: where the camera was when its ``k >= 1`` frames were taken.
+
+    Attributes:
+        made: whether the motion that was asked for was made.
+        T_world_camera: (k, 4, 4) true poses, in order of time; the last is where it ended.
+        T_world_camera_kinematic: (k, 4, 4) the same poses as the carrier's kinematics report them.
+        times_s: (k,) seconds since the motion began.
+        energy_j: mechanical work spent, joules; 0 for a carrier without mass.
+    """
+
+    made: bool
+    T_world_camera: Float64
+    T_world_camera_kinematic: Float64
+    times_s: Float64
+    energy_j: float = 0.0
+
+    @staticmethod
+    def at_once(made: bool, T_world_camera: Float64) -> Movement:
+        """One frame, one frame period later, at a pose (4, 4) that is known exactly."""
+        pose = np.array(T_world_camera, dtype=np.float64)[None]
+        return Movement(made, pose, pose.copy(), np.array([FRAME_PERIOD_S]))
+
 
 class Embodiment(ABC):
-    """Holds the camera in the world and executes one of ``n`` candidate motions."""
+    """Holds the camera in the world and executes one of ``n`` candidate motions.
+
+    Attributes:
+        T_world_camera: (4, 4) where the camera truly is.
+        T_world_camera_kinematic: (4, 4) where it is by the carrier's kinematics.
+        num_actions: n.
+    """
 
     T_world_camera: Float64
     num_actions: int
 
+    @property
+    def T_world_camera_kinematic(self) -> Float64:
+        """(4, 4) the camera by the carrier's kinematics; the truth for a carrier without joints."""
+        return self.T_world_camera
+
     @abstractmethod
     def reset(self, T_world_camera: Float64, rng: np.random.Generator) -> None:
-        """Put the camera at a start pose (4, 4)."""
+        """Put the camera at, or as near as it settles to, a start pose (4, 4).
+
+        Raises:
+            UnreachableError: it cannot be held there; the message says why.
+        """
 
     @abstractmethod
     def candidate_motions(self) -> Float64:
@@ -30,8 +74,8 @@ class Embodiment(ABC):
         """(n,) whether each motion can be made without touching anything."""
 
     @abstractmethod
-    def move(self, action: int) -> bool:
-        """Make motion ``action`` if nothing blocks it; return whether it was made."""
+    def move(self, action: int) -> Movement:
+        """Make motion ``action``, as far as nothing blocks it."""
 
     @abstractmethod
     def get_state(self) -> dict[str, Any]:

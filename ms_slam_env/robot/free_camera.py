@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env.errors import UnreachableError
 from ms_slam_env.geometry import invert
-from ms_slam_env.robot.base import Embodiment
+from ms_slam_env.robot.base import Embodiment, Movement
 from ms_slam_env.robot.motions import (
     NUM_ROTATIONS,
     NUM_TRANSLATIONS,
@@ -20,6 +21,21 @@ from ms_slam_env.scenes.base import Scene
 Float64 = NDArray[np.float64]
 
 CAMERA_RADIUS_M = 0.1  # half the width of an ASUS Xtion (18 cm), rounded up
+
+
+def check_room(scene: Scene, T_world_camera: Float64) -> Float64:
+    """Return a copy of the pose (4, 4) if the camera's ball has room there.
+
+    Raises:
+        UnreachableError: it has not.
+    """
+    position = T_world_camera[:3, 3]
+    if scene.clearance(position[None])[0] < CAMERA_RADIUS_M:
+        raise UnreachableError(
+            f"no free space of {CAMERA_RADIUS_M} m around {np.round(position, 3).tolist()} "
+            f"in scene {scene.name}"
+        )
+    return np.array(T_world_camera, dtype=np.float64)
 
 
 class FreeCamera(Embodiment):
@@ -36,8 +52,12 @@ class FreeCamera(Embodiment):
         self.T_world_camera = np.eye(4)
 
     def reset(self, T_world_camera: Float64, rng: np.random.Generator) -> None:
-        """Put the camera at a start pose (4, 4)."""
-        self.T_world_camera = np.array(T_world_camera, dtype=np.float64)
+        """Put the camera at a start pose (4, 4).
+
+        Raises:
+            UnreachableError: something is in the way.
+        """
+        self.T_world_camera = check_room(self.scene, T_world_camera)
         self._masks = None
 
     def candidate_motions(self) -> Float64:
@@ -56,13 +76,13 @@ class FreeCamera(Embodiment):
             self._masks = np.repeat(np.array(free), NUM_ROTATIONS)
         return self._masks.copy()
 
-    def move(self, action: int) -> bool:
-        """Make motion ``action`` if nothing blocks it; return whether it was made."""
-        if not self.action_masks()[action]:
-            return False
-        self.T_world_camera = self.T_world_camera @ self._motions[action]
-        self._masks = None
-        return True
+    def move(self, action: int) -> Movement:
+        """Make motion ``action`` if nothing blocks it."""
+        made = bool(self.action_masks()[action])
+        if made:
+            self.T_world_camera = self.T_world_camera @ self._motions[action]
+            self._masks = None
+        return Movement.at_once(made, self.T_world_camera)
 
     def get_state(self) -> dict[str, Any]:
         """The pose."""
@@ -92,8 +112,12 @@ class FixedTranslation(Embodiment):
         self._direction = np.zeros(3)
 
     def reset(self, T_world_camera: Float64, rng: np.random.Generator) -> None:
-        """Put the camera at a start pose (4, 4) and choose the longest of 16 level lines."""
-        self.T_world_camera = np.array(T_world_camera, dtype=np.float64)
+        """Put the camera at a start pose (4, 4) and choose the longest of 16 level lines.
+
+        Raises:
+            UnreachableError: something is in the way.
+        """
+        self.T_world_camera = check_room(self.scene, T_world_camera)
         offset = rng.uniform(0, 2 * np.pi)
         angles = offset + np.arange(self._DIRECTIONS_TRIED) * 2 * np.pi / self._DIRECTIONS_TRIED
         directions = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1)
@@ -127,13 +151,13 @@ class FixedTranslation(Embodiment):
         """(7,) all true: turning is always possible and the line turns back by itself."""
         return np.ones(NUM_ROTATIONS, dtype=bool)
 
-    def move(self, action: int) -> bool:
+    def move(self, action: int) -> Movement:
         """Step along the line and turn; always possible."""
         step = self._translation()
         self.T_world_camera = self.T_world_camera @ self.candidate_motions()[action]
         if step @ self._direction < 0:
             self._direction = -self._direction
-        return True
+        return Movement.at_once(True, self.T_world_camera)
 
     def get_state(self) -> dict[str, Any]:
         """The pose and the line."""

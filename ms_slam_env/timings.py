@@ -31,6 +31,12 @@ class Timings:
             self.total[name] += elapsed
             self.calls[name] += 1
 
+    def clear(self) -> None:
+        """Forget everything."""
+        self.total.clear()
+        self.calls.clear()
+        self.last.clear()
+
     def mean_ms(self) -> dict[str, float]:
         """Mean milliseconds a call of each stage."""
         return {name: 1e3 * self.total[name] / self.calls[name] for name in self.total}

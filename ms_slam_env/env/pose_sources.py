@@ -1,0 +1,89 @@
+"""Where the estimated pose comes from: SLAM, forward kinematics, or the truth."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.camera import RGBDFrame
+from ms_slam_env.geometry import invert
+from ms_slam_env.slam.base import SlamBackend, TrackResult
+
+Float64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A frame and what is known of where it was taken, without looking at it.
+
+    Attributes:
+        frame: the live frame.
+        T_world_camera: (4, 4) the truth.
+        T_world_camera_kinematic: (4, 4) by forward kinematics, which start at the true start pose.
+        T_previous_camera_kinematic: (4, 4) motion since the frame before, by forward kinematics.
+        T_world_previous_estimate: (4, 4) estimate at the frame before.
+    """
+
+    frame: RGBDFrame
+    T_world_camera: Float64
+    T_world_camera_kinematic: Float64
+    T_previous_camera_kinematic: Float64
+    T_world_previous_estimate: Float64
+
+
+class PoseSource(ABC):
+    """Says where a frame was taken and has it fused into the map."""
+
+    @abstractmethod
+    def locate(self, slam: SlamBackend, sighting: Sighting) -> TrackResult:
+        """Estimate the pose of a frame that is not the first."""
+
+
+class SlamPose(PoseSource):
+    """SLAM tracks the frame; it knows nothing of joints."""
+
+    def locate(self, slam: SlamBackend, sighting: Sighting) -> TrackResult:
+        """Track."""
+        return slam.track(sighting.frame)
+
+
+class GuessedSlamPose(PoseSource):
+    """SLAM tracks the frame, starting from the motion that the kinematics report."""
+
+    def locate(self, slam: SlamBackend, sighting: Sighting) -> TrackResult:
+        """Track from the last estimate, moved as the joints moved."""
+        guess = sighting.T_world_previous_estimate @ sighting.T_previous_camera_kinematic
+        return slam.track(sighting.frame, guess)
+
+
+class KinematicPose(PoseSource):
+    """Forward kinematics alone, with their noise and bias; SLAM only maps."""
+
+    def locate(self, slam: SlamBackend, sighting: Sighting) -> TrackResult:
+        """Fuse at the kinematic pose."""
+        return slam.fuse(sighting.frame, sighting.T_world_camera_kinematic)
+
+
+class TruePose(PoseSource):
+    """The true pose: what a perfect tracker would leave to mapping."""
+
+    def locate(self, slam: SlamBackend, sighting: Sighting) -> TrackResult:
+        """Fuse at the true pose."""
+        return slam.fuse(sighting.frame, sighting.T_world_camera)
+
+
+def relative_motion(T_world_a: Float64, T_world_b: Float64) -> Float64:
+    """``T_a_b`` (4, 4)."""
+    return invert(T_world_a) @ T_world_b
+
+
+POSE_SOURCES: dict[str, type[PoseSource]] = {
+    "slam": SlamPose,
+    "slam-kinematics": GuessedSlamPose,
+    "kinematics": KinematicPose,
+    "ground_truth": TruePose,
+}
+"""Name of the option ``pose`` to variant."""

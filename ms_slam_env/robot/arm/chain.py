@@ -1,0 +1,112 @@
+"""A serial chain of hinges from the base to the camera: forward kinematics and Jacobian."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float64 = NDArray[np.float64]
+Int32 = NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Geometry of an arm with ``n`` joints and ``m`` capsules around its links.
+
+    Link 0 is the base, link ``i`` moves with joint ``i - 1``. The frame of a moving link has its
+    origin on the axis of its joint.
+
+    Attributes:
+        T_parent_joint: (n, 4, 4) frame of each joint at angle 0 in the link before it.
+        axes: (n, 3) unit axis of each joint in its own frame.
+        T_last_camera: (4, 4) camera in the last link: x right, y down, z forward.
+        lower: (n,) lower joint limits, radians; -inf where there is none.
+        upper: (n,) upper joint limits, radians; inf where there is none.
+        speed: (n,) greatest joint speeds, radians a second.
+        capsule_link: (m,) the link that each capsule belongs to.
+        capsule_ends: (m, 2, 3) ends of its axis in the link's frame; equal ends make a ball.
+        capsule_radius: (m,) metres.
+        self_pairs: (p, 2) capsules that must stay apart.
+    """
+
+    T_parent_joint: Float64
+    axes: Float64
+    T_last_camera: Float64
+    lower: Float64
+    upper: Float64
+    speed: Float64
+    capsule_link: Int32
+    capsule_ends: Float64
+    capsule_radius: Float64
+    self_pairs: Int32
+
+    @property
+    def num_joints(self) -> int:
+        """Number of joints."""
+        return len(self.axes)
+
+    def link_poses(self, q: Float64) -> Float64:
+        """Poses ``T_base_link`` (..., n + 1, 4, 4) of the links at joint angles (..., n)."""
+        angles = np.asarray(q, dtype=np.float64)
+        poses = np.empty((*angles.shape[:-1], self.num_joints + 1, 4, 4))
+        poses[..., 0, :, :] = np.eye(4)
+        for i in range(self.num_joints):
+            turned = self.T_parent_joint[i] @ _rotation(self.axes[i], angles[..., i])
+            poses[..., i + 1, :, :] = poses[..., i, :, :] @ turned
+        return poses
+
+    def camera_pose(self, q: Float64) -> Float64:
+        """Pose ``T_base_camera`` (..., 4, 4) at joint angles (..., n)."""
+        return self.link_poses(q)[..., -1, :, :] @ self.T_last_camera
+
+    def camera_jacobian(self, q: Float64) -> Float64:
+        """(6, n) linear, then angular velocity of the camera in the base frame, per joint speed."""
+        links = self.link_poses(q)[1:]
+        axes = np.einsum("nij,nj->ni", links[:, :3, :3], self.axes)
+        arms = (links[-1] @ self.T_last_camera)[:3, 3] - links[:, :3, 3]
+        return np.concatenate([np.cross(axes, arms), axes], axis=1).T
+
+    def capsules(self, q: Float64) -> Float64:
+        """Ends (..., m, 2, 3) of the capsules' axes in the base frame at joint angles (..., n)."""
+        poses = self.link_poses(q)[..., self.capsule_link, :, :]  # (..., m, 4, 4)
+        R, t = poses[..., :3, :3], poses[..., :3, 3]
+        return np.einsum("...mij,mkj->...mki", R, self.capsule_ends) + t[..., None, :]
+
+    def within_limits(self, q: Float64, margin_rad: float = 0.0) -> NDArray[np.bool_]:
+        """(...,) whether joint angles (..., n) keep ``margin_rad`` from every limit."""
+        inside = (q >= self.lower + margin_rad) & (q <= self.upper - margin_rad)
+        return np.asarray(inside.all(axis=-1))
+
+
+def _rotation(axis: Float64, angle: Float64) -> Float64:
+    """Rotations (..., 4, 4) about a unit axis (3,) by angles (...,): Rodrigues' formula."""
+    x, y, z = axis
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    turned = np.zeros((*np.shape(angle), 4, 4))
+    sine, cosine = np.sin(angle)[..., None, None], np.cos(angle)[..., None, None]
+    turned[..., :3, :3] = np.eye(3) + sine * K + (1 - cosine) * (K @ K)
+    turned[..., 3, 3] = 1
+    return turned
+
+
+def segment_distance(a: Float64, b: Float64) -> Float64:
+    """Distances (...,) between segments ``a`` and ``b`` (..., 2, 3).
+
+    Lumelsky's closest points by clamping (Ericson, Real-Time Collision Detection, 5.1.9).
+    """
+    d1, d2 = a[..., 1, :] - a[..., 0, :], b[..., 1, :] - b[..., 0, :]
+    r = a[..., 0, :] - b[..., 0, :]
+    tiny = 1e-12
+    aa, ee = (d1 * d1).sum(-1), (d2 * d2).sum(-1)
+    bb, cc, ff = (d1 * d2).sum(-1), (d1 * r).sum(-1), (d2 * r).sum(-1)
+    denominator = aa * ee - bb * bb
+    parallel = denominator <= tiny
+    s = np.where(parallel, 0.0, (bb * ff - cc * ee) / np.where(parallel, 1.0, denominator))
+    s = np.clip(s, 0.0, 1.0)
+    t = (bb * s + ff) / np.maximum(ee, tiny)
+    clamped = np.clip(t, 0.0, 1.0)
+    s = np.where(t == clamped, s, np.clip((bb * clamped - cc) / np.maximum(aa, tiny), 0.0, 1.0))
+    gap = r + d1 * s[..., None] - d2 * clamped[..., None]
+    return np.sqrt((gap * gap).sum(-1))

@@ -1,0 +1,94 @@
+"""Configuration of an arm: model, place, speed, controller and imperfections."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from ms_slam_env.config import check_range
+from ms_slam_env.errors import InputError
+
+
+@dataclass(frozen=True)
+class ArmNoise:
+    """Imperfections of an arm beyond the sag and lag that follow from its physics.
+
+    Drawn once an episode: zero offsets of the joint sensors, hand-eye calibration. Drawn all the
+    time: reading noise, vibration. All zero is a perfect arm.
+
+    Attributes:
+        joint_offset_rad: standard deviation of a joint's zero offset: kinematics' bias.
+        encoder_rad: standard deviation of one joint reading.
+        hand_eye_m: standard deviation, per axis, of the camera's assumed place on the hand.
+        hand_eye_rad: the same for its orientation.
+        backlash_rad: play of each gear, from end to end.
+        vibration_nm: standard deviation of the torque noise of a joint moving at full speed, for
+            the joint with the greatest torque; in proportion to torque for the others.
+    """
+
+    joint_offset_rad: float = math.radians(0.2)
+    encoder_rad: float = math.radians(0.02)
+    hand_eye_m: float = 0.002
+    hand_eye_rad: float = math.radians(0.3)
+    backlash_rad: float = math.radians(0.1)
+    vibration_nm: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        for name in ("joint_offset_rad", "encoder_rad", "hand_eye_rad", "backlash_rad"):
+            check_range(self, name, 0, math.radians(20))
+        check_range(self, "hand_eye_m", 0, 0.1)
+        check_range(self, "vibration_nm", 0, 100)
+
+
+@dataclass(frozen=True)
+class ArmConfig:
+    """An arm that holds the camera.
+
+    Attributes:
+        model: ``mico``, or the path of an MJCF file whose hinges lead to a site with the axes of a
+            camera (x right, y down, z forward).
+        camera_site: name of that site.
+        base: x, y, z (metres) and yaw (radians) of the arm's base in the world; None puts the arm
+            where it can hold the camera at the start pose.
+        frames_per_action: frames that reach SLAM during one motion, the last at its end; None for
+            as many as arrive at ``camera_hz`` while the arm moves at its real speed.
+        camera_hz: frames a second.
+        speed_m_s: speed of the camera; Kinova states 0.2 m/s for the Mico.
+        speed_rad_s: rate of turn of the camera.
+        joint_speed_rad_s: limit for every joint of a model that does not state its own.
+        control_hz: rate at which the controller solves the differential inverse kinematics.
+        clearance_m: distance that the links keep from furniture and from each other.
+        noise: imperfections.
+    """
+
+    model: str = "mico"
+    camera_site: str = "camera"
+    base: tuple[float, float, float, float] | None = None
+    frames_per_action: int | None = None
+    camera_hz: float = 10.0
+    speed_m_s: float = 0.2
+    speed_rad_s: float = math.radians(36)
+    joint_speed_rad_s: float = 1.0
+    control_hz: float = 25.0
+    clearance_m: float = 0.02
+    noise: ArmNoise = field(default_factory=ArmNoise)
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        if self.frames_per_action is not None:
+            check_range(self, "frames_per_action", 1, 1000)
+        check_range(self, "camera_hz", 0.1, 30)
+        check_range(self, "speed_m_s", 0.001, 5)
+        check_range(self, "speed_rad_s", 0.001, 20)
+        check_range(self, "joint_speed_rad_s", 0.001, 20)
+        check_range(self, "control_hz", 5, 500)
+        check_range(self, "clearance_m", 0, 0.5)
+        if self.base is not None:
+            numbers = isinstance(self.base, (tuple, list)) and len(self.base) == 4
+            if not numbers or not all(
+                isinstance(v, (int, float)) and math.isfinite(v) for v in self.base
+            ):
+                raise InputError(
+                    f"ArmConfig.base = {self.base!r} must be four numbers, x, y, z and yaw, or None"
+                )

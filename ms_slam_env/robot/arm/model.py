@@ -1,0 +1,177 @@
+"""An arm read from an MJCF file: MuJoCo's model of it and the chain that leads to the camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import make_pose
+from ms_slam_env.robot.arm.capsules import link_capsules, separate_pairs
+from ms_slam_env.robot.arm.chain import Chain
+
+Float64 = NDArray[np.float64]
+Int32 = NDArray[np.int32]
+
+ARM_MODELS = {"mico": Path(__file__).with_name("mico.xml")}
+"""Arms that come with the package."""
+
+
+@dataclass(frozen=True)
+class ArmModel:
+    """MuJoCo's model and what the planner needs of it; shared, never changed.
+
+    Attributes:
+        path: the MJCF file.
+        mj: the compiled model, its base at the origin.
+        chain: the ``n`` hinges from base to camera.
+        qpos: (n,) places of the hinges in MuJoCo's ``qpos``.
+        dof: (n,) places in ``qvel``.
+        actuators: (n,) the position actuator of each hinge.
+        camera_site: id of the camera's site.
+        home: (n,) joint angles to start a search from: key frame ``home``, or the initial state.
+    """
+
+    path: Path
+    mj: mujoco.MjModel
+    chain: Chain
+    qpos: Int32
+    dof: Int32
+    actuators: Int32
+    camera_site: int
+    home: Float64
+
+
+@lru_cache(maxsize=8)
+def load_arm(model: str, camera_site: str = "camera", joint_speed_rad_s: float = 1.0) -> ArmModel:
+    """Read arm ``model``: a name of ``ARM_MODELS`` or the path of an MJCF file.
+
+    The file needs a site ``camera_site`` with the axes of a camera (x right, y down, z forward)
+    that hinges lead to, each with a position actuator and no other joint between. A ``<custom>``
+    numeric ``joint_speed`` gives the greatest speeds of the joints in radians a second,
+    ``joint_speed_rad_s`` holds where it is missing. Joints beside the chain keep their initial
+    place.
+
+    Raises:
+        InputError: no such file, not an MJCF, no such site, or joints that make no serial arm.
+    """
+    path = ARM_MODELS.get(model, Path(model))
+    mj = _compile(model, path)
+    site = mujoco.mj_name2id(mj, mujoco.mjtObj.mjOBJ_SITE, camera_site)
+    if site < 0:
+        sites = ", ".join(mj.site(i).name for i in range(mj.nsite)) or "none"
+        raise InputError(f"arm {path}: no site named {camera_site!r}; its sites: {sites}")
+    joints = _joints_to(mj, int(mj.site_bodyid[site]), path)
+    qpos = mj.jnt_qposadr[joints].astype(np.int32)
+    key = mujoco.mj_name2id(mj, mujoco.mjtObj.mjOBJ_KEY, "home")
+    home = (mj.key_qpos[key] if key >= 0 else mj.qpos0)[qpos].copy()
+    speed = _joint_speed(mj, joints, joint_speed_rad_s, path)
+    chain = _chain(mj, joints, site, speed, home)
+    return ArmModel(
+        path=path,
+        mj=mj,
+        chain=chain,
+        qpos=qpos,
+        dof=mj.jnt_dofadr[joints].astype(np.int32),
+        actuators=_actuators(mj, joints, path),
+        camera_site=site,
+        home=home,
+    )
+
+
+def _compile(model: str, path: Path) -> mujoco.MjModel:
+    if not path.is_file():
+        raise InputError(
+            f"unknown arm {model!r}; valid choices: {', '.join(ARM_MODELS)}, "
+            "or the path of an MJCF file"
+        )
+    try:
+        return mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"arm {path}: MuJoCo cannot read it: {reason}") from None
+
+
+def _joints_to(mj: mujoco.MjModel, body: int, path: Path) -> Int32:
+    """Ids of the hinges on the way from the world to ``body``, in that order."""
+    joints: list[int] = []
+    while body > 0:
+        first, count = int(mj.body_jntadr[body]), int(mj.body_jntnum[body])
+        if count > 1:
+            raise InputError(f"arm {path}: body {mj.body(body).name!r} has {count} joints, not one")
+        if count == 1:
+            if mj.jnt_type[first] != mujoco.mjtJoint.mjJNT_HINGE:
+                raise InputError(
+                    f"arm {path}: joint {mj.joint(first).name!r} on the way to the camera "
+                    "is not a hinge"
+                )
+            joints.append(first)
+        body = int(mj.body_parentid[body])
+    if not joints:
+        raise InputError(f"arm {path}: no joint moves the camera's site")
+    return np.array(joints[::-1], dtype=np.int32)
+
+
+def _actuators(mj: mujoco.MjModel, joints: Int32, path: Path) -> Int32:
+    found = []
+    for joint in joints:
+        drives = (mj.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (
+            mj.actuator_trnid[:, 0] == joint
+        )
+        holds = mj.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
+        place = np.flatnonzero(drives & holds & (mj.actuator_biasprm[:, 1] < 0))
+        if len(place) != 1:
+            raise InputError(
+                f"arm {path}: joint {mj.joint(joint).name!r} needs one position actuator, "
+                f"it has {len(place)}"
+            )
+        found.append(int(place[0]))
+    return np.array(found, dtype=np.int32)
+
+
+def _joint_speed(mj: mujoco.MjModel, joints: Int32, fallback: float, path: Path) -> Float64:
+    numeric = mujoco.mj_name2id(mj, mujoco.mjtObj.mjOBJ_NUMERIC, "joint_speed")
+    if numeric < 0:
+        return np.full(len(joints), fallback)
+    start, size = int(mj.numeric_adr[numeric]), int(mj.numeric_size[numeric])
+    speed = mj.numeric_data[start : start + size].copy()
+    if size != len(joints) or not (speed > 0).all():
+        raise InputError(
+            f"arm {path}: numeric joint_speed must be {len(joints)} numbers above 0, has {speed}"
+        )
+    return speed
+
+
+def _chain(mj: mujoco.MjModel, joints: Int32, site: int, speed: Float64, home: Float64) -> Chain:
+    """Read the chain off the model's state at joint angles 0."""
+    data = mujoco.MjData(mj)
+    data.qpos[:] = mj.qpos0
+    data.qpos[mj.jnt_qposadr[joints]] = 0
+    mujoco.mj_kinematics(mj, data)
+    bodies = mj.jnt_bodyid[joints]
+    rotations = data.xmat[bodies].reshape(-1, 3, 3)
+    links = [np.eye(4)]
+    links += [
+        make_pose(R, anchor) for R, anchor in zip(rotations, data.xanchor[joints], strict=True)
+    ]
+    site_pose = make_pose(data.site_xmat[site].reshape(3, 3), data.site_xpos[site])
+    limited = mj.jnt_limited[joints].astype(bool)
+    capsules = link_capsules(mj, data, bodies, np.stack(links))
+    chain = Chain(
+        T_parent_joint=np.linalg.inv(links[:-1]) @ links[1:],
+        axes=mj.jnt_axis[joints].copy(),
+        T_last_camera=np.linalg.inv(links[-1]) @ site_pose,
+        lower=np.where(limited, mj.jnt_range[joints, 0], -np.inf),
+        upper=np.where(limited, mj.jnt_range[joints, 1], np.inf),
+        speed=speed,
+        capsule_link=capsules.link,
+        capsule_ends=capsules.ends,
+        capsule_radius=capsules.radius,
+        self_pairs=np.zeros((0, 2), dtype=np.int32),
+    )
+    return separate_pairs(chain, home)
