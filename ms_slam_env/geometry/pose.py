@@ -15,10 +15,13 @@ def check_pose(T: ArrayLike, name: str = "pose") -> Array:
     """Return ``T`` as float64 (4, 4) after checking that it is a rigid motion.
 
     Raises:
-        InputError: wrong shape, a value that is not finite, or a rotation part that is not
-            orthonormal to 1e-4 with determinant +1.
+        InputError: not numbers, wrong shape, a value that is not finite, or a rotation part that
+            is not orthonormal to 1e-4 with determinant +1.
     """
-    matrix = np.asarray(T, dtype=np.float64)
+    try:
+        matrix = np.asarray(T, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} must be a (4, 4) array of numbers, got {T!r}") from None
     if matrix.shape != (4, 4):
         raise InputError(f"{name} must have shape (4, 4), got {matrix.shape}")
     if not np.isfinite(matrix).all():

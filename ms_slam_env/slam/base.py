@@ -64,11 +64,27 @@ class SlamBackend(ABC):
         """Forget everything; the next frame is taken at ``T_world_camera`` (identity if None)."""
 
     @abstractmethod
-    def track(self, frame: RGBDFrame) -> TrackResult:
+    def track(self, frame: RGBDFrame, T_world_camera_guess: ArrayLike | None = None) -> TrackResult:
         """Estimate the pose of ``frame`` and fuse it into the map.
 
+        Args:
+            frame: the sensor's frame.
+            T_world_camera_guess: (4, 4) where the camera may be, such as an arm's forward
+                kinematics says. One more pose to start the alignment from, no constraint; the
+                first frame after ``reset`` is taken at the pose given there.
+
         Raises:
-            InputError: the frame's size is not that of the intrinsics.
+            InputError: the frame's size is not that of the intrinsics, or the guess is no pose.
+        """
+
+    @abstractmethod
+    def fuse(self, frame: RGBDFrame, T_world_camera: ArrayLike) -> TrackResult:
+        """Fuse ``frame`` into the map at a pose (4, 4) that is known; nothing is tracked.
+
+        ``track`` may go on from there.
+
+        Raises:
+            InputError: the frame's size is not that of the intrinsics, or the pose is none.
         """
 
     @abstractmethod

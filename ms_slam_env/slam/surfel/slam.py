@@ -1,4 +1,4 @@
-"""The surfel SLAM: preprocess, track against the map's view, fuse, render the next view.
+"""The surfel SLAM: preprocess, render the map, track the frame against that view, fuse.
 
 ElasticFusion (Whelan et al., RSS 2015, figure 2) without loop closure. While tracking is lost the
 pose is held, nothing is fused, and every frame is tried against the map around the last good pose.
@@ -8,22 +8,24 @@ centimetres a view seldom lasts until its surfels are stable.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env._warp import wp
-from ms_slam_env.camera import Intrinsics, RGBDFrame
+from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import check_pose
-from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult, Views
+from ms_slam_env.geometry import check_pose, invert
+from ms_slam_env.slam.base import Float64, TrackResult
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.preprocess import Preprocessor
 from ms_slam_env.slam.surfel.seeds import NUM_SEEDS, relocalisation_seeds, tracking_seeds
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.tracking import Alignment, Tracker
-from ms_slam_env.slam.surfel.types import LiveFrame
+from ms_slam_env.slam.surfel.types import LiveFrame, ModelView
 from ms_slam_env.slam.surfel.verdict import (
     REASONS,
     STAT_INLIER_FRACTION,
@@ -57,7 +59,8 @@ class BatchedSurfelSlam:
         self._started = np.zeros(batch, dtype=bool)
         self._lost = np.zeros(batch, dtype=np.int32)  # frames since tracking was lost
         self._time = np.zeros(batch, dtype=np.int32)
-        self._view = self.map.render_model(self._device_poses)
+        self._view: ModelView
+        self._view_poses: Float64 | None = None  # of ``_view``; None: the maps have changed since
 
     def reset(self, T_world_camera: ArrayLike | None = None, env: int = 0) -> None:
         """Forget one env; its next frame is taken at ``T_world_camera`` (identity if None)."""
@@ -68,13 +71,53 @@ class BatchedSurfelSlam:
         self._lost[env] = 0
         self._time[env] = 0
         self.map.clear(env)
+        self._view_poses = None
 
-    def track(self, color: NDArray[np.uint8], depth: NDArray[np.float32]) -> list[TrackResult]:
+    def track(
+        self,
+        color: NDArray[np.uint8],
+        depth: NDArray[np.float32],
+        T_world_camera_guess: Sequence[ArrayLike | None] | None = None,
+    ) -> list[TrackResult]:
         """Track and fuse one frame per env: colour (B, H, W, 3) uint8, depth (B, H, W) metres.
 
+        ``T_world_camera_guess`` holds for every env a pose (4, 4) to start from too, or None.
+
         Raises:
-            InputError: another batch or image size; NaN, infinite or negative depth.
+            InputError: another batch or image size; NaN, infinite or negative depth; a guess
+                that is no pose.
         """
+        self._check_images(color, depth)
+        guesses = self._check_guesses(T_world_camera_guess)
+        live = self.preprocess(color, depth)
+        results = self._locate(live, guesses)
+        good = np.array([result.tracking_ok for result in results])
+        self._fuse(live, good)
+        return results
+
+    def fuse(
+        self, color: NDArray[np.uint8], depth: NDArray[np.float32], T_world_camera: Float64
+    ) -> list[TrackResult]:
+        """Fuse one frame per env at known poses (B, 4, 4), without tracking.
+
+        Raises:
+            InputError: another batch or image size; NaN, infinite or negative depth; no poses.
+        """
+        self._check_images(color, depth)
+        poses = self._check_poses(T_world_camera)
+        live = self.preprocess(color, depth)
+        for env in range(self.batch):
+            moves_on = self._started[env] and not self._lost[env]
+            motion = invert(self.poses[env]) @ poses[env]
+            self._motions[env] = motion if moves_on else np.eye(4)
+            # With too little to see, the first frame that is tracked starts the map.
+            self._started[env] = self._started[env] or self._readings(env, live) >= FEWEST_READINGS
+        self.poses = poses
+        self._lost[:] = 0
+        self._fuse(live, np.ones(self.batch, dtype=bool))
+        return [TrackResult(pose.copy(), True) for pose in poses]
+
+    def _check_images(self, color: NDArray[np.uint8], depth: NDArray[np.float32]) -> None:
         size = (self.batch, *self.intrinsics.shape)
         if color.shape != (*size, 3) or depth.shape != size:
             raise InputError(
@@ -82,15 +125,33 @@ class BatchedSurfelSlam:
             )
         if not (depth.min() >= 0 and depth.max() < np.inf):
             raise InputError("depth holds NaN, infinite or negative values; 0 means no reading")
-        live = self.preprocess(color, depth)
-        results = self._locate(live)
-        good = np.array([result.tracking_ok for result in results])
-        self._fuse(live, good)
-        self._render()
-        self._time += 1
-        return results
 
-    def _locate(self, live: LiveFrame) -> list[TrackResult]:
+    def _check_poses(self, poses: Float64) -> Float64:
+        if np.ndim(poses) != 3 or len(poses) != self.batch:
+            raise InputError(
+                f"T_world_camera must have shape {(self.batch, 4, 4)}, got {np.shape(poses)}"
+            )
+        return np.stack([check_pose(pose, "T_world_camera") for pose in poses])
+
+    def _check_guesses(self, guesses: Sequence[ArrayLike | None] | None) -> Float64 | None:
+        """Guesses (B, 4, 4), NaN where an env has none; None if none has."""
+        if guesses is None:
+            return None
+        if len(guesses) != self.batch:
+            raise InputError(
+                f"T_world_camera_guess must hold {self.batch} poses or None, got {len(guesses)}"
+            )
+        if all(guess is None for guess in guesses):
+            return None
+        none = np.full((4, 4), np.nan)
+        return np.stack(
+            [
+                none if guess is None else check_pose(guess, "T_world_camera_guess")
+                for guess in guesses
+            ]
+        )
+
+    def _locate(self, live: LiveFrame, guesses: Float64 | None) -> list[TrackResult]:
         """Poses of the live frames: given for the first, tracked or searched for the others."""
         self.tracker.set_frame(live)
         lost = self._lost > 0
@@ -103,33 +164,57 @@ class BatchedSurfelSlam:
             ]
         )
         limits = make_limits(lost, self._lost)
-        alignment = self.tracker.align(self._view, self.poses, seeds, limits)
+        view = self._render(self.poses)
+        alignment = self.tracker.align(view, self.poses, seeds, limits, guesses)
+        if guesses is not None:
+            alignment = self._search_at_guess(alignment, guesses)
         alignment = self._search_again(alignment)
         return [
             self._accept(env, alignment) if self._started[env] else self._start(env, live)
             for env in range(self.batch)
         ]
 
+    def _search_at_guess(self, alignment: Alignment, guesses: Float64) -> Alignment:
+        """Align the envs that failed with the view from their guess, under stricter limits.
+
+        A large motion leaves little of the last pose's view in sight.
+        """
+        failed = self._failed(alignment) & np.isfinite(guesses[:, 0, 0])
+        if not failed.any():
+            return alignment
+        origins = np.where(failed[:, None, None], guesses, self.poses)
+        seeds = np.tile(tracking_seeds(np.eye(4)), (self.batch, 1, 1, 1))
+        limits = make_limits(np.ones(self.batch, dtype=bool), self._lost)
+        again = self.tracker.align(self._render(origins), origins, seeds, limits)
+        again = replace(again, T_model_live=invert(self.poses) @ again.T_world_live)
+        return alignment.replace(failed & (again.verdict == 0), again)
+
     def _search_again(self, alignment: Alignment) -> Alignment:
         """Give the envs that failed more starting poses, under stricter limits."""
         strict = np.ones(self.batch, dtype=bool)
         for attempt in range(1, 1 + RETRIES):
-            failed = self._started & (alignment.verdict != 0)
+            failed = self._failed(alignment)
             if not failed.any():
                 break
             seeds = np.stack(
                 [relocalisation_seeds(attempt + RETRIES * int(lost)) for lost in self._lost]
             )
             again = self.tracker.align(
-                self._view, self.poses, seeds, make_limits(strict, self._lost)
+                self._render(self.poses), self.poses, seeds, make_limits(strict, self._lost)
             )
             alignment = alignment.replace(failed & (again.verdict == 0), again)
         return alignment
 
+    def _failed(self, alignment: Alignment) -> NDArray[np.bool_]:
+        return self._started & (alignment.verdict != 0)
+
+    def _readings(self, env: int, live: LiveFrame) -> float:
+        """Share of a frame's pixels that have depth."""
+        return float((live.depth[env].numpy() > 0).mean())
+
     def _start(self, env: int, live: LiveFrame) -> TrackResult:
         """Take the first frame at the given pose, if there is something in it to map."""
-        readings = float((live.depth[env].numpy() > 0).mean())
-        if readings < FEWEST_READINGS:
+        if self._readings(env, live) < FEWEST_READINGS:
             reason = "the first frame has too few depth readings"
             return TrackResult(self.poses[env].copy(), False, inlier_fraction=0.0, reason=reason)
         self._started[env] = True
@@ -158,6 +243,9 @@ class BatchedSurfelSlam:
 
     def _fuse(self, live: LiveFrame, good: NDArray[np.bool_]) -> None:
         """Fuse the frames with a good pose; a fast camera's readings weigh less."""
+        if not good.any():
+            self._time += 1
+            return
         self._device_poses.assign(self.poses.astype(np.float32))
         self._device_time.assign(self._time)
         self._device_weight.assign(motion_weight(self._motions))
@@ -165,11 +253,16 @@ class BatchedSurfelSlam:
         self.map.fuse(
             live, self._device_poses, self._device_time, self._device_weight, self._device_mask
         )
+        self._time += 1
+        self._view_poses = None
 
-    def _render(self) -> None:
-        """Render the map from the current poses: what the next frame is tracked against."""
-        self._device_poses.assign(self.poses.astype(np.float32))
-        self._view = self.map.render_model(self._device_poses)
+    def _render(self, poses: Float64) -> ModelView:
+        """Render the maps from ``poses`` (B, 4, 4), unless that view is at hand."""
+        if self._view_poses is None or not np.array_equal(self._view_poses, poses):
+            self._device_poses.assign(poses.astype(np.float32))
+            self._view = self.map.render_model(self._device_poses)
+            self._view_poses = poses.copy()
+        return self._view
 
     def get_state(self) -> dict[str, Any]:
         """Everything needed to go on bit-exactly, as NumPy arrays."""
@@ -190,7 +283,7 @@ class BatchedSurfelSlam:
         self._lost = state["lost"].copy()
         self._time = state["time"].copy()
         self.map.set_state(state["map"])
-        self._render()
+        self._view_poses = None
 
 
 def motion_weight(motions: Float64) -> NDArray[np.float32]:
@@ -202,66 +295,3 @@ def motion_weight(motions: Float64) -> NDArray[np.float32]:
     cosine = (np.trace(motions[:, :3, :3], axis1=1, axis2=2) - 1) / 2
     size = np.maximum(distance, np.arccos(np.clip(cosine, -1, 1)))
     return np.maximum(0.5, 1 - size / 0.2).astype(np.float32)
-
-
-class SurfelSlam(SlamBackend):
-    """The surfel SLAM of one camera."""
-
-    def __init__(
-        self, intrinsics: Intrinsics, config: SurfelConfig | None = None, device: str = "cpu"
-    ) -> None:
-        """Start empty at the identity pose."""
-        self.intrinsics = intrinsics
-        self.config = config or SurfelConfig()
-        self._slam = BatchedSurfelSlam(1, intrinsics, self.config, device)
-
-    @property
-    def map(self) -> SurfelMap:
-        """The surfels."""
-        return self._slam.map
-
-    def reset(self, T_world_camera: ArrayLike | None = None) -> None:
-        """Forget everything; the next frame is taken at ``T_world_camera`` (identity if None)."""
-        self._slam.reset(T_world_camera)
-
-    def track(self, frame: RGBDFrame) -> TrackResult:
-        """Estimate the pose of ``frame`` and fuse it into the map.
-
-        Raises:
-            InputError: the frame's size is not that of the intrinsics.
-        """
-        self.intrinsics.check_image(frame.depth, "frame")
-        return self._slam.track(frame.color[None], frame.depth[None])[0]
-
-    def predict(self, poses: ArrayLike, scale: float = 1.0) -> Views:
-        """Render the map from ``poses`` (N, 4, 4) T_world_camera at ``scale`` times the size.
-
-        Raises:
-            InputError: poses of another shape, or a scale outside (0, 1].
-        """
-        stack = np.asarray(poses, dtype=np.float64)
-        if stack.ndim != 3 or stack.shape[1:] != (4, 4):
-            raise InputError(f"poses must have shape (N, 4, 4), got {stack.shape}")
-        if not 0 < scale <= 1:
-            raise InputError(f"scale = {scale} is outside (0, 1]")
-        return self.map.predict(stack, scale)
-
-    def surface_points(self) -> Float64:
-        """All living surfels (M, 3): the stable ones and the young ones seen of late.
-
-        Episodes are too short for most surfels to become stable, and the map itself removes
-        those that stay unconfirmed.
-        """
-        return self.map.points(stable=False)
-
-    def surface_colors(self) -> NDArray[np.uint8]:
-        """Colours (M, 3) RGB of ``surface_points``."""
-        return self.map.colors(stable=False)
-
-    def get_state(self) -> dict[str, Any]:
-        """Everything needed to go on bit-exactly, as NumPy arrays."""
-        return self._slam.get_state()
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state that ``get_state`` returned."""
-        self._slam.set_state(state)

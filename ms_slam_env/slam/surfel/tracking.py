@@ -14,9 +14,16 @@ from numpy.typing import NDArray
 
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
+from ms_slam_env.geometry import invert
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.launches import Launches
-from ms_slam_env.slam.surfel.normal_equations import NUM_SUMS, RUNNING, Weights, accumulate
+from ms_slam_env.slam.surfel.normal_equations import (
+    NUM_SUMS,
+    OFF,
+    RUNNING,
+    Weights,
+    accumulate,
+)
 from ms_slam_env.slam.surfel.preprocess import copy_in
 from ms_slam_env.slam.surfel.pyramid import Level, Pyramid
 from ms_slam_env.slam.surfel.solve import gauss_newton_step, reduce_sums
@@ -33,7 +40,7 @@ Float64 = NDArray[np.float64]
 
 SEARCH_POINTS = 400
 SEARCH_ITERATIONS = 5
-NUM_FIRST = 2  # seeds tried first: at rest and at constant velocity
+NUM_FIRST = 2  # seeds tried first, with the guess if any: at rest and at constant velocity
 GOOD_SCORE = 0.4  # of a first seed, which makes the other seeds needless
 SPARSE = 0.3  # share of the points that all iterations but the last look at
 SMALLEST_STEP = (2.0e-4, 4.0e-4, 1.0e-3)  # metres and radians, per level, finest first
@@ -108,7 +115,7 @@ class Tracker:
         slots = max(self._slots(level, self._stride(level)) for level in range(num_levels))
         slots = max(slots, self._slots(num_levels - 1, self._search_stride()))
 
-        self._first = _Hypotheses(batch, NUM_FIRST, slots, device)
+        self._first = _Hypotheses(batch, NUM_FIRST + 1, slots, device)  # the last is the guess
         self._more = _Hypotheses(batch, num_seeds - NUM_FIRST, slots, device)
         self._one = _Hypotheses(batch, 1, slots, device)
         self._launches = Launches(device)
@@ -142,7 +149,12 @@ class Tracker:
         self._live_levels = self._live.build(live.vertices, live.normals, live.intensity)
 
     def align(
-        self, model: ModelView, T_world_model: Float64, seeds: Float64, limits: NDArray[np.void]
+        self,
+        model: ModelView,
+        T_world_model: Float64,
+        seeds: Float64,
+        limits: NDArray[np.void],
+        guesses: Float64 | None = None,
     ) -> Alignment:
         """Align the frames set before with ``model``.
 
@@ -151,13 +163,13 @@ class Tracker:
             T_world_model: (B, 4, 4).
             seeds: (B, K, 4, 4) starting poses T_model_live.
             limits: (B,) structured array of ``verdict.Limits``.
+            guesses: (B, 4, 4) one more starting pose T_world_live, NaN for an env without; None
+                if no env has one.
         """
         self._expect(self._seen[0], model)
         levels = self._model.build(model.vertices, model.normals, model.intensity)
         one = self._one
-        copy_in(self._first.pose, seeds[:, :NUM_FIRST])
-        copy_in(self._more.pose, seeds[:, NUM_FIRST:])
-        self._first.active.fill_(RUNNING)
+        self._start_from(seeds, T_world_model, guesses)
         copy_in(self._T_world_model, T_world_model)
         self._limits.assign(limits)
         coarsest = len(levels) - 1
@@ -185,6 +197,18 @@ class Tracker:
             stats=self._stats.numpy().copy(),
         )
 
+    def _start_from(self, seeds: Float64, T_world_model: Float64, guesses: Float64 | None) -> None:
+        """Set the poses of all hypotheses; an env without a guess leaves that one out."""
+        if guesses is None:
+            guesses = np.full((self.batch, 4, 4), np.nan)
+        given = np.isfinite(guesses[:, 0, 0])
+        relative = np.where(given[:, None, None], invert(T_world_model) @ guesses, np.eye(4))
+        active = np.full((self.batch, NUM_FIRST + 1), RUNNING, dtype=np.int32)
+        active[:, NUM_FIRST] = np.where(given, RUNNING, OFF)
+        copy_in(self._first.pose, np.concatenate([seeds[:, :NUM_FIRST], relative[:, None]], axis=1))
+        copy_in(self._first.active, active)
+        copy_in(self._more.pose, seeds[:, NUM_FIRST:])
+
     def _expect(self, live: LiveFrame | None, model: ModelView | None) -> None:
         """Forget the recorded launches if these are not the images that they were made for."""
         if self._seen[0] is not live or self._seen[1] is not model:
@@ -203,8 +227,8 @@ class Tracker:
                 "widen",
                 widen_search,
                 self.batch,
-                [first.sums, self.good_score],
-                [more.sums, more.active],
+                [first.active, self.good_score],
+                [first.sums, more.sums, more.active],
             )
         if more.running():
             self._settle(levels, coarsest, more)

@@ -71,15 +71,18 @@ def _score(sums: wp.array3d(dtype=wp.float64), b: int, k: int):
 
 @wp.kernel
 def widen_search(
-    first_sums: wp.array3d(dtype=wp.float64),
+    first_active: wp.array2d(dtype=wp.int32),
     good_score: wp.float64,
+    first_sums: wp.array3d(dtype=wp.float64),
     more_sums: wp.array3d(dtype=wp.float64),
     more_active: wp.array2d(dtype=wp.int32),
 ):
     """Switch on the further seeds (B, K2) unless one of the first (B, K1) fits well already."""
     b = wp.tid()
-    best = _score(first_sums, b, 0)
-    for k in range(1, first_sums.shape[1]):
+    best = wp.float64(1.0e9)
+    for k in range(first_sums.shape[1]):
+        if first_active[b, k] == OFF:
+            first_sums[b, k, 28] = wp.float64(0.0)  # no points: the worst score
         best = wp.min(best, _score(first_sums, b, k))
     for k in range(more_active.shape[1]):
         if best > good_score:

@@ -1,0 +1,206 @@
+"""Poses from outside: a guess that tracking starts from, and frames fused at known poses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from box_scene import BoxScene
+from scipy.spatial import cKDTree
+
+from ms_slam_env import slam
+from ms_slam_env.camera import RGBDFrame, xtion
+from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import look_at, make_pose, so3_exp
+from ms_slam_env.sensor import RGBDSensor
+from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
+
+CAMERA = xtion("160x120")
+START = look_at([-0.8, -0.8, 1.2], [1.2, 0.1, 0.5])
+CONFIG = SurfelConfig(max_surfels=60_000, depth_cutoff_m=4.0)
+# 40 cm along the viewing direction and up, 30 degrees about a slanted axis
+JUMP = START @ make_pose(so3_exp(np.radians([12.0, 20.0, 19.0])), [0.12, -0.1, 0.37])
+
+
+def _path(count: int) -> np.ndarray:
+    """A slow arc: 1 cm and 0.5 degrees a frame."""
+    poses = [START]
+    for _ in range(count - 1):
+        poses.append(poses[-1] @ make_pose(so3_exp([0, np.radians(-0.5), 0]), [0.01, 0, 0.002]))
+    return np.stack(poses)
+
+
+@pytest.fixture(scope="module")
+def frames(box_scene: BoxScene) -> list[RGBDFrame]:
+    sensor = RGBDSensor(box_scene, CAMERA, noise="kinect", seed=0)
+    return [sensor.capture(pose, index) for index, pose in enumerate(_path(10))]
+
+
+@pytest.fixture(scope="module")
+def jump_frame(box_scene: BoxScene) -> RGBDFrame:
+    return RGBDSensor(box_scene, CAMERA, noise="kinect", seed=1).capture(JUMP, 0)
+
+
+def _new() -> slam.SlamBackend:
+    backend = slam.make("surfel", CAMERA, max_surfels=60_000, depth_cutoff_m=4.0)
+    backend.reset(START)
+    return backend
+
+
+def _black() -> RGBDFrame:
+    return RGBDFrame(
+        np.zeros((*CAMERA.shape, 3), dtype=np.uint8), np.zeros(CAMERA.shape, dtype=np.float32)
+    )
+
+
+def _error_m(result: slam.TrackResult, truth: np.ndarray) -> float:
+    return float(np.linalg.norm(result.T_world_camera[:3, 3] - truth[:3, 3]))
+
+
+def test_the_jump_is_as_large_as_it_says():
+    motion = np.linalg.inv(START) @ JUMP
+    assert np.linalg.norm(motion[:3, 3]) > 0.4
+    assert np.degrees(np.arccos((np.trace(motion[:3, :3]) - 1) / 2)) > 30
+
+
+@pytest.mark.parametrize("lost_frames", [0, 2])
+def test_a_guess_finds_a_jump_that_plain_tracking_loses(frames, jump_frame, lost_frames):
+    for guess in (None, JUMP):
+        backend = _new()
+        backend.track(frames[0])
+        for _ in range(lost_frames):
+            assert not backend.track(_black(), JUMP).tracking_ok
+        result = backend.track(jump_frame, guess)
+        assert result.tracking_ok == (guess is not None), result.reason
+    assert _error_m(result, JUMP) < 0.02
+    assert result.relocalised == bool(lost_frames)
+    assert backend.track(jump_frame).tracking_ok
+
+
+def test_the_alignment_corrects_a_guess_that_is_a_little_off(frames, jump_frame):
+    backend = _new()
+    backend.track(frames[0])
+    off = JUMP @ make_pose(so3_exp(np.radians([2.0, -3.0, 2.0])), [0.03, -0.02, 0.04])
+    result = backend.track(jump_frame, off)
+    assert result.tracking_ok, result.reason
+    assert _error_m(result, JUMP) < 0.02
+
+
+def test_wrong_guesses_do_no_harm(frames):
+    rng = np.random.default_rng(0)
+    plain, guided = _new(), _new()
+    for frame, truth in zip(frames, _path(10), strict=True):
+        wrong = truth @ make_pose(so3_exp(rng.uniform(-1, 1, 3)), rng.uniform(-0.6, 0.6, 3))
+        result = guided.track(frame, wrong)
+        assert result.tracking_ok, result.reason
+        assert _error_m(result, truth) < _error_m(plain.track(frame), truth) + 0.002
+
+
+def test_a_guess_does_not_make_a_frame_from_elsewhere_tracked(frames, box_scene):
+    backend = _new()
+    for frame in frames[:4]:
+        backend.track(frame)
+    elsewhere = look_at([-0.5, 0.5, 1.2], [-1.5, -1.5, 0.6])
+    frame = RGBDSensor(box_scene, CAMERA, noise="kinect", seed=1).capture(elsewhere, 0)
+    for guess in (elsewhere, START, JUMP):
+        assert not backend.track(frame, guess).tracking_ok
+
+
+def test_the_first_frame_is_taken_at_the_pose_of_the_reset(frames):
+    result = _new().track(frames[0], JUMP)
+    np.testing.assert_array_equal(result.T_world_camera, START)
+
+
+def test_guesses_of_a_batch_are_those_of_its_envs_alone(frames, jump_frame):
+    color = np.stack([jump_frame.color, frames[1].color, jump_frame.color])
+    depth = np.stack([jump_frame.depth, frames[1].depth, jump_frame.depth])
+    guesses = [JUMP, None, None]
+    together = BatchedSurfelSlam(3, CAMERA, CONFIG)
+    for env in range(3):
+        together.reset(START, env)
+    first = frames[0]
+    together.track(np.stack([first.color] * 3), np.stack([first.depth] * 3))
+    results = together.track(color, depth, guesses)
+    assert [result.tracking_ok for result in results] == [True, True, False]
+    after = together.track(color, depth)
+    for env, guess in enumerate(guesses):
+        alone = _new()
+        alone.track(first)
+        frame = RGBDFrame(color[env], depth[env])
+        for again in (results[env], after[env]):
+            single = alone.track(frame, guess)
+            guess = None
+            assert single.tracking_ok == again.tracking_ok
+            np.testing.assert_array_equal(single.T_world_camera, again.T_world_camera)
+
+
+def test_frames_fused_at_true_poses_map_the_true_surface(frames, box_scene):
+    backend = _new()
+    for frame, truth in zip(frames, _path(10), strict=True):
+        result = backend.fuse(frame, truth)
+        assert result.tracking_ok
+        np.testing.assert_array_equal(result.T_world_camera, truth)
+    points, _ = box_scene.surface_points(0.01)
+    estimated = backend.surface_points()
+    assert len(estimated) > 10_000
+    distance, _ = cKDTree(points).query(estimated)
+    assert np.median(distance) < 0.01
+    assert np.quantile(distance, 0.9) < 0.03
+
+
+def test_tracking_goes_on_from_fused_frames(frames):
+    backend = _new()
+    path = _path(10)
+    backend.track(frames[0])
+    backend.track(_black())
+    for index in (5, 6):
+        assert not backend.fuse(frames[index], path[index]).relocalised
+    for index in (7, 8, 9):
+        result = backend.track(frames[index])
+        assert result.tracking_ok
+        assert not result.relocalised
+        assert _error_m(result, path[index]) < 0.008
+
+
+def test_a_fused_frame_without_depth_leaves_the_map_to_start(frames):
+    backend = _new()
+    assert backend.fuse(_black(), START).tracking_ok
+    assert len(backend.surface_points()) == 0
+    np.testing.assert_array_equal(backend.track(frames[0]).T_world_camera, START)
+
+
+def test_state_with_fused_frames_goes_on_bit_exactly(frames):
+    path = _path(10)
+    backend = _new()
+    for index in range(4):
+        backend.fuse(frames[index], path[index])
+    state = backend.get_state()
+    ends = []
+    for other in (backend, _new()):
+        other.set_state(state)
+        poses = [other.track(frames[4]).T_world_camera, other.track(frames[5], path[5])]
+        other.fuse(frames[6], path[6])
+        ends.append((poses[0], poses[1].T_world_camera, other.track(frames[7]).T_world_camera))
+        ends[-1] += (other.map_points(),)
+    for a, b in zip(*ends, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_bad_poses_are_refused(frames):
+    backend = _new()
+    small = RGBDFrame(np.zeros((60, 80, 3), dtype=np.uint8), np.zeros((60, 80), dtype=np.float32))
+    with pytest.raises(InputError, match="80x60"):
+        backend.fuse(small, START)
+    for bad in (np.eye(3), np.full((4, 4), np.nan), 2 * np.eye(4), "here"):
+        with pytest.raises(InputError, match="T_world_camera_guess"):
+            backend.track(frames[0], bad)
+        with pytest.raises(InputError, match="T_world_camera"):
+            backend.fuse(frames[0], bad)
+    batched = BatchedSurfelSlam(1, CAMERA, CONFIG)
+    color, depth = frames[0].color[None], frames[0].depth[None]
+    with pytest.raises(InputError, match="must hold 1 poses"):
+        batched.track(color, depth, [None, None])
+    with pytest.raises(InputError, match=r"shape \(1, 4, 4\), got \(4, 4\)"):
+        batched.fuse(color, depth, START)
+    with pytest.raises(InputError, match="depth holds"):
+        batched.fuse(color, np.full_like(depth, np.nan), START[None])
+    assert len(backend.surface_points()) == 0
