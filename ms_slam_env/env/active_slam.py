@@ -243,6 +243,11 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
         return np.stack(self._current().kinematics)
 
     @property
+    def tracked(self) -> NDArray[np.bool_]:
+        """(N,) whether each frame was tracked, and so is part of the map."""
+        return np.array(self._current().tracked)
+
+    @property
     def timestamps(self) -> Float64:
         """(N,) simulated seconds since the start of the episode, of each frame."""
         return np.array(self._current().times)

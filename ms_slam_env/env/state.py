@@ -20,9 +20,9 @@ Float64 = NDArray[np.float64]
 class EpisodeState:
     """Trajectories, last frame and running measures of one episode.
 
-    One step brings one frame or several. ``truth``, ``kinematics``, ``estimates``, ``times``,
-    ``errors`` and ``frame_divergences`` (from the frame before) have an entry a frame; the
-    step's ``divergence`` compares its last frame with the last one of the step before.
+    One step brings one frame or several. ``truth``, ``kinematics``, ``estimates``, ``tracked``,
+    ``times``, ``errors`` and ``frame_divergences`` (from the frame before) have an entry a frame;
+    the step's ``divergence`` compares its last frame with the last one of the step before.
     """
 
     scene: str
@@ -39,6 +39,7 @@ class EpisodeState:
     truth: list[Float64] = field(default_factory=list)
     kinematics: list[Float64] = field(default_factory=list)
     estimates: list[Float64] = field(default_factory=list)
+    tracked: list[bool] = field(default_factory=list)
     times: list[float] = field(default_factory=list)
     frame_divergences: list[Float64] = field(default_factory=list)
     divergence: Float64 = field(default_factory=lambda: np.zeros(2))
@@ -60,6 +61,7 @@ class EpisodeState:
         self.truth.append(sighting.T_world_camera.copy())
         self.kinematics.append(sighting.T_world_camera_kinematic.copy())
         self.estimates.append(result.T_world_camera.copy())
+        self.tracked.append(result.tracking_ok)
         self.times.append(frame.timestamp)
         self.frame_divergences.append(divergence)
         error = float(np.linalg.norm(result.T_world_camera[:3, 3] - sighting.T_world_camera[:3, 3]))
