@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 
 import mujoco
@@ -17,9 +18,7 @@ Int32 = NDArray[np.int32]
 _PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 _BALL = int(mujoco.mjtGeom.mjGEOM_SPHERE)
 _ROUND = (int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER))
-_NEIGHBOURS = (
-    2  # links this near in the chain touch by construction, or their limits keep them apart
-)
+_NEIGHBOURS = 2  # links this near touch by construction, or joint limits keep them apart
 
 
 @dataclass(frozen=True)
@@ -78,11 +77,13 @@ def _capsule(mj: mujoco.MjModel, geom: int) -> tuple[float, float, int, Float64]
         return 0.0, float(size[0]), 2, np.zeros(3)
     if kind in _ROUND:
         return float(size[1]), float(size[0]), 2, np.zeros(3)
-    # Boxes, ellipsoids and meshes by their bounding box, along its longest side.
+    # Boxes, ellipsoids and meshes by their bounding box, along its longest side. Ending the axis
+    # before the corners costs width and saves more length.
     centre, half_sides = mj.geom_aabb[geom, :3].copy(), mj.geom_aabb[geom, 3:]
     axis = int(np.argmax(half_sides))
-    radius = float(np.linalg.norm(np.delete(half_sides, axis)))
-    return max(0.0, float(half_sides[axis]) - 0.5 * radius), radius, axis, centre
+    across = float(np.linalg.norm(np.delete(half_sides, axis)))
+    half = max(0.0, float(half_sides[axis]) - 0.5 * across)
+    return half, math.hypot(across, half_sides[axis] - half), axis, centre
 
 
 def separate_pairs(chain: Chain, home: Float64) -> Chain:

@@ -102,11 +102,13 @@ def segment_distance(a: Float64, b: Float64) -> Float64:
     aa, ee = (d1 * d1).sum(-1), (d2 * d2).sum(-1)
     bb, cc, ff = (d1 * d2).sum(-1), (d1 * r).sum(-1), (d2 * r).sum(-1)
     denominator = aa * ee - bb * bb
-    parallel = denominator <= tiny
+    parallel = denominator <= tiny * aa * ee
     s = np.where(parallel, 0.0, (bb * ff - cc * ee) / np.where(parallel, 1.0, denominator))
     s = np.clip(s, 0.0, 1.0)
-    t = (bb * s + ff) / np.maximum(ee, tiny)
+    ball = ee <= tiny  # b is a point: t has no meaning, s is that of the nearest point of a
+    t = np.where(ball, 0.0, (bb * s + ff) / np.maximum(ee, tiny))
     clamped = np.clip(t, 0.0, 1.0)
-    s = np.where(t == clamped, s, np.clip((bb * clamped - cc) / np.maximum(aa, tiny), 0.0, 1.0))
+    again = np.clip((bb * clamped - cc) / np.maximum(aa, tiny), 0.0, 1.0)
+    s = np.where((t == clamped) & ~ball, s, again)
     gap = r + d1 * s[..., None] - d2 * clamped[..., None]
     return np.sqrt((gap * gap).sum(-1))
