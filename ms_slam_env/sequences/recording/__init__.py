@@ -1,0 +1,6 @@
+"""Recorded RGB-D sequences on disk: one class of recording, one file per folder layout."""
+
+from ms_slam_env.sequences.recording.layouts import LAYOUTS, open_recording
+from ms_slam_env.sequences.recording.recording import Entry, Recording
+
+__all__ = ["LAYOUTS", "Entry", "Recording", "open_recording"]

@@ -1,0 +1,233 @@
+"""Folder layouts of well-known RGB-D datasets."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.sequences.recording.listings import (
+    Calibration,
+    Listed,
+    associate,
+    calibration,
+    flip_y,
+    listed_images,
+    number,
+    read_intrinsics,
+    read_matrix,
+    rows,
+)
+from ms_slam_env.sequences.recording.recording import Entry, Recording
+from ms_slam_env.sequences.tum import read_trajectory
+
+Float64 = NDArray[np.float64]
+
+FRAME_RATE_HZ = 30.0  # where a layout has no times
+IMAGES = (".png", ".pgm", ".jpg", ".jpeg", ".ppm", ".tif", ".tiff")
+
+# Published calibrations of the colour cameras, to which depth is registered, 640x480: TUM RGB-D
+# benchmark, "Intrinsic camera calibration of the Kinect"; ICL-NUIM page; 7-Scenes page (default).
+TUM_CAMERAS = {
+    "freiburg1": (517.3, 516.5, 318.6, 255.3),
+    "freiburg2": (520.9, 521.0, 325.1, 249.7),
+    "freiburg3": (535.4, 539.2, 320.1, 247.6),
+}
+ICL_NUIM_CAMERA = (481.2, -480.0, 319.5, 239.5)
+SEVEN_SCENES_CAMERA = (585.0, 585.0, 320.0, 240.0)
+DEPTH_SCALE = 5000.0
+SEVEN_SCENES_NO_READING = 65535
+
+
+def _calibration_of(
+    folder: Path, given: Intrinsics | None, known: tuple[float, float, float, float] | None
+) -> Calibration:
+    """The user's, the folder's, or the published calibration of the dataset, in that order."""
+    if given is not None:
+        return Calibration(given, False, None)
+    if (folder / "intrinsics.txt").is_file():
+        return read_intrinsics(folder / "intrinsics.txt")
+    if known is not None:
+        return calibration(*known, 640, 480)
+    raise InputError(
+        f"intrinsics of {folder} are missing: write 'fx fy cx cy width height [depth_scale]' into "
+        f"{folder / 'intrinsics.txt'}"
+    )
+
+
+def _pairs(folder: Path) -> list[Entry]:
+    """Frames from ``associations.txt``, or from ``depth.txt`` and ``rgb.txt`` by their times."""
+    for name in ("associations.txt", "association.txt"):
+        if (folder / name).is_file():
+            return _associations(folder / name)
+    depth = listed_images(folder / "depth.txt")
+    if not (folder / "rgb.txt").is_file():
+        return [Entry(image.timestamp, image.path, None, image.where) for image in depth]
+    color = listed_images(folder / "rgb.txt")
+    pairs = associate(_times(depth), _times(color))
+    if not len(pairs):
+        raise InputError(f"{folder}: no image of rgb.txt is as old as one of depth.txt")
+    return [
+        Entry(depth[d].timestamp, depth[d].path, color[c].path, depth[d].where) for d, c in pairs
+    ]
+
+
+def _times(images: list[Listed]) -> Float64:
+    return np.array([image.timestamp for image in images])
+
+
+def _associations(path: Path) -> list[Entry]:
+    """Lines ``time file time file``; the file whose path contains "depth" is the depth image."""
+    entries = []
+    for where, words in rows(path):
+        if len(words) != 4:
+            raise InputError(f"{where}: expected 'time file time file', got {' '.join(words)!r}")
+        first_is_depth = "depth" in words[1].lower()
+        d, c = (0, 2) if first_is_depth else (2, 0)
+        time = number(words[d], where)
+        entries.append(Entry(time, path.parent / words[d + 1], path.parent / words[c + 1], where))
+    return entries
+
+
+def _trajectory(folder: Path, flipped: bool) -> tuple[Float64, Float64] | tuple[None, None]:
+    found = [folder / "groundtruth.txt", *sorted(folder.glob("*.gt.freiburg"))]
+    for path in found:
+        if path.is_file():
+            times, poses = read_trajectory(path)
+            return times, flip_y(poses) if flipped else poses
+    return None, None
+
+
+def open_tum(folder: Path, intrinsics: Intrinsics | None) -> Recording:
+    """TUM RGB-D benchmark: ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``; scale 5000."""
+    camera = next((TUM_CAMERAS[name] for name in TUM_CAMERAS if name in folder.name), None)
+    return _listed(folder, "tum", _calibration_of(folder, intrinsics, camera))
+
+
+def open_icl_nuim(folder: Path, intrinsics: Intrinsics | None) -> Recording:
+    """ICL-NUIM, TUM-compatible: ``associations.txt``, ``*.gt.freiburg``; y up in its poses."""
+    return _listed(folder, "icl-nuim", _calibration_of(folder, intrinsics, ICL_NUIM_CAMERA))
+
+
+def _listed(folder: Path, layout: str, camera: Calibration) -> Recording:
+    times, truth = _trajectory(folder, camera.flipped)
+    return Recording(
+        name=folder.name,
+        layout=layout,
+        entries=tuple(_pairs(folder)),
+        source=camera.intrinsics,
+        intrinsics=camera.intrinsics,
+        depth_scale=camera.depth_scale or DEPTH_SCALE,
+        truth_times=times,
+        truth=truth,
+    )
+
+
+def open_seven_scenes(folder: Path, intrinsics: Intrinsics | None) -> Recording:
+    """7-Scenes: ``frame-NNNNNN.color.png``, ``.depth.png`` in millimetres, ``.pose.txt``."""
+    camera = _calibration_of(folder, intrinsics, SEVEN_SCENES_CAMERA)
+    entries, poses = [], []
+    for depth in sorted(folder.glob("frame-*.depth.png")):
+        stem = depth.name.removesuffix(".depth.png")
+        color, pose = folder / f"{stem}.color.png", folder / f"{stem}.pose.txt"
+        time = number(stem.removeprefix("frame-"), str(depth)) / FRAME_RATE_HZ
+        entries.append(Entry(time, depth, color, str(depth)))
+        if pose.is_file():
+            poses.append((time, read_matrix(pose)))
+    return Recording(
+        name=folder.name,
+        layout="7-scenes",
+        entries=tuple(entries),
+        source=camera.intrinsics,
+        intrinsics=camera.intrinsics,
+        depth_scale=camera.depth_scale or 1000.0,
+        no_reading=SEVEN_SCENES_NO_READING,
+        truth_times=np.array([time for time, _ in poses]) if poses else None,
+        truth=np.stack([T for _, T in poses]) if poses else None,
+    )
+
+
+def open_folder(folder: Path, intrinsics: Intrinsics | None) -> Recording:
+    """Folders ``depth`` and, if there is colour, ``rgb`` or ``color``; files paired by order."""
+    camera = _calibration_of(folder, intrinsics, None)
+    depth = _images(folder / "depth")
+    color_folder = next((folder / n for n in ("rgb", "color") if (folder / n).is_dir()), None)
+    color: list[Path | None] = [None] * len(depth)
+    if color_folder is not None:
+        color = list(_images(color_folder))
+        if len(color) != len(depth):
+            raise InputError(f"{folder}: {len(depth)} depth images but {len(color)} colour images")
+    times, truth = _trajectory(folder, camera.flipped)
+    return Recording(
+        name=folder.name,
+        layout="folder",
+        entries=tuple(
+            Entry(index / FRAME_RATE_HZ, d, c, str(d))
+            for index, (d, c) in enumerate(zip(depth, color, strict=True))
+        ),
+        source=camera.intrinsics,
+        intrinsics=camera.intrinsics,
+        depth_scale=camera.depth_scale or DEPTH_SCALE,
+        truth_times=times,
+        truth=truth,
+    )
+
+
+def _images(folder: Path) -> list[Path]:
+    """Images of a folder in the order of the numbers in their names."""
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder of images")
+    found = [path for path in folder.iterdir() if path.suffix.lower() in IMAGES]
+    return sorted(found, key=lambda path: [int(n) for n in re.findall(r"\d+", path.stem)])
+
+
+LAYOUTS: dict[str, Callable[[Path, Intrinsics | None], Recording]] = {
+    "tum": open_tum,
+    "icl-nuim": open_icl_nuim,
+    "7-scenes": open_seven_scenes,
+    "folder": open_folder,
+}
+"""Name of a layout to its reader."""
+
+
+def _recognise(folder: Path) -> str:
+    """The layout of a folder, by the files in it."""
+    if any(folder.glob("*.gt.freiburg")):
+        return "icl-nuim"
+    if any((folder / n).is_file() for n in ("depth.txt", "associations.txt", "association.txt")):
+        return "tum"
+    if any(folder.glob("frame-*.depth.png")):
+        return "7-scenes"
+    if (folder / "depth").is_dir():
+        return "folder"
+    raise InputError(
+        f"{folder} is no RGB-D sequence: found neither depth.txt or associations.txt (TUM, "
+        "ICL-NUIM) nor frame-*.depth.png (7-Scenes) nor a folder depth"
+    )
+
+
+def open_recording(
+    path: str | Path, layout: str = "auto", intrinsics: Intrinsics | None = None
+) -> Recording:
+    """Open a recorded sequence; images are read later, frame by frame.
+
+    Args:
+        path: its folder.
+        layout: ``auto`` or one of ``LAYOUTS``.
+        intrinsics: of the images on disk; by default those of ``intrinsics.txt`` in the folder,
+            else the published ones of the dataset.
+
+    Raises:
+        InputError: no such folder or layout, intrinsics missing, a listing that does not parse.
+    """
+    folder = Path(path).resolve()
+    if not folder.is_dir():
+        raise InputError(f"no sequence at {path}: not a folder")
+    if layout != "auto" and layout not in LAYOUTS:
+        raise unknown("layout", layout, ("auto", *LAYOUTS))
+    return LAYOUTS[_recognise(folder) if layout == "auto" else layout](folder, intrinsics)

@@ -1,0 +1,162 @@
+"""Text files that list a sequence's images, poses and intrinsics, line by line."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import check_pose
+
+Float64 = NDArray[np.float64]
+
+MAX_DIFFERENCE_S = 0.02
+"""Colour and depth further apart in time are not one frame (the tolerance of the TUM tools)."""
+
+
+@dataclass(frozen=True)
+class Listed:
+    """A file with its time and the line that lists it."""
+
+    timestamp: float
+    path: Path
+    where: str
+
+
+def rows(path: Path) -> Iterator[tuple[str, list[str]]]:
+    """Yield (``file:line``, words) of every line that is neither empty nor a comment.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read {path}: {error}") from None
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split("#")[0].replace(",", " ").split()
+        if words:
+            yield f"{path}:{number}", words
+
+
+def number(word: str, where: str) -> float:
+    """Read a finite number.
+
+    Raises:
+        InputError: naming file and line.
+    """
+    try:
+        value = float(word)
+    except ValueError:
+        raise InputError(f"{where}: {word!r} is not a number") from None
+    if not math.isfinite(value):
+        raise InputError(f"{where}: {word} is not finite")
+    return value
+
+
+def listed_images(path: Path) -> list[Listed]:
+    """Lines ``timestamp filename``, times increasing, files relative to the listing's folder.
+
+    Raises:
+        InputError: naming file and line.
+    """
+    found: list[Listed] = []
+    for where, words in rows(path):
+        if len(words) != 2:
+            raise InputError(f"{where}: expected 'timestamp filename', got {' '.join(words)!r}")
+        time = number(words[0], where)
+        if found and time <= found[-1].timestamp:
+            raise InputError(
+                f"{where}: timestamp {words[0]} does not come after {found[-1].timestamp}"
+            )
+        found.append(Listed(time, path.parent / words[1], where))
+    if not found:
+        raise InputError(f"{path} lists no image")
+    return found
+
+
+def associate(first: Float64, second: Float64, most: float = MAX_DIFFERENCE_S) -> NDArray[np.int64]:
+    """Pair times (N,) and (M,) that are each other's nearest: indices (K, 2).
+
+    Pairs more than ``most`` seconds apart are left out.
+    """
+    nearest = np.array([int(np.abs(second - t).argmin()) for t in first], dtype=np.int64)
+    back = np.array([int(np.abs(first - t).argmin()) for t in second], dtype=np.int64)
+    index = np.arange(len(first))
+    fits = (back[nearest] == index) & (np.abs(second[nearest] - first) <= most)
+    return np.stack([index[fits], nearest[fits]], axis=1)
+
+
+def read_matrix(path: Path) -> Float64:
+    """Read a pose (4, 4) T_world_camera written as four rows of four numbers.
+
+    Raises:
+        InputError: another shape, NaN, or no rigid motion.
+    """
+    values = [[number(word, where) for word in words] for where, words in rows(path)]
+    if [len(row) for row in values] != [4, 4, 4, 4]:
+        raise InputError(f"{path}: expected 4 rows of 4 numbers")
+    return check_pose(np.array(values), str(path))
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What ``intrinsics.txt`` says.
+
+    Attributes:
+        intrinsics: with positive focal lengths.
+        flipped: fy was negative: the camera frame of the poses has y up.
+        depth_scale: value of a depth image for one metre; None where the file does not say.
+    """
+
+    intrinsics: Intrinsics
+    flipped: bool
+    depth_scale: float | None
+
+
+def read_intrinsics(path: Path) -> Calibration:
+    """Read ``fx fy cx cy width height [depth_scale]``.
+
+    Raises:
+        InputError: naming file and line.
+    """
+    for where, words in rows(path):
+        values = [number(word, where) for word in words]
+        if len(values) not in (6, 7):
+            raise InputError(
+                f"{where}: expected 'fx fy cx cy width height [depth_scale]', "
+                f"got {' '.join(words)!r}"
+            )
+        return calibration(*values)
+    raise InputError(f"{path} holds no intrinsics: 'fx fy cx cy width height [depth_scale]'")
+
+
+def calibration(
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    width: float,
+    height: float,
+    depth_scale: float | None = None,
+) -> Calibration:
+    """Intrinsics whose fy may be negative, as ICL-NUIM states them."""
+    if depth_scale is not None and not depth_scale > 0:
+        raise InputError(f"depth_scale = {depth_scale} must be above 0")
+    intrinsics = Intrinsics(fx, abs(fy), cx, cy, round(width), round(height))
+    return Calibration(intrinsics, fy < 0, depth_scale)
+
+
+def flip_y(poses: Float64) -> Float64:
+    """Poses (N, 4, 4) of cameras with y up in a left-handed world, as seen in a mirror.
+
+    The mirror y -> -y in both frames turns them into right-handed poses of cameras with y down.
+    """
+    mirror = np.diag([1.0, -1.0, 1.0, 1.0])
+    return mirror @ poses @ mirror

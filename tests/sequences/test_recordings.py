@@ -1,0 +1,228 @@
+"""Recorded sequences: four folder layouts, and one clear error for each way they can be broken."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import make_pose, so3_exp
+from ms_slam_env.sequences import write_trajectory
+from ms_slam_env.sequences.recording import open_recording
+from ms_slam_env.sequences.recording.listings import associate, flip_y
+
+LR_KT3 = Path(__file__).resolve().parents[3] / "shared/data/icl_nuim/lr_kt3_depth"
+WIDTH, HEIGHT = 32, 24
+INTRINSICS = "30 30 15.5 11.5 32 24"
+
+
+def depth_values(index):
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    return (1000 + 100 * index + 10 * v + u).astype(np.uint16)
+
+
+def colors(index):
+    return np.full((HEIGHT, WIDTH, 3), (10 * index, 20, 30), dtype=np.uint8)
+
+
+def poses(count):
+    return np.stack([make_pose(so3_exp([0, 0.1 * k, 0]), [0.1 * k, 0, 1]) for k in range(count)])
+
+
+def write_images(folder, count=3, depth="depth/{}.png", color="rgb/{}.png"):
+    for index in range(count):
+        for pattern, pixels in ((depth, depth_values(index)), (color, colors(index))):
+            path = folder / pattern.format(index)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(pixels).save(path)
+
+
+@pytest.fixture
+def tum(tmp_path):
+    folder = tmp_path / "recording"
+    write_images(folder)
+    listing = "# timestamp filename\n" + "".join(f"{k / 30:.6f} rgb/{k}.png\n" for k in range(3))
+    (folder / "rgb.txt").write_text(listing)
+    depth = "".join(f"{k / 30 + 0.004:.6f} depth/{k}.png\n" for k in range(3))
+    (folder / "depth.txt").write_text(depth)
+    (folder / "intrinsics.txt").write_text(f"# fx fy cx cy width height\n{INTRINSICS} 1000\n")
+    write_trajectory(folder / "groundtruth.txt", np.arange(3) / 30, poses(3))
+    return folder
+
+
+def test_tum_layout(tum):
+    recording = open_recording(tum)
+    assert (recording.layout, len(recording), recording.has_color) == ("tum", 3, True)
+    assert recording.source == Intrinsics(30, 30, 15.5, 11.5, 32, 24)
+    for index, frame in enumerate(recording):
+        np.testing.assert_allclose(frame.depth, depth_values(index) / 1000, rtol=1e-6)
+        np.testing.assert_array_equal(frame.color, colors(index))
+        assert frame.timestamp == pytest.approx(index / 30 + 0.004, abs=1e-6)
+    np.testing.assert_allclose(recording.truth, poses(3), atol=1e-8)
+
+
+def test_associations_in_either_order(tum):
+    for line in ("{0} depth/{0}.png {0} rgb/{0}.png\n", "{0} rgb/{0}.png {0} depth/{0}.png\n"):
+        (tum / "associations.txt").write_text("".join(line.format(k) for k in range(3)))
+        recording = open_recording(tum)
+        assert [entry.depth.parent.name for entry in recording.entries] == ["depth"] * 3
+        assert list(recording.timestamps) == [0, 1, 2]
+
+
+def test_icl_nuim_layout_turns_its_mirrored_poses(tmp_path):
+    folder = tmp_path / "living_room_traj0"
+    write_images(folder)
+    lines = "".join(f"{k} depth/{k}.png {k} rgb/{k}.png\n" for k in range(3))
+    (folder / "associations.txt").write_text(lines)
+    (folder / "intrinsics.txt").write_text("30 -30 15.5 11.5 32 24\n")
+    write_trajectory(folder / "livingRoom0.gt.freiburg", np.arange(3), poses(3))
+    recording = open_recording(folder)
+    assert (recording.layout, recording.depth_scale) == ("icl-nuim", 5000)
+    assert recording.source.fy == 30
+    # A point seen at v rows below the centre must lie below in the camera's frame, in the same
+    # mirrored world: fy < 0 with y up gives the same pixels as fy > 0 with y down.
+    mirror = np.diag([1.0, -1.0, 1.0, 1.0])
+    point = np.array([0.3, 0.2, 1.5, 1.0])
+    for T_up, T_down in zip(poses(3), recording.truth, strict=True):
+        np.testing.assert_allclose(mirror @ T_up @ point, T_down @ (mirror @ point), atol=1e-8)
+    np.testing.assert_allclose(flip_y(flip_y(poses(3))), poses(3))
+
+
+def test_seven_scenes_layout(tmp_path):
+    folder = tmp_path / "seq-01"
+    write_images(folder, 2, "frame-00000{}.depth.png", "frame-00000{}.color.png")
+    broken = depth_values(0)
+    broken[3, 4] = 65535
+    Image.fromarray(broken).save(folder / "frame-000000.depth.png")
+    for index, T in enumerate(poses(2)):
+        np.savetxt(folder / f"frame-00000{index}.pose.txt", T)
+    (folder / "intrinsics.txt").write_text(INTRINSICS)
+    recording = open_recording(folder)
+    assert (recording.layout, len(recording)) == ("7-scenes", 2)
+    depth = recording.frame(0).depth
+    assert depth[3, 4] == 0
+    assert depth[0, 0] == pytest.approx(1.0)
+    np.testing.assert_allclose(recording.truth, poses(2))
+
+
+def test_seven_scenes_has_a_published_calibration(tmp_path):
+    folder = tmp_path / "seq-01"
+    write_images(folder, 1, "frame-00000{}.depth.png", "frame-00000{}.color.png")
+    assert open_recording(folder).source == Intrinsics(585, 585, 320, 240, 640, 480)
+
+
+def test_plain_folder_pairs_by_number(tmp_path):
+    folder = tmp_path / "mine"
+    write_images(folder, 12)
+    (folder / "intrinsics.txt").write_text(f"{INTRINSICS} 2000")
+    recording = open_recording(folder)
+    assert recording.layout == "folder"
+    assert [entry.depth.name for entry in recording.entries][-2:] == ["10.png", "11.png"]
+    np.testing.assert_allclose(recording.frame(11).depth, depth_values(11) / 2000, rtol=1e-6)
+
+
+def test_depth_alone_has_black_colour(tum):
+    (tum / "rgb.txt").unlink()
+    recording = open_recording(tum)
+    assert not recording.has_color
+    assert not recording.frame(0).color.any()
+
+
+@pytest.mark.skipif(not LR_KT3.is_dir(), reason="lr_kt3_depth is not on this machine")
+def test_lr_kt3_at_half_size():
+    recording = open_recording(LR_KT3).at_size("160x120")
+    assert (len(recording), recording.intrinsics.shape) == (600, (120, 160))
+    assert recording.intrinsics.cx == pytest.approx((159.75 + 0.5) / 2 - 0.5)
+    frame = recording.frame(599)
+    assert frame.depth.shape == (120, 160)
+    assert 0.5 < np.median(frame.depth[frame.depth > 0]) < 5
+
+
+def test_association_is_mutual_and_bounded():
+    first = np.array([0.0, 0.033, 0.066, 1.0])
+    second = np.array([0.004, 0.036, 0.041, 0.9])
+    np.testing.assert_array_equal(associate(first, second), [[0, 0], [1, 1]])
+
+
+def broken(folder, name, text):
+    (folder / name).write_text(text)
+
+
+CASES = {
+    "no such folder": (lambda f: f / "nowhere", "not a folder"),
+    "empty folder": (lambda f: (f / "empty").mkdir() or f / "empty", "is no RGB-D sequence"),
+    "empty listing": (lambda f: broken(f, "depth.txt", "# nothing\n"), r"depth\.txt lists no im"),
+    "unsorted": (
+        lambda f: broken(f, "depth.txt", "1 depth/0.png\n0.5 depth/1.png\n"),
+        r"depth\.txt:2: timestamp 0\.5 does not come after 1",
+    ),
+    "duplicate": (
+        lambda f: broken(f, "depth.txt", "1 depth/0.png\n1 depth/1.png\n"),
+        r"depth\.txt:2: timestamp 1 does not come after 1",
+    ),
+    "not a number": (
+        lambda f: broken(f, "rgb.txt", "\nnoon rgb/0.png\n"),
+        r"rgb\.txt:2: 'noon' is not a number",
+    ),
+    "three words": (
+        lambda f: broken(f, "depth.txt", "0 depth/0.png 1\n"),
+        r"depth\.txt:1: expected 'timestamp filename'",
+    ),
+    "no intrinsics": (lambda f: (f / "intrinsics.txt").unlink(), "intrinsics of .* are missing"),
+    "short intrinsics": (
+        lambda f: broken(f, "intrinsics.txt", "# fx\n30 30 15\n"),
+        r"intrinsics\.txt:2: expected 'fx fy cx cy width height",
+    ),
+    "NaN pose": (
+        lambda f: broken(f, "groundtruth.txt", "0 nan 0 0 0 0 0 1\n"),
+        r"groundtruth\.txt, line 1: a number is not finite",
+    ),
+    "times that never meet": (
+        lambda f: broken(f, "rgb.txt", "100 rgb/0.png\n"),
+        r"no image of rgb\.txt is as old",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_broken_listings(tum, case):
+    breaks, message = CASES[case]
+    where = breaks(tum)
+    with pytest.raises(InputError, match=message) as caught:
+        open_recording(where if isinstance(where, Path) else tum)
+    assert "\n" not in str(caught.value)
+
+
+IMAGES = {
+    "missing": (lambda p: p.unlink(), "No such file"),
+    "truncated": (lambda p: p.write_bytes(p.read_bytes()[:60]), "truncated|cannot identify|broken"),
+    "another size": (
+        lambda p: Image.fromarray(depth_values(0)[:20]).save(p),
+        "is 32x20 but the intrinsics say 32x24",
+    ),
+    "colour for depth": (lambda p: Image.fromarray(colors(0)).save(p), "not a 16-bit depth image"),
+}
+
+
+@pytest.mark.parametrize("case", IMAGES)
+def test_broken_images(tum, case):
+    breaks, message = IMAGES[case]
+    breaks(tum / "depth/1.png")
+    recording = open_recording(tum)
+    recording.frame(0)
+    with pytest.raises(InputError, match=message) as caught:
+        recording.frame(1)
+    assert re.search(r"depth\.txt:2: .*1\.png", str(caught.value))
+
+
+def test_unknown_choices(tum):
+    with pytest.raises(InputError, match="unknown layout 'bag'; valid choices: auto, tum"):
+        open_recording(tum, layout="bag")
+    recording = open_recording(tum)
+    with pytest.raises(InputError, match="valid choices: native, 80x60"):
+        recording.at_size("1x1")
+    with pytest.raises(InputError, match="cannot be reduced to 160x120"):
+        recording.at_size("160x120")
