@@ -94,6 +94,7 @@ def separate_pairs(chain: Chain, home: Float64) -> Chain:
     first, second = first[far], second[far]
     ends = chain.capsules(home)
     gap = segment_distance(ends[first], ends[second])
-    free = gap > chain.capsule_radius[first] + chain.capsule_radius[second]
+    gap = gap - chain.capsule_radius[first] - chain.capsule_radius[second]
+    free = gap > 0
     pairs = np.stack([first[free], second[free]], axis=1).astype(np.int32)
-    return dataclasses.replace(chain, self_pairs=pairs)
+    return dataclasses.replace(chain, self_pairs=pairs, self_gap=gap[free])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,7 @@ class Chain:
         capsule_ends: (m, 2, 3) ends of its axis in the link's frame; equal ends make a ball.
         capsule_radius: (m,) metres.
         self_pairs: (p, 2) capsules that must stay apart.
+        self_gap: (p,) metres between the surfaces of these pairs at the arm's home.
     """
 
     T_parent_joint: Float64
@@ -41,6 +42,7 @@ class Chain:
     capsule_ends: Float64
     capsule_radius: Float64
     self_pairs: Int32
+    self_gap: Float64 = field(default_factory=lambda: np.zeros(0))
 
     @property
     def num_joints(self) -> int:
@@ -62,11 +64,12 @@ class Chain:
         return self.link_poses(q)[..., -1, :, :] @ self.T_last_camera
 
     def camera_jacobian(self, q: Float64) -> Float64:
-        """(6, n) linear, then angular velocity of the camera in the base frame, per joint speed."""
-        links = self.link_poses(q)[1:]
-        axes = np.einsum("nij,nj->ni", links[:, :3, :3], self.axes)
-        arms = (links[-1] @ self.T_last_camera)[:3, 3] - links[:, :3, 3]
-        return np.concatenate([np.cross(axes, arms), axes], axis=1).T
+        """(..., 6, n) linear, then angular velocity of the camera in the base frame per speed."""
+        links = self.link_poses(q)[..., 1:, :, :]
+        axes = np.einsum("...nij,nj->...ni", links[..., :3, :3], self.axes)
+        camera = (links[..., -1, :, :] @ self.T_last_camera)[..., None, :3, 3]
+        arms = camera - links[..., :3, 3]
+        return np.swapaxes(np.concatenate([np.cross(axes, arms), axes], axis=-1), -1, -2)
 
     def capsules(self, q: Float64) -> Float64:
         """Ends (..., m, 2, 3) of the capsules' axes in the base frame at joint angles (..., n)."""

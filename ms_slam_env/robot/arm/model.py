@@ -22,7 +22,7 @@ ARM_MODELS = {"mico": Path(__file__).with_name("mico.xml")}
 """Arms that come with the package."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ArmModel:
     """MuJoCo's model and what the planner needs of it; shared, never changed.
 

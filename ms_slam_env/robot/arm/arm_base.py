@@ -1,0 +1,124 @@
+"""What every arm that holds the camera shares: its place, its candidate motions, their mask."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.robot.arm.config import ArmConfig
+from ms_slam_env.robot.arm.model import load_arm
+from ms_slam_env.robot.arm.placement import place_arm, reach_m
+from ms_slam_env.robot.arm.reach import Reach, ReachResult
+from ms_slam_env.robot.arm.surroundings import Surroundings
+from ms_slam_env.robot.base import Embodiment
+from ms_slam_env.robot.motions import NUM_MOTIONS, decompose
+from ms_slam_env.scenes.base import Scene
+from ms_slam_env.timings import Timings
+
+Float64 = NDArray[np.float64]
+
+
+def frame_times(duration_s: float, config: ArmConfig) -> Float64:
+    """Seconds (k,) after the start of a motion at which its frames are taken, the last at its end.
+
+    With ``frames_per_action = k`` they are k equal parts of the duration apart; a motion without
+    duration takes k periods of the camera. Without it they arrive at ``camera_hz``, at least one,
+    and the arm rests from the motion's end until the last of them, less than one period later.
+    """
+    k = config.frames_per_action
+    if k is not None and duration_s > 0:
+        return duration_s * np.arange(1, k + 1) / k
+    if k is None:
+        k = max(1, int(np.ceil(duration_s * config.camera_hz - 1e-6)))
+    return np.arange(1, k + 1) / config.camera_hz
+
+
+class ArmEmbodiment(Embodiment):
+    """An arm on a base that stands still, and the paper's 49 motions of the camera it holds.
+
+    Attributes:
+        scene: the world.
+        config: of the arm.
+        timings: charged with the stage ``mask``.
+        model: the arm.
+        motions: (49, 4, 4) the candidate motions ``T_camera_next``.
+        T_world_base: (4, 4) where the arm stands.
+        surroundings: furniture around it.
+        reach: which motions it can make.
+        q: (n,) joint angles where the arm is.
+        T_world_camera: (4, 4) where the camera is.
+    """
+
+    num_actions = NUM_MOTIONS
+
+    def __init__(
+        self, scene: Scene, config: ArmConfig, step_m: float, step_rad: float, timings: Timings
+    ) -> None:
+        self.scene = scene
+        self.config = config
+        self.timings = timings
+        self.model = load_arm(config.model, config.camera_site, config.joint_speed_rad_s)
+        self.motions = decompose(step_m, step_rad)
+        self.motions.flags.writeable = False
+        self.T_world_base = np.eye(4)
+        self.set_joints(self.model.home)
+
+    def reset(self, T_world_camera: Float64, rng: np.random.Generator) -> None:
+        """Put the arm where it can hold the camera at a start pose (4, 4).
+
+        Raises:
+            UnreachableError: it cannot be held there; the message says why.
+        """
+        T_world_base, q = place_arm(self.model, self.scene, T_world_camera, self.config, rng)
+        self.stand_at(T_world_base)
+        self.start_at(q, rng)
+
+    def stand_at(self, T_world_base: Float64) -> None:
+        """Move the base to a pose (4, 4) and look around from there."""
+        self.T_world_base = np.array(T_world_base, dtype=np.float64)
+        self.surroundings = Surroundings(self.scene, self.T_world_base, reach_m(self.model.chain))
+        self.reach = Reach(self.model.chain, self.surroundings, self.config)
+
+    def start_at(self, q: Float64, rng: np.random.Generator) -> None:
+        """Hold the arm at rest at joint angles (n,) at the start of an episode."""
+        self.set_joints(q)
+
+    def set_joints(self, q: Float64) -> None:
+        """The arm is now at joint angles (n,)."""
+        self.q = np.array(q, dtype=np.float64)
+        self.T_world_camera = self.T_world_base @ self.model.chain.camera_pose(self.q)
+        self._probe: ReachResult | None = None
+
+    def planning_state(self) -> tuple[Float64, Float64]:
+        """Joint angles (n,) and camera ``T_base_camera`` (4, 4) that motions are planned from.
+
+        What the arm itself believes; the truth for an arm without errors.
+        """
+        return self.q, self.model.chain.camera_pose(self.q)
+
+    def probe(self) -> ReachResult:
+        """Which of the 49 motions the arm can make from here, and how; worked out once a place."""
+        if self._probe is None:
+            with self.timings.stage("mask"):
+                q, T_base_camera = self.planning_state()
+                self._probe = self.reach.probe(q, T_base_camera @ self.motions)
+        return self._probe
+
+    def candidate_motions(self) -> Float64:
+        """The 49 motions ``T_camera_next`` (49, 4, 4), the same everywhere."""
+        return self.motions
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """(49,) whether the arm reaches each target on a straight line without touching."""
+        return self.probe().ok.copy()
+
+    def get_state(self) -> dict[str, Any]:
+        """Where the arm stands and its joint angles; the rest follows from them."""
+        return {"T_world_base": self.T_world_base.copy(), "q": self.q.copy()}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state that ``get_state`` returned."""
+        self.stand_at(state["T_world_base"])
+        self.set_joints(state["q"])

@@ -1,0 +1,233 @@
+"""Where an arm stands, and how it is bent, when an episode begins."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.errors import UnreachableError
+from ms_slam_env.geometry import invert, make_pose, so3_exp, transform_points
+from ms_slam_env.robot.arm.chain import Chain
+from ms_slam_env.robot.arm.config import ArmConfig
+from ms_slam_env.robot.arm.inverse import solve_pose
+from ms_slam_env.robot.arm.model import ArmModel
+from ms_slam_env.robot.arm.postures import (
+    Postures,
+    effort,
+    good_postures,
+    links_apart,
+    turn_upright,
+    wrap_joints,
+)
+from ms_slam_env.robot.arm.reach import LIMIT_MARGIN_RAD, Reach
+from ms_slam_env.robot.arm.surroundings import Surroundings
+from ms_slam_env.robot.motions import decompose
+from ms_slam_env.scenes.base import Scene
+
+Float64 = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+COLUMN_RADIUS_M = 0.08
+"""Radius of the column that carries a base above the floor."""
+
+_STEP_M, _STEP_RAD = 0.12, np.radians(12)  # motions that a place is judged by
+_PROBED = 4  # postures whose motions are counted
+_ENOUGH = 45  # motions: no need to look further
+_TRIED = 64  # good postures nearest to the wanted inclination of the camera
+_SEEDS = 24  # starting points of inverse kinematics for a given base
+_GRID_M = 0.05  # vertical distance of the points of a column that are checked
+
+
+def place_arm(
+    model: ArmModel,
+    scene: Scene,
+    T_world_camera: Float64,
+    config: ArmConfig,
+    rng: np.random.Generator,
+) -> tuple[Float64, Float64]:
+    """Find base pose T_world_base (4, 4) and joint angles (n,) that hold the camera at a pose.
+
+    Without ``config.base`` the arm stands upright on a column on the floor. Among the postures
+    that keep its limits and touch nothing it takes one from which most of the 49 motions are
+    possible. With ``config.base`` only the joint angles are free.
+
+    Raises:
+        UnreachableError: no such place or joint angles; the message says why.
+    """
+    if config.base is None:
+        return _stand_anywhere(model, scene, T_world_camera, config)
+    return _stand_on_base(model, scene, T_world_camera, config)
+
+
+@lru_cache(maxsize=8)
+def model_reach_m(model: ArmModel) -> float:
+    """Distance from the base that no part of the arm exceeds."""
+    return reach_m(model.chain)
+
+
+def reach_m(chain: Chain) -> float:
+    """Distance from the base that no part of the arm exceeds: the stretched chain."""
+    to_link = np.concatenate(
+        [[0.0], np.cumsum(np.linalg.norm(chain.T_parent_joint[:, :3, 3], axis=1))]
+    )
+    camera = to_link[-1] + np.linalg.norm(chain.T_last_camera[:3, 3])
+    ends = np.linalg.norm(chain.capsule_ends, axis=-1).max(axis=-1, initial=0.0)
+    skin = to_link[chain.capsule_link] + ends + chain.capsule_radius
+    return float(max(camera, skin.max(initial=0.0)))
+
+
+def _stand_anywhere(
+    model: ArmModel, scene: Scene, T_world_camera: Float64, config: ArmConfig
+) -> tuple[Float64, Float64]:
+    """Choose a posture with the camera's inclination; the base follows from it."""
+    chain = model.chain
+    postures = good_postures(model, config.speed_m_s, config.speed_rad_s)
+    up = T_world_camera[2, :3]
+    nearest = np.argsort(-(postures.up @ up), kind="stable")[:_TRIED]
+    q, upright = turn_upright(chain, postures.q[nearest], up)
+    q = wrap_joints(chain, q)
+    bendable = upright & chain.within_limits(q, LIMIT_MARGIN_RAD) & links_apart(chain, q)
+    T_world_base = T_world_camera @ invert(chain.camera_pose(q))
+    supported = _column_is_free(scene, T_world_base[:, :3, 3], T_world_camera[:3, 3])
+    clear = _links_are_free(chain, scene, T_world_base, q, config.clearance_m)
+    possible = np.flatnonzero(bendable & supported & clear)
+    if len(possible) == 0:
+        raise UnreachableError(
+            f"arm {model.path.stem} cannot hold the camera at "
+            f"{_words(T_world_camera[:3, 3])} in scene {scene.name}: of {len(q)} postures "
+            f"{int((~bendable).sum())} do not reach that inclination, "
+            f"{int((bendable & ~supported).sum())} have no free floor for the base, in "
+            f"{int((bendable & supported & ~clear).sum())} the arm would touch furniture"
+        )
+    order = possible[np.argsort(effort(chain, q[possible], config.speed_m_s, config.speed_rad_s))]
+    return _most_able(model, scene, config, T_world_base[order], q[order])
+
+
+def _stand_on_base(
+    model: ArmModel, scene: Scene, T_world_camera: Float64, config: ArmConfig
+) -> tuple[Float64, Float64]:
+    """Solve inverse kinematics from a given base."""
+    assert config.base is not None
+    chain = model.chain
+    x, y, z, yaw = config.base
+    T_world_base = make_pose(so3_exp([0.0, 0.0, yaw]), [x, y, z])
+    _check_base(model, scene, T_world_base)
+    postures = good_postures(model, config.speed_m_s, config.speed_rad_s)
+    target = invert(T_world_base) @ T_world_camera
+    found = solve_pose(chain, _seeds(postures, model.home, target), target)
+    reached = found.accurate()
+    where = f"start pose {_words(T_world_camera[:3, 3])}"
+    arm = f"arm {model.path.stem} from base {_words(T_world_base[:3, 3])}"
+    if not reached.any():
+        raise UnreachableError(f"{where} unreachable for {arm}")
+    q = wrap_joints(chain, found.q[reached])
+    q = q[chain.within_limits(q, LIMIT_MARGIN_RAD)]
+    if len(q) == 0:
+        raise UnreachableError(f"{where} is outside the joint limits of {arm}")
+    q = q[links_apart(chain, q)]
+    if len(q) == 0:
+        raise UnreachableError(f"{where} would make the links touch each other: {arm}")
+    bases = np.tile(T_world_base, (len(q), 1, 1))
+    clear = _links_are_free(chain, scene, bases, q, config.clearance_m)
+    if not clear.any():
+        raise UnreachableError(f"{where} would make the links touch furniture: {arm}")
+    q = q[clear]
+    order = np.argsort(effort(chain, q, config.speed_m_s, config.speed_rad_s), kind="stable")
+    return _most_able(model, scene, config, bases[: len(q)], q[order])
+
+
+def _most_able(
+    model: ArmModel, scene: Scene, config: ArmConfig, T_world_base: Float64, q: Float64
+) -> tuple[Float64, Float64]:
+    """Of places (s, 4, 4) with postures (s, n), the one with the most possible motions."""
+    motions = decompose(_STEP_M, _STEP_RAD)
+    best, most = 0, -1
+    for index in range(min(_PROBED, len(q))):
+        surroundings = Surroundings(scene, T_world_base[index], model_reach_m(model))
+        reach = Reach(model.chain, surroundings, config)
+        result = reach.probe(q[index], model.chain.camera_pose(q[index]) @ motions)
+        count = int(result.ok.sum())
+        if count > most:
+            best, most = index, count
+        if most >= _ENOUGH:
+            break
+    return T_world_base[best], q[best]
+
+
+def _seeds(postures: Postures, home: Float64, target: Float64) -> Float64:
+    """Joint angles (s, n) whose camera is near a target (4, 4), and the home."""
+    cameras = postures.any_T_base_camera
+    apart = np.linalg.norm(cameras[:, :3, 3] - target[:3, 3], axis=1)
+    cosine = 0.5 * (np.einsum("sij,ij->s", cameras[:, :3, :3], target[:3, :3]) - 1)
+    turned = np.arccos(np.clip(cosine, -1, 1))
+    nearest = np.argsort(apart + 0.3 * turned, kind="stable")[:_SEEDS]
+    return np.concatenate([home[None], postures.any_q[nearest]])
+
+
+def _check_base(model: ArmModel, scene: Scene, T_world_base: Float64) -> None:
+    """Refuse a base that is in something, other than standing on it.
+
+    Raises:
+        UnreachableError: with the free space around it.
+    """
+    chain = model.chain
+    fixed = np.flatnonzero(chain.capsule_link == 0)
+    for index in fixed:
+        a, b = transform_points(T_world_base, chain.capsule_ends[index])
+        points = a + np.linspace(0, 1, 5)[:, None] * (b - a)
+        # the surface that it stands on may be as near as the base's own plane
+        height = points[:, 2] - T_world_base[2, 3] - _GRID_M
+        need = np.clip(height, 0.0, chain.capsule_radius[index])
+        free = scene.clearance(points)
+        worst = int(np.argmax(need - free))
+        if free[worst] < need[worst]:
+            raise UnreachableError(
+                f"arm inside furniture: base at {_words(T_world_base[:3, 3])} has "
+                f"{free[worst]:.3f} m of free space, needs {need[worst]:.3f} m"
+            )
+
+
+def _column_is_free(scene: Scene, bases: Float64, camera: Float64) -> Bool:
+    """(s,) whether bases at (s, 3) can stand on a column down to the floor around the camera."""
+    floor = _floor_below(scene, camera)
+    height = bases[:, 2] - floor
+    steps = max(2, int(np.ceil(max(height.max(), 0.0) / _GRID_M)) + 1)
+    share = np.linspace(0.0, 1.0, steps)
+    z = floor + share * np.maximum(height, 0.0)[:, None]  # (s, steps)
+    points = np.stack([*(np.broadcast_to(bases[:, k, None], z.shape) for k in (0, 1)), z], axis=-1)
+    free = scene.clearance(points.reshape(-1, 3)).reshape(z.shape)
+    need = np.clip(z - floor - 2 * _GRID_M, 0.0, COLUMN_RADIUS_M)
+    return np.asarray((height >= 0) & (free >= need).all(axis=1))
+
+
+def _floor_below(scene: Scene, camera: Float64) -> float:
+    """Height of the lowest thing that is met going down within 1.2 m around the camera."""
+    ticks = np.arange(-1.2, 1.3, 0.3)
+    depth = np.arange(0.0, 4.0, _GRID_M)
+    x, y, down = np.meshgrid(ticks, ticks, depth, indexing="ij")
+    points = camera + np.stack([x, y, -down], axis=-1)
+    blocked = scene.clearance(points.reshape(-1, 3)).reshape(x.shape) <= 0
+    blocked[..., -1] = True
+    first = np.argmax(blocked, axis=-1)
+    return float(camera[2] - depth[first.max()])
+
+
+def _links_are_free(
+    chain: Chain, scene: Scene, T_world_base: Float64, q: Float64, clearance_m: float
+) -> Bool:
+    """(s,) whether the moving links keep their distance, arms (s, n) on bases (s, 4, 4)."""
+    moving = chain.capsule_link > 0
+    ends = chain.capsules(q)[:, moving]  # (s, m, 2, 3)
+    share = np.linspace(0, 1, 4)[:, None]
+    points = ends[..., :1, :] + share * (ends[..., 1:, :] - ends[..., :1, :])  # (s, m, 4, 3)
+    world = np.einsum("sij,smkj->smki", T_world_base[:, :3, :3], points)
+    world += T_world_base[:, None, None, :3, 3]
+    free = scene.clearance(world.reshape(-1, 3)).reshape(points.shape[:-1])
+    need = chain.capsule_radius[moving] + clearance_m
+    return np.asarray((free >= need[:, None]).all(axis=(1, 2)))
+
+
+def _words(position: Float64) -> str:
+    return str(np.round(position, 3).tolist())

@@ -1,0 +1,232 @@
+"""Which camera motions an arm can make: straight ways followed in joint space and checked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ms_slam_env._warp import wp
+from ms_slam_env.geometry import invert
+from ms_slam_env.robot.arm.chain import Chain
+from ms_slam_env.robot.arm.config import ArmConfig
+from ms_slam_env.robot.arm.path import PEAK_SPEED
+from ms_slam_env.robot.arm.reach_kernels import Arm, Grid, Scratch, follow, start_deficits
+from ms_slam_env.robot.arm.surroundings import Surroundings
+
+Float64 = NDArray[np.float64]
+Int32 = NDArray[np.int32]
+
+REASONS = ("ok", "unreachable", "joint limit", "joint speed", "furniture", "self-collision")
+"""Words for ``ReachResult.reason``."""
+
+WAYPOINTS = 8
+"""Joint configurations along a way, its ends included."""
+
+MOST_STRETCH = 2.0
+"""A way on which a joint would take more than this times the camera's duration is refused."""
+
+LIMIT_MARGIN_RAD = 0.02
+"""Distance that planned joint angles keep from their limits."""
+
+_STILL_S = 1e-6  # duration given to a way without motion
+_SHORTEST_PART_M = 0.03  # of a capsule, between two balls that cover it
+
+
+@dataclass(frozen=True)
+class ReachResult:
+    """What became of ``k`` ways.
+
+    Attributes:
+        ok: (k,) the arm can make the motion.
+        reason: (k,) index into ``REASONS``; 0 where ok.
+        q: (k, W, n) joint angles at equal parts of the way, the first at its start, the last at
+            its end; only the start is sure to be there where the motion is not ok.
+        duration_s: (k,) of the motion; longer than the camera's own where a joint needs longer;
+            0 without motion.
+    """
+
+    ok: NDArray[np.bool_]
+    reason: Int32
+    q: Float64
+    duration_s: Float64
+
+
+class Reach:
+    """Follows straight ways of the camera with the joints and says which are possible.
+
+    A way is possible if at each of its waypoints inverse kinematics finds joint angles within 1 mm
+    and 0.1 degrees of it, limits are kept, capsules around the links stay ``clearance_m`` away
+    from furniture (beyond the slack of ``Surroundings``) and from each other, and no joint needs
+    more than ``MOST_STRETCH`` times the duration of the camera's way. Between waypoints nothing is
+    checked: links move about 2 cm from one to the next, half of which the clearance covers.
+    Pairs of links that are closer than the clearance at the arm's home need half that gap.
+
+    An arm that stands too close already, by less than the clearance, may go on, though not closer:
+    a pose reached with a small error must not be a trap. The motion that stands still is always
+    possible.
+    """
+
+    def __init__(
+        self, chain: Chain, surroundings: Surroundings, config: ArmConfig, device: str = "cpu"
+    ) -> None:
+        self._chain = chain
+        self._config = config
+        self._device = device
+        self._arm = _arm(chain, config.clearance_m, device)
+        self._grid = _grid(surroundings, device)
+        self._buffers: dict[int, _Buffers] = {}
+
+    def probe(self, q: Float64, T_base_targets: Float64) -> ReachResult:
+        """Try the straight ways from joint angles (n,) to camera poses (k, 4, 4)."""
+        T_start = self._chain.camera_pose(q)
+        targets = np.asarray(T_base_targets, dtype=np.float64)
+        step = targets[:, :3, 3] - T_start[:3, 3]
+        turn = Rotation.from_matrix(T_start[:3, :3].T @ targets[:, :3, :3]).as_rotvec()
+        duration = PEAK_SPEED * np.maximum(
+            np.linalg.norm(step, axis=1) / self._config.speed_m_s,
+            np.linalg.norm(turn, axis=1) / self._config.speed_rad_s,
+        )
+        still = duration < _STILL_S
+        buffers = self._buffers.get(len(targets))
+        if buffers is None:
+            buffers = _Buffers(len(targets), self._chain, self._device)
+            self._buffers[len(targets)] = buffers
+        buffers.fill(q, step, turn, np.maximum(duration, _STILL_S))
+        wp.launch(
+            start_deficits,
+            dim=1,
+            inputs=[
+                self._arm,
+                self._grid,
+                buffers.scratch,
+                buffers.q,
+                self._config.clearance_m,
+                buffers.deficit,
+            ],
+            device=self._device,
+        )
+        wp.launch(
+            follow,
+            dim=len(targets),
+            inputs=[
+                self._arm,
+                self._grid,
+                buffers.scratch,
+                wp.mat33(T_start[:3, :3]),
+                wp.vec3(T_start[:3, 3]),
+                buffers.step,
+                buffers.turn,
+                buffers.duration,
+                buffers.deficit,
+                LIMIT_MARGIN_RAD,
+                MOST_STRETCH,
+                PEAK_SPEED,
+                buffers.q,
+                buffers.stretch,
+                buffers.reason,
+            ],
+            device=self._device,
+        )
+        reason = np.where(still, 0, buffers.reason.numpy()).astype(np.int32)
+        ok = reason == 0
+        waypoints = buffers.q.numpy().astype(np.float64)
+        waypoints[still] = q
+        waypoints[:, 0] = q
+        seconds = np.where(still, 0.0, duration * np.where(ok, buffers.stretch.numpy(), 1.0))
+        return ReachResult(ok, reason, waypoints, seconds)
+
+
+class _Buffers:
+    """Device arrays for ``k`` ways."""
+
+    def __init__(self, k: int, chain: Chain, device: str) -> None:
+        n, m = chain.num_joints, len(chain.capsule_link)
+
+        def array(shape: tuple[int, ...], dtype: Any) -> Any:
+            return wp.zeros(shape, dtype=dtype, device=device)
+
+        self.q = array((k, WAYPOINTS, n), wp.float32)
+        self.step = array((k,), wp.vec3)
+        self.turn = array((k,), wp.vec3)
+        self.duration = array((k,), wp.float32)
+        self.stretch = array((k,), wp.float32)
+        self.reason = array((k,), wp.int32)
+        self.deficit = array((2,), wp.float32)
+        self.scratch = Scratch()
+        self.scratch.R = array((k, n + 2), wp.mat33)
+        self.scratch.t = array((k, n + 2), wp.vec3)
+        self.scratch.a = array((k, max(m, 1)), wp.vec3)
+        self.scratch.b = array((k, max(m, 1)), wp.vec3)
+        self._start = np.zeros((k, WAYPOINTS, n), dtype=np.float32)
+
+    def fill(self, q: Float64, step: Float64, turn: Float64, duration: Float64) -> None:
+        """Load the ways."""
+        self._start[:] = q
+        self.q.assign(self._start)
+        self.step.assign(step.astype(np.float32))
+        self.turn.assign(turn.astype(np.float32))
+        self.duration.assign(duration.astype(np.float32))
+
+
+def _arm(chain: Chain, clearance_m: float, device: str) -> Arm:
+    """The chain for the kernel: joint frames turned so that their z axes are the joints' axes."""
+    turns = [np.eye(4)] + [_turn_to_z(axis) for axis in chain.axes]  # link frame <- turned frame
+    fixed = [*chain.T_parent_joint, chain.T_last_camera]
+    after = [*turns[1:], np.eye(4)]
+    joints = np.stack([invert(a) @ T @ b for a, T, b in zip(turns, fixed, after, strict=True)])
+    ends = chain.capsule_ends
+    back = invert(np.stack(turns))[chain.capsule_link][:, :3, :3]
+    ends = np.einsum("mij,mkj->mki", back, ends)
+    radius = chain.capsule_radius
+    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    parts = np.ceil(length / np.maximum(radius, _SHORTEST_PART_M) - 1e-6).astype(np.int32)
+    part = length / np.maximum(parts, 1)
+    pairs = chain.self_pairs
+    apart = np.minimum(clearance_m, 0.5 * chain.self_gap)
+
+    arm = Arm()
+    arm.num_joints = chain.num_joints
+    arm.joint_R = _array(joints[:, :3, :3], wp.mat33, device)
+    arm.joint_t = _array(joints[:, :3, 3], wp.vec3, device)
+    arm.lower = _array(np.maximum(chain.lower, -1e6), wp.float32, device)
+    arm.upper = _array(np.minimum(chain.upper, 1e6), wp.float32, device)
+    arm.speed = _array(chain.speed, wp.float32, device)
+    arm.capsule_link = _array(chain.capsule_link, wp.int32, device)
+    arm.capsule_a = _array(ends[:, 0], wp.vec3, device)
+    arm.capsule_b = _array(ends[:, 1], wp.vec3, device)
+    arm.capsule_parts = _array(parts, wp.int32, device)
+    arm.capsule_need = _array(radius + clearance_m, wp.float32, device)
+    # balls of this radius around the ends of the parts hold the whole capsule
+    arm.capsule_cover = _array(np.hypot(radius, 0.5 * part) + clearance_m, wp.float32, device)
+    arm.pair = _array(pairs, wp.vec2i, device)
+    arm.pair_need = _array(radius[pairs].sum(axis=1) + apart, wp.float32, device)
+    return arm
+
+
+def _grid(surroundings: Surroundings, device: str) -> Grid:
+    """The surroundings for the kernel."""
+    T = surroundings.T_world_base
+    grid = Grid()
+    grid.distance = _array(surroundings.grid, wp.float32, device)
+    grid.R_grid_base = wp.mat33(T[:3, :3] / surroundings.voxel_m)
+    grid.t_grid_base = wp.vec3((T[:3, 3] - surroundings.origin) / surroundings.voxel_m)
+    return grid
+
+
+def _array(values: NDArray[Any], dtype: Any, device: str) -> Any:
+    kind = np.int32 if dtype in (wp.int32, wp.vec2i) else np.float32
+    return wp.array(np.ascontiguousarray(values, dtype=kind), dtype=dtype, device=device)
+
+
+def _turn_to_z(axis: Float64) -> Float64:
+    """A rotation (4, 4) that maps z to a unit axis (3,)."""
+    aside = np.eye(3)[np.argmin(np.abs(axis))]
+    x = np.cross(aside, axis)
+    x /= np.linalg.norm(x)
+    turn = np.eye(4)
+    turn[:3, :3] = np.stack([x, np.cross(axis, x), axis], axis=1)
+    return turn
