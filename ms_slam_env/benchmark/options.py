@@ -28,12 +28,11 @@ def parse_value(text: str, name: str) -> Any:
         raise InputError(f"option {name!r}: {text!r} is not a YAML value") from None
 
 
-def parse_options(texts: Sequence[str]) -> dict[str, Any]:
-    """Nested mapping of ``EnvConfig`` from texts ``name.name=value``; values are YAML.
+def nested_options(texts: Sequence[str]) -> dict[str, Any]:
+    """Nested mapping from texts ``name.name=value``; values are YAML.
 
     Raises:
-        InputError: no ``=``, an unknown name (the message lists the valid ones), a value out of
-            range, or a name that the benchmark sets itself.
+        InputError: no ``=``, a value that is not YAML, or a name that is value and mapping.
     """
     result: dict[str, Any] = {}
     for text in texts:
@@ -41,14 +40,26 @@ def parse_options(texts: Sequence[str]) -> dict[str, Any]:
         *parents, name = path.split(".")
         if not equals:
             raise InputError(f"option {text!r} is not name=value")
-        if (parents or [name])[0] in OWN_OPTIONS:
-            raise InputError(f"option {path!r} is not free: the benchmark sets it")
         inner = result
         for parent in parents:
             inner = inner.setdefault(parent, {})
             if not isinstance(inner, dict):
                 raise InputError(f"option {path!r}: {parent} already has a value")
         inner[name] = parse_value(value, path)
+    return result
+
+
+def parse_options(texts: Sequence[str]) -> dict[str, Any]:
+    """Nested mapping of ``EnvConfig`` from texts ``name.name=value``; values are YAML.
+
+    Raises:
+        InputError: no ``=``, an unknown name (the message lists the valid ones), a value out of
+            range, or a name that the benchmark sets itself.
+    """
+    result = nested_options(texts)
+    for name in result:
+        if name in OWN_OPTIONS:
+            raise InputError(f"option {name!r} is not free: the benchmark sets it")
     backend = from_dict(EnvConfig, result).slam
     if backend not in BACKENDS:
         raise unknown("SLAM backend", backend, BACKENDS)

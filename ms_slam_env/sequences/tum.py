@@ -16,6 +16,16 @@ Float64 = NDArray[np.float64]
 _FIELDS = "timestamp tx ty tz qx qy qz qw"
 
 
+TRAJECTORY_HEADER = f"# {_FIELDS}"
+"""First line of a file of poses."""
+
+
+def trajectory_line(timestamp: float, T_world_camera: Float64) -> str:
+    """One pose (4, 4) at ``timestamp`` in seconds, without line end."""
+    values = (*T_world_camera[:3, 3], *quaternion_from_pose(T_world_camera))
+    return f"{timestamp:.6f} " + " ".join(f"{value:.9f}" for value in values)
+
+
 def write_trajectory(path: str | Path, timestamps: ArrayLike, poses: ArrayLike) -> None:
     """Write poses T_world_camera (N, 4, 4) at ``timestamps`` (N,) in seconds.
 
@@ -26,10 +36,7 @@ def write_trajectory(path: str | Path, timestamps: ArrayLike, poses: ArrayLike) 
     matrices = np.asarray(poses, dtype=np.float64)
     if times.ndim != 1 or matrices.shape != (len(times), 4, 4):
         raise InputError(f"{len(times)} timestamps do not fit poses of shape {matrices.shape}")
-    lines = [f"# {_FIELDS}"]
-    for time, T in zip(times, matrices, strict=True):
-        values = (*T[:3, 3], *quaternion_from_pose(T))
-        lines.append(f"{time:.6f} " + " ".join(f"{value:.9f}" for value in values))
+    lines = [TRAJECTORY_HEADER, *map(trajectory_line, times, matrices)]
     Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 

@@ -106,6 +106,14 @@ class SlamBackend(ABC):
         """
         return self.surface_points()
 
+    def map_attributes(self) -> dict[str, NDArray[Any]]:
+        """What is known of each of ``surface_points``, by name, in the same order.
+
+        ``color`` (M, 3) uint8 RGB; where the backend has them ``normal`` (M, 3), ``radius`` (M,)
+        metres, ``confidence`` (M,).
+        """
+        return {"color": self.surface_colors()}
+
     @abstractmethod
     def get_state(self) -> dict[str, Any]:
         """Everything needed to go on bit-exactly, as NumPy arrays and plain values."""

@@ -15,10 +15,9 @@ import pytest
 from ms_slam_env.benchmark import planner_benchmark
 from ms_slam_env.benchmark.planner_report import DETAILS, HEADLINE
 from ms_slam_env.benchmark.records import Row
-from ms_slam_env.benchmark.trajectory_evaluation import associate
 from ms_slam_env.cli import COMMANDS, main
 from ms_slam_env.geometry import make_pose, so3_exp
-from ms_slam_env.sequences import write_trajectory
+from ms_slam_env.sequences import associate, write_trajectory
 
 
 def one_line(text: str) -> str:
@@ -30,7 +29,7 @@ def one_line(text: str) -> str:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["fly"], "unknown command 'fly'; valid choices: benchmark, evaluate, train"),
+        (["fly"], "unknown command 'fly'; valid choices: benchmark, evaluate, run, train"),
         (["benchmark", "--planners", "nonsense"], "unknown planner 'nonsense'; valid choices:"),
         (["benchmark", "--scenes", "mars"], "unknown scene 'mars'; valid choices: living_room"),
         (["benchmark", "--scenes", "missing.glb"], "mesh file 'missing.glb' does not exist"),

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.sequences.association import associate
 from ms_slam_env.sequences.recording.listings import (
+    MAX_DIFFERENCE_S,
     Calibration,
     Listed,
-    associate,
     calibration,
     flip_y,
     listed_images,
@@ -69,8 +70,8 @@ def _pairs(folder: Path) -> list[Entry]:
     if not (folder / "rgb.txt").is_file():
         return [Entry(image.timestamp, image.path, None, image.where) for image in depth]
     color = listed_images(folder / "rgb.txt")
-    pairs = associate(_times(depth), _times(color))
-    if not len(pairs):
+    pairs = list(zip(*associate(_times(depth), _times(color), MAX_DIFFERENCE_S), strict=True))
+    if not pairs:
         raise InputError(f"{folder}: no image of rgb.txt is as old as one of depth.txt")
     return [
         Entry(depth[d].timestamp, depth[d].path, color[c].path, depth[d].where) for d, c in pairs

@@ -81,18 +81,6 @@ def listed_images(path: Path) -> list[Listed]:
     return found
 
 
-def associate(first: Float64, second: Float64, most: float = MAX_DIFFERENCE_S) -> NDArray[np.int64]:
-    """Pair times (N,) and (M,) that are each other's nearest: indices (K, 2).
-
-    Pairs more than ``most`` seconds apart are left out.
-    """
-    nearest = np.array([int(np.abs(second - t).argmin()) for t in first], dtype=np.int64)
-    back = np.array([int(np.abs(first - t).argmin()) for t in second], dtype=np.int64)
-    index = np.arange(len(first))
-    fits = (back[nearest] == index) & (np.abs(second[nearest] - first) <= most)
-    return np.stack([index[fits], nearest[fits]], axis=1)
-
-
 def read_matrix(path: Path) -> Float64:
     """Read a pose (4, 4) T_world_camera written as four rows of four numbers.
 

@@ -1,0 +1,155 @@
+"""A SLAM backend over a recorded sequence: trajectory, map and metrics in a folder."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from ms_slam_env import metrics, slam
+from ms_slam_env.benchmark.point_cloud import write_ply
+from ms_slam_env.benchmark.provenance import provenance
+from ms_slam_env.benchmark.records import write_json
+from ms_slam_env.geometry import invert
+from ms_slam_env.sequences import associate
+from ms_slam_env.sequences.recording import Recording
+from ms_slam_env.sequences.tum import TRAJECTORY_HEADER, trajectory_line
+from ms_slam_env.slam.base import TrackResult
+
+Float64 = NDArray[np.float64]
+
+TRAJECTORY, UNFINISHED, MAP, METRICS = (
+    "trajectory.txt",
+    "trajectory.incomplete.txt",
+    "map.ply",
+    "metrics.json",
+)
+MAX_DIFFERENCE_S = 0.02
+
+
+@dataclass
+class Track:
+    """What SLAM said, frame by frame."""
+
+    times: list[float] = field(default_factory=list)
+    poses: list[Float64] = field(default_factory=list)
+    tracking_ok: list[bool] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+
+    def append(self, timestamp: float, result: TrackResult, seconds: float) -> None:
+        """Add a frame."""
+        self.times.append(timestamp)
+        self.poses.append(result.T_world_camera)
+        self.tracking_ok.append(result.tracking_ok)
+        self.seconds.append(seconds)
+
+
+def run_sequence(
+    recording: Recording, backend: str, params: dict[str, Any], out: Path
+) -> dict[str, Any]:
+    """Track every frame of ``recording`` and write what came of it to ``out``.
+
+    SLAM starts at the true pose of the first frame where that is known, else at the identity.
+    While it runs, the trajectory so far stands in ``trajectory.incomplete.txt``; at the end it is
+    renamed to ``trajectory.txt``, beside ``map.ply`` and ``metrics.json``. A run that fails or is
+    interrupted leaves the unfinished file and a ``metrics.json`` that says so.
+
+    Returns:
+        the content of ``metrics.json``.
+
+    Raises:
+        InputError: a bad option, or an image that cannot be read.
+    """
+    system = slam.make(backend, recording.intrinsics, **params)
+    system.reset(_start(recording))
+    out.mkdir(parents=True, exist_ok=True)
+    for old in (TRAJECTORY, MAP, METRICS):
+        (out / old).unlink(missing_ok=True)
+    track = Track()
+    result: dict[str, Any] = {"complete": False}
+    about = {
+        "sequence": recording.name,
+        "layout": recording.layout,
+        "backend": backend,
+        "params": params,
+        "image_size": f"{recording.intrinsics.width}x{recording.intrinsics.height}",
+        **provenance(),
+    }
+    try:
+        with (out / UNFINISHED).open("w", encoding="utf-8") as file:
+            file.write(TRAJECTORY_HEADER + "\n")
+            _track_all(recording, system, track, file)
+        write_ply(out / MAP, system.surface_points(), system.map_attributes())
+        os.replace(out / UNFINISHED, out / TRAJECTORY)
+        result["complete"] = True
+    except BaseException as error:
+        result["error"] = str(error) or type(error).__name__
+        raise
+    finally:
+        result.update(measure(track, recording))
+        write_json(out / METRICS, {**result, **about})
+    return result
+
+
+def _track_all(recording: Recording, system: slam.SlamBackend, track: Track, file: Any) -> None:
+    with tqdm(total=len(recording), desc=recording.name, unit="frame") as bar:
+        for frame in recording:
+            start = time.process_time()
+            result = system.track(frame)
+            track.append(frame.timestamp, result, time.process_time() - start)
+            file.write(trajectory_line(frame.timestamp, result.T_world_camera) + "\n")
+            file.flush()
+            bar.set_postfix_str("tracking" if result.tracking_ok else "LOST", refresh=False)
+            bar.update()
+
+
+def _start(recording: Recording) -> Float64 | None:
+    """The true pose of the first frame, where one is near in time."""
+    if recording.truth is None or recording.truth_times is None:
+        return None
+    nearest = int(np.abs(recording.truth_times - recording.timestamps[0]).argmin())
+    if abs(recording.truth_times[nearest] - recording.timestamps[0]) > MAX_DIFFERENCE_S:
+        return None
+    return recording.truth[nearest]
+
+
+def measure(track: Track, recording: Recording) -> dict[str, Any]:
+    """Metrics of a run, finished or not; those against the truth only where there is one.
+
+    ``frames``, ``lost_frames``, processor time a frame (``ms_median``, ``ms_p95``), ``path_m`` of
+    the estimate; ``ate_m`` (RMSE after SE(3) alignment), ``ate_max_m``, ``rpe_m``, ``rpe_rad``.
+    """
+    if not track.times:
+        return {"frames": 0}
+    poses = np.stack(track.poses)
+    ms = 1e3 * np.array(track.seconds)
+    result: dict[str, Any] = {
+        "frames": len(poses),
+        "lost_frames": int(len(poses) - sum(track.tracking_ok)),
+        "ms_median": float(np.median(ms)),
+        "ms_p95": float(np.percentile(ms, 95)),
+        "path_m": metrics.path_length(poses),
+    }
+    if recording.truth is None or recording.truth_times is None:
+        return result
+    times = np.array(track.times)
+    estimate, truth = associate(times, recording.truth_times, MAX_DIFFERENCE_S)
+    if len(estimate) < 2:
+        return result
+    P, Q = poses[estimate], recording.truth[truth]
+    ate = metrics.ate_statistics(P, Q)
+    return {
+        **result,
+        "compared": len(P),
+        "ate_m": ate.rmse,
+        "ate_max_m": ate.max,
+        "ate_unaligned_m": metrics.ate_rmse(Q[0] @ invert(P[0]) @ P, Q, align="none"),
+        "rpe_m": metrics.rpe_rmse(P, Q),
+        "rpe_rad": metrics.rpe_rmse(P, Q, kind="rotation"),
+    }

@@ -1,0 +1,48 @@
+"""``ms-slam run``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from ms_slam_env.benchmark.command_line import parse
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Run a SLAM backend over a recorded RGB-D sequence.
+
+    Layouts: TUM RGB-D, ICL-NUIM, 7-Scenes, or folders depth and rgb with an intrinsics.txt of
+    "fx fy cx cy width height [depth_scale]". Writes trajectory.txt (TUM), map.ply, metrics.json.
+    """
+
+    sequence: tyro.conf.Positional[Path]
+    """Folder of the sequence."""
+    backend: str = "surfel"
+    """SLAM backend."""
+    image_size: str = "native"
+    """Reduce the images to this size, such as 160x120."""
+    layout: str = "auto"
+    """auto, tum, icl-nuim, 7-scenes or folder."""
+    params: tuple[str, ...] = ()
+    """Parameters of the backend, as in icp_rgb_weight=0.2."""
+    out: Path = Path("results/run")
+    """Folder of the results."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run, write, and print what was measured."""
+    args = parse(Arguments, arguments, "ms-slam run")
+    from ms_slam_env.benchmark.options import nested_options
+    from ms_slam_env.benchmark.sequence_run import run_sequence
+    from ms_slam_env.sequences.recording import open_recording
+
+    recording = open_recording(args.sequence, args.layout).at_size(args.image_size)
+    result = run_sequence(recording, args.backend, nested_options(args.params), args.out)
+    for name in ("frames", "lost_frames", "ms_median", "path_m", "ate_m", "rpe_m"):
+        if name in result:
+            print(f"{name:12} {result[name]:.4g}")
+    return 0

@@ -1,0 +1,114 @@
+"""``ms-slam run``: what it writes, and what an unfinished run leaves."""
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from ms_slam_env.camera import xtion
+from ms_slam_env.cli import main
+from ms_slam_env.geometry import look_at
+from ms_slam_env.metrics import ate_rmse
+from ms_slam_env.sequences import read_trajectory, render_sequence, write_trajectory
+
+FRAMES = 8
+
+
+@pytest.fixture(scope="module")
+def sequence(box_scene, tmp_path_factory):
+    """A short sequence of the box scene in the TUM layout, 80x60."""
+    folder = tmp_path_factory.mktemp("sequences") / "box"
+    intrinsics = xtion("80x60")
+    eye = box_scene.sample_start(np.random.default_rng(0))[:3, 3]
+    low, high = box_scene.mesh.vertices.min(0), box_scene.mesh.vertices.max(0)
+    middle = (low + high) / 2
+    poses = np.stack([look_at(eye + 0.01 * k * np.eye(3)[0], middle) for k in range(FRAMES)])
+    rendered = render_sequence(box_scene, poses, intrinsics)
+    for name in ("rgb", "depth"):
+        (folder / name).mkdir(parents=True)
+    listings = {"rgb": [], "depth": []}
+    for index, frame in enumerate(rendered.frames):
+        Image.fromarray(frame.color).save(folder / f"rgb/{index}.png")
+        values = np.rint(frame.depth * 5000).astype(np.uint16)
+        Image.fromarray(values).save(folder / f"depth/{index}.png")
+        for name, lines in listings.items():
+            lines.append(f"{frame.timestamp:.6f} {name}/{index}.png")
+    for name, lines in listings.items():
+        (folder / f"{name}.txt").write_text("\n".join(lines))
+    i = intrinsics
+    (folder / "intrinsics.txt").write_text(f"{i.fx} {i.fy} {i.cx} {i.cy} {i.width} {i.height}")
+    times = [frame.timestamp for frame in rendered.frames]
+    write_trajectory(folder / "groundtruth.txt", times, poses)
+    return folder
+
+
+def test_writes_trajectory_map_and_metrics(sequence, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["run", str(sequence), "--out", str(out)]) == 0
+    assert sorted(path.name for path in out.iterdir()) == [
+        "map.ply",
+        "metrics.json",
+        "trajectory.txt",
+    ]
+    times, poses = read_trajectory(out / "trajectory.txt")
+    _, truth = read_trajectory(sequence / "groundtruth.txt")
+    written = json.loads((out / "metrics.json").read_text())
+    assert written["complete"]
+    assert (written["frames"], written["lost_frames"], len(times)) == (FRAMES, 0, FRAMES)
+    assert written["ate_m"] == pytest.approx(ate_rmse(poses, truth), abs=1e-6)
+    assert written["ate_m"] < 0.01
+    np.testing.assert_allclose(poses[0], truth[0], atol=1e-6)
+    cloud = trimesh.load(out / "map.ply")
+    assert len(cloud.vertices) > 1000
+    raw = cloud.metadata["_ply_raw"]["vertex"]["properties"]
+    assert {"red", "nx", "ny", "nz", "radius", "confidence"} <= set(raw)
+    assert "ate_m" in capsys.readouterr().out
+
+
+def test_reduced_images_and_parameters(sequence, tmp_path):
+    out = tmp_path / "out"
+    command = ["run", str(sequence), "--out", str(out), "--params", "depth_cutoff_m=2.5"]
+    assert main(command) == 0
+    assert json.loads((out / "metrics.json").read_text())["params"] == {"depth_cutoff_m": 2.5}
+    farthest = np.linalg.norm(trimesh.load(out / "map.ply").vertices, axis=1).max()
+    assert np.isfinite(farthest)
+
+
+def test_a_run_that_fails_keeps_the_trajectory_so_far(sequence, tmp_path, capsys):
+    import shutil
+
+    broken = tmp_path / "broken"
+    shutil.copytree(sequence, broken)
+    image = broken / "depth/5.png"
+    image.write_bytes(image.read_bytes()[:100])
+    out = tmp_path / "out"
+    assert main(["run", str(broken), "--out", str(out)]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert "depth.txt:6" in lines[-1]
+    assert "5.png" in lines[-1]
+    assert not (out / "trajectory.txt").exists()
+    times, _ = read_trajectory(out / "trajectory.incomplete.txt")
+    assert len(times) == 5
+    written = json.loads((out / "metrics.json").read_text())
+    assert not written["complete"]
+    assert written["frames"] == 5
+    assert "5.png" in written["error"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["run", "nowhere"], "no sequence at nowhere: not a folder"),
+        (["run", "SEQUENCE", "--backend", "orb"], "unknown SLAM backend 'orb'; valid choices: su"),
+        (["run", "SEQUENCE", "--params", "speed"], "option 'speed' is not name=value"),
+        (["run", "SEQUENCE", "--params", "speed=1"], "'slam_config.speed'; valid choices"),
+        (["run", "SEQUENCE", "--image-size", "3x2"], "unknown image size '3x2'"),
+    ],
+)
+def test_bad_input_is_one_line(arguments, message, sequence, tmp_path, capsys):
+    words = [str(sequence) if word == "SEQUENCE" else word for word in arguments]
+    assert main([*words, "--out", str(tmp_path / "out")]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert message in lines[-1]
