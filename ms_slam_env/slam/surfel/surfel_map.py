@@ -199,13 +199,14 @@ class SurfelMap:
 
     def points(self, env: int = 0, stable: bool = True) -> Float64:
         """Positions (M, 3) of the living surfels, world frame; only stable ones if asked."""
-        return self._living("position", env, stable).astype(np.float64)
+        return self.attribute("position", env, stable).astype(np.float64)
 
     def colors(self, env: int = 0, stable: bool = True) -> NDArray[np.uint8]:
         """Colours (M, 3) RGB of ``points``, in the same order."""
-        return np.clip(np.rint(self._living("color", env, stable)), 0, 255).astype(np.uint8)
+        return np.clip(np.rint(self.attribute("color", env, stable)), 0, 255).astype(np.uint8)
 
-    def _living(self, name: str, env: int, stable: bool) -> NDArray[np.float32]:
+    def attribute(self, name: str, env: int = 0, stable: bool = True) -> NDArray[np.float32]:
+        """Array ``name`` of the living surfels, in the order of ``points``."""
         used = int(self.surfels.count.numpy()[env])
         confidence = self.surfels.confidence[env, :used].numpy()
         keep = confidence > 0

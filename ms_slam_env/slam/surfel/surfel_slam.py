@@ -80,6 +80,12 @@ class SurfelSlam(SlamBackend):
         """Colours (M, 3) RGB of ``surface_points``."""
         return self.map.colors(stable=False)
 
+    def map_attributes(self) -> dict[str, NDArray[Any]]:
+        """Colour, normal, radius and confidence of ``surface_points``."""
+        names = ("normal", "radius", "confidence")
+        living = {name: self.map.attribute(name, stable=False) for name in names}
+        return {"color": self.surface_colors(), **living}
+
     def get_state(self) -> dict[str, Any]:
         """Everything needed to go on bit-exactly, as NumPy arrays."""
         return self._slam.get_state()
