@@ -14,6 +14,8 @@ from ms_slam_env.robot.arm.config import ArmConfig
 from ms_slam_env.robot.arm.inverse import solve_pose
 from ms_slam_env.robot.arm.model import ArmModel
 from ms_slam_env.robot.arm.postures import (
+    STEP_M,
+    STEP_RAD,
     Postures,
     effort,
     good_postures,
@@ -32,11 +34,11 @@ Bool = NDArray[np.bool_]
 COLUMN_RADIUS_M = 0.08
 """Radius of the column that carries a base above the floor."""
 
-_STEP_M, _STEP_RAD = 0.12, np.radians(12)  # motions that a place is judged by
 _PROBED = 4  # postures whose motions are counted
 _ENOUGH = 45  # motions: no need to look further
 _TRIED = 64  # good postures nearest to the wanted inclination of the camera
 _SEEDS = 24  # starting points of inverse kinematics for a given base
+_MET_M = 0.02  # closer than this to a surface is on it
 _GRID_M = 0.05  # vertical distance of the points of a column that are checked
 
 
@@ -142,7 +144,7 @@ def _most_able(
     model: ArmModel, scene: Scene, config: ArmConfig, T_world_base: Float64, q: Float64
 ) -> tuple[Float64, Float64]:
     """Of places (s, 4, 4) with postures (s, n), the one with the most possible motions."""
-    motions = decompose(_STEP_M, _STEP_RAD)
+    motions = decompose(STEP_M, STEP_RAD)
     best, most = 0, -1
     for index in range(min(_PROBED, len(q))):
         surroundings = Surroundings(scene, T_world_base[index], model_reach_m(model))
@@ -198,20 +200,20 @@ def _column_is_free(scene: Scene, bases: Float64, camera: Float64) -> Bool:
     z = floor + share * np.maximum(height, 0.0)[:, None]  # (s, steps)
     points = np.stack([*(np.broadcast_to(bases[:, k, None], z.shape) for k in (0, 1)), z], axis=-1)
     free = scene.clearance(points.reshape(-1, 3)).reshape(z.shape)
-    need = np.clip(z - floor - 2 * _GRID_M, 0.0, COLUMN_RADIUS_M)
+    need = np.clip(z - floor - _GRID_M, 0.0, COLUMN_RADIUS_M)
     return np.asarray((height >= 0) & (free >= need).all(axis=1))
 
 
 def _floor_below(scene: Scene, camera: Float64) -> float:
     """Height of the lowest thing that is met going down within 1.2 m around the camera."""
-    ticks = np.arange(-1.2, 1.3, 0.3)
-    depth = np.arange(0.0, 4.0, _GRID_M)
+    ticks = np.arange(-1.2, 1.3, 0.4)
+    depth = np.arange(0.0, 3.0, 0.5 * _GRID_M)
     x, y, down = np.meshgrid(ticks, ticks, depth, indexing="ij")
     points = camera + np.stack([x, y, -down], axis=-1)
-    blocked = scene.clearance(points.reshape(-1, 3)).reshape(x.shape) <= 0
-    blocked[..., -1] = True
-    first = np.argmax(blocked, axis=-1)
-    return float(camera[2] - depth[first.max()])
+    free = scene.clearance(points.reshape(-1, 3)).reshape(x.shape)
+    met = np.logical_or.accumulate(free <= _MET_M, axis=-1)
+    bottom = np.where(met, np.inf, points[..., 2] - free)  # the space goes on down to there
+    return float(bottom.min(initial=camera[2]))
 
 
 def _links_are_free(

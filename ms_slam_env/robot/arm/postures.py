@@ -7,14 +7,19 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ms_slam_env.robot.arm.chain import Chain, segment_distance
 from ms_slam_env.robot.arm.model import ArmModel
+from ms_slam_env.robot.motions import decompose
 
 Float64 = NDArray[np.float64]
 
 LIMIT_MARGIN_RAD = 0.15
 """Distance that a posture keeps from joint limits, so that motions are left on both sides."""
+
+STEP_M, STEP_RAD = 0.12, np.radians(12)
+"""Motions that a posture is judged by."""
 
 _SAMPLES = 20_000
 _PITCHES = 19  # evenly from straight down to straight up
@@ -22,6 +27,7 @@ _TRIED_PER_PITCH = 300
 _KEPT_PER_PITCH = 24
 _APART_M = 0.06  # least distance between the bases of two postures of one pitch
 _DAMPING = 0.02
+_TOO_HARD = 4.0
 
 
 @dataclass(frozen=True)
@@ -79,25 +85,38 @@ def good_postures(model: ArmModel, speed_m_s: float, speed_rad_s: float) -> Post
 
 
 def effort(chain: Chain, q: Float64, speed_m_s: float, speed_rad_s: float) -> Float64:
-    """(s,) how hard the joints at (s, n) work for the camera's motions; 1 is their limit.
+    """(s,) how hard the joints at (s, n) work, on average over the 49 motions of the camera.
 
-    Greatest ratio of needed to permitted joint speed over translations along and rotations about
-    the camera's axes at the camera's speeds, by the damped inverse of the Jacobian. Very large
-    where the camera is out of control.
+    For each motion the greatest ratio of needed to permitted joint speed, by the damped inverse of
+    the Jacobian where the motion begins, at least 1 (the joints are fast enough) and at most 4
+    (too slow, or out of control).
     """
     if len(q) == 0:
         return np.zeros(0)
     J = chain.camera_jacobian(q)
     R = chain.camera_pose(q)[:, :3, :3]
-    twists = np.zeros((len(q), 6, 6))  # columns
-    twists[:, :3, :3], twists[:, 3:, 3:] = speed_m_s * R, speed_rad_s * R
+    rates = _camera_rates(speed_m_s, speed_rad_s)
+    twists = np.concatenate([R @ rates[:3], R @ rates[3:]], axis=1)  # (s, 6, 49)
     J_transposed = np.swapaxes(J, -1, -2)
-    inverse = np.linalg.solve(J @ J_transposed + _DAMPING**2 * np.eye(6), twists)
-    speeds = np.abs(J_transposed @ inverse) / chain.speed[:, None]  # (s, n, 6)
-    missed = np.linalg.norm(J @ J_transposed @ inverse - twists, axis=1)
-    wanted = np.linalg.norm(twists, axis=1)
-    lost = (missed > 0.5 * wanted).sum(axis=-1)  # directions that the arm does not have
-    return speeds.max(axis=1).max(axis=-1) + 2.0 * lost
+    inverse = J_transposed @ np.linalg.inv(J @ J_transposed + _DAMPING**2 * np.eye(6))
+    speeds = inverse @ twists
+    ratio = np.abs(speeds / chain.speed[:, None]).max(axis=1)  # (s, 49)
+    missed = np.linalg.norm(J @ speeds - twists, axis=1)
+    ratio[missed > 0.3 * np.linalg.norm(twists, axis=1)] = np.inf
+    return np.clip(ratio, 1.0, _TOO_HARD).mean(axis=1)
+
+
+def _camera_rates(speed_m_s: float, speed_rad_s: float) -> Float64:
+    """(6, 49) greatest linear and angular velocity of each motion in the camera's frame."""
+    motions = decompose(STEP_M, STEP_RAD)
+    way = np.concatenate(
+        [motions[:, :3, 3], Rotation.from_matrix(motions[:, :3, :3]).as_rotvec()], 1
+    )
+    least_s = np.maximum(
+        np.linalg.norm(way[:, :3], axis=1) / speed_m_s,
+        np.linalg.norm(way[:, 3:], axis=1) / speed_rad_s,
+    )
+    return (way / np.maximum(least_s, 1e-9)[:, None]).T
 
 
 def turn_upright(

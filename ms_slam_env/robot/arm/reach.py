@@ -26,7 +26,7 @@ REASONS = ("ok", "unreachable", "joint limit", "joint speed", "furniture", "self
 WAYPOINTS = 8
 """Joint configurations along a way, its ends included."""
 
-MOST_STRETCH = 2.0
+MOST_STRETCH = 3.0
 """A way on which a joint would take more than this times the camera's duration is refused."""
 
 LIMIT_MARGIN_RAD = 0.02

@@ -1,3 +1,4 @@
+# ruff: noqa: UP018, RUF046 (Warp needs variables, not constants)
 """Warp kernel that follows the camera's straight way to every candidate with the joints.
 
 One thread follows one candidate: inverse kinematics from waypoint to waypoint, then the checks,
