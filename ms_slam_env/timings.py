@@ -12,28 +12,37 @@ class Timings:
     """Seconds spent in each stage: in its last call, and in total with the number of calls.
 
     Stages nest: ``observation`` contains the ``lookahead`` that the variant of that name asks for.
+    ``total`` counts what is nested in a stage, ``own`` does not, so that the ``own`` of all stages
+    add up to the time spent in any.
     """
 
     def __init__(self) -> None:
         self.total: dict[str, float] = defaultdict(float)
+        self.own: dict[str, float] = defaultdict(float)
         self.calls: dict[str, int] = defaultdict(int)
         self.last: dict[str, float] = {}
+        self._nested: list[float] = []  # seconds of the stages within each open one
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Charge the enclosed block to stage ``name``."""
         start = time.perf_counter()
+        self._nested.append(0.0)
         try:
             yield
         finally:
             elapsed = time.perf_counter() - start
             self.last[name] = elapsed
             self.total[name] += elapsed
+            self.own[name] += elapsed - self._nested.pop()
             self.calls[name] += 1
+            if self._nested:
+                self._nested[-1] += elapsed
 
     def clear(self) -> None:
         """Forget everything."""
         self.total.clear()
+        self.own.clear()
         self.calls.clear()
         self.last.clear()
 

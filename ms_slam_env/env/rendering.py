@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, look_at, transform_points
 from ms_slam_env.robot import describe
+from ms_slam_env.robot.arm.arm_base import ArmEmbodiment
 
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv
@@ -24,6 +25,10 @@ _PLOT = (160, 320)
 _TRUE_COLOR = (60, 180, 75)
 _ESTIMATE_COLOR = (230, 60, 60)
 _TARGET_COLOR = (120, 120, 120)
+_LINK_COLOR = (40, 40, 45)
+_JOINT_COLOR = (235, 160, 40)
+_BASE_RADIUS_M = 0.08
+_NEAREST_M = 0.1  # what is nearer to the point of view is not drawn
 _BACKGROUND = 250
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _MAX_DEPTH_M = 5.0
@@ -43,9 +48,9 @@ class Renderer:
 
     def _color(self, env: ActiveSlamEnv) -> Image:
         image = cv2.resize(env.last_frame.color, _PANEL[::-1])
-        step = len(env.trajectory_truth) - 1
+        frame = len(env.trajectory_truth) - 1
         state = "" if env.tracking_ok else ", TRACKING LOST"
-        return _caption(image, f"{env.scene.name} {step}: {describe(env.last_motion)}{state}")
+        return _caption(image, f"{env.scene.name} {frame}: {describe(env.last_motion)}{state}")
 
     def _depth(self, env: ActiveSlamEnv) -> Image:
         depth = env.last_frame.depth
@@ -62,6 +67,8 @@ class Renderer:
         canvas = np.full((*_MAP, 3), _BACKGROUND, np.uint8)
         points, colors = env.slam.surface_points(), env.slam.surface_colors()
         _splat(canvas, camera, T_world_outside, points, colors)
+        if isinstance(env.embodiment, ArmEmbodiment):
+            _draw_arm(canvas, camera, T_world_outside, env.embodiment)
         estimate = env.trajectory_estimate
         _draw_path(canvas, camera, T_world_outside, truth, _TRUE_COLOR, width=4)
         _draw_path(canvas, camera, T_world_outside, estimate, _ESTIMATE_COLOR, width=1)
@@ -104,7 +111,7 @@ def _project(
     camera: Intrinsics, T_world_camera: Float64, points: Float64
 ) -> tuple[Float64, Float64]:
     local = transform_points(invert(T_world_camera), points)
-    in_front = local[:, 2] > 0.1
+    in_front = local[:, 2] > _NEAREST_M
     pixels = np.full((len(local), 2), -1.0)
     pixels[in_front] = camera.project(local[in_front])
     return pixels, local[:, 2]
@@ -136,6 +143,25 @@ def _draw_path(
     line = np.rint(pixels).astype(np.int32)
     cv2.polylines(canvas, [line], False, color, width, cv2.LINE_AA)
     cv2.circle(canvas, (int(line[-1, 0]), int(line[-1, 1])), 2 + width, color, -1, cv2.LINE_AA)
+
+
+def _draw_arm(
+    canvas: Image, camera: Intrinsics, T_world_camera: Float64, arm: ArmEmbodiment
+) -> None:
+    """Links as lines from joint to joint and on to the camera, the base as a disc."""
+    angles = np.linspace(0, 2 * np.pi, 24)
+    rim = _BASE_RADIUS_M * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+    links = arm.model.chain.link_poses(arm.q)[:, :3, 3]
+    joints = np.vstack([transform_points(arm.T_world_base, links), arm.T_world_camera[:3, 3]])
+    disc, depth = _project(camera, T_world_camera, transform_points(arm.T_world_base, rim))
+    line, line_depth = _project(camera, T_world_camera, joints)
+    if min(depth.min(), line_depth.min()) <= _NEAREST_M:
+        return  # partly behind the point of view
+    cv2.fillConvexPoly(canvas, np.rint(disc).astype(np.int32), _LINK_COLOR, cv2.LINE_AA)
+    corners = np.rint(line).astype(np.int32)
+    cv2.polylines(canvas, [corners], False, _LINK_COLOR, 5, cv2.LINE_AA)
+    for u, v in corners[1:-1].tolist():
+        cv2.circle(canvas, (u, v), 3, _JOINT_COLOR, -1, cv2.LINE_AA)
 
 
 def _plot(values: Float64, target: float | None, top: float, title: str) -> Image:

@@ -1,0 +1,169 @@
+"""The picture of the arm: `python -m ms_slam_env.benchmark.arm_figure --out FILE.png`.
+
+The arm where an episode put it in several scenes, seen from outside by the project's own renderer,
+and what its camera sees. No OpenGL is needed.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env import scenes
+from ms_slam_env.benchmark.arm_mesh import LABEL, arm_parts, column_parts, scene_with
+from ms_slam_env.benchmark.command_line import exit_code, parse
+from ms_slam_env.camera import Intrinsics, xtion
+from ms_slam_env.config import check_range
+from ms_slam_env.env.config import EnvConfig
+from ms_slam_env.errors import InputError, UnreachableError
+from ms_slam_env.geometry import look_at, make_pose
+from ms_slam_env.robot.arm import ArmConfig
+from ms_slam_env.robot.arm.kinematic_arm import KinematicArm
+from ms_slam_env.scenes import Scene
+from ms_slam_env.sensor import RGBDSensor
+from ms_slam_env.timings import Timings
+
+PROGRAM = "python -m ms_slam_env.benchmark.arm_figure"
+
+Image = NDArray[np.uint8]
+Float64 = NDArray[np.float64]
+
+_FILL = 1.25  # distance of the near view in diagonals of the box around the arm
+_FARTHER_M = 0.9  # the far view
+_AZIMUTHS, _HEIGHTS = 24, (0.15, 0.45, 0.75)  # of the viewpoints tried; heights per distance
+_WALL_GAP_M = 0.15  # that a viewpoint keeps from everything
+_SMOOTH = 2  # pixels rendered for one shown, each way
+_START_TRIES = 20
+_TITLE = 18
+_BORDER = 4
+
+
+@dataclass(frozen=True)
+class Options:
+    """Draw the arm in scenes, and what its camera sees."""
+
+    scenes: tuple[str, ...] = ("table", "wall", "carpet", "living_room")
+    """One row a scene."""
+    seed: int = 1000
+    """Of scene, start pose and motions."""
+    moves: int = 3
+    """Random motions between start and picture."""
+    width: int = 320
+    """Of one image, pixels."""
+    arm: ArmConfig = field(default_factory=ArmConfig)
+    """The arm."""
+    out: Path = Path("docs/pictures/arm.png")
+    """The PNG file to write."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers out of range."""
+        check_range(self, "seed", 0, 2**31)
+        check_range(self, "moves", 0, 1000)
+        check_range(self, "width", 16, 4096)
+
+
+def arm_in(scene: Scene, config: ArmConfig, moves: int, seed: int) -> KinematicArm:
+    """An arm at a drawn start pose of a scene, after some random motions."""
+    rng = np.random.default_rng(seed)
+    arm = KinematicArm(scene, config, EnvConfig.step_m, EnvConfig.step_rad, Timings())
+    for _ in range(_START_TRIES):
+        try:
+            arm.reset(scene.sample_start(rng), rng)
+            break
+        except UnreachableError:
+            continue
+    else:
+        raise UnreachableError(f"scene {scene.name!r}: no start pose that the arm can hold")
+    for _ in range(moves):
+        arm.move(int(rng.choice(np.flatnonzero(arm.action_masks()))))
+    return arm
+
+
+def pictures(scene: Scene, arm: KinematicArm, width: int) -> tuple[Image, Image, Image]:
+    """The arm from afar and near, and the view of its camera, each (3/4 width, width, 3)."""
+    base = arm.T_world_base[:3, 3]
+    parts = arm_parts(arm.model, arm.q, arm.T_world_base)
+    shown = scene_with(scene, parts + column_parts(base, floor_below(scene, base)))
+    corners = np.concatenate([part.corners.reshape(-1, 3) for part in parts])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    near = _FILL * float(np.linalg.norm(high - low))
+    outside = [
+        _view(scene, shown, 0.5 * (low + high), distance, width)
+        for distance in (near + _FARTHER_M, near)
+    ]
+    camera = RGBDSensor(scene, xtion("640x480"), noise="none").ground_truth(arm.T_world_camera)
+    return outside[0], outside[1], _shrunk(camera.color, width)
+
+
+def floor_below(scene: Scene, point: Float64) -> float:
+    """Height of the surface under a point (3,); the point's own where there is none."""
+    camera = Intrinsics(fx=1, fy=1, cx=0, cy=0, width=1, height=1)
+    start = point + np.array([0, 0, 0.01])
+    down = make_pose(np.diag([1.0, -1.0, -1.0]), start)
+    depth = float(RGBDSensor(scene, camera, noise="none").ground_truth(down).depth[0, 0])
+    return float(start[2] - depth) if depth > 0 else float(point[2])
+
+
+def _view(scene: Scene, shown: Scene, target: Float64, distance: float, width: int) -> Image:
+    """The arm around ``target`` (3,) from the side that shows most of it."""
+    angles = np.linspace(0, 2 * np.pi, _AZIMUTHS, endpoint=False)
+    offsets = np.array([(np.cos(a), np.sin(a), h) for h in _HEIGHTS for a in angles])
+    offsets *= distance / np.linalg.norm(offsets, axis=1, keepdims=True)
+    places = target + offsets
+    places = places[scene.clearance(places) > _WALL_GAP_M]
+    if len(places) == 0:
+        raise InputError(f"scene {scene.name!r} has no room to look at the arm from outside")
+    poses = [look_at(place, target) for place in places]
+    sensor = RGBDSensor(shown, _outside_camera(80), noise="none")
+    arm = shown.mesh.labels.index(LABEL)
+    best = max(poses, key=lambda pose: int((sensor.ground_truth(pose).labels == arm).sum()))
+    large = RGBDSensor(shown, _outside_camera(_SMOOTH * width), noise="none").ground_truth(best)
+    return _shrunk(large.color, width)
+
+
+def _shrunk(image: Image, width: int) -> Image:
+    size = (width, 3 * width // 4)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def _outside_camera(width: int) -> Intrinsics:
+    height = 3 * width // 4
+    return Intrinsics(width, width, (width - 1) / 2, (height - 1) / 2, width, height)
+
+
+def contact_sheet(options: Options) -> Image:
+    """Return the whole sheet, an RGB image, one row a scene."""
+    rows = []
+    for name in options.scenes:
+        scene = scenes.make(name, options.seed)
+        arm = arm_in(scene, options.arm, options.moves, options.seed)
+        framed = [
+            cv2.copyMakeBorder(i, 0, _BORDER, 0, _BORDER, cv2.BORDER_CONSTANT, value=(255,) * 3)
+            for i in pictures(scene, arm, options.width)
+        ]
+        strip = np.concatenate(framed, 1)
+        title = np.full((_TITLE, strip.shape[1], 3), 255, np.uint8)
+        text = f"{name}, seed {options.seed}: from afar, from near, what the arm's camera sees"
+        at = (2, _TITLE - 5)
+        cv2.putText(title, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.42, (30, 30, 30), 1, cv2.LINE_AA)
+        rows += [title, strip]
+    return np.concatenate(rows, 0)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Write the sheet; return the exit code."""
+    options = parse(Options, arguments, PROGRAM)
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    sheet = contact_sheet(options)
+    cv2.imwrite(str(options.out), sheet[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(main, PROGRAM))
