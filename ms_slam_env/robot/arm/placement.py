@@ -205,12 +205,14 @@ def _column_is_free(scene: Scene, bases: Float64, camera: Float64) -> Bool:
 
 
 def _floor_below(scene: Scene, camera: Float64) -> float:
-    """Height of the lowest thing that is met going down within 1.2 m around the camera."""
+    """Height of the lowest thing that is met going level up to 1.2 m from the camera, then down."""
     ticks = np.arange(-1.2, 1.3, 0.4)
-    depth = np.arange(0.0, 3.0, 0.5 * _GRID_M)
-    x, y, down = np.meshgrid(ticks, ticks, depth, indexing="ij")
-    points = camera + np.stack([x, y, -down], axis=-1)
-    free = scene.clearance(points.reshape(-1, 3)).reshape(x.shape)
+    aside = np.stack(np.meshgrid(ticks, ticks, [0.0], indexing="ij"), axis=-1).reshape(-1, 1, 3)
+    level = camera + aside * np.linspace(0.0, 1.0, 60)[:, None]  # (c, 60, 3)
+    open_way = (scene.clearance(level.reshape(-1, 3)) > _MET_M).reshape(level.shape[:2]).all(axis=1)
+    down = np.arange(0.0, 3.0, 0.5 * _GRID_M)
+    points = level[open_way, -1:] - down[:, None] * np.array([0.0, 0.0, 1.0])
+    free = scene.clearance(points.reshape(-1, 3)).reshape(points.shape[:2])
     met = np.logical_or.accumulate(free <= _MET_M, axis=-1)
     bottom = np.where(met, np.inf, points[..., 2] - free)  # the space goes on down to there
     return float(bottom.min(initial=camera[2]))

@@ -1,4 +1,5 @@
-# ruff: noqa: UP018, RUF046 (Warp needs variables, not constants)
+# ruff: noqa: UP018, RUF046
+# Warp code: float(0.0) declares a variable that changes.
 """Warp kernel that follows the camera's straight way to every candidate with the joints.
 
 One thread follows one candidate: inverse kinematics from waypoint to waypoint, then the checks,
