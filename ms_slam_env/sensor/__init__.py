@@ -1,6 +1,11 @@
 """The RGB-D sensor: ray casting, shading and published Kinect noise."""
 
-from ms_slam_env.sensor.casters import EmbreeRayCaster, RayCaster, WarpRayCaster
+from ms_slam_env.sensor.casters import (
+    EmbreeRayCaster,
+    EmbreeSingleRayCaster,
+    RayCaster,
+    WarpRayCaster,
+)
 from ms_slam_env.sensor.noise import NOISE_MODELS, NoiseConfig, NoNoise
 from ms_slam_env.sensor.rgbd import FRAME_RATE_HZ, RGBDSensor, TrueView
 
@@ -8,6 +13,7 @@ __all__ = [
     "FRAME_RATE_HZ",
     "NOISE_MODELS",
     "EmbreeRayCaster",
+    "EmbreeSingleRayCaster",
     "NoNoise",
     "NoiseConfig",
     "RGBDSensor",

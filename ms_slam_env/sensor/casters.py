@@ -1,8 +1,10 @@
-"""Ray casting against the triangles of a scene: what each ray meets first."""
+"""Ray casting against the triangles of a scene: what the ray of each pixel meets first."""
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
@@ -10,21 +12,26 @@ from embreex.rtcore_scene import EmbreeScene
 
 from ms_slam_env._warp import wp
 from ms_slam_env.scenes.base import TexturedMesh
-from ms_slam_env.sensor.rays import query_rays
+from ms_slam_env.sensor.embree import PacketScene, embree_library
+from ms_slam_env.sensor.packets import TILE_HEIGHT, TILE_WIDTH, cast_tiles
+from ms_slam_env.sensor.rays import Pinhole, cast_rays, generate_rays
 
 
 class Hits:
     """First hit of N rays, as Warp arrays on one device, overwritten by the next cast.
 
     Attributes:
-        t: (N,) float32 ray parameter, origin + t * direction; undefined where ``face`` is -1.
+        shape: (B, H, W) of the images whose rays they are, N = B * H * W.
+        t: (N,) float32 ray parameter, which is the depth; undefined where ``face`` is -1.
         u: (N,) float32 barycentric weight of the face's second corner.
         v: (N,) float32 barycentric weight of the face's third corner.
         face: (N,) int32 index of the face, -1 where the ray meets nothing.
     """
 
-    def __init__(self, count: int, device: str) -> None:
-        """Allocate room for ``count`` rays."""
+    def __init__(self, shape: tuple[int, int, int], device: str) -> None:
+        """Allocate room for the rays of images (B, H, W), in that order."""
+        self.shape = shape
+        count = math.prod(shape)
         self.t = wp.zeros(count, dtype=wp.float32, device=device)
         self.u = wp.zeros(count, dtype=wp.float32, device=device)
         self.v = wp.zeros(count, dtype=wp.float32, device=device)
@@ -32,15 +39,46 @@ class Hits:
 
 
 class RayCaster(ABC):
-    """Finds the first triangle that each ray meets."""
+    """Finds the first triangle that the ray of each pixel meets."""
 
     @abstractmethod
-    def cast(self, origins: wp.array, directions: wp.array, hits: Hits) -> None:
-        """Cast rays (N,) vec3 each, directions of any length, and write the result to ``hits``."""
+    def bind(self, poses: wp.array, camera: Pinhole, hits: Hits) -> Callable[[], None]:
+        """Return a function that casts the rays of poses (B,) mat44 and overwrites ``hits``.
+
+        It reads the poses anew at each call.
+        """
 
 
 class EmbreeRayCaster(RayCaster):
-    """Intel Embree on the CPU, one thread."""
+    """Intel Embree on the CPU, one thread, packets of eight rays."""
+
+    def __init__(self, mesh: TexturedMesh) -> None:
+        """Build Embree's acceleration structure.
+
+        Raises:
+            OSError: Embree's packet functions cannot be reached.
+        """
+        library = embree_library()
+        if library is None:
+            raise OSError("the installed embreex does not give access to Embree 4's ray packets")
+        self._scene = PacketScene(library, mesh.vertices, mesh.faces)
+
+    def bind(self, poses: wp.array, camera: Pinhole, hits: Hits) -> Callable[[], None]:
+        """See the base class; the arrays live on the CPU."""
+        batch, height, width = hits.shape
+        command = wp.launch(
+            cast_tiles,
+            dim=(batch, -(-height // TILE_HEIGHT), -(-width // TILE_WIDTH)),
+            inputs=[self._scene.intersect, self._scene.scene, poses, camera],
+            outputs=[hits.t, hits.u, hits.v, hits.face],
+            device="cpu",
+            record_cmd=True,
+        )
+        return command.launch
+
+
+class EmbreeSingleRayCaster(RayCaster):
+    """Intel Embree on the CPU, one ray at a time, through embreex's own interface."""
 
     def __init__(self, mesh: TexturedMesh) -> None:
         """Build Embree's acceleration structure."""
@@ -48,13 +86,29 @@ class EmbreeRayCaster(RayCaster):
         corners = np.ascontiguousarray(mesh.vertices[mesh.faces], dtype=np.float32)
         self._geometry = TriangleMesh(self._scene, corners)
 
-    def cast(self, origins: wp.array, directions: wp.array, hits: Hits) -> None:
-        """Cast rays (N,) that live on the CPU."""
-        result = self._scene.run(origins.numpy(), directions.numpy(), output=True)
-        np.copyto(hits.t.numpy(), result["tfar"])
-        np.copyto(hits.u.numpy(), result["u"])
-        np.copyto(hits.v.numpy(), result["v"])
-        np.copyto(hits.face.numpy(), result["primID"])
+    def bind(self, poses: wp.array, camera: Pinhole, hits: Hits) -> Callable[[], None]:
+        """See the base class; the arrays live on the CPU."""
+        count = math.prod(hits.shape)
+        origins = wp.zeros(count, dtype=wp.vec3, device="cpu")
+        directions = wp.zeros(count, dtype=wp.vec3, device="cpu")
+        generate = wp.launch(
+            generate_rays,
+            dim=hits.shape,
+            inputs=[poses, camera],
+            outputs=[origins, directions],
+            device="cpu",
+            record_cmd=True,
+        )
+
+        def cast() -> None:
+            generate.launch()
+            result = self._scene.run(origins.numpy(), directions.numpy(), output=True)
+            np.copyto(hits.t.numpy(), result["tfar"])
+            np.copyto(hits.u.numpy(), result["u"])
+            np.copyto(hits.v.numpy(), result["v"])
+            np.copyto(hits.face.numpy(), result["primID"])
+
+        return cast
 
 
 class WarpRayCaster(RayCaster):
@@ -68,17 +122,21 @@ class WarpRayCaster(RayCaster):
             indices=wp.array(mesh.faces.ravel(), dtype=wp.int32, device=device),
         )
 
-    def cast(self, origins: wp.array, directions: wp.array, hits: Hits) -> None:
-        """Cast rays (N,) that live on the device of the mesh."""
-        wp.launch(
-            query_rays,
-            dim=origins.shape[0],
-            inputs=[self._mesh.id, origins, directions],
+    def bind(self, poses: wp.array, camera: Pinhole, hits: Hits) -> Callable[[], None]:
+        """See the base class; the arrays live on the device of the mesh."""
+        command = wp.launch(
+            cast_rays,
+            dim=hits.shape,
+            inputs=[self._mesh.id, poses, camera],
             outputs=[hits.t, hits.u, hits.v, hits.face],
             device=self._device,
+            record_cmd=True,
         )
+        return command.launch
 
 
 def make_caster(mesh: TexturedMesh, device: str) -> RayCaster:
     """Return the fastest caster of a device: Embree on the CPU, Warp elsewhere."""
-    return EmbreeRayCaster(mesh) if device == "cpu" else WarpRayCaster(mesh, device)
+    if device != "cpu":
+        return WarpRayCaster(mesh, device)
+    return EmbreeSingleRayCaster(mesh) if embree_library() is None else EmbreeRayCaster(mesh)

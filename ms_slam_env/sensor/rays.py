@@ -67,18 +67,21 @@ def generate_rays(
 
 
 @wp.kernel
-def query_rays(
+def cast_rays(
     mesh: wp.uint64,
-    origins: wp.array(dtype=wp.vec3),  # (N,)
-    directions: wp.array(dtype=wp.vec3),  # (N,)
-    t: wp.array(dtype=wp.float32),  # (N,)
-    u: wp.array(dtype=wp.float32),  # (N,)
-    v: wp.array(dtype=wp.float32),  # (N,)
-    face: wp.array(dtype=wp.int32),  # (N,)
+    T_world_camera: wp.array(dtype=wp.mat44),  # (B,)
+    camera: Pinhole,
+    t: wp.array(dtype=wp.float32),  # (B * H * W,)
+    u: wp.array(dtype=wp.float32),
+    v: wp.array(dtype=wp.float32),
+    face: wp.array(dtype=wp.int32),
 ):
-    """First hit of each ray; face -1 where there is none."""
-    i = wp.tid()
-    query = wp.mesh_query_ray(mesh, origins[i], directions[i], 1.0e6)
+    """First hit of the ray of each pixel; face -1 where there is none."""
+    b, y, x = wp.tid()
+    T = T_world_camera[b]
+    i = (b * camera.height + y) * camera.width + x
+    ray = world_ray(T, camera, float(x), float(y))
+    query = wp.mesh_query_ray(mesh, camera_centre(T), ray, 1.0e6)
     if query.result:
         t[i] = query.t
         # Warp's u and v weigh the first and second corner

@@ -2,30 +2,24 @@
 
 from __future__ import annotations
 
+import math
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose
-from ms_slam_env.scenes.base import Scene, TexturedMesh
-from ms_slam_env.sensor.casters import Hits, RayCaster, make_caster
-from ms_slam_env.sensor.depth_noise import make_depth_noise, measure_depth, projector_shadow
+from ms_slam_env.scenes.base import Scene
+from ms_slam_env.sensor.casters import RayCaster, make_caster
+from ms_slam_env.sensor.depth_noise import make_depth_noise
+from ms_slam_env.sensor.images import Images, Tables, upload_surfaces
 from ms_slam_env.sensor.noise import NoiseConfig, noise_config
-from ms_slam_env.sensor.random_numbers import frame_key, normal_table
-from ms_slam_env.sensor.rays import generate_rays, make_pinhole
-from ms_slam_env.sensor.shading import Surfaces, shade, true_geometry
-from ms_slam_env.sensor.textures import (
-    decode_table,
-    encode_table,
-    face_planes,
-    pack_textures,
-    texel_density,
-)
+from ms_slam_env.sensor.random_numbers import frame_key
+from ms_slam_env.sensor.rays import make_pinhole
 
 FRAME_RATE_HZ = 30.0
 """Rate of the simulated sensor; gives a frame its time stamp when the caller does not."""
@@ -50,43 +44,23 @@ class TrueView:
     points: NDArray[np.float32]
 
 
-class _Buffers:
-    """Arrays for ``batch`` images, kept between frames."""
+class _OfThread(threading.local):
+    """What each thread has of a sensor for itself."""
 
-    def __init__(self, batch: int, pixels: int, device: str) -> None:
-        count = batch * pixels
-        self.poses = wp.zeros(batch, dtype=wp.mat44, device=device)
-        self.keys = wp.zeros((batch, 2), dtype=wp.uint32, device=device)
-        self.origins = wp.zeros(count, dtype=wp.vec3, device=device)
-        self.directions = wp.zeros(count, dtype=wp.vec3, device=device)
-        self.hits = Hits(count, device)
-        self.shadow = wp.zeros(count, dtype=wp.uint8, device=device)
-        self.color = wp.zeros((count, 3), dtype=wp.uint8, device=device)
-        self.depth = wp.zeros(count, dtype=wp.float32, device=device)
+    def __init__(self) -> None:
+        self.images: dict[int, Images] = {}  # by number of images
+        self.last: Images | None = None
 
 
-def _upload_surfaces(mesh: TexturedMesh, device: str) -> Surfaces:
-    textures = pack_textures(mesh.textures)
-    normals, planes = face_planes(mesh)
-    surfaces = Surfaces()
-    surfaces.uv = wp.array(mesh.uv, dtype=wp.vec2, device=device)
-    surfaces.irradiance = wp.array(mesh.irradiance, dtype=wp.vec3, device=device)
-    surfaces.normal = wp.array(normals, dtype=wp.vec3, device=device)
-    surfaces.plane = wp.array(planes, dtype=wp.float32, device=device)
-    surfaces.density = wp.array(texel_density(mesh), dtype=wp.float32, device=device)
-    surfaces.texture = wp.array(mesh.face_texture, dtype=wp.int32, device=device)
-    surfaces.label = wp.array(mesh.face_label, dtype=wp.int32, device=device)
-    surfaces.texels = wp.array(textures.texels, dtype=wp.uint32, device=device)
-    surfaces.offsets = wp.array(textures.offsets, dtype=wp.int32, device=device)
-    surfaces.sizes = wp.array(textures.sizes, dtype=wp.vec3i, device=device)
-    return surfaces
+_RECORDING = threading.Lock()  # loading and recording kernels is Warp's business, one at a time
 
 
 class RGBDSensor:
     """A colour and depth camera in a scene.
 
     The noise of a frame is a function of (seed, index, pixel) alone: the order of the calls and
-    the batch in which a frame is rendered do not matter.
+    the batch in which a frame is rendered do not matter. Several threads may use one sensor: each
+    has buffers of its own.
     """
 
     def __init__(
@@ -120,11 +94,9 @@ class RGBDSensor:
         self._caster = caster or make_caster(scene.mesh, device)
         self._camera = make_pinhole(intrinsics)
         self._depth_noise = make_depth_noise(self.noise, intrinsics)
-        self._surfaces = _upload_surfaces(scene.mesh, device)
-        self._normals: wp.array = wp.array(normal_table(), dtype=wp.float32, device=device)
-        self._decode: wp.array = wp.array(decode_table(), dtype=wp.float32, device=device)
-        self._encode: wp.array = wp.array(encode_table(), dtype=wp.float32, device=device)
-        self._buffers: dict[int, _Buffers] = {}
+        self._surfaces = upload_surfaces(scene.mesh, device)
+        self._tables = Tables(device)
+        self._of_thread = _OfThread()
 
     def capture(
         self,
@@ -145,52 +117,52 @@ class RGBDSensor:
             InputError: a pose that is not a finite rigid motion, or a bad index or seed.
         """
         poses = np.asarray(T_world_camera, dtype=np.float64)[None]
-        frame = self.capture_batch(poses, [index], seed)[0]
-        if timestamp is None:
-            return frame
-        return RGBDFrame(frame.color, frame.depth, float(timestamp))
+        times = None if timestamp is None else [timestamp]
+        return self.capture_batch(poses, [index], seed, times)[0]
 
     def capture_batch(
         self,
         T_world_camera: ArrayLike,
         indices: Sequence[int] | NDArray[np.integer],
         seed: int | None = None,
+        timestamps: Sequence[float] | NDArray[np.floating] | None = None,
     ) -> list[RGBDFrame]:
         """Take frames ``indices`` (B,) from poses (B, 4, 4) at once.
 
+        Args:
+            T_world_camera: poses of the camera.
+            indices: counters of the noise, one a pose.
+            seed: of the noise, in place of the sensor's own.
+            timestamps: (B,) seconds; index / 30 Hz by default.
+
         Raises:
-            InputError: a pose that is not a finite rigid motion, or indices that do not fit.
+            InputError: a pose that is not a finite rigid motion, a bad index, seed or time stamp,
+                or as many indices or time stamps as there are not poses.
         """
         poses = np.asarray(T_world_camera, dtype=np.float64)
         if len(poses) != len(indices) or len(poses) == 0:
             raise InputError(f"{len(indices)} frame indices for poses of shape {poses.shape}")
-        buffers = self._cast(poses)
+        for pose in poses:
+            check_pose(pose, "T_world_camera")
         noise_seed = self.seed if seed is None else seed
         keys = np.stack([frame_key(noise_seed, index) for index in indices])
-        buffers.keys.assign(keys)
-        self._shade(buffers, len(poses), self.noise.shot, self.noise.read)
-        self._measure(buffers, len(poses))
-        height, width = self.intrinsics.shape
-        colors = buffers.color.numpy().reshape(-1, height, width, 3)
-        depths = buffers.depth.numpy().reshape(-1, height, width)
-        return [
-            RGBDFrame(colors[b].copy(), depths[b].copy(), float(index) / FRAME_RATE_HZ)
-            for b, index in enumerate(indices)
-        ]
+        times = _frame_times(indices, timestamps)
+        images = self._images(len(poses))
+        colors, depths = images.capture(poses, keys)
+        self._of_thread.last = images
+        return [RGBDFrame(colors[b].copy(), depths[b].copy(), time) for b, time in enumerate(times)]
 
     def last_true_depth(self) -> NDArray[np.float32]:
-        """True depth (H, W) of the frame that ``capture`` took last, metres; 0 = no surface.
+        """True depth (H, W) of the frame that this thread captured last, metres; 0 = no surface.
 
-        Costs no second ray cast. Other users of the same sensor overwrite it.
+        Costs no second ray cast. Other users of the same sensor in the same thread overwrite it.
 
         Raises:
             InputError: nothing was captured yet.
         """
-        if 1 not in self._buffers:
+        if self._of_thread.last is None:
             raise InputError("the sensor has captured no frame yet")
-        hits = self._buffers[1].hits
-        depth = np.where(hits.face.numpy() >= 0, hits.t.numpy(), np.float32(0))
-        return depth.reshape(self.intrinsics.shape)
+        return self._of_thread.last.true_depth()[-1]
 
     def ground_truth(self, T_world_camera: ArrayLike) -> TrueView:
         """Noise-free view from pose ``T_world_camera`` (4, 4).
@@ -198,106 +170,40 @@ class RGBDSensor:
         Raises:
             InputError: a pose that is not a finite rigid motion.
         """
-        buffers = self._cast(np.asarray(T_world_camera, dtype=np.float64)[None])
-        self._shade(buffers, 1, 0.0, 0.0)
-        height, width = self.intrinsics.shape
-        count = height * width
-        depth = wp.zeros(count, dtype=wp.float32, device=self.device)
-        normals = wp.zeros(count, dtype=wp.vec3, device=self.device)
-        labels = wp.zeros(count, dtype=wp.int32, device=self.device)
-        points = wp.zeros(count, dtype=wp.vec3, device=self.device)
-        wp.launch(
-            true_geometry,
-            dim=(1, height, width),
-            inputs=[
-                buffers.poses,
-                self._camera,
-                buffers.hits.t,
-                buffers.hits.face,
-                self._surfaces,
-            ],
-            outputs=[depth, normals, labels, points],
-            device=self.device,
-        )
-        return TrueView(
-            color=buffers.color.numpy().reshape(height, width, 3).copy(),
-            depth=depth.numpy().reshape(height, width),
-            normals=normals.numpy().reshape(height, width, 3),
-            labels=labels.numpy().reshape(height, width),
-            points=points.numpy().reshape(height, width, 3),
-        )
+        pose = check_pose(T_world_camera, "T_world_camera")
+        color, depth, normals, labels, points = self._images(1).truth(pose[None])
+        return TrueView(color[0], depth[0], normals[0], labels[0], points[0])
 
-    def _cast(self, poses: NDArray[np.float64]) -> _Buffers:
-        """Upload the poses (B, 4, 4) and find what their rays hit."""
-        for pose in poses:
-            check_pose(pose, "T_world_camera")
-        batch = len(poses)
-        height, width = self.intrinsics.shape
-        if batch not in self._buffers:
-            self._buffers[batch] = _Buffers(batch, height * width, self.device)
-        buffers = self._buffers[batch]
-        buffers.poses.assign(poses.astype(np.float32))
-        wp.launch(
-            generate_rays,
-            dim=(batch, height, width),
-            inputs=[buffers.poses, self._camera],
-            outputs=[buffers.origins, buffers.directions],
-            device=self.device,
-        )
-        self._caster.cast(buffers.origins, buffers.directions, buffers.hits)
-        return buffers
+    def _images(self, batch: int) -> Images:
+        """This thread's buffers for ``batch`` images."""
+        images = self._of_thread.images.get(batch)
+        if images is None:
+            with _RECORDING:
+                images = Images(
+                    (batch, *self.intrinsics.shape),
+                    self._camera,
+                    self._caster,
+                    self._surfaces,
+                    self._tables,
+                    self.noise,
+                    self._depth_noise,
+                    self.scene.exposure,
+                    self.device,
+                )
+            self._of_thread.images[batch] = images
+        return images
 
-    def _shade(self, buffers: _Buffers, batch: int, shot: float, read: float) -> None:
-        hits = buffers.hits
-        wp.launch(
-            shade,
-            dim=(batch, *self.intrinsics.shape),
-            inputs=[
-                buffers.poses,
-                self._camera,
-                hits.t,
-                hits.u,
-                hits.v,
-                hits.face,
-                self._surfaces,
-                self.scene.exposure,
-                shot,
-                read,
-                buffers.keys,
-                self._normals,
-                self._decode,
-                self._encode,
-            ],
-            outputs=[buffers.color],
-            device=self.device,
-        )
 
-    def _measure(self, buffers: _Buffers, batch: int) -> None:
-        hits = buffers.hits
-        height, width = self.intrinsics.shape
-        if self.noise.shadow:
-            wp.launch(
-                projector_shadow,
-                dim=batch * height,
-                inputs=[hits.t, hits.face, width, self._depth_noise],
-                outputs=[buffers.shadow],
-                device=self.device,
-            )
-        wp.launch(
-            measure_depth,
-            dim=(batch, height, width),
-            inputs=[
-                buffers.poses,
-                self._camera,
-                hits.t,
-                hits.face,
-                self._surfaces.normal,
-                self._surfaces.plane,
-                buffers.shadow,
-                self._depth_noise,
-                buffers.keys,
-                self._normals,
-            ],
-            outputs=[buffers.depth],
-            device=self.device,
-        )
+def _frame_times(
+    indices: Sequence[int] | NDArray[np.integer],
+    timestamps: Sequence[float] | NDArray[np.floating] | None,
+) -> list[float]:
+    """Time of each frame in seconds."""
+    if timestamps is None:
+        return [float(index) / FRAME_RATE_HZ for index in indices]
+    if len(timestamps) != len(indices):
+        raise InputError(f"{len(timestamps)} time stamps for {len(indices)} frames")
+    times = [float(timestamp) for timestamp in timestamps]
+    if not all(math.isfinite(time) for time in times):
+        raise InputError(f"time stamps must be finite, got {times}")
+    return times

@@ -6,9 +6,14 @@ from box_scene import ROOM_HIGH, ROOM_LOW, BoxScene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ms_slam_env.camera import xtion
+from ms_slam_env.camera import Intrinsics, xtion
 from ms_slam_env.geometry import look_at
-from ms_slam_env.sensor import EmbreeRayCaster, RGBDSensor, WarpRayCaster
+from ms_slam_env.sensor import (
+    EmbreeRayCaster,
+    EmbreeSingleRayCaster,
+    RGBDSensor,
+    WarpRayCaster,
+)
 
 SMALL = xtion("80x60")
 
@@ -56,6 +61,22 @@ def test_casters_agree(sensors, box_scene: BoxScene, seed: int) -> None:
     np.testing.assert_allclose(embree.depth[same], warp.depth[same], rtol=1e-4)
     difference = np.abs(embree.color[same].astype(int) - warp.color[same])
     assert np.percentile(difference, 99) <= 1
+
+
+@pytest.mark.parametrize("size", [(80, 60), (37, 23), (3, 1)])
+def test_packets_meet_what_single_rays_meet(box_scene: BoxScene, size: tuple[int, int]) -> None:
+    """Also where the tiles of a packet stick out of the image."""
+    width, height = size
+    camera = Intrinsics(70.0, 70.0, width / 2 - 0.5, height / 2 - 0.5, width, height)
+    packets = RGBDSensor(box_scene, camera, caster=EmbreeRayCaster(box_scene.mesh))
+    single = RGBDSensor(box_scene, camera, caster=EmbreeSingleRayCaster(box_scene.mesh))
+    for seed in range(4):
+        T = box_scene.sample_start(np.random.default_rng(seed))
+        a, b = packets.ground_truth(T), single.ground_truth(T)
+        np.testing.assert_array_equal(a.depth, b.depth)
+        assert (a.labels == b.labels).mean() > 0.999  # on a shared edge either face is right
+        noisy = packets.capture(T, seed), single.capture(T, seed)
+        assert (noisy[0].depth == noisy[1].depth).mean() > 0.999
 
 
 def test_truth_is_consistent(sensors, box_scene: BoxScene) -> None:

@@ -1,5 +1,8 @@
 """The sensor as a whole: determinism, batches, bad input."""
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 from box_scene import BoxScene
@@ -99,9 +102,46 @@ def test_a_batch_needs_one_index_a_pose(sensor: RGBDSensor, pose) -> None:
         sensor.capture_batch(pose[None], [0, 1])
 
 
+def test_a_batch_takes_time_stamps(sensor: RGBDSensor, pose) -> None:
+    frames = sensor.capture_batch([pose, pose], [3, 4], timestamps=[0.25, 0.75])
+    assert [frame.timestamp for frame in frames] == [0.25, 0.75]
+    frames = sensor.capture_batch([pose, pose], [3, 6])
+    assert [frame.timestamp for frame in frames] == pytest.approx([0.1, 0.2])
+    with pytest.raises(InputError, match="1 time stamps for 2 frames"):
+        sensor.capture_batch([pose, pose], [3, 4], timestamps=[0.25])
+    with pytest.raises(InputError, match="finite"):
+        sensor.capture(pose, 3, timestamp=float("nan"))
+
+
+def test_threads_share_a_sensor(box_scene: BoxScene) -> None:
+    """Each thread gets the frames, and the true depth, that it would get alone."""
+    sensor = RGBDSensor(box_scene, K)
+    rng = np.random.default_rng(2)
+    poses = [box_scene.sample_start(rng) for _ in range(4)]
+    alone = [[sensor.capture(T, index, seed=7) for index in range(15)] for T in poses]
+    truth = [sensor.ground_truth(T).depth for T in poses]
+    start = threading.Barrier(len(poses))
+
+    def work(which: int) -> list[bool]:
+        start.wait()
+        equal = []
+        for index, expected in enumerate(alone[which]):
+            frame = sensor.capture(poses[which], index, seed=7)
+            equal.append(same(frame, expected))
+            equal.append(np.array_equal(sensor.last_true_depth(), truth[which]))
+        return equal
+
+    with ThreadPoolExecutor(len(poses)) as pool:
+        assert all(all(equal) for equal in pool.map(work, range(len(poses))))
+
+
 def test_true_depth_of_the_last_frame(box_scene: BoxScene, pose) -> None:
     sensor = RGBDSensor(box_scene, K)
     with pytest.raises(InputError, match="captured no frame"):
         sensor.last_true_depth()
     sensor.capture(pose, 0)
-    assert np.array_equal(sensor.last_true_depth(), sensor.ground_truth(pose).depth)
+    truth = sensor.ground_truth(pose).depth
+    assert np.array_equal(sensor.last_true_depth(), truth)
+    other = box_scene.sample_start(np.random.default_rng(5))
+    sensor.capture_batch([pose, other], [0, 1])
+    assert np.array_equal(sensor.last_true_depth(), sensor.ground_truth(other).depth)

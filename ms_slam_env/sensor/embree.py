@@ -1,0 +1,98 @@
+"""Intel Embree's C interface, of the library that embreex brings along.
+
+embreex itself offers one ray at a time; packets of eight rays, which share the walk through the
+hierarchy, need the functions below. Names and constants are those of embree4/rtcore.h.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from embreex import rtcore_scene
+from numpy.typing import NDArray
+
+PACKET_FUNCTION = "rtcIntersect8"
+_VERSION_MAJOR = 4
+_RTC_DEVICE_PROPERTY_VERSION_MAJOR = 1
+_RTC_GEOMETRY_TYPE_TRIANGLE = 0
+_RTC_BUFFER_TYPE_INDEX = 0
+_RTC_BUFFER_TYPE_VERTEX = 1
+_RTC_FORMAT_UINT3 = 0x5003
+_RTC_FORMAT_FLOAT3 = 0x9003
+_RTC_SCENE_FLAG_ROBUST = 1 << 2  # as embreex: no ray slips through between two triangles
+_P, _I, _U, _N = ctypes.c_void_p, ctypes.c_int, ctypes.c_uint, ctypes.c_size_t
+_FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
+    "rtcNewDevice": (_P, [ctypes.c_char_p]),
+    "rtcGetDeviceProperty": (ctypes.c_ssize_t, [_P, _I]),
+    "rtcReleaseDevice": (None, [_P]),
+    "rtcNewScene": (_P, [_P]),
+    "rtcSetSceneFlags": (None, [_P, _I]),
+    "rtcCommitScene": (None, [_P]),
+    "rtcReleaseScene": (None, [_P]),
+    "rtcNewGeometry": (_P, [_P, _I]),
+    "rtcSetNewGeometryBuffer": (_P, [_P, _I, _U, _I, _N, _N]),
+    "rtcCommitGeometry": (None, [_P]),
+    "rtcAttachGeometry": (_U, [_P, _P]),
+    "rtcReleaseGeometry": (None, [_P]),
+}
+
+
+@lru_cache(maxsize=1)
+def embree_library() -> ctypes.CDLL | None:
+    """Embree 4 with the types of its functions declared; None where it cannot be reached.
+
+    The extension module is opened, not the library: where the loader also searches what a library
+    depends on (Linux, macOS) that finds Embree wherever its wheel has put it.
+    """
+    library = ctypes.CDLL(rtcore_scene.__file__)
+    try:
+        getattr(library, PACKET_FUNCTION)
+        for name, (result, arguments) in _FUNCTIONS.items():
+            function = getattr(library, name)
+            function.restype, function.argtypes = result, arguments
+    except AttributeError:
+        return None
+    device = library.rtcNewDevice(b"threads=1")
+    version = library.rtcGetDeviceProperty(device, _RTC_DEVICE_PROPERTY_VERSION_MAJOR)
+    library.rtcReleaseDevice(device)
+    return library if version == _VERSION_MAJOR else None
+
+
+class PacketScene:
+    """Triangles in an Embree scene of their own, built on one thread.
+
+    Attributes:
+        scene: address of the RTCScene.
+        intersect: address of the function that casts eight rays.
+    """
+
+    def __init__(
+        self, library: ctypes.CDLL, vertices: NDArray[np.float32], faces: NDArray[np.int32]
+    ) -> None:
+        """Copy vertices (V, 3) and faces (F, 3) and build the hierarchy."""
+        self._library = library
+        self._device = library.rtcNewDevice(b"threads=1")
+        self.scene: int = library.rtcNewScene(self._device)
+        library.rtcSetSceneFlags(self.scene, _RTC_SCENE_FLAG_ROBUST)
+        geometry = library.rtcNewGeometry(self._device, _RTC_GEOMETRY_TYPE_TRIANGLE)
+        for kind, form, rows in (
+            (_RTC_BUFFER_TYPE_VERTEX, _RTC_FORMAT_FLOAT3, vertices.astype(np.float32)),
+            (_RTC_BUFFER_TYPE_INDEX, _RTC_FORMAT_UINT3, faces.astype(np.uint32)),
+        ):
+            values = np.ascontiguousarray(rows)
+            room = library.rtcSetNewGeometryBuffer(geometry, kind, 0, form, 12, len(values))
+            ctypes.memmove(room, values.ctypes.data, values.nbytes)
+        library.rtcCommitGeometry(geometry)
+        library.rtcAttachGeometry(self.scene, geometry)
+        library.rtcReleaseGeometry(geometry)
+        library.rtcCommitScene(self.scene)
+        function = ctypes.cast(getattr(library, PACKET_FUNCTION), ctypes.c_void_p)
+        self.intersect: int = function.value or 0
+
+    def __del__(self) -> None:
+        """Give the scene back."""
+        self._library.rtcReleaseScene(self.scene)
+        self._library.rtcReleaseDevice(self._device)

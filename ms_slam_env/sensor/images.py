@@ -1,0 +1,158 @@
+"""The arrays of a number of images and the launches that fill them, recorded once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env._warp import wp
+from ms_slam_env.scenes.base import TexturedMesh
+from ms_slam_env.sensor.casters import Hits, RayCaster
+from ms_slam_env.sensor.depth_noise import DepthNoise, measure_depth, projector_shadow
+from ms_slam_env.sensor.noise import NoiseConfig
+from ms_slam_env.sensor.random_numbers import normal_table
+from ms_slam_env.sensor.rays import Pinhole
+from ms_slam_env.sensor.shading import Surfaces, shade, true_geometry
+from ms_slam_env.sensor.textures import (
+    decode_table,
+    encode_table,
+    face_planes,
+    pack_textures,
+    texel_density,
+)
+
+
+def upload_surfaces(mesh: TexturedMesh, device: str) -> Surfaces:
+    """What shading needs to know of a mesh, on the device."""
+    textures = pack_textures(mesh.textures)
+    normals, planes = face_planes(mesh)
+    surfaces = Surfaces()
+    surfaces.uv = wp.array(mesh.uv, dtype=wp.vec2, device=device)
+    surfaces.irradiance = wp.array(mesh.irradiance, dtype=wp.vec3, device=device)
+    surfaces.normal = wp.array(normals, dtype=wp.vec3, device=device)
+    surfaces.plane = wp.array(planes, dtype=wp.float32, device=device)
+    surfaces.density = wp.array(texel_density(mesh), dtype=wp.float32, device=device)
+    surfaces.texture = wp.array(mesh.face_texture, dtype=wp.int32, device=device)
+    surfaces.label = wp.array(mesh.face_label, dtype=wp.int32, device=device)
+    surfaces.texels = wp.array(textures.texels, dtype=wp.uint32, device=device)
+    surfaces.offsets = wp.array(textures.offsets, dtype=wp.int32, device=device)
+    surfaces.sizes = wp.array(textures.sizes, dtype=wp.vec3i, device=device)
+    return surfaces
+
+
+class Tables:
+    """Tables on a device: quantiles of N(0, 1), sRGB to linear, linear to sRGB."""
+
+    def __init__(self, device: str) -> None:
+        """Upload them."""
+        self.normals: wp.array = wp.array(normal_table(), dtype=wp.float32, device=device)
+        self.decode: wp.array = wp.array(decode_table(), dtype=wp.float32, device=device)
+        self.encode: wp.array = wp.array(encode_table(), dtype=wp.float32, device=device)
+
+
+class Images:
+    """Arrays for a number of images and the work on them, overwritten from call to call.
+
+    Packing the arguments of a launch in Python costs more than a small kernel, so the launches are
+    recorded. One thread at a time may use an object.
+    """
+
+    def __init__(
+        self,
+        shape: tuple[int, int, int],
+        camera: Pinhole,
+        caster: RayCaster,
+        surfaces: Surfaces,
+        tables: Tables,
+        noise: NoiseConfig,
+        depth_noise: DepthNoise,
+        exposure: float,
+        device: str,
+    ) -> None:
+        """Allocate the arrays for images (B, H, W) and record the launches."""
+        self._device = device
+        self._shape = shape
+        self._camera = camera
+        self._surfaces = surfaces
+        batch, height, width = shape
+        count = batch * height * width
+        self._poses = wp.zeros(batch, dtype=wp.mat44, device=device)
+        self._keys = wp.zeros((batch, 2), dtype=wp.uint32, device=device)
+        self._hits = hits = Hits(shape, device)
+        self._shadow = wp.zeros(count, dtype=wp.uint8, device=device)
+        self._color = wp.zeros((count, 3), dtype=wp.uint8, device=device)
+        self._depth = wp.zeros(count, dtype=wp.float32, device=device)
+        self._cast = caster.bind(self._poses, camera, hits)
+
+        def shading(shot: float, read: float) -> Any:
+            found = [self._poses, camera, hits.t, hits.u, hits.v, hits.face, surfaces]
+            lookup = [self._keys, tables.normals, tables.decode, tables.encode]
+            return self._record(
+                shade, self._shape, [*found, exposure, shot, read, *lookup], [self._color]
+            )
+
+        self._shade = shading(noise.shot, noise.read)
+        self._shade_ideal = shading(0.0, 0.0)
+        self._measure = []
+        if noise.shadow:
+            inputs = [hits.t, hits.face, width, depth_noise]
+            self._measure.append(
+                self._record(projector_shadow, batch * height, inputs, [self._shadow])
+            )
+        inputs = [self._poses, camera, hits.t, hits.face, surfaces.normal, surfaces.plane]
+        inputs += [self._shadow, depth_noise, self._keys, tables.normals]
+        self._measure.append(self._record(measure_depth, self._shape, inputs, [self._depth]))
+
+    def _record(
+        self, kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], outputs: Sequence[Any]
+    ) -> Any:
+        return wp.launch(
+            kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._device, record_cmd=True
+        )
+
+    def capture(
+        self, poses: NDArray[np.float64], keys: NDArray[np.uint32]
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """Noisy colour (B, H, W, 3) and depth (B, H, W) from poses (B, 4, 4) with keys (B, 2)."""
+        self._upload(self._poses, poses)
+        self._upload(self._keys, keys)
+        self._cast()
+        self._shade.launch()
+        for command in self._measure:
+            command.launch()
+        colors = self._color.numpy().reshape(*self._shape, 3)
+        return colors, self._depth.numpy().reshape(self._shape)
+
+    def true_depth(self) -> NDArray[np.float32]:
+        """True depth (B, H, W) of the last capture, metres; 0 = no surface."""
+        depth = np.where(self._hits.face.numpy() >= 0, self._hits.t.numpy(), np.float32(0))
+        return depth.reshape(self._shape)
+
+    def truth(self, poses: NDArray[np.float64]) -> list[NDArray[Any]]:
+        """Noise-free colour, depth, normals, labels and points from poses (B, 4, 4)."""
+        self._upload(self._poses, poses)
+        self._cast()
+        self._shade_ideal.launch()
+        count = self._depth.shape[0]
+        outputs: list[wp.array] = [
+            wp.zeros(count, dtype=dtype, device=self._device)
+            for dtype in (wp.float32, wp.vec3, wp.int32, wp.vec3)
+        ]
+        wp.launch(
+            true_geometry,
+            dim=self._shape,
+            inputs=[self._poses, self._camera, self._hits.t, self._hits.face, self._surfaces],
+            outputs=outputs,
+            device=self._device,
+        )
+        arrays = [self._color.numpy().copy(), *(array.numpy() for array in outputs)]
+        return [array.reshape(*self._shape, *array.shape[1:]) for array in arrays]
+
+    def _upload(self, array: wp.array, values: NDArray[Any]) -> None:
+        if self._device == "cpu":
+            array.numpy()[...] = values  # a view, and ten times as fast as assign
+        else:
+            array.assign(values.astype(wp.dtype_to_numpy(array.dtype)))
