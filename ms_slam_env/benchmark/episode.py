@@ -70,14 +70,15 @@ def run_episode(spec: EpisodeSpec) -> dict[str, Any]:
 
     Returns:
         the metrics by name, see :func:`measure_trajectory` and :func:`measure_map`, with
-        ``steps``, ``return``, ``decision_ms`` (mean time of a decision) and ``ate_over_time``
-        (running RMSE after each step, unaligned, metres).
+        ``steps``, ``return``, ``decision_ms`` (mean time of a decision), ``ate_over_time``
+        (running RMSE after each step, unaligned, metres), ``time_s`` (simulated) and ``energy_j``
+        (mechanical work of the motion).
     """
-    env = _make_env(spec)
+    env = make_env(spec)
     try:
         world = cast(ActiveSlamEnv, env.unwrapped)
         planner = make_planner(spec.planner, world, spec.seed)
-        progress = _play(env, planner, spec.seed)
+        progress = play(env, planner, spec.seed)
         trajectory = measure_trajectory(world)
         trajectory["lost"] |= progress["lost_steps_share"] > 0
         return {**progress, **trajectory, **measure_map(world, spec)}
@@ -99,7 +100,7 @@ def check_episodes(specs: Sequence[EpisodeSpec]) -> None:
         for spec in specs
     }
     for spec in different.values():
-        env = _make_env(spec)
+        env = make_env(spec)
         try:
             make_planner(spec.planner, env.unwrapped, spec.seed)
         except InputError:
@@ -111,7 +112,8 @@ def check_episodes(specs: Sequence[EpisodeSpec]) -> None:
             env.close()
 
 
-def _make_env(spec: EpisodeSpec) -> gym.Env[Any, Any]:
+def make_env(spec: EpisodeSpec) -> gym.Env[Any, Any]:
+    """The environment of an episode."""
     planner_type = planner_class(parse_planner(spec.planner)[0])
     return gym.make(
         spec.env_id,
@@ -128,7 +130,10 @@ def _make_env(spec: EpisodeSpec) -> gym.Env[Any, Any]:
     )
 
 
-def _play(env: gym.Env[Any, Any], planner: Planner, seed: int) -> dict[str, Any]:
+def play(
+    env: gym.Env[Any, Any], planner: Planner, seed: int, seconds: float = math.inf
+) -> dict[str, Any]:
+    """Play one episode to its end, or until ``seconds`` of simulated time have passed."""
     observation, info = env.reset(seed=seed)
     planner.reset()
     total, decision_s, lost = 0.0, 0.0, []
@@ -139,7 +144,7 @@ def _play(env: gym.Env[Any, Any], planner: Planner, seed: int) -> dict[str, Any]
         action = planner.act(observation, info)
         decision_s += time.perf_counter() - start
         observation, reward, terminated, truncated, info = env.step(action)
-        over = terminated or truncated
+        over = terminated or truncated or info["time"] >= seconds
         total += float(reward)
         ate.append(round(float(info["ate"]), 6))
         lost.append(not info["tracking_ok"])
@@ -149,6 +154,8 @@ def _play(env: gym.Env[Any, Any], planner: Planner, seed: int) -> dict[str, Any]
         "decision_ms": 1e3 * decision_s / len(ate),
         "lost_steps_share": float(np.mean(lost)),
         "terminated": bool(terminated),
+        "time_s": float(info["time"]),
+        "energy_j": float(info["energy"]),
         "ate_over_time": ate,
     }
 

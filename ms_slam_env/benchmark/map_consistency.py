@@ -1,0 +1,89 @@
+"""The verdict on the map of an episode: does it show an object twice?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.benchmark.map_truth import SURFACE_SPACING_M
+from ms_slam_env.env import ActiveSlamEnv
+from ms_slam_env.env.worlds import get_scene
+from ms_slam_env.metrics import voxel_thin
+from ms_slam_env.metrics.consistency import (
+    ConsistencyRule,
+    MapConsistency,
+    ObjectConsistency,
+    judge_consistency,
+)
+from ms_slam_env.metrics.sightings import LabelledView, count_votes, distinct_placements
+from ms_slam_env.sensor import RGBDSensor
+
+Float64 = NDArray[np.float64]
+
+MAP_VOXEL_M = 0.01
+MOST_VIEWS = 200  # of an episode's frames, evenly picked: the verdict costs some 3 s
+
+
+@dataclass(frozen=True)
+class JudgedMap:
+    """A map and the verdict on it.
+
+    Attributes:
+        points: (N, 3) of the map that were judged, world frame.
+        consistency: the verdict.
+        labels: names of the scene's objects.
+    """
+
+    points: Float64
+    consistency: MapConsistency
+    labels: tuple[str, ...]
+
+    def name(self, item: ObjectConsistency) -> str:
+        """Name of an object."""
+        return self.labels[item.label]
+
+
+def judge_episode(world: ActiveSlamEnv, rule: ConsistencyRule | None = None) -> JudgedMap:
+    """Judge the map of the episode just played.
+
+    The frames are rendered again without noise from their true poses, with the objects' labels.
+    """
+    frames = np.flatnonzero(world.tracked)
+    picked = frames[np.unique(np.linspace(0, len(frames) - 1, MOST_VIEWS).astype(int))]
+    truth, estimate = world.trajectory_truth, world.trajectory_estimate
+    views = [labelled_view(world.sensor, truth[k], estimate[k]) for k in picked]
+    return judge_map(world.slam.map_points(), views, world.sensor, rule)
+
+
+def labelled_view(
+    sensor: RGBDSensor, T_world_camera: Float64, T_world_camera_estimate: Float64
+) -> LabelledView:
+    """What a frame from a true pose (4, 4) showed, for SLAM that put it at an estimated one."""
+    view = sensor.ground_truth(T_world_camera)
+    return LabelledView(T_world_camera, T_world_camera_estimate, view.depth, view.labels)
+
+
+def judge_map(
+    map_points: Float64,
+    views: list[LabelledView],
+    sensor: RGBDSensor,
+    rule: ConsistencyRule | None = None,
+) -> JudgedMap:
+    """Judge a map (N, 3) that was made of ``views`` of the sensor's scene."""
+    rule = rule or ConsistencyRule()
+    scene = sensor.scene
+    labels = scene.mesh.labels
+    points = voxel_thin(map_points, MAP_VOXEL_M)
+    votes = count_votes(points, views, sensor.intrinsics, len(labels))
+    surface, owner = _labelled_surface(scene.name, scene.seed)
+    placements = distinct_placements(views, points, rule.apart_m / 2)
+    verdict = judge_consistency(points, votes, surface, owner, rule, placements)
+    return JudgedMap(points, verdict, labels)
+
+
+@lru_cache(maxsize=2)
+def _labelled_surface(scene: str, seed: int) -> tuple[Float64, NDArray[np.int32]]:
+    return get_scene(scene, seed).surface_points(SURFACE_SPACING_M)

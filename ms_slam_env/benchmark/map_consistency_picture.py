@@ -1,0 +1,104 @@
+"""Pictures of judged maps: as SLAM coloured them, and with second copies of objects in red."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from ms_slam_env.benchmark.figures import caption, new_figure, save
+from ms_slam_env.benchmark.map_consistency import JudgedMap
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.geometry import invert, look_at, transform_points
+
+Float64 = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+CAMERA = Intrinsics(fx=460.0, fy=460.0, cx=319.5, cy=239.5, width=640, height=480)
+RED = (225, 30, 30)
+_BACKGROUND = 255
+_NEAREST_M = 0.35  # what hangs in front of the eye would hide the rest
+_DOT_M = 0.014  # the points are a centimetre apart
+
+
+def save_map_picture(
+    judged: JudgedMap,
+    map_points: ArrayLike,
+    map_colors: ArrayLike,
+    cameras: ArrayLike,
+    path: Path,
+    title: str,
+) -> Path:
+    """Draw a judged map twice, seen obliquely from behind the cameras that made it.
+
+    Args:
+        judged: the map and its verdict.
+        map_points: (M, 3) of the whole map.
+        map_colors: (M, 3) uint8, its colours.
+        cameras: (K, 3) estimated positions of the camera.
+        path: of the PNG.
+        title: what map this is; the verdict is appended.
+    """
+    nearest = cKDTree(np.asarray(map_points)).query(judged.points)[1]
+    colors = np.asarray(map_colors)[nearest]
+    pose = overview_pose(judged.points, np.asarray(cameras))
+    marked = (0.35 * colors + 0.65 * 235).astype(np.uint8)
+    marked[judged.consistency.apart] = RED
+    figure: Figure = new_figure(2, width=5.0, height=4.3)
+    left, right = figure.subplots(1, 2)
+    for ax, colours, name in ((left, colors, "the map"), (right, marked, "second copies in red")):
+        ax.imshow(render_points(judged.points, colours, pose, CAMERA))
+        ax.set_title(name, fontsize="small")
+        ax.axis("off")
+    caption(figure, f"{title}: {describe(judged)}")
+    return save(figure, path)
+
+
+def describe(judged: JudgedMap) -> str:
+    """The verdict in words, with the objects that are there twice, the worst five first."""
+    twice = judged.consistency.duplicated
+    if not twice:
+        return "success, no object is there twice"
+    names = [f"{judged.name(item)} ({100 * item.apart_share:.0f} %)" for item in twice[:5]]
+    more = f" and {len(twice) - 5} more" if len(twice) > 5 else ""
+    return "failure, twice there: " + ", ".join(names) + more
+
+
+def overview_pose(points: Float64, cameras: Float64) -> Float64:
+    """A pose (4, 4) behind and above the cameras (K, 3) that looks at the points (N, 3)."""
+    target, eye = np.median(points, axis=0), cameras.mean(axis=0)
+    back = eye - target
+    back[2] = 0.0
+    back /= max(float(np.linalg.norm(back)), 1e-6)
+    return look_at(eye + 0.7 * back + np.array([0.0, 0.0, 0.5]), target)
+
+
+def render_points(
+    points: Float64, colors: ArrayLike, T_world_camera: Float64, intrinsics: Intrinsics
+) -> Image:
+    """Points (N, 3) with colours (N, 3) uint8 as dots that hide what is behind, (H, W, 3) uint8."""
+    camera = transform_points(invert(T_world_camera), points)
+    ahead = camera[:, 2] > _NEAREST_M
+    camera, shades = camera[ahead], np.asarray(colors, dtype=np.uint8)[ahead]
+    order = np.argsort(-camera[:, 2], kind="stable")  # far ones first, near ones over them
+    camera, shades = camera[order], shades[order]
+    column, row = np.rint(intrinsics.project(camera)).astype(np.int64).T
+    radius = np.ceil(0.5 * _DOT_M * intrinsics.fx / camera[:, 2]).astype(np.int64)
+    reach = int(radius.max(initial=0))
+    image = np.full((*intrinsics.shape, 3), _BACKGROUND, np.uint8)
+    depth = np.full(intrinsics.shape, np.inf)
+    for dy in range(-reach, reach + 1):
+        for dx in range(-reach, reach + 1):
+            x, y = column + dx, row + dy
+            drawn = (radius >= max(abs(dx), abs(dy))) & (x >= 0) & (x < intrinsics.width)
+            drawn &= (y >= 0) & (y < intrinsics.height)
+            layer = np.full(intrinsics.shape, np.inf)
+            layer[y[drawn], x[drawn]] = camera[drawn, 2]  # of several, the last is the nearest
+            shade = np.zeros_like(image)
+            shade[y[drawn], x[drawn]] = shades[drawn]
+            nearer = layer < depth
+            image[nearer], depth[nearer] = shade[nearer], layer[nearer]
+    return image
