@@ -17,94 +17,94 @@ from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.launches import Launches
+from ms_slam_env.slam.surfel.memory import fetch, put
 from ms_slam_env.slam.surfel.types import LiveFrame
 
 
 @wp.kernel
 def _convert(
-    raw_depth: wp.array3d(dtype=wp.float32),
-    raw_color: wp.array4d(dtype=wp.uint8),
+    raw_depth: wp.array(dtype=wp.float32),
+    raw_color: wp.array(dtype=wp.uint8),
     cutoff_m: wp.float32,
+    width: wp.int32,
     columns: wp.int32,  # per thread
-    inverse_depth: wp.array3d(dtype=wp.float32),
-    color: wp.array3d(dtype=wp.vec3),
-    intensity: wp.array3d(dtype=wp.float32),
+    inverse_depth: wp.array(dtype=wp.float32),
+    color: wp.array(dtype=wp.vec3),
+    intensity: wp.array(dtype=wp.float32),
 ):
     """Inverse depth (0 for no reading or one beyond the cutoff), colour and its BT.601 luma."""
-    b, v, piece = wp.tid()
-    for u in range(piece * columns, wp.min((piece + 1) * columns, raw_depth.shape[2])):
-        z = raw_depth[b, v, u]
-        inverse = wp.float32(0.0)
-        if z > 0.0 and z <= cutoff_m:
-            inverse = 1.0 / z
-        inverse_depth[b, v, u] = inverse
-        red = wp.float32(raw_color[b, v, u, 0])
-        green = wp.float32(raw_color[b, v, u, 1])
-        blue = wp.float32(raw_color[b, v, u, 2])
-        color[b, v, u] = wp.vec3(red, green, blue)
-        intensity[b, v, u] = 0.299 * red + 0.587 * green + 0.114 * blue
-
-
-@wp.func
-def _weigh(near: float, centre: float, spatial: float, per_cutoff_squared: float):
-    """Weight of a neighbour and its weighted difference; without a branch, which would be guessed
-    wrongly at every second noisy pixel.
-    """
-    difference = near - centre
-    # Tukey's bisquare has the curvature of the Gaussian at 0 and needs no exp().
-    closeness = wp.max(1.0 - difference * difference * per_cutoff_squared, 0.0)
-    weight = wp.where(near > 0.0, spatial * closeness * closeness, 0.0)
-    return wp.vec2(weight, weight * difference)
+    row, piece = wp.tid()
+    i = row * width + piece * columns
+    end = row * width + wp.min((piece + 1) * columns, width)
+    while i < end:
+        z = fetch(raw_depth, i)
+        valid = z > 0.0 and z <= cutoff_m
+        put(inverse_depth, i, wp.where(valid, 1.0 / wp.where(valid, z, 1.0), 0.0))
+        red = wp.float32(fetch(raw_color, 3 * i))
+        green = wp.float32(fetch(raw_color, 3 * i + 1))
+        blue = wp.float32(fetch(raw_color, 3 * i + 2))
+        put(color, i, wp.vec3(red, green, blue))
+        put(intensity, i, 0.299 * red + 0.587 * green + 0.114 * blue)
+        i += 1
 
 
 @wp.kernel
-def _filter_columns(
-    inverse_depth: wp.array3d(dtype=wp.float32),
+def _filter(
+    inverse_depth: wp.array(dtype=wp.float32),
+    height: wp.int32,
+    width: wp.int32,
+    columns: wp.int32,
+    along_rows: wp.int32,  # 1: neighbours are in the same row; 0: in the same column
     spatial_weights: wp.array(dtype=wp.float32),  # (radius + 1,)
     per_cutoff_squared: wp.float32,  # 1 / (difference of inverse depth that weighs nothing)^2
-    columns: wp.int32,
-    filtered: wp.array3d(dtype=wp.float32),
+    weights: wp.array(dtype=wp.float32),  # working memory, per pixel
+    shifts: wp.array(dtype=wp.float32),
+    filtered: wp.array(dtype=wp.float32),
 ):
-    """Bilateral filter along the columns of the image."""
-    b, v, piece = wp.tid()
-    last = inverse_depth.shape[1] - 1
-    radius = spatial_weights.shape[0] - 1
-    for u in range(piece * columns, wp.min((piece + 1) * columns, inverse_depth.shape[2])):
-        centre = inverse_depth[b, v, u]
-        sums = wp.vec2(spatial_weights[0], 0.0)
-        if centre > 0.0:
-            for offset in range(wp.max(-radius, -v), 0):
-                near = inverse_depth[b, v + offset, u]
-                sums += _weigh(near, centre, spatial_weights[-offset], per_cutoff_squared)
-            for offset in range(1, wp.min(radius, last - v) + 1):
-                near = inverse_depth[b, v + offset, u]
-                sums += _weigh(near, centre, spatial_weights[offset], per_cutoff_squared)
-        filtered[b, v, u] = centre + sums[1] / sums[0]
+    """Bilateral filter along the rows or the columns of the image.
 
-
-@wp.kernel
-def _filter_rows(
-    inverse_depth: wp.array3d(dtype=wp.float32),
-    spatial_weights: wp.array(dtype=wp.float32),
-    per_cutoff_squared: wp.float32,
-    columns: wp.int32,
-    filtered: wp.array3d(dtype=wp.float32),
-):
-    """Bilateral filter along the rows of the image."""
-    b, v, piece = wp.tid()
-    last = inverse_depth.shape[2] - 1
+    The loop over neighbours is outside, the one over pixels inside and without branches: the
+    compiler turns it into operations on many pixels at once.
+    """
+    row, piece = wp.tid()
+    v = row % height
     radius = spatial_weights.shape[0] - 1
-    for u in range(piece * columns, wp.min((piece + 1) * columns, inverse_depth.shape[2])):
-        centre = inverse_depth[b, v, u]
-        sums = wp.vec2(spatial_weights[0], 0.0)
-        if centre > 0.0:
-            for offset in range(wp.max(-radius, -u), 0):
-                near = inverse_depth[b, v, u + offset]
-                sums += _weigh(near, centre, spatial_weights[-offset], per_cutoff_squared)
-            for offset in range(1, wp.min(radius, last - u) + 1):
-                near = inverse_depth[b, v, u + offset]
-                sums += _weigh(near, centre, spatial_weights[offset], per_cutoff_squared)
-        filtered[b, v, u] = centre + sums[1] / sums[0]
+    start = row * width
+    first = piece * columns
+    last = wp.min((piece + 1) * columns, width)
+    i = start + first
+    while i < start + last:
+        put(weights, i, fetch(spatial_weights, 0))
+        put(shifts, i, 0.0)
+        i += 1
+    for offset in range(-radius, radius + 1):
+        spatial = fetch(spatial_weights, wp.abs(offset))
+        i = start + first
+        end = start + last
+        to_near = offset * width
+        if along_rows != 0:
+            i = start + wp.max(first, -offset)
+            end = start + wp.min(last, width - offset)
+            to_near = offset
+        elif v + offset < 0 or v + offset >= height:
+            end = i
+        if offset == 0:
+            end = i
+        while i < end:
+            near = fetch(inverse_depth, i + to_near)
+            difference = near - fetch(inverse_depth, i)
+            # Tukey's bisquare has the curvature of the Gaussian at 0 and needs no exp().
+            closeness = wp.max(1.0 - difference * difference * per_cutoff_squared, 0.0)
+            weight = wp.where(near > 0.0, spatial * closeness * closeness, 0.0)
+            put(weights, i, fetch(weights, i) + weight)
+            put(shifts, i, fetch(shifts, i) + weight * difference)
+            i += 1
+    i = start + first
+    while i < start + last:
+        centre = fetch(inverse_depth, i)
+        mean = centre + fetch(shifts, i) / fetch(weights, i)
+        put(filtered, i, wp.where(centre > 0.0, mean, 0.0))
+        i += 1
 
 
 @wp.func
@@ -121,57 +121,87 @@ def _slope(before: float, here: float, after: float, largest: float):
     return wp.vec2(total / wp.max(count, 1.0), wp.min(count, 1.0))
 
 
+@wp.func
+def _normal(
+    left: float,
+    right: float,
+    above: float,
+    below: float,
+    inverse: float,
+    largest: float,
+    ray: wp.vec2,
+    focal_per_step: wp.vec2,
+):
+    """Unit normal of a pixel from its inverse depth and its neighbours'; 0 where invalid."""
+    slope_u = _slope(left, inverse, right, largest)
+    slope_v = _slope(above, inverse, below, largest)
+    # On a plane n . p = d, inverse depth is n . ray / d, linear in the ray's x and y:
+    # its gradient there, and its value at ray (0, 0, 1), are the normal up to scale.
+    a = slope_u[0] * focal_per_step[0]
+    c = slope_v[0] * focal_per_step[1]
+    normal = wp.vec3(a, c, inverse - a * ray[0] - c * ray[1])
+    squared = wp.dot(normal, normal)
+    valid = inverse > 0.0 and slope_u[1] * slope_v[1] > 0.0 and squared > 0.0
+    return wp.where(valid, -1.0 / wp.sqrt(wp.where(valid, squared, 1.0)), 0.0) * normal
+
+
 @wp.kernel
 def _surface(
-    inverse_depth: wp.array3d(dtype=wp.float32),
+    inverse_depth: wp.array(dtype=wp.float32),
+    height: wp.int32,
+    width: wp.int32,
+    columns: wp.int32,
     step: wp.int32,
     largest: wp.float32,
     focal: wp.vec2,
     centre: wp.vec2,
-    columns: wp.int32,
-    depth: wp.array3d(dtype=wp.float32),
-    vertices: wp.array3d(dtype=wp.vec3),
-    normals: wp.array3d(dtype=wp.vec3),
+    depth: wp.array(dtype=wp.float32),
+    vertices: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
 ):
     """Depth, vertices and normals of filtered inverse depth."""
-    b, v, piece = wp.tid()
-    height = inverse_depth.shape[1]
-    width = inverse_depth.shape[2]
+    row, piece = wp.tid()
+    v = row % height
+    start = row * width
+    first = piece * columns
+    last = wp.min((piece + 1) * columns, width)
     per_focal = 1.0 / focal[0]
     y = (wp.float32(v) - centre[1]) / focal[1]
-    for u in range(piece * columns, wp.min((piece + 1) * columns, width)):
-        inverse = inverse_depth[b, v, u]
-        if inverse == 0.0:
-            depth[b, v, u] = 0.0
-            vertices[b, v, u] = wp.vec3(0.0, 0.0, 0.0)
-            normals[b, v, u] = wp.vec3(0.0, 0.0, 0.0)
-            continue
-        z = 1.0 / inverse
-        ray = wp.vec3((wp.float32(u) - centre[0]) * per_focal, y, 1.0)
-        depth[b, v, u] = z
-        vertices[b, v, u] = z * ray
-        left = wp.float32(0.0)
-        right = wp.float32(0.0)
-        above = wp.float32(0.0)
-        below = wp.float32(0.0)
-        if u >= step:
-            left = inverse_depth[b, v, u - step]
-        if u + step < width:
-            right = inverse_depth[b, v, u + step]
-        if v >= step:
-            above = inverse_depth[b, v - step, u]
-        if v + step < height:
-            below = inverse_depth[b, v + step, u]
-        slope_u = _slope(left, inverse, right, largest)
-        slope_v = _slope(above, inverse, below, largest)
-        normal = wp.vec3(0.0, 0.0, 0.0)
-        if slope_u[1] > 0.0 and slope_v[1] > 0.0:
-            # On a plane n . p = d, inverse depth is n . ray / d, linear in the ray's x and y:
-            # its gradient there, and its value at ray (0, 0, 1), are the normal up to scale.
-            a = slope_u[0] * focal[0] / wp.float32(step)
-            c = slope_v[0] * focal[1] / wp.float32(step)
-            normal = -wp.normalize(wp.vec3(a, c, inverse - a * ray[0] - c * ray[1]))
-        normals[b, v, u] = normal
+    i = start + first
+    while i < start + last:
+        inverse = fetch(inverse_depth, i)
+        z = wp.where(inverse > 0.0, 1.0 / wp.where(inverse > 0.0, inverse, 1.0), 0.0)
+        put(depth, i, z)
+        put(vertices, i, wp.vec3(z * (wp.float32(i - start) - centre[0]) * per_focal, z * y, z))
+        i += 1
+    focal_per_step = focal / wp.float32(step)
+    has_above = wp.where(v >= step, 1.0, 0.0)  # outside the image the inverse depth counts as 0
+    has_below = wp.where(v + step < height, 1.0, 0.0)
+    to_above = wp.where(v >= step, -step * width, 0)
+    to_below = wp.where(v + step < height, step * width, 0)
+    for part in range(3):  # the columns near the left border, those inside, those near the right
+        i = start + wp.max(first, wp.where(part == 0, 0, wp.where(part == 1, step, width - step)))
+        end = start + wp.min(
+            last, wp.where(part == 0, step, wp.where(part == 1, width - step, width))
+        )
+        has_left = wp.where(part == 0, 0.0, 1.0)
+        has_right = wp.where(part == 2, 0.0, 1.0)
+        to_left = wp.where(part == 0, 0, -step)
+        to_right = wp.where(part == 2, 0, step)
+        while i < end:
+            ray = wp.vec2((wp.float32(i - start) - centre[0]) * per_focal, y)
+            normal = _normal(
+                has_left * fetch(inverse_depth, i + to_left),
+                has_right * fetch(inverse_depth, i + to_right),
+                has_above * fetch(inverse_depth, i + to_above),
+                has_below * fetch(inverse_depth, i + to_below),
+                fetch(inverse_depth, i),
+                largest,
+                ray,
+                focal_per_step,
+            )
+            put(normals, i, normal)
+            i += 1
 
 
 def copy_in(target: wp.array, values: NDArray[Any]) -> None:
@@ -203,7 +233,9 @@ class Preprocessor:
             color=wp.zeros(shape, dtype=wp.vec3, device=device),
             intensity=wp.zeros(shape, dtype=wp.float32, device=device),
         )
-        self._filtered = [wp.zeros_like(self._inverse_depth) for _ in range(2)]
+        self._filtered, self._weights, self._shifts = (
+            wp.zeros_like(self._inverse_depth) for _ in range(3)
+        )
         offsets = np.arange(config.bilateral_radius_px + 1, dtype=np.float32)
         weights = np.exp(-(offsets**2) / (2 * config.bilateral_sigma_px**2))
         self._spatial_weights = wp.array(weights, dtype=wp.float32, device=device)
@@ -212,7 +244,7 @@ class Preprocessor:
         # The CPU runs one thread after another: whole rows. A GPU wants many threads.
         self._columns = 1 if wp.get_device(device).is_cuda else intrinsics.width
         self._launches = Launches(device)
-        self._dim = (batch, intrinsics.height, -(-intrinsics.width // self._columns))
+        self._dim = (batch * intrinsics.height, -(-intrinsics.width // self._columns))
 
     def __call__(self, color: NDArray[np.uint8], depth: NDArray[np.float32]) -> LiveFrame:
         """Preprocess colour (B, H, W, 3) uint8 and depth (B, H, W) float32 m into one LiveFrame.
@@ -232,31 +264,37 @@ class Preprocessor:
     def _record(self) -> None:
         """Run the stages for the first time and keep their launches: all buffers stay."""
         frame, config, camera, dim = self.frame, self.config, self.intrinsics, self._dim
+        size = [camera.height, camera.width, self._columns]
+        inverse, filtered = self._inverse_depth.flatten(), self._filtered.flatten()
         self._launches.record(
             "convert",
             _convert,
             dim,
-            [frame.raw_depth, self._raw_color, config.depth_cutoff_m, self._columns],
-            [self._inverse_depth, frame.color, frame.intensity],
+            [
+                frame.raw_depth.flatten(),
+                self._raw_color.flatten(),
+                config.depth_cutoff_m,
+                *size[1:],
+            ],
+            [inverse, frame.color.flatten(), frame.intensity.flatten()],
         )
         per_cutoff_squared = 1.0 / (2.0 * config.bilateral_sigma_m) ** 2
-        source = self._inverse_depth
-        kernels = {"filter columns": _filter_columns, "filter rows": _filter_rows}
-        for (name, kernel), target in zip(kernels.items(), self._filtered, strict=True):
+        working = [self._weights.flatten(), self._shifts.flatten()]
+        passes = {"filter columns": (inverse, 0, filtered), "filter rows": (filtered, 1, inverse)}
+        for name, (source, along_rows, target) in passes.items():
             self._launches.record(
                 name,
-                kernel,
+                _filter,
                 dim,
-                [source, self._spatial_weights, per_cutoff_squared, self._columns],
+                [source, *size, along_rows, self._spatial_weights, per_cutoff_squared, *working],
                 [target],
             )
-            source = target
         edge = config.normal_edge_per_m * self._normal_step * 160 / camera.width
         focal, centre = wp.vec2(camera.fx, camera.fy), wp.vec2(camera.cx, camera.cy)
         self._launches.record(
             "surface",
             _surface,
             dim,
-            [source, self._normal_step, edge, focal, centre, self._columns],
-            [frame.depth, frame.vertices, frame.normals],
+            [inverse, *size, self._normal_step, edge, focal, centre],
+            [frame.depth.flatten(), frame.vertices.flatten(), frame.normals.flatten()],
         )

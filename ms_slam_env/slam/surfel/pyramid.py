@@ -12,76 +12,108 @@ from dataclasses import dataclass
 
 from ms_slam_env._warp import wp
 from ms_slam_env.slam.surfel.launches import Launches
+from ms_slam_env.slam.surfel.memory import fetch, put
 
 EDGE_FRACTION = 0.03  # pixels of a block further behind the front one than this are another surface
 
 
+@wp.func
+def _share(p: wp.vec3, limit: float):
+    """1 for a valid pixel that is not behind the limit, else 0."""
+    return wp.where(p[2] > 0.0 and p[2] <= limit, 1.0, 0.0)
+
+
+@wp.func
+def _distance(p: wp.vec3):
+    """Depth of a pixel; very far where invalid."""
+    return wp.where(p[2] > 0.0, p[2], 1.0e9)
+
+
 @wp.kernel
 def _downsample(
-    vertices: wp.array3d(dtype=wp.vec3),
-    normals: wp.array3d(dtype=wp.vec3),
-    intensity: wp.array3d(dtype=wp.float32),
+    vertices: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    intensity: wp.array(dtype=wp.float32),
+    height: wp.int32,  # of the fine image
+    width: wp.int32,
     edge_fraction: wp.float32,
-    columns: wp.int32,  # per thread
-    coarse_vertices: wp.array3d(dtype=wp.vec3),
-    coarse_normals: wp.array3d(dtype=wp.vec3),
-    coarse_intensity: wp.array3d(dtype=wp.float32),
+    columns: wp.int32,  # of the coarse image, per thread
+    coarse_vertices: wp.array(dtype=wp.vec3),
+    coarse_normals: wp.array(dtype=wp.vec3),
+    coarse_intensity: wp.array(dtype=wp.float32),
 ):
-    b, v, piece = wp.tid()
-    width = coarse_vertices.shape[2]
-    for u in range(piece * columns, wp.min((piece + 1) * columns, width)):
-        front = wp.float32(1.0e9)
-        for i in range(4):
-            z = vertices[b, 2 * v + i / 2, 2 * u + i % 2][2]
-            if z > 0.0:
-                front = wp.min(front, z)
+    row, piece = wp.tid()
+    coarse_height = height / 2
+    coarse_width = width / 2
+    b = row / coarse_height
+    u = piece * columns
+    end = wp.min(u + columns, coarse_width)
+    i = row * coarse_width + u  # in the coarse image
+    j = (b * height + 2 * (row - b * coarse_height)) * width + 2 * u  # in the fine one
+    while u < end:
+        p00 = fetch(vertices, j)
+        p01 = fetch(vertices, j + 1)
+        p10 = fetch(vertices, j + width)
+        p11 = fetch(vertices, j + width + 1)
+        front = wp.min(
+            wp.min(_distance(p00), _distance(p01)), wp.min(_distance(p10), _distance(p11))
+        )
         limit = front * (1.0 + edge_fraction)
-        vertex = wp.vec3(0.0, 0.0, 0.0)
-        normal = wp.vec3(0.0, 0.0, 0.0)
-        grey = wp.float32(0.0)
-        count = wp.float32(0.0)
-        grey_any = wp.float32(0.0)
-        for i in range(4):
-            p = vertices[b, 2 * v + i / 2, 2 * u + i % 2]
-            value = intensity[b, 2 * v + i / 2, 2 * u + i % 2]
-            share = wp.float32(0.0)
-            if p[2] > 0.0 and p[2] <= limit:
-                share = 1.0
-            vertex += share * p
-            normal += share * normals[b, 2 * v + i / 2, 2 * u + i % 2]
-            grey += share * value
-            count += share
-            grey_any += value
-        per_count = wp.float32(1.0)
-        if count > 1.0:
-            per_count = 1.0 / count
-        coarse_vertices[b, v, u] = vertex * per_count
-        coarse_normals[b, v, u] = wp.normalize(normal)  # 0 stays 0
+        s00 = _share(p00, limit)
+        s01 = _share(p01, limit)
+        s10 = _share(p10, limit)
+        s11 = _share(p11, limit)
+        normal = s00 * fetch(normals, j) + s01 * fetch(normals, j + 1)
+        normal += s10 * fetch(normals, j + width) + s11 * fetch(normals, j + width + 1)
+        i00 = fetch(intensity, j)
+        i01 = fetch(intensity, j + 1)
+        i10 = fetch(intensity, j + width)
+        i11 = fetch(intensity, j + width + 1)
+        count = s00 + s01 + s10 + s11
+        per_count = 1.0 / wp.max(count, 1.0)
+        grey = (s00 * i00 + s01 * i01 + s10 * i10 + s11 * i11) * per_count
+        squared = wp.dot(normal, normal)
+        has_normal = squared > 0.0
+        scale = wp.where(has_normal, 1.0 / wp.sqrt(wp.where(has_normal, squared, 1.0)), 0.0)
+        put(coarse_vertices, i, (s00 * p00 + s01 * p01 + s10 * p10 + s11 * p11) * per_count)
+        put(coarse_normals, i, scale * normal)
         # The sensor's grey value is good where its depth is missing.
-        coarse_intensity[b, v, u] = wp.where(count > 0.0, grey * per_count, 0.25 * grey_any)
+        mean = 0.25 * (i00 + i01 + i10 + i11)
+        put(coarse_intensity, i, wp.where(count > 0.0, grey, mean))
+        u += 1
+        i += 1
+        j += 2
 
 
 @wp.kernel
 def _intensity_gradient(
-    intensity: wp.array3d(dtype=wp.float32),
+    intensity: wp.array(dtype=wp.float32),
+    height: wp.int32,
+    width: wp.int32,
     columns: wp.int32,
-    gradient: wp.array3d(dtype=wp.vec3),
+    gradient: wp.array(dtype=wp.vec3),
 ):
     """Write (intensity, d/du, d/dv) by central differences, one-sided at the border."""
-    b, v, piece = wp.tid()
-    last = intensity.shape[2] - 1
-    above = wp.max(v - 1, 0)
-    below = wp.min(v + 1, intensity.shape[1] - 1)
-    per_height = 1.0 / float(wp.max(below - above, 1))
-    for u in range(piece * columns, wp.min((piece + 1) * columns, last + 1)):
-        left = wp.max(u - 1, 0)
-        right = wp.min(u + 1, last)
-        per_width = wp.where(right - left == 2, 0.5, 1.0)
-        gradient[b, v, u] = wp.vec3(
-            intensity[b, v, u],
-            (intensity[b, v, right] - intensity[b, v, left]) * per_width,
-            (intensity[b, below, u] - intensity[b, above, u]) * per_height,
-        )
+    row, piece = wp.tid()
+    v = row % height
+    to_above = wp.where(v > 0, -width, 0)
+    to_below = wp.where(v < height - 1, width, 0)
+    per_height = wp.where(v > 0 and v < height - 1, 0.5, 1.0)
+    start = row * width
+    first = start + piece * columns
+    last = start + wp.min((piece + 1) * columns, width)
+    for part in range(3):  # the left border, the columns inside, the right border
+        i = wp.max(first, start + wp.where(part == 0, 0, wp.where(part == 1, 1, width - 1)))
+        end = start + wp.where(part == 0, 1, wp.where(part == 1, width - 1, width))
+        end = wp.min(last, end)
+        to_left = wp.where(part == 0, 0, -1)
+        to_right = wp.where(part == 2, 0, 1)
+        per_width = wp.where(part == 1, 0.5, 1.0)
+        while i < end:
+            slope_u = (fetch(intensity, i + to_right) - fetch(intensity, i + to_left)) * per_width
+            slope_v = (fetch(intensity, i + to_below) - fetch(intensity, i + to_above)) * per_height
+            put(gradient, i, wp.vec3(fetch(intensity, i), slope_u, slope_v))
+            i += 1
 
 
 @dataclass(frozen=True)
@@ -110,7 +142,6 @@ class Pyramid:
         # The CPU runs one thread after another: whole rows. A GPU wants many threads.
         self._columns = 1 if wp.get_device(device).is_cuda else shape[1]
         self._levels: list[Level] = []
-        self._with_gradient = with_gradient
         self._coarse: list[Level] = []
         size = (batch, *shape)
         self._gradient = wp.zeros(size, dtype=wp.vec3, device=device) if with_gradient else None
@@ -139,22 +170,33 @@ class Pyramid:
                     key,
                     _downsample,
                     self._dim(coarse),
-                    [fine.vertices, fine.normals, fine.intensity, EDGE_FRACTION, self._columns],
-                    [coarse.vertices, coarse.normals, coarse.intensity],
+                    [
+                        *(a.flatten() for a in (fine.vertices, fine.normals, fine.intensity)),
+                        *fine.vertices.shape[1:],
+                        EDGE_FRACTION,
+                        self._columns,
+                    ],
+                    [
+                        coarse.vertices.flatten(),
+                        coarse.normals.flatten(),
+                        coarse.intensity.flatten(),
+                    ],
                 )
-        for index, level in enumerate(self._levels if self._with_gradient else ()):
+        for index, level in enumerate(self._levels):
+            if level.gradient is None:
+                continue
             key = ("gradient", index)
             if not self._launches.replay(key):
                 self._launches.record(
                     key,
                     _intensity_gradient,
                     self._dim(level),
-                    [level.intensity, self._columns],
-                    [level.gradient],
+                    [level.intensity.flatten(), *level.intensity.shape[1:], self._columns],
+                    [level.gradient.flatten()],
                 )
         return self._levels
 
-    def _dim(self, level: Level) -> tuple[int, int, int]:
+    def _dim(self, level: Level) -> tuple[int, int]:
         """Threads of a kernel that writes ``level``: a piece of a row each."""
         batch, height, width = level.vertices.shape
-        return batch, height, -(-width // self._columns)
+        return batch * height, -(-width // self._columns)
