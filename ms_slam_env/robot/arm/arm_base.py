@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.robot.arm.config import ArmConfig
 from ms_slam_env.robot.arm.model import load_arm
-from ms_slam_env.robot.arm.placement import place_arm, reach_m
+from ms_slam_env.robot.arm.placement import place_arm, reach_m, standing_chain
 from ms_slam_env.robot.arm.reach import Reach, ReachResult
 from ms_slam_env.robot.arm.surroundings import Surroundings
 from ms_slam_env.robot.base import Embodiment
@@ -43,6 +43,7 @@ class ArmEmbodiment(Embodiment):
         config: of the arm.
         timings: charged with the stage ``mask``.
         model: the arm.
+        chain: the arm as it stands: ``model.chain``, and the column below it if there is one.
         motions: (49, 4, 4) the candidate motions ``T_camera_next``.
         T_world_base: (4, 4) where the arm stands.
         surroundings: furniture around it.
@@ -60,6 +61,7 @@ class ArmEmbodiment(Embodiment):
         self.config = config
         self.timings = timings
         self.model = load_arm(config.model, config.camera_site, config.joint_speed_rad_s)
+        self.chain = standing_chain(self.model, config)
         self.motions = decompose(step_m, step_rad)
         self.motions.flags.writeable = False
         self.T_world_base = np.eye(4)
@@ -78,8 +80,8 @@ class ArmEmbodiment(Embodiment):
     def stand_at(self, T_world_base: Float64) -> None:
         """Move the base to a pose (4, 4) and look around from there."""
         self.T_world_base = np.array(T_world_base, dtype=np.float64)
-        self.surroundings = Surroundings(self.scene, self.T_world_base, reach_m(self.model.chain))
-        self.reach = Reach(self.model.chain, self.surroundings, self.config)
+        self.surroundings = Surroundings(self.scene, self.T_world_base, reach_m(self.chain))
+        self.reach = Reach(self.chain, self.surroundings, self.config)
 
     def start_at(self, q: Float64, rng: np.random.Generator) -> None:
         """Hold the arm at rest at joint angles (n,) at the start of an episode."""
@@ -88,7 +90,7 @@ class ArmEmbodiment(Embodiment):
     def set_joints(self, q: Float64) -> None:
         """The arm is now at joint angles (n,)."""
         self.q = np.array(q, dtype=np.float64)
-        self.T_world_camera = self.T_world_base @ self.model.chain.camera_pose(self.q)
+        self.T_world_camera = self.T_world_base @ self.chain.camera_pose(self.q)
         self._probe: ReachResult | None = None
 
     def planning_state(self) -> tuple[Float64, Float64]:
@@ -96,7 +98,7 @@ class ArmEmbodiment(Embodiment):
 
         What the arm itself believes; the truth for an arm without errors.
         """
-        return self.q, self.model.chain.camera_pose(self.q)
+        return self.q, self.chain.camera_pose(self.q)
 
     def probe(self) -> ReachResult:
         """Which of the 49 motions the arm can make from here, and how; worked out once a place."""

@@ -98,3 +98,15 @@ def separate_pairs(chain: Chain, home: Float64) -> Chain:
     free = gap > 0
     pairs = np.stack([first[free], second[free]], axis=1).astype(np.int32)
     return dataclasses.replace(chain, self_pairs=pairs, self_gap=gap[free])
+
+
+def with_column(chain: Chain, home: Float64, radius_m: float, height_m: float) -> Chain:
+    """The chain whose base stands on an upright column that its links must not touch."""
+    column = np.array([[[0.0, 0.0, -radius_m], [0.0, 0.0, -max(height_m, radius_m)]]])
+    extended = dataclasses.replace(
+        chain,
+        capsule_link=np.append(chain.capsule_link, 0).astype(np.int32),
+        capsule_ends=np.concatenate([chain.capsule_ends, column]),
+        capsule_radius=np.append(chain.capsule_radius, radius_m),
+    )
+    return separate_pairs(extended, home)

@@ -11,7 +11,7 @@ Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Chain:
     """Geometry of an arm with ``n`` joints and ``m`` capsules around its links.
 

@@ -31,10 +31,10 @@ class KinematicArm(ArmEmbodiment):
         else:
             q = np.tile(self.q, (len(times), 1))
         if made and duration > 0:
-            target = self.model.chain.camera_pose(self.q) @ self.motions[action]
-            q[times >= duration] = solve_pose(self.model.chain, q[-1:], target).q[0]
+            target = self.chain.camera_pose(self.q) @ self.motions[action]
+            q[times >= duration] = solve_pose(self.chain, q[-1:], target).q[0]
         self.set_joints(q[-1])
-        poses = self.T_world_base @ self.model.chain.camera_pose(q)
+        poses = self.T_world_base @ self.chain.camera_pose(q)
         return Movement(made, poses, poses.copy(), times)
 
     @staticmethod

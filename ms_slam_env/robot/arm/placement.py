@@ -9,17 +9,20 @@ from numpy.typing import NDArray
 
 from ms_slam_env.errors import UnreachableError
 from ms_slam_env.geometry import invert, make_pose, so3_exp, transform_points
+from ms_slam_env.robot.arm.capsules import with_column
 from ms_slam_env.robot.arm.chain import Chain
 from ms_slam_env.robot.arm.config import ArmConfig
 from ms_slam_env.robot.arm.inverse import solve_pose
 from ms_slam_env.robot.arm.model import ArmModel
 from ms_slam_env.robot.arm.postures import (
+    PITCHES,
     STEP_M,
     STEP_RAD,
-    Postures,
+    Samples,
     effort,
-    good_postures,
     links_apart,
+    postures_at,
+    sample_joints,
     turn_upright,
     wrap_joints,
 )
@@ -35,8 +38,8 @@ COLUMN_RADIUS_M = 0.08
 """Radius of the column that carries a base above the floor."""
 
 _PROBED = 4  # postures whose motions are counted
-_ENOUGH = 45  # motions: no need to look further
-_TRIED = 64  # good postures nearest to the wanted inclination of the camera
+_ENOUGH = 46  # motions: no need to look further
+_PITCHES_TRIED = 2  # nearest to that of the camera
 _SEEDS = 24  # starting points of inverse kinematics for a given base
 _MET_M = 0.02  # closer than this to a surface is on it
 _GRID_M = 0.05  # vertical distance of the points of a column that are checked
@@ -63,10 +66,23 @@ def place_arm(
     return _stand_on_base(model, scene, T_world_camera, config)
 
 
+def standing_chain(model: ArmModel, config: ArmConfig) -> Chain:
+    """The arm's chain as it stands: on a column that its links must not touch, or on a base."""
+    return model.chain if config.base is not None else _on_column(model)
+
+
 @lru_cache(maxsize=8)
-def model_reach_m(model: ArmModel) -> float:
-    """Distance from the base that no part of the arm exceeds."""
-    return reach_m(model.chain)
+def _on_column(model: ArmModel) -> Chain:
+    return with_column(model.chain, model.home, COLUMN_RADIUS_M, reach_m(model.chain))
+
+
+def _planning(config: ArmConfig) -> ArmConfig:
+    """What of a configuration the search for postures depends on, so that it is shared."""
+    return ArmConfig(
+        speed_m_s=config.speed_m_s,
+        speed_rad_s=config.speed_rad_s,
+        clearance_m=config.clearance_m,
+    )
 
 
 def reach_m(chain: Chain) -> float:
@@ -84,11 +100,13 @@ def _stand_anywhere(
     model: ArmModel, scene: Scene, T_world_camera: Float64, config: ArmConfig
 ) -> tuple[Float64, Float64]:
     """Choose a posture with the camera's inclination; the base follows from it."""
-    chain = model.chain
-    postures = good_postures(model, config.speed_m_s, config.speed_rad_s)
+    chain = standing_chain(model, config)
     up = T_world_camera[2, :3]
-    nearest = np.argsort(-(postures.up @ up), kind="stable")[:_TRIED]
-    q, upright = turn_upright(chain, postures.q[nearest], up)
+    pitch = np.arcsin(np.clip(up[2], -1, 1))
+    nearest = np.argsort(np.abs(PITCHES - pitch), kind="stable")[:_PITCHES_TRIED]
+    postures = [postures_at(chain, tuple(model.home), _planning(config), int(i)) for i in nearest]
+    motions = np.concatenate([some.motions for some in postures])
+    q, upright = turn_upright(chain, np.concatenate([some.q for some in postures]), up)
     q = wrap_joints(chain, q)
     bendable = upright & chain.within_limits(q, LIMIT_MARGIN_RAD) & links_apart(chain, q)
     T_world_base = T_world_camera @ invert(chain.camera_pose(q))
@@ -103,7 +121,7 @@ def _stand_anywhere(
             f"{int((bendable & ~supported).sum())} have no free floor for the base, in "
             f"{int((bendable & supported & ~clear).sum())} the arm would touch furniture"
         )
-    order = possible[np.argsort(effort(chain, q[possible], config.speed_m_s, config.speed_rad_s))]
+    order = possible[np.argsort(-motions[possible], kind="stable")]
     return _most_able(model, scene, config, T_world_base[order], q[order])
 
 
@@ -112,13 +130,13 @@ def _stand_on_base(
 ) -> tuple[Float64, Float64]:
     """Solve inverse kinematics from a given base."""
     assert config.base is not None
-    chain = model.chain
+    chain = standing_chain(model, config)
     x, y, z, yaw = config.base
     T_world_base = make_pose(so3_exp([0.0, 0.0, yaw]), [x, y, z])
     _check_base(model, scene, T_world_base)
-    postures = good_postures(model, config.speed_m_s, config.speed_rad_s)
+    samples = sample_joints(chain, tuple(model.home), _planning(config))
     target = invert(T_world_base) @ T_world_camera
-    found = solve_pose(chain, _seeds(postures, model.home, target), target)
+    found = solve_pose(chain, _seeds(samples, model.home, target), target)
     reached = found.accurate()
     where = f"start pose {_words(T_world_camera[:3, 3])}"
     arm = f"arm {model.path.stem} from base {_words(T_world_base[:3, 3])}"
@@ -144,12 +162,13 @@ def _most_able(
     model: ArmModel, scene: Scene, config: ArmConfig, T_world_base: Float64, q: Float64
 ) -> tuple[Float64, Float64]:
     """Of places (s, 4, 4) with postures (s, n), the one with the most possible motions."""
+    chain = standing_chain(model, config)
     motions = decompose(STEP_M, STEP_RAD)
     best, most = 0, -1
     for index in range(min(_PROBED, len(q))):
-        surroundings = Surroundings(scene, T_world_base[index], model_reach_m(model))
-        reach = Reach(model.chain, surroundings, config)
-        result = reach.probe(q[index], model.chain.camera_pose(q[index]) @ motions)
+        surroundings = Surroundings(scene, T_world_base[index], reach_m(chain))
+        reach = Reach(chain, surroundings, config)
+        result = reach.probe(q[index], chain.camera_pose(q[index]) @ motions)
         count = int(result.ok.sum())
         if count > most:
             best, most = index, count
@@ -158,14 +177,14 @@ def _most_able(
     return T_world_base[best], q[best]
 
 
-def _seeds(postures: Postures, home: Float64, target: Float64) -> Float64:
+def _seeds(samples: Samples, home: Float64, target: Float64) -> Float64:
     """Joint angles (s, n) whose camera is near a target (4, 4), and the home."""
-    cameras = postures.any_T_base_camera
+    cameras = samples.T_base_camera
     apart = np.linalg.norm(cameras[:, :3, 3] - target[:3, 3], axis=1)
     cosine = 0.5 * (np.einsum("sij,ij->s", cameras[:, :3, :3], target[:3, :3]) - 1)
     turned = np.arccos(np.clip(cosine, -1, 1))
     nearest = np.argsort(apart + 0.3 * turned, kind="stable")[:_SEEDS]
-    return np.concatenate([home[None], postures.any_q[nearest]])
+    return np.concatenate([home[None], samples.q[nearest]])
 
 
 def _check_base(model: ArmModel, scene: Scene, T_world_base: Float64) -> None:

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ms_slam_env.robot.arm.chain import Chain, segment_distance
-from ms_slam_env.robot.arm.model import ArmModel
+from ms_slam_env.robot.arm.config import ArmConfig
+from ms_slam_env.robot.arm.reach import Reach
+from ms_slam_env.robot.arm.surroundings import Surroundings
 from ms_slam_env.robot.motions import decompose
 
 Float64 = NDArray[np.float64]
@@ -21,10 +23,12 @@ LIMIT_MARGIN_RAD = 0.15
 STEP_M, STEP_RAD = 0.12, np.radians(12)
 """Motions that a posture is judged by."""
 
+PITCHES = np.linspace(-np.pi / 2, np.pi / 2, 19)
+"""Pitches of the camera, from straight down to straight up, for which postures are kept."""
+
 _SAMPLES = 20_000
-_PITCHES = 19  # evenly from straight down to straight up
-_TRIED_PER_PITCH = 300
-_KEPT_PER_PITCH = 24
+_TRIED = 300
+_KEPT = 24
 _APART_M = 0.06  # least distance between the bases of two postures of one pitch
 _DAMPING = 0.02
 _TOO_HARD = 4.0
@@ -32,56 +36,80 @@ _TOO_HARD = 4.0
 
 @dataclass(frozen=True)
 class Postures:
-    """Good postures of an arm, and many more that are merely possible.
+    """Good postures of an arm for one pitch of the camera, the best first.
 
     Attributes:
-        q: (l, n) joint angles, best first within each pitch of the camera.
-        up: (l, 3) the base's z axis in the camera's frame.
-        effort: (l,) see :func:`effort`.
-        any_q: (s, n) joint angles all over the arm's range.
-        any_T_base_camera: (s, 4, 4) camera at those.
+        q: (l, n) joint angles; the camera has that pitch and no roll, the base is upright.
+        motions: (l,) how many of the 49 motions the arm can make there where nothing else is.
     """
 
     q: Float64
-    up: Float64
+    motions: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Joint angles (s, n) all over an arm's range, and what is known of them.
+
+    Attributes:
+        q: (s, n).
+        T_base_camera: (s, 4, 4).
+        effort: (s,) see :func:`effort`.
+    """
+
+    q: Float64
+    T_base_camera: Float64
     effort: Float64
-    any_q: Float64
-    any_T_base_camera: Float64
+
+
+class _Nothing:
+    """A world without furniture."""
+
+    def clearance(self, points: Float64) -> Float64:
+        """Far (N,) from everything at points (N, 3)."""
+        return np.full(len(points), 100.0)
 
 
 @lru_cache(maxsize=8)
-def good_postures(model: ArmModel, speed_m_s: float, speed_rad_s: float) -> Postures:
-    """Search an arm's joint space, from a fixed seed, for postures with the camera upright.
-
-    For each of 19 pitches of the camera, random joint angles are turned until the camera has that
-    pitch and no roll; kept are those of least effort that leave the links apart, with bases at
-    different places as seen from the camera.
-    """
-    chain = model.chain
-    low, high = _range(chain, model.home)
+def sample_joints(chain: Chain, home: tuple[float, ...], config: ArmConfig) -> Samples:
+    """Draw joint angles evenly, at most one turn around the home, from a fixed seed."""
+    around = np.array(home)
+    low = np.maximum(chain.lower + LIMIT_MARGIN_RAD, around - np.pi)
+    high = np.minimum(chain.upper - LIMIT_MARGIN_RAD, around + np.pi)
     rng = np.random.default_rng(0)
-    any_q = rng.uniform(low, high, (_SAMPLES, chain.num_joints))
-    any_camera = chain.camera_pose(any_q)
-    any_effort = effort(chain, any_q, speed_m_s, speed_rad_s)
-    any_up = any_camera[:, 2, :3]
-    kept = []
-    for pitch in np.linspace(-np.pi / 2, np.pi / 2, _PITCHES):
-        up = np.array([0.0, -np.cos(pitch), np.sin(pitch)])
-        score = any_effort + 2 * np.arccos(np.clip(any_up @ up, -1, 1))
-        start = np.argsort(score, kind="stable")[:_TRIED_PER_PITCH]
-        q, reached = turn_upright(chain, any_q[start], up)
-        q = q[reached & chain.within_limits(q, LIMIT_MARGIN_RAD)]
-        q = q[links_apart(chain, q)]
-        q = q[np.argsort(effort(chain, q, speed_m_s, speed_rad_s), kind="stable")]
-        kept.append(_spread(chain, q))
-    q = np.concatenate(kept)
-    return Postures(
-        q=q,
-        up=chain.camera_pose(q)[:, 2, :3],
-        effort=effort(chain, q, speed_m_s, speed_rad_s),
-        any_q=any_q,
-        any_T_base_camera=any_camera,
-    )
+    q = rng.uniform(np.minimum(low, high), np.maximum(low, high), (_SAMPLES, chain.num_joints))
+    return Samples(q, chain.camera_pose(q), effort(chain, q, config.speed_m_s, config.speed_rad_s))
+
+
+@lru_cache(maxsize=256)
+def postures_at(
+    chain: Chain, home: tuple[float, ...], config: ArmConfig, pitch_index: int
+) -> Postures:
+    """Search for postures with the camera at one of ``PITCHES`` and upright.
+
+    Random joint angles are turned until the camera has that pitch and no roll. Of those that leave
+    joints and links room, the ones of least effort with bases at different places, as seen from
+    the camera, are kept, and their motions counted.
+    """
+    samples = sample_joints(chain, home, config)
+    pitch = PITCHES[pitch_index]
+    up = np.array([0.0, -np.cos(pitch), np.sin(pitch)])
+    away = np.arccos(np.clip(samples.T_base_camera[:, 2, :3] @ up, -1, 1))
+    start = np.argsort(samples.effort + 2 * away, kind="stable")[:_TRIED]
+    q, reached = turn_upright(chain, samples.q[start], up)
+    q = q[reached & chain.within_limits(q, LIMIT_MARGIN_RAD)]
+    q = q[links_apart(chain, q)]
+    q = q[np.argsort(effort(chain, q, config.speed_m_s, config.speed_rad_s), kind="stable")]
+    q = _spread(chain, q)
+    nowhere = Surroundings(_Nothing(), np.eye(4), 0.5)
+    reach = Reach(chain, nowhere, config)
+    count = np.array([_count_motions(chain, reach, posture) for posture in q], dtype=np.int64)
+    best = np.argsort(-count, kind="stable")
+    return Postures(q[best], count[best])
+
+
+def _count_motions(chain: Chain, reach: Reach, q: Float64) -> int:
+    return int(reach.probe(q, chain.camera_pose(q) @ decompose(STEP_M, STEP_RAD)).ok.sum())
 
 
 def effort(chain: Chain, q: Float64, speed_m_s: float, speed_rad_s: float) -> Float64:
@@ -167,21 +195,14 @@ def wrap_joints(chain: Chain, q: Float64) -> Float64:
     return middle + np.remainder(q - middle + np.pi, 2 * np.pi) - np.pi
 
 
-def _range(chain: Chain, home: Float64) -> tuple[Float64, Float64]:
-    """Bounds (n,) of joint angles to search: the limits, at most one turn around the home."""
-    low = np.maximum(chain.lower + LIMIT_MARGIN_RAD, home - np.pi)
-    high = np.minimum(chain.upper - LIMIT_MARGIN_RAD, home + np.pi)
-    return np.minimum(low, high), np.maximum(low, high)
-
-
 def _spread(chain: Chain, q: Float64) -> Float64:
-    """Up to ``_KEPT_PER_PITCH`` of postures (s, n), the first preferred, with bases apart."""
+    """Up to ``_KEPT`` of postures (s, n), the first preferred, with bases apart."""
     R_t = chain.camera_pose(q)
     base = -np.einsum("sji,sj->si", R_t[:, :3, :3], R_t[:, :3, 3])
     free = np.ones(len(q), dtype=bool)
     chosen: list[int] = []
     for index in range(len(q)):
-        if len(chosen) == _KEPT_PER_PITCH:
+        if len(chosen) == _KEPT:
             break
         if free[index]:
             chosen.append(index)

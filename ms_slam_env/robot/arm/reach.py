@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -23,8 +24,12 @@ Int32 = NDArray[np.int32]
 REASONS = ("ok", "unreachable", "joint limit", "joint speed", "furniture", "self-collision")
 """Words for ``ReachResult.reason``."""
 
-WAYPOINTS = 8
-"""Joint configurations along a way, its ends included."""
+FEWEST_PARTS = 7
+"""A way is cut into at least so many parts between waypoints."""
+
+LONGEST_PART_M = 0.02
+LONGEST_PART_RAD = np.radians(2.0)
+"""Longer ways into more, until the camera moves no more than this in each."""
 
 MOST_STRETCH = 3.0
 """A way on which a joint would take more than this times the camera's duration is refused."""
@@ -62,7 +67,7 @@ class Reach:
     and 0.1 degrees of it, limits are kept, capsules around the links stay ``clearance_m`` away
     from furniture (beyond the slack of ``Surroundings``) and from each other, and no joint needs
     more than ``MOST_STRETCH`` times the duration of the camera's way. Between waypoints nothing is
-    checked: links move about 2 cm from one to the next, half of which the clearance covers.
+    checked: the camera moves at most 2 cm from one to the next, half of which the clearance covers.
     Pairs of links that are closer than the clearance at the arm's home need half that gap.
 
     An arm that stands too close already, by less than the clearance, may go on, though not closer:
@@ -78,7 +83,7 @@ class Reach:
         self._device = device
         self._arm = _arm(chain, config.clearance_m, device)
         self._grid = _grid(surroundings, device)
-        self._buffers: dict[int, _Buffers] = {}
+        self._buffers: dict[tuple[int, int], _Buffers] = {}
 
     def probe(self, q: Float64, T_base_targets: Float64) -> ReachResult:
         """Try the straight ways from joint angles (n,) to camera poses (k, 4, 4)."""
@@ -91,10 +96,10 @@ class Reach:
             np.linalg.norm(turn, axis=1) / self._config.speed_rad_s,
         )
         still = duration < _STILL_S
-        buffers = self._buffers.get(len(targets))
-        if buffers is None:
-            buffers = _Buffers(len(targets), self._chain, self._device)
-            self._buffers[len(targets)] = buffers
+        size = len(targets), 1 + _parts(step, turn)
+        if size not in self._buffers:
+            self._buffers[size] = _Buffers(*size, self._chain, self._device)
+        buffers = self._buffers[size]
         buffers.fill(q, step, turn, np.maximum(duration, _STILL_S))
         wp.launch(
             start_deficits,
@@ -140,16 +145,23 @@ class Reach:
         return ReachResult(ok, reason, waypoints, seconds)
 
 
-class _Buffers:
-    """Device arrays for ``k`` ways."""
+def _parts(step: Float64, turn: Float64) -> int:
+    """How many parts the longest of ways with translations and rotations (k, 3) needs."""
+    metres = np.linalg.norm(step, axis=1).max(initial=0.0) / LONGEST_PART_M
+    radians = np.linalg.norm(turn, axis=1).max(initial=0.0) / LONGEST_PART_RAD
+    return max(FEWEST_PARTS, int(np.ceil(max(metres, radians) - 1e-6)))
 
-    def __init__(self, k: int, chain: Chain, device: str) -> None:
+
+class _Buffers:
+    """Device arrays for ``k`` ways of ``w`` waypoints."""
+
+    def __init__(self, k: int, w: int, chain: Chain, device: str) -> None:
         n, m = chain.num_joints, len(chain.capsule_link)
 
         def array(shape: tuple[int, ...], dtype: Any) -> Any:
             return wp.zeros(shape, dtype=dtype, device=device)
 
-        self.q = array((k, WAYPOINTS, n), wp.float32)
+        self.q = array((k, w, n), wp.float32)
         self.step = array((k,), wp.vec3)
         self.turn = array((k,), wp.vec3)
         self.duration = array((k,), wp.float32)
@@ -161,7 +173,7 @@ class _Buffers:
         self.scratch.t = array((k, n + 2), wp.vec3)
         self.scratch.a = array((k, max(m, 1)), wp.vec3)
         self.scratch.b = array((k, max(m, 1)), wp.vec3)
-        self._start = np.zeros((k, WAYPOINTS, n), dtype=np.float32)
+        self._start = np.zeros((k, w, n), dtype=np.float32)
 
     def fill(self, q: Float64, step: Float64, turn: Float64, duration: Float64) -> None:
         """Load the ways."""
@@ -172,6 +184,7 @@ class _Buffers:
         self.duration.assign(duration.astype(np.float32))
 
 
+@lru_cache(maxsize=16)
 def _arm(chain: Chain, clearance_m: float, device: str) -> Arm:
     """The chain for the kernel: joint frames turned so that their z axes are the joints' axes."""
     turns = [np.eye(4)] + [_turn_to_z(axis) for axis in chain.axes]  # link frame <- turned frame
