@@ -47,11 +47,13 @@ def slow_fuse(
         u, v = SMALL.project(p)
         if not (-0.5 < u < width - 0.5 and -0.5 < v < height - 0.5):
             continue
+        u, v = np.clip(u, 0, width - 1), np.clip(v, 0, height - 1)
+        u0, v0 = min(int(u), width - 2), min(int(v), height - 2)
         tolerance = config.fusion_distance_m * (0.7 + 0.3 * p[2] ** 2)
         weights, shifts, tints, behind = [], [], [], 0
-        for y in (int(np.floor(v)), int(np.floor(v)) + 1):
-            for x in (int(np.floor(u)), int(np.floor(u)) + 1):
-                if not (0 <= x < width and 0 <= y < height) or vertices[y, x, 2] <= 0:
+        for y in (v0, v0 + 1):
+            for x in (u0, u0 + 1):
+                if vertices[y, x, 2] <= 0:
                     continue
                 d = vertices[y, x] - p
                 if abs(n @ d) < tolerance and abs(d[2]) < 3 * tolerance:
@@ -66,11 +68,9 @@ def slow_fuse(
             c = 0.5 * c - 0.5
         elif sum(weights) > 0.25:
             out["seen"][i] = time
-            live = normals[
-                int(np.clip(np.floor(v + 0.5), 0, height - 1)),
-                int(np.clip(np.floor(u + 0.5), 0, width - 1)),
-            ]
-            alpha = radial_weight(u, v)
+            nearest = int(np.floor(u + 0.5)), int(np.floor(v + 0.5))
+            live = normals[nearest[1], nearest[0]]
+            alpha = radial_weight(*nearest)
             if live @ n > np.cos(np.radians(config.fusion_angle_deg)):
                 radius = new_radius(p[2], live, p, config)
                 if radius < 1.5 * out["radius"][i]:
@@ -182,7 +182,7 @@ def test_unseen_unstable_surfels_go_and_stable_ones_stay() -> None:
     surfel_map = SurfelMap(1, SMALL, config)
     away = make_pose(so3_exp([0.0, np.pi, 0.0]), [0.0, 0.0, 0.0])
     elsewhere = live_frame(np.eye(4)[None])
-    elsewhere.vertices.zero_()  # nothing to see there
+    elsewhere.depth.zero_()  # nothing to see there
     for time in range(6):
         fuse(surfel_map, live_frame(np.eye(4)[None]), np.eye(4)[None], time)
     stable, everything = len(surfel_map.points()), surfel_map.count()

@@ -1,5 +1,3 @@
-# ruff: noqa: UP018, RUF046
-# Warp code: float(0.0) declares a variable that changes.
 """Kernels that fuse a live frame into the map.
 
 Association is projective (Keller et al., 3DV 2013, section 4), but from the surfel to the image:
@@ -12,12 +10,22 @@ mapped point, seen again with noise or from between the old pixels, makes no sec
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ms_slam_env._warp import wp
-from ms_slam_env.slam.surfel.splat import SplatCamera, floor_int
-from ms_slam_env.slam.surfel.surfel_arrays import Surfels, VisibleList, depth_tolerance
+from ms_slam_env.slam.surfel.memory import fetch, mark, put
+from ms_slam_env.slam.surfel.splat import SplatCamera
+from ms_slam_env.slam.surfel.surfel_arrays import (
+    Surfels,
+    VisibleList,
+    depth_tolerance,
+    rotation_of,
+    translation_of,
+)
 
 COARSER = wp.constant(1.5)  # a reading with a radius this much larger refines nothing (Keller)
-CENTRALITY = wp.constant(1.0 / (2.0 * 0.6 * 0.6))  # of the radial weight, Keller section 4.1
+CENTRALITY = 1.0 / (2.0 * 0.6 * 0.6)  # of the radial weight, Keller section 4.1
 STEEPEST = wp.constant(0.3)  # cosine of the view angle below which radii no longer grow
 
 
@@ -47,13 +55,45 @@ def reading_radius(z: float, n: wp.vec3, vertex: wp.vec3, focal: float, radius_p
     return radius_px * z / (focal * wp.max(cosine, STEEPEST))
 
 
+def radial_weights(height: int, width: int) -> NDArray[np.float32]:
+    """Gaussian (H, W) of the distance to the centre over half the diagonal (Keller, 4.1)."""
+    v, u = np.mgrid[:height, :width]
+    squared = (u - 0.5 * (width - 1)) ** 2 + (v - 0.5 * (height - 1)) ** 2
+    return np.exp(-CENTRALITY * squared / (0.25 * (width**2 + height**2))).astype(np.float32)
+
+
+@wp.struct
+class Corner:
+    """What one reading says about a surfel.
+
+    Attributes:
+        weight: bilinear weight, 0 if the reading is not of the surfel's surface.
+        shift: weight times distance along the surfel's normal, metres.
+        behind: 1 if the reading lies well behind the surfel, else 0.
+    """
+
+    weight: float
+    shift: float
+    behind: int
+
+
 @wp.func
-def radial_weight(u: float, v: float, width: int, height: int):
-    """Gaussian of the distance to the image's centre over half the diagonal (Keller, 4.1)."""
-    x = u - 0.5 * float(width - 1)
-    y = v - 0.5 * float(height - 1)
-    half_diagonal_squared = 0.25 * float(width * width + height * height)
-    return wp.exp(-CENTRALITY * (x * x + y * y) / half_diagonal_squared)
+def look_at_reading(
+    z: float, slope: float, offset: float, depth: float, tolerance: float, bilinear: float
+):
+    """Compare a reading at depth z with a surfel at ``depth``.
+
+    ``slope`` z - ``offset`` is the reading's distance along the surfel's normal.
+    """
+    distance = slope * z - offset
+    beyond = z - depth
+    valid = z > 0.0
+    near = valid and wp.abs(distance) < tolerance and wp.abs(beyond) < 3.0 * tolerance
+    corner = Corner()
+    corner.weight = wp.where(near, bilinear, 0.0)
+    corner.shift = corner.weight * distance
+    corner.behind = wp.where(valid and beyond > 3.0 * tolerance, 1, 0)
+    return corner
 
 
 @wp.kernel
@@ -67,87 +107,123 @@ def update_surfels(
     weight: wp.array(dtype=wp.float32),
     parameters: FusionParameters,
     workers: int,
-    live_vertices: wp.array3d(dtype=wp.vec3),
-    live_normals: wp.array3d(dtype=wp.vec3),
-    live_color: wp.array3d(dtype=wp.vec3),
-    covered: wp.array3d(dtype=wp.int32),
+    live_depth: wp.array(dtype=wp.float32),
+    live_normals: wp.array(dtype=wp.vec3),
+    live_color: wp.array(dtype=wp.vec3),
+    radial: wp.array(dtype=wp.float32),
+    covered: wp.array(dtype=wp.int32),
 ) -> None:
     """Average each visible surfel with the readings about its projection; mark covered pixels.
 
     A surfel in front of all four readings contradicts free space; one whose normal disagrees
-    contradicts the surface: both lose confidence and die at zero.
+    contradicts the surface: both lose confidence and die at zero. Images are flat.
     """
     b, worker = wp.tid()
     if mask[b] == 0:
         return
-    height = live_vertices.shape[1]
-    width = live_vertices.shape[2]
+    height = camera.height
+    width = camera.width
+    image = b * height * width
     T = poses[b]
+    R = rotation_of(T)
+    t = translation_of(T)
+    now = time[b]
+    gain = weight[b]
+    per_fx = 1.0 / camera.focal[0]
+    per_fy = 1.0 / camera.focal[1]
     coverage_squared = parameters.coverage_px * parameters.coverage_px
-    for j in range(worker, visible.count[b], workers):
-        p = visible.position[b, j]
-        n = visible.normal[b, j]
-        u = camera.focal[0] * p[0] / p[2] + camera.centre[0]
-        v = camera.focal[1] * p[1] / p[2] + camera.centre[1]
-        u0 = floor_int(u)
-        v0 = floor_int(v)
+    count = visible.count[b]
+    j = int(worker)
+    while j < count:
+        p = fetch(visible.position, b, j)
+        n = fetch(visible.normal, b, j)
+        i = fetch(visible.index, b, j)
+        j += workers
+        per_z = 1.0 / p[2]
+        u = camera.focal[0] * p[0] * per_z + camera.centre[0]
+        v = camera.focal[1] * p[1] * per_z + camera.centre[1]
+        u0 = wp.clamp(int(u), 0, width - 2)
+        v0 = wp.clamp(int(v), 0, height - 2)
+        right = wp.clamp(u - float(u0), 0.0, 1.0)
+        down = wp.clamp(v - float(v0), 0.0, 1.0)
+        left = 1.0 - right
+        up = 1.0 - down
+        pixel = image + v0 * width + u0
         tolerance = depth_tolerance(parameters.distance_m, p[2])
-        total = float(0.0)
-        shift = float(0.0)
-        mean_color = wp.vec3(0.0, 0.0, 0.0)
-        behind = int(0)
-        for corner in range(4):  # without branches, which noise would make guesses
-            x = u0 + corner % 2
-            y = v0 + corner / 2
-            inside = x >= 0 and x < width and y >= 0 and y < height
-            x = wp.clamp(x, 0, width - 1)
-            y = wp.clamp(y, 0, height - 1)
-            q = live_vertices[b, y, x]
-            difference = q - p
-            distance = wp.dot(n, difference)
-            valid = inside and q[2] > 0.0
-            near = wp.abs(distance) < tolerance and wp.abs(difference[2]) < 3.0 * tolerance
-            du = wp.abs(float(x) - u)
-            dv = wp.abs(float(y) - v)
-            w = wp.where(valid and near, (1.0 - du) * (1.0 - dv), 0.0)
-            total += w
-            shift += w * distance
-            mean_color += w * live_color[b, y, x]
-            covers = valid and near and du * du + dv * dv < coverage_squared
-            wp.atomic_max(covered, b, y, x, wp.where(covers, 1, 0))
-            behind += wp.where(valid and not near and difference[2] > 3.0 * tolerance, 1, 0)
-        i = visible.index[b, j]
-        confidence = surfels.confidence[b, i]
-        if behind == 4:
-            confidence = 0.5 * confidence - 0.5
-        elif total > 0.25:
-            x = wp.clamp(floor_int(u + 0.5), 0, width - 1)
-            y = wp.clamp(floor_int(v + 0.5), 0, height - 1)
-            live_normal = live_normals[b, y, x]
-            agreement = wp.dot(live_normal, n)
-            alpha = weight[b] * radial_weight(u, v, width, height)
-            surfels.seen[b, i] = time[b]
-            if agreement > parameters.min_cosine:
-                radius = surfels.radius[b, i]
+        # A reading at depth z is z (x, y, 1): its distance along n is z n . (x, y, 1) - n . p.
+        offset = wp.dot(n, p)
+        step_u = n[0] * per_fx
+        step_v = n[1] * per_fy
+        slope = (
+            (float(u0) - camera.centre[0]) * step_u + (float(v0) - camera.centre[1]) * step_v + n[2]
+        )
+        c00 = look_at_reading(fetch(live_depth, pixel), slope, offset, p[2], tolerance, left * up)
+        c01 = look_at_reading(
+            fetch(live_depth, pixel + 1), slope + step_u, offset, p[2], tolerance, right * up
+        )
+        c10 = look_at_reading(
+            fetch(live_depth, pixel + width),
+            slope + step_v,
+            offset,
+            p[2],
+            tolerance,
+            left * down,
+        )
+        c11 = look_at_reading(
+            fetch(live_depth, pixel + width + 1),
+            slope + step_u + step_v,
+            offset,
+            p[2],
+            tolerance,
+            right * down,
+        )
+        l2 = left * left
+        r2 = right * right
+        u2 = up * up
+        d2 = down * down
+        mark(covered, pixel, c00.weight > 0.0 and r2 + d2 < coverage_squared)
+        mark(covered, pixel + 1, c01.weight > 0.0 and l2 + d2 < coverage_squared)
+        mark(covered, pixel + width, c10.weight > 0.0 and r2 + u2 < coverage_squared)
+        mark(covered, pixel + width + 1, c11.weight > 0.0 and l2 + u2 < coverage_squared)
+        total = c00.weight + c01.weight + c10.weight + c11.weight
+        confidence = fetch(surfels.confidence, b, i)
+        if total > 0.25:
+            nearest = pixel + wp.where(right >= 0.5, 1, 0) + wp.where(down >= 0.5, width, 0)
+            live_normal = fetch(live_normals, nearest)
+            alpha = gain * fetch(radial, nearest - image)
+            put(surfels.seen, b, i, now)
+            if wp.dot(live_normal, n) > parameters.min_cosine:
+                radius = fetch(surfels.radius, b, i)
                 live_radius = reading_radius(
                     p[2], live_normal, p, camera.focal[0], parameters.radius_px
                 )
                 if live_radius < COARSER * radius:
+                    per_total = 1.0 / total
+                    shift = (c00.shift + c01.shift + c10.shift + c11.shift) * per_total
+                    mean_color = (
+                        c00.weight * fetch(live_color, pixel)
+                        + c01.weight * fetch(live_color, pixel + 1)
+                        + c10.weight * fetch(live_color, pixel + width)
+                        + c11.weight * fetch(live_color, pixel + width + 1)
+                    )
                     keep = confidence / (confidence + alpha)
                     take = 1.0 - keep
-                    moved = p + (take * shift / total) * n
+                    moved = p + (take * shift) * n
                     turned = wp.normalize(keep * n + take * live_normal)
-                    surfels.position[b, i] = wp.transform_point(T, moved)
-                    surfels.normal[b, i] = wp.transform_vector(T, turned)
-                    surfels.color[b, i] = keep * surfels.color[b, i] + (take / total) * mean_color
-                    surfels.radius[b, i] = keep * radius + take * live_radius
+                    put(surfels.position, b, i, R * moved + t)
+                    put(surfels.normal, b, i, R * turned)
+                    color = keep * fetch(surfels.color, b, i) + (take * per_total) * mean_color
+                    put(surfels.color, b, i, color)
+                    put(surfels.radius, b, i, keep * radius + take * live_radius)
                 confidence = wp.min(confidence + alpha, parameters.max_confidence)
             elif wp.dot(live_normal, live_normal) > 0.0:
                 confidence -= 0.5 * alpha
+        elif c00.behind + c01.behind + c10.behind + c11.behind == 4:
+            confidence = 0.5 * confidence - 0.5
         if confidence <= 0.0:
             confidence = 0.0
             wp.atomic_add(surfels.dead, b, 1)
-        surfels.confidence[b, i] = confidence
+        put(surfels.confidence, b, i, confidence)
 
 
 @wp.kernel
@@ -161,10 +237,11 @@ def add_surfels(
     weight: wp.array(dtype=wp.float32),
     parameters: FusionParameters,
     workers: int,
-    live_vertices: wp.array3d(dtype=wp.vec3),
-    live_normals: wp.array3d(dtype=wp.vec3),
-    live_color: wp.array3d(dtype=wp.vec3),
-    covered: wp.array3d(dtype=wp.int32),
+    live_depth: wp.array(dtype=wp.float32),
+    live_normals: wp.array(dtype=wp.vec3),
+    live_color: wp.array(dtype=wp.vec3),
+    radial: wp.array(dtype=wp.float32),
+    covered: wp.array(dtype=wp.int32),
 ) -> None:
     """Start a surfel at every uncovered reading with a normal; a full map drops it.
 
@@ -173,28 +250,35 @@ def add_surfels(
     b, worker = wp.tid()
     if mask[b] == 0:
         return
-    height = live_vertices.shape[1]
-    width = live_vertices.shape[2]
+    height = camera.height
+    width = camera.width
+    image = b * height * width
     T = poses[b]
-    for pixel in range(worker, height * width, workers):
-        v = pixel / width
-        u = pixel - v * width
-        if covered[b, v, u] == 0:
-            p = live_vertices[b, v, u]
-            n = live_normals[b, v, u]
-            if p[2] > 0.0 and wp.dot(n, p) < 0.0:
+    R = rotation_of(T)
+    t = translation_of(T)
+    pixel = int(worker)
+    while pixel < height * width:
+        z = fetch(live_depth, image + pixel)
+        if fetch(covered, image + pixel) == 0 and z > 0.0:
+            v = pixel / width
+            u = pixel - v * width
+            p = wp.vec3(
+                z * (float(u) - camera.centre[0]) / camera.focal[0],
+                z * (float(v) - camera.centre[1]) / camera.focal[1],
+                z,
+            )
+            n = fetch(live_normals, image + pixel)
+            if wp.dot(n, p) < 0.0:
                 slot = wp.atomic_add(surfels.count, b, 1)
                 if slot < capacity:
-                    surfels.position[b, slot] = wp.transform_point(T, p)
-                    surfels.normal[b, slot] = wp.transform_vector(T, n)
-                    surfels.color[b, slot] = live_color[b, v, u]
-                    surfels.radius[b, slot] = reading_radius(
-                        p[2], n, p, camera.focal[0], parameters.radius_px
-                    )
-                    surfels.confidence[b, slot] = weight[b] * radial_weight(
-                        float(u), float(v), width, height
-                    )
-                    surfels.created[b, slot] = time[b]
-                    surfels.seen[b, slot] = time[b]
+                    put(surfels.position, b, slot, R * p + t)
+                    put(surfels.normal, b, slot, R * n)
+                    put(surfels.color, b, slot, fetch(live_color, image + pixel))
+                    radius = reading_radius(z, n, p, camera.focal[0], parameters.radius_px)
+                    put(surfels.radius, b, slot, radius)
+                    put(surfels.confidence, b, slot, weight[b] * fetch(radial, pixel))
+                    put(surfels.created, b, slot, time[b])
+                    put(surfels.seen, b, slot, time[b])
                 else:
                     wp.atomic_add(surfels.dropped, b, 1)
+        pixel += workers

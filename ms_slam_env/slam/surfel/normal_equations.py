@@ -91,7 +91,6 @@ def accumulate(
     if active[b, k] != RUNNING:
         return
     width = model_vertices.shape[2]
-    height = model_vertices.shape[1]
     T = pose[b, k]
     R_inverse = wp.mat33(
         float(T[0, 0]), float(T[1, 0]), float(T[2, 0]),
@@ -99,8 +98,8 @@ def accumulate(
         float(T[0, 2]), float(T[1, 2]), float(T[2, 2]),
     )  # fmt: skip
     t_inverse = -(R_inverse * wp.vec3(float(T[0, 3]), float(T[1, 3]), float(T[2, 3])))
-    u_limit = float(width - 1)
-    v_limit = float(height - 1)
+    u_limit = float(live_vertices.shape[2] - 1)
+    v_limit = float(live_vertices.shape[1] - 1)
     zero = wp.mat33(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     H_tt = wp.mat33(zero)  # blocks of H: translation, translation-rotation, rotation
     H_tr = wp.mat33(zero)

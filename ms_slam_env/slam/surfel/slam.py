@@ -24,7 +24,7 @@ from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.preprocess import Preprocessor
 from ms_slam_env.slam.surfel.seeds import NUM_SEEDS, relocalisation_seeds, tracking_seeds
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
-from ms_slam_env.slam.surfel.tracking import Alignment, Tracker
+from ms_slam_env.slam.surfel.tracking import Alignment, Tracker, model_stride
 from ms_slam_env.slam.surfel.types import LiveFrame, ModelView
 from ms_slam_env.slam.surfel.verdict import (
     REASONS,
@@ -48,8 +48,9 @@ class BatchedSurfelSlam:
         self.intrinsics = intrinsics
         self.config = config
         self.preprocess = Preprocessor(batch, intrinsics, config, device)
-        self.tracker = Tracker(batch, NUM_SEEDS, intrinsics, config, device)
-        self.map = SurfelMap(batch, intrinsics, config, device)
+        stride = model_stride(intrinsics, config)
+        self.tracker = Tracker(batch, NUM_SEEDS, intrinsics, config, device, stride)
+        self.map = SurfelMap(batch, intrinsics, config, device, stride)
         self._device_poses = wp.zeros(batch, dtype=wp.mat44, device=device)
         self._device_time = wp.zeros(batch, dtype=wp.int32, device=device)
         self._device_weight = wp.zeros(batch, dtype=wp.float32, device=device)

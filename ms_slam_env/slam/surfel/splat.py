@@ -14,6 +14,7 @@ arithmetic.
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
+from ms_slam_env.slam.surfel.memory import fetch, put, raise_to
 from ms_slam_env.slam.surfel.surfel_arrays import (
     Surfels,
     VisibleList,
@@ -109,18 +110,21 @@ def cull(
     z_near = camera.z_near
     z_far = camera.z_far
     forward = wp.vec3(R[2, 0], R[2, 1], R[2, 2])
-    for i in range(worker, surfels.count[b], workers):
-        world = surfels.position[b, i]
+    count = surfels.count[b]
+    i = int(worker)
+    while i < count:
+        world = fetch(surfels.position, b, i)
         z = wp.dot(forward, world) + t[2]
         if z > z_near and z < z_far:
             p = R * world + t
             if p[0] > low_u * z and p[0] < high_u * z and p[1] > low_v * z and p[1] < high_v * z:
-                n = R * surfels.normal[b, i]
-                if wp.dot(n, p) < 0.0 and surfels.confidence[b, i] > 0.0:
+                n = R * fetch(surfels.normal, b, i)
+                if wp.dot(n, p) < 0.0 and fetch(surfels.confidence, b, i) > 0.0:
                     slot = wp.atomic_add(visible.count, k, 1)
-                    visible.index[k, slot] = i
-                    visible.position[k, slot] = p
-                    visible.normal[k, slot] = n
+                    put(visible.index, k, slot, i)
+                    put(visible.position, k, slot, p)
+                    put(visible.normal, k, slot, n)
+        i += workers
 
 
 @wp.func
@@ -192,21 +196,28 @@ def splat_depth(
     b = first_env + k
     width = camera.width
     image = k * camera.height * width
-    for j in range(worker, visible.count[k], workers):
+    count = visible.count[k]
+    j = int(worker)
+    while j < count:
         disc = project_disc(
-            visible.position[k, j],
-            visible.normal[k, j],
-            surfels.radius[b, visible.index[k, j]],
+            fetch(visible.position, k, j),
+            fetch(visible.normal, k, j),
+            fetch(surfels.radius, b, fetch(visible.index, k, j)),
             camera,
         )
-        for v in range(disc.low[1], disc.high[1] + 1):
+        v = int(disc.low[1])
+        while v <= disc.high[1]:
             dv = float(v) - disc.v
             row = image + v * width
-            for u in range(disc.low[0], disc.high[0] + 1):
+            u = int(disc.low[0])
+            while u <= disc.high[0]:
                 du = float(u) - disc.u
                 inverse = disc.inverse + du * disc.slope_u + dv * disc.slope_v
                 inside = squared_offset(disc, du, dv, inverse) <= disc.rim
-                wp.atomic_max(z_buffer, row + u, wp.where(inside, inverse, 0.0))
+                raise_to(z_buffer, row + u, wp.where(inside, inverse, 0.0))
+                u += 1
+            v += 1
+        j += workers
 
 
 @wp.kernel
@@ -227,28 +238,35 @@ def splat_attributes(
     b = first_env + k
     width = camera.width
     image = k * camera.height * width
-    for j in range(worker, visible.count[k], workers):
-        n = visible.normal[k, j]
-        i = visible.index[k, j]
-        disc = project_disc(visible.position[k, j], n, surfels.radius[b, i], camera)
-        color = surfels.color[b, i]
-        confidence = wp.min(surfels.confidence[b, i], camera.max_weight)
+    count = visible.count[k]
+    j = int(worker)
+    while j < count:
+        n = fetch(visible.normal, k, j)
+        i = fetch(visible.index, k, j)
+        disc = project_disc(fetch(visible.position, k, j), n, fetch(surfels.radius, b, i), camera)
+        color = fetch(surfels.color, b, i)
+        confidence = wp.min(fetch(surfels.confidence, b, i), camera.max_weight)
         inverse_rim = 1.0 / disc.rim
         # Same surface: z < front + tolerance. To first order in inverse depth.
         reach = depth_tolerance(camera.tolerance_m, disc.z) * disc.inverse * disc.inverse
-        for v in range(disc.low[1], disc.high[1] + 1):
+        v = int(disc.low[1])
+        while v <= disc.high[1]:
             dv = float(v) - disc.v
             row = image + v * width
-            for u in range(disc.low[0], disc.high[0] + 1):
+            u = int(disc.low[0])
+            while u <= disc.high[0]:
                 du = float(u) - disc.u
                 inverse = disc.inverse + du * disc.slope_u + dv * disc.slope_v
                 share = squared_offset(disc, du, dv, inverse) * inverse_rim
-                if share <= 1.0 and inverse >= z_buffer[row + u] - reach:
+                if share <= 1.0 and inverse >= fetch(z_buffer, row + u) - reach:
                     w = confidence * (1.05 - share)
                     sample = Sums(
                         n[0], n[1], n[2], 1.0, color[0], color[1], color[2], 1.0 / inverse
                     )
                     wp.atomic_add(sums, row + u, w * sample)
+                u += 1
+            v += 1
+        j += workers
 
 
 @wp.kernel

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,11 +16,12 @@ from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.fusion import (
     FusionParameters,
     add_surfels,
+    radial_weights,
     update_surfels,
 )
 from ms_slam_env.slam.surfel.prediction import DeviceViews, ViewPredictor
 from ms_slam_env.slam.surfel.removal import gather, list_survivors, put_back
-from ms_slam_env.slam.surfel.splat_renderer import SplatParameters, SplatRenderer
+from ms_slam_env.slam.surfel.splat_renderer import SplatParameters, SplatRenderer, every_nth
 from ms_slam_env.slam.surfel.surfel_arrays import (
     ATTRIBUTES,
     COUNTERS,
@@ -31,7 +33,7 @@ from ms_slam_env.slam.surfel.types import LiveFrame, ModelView
 Float64 = NDArray[np.float64]
 
 GPU_WORKERS = 8192  # threads that share one env's surfels
-_CHANGING = ("poses", "mask", "time", "weight", "live_vertices", "live_normals", "live_color")
+_CHANGING = ("poses", "mask", "time", "weight", "live_depth", "live_normals", "live_color")
 
 
 class SurfelMap:
@@ -42,13 +44,19 @@ class SurfelMap:
         intrinsics: of the live camera.
         config: parameters of fusion and removal.
         device: Warp device, ``"cpu"`` or ``"cuda"``.
+        model_stride: ``render_model`` draws every so many-th row and column of the image.
 
     Attributes:
         surfels: the maps on the device.
     """
 
     def __init__(
-        self, batch: int, intrinsics: Intrinsics, config: SurfelConfig, device: str = "cpu"
+        self,
+        batch: int,
+        intrinsics: Intrinsics,
+        config: SurfelConfig,
+        device: str = "cpu",
+        model_stride: int = 1,
     ) -> None:
         self.batch = batch
         self.intrinsics = intrinsics
@@ -61,7 +69,8 @@ class SurfelMap:
         self._visible = allocate_visible(batch, capacity, device)
         self._survivors = wp.zeros((batch, capacity), dtype=wp.int32, device=device)
         self._kept = wp.zeros(batch, dtype=wp.int32, device=device)
-        self._covered = wp.zeros((batch, *intrinsics.shape), dtype=wp.int32, device=device)
+        pixels = batch * intrinsics.width * intrinsics.height
+        self._covered = wp.zeros(pixels, dtype=wp.int32, device=device)
         self._fusion = FusionParameters()
         self._fusion.distance_m = config.fusion_distance_m
         self._fusion.min_cosine = math.cos(math.radians(config.fusion_angle_deg))
@@ -72,6 +81,21 @@ class SurfelMap:
         self._renderer = SplatRenderer(
             self.surfels, self._visible, batch, intrinsics, parameters, self._workers, device
         )
+        self._model_renderer = self._renderer
+        if model_stride > 1:
+            self._model_renderer = SplatRenderer(
+                self.surfels,
+                self._visible,
+                batch,
+                every_nth(intrinsics, model_stride),
+                replace(
+                    parameters,
+                    min_px=parameters.min_px / model_stride,
+                    max_px=parameters.max_px / model_stride,
+                ),
+                self._workers,
+                device,
+            )
         self._predictor = ViewPredictor(
             self.surfels, self._visible, intrinsics, parameters, self._workers, device
         )
@@ -106,7 +130,8 @@ class SurfelMap:
         self._renderer.cull(poses, margin_px=0.0)
         self._covered.zero_()
         self._kept.zero_()
-        changing = (poses, mask, time, weight, live.vertices, live.normals, live.color)
+        images = (live.depth.flatten(), live.normals.flatten(), live.color.flatten())
+        changing = (poses, mask, time, weight, *images)
         for command in (self._update, self._add):
             for name, value in zip(_CHANGING, changing, strict=True):
                 command.set_param_by_name(name, value)
@@ -124,9 +149,12 @@ class SurfelMap:
         poses = wp.zeros(self.batch, dtype=wp.mat44, device=self.device)
         integers = wp.zeros(self.batch, dtype=wp.int32, device=self.device)
         floats = wp.zeros(self.batch, dtype=wp.float32, device=self.device)
-        image = wp.zeros((self.batch, *self.intrinsics.shape), dtype=wp.vec3, device=self.device)
+        pixels = math.prod((self.batch, *self.intrinsics.shape))
+        depth = wp.zeros(pixels, dtype=wp.float32, device=self.device)
+        image = wp.zeros(pixels, dtype=wp.vec3, device=self.device)
+        radial = radial_weights(*self.intrinsics.shape).ravel()
         frame = [poses, self._renderer.camera, integers, integers, floats, self._fusion, workers]
-        frame += [image, image, image, self._covered]
+        frame += [depth, image, image, wp.array(radial, device=self.device), self._covered]
 
         def record(kernel: Any, inputs: list[Any]) -> Any:
             return wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, record_cmd=True)
@@ -160,8 +188,8 @@ class SurfelMap:
 
         The images are overwritten by the next call.
         """
-        self._renderer.cull(poses)
-        return self._renderer.splat()
+        self._model_renderer.cull(poses)
+        return self._model_renderer.splat()
 
     def predict_device(
         self, poses: ArrayLike, scale: float = 1.0, first_env: int = 0

@@ -75,6 +75,21 @@ class Alignment:
         )
 
 
+def model_stride(intrinsics: Intrinsics, config: SurfelConfig) -> int:
+    """Every how many-th row and column of the model view tracking looks at: 1, 2 or 4.
+
+    The others need not be drawn. Coarse levels lose the mean of 2x2 pixels that the live image
+    has there; discs overlap, so the model's view is smooth already.
+    """
+    stride = _point_stride(intrinsics.shape, config.points_per_level)
+    return max(s for s in (1, 2, 4) if s <= stride)
+
+
+def _point_stride(shape: tuple[int, int], points: float) -> int:
+    """Step between rows and columns that picks about so many pixels of an image."""
+    return max(1, round((shape[0] * shape[1] / points) ** 0.5))
+
+
 class _Hypotheses:
     """Device buffers of K poses per env: pose, state, sums and partial sums."""
 
@@ -101,15 +116,28 @@ class Tracker:
         intrinsics: Intrinsics,
         config: SurfelConfig,
         device: str = "cpu",
+        model_stride: int = 1,
     ) -> None:
-        """Allocate for ``batch`` envs that each try ``num_seeds`` starting poses a frame."""
+        """Allocate for ``batch`` envs that each try ``num_seeds`` starting poses a frame.
+
+        The model views hold every ``model_stride``-th row and column of the image (1, 2, 4).
+        """
         self.config = config
         self.device = device
         self.batch = batch
         num_levels = len(config.iterations)
         self._cameras = [intrinsics.scaled(0.5**level) for level in range(num_levels)]
         self._live = Pyramid(batch, intrinsics.shape, num_levels, True, device)
-        self._model = Pyramid(batch, intrinsics.shape, num_levels, False, device)
+        # A level takes the model's image of its own spacing, or else the finest.
+        skipped = model_stride.bit_length() - 1
+        self._model_level = [max(0, level - skipped) for level in range(num_levels)]
+        self._model_shapes = [
+            tuple(-(-size // model_stride) // 2**level for size in intrinsics.shape)
+            for level in self._model_level
+        ]
+        self._model = Pyramid(
+            batch, self._model_shapes[0], self._model_level[-1] + 1, False, device
+        )
         # The CPU runs one thread after another: whole rows. A GPU wants many threads.
         self._columns = 32 if wp.get_device(device).is_cuda else 1 << 20
         slots = max(self._slots(level, self._stride(level)) for level in range(num_levels))
@@ -130,18 +158,14 @@ class Tracker:
         self._weights = [_weights(config, level) for level in range(num_levels)]
 
     def _stride(self, level: int, share: float = 1.0) -> int:
-        camera = self._cameras[level]
-        pixels = camera.width * camera.height
-        return max(1, round((pixels / (share * self.config.points_per_level)) ** 0.5))
+        return _point_stride(self._model_shapes[level], share * self.config.points_per_level)
 
     def _search_stride(self) -> int:
-        camera = self._cameras[-1]
-        return max(1, round((camera.width * camera.height / SEARCH_POINTS) ** 0.5))
+        return _point_stride(self._model_shapes[-1], SEARCH_POINTS)
 
     def _slots(self, level: int, stride: int) -> int:
-        camera = self._cameras[level]
-        pieces = -(-camera.width // min(self._columns, camera.width))
-        return -(-camera.height // stride) * pieces
+        height, width = self._model_shapes[level]
+        return -(-height // stride) * -(-width // min(self._columns, width))
 
     def set_frame(self, live: LiveFrame) -> None:
         """Build the pyramid of the live frames; ``align`` may then be called several times."""
@@ -167,7 +191,8 @@ class Tracker:
                 if no env has one.
         """
         self._expect(self._seen[0], model)
-        levels = self._model.build(model.vertices, model.normals, model.intensity)
+        images = self._model.build(model.vertices, model.normals, model.intensity)
+        levels = [images[index] for index in self._model_level]
         one = self._one
         self._start_from(seeds, T_world_model, guesses)
         copy_in(self._T_world_model, T_world_model)
@@ -267,7 +292,8 @@ class Tracker:
             return
         camera, model, live = self._cameras[level], levels[level], self._live_levels[level]
         slots = self._slots(level, stride)
-        rows = -(-camera.height // stride)
+        height, width = self._model_shapes[level]
+        rows = -(-height // stride)
         self._launches.record(
             ("accumulate", key),
             accumulate,
@@ -283,7 +309,7 @@ class Tracker:
                 wp.vec2(camera.cx, camera.cy),
                 self._weights[level],
                 stride,
-                min(self._columns, camera.width),
+                min(self._columns, width),
                 state.pose,
                 state.active,
             ],
