@@ -58,7 +58,7 @@ def arm_parts(model: ArmModel, q: Float64, T_world_base: Float64) -> list[Part]:
         T_base_geom[:3, :3] = data.geom_xmat[geom].reshape(3, 3)
         T_base_geom[:3, 3] = data.geom_xpos[geom]
         r, g, b = map(float, rgba[:3])
-        parts.append(_part(_solid(mj, geom), T_world_base @ T_base_geom, (r, g, b)))
+        parts.append(_part(solid_of(mj, geom), T_world_base @ T_base_geom, (r, g, b)))
     return parts
 
 
@@ -116,7 +116,7 @@ def scene_with(scene: Scene, parts: list[Part]) -> Scene:
     return seen
 
 
-def _solid(mj: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
+def solid_of(mj: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
     """A geom's surface in its own frame."""
     kind, size = int(mj.geom_type[geom]), mj.geom_size[geom]
     types = mujoco.mjtGeom
