@@ -19,6 +19,7 @@ from ms_slam_env.metrics.consistency import (
     judge_consistency,
 )
 from ms_slam_env.metrics.sightings import LabelledView, count_votes, distinct_placements
+from ms_slam_env.scenes.sampling import sample_surface
 from ms_slam_env.sensor import RGBDSensor
 
 Float64 = NDArray[np.float64]
@@ -78,12 +79,19 @@ def judge_map(
     labels = scene.mesh.labels
     points = voxel_thin(map_points, MAP_VOXEL_M)
     votes = count_votes(points, views, sensor.intrinsics, len(labels))
-    surface, owner = _labelled_surface(scene.name, scene.seed)
+    surface, owner = labelled_surface(scene.name, scene.seed)
     placements = distinct_placements(views, points, rule.apart_m / 2)
     verdict = judge_consistency(points, votes, surface, owner, rule, placements)
     return JudgedMap(points, verdict, labels)
 
 
 @lru_cache(maxsize=2)
-def _labelled_surface(scene: str, seed: int) -> tuple[Float64, NDArray[np.int32]]:
-    return get_scene(scene, seed).surface_points(SURFACE_SPACING_M)
+def labelled_surface(scene: str, seed: int) -> tuple[Float64, NDArray[np.int32]]:
+    """The whole surface of a scene: points (N, 3) and the object (N,) of each.
+
+    Also what ``Scene.surface_points`` leaves out as hidden: cameras do see into the narrow places
+    that it takes for closed, and to a seat's inner side.
+    """
+    mesh = get_scene(scene, seed).mesh
+    points, face = sample_surface(mesh.vertices, mesh.faces, SURFACE_SPACING_M)
+    return points, mesh.face_label[face]
