@@ -10,7 +10,7 @@ from gymnasium.vector import SyncVectorEnv
 MAX_EPISODE_STEPS = 150
 
 _EMBODIMENT_OF_ID = {
-    "MSActiveSLAM-v0": "free",
+    "MSActiveSLAM-v0": "arm",
     "MSActiveSLAM-FreeCamera-v0": "free",
     "MSActiveSLAM-FixedTranslation-v0": "fixed-translation",
 }

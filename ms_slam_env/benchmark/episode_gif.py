@@ -38,7 +38,7 @@ def main() -> int:
     """Run the episode and write one picture a step; return the exit code."""
     args = parse(Args, None, PROGRAM)
     env = gymnasium.make(
-        "MSActiveSLAM-v0",
+        "MSActiveSLAM-FreeCamera-v0",
         scene=args.scene,
         scene_seed=args.scene_seed,
         step_m=args.step_m,

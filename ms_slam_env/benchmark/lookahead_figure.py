@@ -38,7 +38,7 @@ class Args:
 def main() -> int:
     """Move at random for a while, predict the 49 candidates and draw them; return the exit code."""
     args = parse(Args, None, PROGRAM)
-    env = gymnasium.make("MSActiveSLAM-v0", scene=args.scene, scene_seed=args.scene_seed)
+    env = gymnasium.make("MSActiveSLAM-FreeCamera-v0", scene=args.scene, scene_seed=args.scene_seed)
     _, info = env.reset(seed=args.seed)
     rng = np.random.default_rng(args.seed)
     for _ in range(args.steps_before):

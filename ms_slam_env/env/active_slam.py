@@ -84,7 +84,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
     v0: first version.
 
     Args:
-        embodiment: ``free`` or ``fixed-translation``.
+        embodiment: ``arm`` (with physics), ``arm-kinematic``, ``free`` or ``fixed-translation``.
         render_mode: None or ``rgb_array``.
         **options: fields of ``EnvConfig``.
 

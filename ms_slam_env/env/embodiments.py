@@ -13,6 +13,7 @@ from ms_slam_env.robot import (
     FixedTranslation,
     FreeCamera,
 )
+from ms_slam_env.robot.arm.dynamic_arm import DynamicArm
 from ms_slam_env.robot.arm.kinematic_arm import KinematicArm
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.timings import Timings
@@ -34,11 +35,16 @@ def _fixed_translation(scene: Scene, config: EnvConfig, timings: Timings) -> Emb
     return FixedTranslation(scene, config.step_m, config.step_rad)
 
 
+def _arm(scene: Scene, config: EnvConfig, timings: Timings) -> Embodiment:
+    return DynamicArm(scene, config.arm, config.step_m, config.step_rad, timings)
+
+
 def _arm_kinematic(scene: Scene, config: EnvConfig, timings: Timings) -> Embodiment:
     return KinematicArm(scene, config.arm, config.step_m, config.step_rad, timings)
 
 
 EMBODIMENTS = {
+    "arm": EmbodimentType(NUM_MOTIONS, _arm),
     "arm-kinematic": EmbodimentType(NUM_MOTIONS, _arm_kinematic),
     "free": EmbodimentType(NUM_MOTIONS, _free),
     "fixed-translation": EmbodimentType(NUM_ROTATIONS, _fixed_translation),

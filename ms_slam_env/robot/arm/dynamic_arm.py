@@ -1,0 +1,209 @@
+"""An arm with physics: differential inverse kinematics commands it, MuJoCo moves it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.geometry import relative_angle, transform_points
+from ms_slam_env.robot.arm.arm_base import ArmEmbodiment, frame_times
+from ms_slam_env.robot.arm.config import ArmConfig
+from ms_slam_env.robot.arm.controller import Controller, Plan
+from ms_slam_env.robot.arm.dynamics import ArmDynamics, Motion
+from ms_slam_env.robot.arm.imperfections import Imperfections
+from ms_slam_env.robot.base import Movement
+from ms_slam_env.scenes.base import Scene
+from ms_slam_env.timings import Timings
+
+Float64 = NDArray[np.float64]
+
+_SETTLE_S = 1.0  # before the first frame
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """What came of a motion that was tried whatever the mask says.
+
+    Attributes:
+        reached: the command kept to the camera's way and ended at the target, to 2 mm, 0.2 deg,
+            and nothing stopped the arm.
+        stopped: the arm came so close to furniture that it made a protective stop.
+        error_m: distance between where the camera ended and where it was commanded to.
+        error_rad: angle of the same.
+        q: (t, n) joint angles of the links after every step of the physics.
+    """
+
+    reached: bool
+    stopped: bool
+    error_m: float
+    error_rad: float
+    q: Float64
+
+
+class DynamicArm(ArmEmbodiment):
+    """The arm with mass, servos and imperfections: what it really reaches is where the camera is.
+
+    Motions are planned from the commanded joint angles, so that sag and errors do not add up. The
+    kinematic pose is that of the joint sensors' readings.
+
+    Attributes:
+        q_command: (n,) joint angles that the servos hold.
+        controller: plans motions.
+        dynamics: physics.
+        imperfections: of this episode.
+    """
+
+    def __init__(
+        self, scene: Scene, config: ArmConfig, step_m: float, step_rad: float, timings: Timings
+    ) -> None:
+        super().__init__(scene, config, step_m, step_rad, timings)
+        self.dynamics = ArmDynamics(self.model)
+        force = self.model.mj.actuator_forcerange[self.model.actuators, 1]
+        greatest = float(force.max())
+        self._torque_share = force / greatest if greatest > 0 else np.ones(len(force))
+        self.start_at(self.model.home, np.random.default_rng(0))
+
+    def stand_at(self, T_world_base: Float64) -> None:
+        """Move the base to a pose (4, 4) and look around from there."""
+        super().stand_at(T_world_base)
+        self.controller = Controller(self.model, self.surroundings, self.config)
+
+    def start_at(self, q: Float64, rng: np.random.Generator) -> None:
+        """Hold the arm at joint angles (n,) until it has settled under its load."""
+        self.q_command = np.array(q, dtype=np.float64)
+        self.imperfections = Imperfections(self.config.noise, self._torque_share, rng)
+        self.dynamics.reset(self.q_command)
+        self._hold(_SETTLE_S)
+
+    @property
+    def T_world_camera_kinematic(self) -> Float64:
+        """(4, 4) the camera by the last readings of the joint sensors."""
+        return self._kinematic
+
+    def planning_state(self) -> tuple[Float64, Float64]:
+        """The commanded joint angles and the camera there."""
+        return self.q_command, self.model.chain.camera_pose(self.q_command)
+
+    def move(self, action: int) -> Movement:
+        """Make motion ``action`` if the mask allows it, else hold still for a frame."""
+        probe = self.probe()
+        if probe.ok[action]:
+            plan = self._plan(action)
+        else:
+            plan = Plan(self.q_command[None], 1 / self.config.control_hz, False, 0.0, 0.0)
+        return self._execute(plan)[0]
+
+    def attempt(self, action: int) -> Attempt:
+        """Try motion ``action`` whatever the mask says, then take everything back."""
+        before, probe = self._moving_state(), self.probe()
+        plan = self._plan(action)
+        _, stopped, q_link = self._execute(plan)
+        wanted = self.T_world_base @ self.model.chain.camera_pose(plan.q[-1])
+        error_m = float(np.linalg.norm(self.T_world_camera[:3, 3] - wanted[:3, 3]))
+        error_rad = relative_angle(self.T_world_camera[:3, :3], wanted[:3, :3])
+        self._restore(before)
+        self._probe = probe
+        return Attempt(plan.followed and not stopped, stopped, error_m, error_rad, q_link)
+
+    def get_state(self) -> dict[str, Any]:
+        """Where the arm stands, its physics, its errors and the state of its random numbers."""
+        return {"T_world_base": self.T_world_base.copy(), **self._moving_state()}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state that ``get_state`` returned."""
+        self.stand_at(state["T_world_base"])
+        self._restore(state)
+
+    def _plan(self, action: int) -> Plan:
+        probe = self.probe()
+        q, T_base_camera = self.planning_state()
+        least_s = float(probe.duration_s[action])
+        with self.timings.stage("ik"):
+            return self.controller.plan(q, T_base_camera @ self.motions[action], least_s)
+
+    def _execute(self, plan: Plan) -> tuple[Movement, bool, Float64]:
+        """Follow a plan; return what happened, whether the arm stopped to protect itself, and the
+        joint angles (t, n) of the links after every step."""
+        times = frame_times(plan.duration_s, self.config)
+        with self.timings.stage("physics"):
+            steps = np.maximum(1, np.round(times / self.dynamics.timestep_s).astype(np.int64))
+            before = self._moving_state()
+            motion, q_link = self._run(plan.q, plan.tick_s, int(steps[-1]))
+            tick = self._first_touch(plan, q_link)
+            if tick is not None:
+                self._restore(before)
+                plan_q = plan.q[: tick + 1]
+                motion, q_link = self._run(plan_q, plan.tick_s, int(steps[-1]))
+                self.q_command = plan_q[-1].copy()
+            else:
+                self.q_command = plan.q[-1].copy()
+            at = steps - 1
+            kinematic = self._kinematic_poses(motion.q[at])
+            self.set_joints(q_link[-1])
+            self._kinematic = kinematic[-1].copy()
+        poses = self.T_world_base @ self.model.chain.camera_pose(q_link[at])
+        stopped = tick is not None
+        made = plan.followed and not stopped
+        seconds = steps * self.dynamics.timestep_s
+        return Movement(made, poses, kinematic, seconds, motion.energy_j), stopped, q_link
+
+    def _run(self, q_command: Float64, tick_s: float, steps: int) -> tuple[Motion, Float64]:
+        """Physics along a command (k + 1, n), and joint angles (t, n) of the links."""
+        disturbance = None
+        if self.config.noise.vibration_nm > 0 and len(q_command) > 1:
+            timestep = self.dynamics.timestep_s
+            speed = np.vstack([np.diff(q_command, axis=0), np.zeros((1, q_command.shape[1]))])
+            tick = (np.arange(steps) * timestep / tick_s).astype(np.int64)
+            share = speed[np.minimum(tick, len(speed) - 1)] / tick_s / self.model.chain.speed
+            disturbance = self.imperfections.torques(share, timestep)
+        motion = self.dynamics.run(q_command, tick_s, steps, disturbance)
+        return motion, self.imperfections.link_angles(motion.q)
+
+    def _first_touch(self, plan: Plan, q_link: Float64) -> int | None:
+        """The first tick at whose end a link is within its radius of furniture, and nearer than
+        it was at the start; None if there is none."""
+        ticks = len(plan.q) - 1
+        if ticks == 0:
+            return None
+        steps = np.round(np.arange(1, ticks + 1) * plan.tick_s / self.dynamics.timestep_s)
+        index = np.clip(steps.astype(np.int64) - 1, 0, len(q_link) - 1)
+        clearance = self.controller.clearance
+        centres = transform_points(
+            self.T_world_base, clearance.balls(np.vstack([self.q, q_link[index]]))
+        )
+        free = self.scene.clearance(centres.reshape(-1, 3)).reshape(centres.shape[:-1])
+        touches = (free < clearance.ball_radius) & (free < free[0])
+        found = np.flatnonzero(touches[1:].any(axis=1))
+        return int(found[0]) + 1 if len(found) else None
+
+    def _hold(self, seconds: float) -> None:
+        """Hold the command for a time."""
+        steps = int(np.ceil(seconds / self.dynamics.timestep_s))
+        motion, q_link = self._run(self.q_command[None], 1.0, steps)
+        self.set_joints(q_link[-1])
+        self._kinematic = self._kinematic_poses(motion.q[-1:])[0]
+
+    def _kinematic_poses(self, q_motor: Float64) -> Float64:
+        """Poses (k, 4, 4) of the camera by readings of the joint sensors at (k, n)."""
+        readings = self.imperfections.readings(q_motor)
+        poses = self.T_world_base @ self.model.chain.camera_pose(readings)
+        return np.asarray(poses @ self.imperfections.T_camera_assumed)
+
+    def _moving_state(self) -> dict[str, Any]:
+        return {
+            "q": self.q.copy(),
+            "q_command": self.q_command.copy(),
+            "kinematic": self._kinematic.copy(),
+            "physics": self.dynamics.state,
+            "imperfections": self.imperfections.get_state(),
+        }
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        self.set_joints(state["q"])
+        self.q_command = state["q_command"].copy()
+        self._kinematic = state["kinematic"].copy()
+        self.dynamics.state = state["physics"]
+        self.imperfections.set_state(state["imperfections"])

@@ -1,0 +1,146 @@
+"""An arm's physics: MuJoCo steps it along commanded joint angles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+from numpy.typing import NDArray
+
+from ms_slam_env.robot.arm.model import ArmModel
+
+Float64 = NDArray[np.float64]
+
+_INPUTS = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_QFRC_APPLIED)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What physics made of a command, after each of ``t`` steps.
+
+    Attributes:
+        q: (t, n) joint angles.
+        velocity: (t, n) radians a second.
+        torque: (t, n) of the motors, Nm, gravity compensation included.
+        energy_j: integral of |torque x velocity|, summed over the joints: mechanical work of
+            motors that recover nothing.
+    """
+
+    q: Float64
+    velocity: Float64
+    torque: Float64
+    energy_j: float
+
+
+class ArmDynamics:
+    """MuJoCo's simulation of an arm whose position servos follow a command.
+
+    The command is made smooth between ticks, and each servo gets its velocity too, as the servos
+    of industrial arms do: what is left are inertia, friction and the load that gravity
+    compensation does not know. All steps of a motion are one native call of MuJoCo's ``Batch``;
+    its state row is all there is to save.
+    """
+
+    def __init__(self, model: ArmModel) -> None:
+        mj = model.mj
+        self._model = model
+        self.timestep_s = float(mj.opt.timestep)
+        self._batch = Batch(mj, 1, nthread=1)
+        self._rest = _holding_controls(mj)
+        actuators = model.actuators
+        self._gear = mj.actuator_gear[actuators, 0].copy()
+        self._gain = mj.actuator_gainprm[actuators, 0].copy()
+        self._bias = mj.actuator_biasprm[actuators, :3].copy()
+        self._passive_support = ~mj.jnt_actgravcomp[mj.dof_jntid[model.dof]].astype(bool)
+
+    def reset(self, q: Float64) -> None:
+        """Hold the arm, at rest, at joint angles (n,)."""
+        self._batch.reset(stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+        self._batch.qpos[0] = self._model.mj.qpos0
+        self._batch.qpos[0, self._model.qpos] = q
+        self._batch.ctrl[0] = self._rest
+
+    @property
+    def q(self) -> Float64:
+        """(n,) joint angles now."""
+        return np.array(self._batch.qpos[0, self._model.qpos])
+
+    @property
+    def state(self) -> Float64:
+        """MuJoCo's integration state, a copy."""
+        return np.array(self._batch.state[0])
+
+    @state.setter
+    def state(self, value: Float64) -> None:
+        self._batch.state[0] = value
+
+    def run(
+        self, q_command: Float64, tick_s: float, steps: int, disturbance: Float64 | None = None
+    ) -> Motion:
+        """Step the arm along commanded joint angles.
+
+        Args:
+            q_command: (k + 1, n) joint angles at the ends of k >= 0 ticks; the last are held after.
+            tick_s: seconds a tick.
+            steps: t >= 1 of physics.
+            disturbance: (t, n) torque on the joints, Nm.
+        """
+        model, mj = self._model, self._model.mj
+        times = self.timestep_s * np.arange(1.0, steps + 1.0)
+        q, velocity = smooth(q_command, tick_s, times)
+        inputs = np.zeros((1, steps, mj.nu + mj.nv))
+        inputs[0, :, : mj.nu] = self._rest
+        inputs[0, :, model.actuators] = self._controls(q, velocity).T
+        if disturbance is not None:
+            inputs[0, :, mj.nu + model.dof] = disturbance.T
+        before = self._batch.qvel[0, model.dof]
+        record = ("qpos", "qvel", "qfrc_actuator", "qfrc_gravcomp")
+        out = self._batch.rollout(steps, inputs, _INPUTS, record=record)
+        speed = out["qvel"][0][:, model.dof]
+        torque = out["qfrc_actuator"][0][:, model.dof]
+        torque += self._passive_support * out["qfrc_gravcomp"][0][:, model.dof]
+        mean_speed = 0.5 * (speed + np.vstack([before, speed[:-1]]))
+        energy = float(np.abs(torque * mean_speed).sum() * self.timestep_s)
+        return Motion(out["qpos"][0][:, model.qpos], speed, torque, energy)
+
+    def _controls(self, q: Float64, velocity: Float64) -> Float64:
+        """Controls (t, n) at which the servos push nowhere at joint angles and velocities (t, n).
+
+        MuJoCo's affine actuator: force = gain u + b0 + b1 gear q + b2 gear dq/dt.
+        """
+        b0, b1, b2 = self._bias.T
+        return -(b0 + b1 * self._gear * q + b2 * self._gear * velocity) / self._gain
+
+
+def smooth(q: Float64, tick_s: float, times: Float64) -> tuple[Float64, Float64]:
+    """Joint angles and velocities (t, n) at times (t,) through (k + 1, n) at the ends of ticks.
+
+    Cubic Hermite splines with central differences as velocities, at rest before and after.
+    """
+    ticks = len(q) - 1
+    if ticks == 0:
+        return np.repeat(q, len(times), axis=0), np.zeros((len(times), q.shape[1]))
+    slope = np.zeros_like(q)
+    slope[1:-1] = 0.5 * (q[2:] - q[:-2])
+    place = np.clip(times / tick_s, 0, ticks)
+    index = np.minimum(place.astype(np.int64), ticks - 1)
+    s = (place - index)[:, None]
+    a, b, da, db = q[index], q[index + 1], slope[index], slope[index + 1]
+    rise = b - a
+    c2, c3 = 3 * rise - 2 * da - db, da + db - 2 * rise
+    return a + s * (da + s * (c2 + s * c3)), (da + s * (2 * c2 + 3 * s * c3)) / tick_s
+
+
+def _holding_controls(mj: mujoco.MjModel) -> Float64:
+    """Controls (nu,) that hold every joint with a position actuator where the model begins."""
+    controls = np.zeros(mj.nu)
+    for actuator in range(mj.nu):
+        b0, b1 = mj.actuator_biasprm[actuator, :2]
+        on_joint = mj.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT
+        gain = mj.actuator_gainprm[actuator, 0]
+        if on_joint and b1 < 0 and gain != 0:
+            start = mj.qpos0[mj.jnt_qposadr[mj.actuator_trnid[actuator, 0]]]
+            controls[actuator] = -(b0 + b1 * mj.actuator_gear[actuator, 0] * start) / gain
+    return controls
