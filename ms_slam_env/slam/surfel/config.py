@@ -44,6 +44,9 @@ class SurfelConfig:
         lateral_noise_px: standard deviation of the place at which it was sampled, pixels.
         points_per_level: the last iteration of tracking looks at about this many pixels; the
             others at three tenths of that.
+        refuse_bad_fits: whether a frame that fits the map badly counts as lost and stays out of the
+            map. If not, every frame is fused at the pose that alignment found, as in ElasticFusion
+            without relocalisation, and a map may show things twice.
 
     Raises:
         InputError: a value outside its range.
@@ -73,6 +76,7 @@ class SurfelConfig:
     intensity_noise: float = 0.5
     lateral_noise_px: float = 0.3
     points_per_level: int = 5000
+    refuse_bad_fits: bool = True
 
     def __post_init__(self) -> None:
         """Refuse values outside the ranges."""
@@ -107,3 +111,7 @@ class SurfelConfig:
         check_range(self, "intensity_noise", 0.01, 255.0)
         check_range(self, "lateral_noise_px", 0.0, 100.0)
         check_range(self, "points_per_level", 100, 10_000_000)
+        if not isinstance(self.refuse_bad_fits, bool):
+            raise InputError(
+                f"SurfelConfig.refuse_bad_fits = {self.refuse_bad_fits!r} must be true or false"
+            )

@@ -27,6 +27,8 @@ from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.tracking import Alignment, Tracker, model_stride
 from ms_slam_env.slam.surfel.types import LiveFrame, ModelView
 from ms_slam_env.slam.surfel.verdict import (
+    FEW_POINTS,
+    OK,
     REASONS,
     STAT_INLIER_FRACTION,
     STAT_RESIDUAL_M,
@@ -167,6 +169,8 @@ class BatchedSurfelSlam:
         limits = make_limits(lost, self._lost)
         view = self._render(self.poses)
         alignment = self.tracker.align(view, self.poses, seeds, limits, guesses)
+        if not self.config.refuse_bad_fits:
+            alignment = accept_any_fit(alignment)
         if guesses is not None:
             alignment = self._search_at_guess(alignment, guesses)
         alignment = self._search_again(alignment)
@@ -285,6 +289,13 @@ class BatchedSurfelSlam:
         self._time = state["time"].copy()
         self.map.set_state(state["map"])
         self._view_poses = None
+
+
+def accept_any_fit(alignment: Alignment) -> Alignment:
+    """The same with a good verdict wherever there was something to align at all."""
+    usable = alignment.verdict != FEW_POINTS
+    usable &= np.isfinite(alignment.T_world_live).all(axis=(1, 2))
+    return replace(alignment, verdict=np.where(usable, OK, FEW_POINTS).astype(np.int32))
 
 
 def motion_weight(motions: Float64) -> NDArray[np.float32]:
