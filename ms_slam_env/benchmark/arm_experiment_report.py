@@ -27,6 +27,7 @@ SHARES = (
     Column("lost", "lost at some time [%]", 100),
 )
 MEDIANS = (
+    Column("lost_frames_share", "frames lost [%]", 100),
     Column("mapped_area_m2", "mapped [m²]"),
     Column("ate_m", "ATE [mm]", 1000),
     Column("worst_share", "worst object's share apart [%]", 100),
@@ -58,7 +59,7 @@ def summarise(rows: Sequence[Row]) -> Summary:
 def compare(rows: Sequence[Row]) -> dict[str, Any]:
     """Successes of the greedy planner and of random walk, by scene, with the paper's.
 
-    ``greedy_better`` is None where one of them has no runs.
+    ``winner`` is the one with the greater share, ``equal``, or None where one has no runs.
     """
     counts = _counts(rows)
     scenes = dict.fromkeys(scene for scene, _ in counts)
@@ -66,10 +67,10 @@ def compare(rows: Sequence[Row]) -> dict[str, Any]:
     for scene in scenes:
         ours = {planner: counts.get((scene, planner), (0, 0)) for planner in (BASELINE, ACTIVE)}
         shares = [wins / runs if runs else math.nan for wins, runs in ours.values()]
-        known = not any(map(math.isnan, shares))
+        winner = BASELINE if shares[0] > shares[1] else ACTIVE if shares[1] > shares[0] else "equal"
         result[scene] = {
             **ours,
-            "greedy_better": shares[1] > shares[0] if known else None,
+            "winner": None if any(map(math.isnan, shares)) else winner,
             "paper": PAPER.get(scene),
         }
     return result
@@ -122,18 +123,17 @@ def comparison_table(rows: Sequence[Row]) -> str:
     """Markdown: successes of greedy and random walk beside the paper's claim."""
     body = []
     for scene, entry in compare(rows).items():
-        better = {True: "yes", False: "no", None: "-"}[entry["greedy_better"]]
         paper = entry["paper"] or {}
         claim = ", ".join(f"{name} {wins} of {runs}" for name, (wins, runs) in paper.items())
         body.append(
             [
                 scene,
                 *("{} of {}".format(*entry[planner]) for planner in (BASELINE, ACTIVE)),
-                better,
-                f"greedy better{': ' + claim if claim else ''}",
+                entry["winner"] or "-",
+                f"{ACTIVE} better{': ' + claim if claim else ''}",
             ]
         )
-    return markdown_table(["scene", BASELINE, ACTIVE, "greedy better", "paper"], body)
+    return markdown_table(["scene", BASELINE, ACTIVE, "better", "paper"], body)
 
 
 def as_plain(cell: Cell) -> dict[str, Any]:
@@ -143,7 +143,7 @@ def as_plain(cell: Cell) -> dict[str, Any]:
 
 def save_figure(summary: Summary, path: Path) -> Path:
     """Draw success, success without being lost at the end, and the mapped area."""
-    panels = (SHARES[0], SHARES[1], MEDIANS[0])
+    panels = (SHARES[0], SHARES[1], MEDIANS[1])
     figure = new_figure(len(panels), width=4.2)
     axes = figure.subplots(1, len(panels))
     for ax, column in zip(axes, panels, strict=True):
