@@ -16,6 +16,7 @@ from ms_slam_env.sensor.noise import NoiseConfig
 from ms_slam_env.sensor.random_numbers import normal_table
 from ms_slam_env.sensor.rays import Pinhole
 from ms_slam_env.sensor.shading import Surfaces, shade, true_geometry
+from ms_slam_env.sensor.spans import span_of
 from ms_slam_env.sensor.textures import (
     decode_table,
     encode_table,
@@ -79,6 +80,8 @@ class Images:
         self._surfaces = surfaces
         batch, height, width = shape
         count = batch * height * width
+        span = span_of(width, device)
+        parts = (batch, height, width // span)
         self._poses = wp.zeros(batch, dtype=wp.mat44, device=device)
         self._keys = wp.zeros((batch, 2), dtype=wp.uint32, device=device)
         self._hits = hits = Hits(shape, device)
@@ -88,10 +91,10 @@ class Images:
         self._cast = caster.bind(self._poses, camera, hits)
 
         def shading(shot: float, read: float) -> Any:
-            found = [self._poses, camera, hits.t, hits.u, hits.v, hits.face, surfaces]
+            found = [self._poses, camera, span, hits.t, hits.u, hits.v, hits.face, surfaces]
             lookup = [self._keys, tables.normals, tables.decode, tables.encode]
             return self._record(
-                shade, self._shape, [*found, exposure, shot, read, *lookup], [self._color]
+                shade, parts, [*found, exposure, shot, read, *lookup], [self._color]
             )
 
         self._shade = shading(noise.shot, noise.read)
@@ -102,9 +105,9 @@ class Images:
             self._measure.append(
                 self._record(projector_shadow, batch * height, inputs, [self._shadow])
             )
-        inputs = [self._poses, camera, hits.t, hits.face, surfaces.normal, surfaces.plane]
+        inputs = [self._poses, camera, span, hits.t, hits.face, surfaces.normal, surfaces.plane]
         inputs += [self._shadow, depth_noise, self._keys, tables.normals]
-        self._measure.append(self._record(measure_depth, self._shape, inputs, [self._depth]))
+        self._measure.append(self._record(measure_depth, parts, inputs, [self._depth]))
 
     def _record(
         self, kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], outputs: Sequence[Any]

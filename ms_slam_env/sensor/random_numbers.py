@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from ms_slam_env._warp import wp
 from ms_slam_env.errors import InputError
 
 NORMAL_STEPS = 65536
@@ -30,36 +29,16 @@ def frame_key(seed: int, index: int) -> NDArray[np.uint32]:
     return np.random.SeedSequence([int(seed), int(index)]).generate_state(2).astype(np.uint32)
 
 
-_PCG_INCREMENT = wp.constant(wp.uint32(2891336453))
+PCG = """
+auto pcg = [](unsigned x) {
+    const unsigned state = x * 747796405u + 2891336453u;
+    const unsigned word = ((state >> ((state >> 28) + 4u)) ^ state) * 277803737u;
+    return (word >> 22) ^ word;
+};
+auto first_word = [&](int pixel) { return pcg(pcg((unsigned)pixel ^ key_0) + key_1); };
+"""
+"""C++: a hash of 32 bits, and the first random word of a pixel under the frame's key.
 
-
-@wp.func
-def pcg(x: wp.uint32) -> wp.uint32:
-    """Hash of 32 bits: Jarzynski and Olano, "Hash Functions for GPU Rendering", JCGT 2020."""
-    state = x * wp.uint32(747796405) + _PCG_INCREMENT
-    word = ((state >> ((state >> wp.uint32(28)) + wp.uint32(4))) ^ state) * wp.uint32(277803737)
-    return (word >> wp.uint32(22)) ^ word
-
-
-@wp.func
-def pixel_state(key_0: wp.uint32, key_1: wp.uint32, pixel: int) -> wp.uint32:
-    """First random word of a pixel; further words follow by ``pcg(state + stream)``."""
-    return pcg(pcg(wp.uint32(pixel) ^ key_0) + key_1)
-
-
-@wp.func
-def normal_low(word: wp.uint32, table: wp.array(dtype=wp.float32)) -> float:
-    """N(0, 1) from the low 16 bits of a random word."""
-    return table[int(word & wp.uint32(65535))]
-
-
-@wp.func
-def normal_high(word: wp.uint32, table: wp.array(dtype=wp.float32)) -> float:
-    """N(0, 1) from the high 16 bits of a random word."""
-    return table[int(word >> wp.uint32(16))]
-
-
-@wp.func
-def uniform(word: wp.uint32) -> float:
-    """Uniform in [0, 1) from the high 24 bits of a random word."""
-    return float(word >> wp.uint32(8)) * (1.0 / 16777216.0)
+Further words follow by ``pcg(word + stream)``. The low and the high 16 bits of a word each index
+``normal_table``. Source: Jarzynski and Olano, "Hash Functions for GPU Rendering", JCGT 2020.
+"""

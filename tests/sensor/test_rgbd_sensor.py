@@ -9,9 +9,9 @@ from box_scene import BoxScene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ms_slam_env.camera import xtion
+from ms_slam_env.camera import Intrinsics, xtion
 from ms_slam_env.errors import InputError
-from ms_slam_env.sensor import RGBDSensor
+from ms_slam_env.sensor import RGBDSensor, images
 
 K = xtion("80x60")
 
@@ -60,6 +60,21 @@ def test_a_batch_equals_its_single_frames(sensor: RGBDSensor, box_scene: BoxScen
     batch = sensor.capture_batch(poses, [4, 9, 2])
     singles = [sensor.capture(T, index) for T, index in zip(poses, (4, 9, 2), strict=True)]
     assert all(same(a, b) for a, b in zip(batch, singles, strict=True))
+
+
+@pytest.mark.parametrize("size", [(80, 60), (37, 23)])
+def test_vectorised_rows_equal_single_pixels(box_scene: BoxScene, monkeypatch, size) -> None:
+    """A thread does a row on the CPU and a pixel on a GPU: the images are the same."""
+    width, height = size
+    camera = Intrinsics(70.0, 70.0, width / 2 - 0.5, height / 2 - 0.5, width, height)
+    rows = RGBDSensor(box_scene, camera)
+    pixels = RGBDSensor(box_scene, camera)
+    for seed in range(4):
+        T = box_scene.sample_start(np.random.default_rng(seed))
+        expected = rows.capture(T, seed)
+        with monkeypatch.context() as patch:
+            patch.setattr(images, "span_of", lambda width, device: 1)
+            assert same(pixels.capture(T, seed), expected)
 
 
 def test_frames_do_not_share_memory(sensor: RGBDSensor, pose) -> None:
