@@ -8,6 +8,9 @@ from __future__ import annotations
 
 from ms_slam_env._warp import wp
 from ms_slam_env.sensor.rays import Pinhole
+from ms_slam_env.sensor.spans import VECTOR_FLAGS
+
+wp.set_module_options(VECTOR_FLAGS)
 
 TILE_WIDTH = 4
 TILE_HEIGHT = 2
