@@ -117,36 +117,3 @@ class ClearanceLimit(mink.Limit):
         G = np.zeros((int(near.sum()), configuration.nv))
         G[:, self._dof] = -(gaps[1:, near] - gaps[0, near]).T / _STEP_RAD
         return mink.Constraint(G, self._gain * np.maximum(spare[near], 0.0))
-
-
-class JointLimit(mink.Limit):
-    """Speed and range of the joints of a chain, the tighter of both.
-
-    The same as mink's VelocityLimit and ConfigurationLimit (gain 1) in half the rows. A joint that
-    is beyond its range already may only go back.
-    """
-
-    def __init__(
-        self,
-        chain: Chain,
-        qpos: NDArray[np.int32],
-        dof: NDArray[np.int32],
-        nv: int,
-        margin_rad: float,
-    ) -> None:
-        self._speed = chain.speed
-        self._lower = chain.lower + margin_rad
-        self._upper = chain.upper - margin_rad
-        self._qpos = qpos
-        one = np.zeros((len(dof), nv))
-        one[np.arange(len(dof)), dof] = 1.0
-        self._G = np.vstack([one, -one])
-
-    def compute_qp_inequalities(
-        self, configuration: mink.Configuration, dt: float
-    ) -> mink.Constraint:
-        """See mink's base class."""
-        q = configuration.data.qpos[self._qpos]
-        room = np.concatenate([self._upper - q, q - self._lower])
-        most = np.concatenate([self._speed, self._speed]) * dt
-        return mink.Constraint(self._G, np.clip(room, 0.0, most))

@@ -70,7 +70,7 @@ class ArmConfig:
     speed_m_s: float = 0.2
     speed_rad_s: float = math.radians(36)
     joint_speed_rad_s: float = 1.0
-    control_hz: float = 25.0
+    control_hz: float = 20.0
     clearance_m: float = 0.02
     noise: ArmNoise = field(default_factory=ArmNoise)
 

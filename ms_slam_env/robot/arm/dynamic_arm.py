@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ms_slam_env.geometry import relative_angle, transform_points
 from ms_slam_env.robot.arm.arm_base import ArmEmbodiment, frame_times
 from ms_slam_env.robot.arm.config import ArmConfig
-from ms_slam_env.robot.arm.controller import Controller, Plan
+from ms_slam_env.robot.arm.controller import Controller, Plan, checked_ticks
 from ms_slam_env.robot.arm.dynamics import ArmDynamics, Motion
 from ms_slam_env.robot.arm.imperfections import Imperfections
 from ms_slam_env.robot.base import Movement
@@ -141,14 +141,12 @@ class DynamicArm(ArmEmbodiment):
             else:
                 self.q_command = plan.q[-1].copy()
             at = steps - 1
-            kinematic = self._kinematic_poses(motion.q[at])
-            self.set_joints(q_link[-1])
-            self._kinematic = kinematic[-1].copy()
-        poses = self.T_world_base @ self.model.chain.camera_pose(q_link[at])
+            poses, kinematic = self._settle_at(motion.q[at], q_link[at])
         stopped = tick is not None
         made = plan.followed and not stopped
         seconds = steps * self.dynamics.timestep_s
-        return Movement(made, poses, kinematic, seconds, motion.energy_j), stopped, q_link
+        movement = Movement(made, poses, kinematic, seconds, motion.energy_j)
+        return movement, stopped, q_link
 
     def _run(self, q_command: Float64, tick_s: float, steps: int) -> tuple[Motion, Float64]:
         """Physics along a command (k + 1, n), and joint angles (t, n) of the links."""
@@ -165,11 +163,11 @@ class DynamicArm(ArmEmbodiment):
     def _first_touch(self, plan: Plan, q_link: Float64) -> int | None:
         """The first tick at whose end a link is within its radius of furniture, and nearer than
         it was at the start; None if there is none."""
-        ticks = len(plan.q) - 1
-        if ticks == 0:
+        ticks = checked_ticks(len(plan.q) - 1)[1:]
+        if len(ticks) == 0:
             return None
-        steps = np.round(np.arange(1, ticks + 1) * plan.tick_s / self.dynamics.timestep_s)
-        index = np.clip(steps.astype(np.int64) - 1, 0, len(q_link) - 1)
+        steps = np.round(ticks * plan.tick_s / self.dynamics.timestep_s).astype(np.int64)
+        index = np.clip(steps - 1, 0, len(q_link) - 1)
         clearance = self.controller.clearance
         centres = transform_points(
             self.T_world_base, clearance.balls(np.vstack([self.q, q_link[index]]))
@@ -177,24 +175,32 @@ class DynamicArm(ArmEmbodiment):
         free = self.scene.clearance(centres.reshape(-1, 3)).reshape(centres.shape[:-1])
         touches = (free < clearance.ball_radius) & (free < free[0])
         found = np.flatnonzero(touches[1:].any(axis=1))
-        return int(found[0]) + 1 if len(found) else None
+        return int(ticks[found[0]]) if len(found) else None
 
     def _hold(self, seconds: float) -> None:
         """Hold the command for a time."""
         steps = int(np.ceil(seconds / self.dynamics.timestep_s))
         motion, q_link = self._run(self.q_command[None], 1.0, steps)
-        self.set_joints(q_link[-1])
-        self._kinematic = self._kinematic_poses(motion.q[-1:])[0]
+        self._settle_at(motion.q[-1:], q_link[-1:])
 
-    def _kinematic_poses(self, q_motor: Float64) -> Float64:
-        """Poses (k, 4, 4) of the camera by readings of the joint sensors at (k, n)."""
+    def _settle_at(self, q_motor: Float64, q_link: Float64) -> tuple[Float64, Float64]:
+        """Be at the last of joint angles (k, n); the camera's poses (k, 4, 4), true and read."""
         readings = self.imperfections.readings(q_motor)
-        poses = self.T_world_base @ self.model.chain.camera_pose(readings)
-        return np.asarray(poses @ self.imperfections.T_camera_assumed)
+        both = self.T_world_base @ self.model.chain.camera_pose(np.stack([q_link, readings]))
+        kinematic = both[1] @ self.imperfections.T_camera_assumed
+        self._be_at(q_link[-1], both[0, -1], kinematic[-1])
+        return both[0], kinematic
+
+    def _be_at(self, q: Float64, T_world_camera: Float64, T_kinematic: Float64) -> None:
+        self.q = q.copy()
+        self.T_world_camera = T_world_camera.copy()
+        self._kinematic = T_kinematic.copy()
+        self._probe = None
 
     def _moving_state(self) -> dict[str, Any]:
         return {
             "q": self.q.copy(),
+            "T_world_camera": self.T_world_camera.copy(),
             "q_command": self.q_command.copy(),
             "kinematic": self._kinematic.copy(),
             "physics": self.dynamics.state,
@@ -202,8 +208,7 @@ class DynamicArm(ArmEmbodiment):
         }
 
     def _restore(self, state: dict[str, Any]) -> None:
-        self.set_joints(state["q"])
+        self._be_at(state["q"], state["T_world_camera"], state["kinematic"])
         self.q_command = state["q_command"].copy()
-        self._kinematic = state["kinematic"].copy()
         self.dynamics.state = state["physics"]
         self.imperfections.set_state(state["imperfections"])

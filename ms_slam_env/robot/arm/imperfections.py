@@ -94,9 +94,8 @@ def play(x: Float64, start: Float64, half_width: float) -> Float64:
     low, high = x - half_width, x + half_width
     reach = 1
     while reach < len(x):
-        lower = np.clip(low[:-reach], low[reach:], high[reach:])
-        upper = np.clip(high[:-reach], low[reach:], high[reach:])
-        low = np.concatenate([low[:reach], lower])
-        high = np.concatenate([high[:reach], upper])
+        edges = low[reach:].copy(), high[reach:].copy()
+        low[reach:] = np.minimum(np.maximum(low[:-reach], edges[0]), edges[1])
+        high[reach:] = np.minimum(np.maximum(high[:-reach], edges[0]), edges[1])
         reach *= 2
     return np.clip(start, low, high)
