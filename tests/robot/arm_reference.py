@@ -1,0 +1,112 @@
+"""A slow, obvious version of what ``Reach`` decides, for tests."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation, Slerp
+
+from ms_slam_env.robot.arm.chain import Chain, segment_distance
+from ms_slam_env.robot.arm.config import ArmConfig
+from ms_slam_env.robot.arm.reach import LIMIT_MARGIN_RAD, MOST_STRETCH
+from ms_slam_env.robot.arm.surroundings import Surroundings
+
+
+@dataclass(frozen=True)
+class SlowWay:
+    """Joint angles along a way, and by how much each requirement is kept (< 0: broken)."""
+
+    q: np.ndarray  # (W, n)
+    off_m: float
+    off_rad: float
+    limit_spare_rad: float
+    stretch: float
+    furniture_spare_m: float  # beyond the radius of the links
+    self_spare_m: float  # beyond radii and what the pair needs
+
+    def ok(self, slack: float) -> bool:
+        """Whether all is kept; ``slack`` > 0 forgives, < 0 asks for more."""
+        return (
+            self.off_m < 1e-3 + 0.1 * slack
+            and self.off_rad < np.radians(0.1) + 0.1 * slack
+            and self.limit_spare_rad > -slack
+            and self.stretch < MOST_STRETCH * (1 + slack)
+            and self.furniture_spare_m > -slack
+            and self.self_spare_m > -slack
+        )
+
+
+def solve(chain: Chain, q: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, float, float]:
+    """Inverse kinematics near ``q`` by SciPy, without our Newton steps."""
+
+    def error(angles: np.ndarray) -> np.ndarray:
+        T = chain.camera_pose(angles)
+        turn = Rotation.from_matrix(target[:3, :3] @ T[:3, :3].T).as_rotvec()
+        return np.concatenate([target[:3, 3] - T[:3, 3], turn])
+
+    def slope(angles: np.ndarray) -> np.ndarray:
+        return -chain.camera_jacobian(angles)
+
+    found = least_squares(error, q, jac=slope, method="trf", xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    return found.x, np.linalg.norm(found.fun[:3]), np.linalg.norm(found.fun[3:])
+
+
+def follow(
+    chain: Chain,
+    surroundings: Surroundings,
+    config: ArmConfig,
+    q: np.ndarray,
+    target: np.ndarray,
+    waypoints: int,
+) -> SlowWay:
+    """Follow the straight way to a camera pose (4, 4) with ``waypoints`` joint configurations."""
+    start = chain.camera_pose(q)
+    share = np.linspace(0, 1, waypoints)
+    turning = Slerp([0, 1], Rotation.from_matrix([start[:3, :3], target[:3, :3]]))
+    angle = (turning(0.0).inv() * turning(1.0)).magnitude()
+    distance = np.linalg.norm(target[:3, 3] - start[:3, 3])
+    duration = 1.25 * max(distance / config.speed_m_s, angle / config.speed_rad_s)
+    ways, off_m, off_rad = [q], 0.0, 0.0
+    for s in share[1:]:
+        T = np.eye(4)
+        T[:3, :3] = turning(s).as_matrix()
+        T[:3, 3] = (1 - s) * start[:3, 3] + s * target[:3, 3]
+        angles, metres, radians = solve(chain, ways[-1], T)
+        ways.append(angles)
+        off_m, off_rad = max(off_m, metres), max(off_rad, radians)
+    joints = np.stack(ways)
+    low, high = chain.lower + LIMIT_MARGIN_RAD, chain.upper - LIMIT_MARGIN_RAD
+    limit = np.minimum(joints - low, high - joints)[1:].min()
+    speed = np.abs(np.diff(joints, axis=0)) * (waypoints - 1) * 1.25 / duration
+    furniture, apart = spares(chain, surroundings, joints[1:], config.clearance_m)
+    return SlowWay(
+        joints,
+        off_m,
+        off_rad,
+        float(limit),
+        float((speed / chain.speed).max()),
+        furniture - config.clearance_m,
+        apart,
+    )
+
+
+def spares(
+    chain: Chain, surroundings: Surroundings, joints: np.ndarray, clearance_m: float
+) -> tuple[float, float]:
+    """Least distance of links to furniture, and of pairs of links beyond what they need."""
+    furniture, apart = np.inf, np.inf
+    moving = np.flatnonzero(chain.capsule_link > 0)
+    need = np.minimum(clearance_m, 0.5 * chain.self_gap)
+    for q in joints:
+        ends = chain.capsules(q)
+        for i in moving:
+            points = ends[i, 0] + np.linspace(0, 1, 40)[:, None] * (ends[i, 1] - ends[i, 0])
+            free = surroundings.distance(points).min() - chain.capsule_radius[i]
+            furniture = min(furniture, free)
+        first, second = chain.self_pairs.T
+        gap = segment_distance(ends[first], ends[second])
+        gap = gap - chain.capsule_radius[first] - chain.capsule_radius[second] - need
+        apart = min(apart, gap.min(initial=np.inf))
+    return float(furniture), float(apart)
