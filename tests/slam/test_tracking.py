@@ -65,9 +65,10 @@ def _synthetic(seed: int = 0) -> dict[str, np.ndarray]:
 def _device_sums(data, T, weights, stride=1, columns=1 << 20):
     kinds = [wp.vec3, wp.vec3, wp.float32, wp.vec3, wp.vec3, wp.vec3]
     images = [
-        wp.array(a[None].astype(np.float32), dtype=k)
+        wp.array(a.astype(np.float32), dtype=k).flatten()
         for a, k in zip(data.values(), kinds, strict=True)
     ]
+    size = wp.vec2i(SMALL.width, SMALL.height)
     columns = min(columns, SMALL.width)
     rows, pieces = -(-SMALL.height // stride), -(-SMALL.width // columns)
     partial = wp.zeros((1, 1, rows * pieces, ne.NUM_SUMS), dtype=wp.float32)
@@ -77,8 +78,8 @@ def _device_sums(data, T, weights, stride=1, columns=1 << 20):
         ne.accumulate,
         dim=(1, 1, rows, pieces),
         inputs=[
-            *images, wp.vec2(SMALL.fx, SMALL.fy), wp.vec2(SMALL.cx, SMALL.cy), weights, stride,
-            columns, wp.array(T[None, None], dtype=wp.mat44d), active,
+            *images, size, size, wp.vec2(SMALL.fx, SMALL.fy), wp.vec2(SMALL.cx, SMALL.cy), weights,
+            stride, columns, wp.array(T[None, None], dtype=wp.mat44d), active,
         ],
         outputs=[partial],
     )  # fmt: skip

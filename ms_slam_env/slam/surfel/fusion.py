@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env._warp import wp
+from ms_slam_env.slam.surfel.discs import SplatCamera
 from ms_slam_env.slam.surfel.memory import fetch, mark, put
-from ms_slam_env.slam.surfel.splat import SplatCamera
 from ms_slam_env.slam.surfel.surfel_arrays import (
     Surfels,
     VisibleList,

@@ -32,6 +32,7 @@ w = 0.1 is about the best on noisy sequences.
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
+from ms_slam_env.slam.surfel.memory import fetch
 
 NUM_SUMS = 36
 """Sums of a pass: 21 of H (upper triangle by rows), 6 of g = J^T W r, then the statistics."""
@@ -49,6 +50,10 @@ SUM_APART = 35  # matched, but the live surface is clearly nearer or farther tha
 OFF = wp.constant(0)  # states of a hypothesis, in ``active``: takes no part
 RUNNING = wp.constant(1)
 RESTING = wp.constant(2)  # converged at its level, wakes at the next
+
+
+Row = wp.types.vector(length=8, dtype=wp.float32)
+"""Six numbers and one more, in as many as one instruction of a CPU works on."""
 
 
 @wp.struct
@@ -71,12 +76,14 @@ class Weights:
 
 @wp.kernel
 def accumulate(
-    model_vertices: wp.array3d(dtype=wp.vec3),
-    model_normals: wp.array3d(dtype=wp.vec3),
-    model_intensity: wp.array3d(dtype=wp.float32),
-    live_vertices: wp.array3d(dtype=wp.vec3),
-    live_normals: wp.array3d(dtype=wp.vec3),
-    live_gradient: wp.array3d(dtype=wp.vec3),
+    model_vertices: wp.array(dtype=wp.vec3),
+    model_normals: wp.array(dtype=wp.vec3),
+    model_intensity: wp.array(dtype=wp.float32),
+    live_vertices: wp.array(dtype=wp.vec3),
+    live_normals: wp.array(dtype=wp.vec3),
+    live_gradient: wp.array(dtype=wp.vec3),
+    model_size: wp.vec2i,  # (width, height) of the model images
+    live_size: wp.vec2i,
     focal: wp.vec2,
     centre: wp.vec2,
     weights: Weights,
@@ -90,7 +97,9 @@ def accumulate(
     b, k, row_index, piece = wp.tid()
     if active[b, k] != RUNNING:
         return
-    width = model_vertices.shape[2]
+    width = model_size[0]
+    live_width = live_size[0]
+    live_image = b * live_width * live_size[1]
     T = pose[b, k]
     R_inverse = wp.mat33(
         float(T[0, 0]), float(T[1, 0]), float(T[2, 0]),
@@ -98,14 +107,15 @@ def accumulate(
         float(T[0, 2]), float(T[1, 2]), float(T[2, 2]),
     )  # fmt: skip
     t_inverse = -(R_inverse * wp.vec3(float(T[0, 3]), float(T[1, 3]), float(T[2, 3])))
-    u_limit = float(live_vertices.shape[2] - 1)
-    v_limit = float(live_vertices.shape[1] - 1)
-    zero = wp.mat33(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    H_tt = wp.mat33(zero)  # blocks of H: translation, translation-rotation, rotation
-    H_tr = wp.mat33(zero)
-    H_rr = wp.mat33(zero)
-    g_t = wp.vec3(0.0, 0.0, 0.0)
-    g_r = wp.vec3(0.0, 0.0, 0.0)
+    u_limit = float(live_width - 1)
+    v_limit = float(live_size[1] - 1)
+    zero = Row(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    H0 = Row(zero)  # rows of H, and the component of g in the seventh place
+    H1 = Row(zero)
+    H2 = Row(zero)
+    H3 = Row(zero)
+    H4 = Row(zero)
+    H5 = Row(zero)
     cost = wp.float32(0.0)
     points = wp.float32(0.0)
     visible = wp.float32(0.0)
@@ -118,8 +128,12 @@ def accumulate(
     v = row_index * stride
     # Neighbouring rows sample different columns, like a chessboard.
     start = piece * columns + (row_index % 2) * (stride // 2)
-    for u in range(start, wp.min((piece + 1) * columns, width), stride):
-        p = model_vertices[b, v, u]
+    model_row = (b * model_size[1] + v) * width
+    i = model_row + start - stride
+    end = model_row + wp.min((piece + 1) * columns, width) - stride
+    while i < end:
+        i += stride
+        p = fetch(model_vertices, i)
         if p[2] <= 0.0:
             continue
         points += 1.0
@@ -136,7 +150,8 @@ def accumulate(
         row = int(y)
         right = x - float(column)
         down = y - float(row)
-        live = live_vertices[b, int(y + 0.5), int(x + 0.5)]
+        nearest = live_image + int(y + 0.5) * live_width + int(x + 0.5)
+        live = fetch(live_vertices, nearest)
         if live[2] > 0.0:
             matched += 1.0
             per_sigma = weights.per_depth_noise * per_z * per_z
@@ -146,8 +161,8 @@ def accumulate(
             if gap > weights.distance_m:
                 cost += 3.0
                 continue  # another surface: neither its depth nor its colour is the model's
-            n = R_inverse * model_normals[b, v, u]
-            if wp.dot(n, live_normals[b, int(y + 0.5), int(x + 0.5)]) > weights.cos_angle:
+            n = R_inverse * fetch(model_normals, i)
+            if wp.dot(n, fetch(live_normals, nearest)) > weights.cos_angle:
                 residual = wp.dot(n, live - q)
                 normalised = residual * per_sigma
                 ratio = normalised * weights.per_cauchy_icp
@@ -158,24 +173,26 @@ def accumulate(
                     squared += residual * residual
                 turn = wp.cross(live, n)
                 weight = weights.icp * robust * per_sigma * per_sigma
-                scaled = weight * n
-                H_tt += wp.outer(scaled, n)
-                H_tr += wp.outer(scaled, turn)
-                H_rr += wp.outer(weight * turn, turn)
-                g_t += residual * scaled
-                g_r += (weight * residual) * turn
+                J = Row(n[0], n[1], n[2], turn[0], turn[1], turn[2], residual, 0.0)
+                H0 += (weight * n[0]) * J
+                H1 += (weight * n[1]) * J
+                H2 += (weight * n[2]) * J
+                H3 += (weight * turn[0]) * J
+                H4 += (weight * turn[1]) * J
+                H5 += (weight * turn[2]) * J
             else:
                 cost += 1.0
         else:
             cost += 0.5
-        top_left = live_gradient[b, row, column]
-        top_right = live_gradient[b, row, column + 1]
-        low_left = live_gradient[b, row + 1, column]
-        low_right = live_gradient[b, row + 1, column + 1]
+        corner = live_image + row * live_width + column
+        top_left = fetch(live_gradient, corner)
+        top_right = fetch(live_gradient, corner + 1)
+        low_left = fetch(live_gradient, corner + live_width)
+        low_right = fetch(live_gradient, corner + live_width + 1)
         top = top_left + right * (top_right - top_left)
         low = low_left + right * (low_right - low_left)
         seen = top + down * (low - top)  # (I, dI/du, dI/dv)
-        residual = seen[0] - model_intensity[b, v, u]
+        residual = seen[0] - fetch(model_intensity, i)
         slope_squared = seen[1] * seen[1] + seen[2] * seen[2]
         per_variance = 1.0 / (weights.grey_variance + weights.pixel_variance * slope_squared)
         ratio = residual * wp.sqrt(per_variance) * weights.per_cauchy_rgb
@@ -190,21 +207,31 @@ def accumulate(
             g = -wp.vec3(gx, gy, -(gx * q[0] + gy * q[1]) * per_z)
             turn = wp.cross(q, g)
             weight = weights.rgb * robust * per_variance
-            scaled = weight * g
-            H_tt += wp.outer(scaled, g)
-            H_tr += wp.outer(scaled, turn)
-            H_rr += wp.outer(weight * turn, turn)
-            g_t += residual * scaled
-            g_r += (weight * residual) * turn
+            J = Row(g[0], g[1], g[2], turn[0], turn[1], turn[2], residual, 0.0)
+            H0 += (weight * g[0]) * J
+            H1 += (weight * g[1]) * J
+            H2 += (weight * g[2]) * J
+            H3 += (weight * turn[0]) * J
+            H4 += (weight * turn[1]) * J
+            H5 += (weight * turn[2]) * J
     slot = row_index * ((width + columns - 1) // columns) + piece
-    for i in range(3):
-        for j in range(3):
-            if j >= i:  # upper triangle by rows of six, five, four, ...
-                partial[b, k, slot, i * (11 - i) / 2 + j] = H_tt[i, j]
-                partial[b, k, slot, (i + 3) * (8 - i) / 2 + j + 3] = H_rr[i, j]
-            partial[b, k, slot, i * (11 - i) / 2 + j + 3] = H_tr[i, j]
-        partial[b, k, slot, 21 + i] = g_t[i]
-        partial[b, k, slot, 24 + i] = g_r[i]
+    for i in range(6):  # upper triangle by rows
+        partial[b, k, slot, i] = H0[i]
+        if i >= 1:
+            partial[b, k, slot, 5 + i] = H1[i]
+        if i >= 2:
+            partial[b, k, slot, 9 + i] = H2[i]
+        if i >= 3:
+            partial[b, k, slot, 12 + i] = H3[i]
+        if i >= 4:
+            partial[b, k, slot, 14 + i] = H4[i]
+    partial[b, k, slot, 20] = H5[5]
+    partial[b, k, slot, 21] = H0[6]
+    partial[b, k, slot, 22] = H1[6]
+    partial[b, k, slot, 23] = H2[6]
+    partial[b, k, slot, 24] = H3[6]
+    partial[b, k, slot, 25] = H4[6]
+    partial[b, k, slot, 26] = H5[6]
     partial[b, k, slot, 27] = cost
     partial[b, k, slot, 28] = points
     partial[b, k, slot, 29] = visible

@@ -12,6 +12,7 @@ from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert
+from ms_slam_env.slam.surfel.discs import Discs
 from ms_slam_env.slam.surfel.prediction_kernels import (
     EMPTY,
     PointCloud,
@@ -128,6 +129,7 @@ class ViewPredictor:
     Args:
         surfels: the maps.
         visible: working list shared with the map's other renderers.
+        discs: working memory shared likewise.
         intrinsics: of the live camera.
         parameters: how discs are drawn.
         workers: threads per env or view.
@@ -138,6 +140,7 @@ class ViewPredictor:
         self,
         surfels: Surfels,
         visible: VisibleList,
+        discs: Discs,
         intrinsics: Intrinsics,
         parameters: SplatParameters,
         workers: int,
@@ -145,6 +148,7 @@ class ViewPredictor:
     ) -> None:
         self.surfels = surfels
         self.visible = visible
+        self.discs = discs
         self.intrinsics = intrinsics
         self.parameters = parameters
         self.workers = workers
@@ -245,6 +249,7 @@ class ViewPredictor:
         return SplatRenderer(
             self.surfels,
             self.visible,
+            self.discs,
             envs,
             intrinsics,
             self.parameters,

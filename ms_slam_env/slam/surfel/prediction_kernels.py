@@ -11,7 +11,7 @@ surfels into every view.
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
-from ms_slam_env.slam.surfel.splat import SplatCamera
+from ms_slam_env.slam.surfel.discs import SplatCamera
 from ms_slam_env.slam.surfel.surfel_arrays import rotation_of, translation_of
 
 EMPTY = wp.constant(wp.int64(0x7FFFFFFFFFFFFFFF))

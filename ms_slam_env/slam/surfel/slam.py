@@ -21,7 +21,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose, invert
 from ms_slam_env.slam.base import Float64, TrackResult
 from ms_slam_env.slam.surfel.config import SurfelConfig
-from ms_slam_env.slam.surfel.preprocess import Preprocessor
+from ms_slam_env.slam.surfel.preprocess import Preprocessor, copy_in
 from ms_slam_env.slam.surfel.seeds import NUM_SEEDS, relocalisation_seeds, tracking_seeds
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.tracking import Alignment, Tracker, model_stride
@@ -251,10 +251,10 @@ class BatchedSurfelSlam:
         if not good.any():
             self._time += 1
             return
-        self._device_poses.assign(self.poses.astype(np.float32))
-        self._device_time.assign(self._time)
-        self._device_weight.assign(motion_weight(self._motions))
-        self._device_mask.assign(good.astype(np.int32))
+        copy_in(self._device_poses, self.poses)
+        copy_in(self._device_time, self._time)
+        copy_in(self._device_weight, motion_weight(self._motions))
+        copy_in(self._device_mask, good)
         self.map.fuse(
             live, self._device_poses, self._device_time, self._device_weight, self._device_mask
         )
@@ -264,7 +264,7 @@ class BatchedSurfelSlam:
     def _render(self, poses: Float64) -> ModelView:
         """Render the maps from ``poses`` (B, 4, 4), unless that view is at hand."""
         if self._view_poses is None or not np.array_equal(self._view_poses, poses):
-            self._device_poses.assign(poses.astype(np.float32))
+            copy_in(self._device_poses, poses)
             self._view = self.map.render_model(self._device_poses)
             self._view_poses = poses.copy()
         return self._view

@@ -14,6 +14,7 @@ arithmetic.
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
+from ms_slam_env.slam.surfel.discs import Discs, SplatCamera, floor_int
 from ms_slam_env.slam.surfel.memory import fetch, put, raise_to
 from ms_slam_env.slam.surfel.surfel_arrays import (
     Surfels,
@@ -25,64 +26,6 @@ from ms_slam_env.slam.surfel.surfel_arrays import (
 
 Sums = wp.types.vector(length=8, dtype=wp.float32)
 """Weighted sums of a pixel: normal (3), weight, colour (3), depth."""
-
-
-@wp.struct
-class SplatCamera:
-    """Image size, focal lengths (px), principal point (px), and how discs are drawn.
-
-    Attributes:
-        width: columns.
-        height: rows.
-        focal: (fx, fy).
-        centre: (cx, cy).
-        z_near: nearest depth drawn, metres.
-        z_far: farthest depth drawn, metres.
-        tolerance_m: discs this far behind the nearest one belong to the same surface (at 1 m).
-        min_px: smallest drawn radius.
-        max_px: largest drawn radius.
-        max_weight: confidence above which a disc weighs no more.
-    """
-
-    width: int
-    height: int
-    focal: wp.vec2
-    centre: wp.vec2
-    z_near: float
-    z_far: float
-    tolerance_m: float
-    min_px: float
-    max_px: float
-    max_weight: float
-
-
-@wp.struct
-class Disc:
-    """A surfel in the image.
-
-    Attributes:
-        u: column of its centre.
-        v: row of its centre.
-        z: depth of its centre.
-        inverse: inverse depth of its centre.
-        slope_u: change of inverse depth per column.
-        slope_v: change of inverse depth per row.
-        rim: squared radius, square metres.
-        pixel: side of a pixel at its depth, metres (columns, rows).
-        low: first column and row that it may cover.
-        high: last column and row that it may cover.
-    """
-
-    u: float
-    v: float
-    z: float
-    inverse: float
-    slope_u: float
-    slope_v: float
-    rim: float
-    pixel: wp.vec2
-    low: wp.vec2i
-    high: wp.vec2i
 
 
 @wp.kernel
@@ -124,99 +67,62 @@ def cull(
                     put(visible.index, k, slot, i)
                     put(visible.position, k, slot, p)
                     put(visible.normal, k, slot, n)
+                    put(visible.radius, k, slot, fetch(surfels.radius, b, i))
         i += workers
 
 
 @wp.func
-def floor_int(x: float) -> int:
-    """Largest integer not above x >= -100; truncation is much faster than ``wp.floor``."""
-    return int(x + 100.0) - 100
+def squared_offset(x: float, y: float, z: float, inverse_offset: float) -> float:
+    """Squared distance (m2) from the centre of a disc at depth z of a point of its plane.
 
-
-@wp.func
-def project_disc(p: wp.vec3, n: wp.vec3, radius: float, camera: SplatCamera) -> Disc:
-    """Footprint of a surfel at p (camera frame) with normal n."""
-    disc = Disc()
-    inverse = 1.0 / p[2]
-    pixel = wp.vec2(p[2] / camera.focal[0], p[2] / camera.focal[1])
-    drawn = wp.clamp(radius, camera.min_px * pixel[0], camera.max_px * pixel[0])
-    # A tilted disc is an ellipse: an offset d in its plane moves the column by (f / z) a . d with
-    # a = (1, 0, -x / z), at most |d| times a's part in the plane. The rest allows for perspective.
-    x = p[0] * inverse
-    y = p[1] * inverse
-    part_u = n[0] - x * n[2]
-    part_v = n[1] - y * n[2]
-    reach_u = 1.05 * (drawn / pixel[0]) * wp.sqrt(1.0 + x * x - part_u * part_u)
-    reach_v = 1.05 * (drawn / pixel[1]) * wp.sqrt(1.0 + y * y - part_v * part_v)
-    u = camera.focal[0] * x + camera.centre[0]
-    v = camera.focal[1] * y + camera.centre[1]
-    # n . ray = (n . p) / z for rays with z = 1, so the inverse depth is (n / (n . p)) . ray.
-    plane = 1.0 / wp.min(wp.dot(n, p), -1.0e-6)
-    disc.u = u
-    disc.v = v
-    disc.z = p[2]
-    disc.inverse = inverse
-    disc.slope_u = n[0] * plane / camera.focal[0]
-    disc.slope_v = n[1] * plane / camera.focal[1]
-    disc.rim = drawn * drawn
-    disc.pixel = pixel
-    disc.low = wp.vec2i(
-        wp.max(floor_int(u - reach_u) + 1, 0), wp.max(floor_int(v - reach_v) + 1, 0)
-    )
-    disc.high = wp.vec2i(
-        wp.min(floor_int(u + reach_u), camera.width - 1),
-        wp.min(floor_int(v + reach_v), camera.height - 1),
-    )
-    return disc
-
-
-@wp.func
-def squared_offset(disc: Disc, du: float, dv: float, inverse: float) -> float:
-    """Squared distance (m2) from the disc's centre of its plane's point at pixel (u+du, v+dv).
-
-    To first order in the offset: only the disc's rim moves, by less than its perspective.
+    The point is x, y (m) and an inverse depth away from the centre. To first order in the offset:
+    only the disc's rim moves, by less than its perspective.
     """
-    x = du * disc.pixel[0]
-    y = dv * disc.pixel[1]
-    z = disc.z * disc.z * (inverse - disc.inverse)
-    return x * x + y * y + z * z
+    away = z * z * inverse_offset
+    return x * x + y * y + away * away
 
 
 @wp.kernel
 def splat_depth(
-    surfels: Surfels,
     visible: VisibleList,
-    first_env: int,
     camera: SplatCamera,
     workers: int,
+    discs: Discs,
     z_buffer: wp.array(dtype=wp.float32),
 ) -> None:
-    """Inverse depth (E * H * W) of the nearest disc at every pixel."""
+    """Inverse depth (E * H * W) of the nearest disc at every pixel; list the discs on a pixel."""
     k, worker = wp.tid()
-    b = first_env + k
     width = camera.width
     image = k * camera.height * width
     count = visible.count[k]
     j = int(worker)
     while j < count:
-        disc = project_disc(
-            fetch(visible.position, k, j),
-            fetch(visible.normal, k, j),
-            fetch(surfels.radius, b, fetch(visible.index, k, j)),
-            camera,
-        )
-        v = int(disc.low[1])
-        while v <= disc.high[1]:
-            dv = float(v) - disc.v
-            row = image + v * width
-            u = int(disc.low[0])
-            while u <= disc.high[0]:
-                du = float(u) - disc.u
-                inverse = disc.inverse + du * disc.slope_u + dv * disc.slope_v
-                inside = squared_offset(disc, du, dv, inverse) <= disc.rim
-                raise_to(z_buffer, row + u, wp.where(inside, inverse, 0.0))
-                u += 1
-            v += 1
+        left = fetch(discs.left, k, j)
+        right = fetch(discs.right, k, j)
+        row = fetch(discs.top, k, j)
+        bottom = fetch(discs.bottom, k, j)
+        if left <= right and row <= bottom:
+            put(discs.drawn, k, wp.atomic_add(discs.num_drawn, k, 1), j)
+            centre_u = fetch(discs.u, k, j)
+            centre_v = fetch(discs.v, k, j)
+            centre_inverse = fetch(discs.inverse, k, j)
+            slope_u = fetch(discs.slope_u, k, j)
+            slope_v = fetch(discs.slope_v, k, j)
+            rim = fetch(discs.rim, k, j)
+            z = 1.0 / centre_inverse
+            pixel_u = z / camera.focal[0]
+            pixel_v = z / camera.focal[1]
+            while row <= bottom:
+                dv = float(row) - centre_v
+                u = int(left)
+                while u <= right:
+                    du = float(u) - centre_u
+                    offset = du * slope_u + dv * slope_v
+                    squared = squared_offset(du * pixel_u, dv * pixel_v, z, offset)
+                    inverse = wp.where(squared <= rim, centre_inverse + offset, 0.0)
+                    raise_to(z_buffer, image + row * width + u, inverse)
+                    u += 1
+                row += 1
         j += workers
 
 
@@ -227,6 +133,7 @@ def splat_attributes(
     first_env: int,
     camera: SplatCamera,
     workers: int,
+    discs: Discs,
     z_buffer: wp.array(dtype=wp.float32),
     sums: wp.array(dtype=Sums),
 ) -> None:
@@ -238,35 +145,47 @@ def splat_attributes(
     b = first_env + k
     width = camera.width
     image = k * camera.height * width
-    count = visible.count[k]
-    j = int(worker)
-    while j < count:
+    count = discs.num_drawn[k]
+    d = int(worker)
+    while d < count:
+        j = fetch(discs.drawn, k, d)
+        left = fetch(discs.left, k, j)
+        right = fetch(discs.right, k, j)
+        row = fetch(discs.top, k, j)
+        bottom = fetch(discs.bottom, k, j)
+        centre_u = fetch(discs.u, k, j)
+        centre_v = fetch(discs.v, k, j)
+        centre_inverse = fetch(discs.inverse, k, j)
+        slope_u = fetch(discs.slope_u, k, j)
+        slope_v = fetch(discs.slope_v, k, j)
+        per_rim = 1.0 / fetch(discs.rim, k, j)
         n = fetch(visible.normal, k, j)
         i = fetch(visible.index, k, j)
-        disc = project_disc(fetch(visible.position, k, j), n, fetch(surfels.radius, b, i), camera)
         color = fetch(surfels.color, b, i)
         confidence = wp.min(fetch(surfels.confidence, b, i), camera.max_weight)
-        inverse_rim = 1.0 / disc.rim
+        z = 1.0 / centre_inverse
+        pixel_u = z / camera.focal[0]
+        pixel_v = z / camera.focal[1]
         # Same surface: z < front + tolerance. To first order in inverse depth.
-        reach = depth_tolerance(camera.tolerance_m, disc.z) * disc.inverse * disc.inverse
-        v = int(disc.low[1])
-        while v <= disc.high[1]:
-            dv = float(v) - disc.v
-            row = image + v * width
-            u = int(disc.low[0])
-            while u <= disc.high[0]:
-                du = float(u) - disc.u
-                inverse = disc.inverse + du * disc.slope_u + dv * disc.slope_v
-                share = squared_offset(disc, du, dv, inverse) * inverse_rim
-                if share <= 1.0 and inverse >= fetch(z_buffer, row + u) - reach:
+        reach = depth_tolerance(camera.tolerance_m, z) * centre_inverse * centre_inverse
+        while row <= bottom:
+            dv = float(row) - centre_v
+            u = int(left)
+            while u <= right:
+                du = float(u) - centre_u
+                offset = du * slope_u + dv * slope_v
+                inverse = centre_inverse + offset
+                share = squared_offset(du * pixel_u, dv * pixel_v, z, offset) * per_rim
+                pixel = image + row * width + u
+                if share <= 1.0 and inverse >= fetch(z_buffer, pixel) - reach:
                     w = confidence * (1.05 - share)
                     sample = Sums(
                         n[0], n[1], n[2], 1.0, color[0], color[1], color[2], 1.0 / inverse
                     )
-                    wp.atomic_add(sums, row + u, w * sample)
+                    wp.atomic_add(sums, pixel, w * sample)
                 u += 1
-            v += 1
-        j += workers
+            row += 1
+        d += workers
 
 
 @wp.kernel
@@ -293,6 +212,7 @@ def list_hidden(
                     hidden.index[k, slot] = visible.index[k, j]
                     hidden.position[k, slot] = p
                     hidden.normal[k, slot] = visible.normal[k, j]
+                    hidden.radius[k, slot] = visible.radius[k, j]
 
 
 @wp.func

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
+from ms_slam_env.slam.surfel.discs import Discs, SplatCamera, project_discs
 from ms_slam_env.slam.surfel.splat import (
-    SplatCamera,
     Sums,
     cull,
     list_hidden,
@@ -64,6 +65,7 @@ class SplatRenderer:
     Args:
         surfels: the maps.
         visible: working list of the surfels in view, shared by all renderers of a map.
+        discs: working memory for such a list, shared likewise.
         envs: number of images rendered at once.
         intrinsics: of the images.
         parameters: how discs are drawn.
@@ -78,6 +80,7 @@ class SplatRenderer:
         self,
         surfels: Surfels,
         visible: VisibleList,
+        discs: Discs,
         envs: int,
         intrinsics: Intrinsics,
         parameters: SplatParameters,
@@ -91,6 +94,7 @@ class SplatRenderer:
         self.camera = splat_camera(intrinsics, parameters)
         self.view = self._new_view()
         self._visible = visible
+        self._discs = discs
         pixels = envs * intrinsics.width * intrinsics.height
         self._z_buffer = wp.zeros(pixels, dtype=wp.float32, device=device)
         self._sums = wp.zeros(pixels, dtype=Sums, device=device)
@@ -109,7 +113,9 @@ class SplatRenderer:
             device=device,
             record_cmd=True,
         )
+        self._cull_arguments: tuple[int | None, wp.array | None, float | None] = (None, None, None)
         self._splats = {id(visible): self._record_splats(surfels, visible)}
+        self._first_env = {id(visible): 0}
         self._surfels = surfels
         self._resolve = wp.launch(
             resolve,
@@ -135,26 +141,31 @@ class SplatRenderer:
             color=wp.zeros(shape, dtype=wp.vec3, device=self.device),
         )
 
-    def _record_splats(self, surfels: Surfels, listed: VisibleList) -> tuple[wp.Launch, wp.Launch]:
-        """The two passes over the surfels of a list."""
-        dim = (self.envs, self.workers)
-        shared = [surfels, listed, 0, self.camera, self.workers, self._z_buffer]
-        depth = wp.launch(splat_depth, dim=dim, inputs=shared, device=self.device, record_cmd=True)
-        attributes = wp.launch(
-            splat_attributes,
-            dim=dim,
-            inputs=[*shared, self._sums],
-            device=self.device,
-            record_cmd=True,
+    def _record_splats(
+        self, surfels: Surfels, listed: VisibleList
+    ) -> tuple[wp.Launch, wp.Launch, wp.Launch]:
+        """The three passes over the surfels of a list."""
+        camera, workers, discs, z_buffer = self.camera, self.workers, self._discs, self._z_buffer
+
+        def record(kernel: Any, inputs: list[Any]) -> wp.Launch:
+            dim = (self.envs, workers)
+            return wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, record_cmd=True)
+
+        shared = [surfels, listed, 0, camera, workers, discs]
+        return (
+            record(project_discs, [listed, camera, workers, discs]),
+            record(splat_depth, [listed, camera, workers, discs, z_buffer]),
+            record(splat_attributes, [*shared, z_buffer, self._sums]),
         )
-        return depth, attributes
 
     def cull(self, poses: wp.array, first_env: int = 0, margin_px: float = 1.0) -> None:
         """List the surfels that the cameras at ``poses`` (envs,) T_world_camera can see."""
         self._visible.count.zero_()
-        self._cull.set_param_at_index(1, first_env)
-        self._cull.set_param_at_index(2, poses)
-        self._cull.set_param_at_index(4, margin_px)
+        changing = (first_env, poses, margin_px)
+        for index, new, old in zip((1, 2, 4), changing, self._cull_arguments, strict=True):
+            if new is not old:
+                self._cull.set_param_at_index(index, new)
+        self._cull_arguments = changing
         self._cull.launch()
 
     def splat(self, first_env: int = 0, listed: VisibleList | None = None) -> ModelView:
@@ -162,11 +173,17 @@ class SplatRenderer:
         listed = self._visible if listed is None else listed
         if id(listed) not in self._splats:
             self._splats[id(listed)] = self._record_splats(self._surfels, listed)
+            self._first_env[id(listed)] = 0
         self._z_buffer.zero_()
         self._sums.zero_()
-        for command in self._splats[id(listed)]:
-            command.set_param_at_index(2, first_env)
-            command.launch()
+        self._discs.num_drawn.zero_()
+        project, depth, attributes = self._splats[id(listed)]
+        if first_env != self._first_env[id(listed)]:
+            attributes.set_param_at_index(2, first_env)
+            self._first_env[id(listed)] = first_env
+        project.launch()
+        depth.launch()
+        attributes.launch()
         self._resolve.launch()
         return self.view
 

@@ -45,6 +45,7 @@ class VisibleList:
     index: wp.array2d(dtype=wp.int32)
     position: wp.array2d(dtype=wp.vec3)
     normal: wp.array2d(dtype=wp.vec3)
+    radius: wp.array2d(dtype=wp.float32)
     count: wp.array(dtype=wp.int32)
 
 
@@ -64,6 +65,7 @@ def allocate_visible(batch: int, capacity: int, device: str) -> VisibleList:
     visible.index = wp.zeros((batch, capacity), dtype=wp.int32, device=device)
     visible.position = wp.zeros((batch, capacity), dtype=wp.vec3, device=device)
     visible.normal = wp.zeros((batch, capacity), dtype=wp.vec3, device=device)
+    visible.radius = wp.zeros((batch, capacity), dtype=wp.float32, device=device)
     visible.count = wp.zeros(batch, dtype=wp.int32, device=device)
     return visible
 

@@ -13,6 +13,7 @@ from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.base import Views
 from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.discs import allocate_discs
 from ms_slam_env.slam.surfel.fusion import (
     FusionParameters,
     add_surfels,
@@ -67,6 +68,7 @@ class SurfelMap:
         self.surfels = allocate_surfels(batch, capacity, device)
         self._spare = allocate_surfels(batch, capacity, device)
         self._visible = allocate_visible(batch, capacity, device)
+        discs = allocate_discs(batch, capacity, device)
         self._survivors = wp.zeros((batch, capacity), dtype=wp.int32, device=device)
         self._kept = wp.zeros(batch, dtype=wp.int32, device=device)
         pixels = batch * intrinsics.width * intrinsics.height
@@ -79,13 +81,14 @@ class SurfelMap:
         self._fusion.max_confidence = config.max_confidence
         parameters = SplatParameters(tolerance_m=config.fusion_distance_m)
         self._renderer = SplatRenderer(
-            self.surfels, self._visible, batch, intrinsics, parameters, self._workers, device
+            self.surfels, self._visible, discs, batch, intrinsics, parameters, self._workers, device
         )
         self._model_renderer = self._renderer
         if model_stride > 1:
             self._model_renderer = SplatRenderer(
                 self.surfels,
                 self._visible,
+                discs,
                 batch,
                 every_nth(intrinsics, model_stride),
                 replace(
@@ -97,8 +100,9 @@ class SurfelMap:
                 device,
             )
         self._predictor = ViewPredictor(
-            self.surfels, self._visible, intrinsics, parameters, self._workers, device
+            self.surfels, self._visible, discs, intrinsics, parameters, self._workers, device
         )
+        self._bound: tuple[Any, ...] = (None,) * 5
         self._record_launches()
 
     def clear(self, env: int | None = None) -> None:
@@ -130,17 +134,27 @@ class SurfelMap:
         self._renderer.cull(poses, margin_px=0.0)
         self._covered.zero_()
         self._kept.zero_()
-        images = (live.depth.flatten(), live.normals.flatten(), live.color.flatten())
-        changing = (poses, mask, time, weight, *images)
-        for command in (self._update, self._add):
-            for name, value in zip(_CHANGING, changing, strict=True):
-                command.set_param_by_name(name, value)
-            command.launch()
-        self._list_survivors.set_param_by_name("mask", mask)
-        self._list_survivors.set_param_by_name("time", time)
+        self._bind(live, poses, time, weight, mask)
+        self._update.launch()
+        self._add.launch()
         self._list_survivors.launch()
         self._gather.launch()
         self._put_back.launch()
+
+    def _bind(
+        self, live: LiveFrame, poses: wp.array, time: wp.array, weight: wp.array, mask: wp.array
+    ) -> None:
+        """Make these the arguments of the recorded launches, if they are not already."""
+        arguments = (live, poses, time, weight, mask)
+        if all(new is old for new, old in zip(arguments, self._bound, strict=True)):
+            return
+        self._bound = arguments
+        images = (live.depth.flatten(), live.normals.flatten(), live.color.flatten())
+        for command in (self._update, self._add):
+            for name, value in zip(_CHANGING, (poses, mask, time, weight, *images), strict=True):
+                command.set_param_by_name(name, value)
+        self._list_survivors.set_param_by_name("mask", mask)
+        self._list_survivors.set_param_by_name("time", time)
 
     def _record_launches(self) -> None:
         """Record the launches of ``fuse``; what changes with the frame is set there."""

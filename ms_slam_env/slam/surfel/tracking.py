@@ -8,6 +8,7 @@ one that explains the frame best goes on. Nothing waits for the device before th
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -299,12 +300,10 @@ class Tracker:
             accumulate,
             (*state.pose.shape, rows, slots // rows),
             [
-                model.vertices,
-                model.normals,
-                model.intensity,
-                live.vertices,
-                live.normals,
-                live.gradient,
+                *_flat(model.vertices, model.normals, model.intensity),
+                *_flat(live.vertices, live.normals, live.gradient),
+                wp.vec2i(width, height),
+                wp.vec2i(camera.width, camera.height),
                 wp.vec2(camera.fx, camera.fy),
                 wp.vec2(camera.cx, camera.cy),
                 self._weights[level],
@@ -335,6 +334,11 @@ class Tracker:
                 [state.sums, DAMPING, smallest, int(last)],
                 [state.pose, state.active],
             )
+
+
+def _flat(*images: Any) -> list[Any]:
+    """One-dimensional views of device arrays."""
+    return [image.flatten() for image in images]
 
 
 def _weights(config: SurfelConfig, level: int) -> Weights:
