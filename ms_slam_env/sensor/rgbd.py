@@ -44,6 +44,9 @@ class TrueView:
     points: NDArray[np.float32]
 
 
+_BATCH_SIZES_KEPT = 8  # buffers for one image of 160x120 take half a megabyte
+
+
 class _OfThread(threading.local):
     """What each thread has of a sensor for itself."""
 
@@ -190,7 +193,10 @@ class RGBDSensor:
                     self.scene.exposure,
                     self.device,
                 )
-            self._of_thread.images[batch] = images
+            kept = self._of_thread.images
+            if len(kept) == _BATCH_SIZES_KEPT:
+                kept.pop(next(iter(kept)))
+            kept[batch] = images
         return images
 
 

@@ -9,9 +9,10 @@ from box_scene import BoxScene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics, xtion
 from ms_slam_env.errors import InputError
-from ms_slam_env.sensor import RGBDSensor, images
+from ms_slam_env.sensor import RGBDSensor, depth_noise, images, rays, shading
 
 K = xtion("80x60")
 
@@ -75,6 +76,25 @@ def test_vectorised_rows_equal_single_pixels(box_scene: BoxScene, monkeypatch, s
         with monkeypatch.context() as patch:
             patch.setattr(images, "span_of", lambda width, device: 1)
             assert same(pixels.capture(T, seed), expected)
+
+
+def test_kernels_compile_for_cuda(tmp_path) -> None:
+    """Into PTX, which needs no GPU; Embree's packets are for the CPU alone."""
+    if not wp.get_cuda_supported_archs():
+        pytest.skip("this build of Warp has no CUDA compiler")
+    for module in (shading, depth_noise, rays):
+        wp.compile_aot_module(module, module_dir=tmp_path, arch=80, use_ptx=True)
+    assert len(list(tmp_path.glob("*.ptx"))) == 3
+
+
+def test_many_batch_sizes_keep_few_buffers(box_scene: BoxScene, pose) -> None:
+    sensor = RGBDSensor(box_scene, K)
+    first = sensor.capture(pose, 0)
+    for size in range(1, 12):
+        frames = sensor.capture_batch(np.tile(pose, (size, 1, 1)), range(size))
+        assert same(frames[0], first)
+    assert len(sensor._of_thread.images) == 8
+    assert same(sensor.capture(pose, 0), first)
 
 
 def test_frames_do_not_share_memory(sensor: RGBDSensor, pose) -> None:
