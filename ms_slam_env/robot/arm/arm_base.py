@@ -73,7 +73,7 @@ class ArmEmbodiment(Embodiment):
         Raises:
             UnreachableError: it cannot be held there; the message says why.
         """
-        T_world_base, q = place_arm(self.model, self.scene, T_world_camera, self.config, rng)
+        T_world_base, q = place_arm(self.model, self.scene, T_world_camera, self.config)
         self.stand_at(T_world_base)
         self.start_at(q, rng)
 

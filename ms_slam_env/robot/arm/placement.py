@@ -50,7 +50,6 @@ def place_arm(
     scene: Scene,
     T_world_camera: Float64,
     config: ArmConfig,
-    rng: np.random.Generator,
 ) -> tuple[Float64, Float64]:
     """Find base pose T_world_base (4, 4) and joint angles (n,) that hold the camera at a pose.
 
