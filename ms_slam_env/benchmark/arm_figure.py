@@ -16,13 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import scenes
-from ms_slam_env.benchmark.arm_mesh import LABEL, arm_parts, column_parts, scene_with
+from ms_slam_env.benchmark.arm_mesh import (
+    LABEL,
+    arm_parts,
+    column_parts,
+    floor_below,
+    scene_with,
+)
 from ms_slam_env.benchmark.command_line import exit_code, parse
 from ms_slam_env.camera import Intrinsics, xtion
 from ms_slam_env.config import check_range
 from ms_slam_env.env.config import EnvConfig
 from ms_slam_env.errors import InputError, UnreachableError
-from ms_slam_env.geometry import look_at, make_pose
+from ms_slam_env.geometry import look_at
 from ms_slam_env.robot.arm import ArmConfig
 from ms_slam_env.robot.arm.kinematic_arm import KinematicArm
 from ms_slam_env.scenes import Scene
@@ -99,15 +105,6 @@ def pictures(scene: Scene, arm: KinematicArm, width: int) -> tuple[Image, Image,
     ]
     camera = RGBDSensor(scene, xtion("640x480"), noise="none").ground_truth(arm.T_world_camera)
     return outside[0], outside[1], _shrunk(camera.color, width)
-
-
-def floor_below(scene: Scene, point: Float64) -> float:
-    """Height of the surface under a point (3,); the point's own where there is none."""
-    camera = Intrinsics(fx=1, fy=1, cx=0, cy=0, width=1, height=1)
-    start = point + np.array([0, 0, 0.01])
-    down = make_pose(np.diag([1.0, -1.0, -1.0]), start)
-    depth = float(RGBDSensor(scene, camera, noise="none").ground_truth(down).depth[0, 0])
-    return float(start[2] - depth) if depth > 0 else float(point[2])
 
 
 def _view(scene: Scene, shown: Scene, target: Float64, distance: float, width: int) -> Image:

@@ -10,9 +10,12 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.geometry import make_pose
 from ms_slam_env.robot.arm import ArmModel
 from ms_slam_env.robot.arm.placement import COLUMN_RADIUS_M
 from ms_slam_env.scenes import Scene, TexturedMesh
+from ms_slam_env.sensor import RGBDSensor
 
 Float64 = NDArray[np.float64]
 
@@ -58,7 +61,7 @@ def arm_parts(model: ArmModel, q: Float64, T_world_base: Float64) -> list[Part]:
         T_base_geom[:3, :3] = data.geom_xmat[geom].reshape(3, 3)
         T_base_geom[:3, 3] = data.geom_xpos[geom]
         r, g, b = map(float, rgba[:3])
-        parts.append(_part(solid_of(mj, geom), T_world_base @ T_base_geom, (r, g, b)))
+        parts.append(_part(_solid(mj, geom), T_world_base @ T_base_geom, (r, g, b)))
     return parts
 
 
@@ -74,6 +77,15 @@ def column_parts(base: Float64, floor_z: float) -> list[Part]:
         T[:3, 3] = [base[0], base[1], floor_z + 0.5 * length]
         parts.append(_part(solid, T, _COLUMN_RGB))
     return parts
+
+
+def floor_below(scene: Scene, point: Float64) -> float:
+    """Height of the surface under a point (3,); the point's own where there is none."""
+    camera = Intrinsics(fx=1, fy=1, cx=0, cy=0, width=1, height=1)
+    start = point + np.array([0, 0, 0.01])
+    down = make_pose(np.diag([1.0, -1.0, -1.0]), start)
+    depth = float(RGBDSensor(scene, camera, noise="none").ground_truth(down).depth[0, 0])
+    return float(start[2] - depth) if depth > 0 else float(point[2])
 
 
 def scene_with(scene: Scene, parts: list[Part]) -> Scene:
@@ -116,7 +128,7 @@ def scene_with(scene: Scene, parts: list[Part]) -> Scene:
     return seen
 
 
-def solid_of(mj: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
+def _solid(mj: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
     """A geom's surface in its own frame."""
     kind, size = int(mj.geom_type[geom]), mj.geom_size[geom]
     types = mujoco.mjtGeom

@@ -8,37 +8,57 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ms_slam_env.benchmark.arm_mesh import solid_of
-from ms_slam_env.geometry import transform_points
+from ms_slam_env.geometry import invert, transform_points
 from ms_slam_env.robot.arm import ArmModel
 from ms_slam_env.scenes import Scene
 
 Float64 = NDArray[np.float64]
 
-FAR_M = 0.15
+FAR_M = 0.1
 """Gaps are exact up to this; what is farther away counts as this far."""
 
-_SURFACE_SPACING_M = 0.005  # a gap of 2 cm comes out at most 0.3 mm too large
-_AXIS_SPACING_M = 0.01  # of balls along the axis of a capsule
-_FLAT_SPACING_M = 0.006  # of points on boxes, cylinders and the like
-_ROUND = (int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_SPHERE))
+_SPACING_M = 0.005  # of a cloud's points: a gap of 2 cm comes out at most 0.3 mm too large
+_CELL_M = 0.04  # of the coarse cloud
+_CAPSULE = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
+_CYLINDER = int(mujoco.mjtGeom.mjGEOM_CYLINDER)
+_BALL = int(mujoco.mjtGeom.mjGEOM_SPHERE)
+_ELLIPSOID = int(mujoco.mjtGeom.mjGEOM_ELLIPSOID)
 
 
-class Furniture:
-    """The true surface of a scene as a searchable cloud of points."""
+class Cloud:
+    """Points (N, 3) of a surface, 5 mm apart, to be found by place."""
 
-    def __init__(self, scene: Scene) -> None:
-        points, _ = scene.surface_points(_SURFACE_SPACING_M)
-        self._tree = cKDTree(points)
+    def __init__(self, points: Float64) -> None:
+        self._points = np.asarray(points, dtype=np.float64)
+        self._tree = cKDTree(self._points)
+        cells = np.unique(np.floor(self._points / _CELL_M).astype(np.int64), axis=0)
+        self._coarse = cKDTree((cells + 0.5) * _CELL_M)
 
-    def distance(self, points: Float64) -> Float64:
-        """Distance (N,) of points (N, 3) to the surface, at most ``FAR_M``."""
-        found, _ = self._tree.query(points, distance_upper_bound=FAR_M)
-        return np.minimum(found, FAR_M)
+    def at_least(self, places: Float64) -> Float64:
+        """A lower bound (n,) of the distance between places (n, 3) and the surface."""
+        return np.asarray(self._coarse.query(places)[0] - 0.5 * np.sqrt(3) * _CELL_M)
+
+    def around(self, place: Float64, radius: float) -> Float64:
+        """The points (k, 3) within ``radius`` of a place (3,)."""
+        return self._points[self._tree.query_ball_point(place, radius)]
+
+
+def furniture_cloud(scene: Scene) -> Cloud:
+    """The true surface of a scene."""
+    return Cloud(scene.surface_points(_SPACING_M)[0])
+
+
+def column_cloud(radius: float, depth: float) -> Cloud:
+    """The column under an arm's base at the origin: round top at the base's plane, to a depth."""
+    angles = np.arange(0, 2 * np.pi, _SPACING_M / radius)
+    ring = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1)
+    tilts = np.arange(0, np.pi / 2, _SPACING_M / radius)
+    dome = [radius * (np.sin(t) * ring + [0, 0, np.cos(t) - 1]) for t in tilts]
+    wall = [radius * ring + [0, 0, z] for z in np.arange(-radius, -depth, -_SPACING_M)]
+    return Cloud(np.concatenate(dome + wall))
 
 
 class ArmTruth:
@@ -46,102 +66,108 @@ class ArmTruth:
 
     Args:
         model: the arm.
-        furniture: around it.
+        furniture: around it, in the world.
         T_world_base: (4, 4) where it stands.
-        column: radius and depth below the base, metres, of the column it stands on; None without.
+        column: under it, in the frame of the base; None without.
     """
 
     def __init__(
         self,
         model: ArmModel,
-        furniture: Furniture,
+        furniture: Cloud,
         T_world_base: Float64,
-        column: tuple[float, float] | None = None,
+        column: Cloud | None = None,
     ) -> None:
         self._mj, self._qpos = model.mj, model.qpos
-        self._furniture = furniture
+        self._furniture, self._column = furniture, column
         self._T_world_base = np.array(T_world_base, dtype=np.float64)
-        self._column = column
         self._data = mujoco.MjData(model.mj)
-        moved = set(_bodies_below(model.mj, model.mj.jnt_bodyid[0]))
-        geoms = [
+        moved = set(_bodies_below(model.mj, int(model.mj.jnt_bodyid[0])))
+        self._geoms = [
             geom
             for geom in range(model.mj.ngeom)
-            if model.mj.geom_bodyid[geom] in moved
+            if int(model.mj.geom_bodyid[geom]) in moved
             and (model.mj.geom_contype[geom] or model.mj.geom_conaffinity[geom])
         ]
-        self._geoms = np.array(geoms)
-        sampled = [_samples(model.mj, geom) for geom in geoms]
-        self._index = np.repeat(np.arange(len(geoms)), [len(points) for points, _ in sampled])
-        self._points = np.concatenate([points for points, _ in sampled])
-        self._radius = np.concatenate([np.full(len(p), r) for p, r in sampled])
 
     def gaps(self, q: Float64) -> Float64:
         """Smallest gap (k,) between moving links and furniture at joint angles (k, n), metres.
 
-        Negative by less than a link's radius where they touch. For shapes other than capsules and
-        balls it is up to 3 mm too small.
+        Not positive where they touch.
         """
         result = np.empty(len(q))
         for i, one in enumerate(q):
-            points = transform_points(self._T_world_base, self._place(one))
-            centres = self._data.geom_xpos[self._geoms]
-            world = transform_points(self._T_world_base, centres)
-            at_least = self._furniture.distance(world) - self._mj.geom_rbound[self._geoms]
-            gap = FAR_M
-            for geom in np.argsort(at_least):
-                if at_least[geom] >= gap:
-                    break
-                own = self._index == geom
-                gap = min(gap, (self._furniture.distance(points[own]) - self._radius[own]).min())
-            result[i] = gap
+            self._place(one)
+            result[i] = self._gap(self._furniture, self._T_world_base)
         return result
 
     def touches_itself(self, q: Float64) -> NDArray[np.bool_]:
         """(k,) whether links touch each other or the column at joint angles (k, n)."""
         result = np.zeros(len(q), dtype=bool)
-        for index, one in enumerate(q):
-            points = self._place(one)
+        for i, one in enumerate(q):
+            self._place(one)
             mujoco.mj_collision(self._mj, self._data)
-            contacts = self._data.contact.dist[: self._data.ncon]
-            result[index] = bool((contacts < 0).any()) or self._touches_column(points)
+            result[i] = (self._data.contact.dist[: self._data.ncon] < 0).any()
+            if self._column is not None and not result[i]:
+                result[i] = self._gap(self._column, np.eye(4)) <= 0
         return result
 
-    def _touches_column(self, points: Float64) -> bool:
-        if self._column is None:
-            return False
-        radius, depth = self._column
-        nearest = np.clip(points[:, 2], -depth, -radius)
-        gap = np.hypot(np.hypot(points[:, 0], points[:, 1]), points[:, 2] - nearest) - radius
-        return bool((gap < self._radius).any())
+    def _gap(self, cloud: Cloud, T_cloud_base: Float64) -> float:
+        data, mj = self._data, self._mj
+        centres = transform_points(T_cloud_base, data.geom_xpos[self._geoms])
+        reach = mj.geom_rbound[self._geoms]
+        at_least = cloud.at_least(centres) - reach
+        gap = FAR_M
+        for k in np.argsort(at_least):
+            if at_least[k] >= gap:
+                break
+            near = cloud.around(centres[k], reach[k] + gap)
+            if len(near) == 0:
+                continue
+            geom = self._geoms[k]
+            T_base_geom = np.eye(4)
+            T_base_geom[:3, :3] = data.geom_xmat[geom].reshape(3, 3)
+            T_base_geom[:3, 3] = data.geom_xpos[geom]
+            local = transform_points(invert(T_cloud_base @ T_base_geom), near)
+            gap = min(gap, float(signed_distance(mj, geom, local).min()))
+        return gap
 
-    def _place(self, q: Float64) -> Float64:
-        """Sample points (N, 3) in the base's frame."""
+    def _place(self, q: Float64) -> None:
         self._data.qpos[:] = self._mj.qpos0
         self._data.qpos[self._qpos] = q
         mujoco.mj_kinematics(self._mj, self._data)
-        geom = self._geoms[self._index]
-        R = self._data.geom_xmat.reshape(-1, 3, 3)[geom]
-        return np.einsum("nij,nj->ni", R, self._points) + self._data.geom_xpos[geom]
+
+
+def signed_distance(mj: mujoco.MjModel, geom: int, points: Float64) -> Float64:
+    """Distance (N,) from points (N, 3) of a geom's frame to its surface, negative inside.
+
+    Exact for balls, capsules, cylinders and boxes; for ellipsoids only near them; meshes by their
+    bounding box.
+    """
+    kind, size = int(mj.geom_type[geom]), mj.geom_size[geom]
+    if kind == _BALL:
+        return np.asarray(np.linalg.norm(points, axis=1) - size[0])
+    if kind == _CAPSULE:
+        beyond = points.copy()
+        beyond[:, 2] -= np.clip(points[:, 2], -size[1], size[1])
+        return np.asarray(np.linalg.norm(beyond, axis=1) - size[0])
+    if kind == _ELLIPSOID:
+        scaled = np.linalg.norm(points / size, axis=1)
+        slope = np.linalg.norm(points / size**2, axis=1)
+        return np.asarray(scaled * (scaled - 1) / np.maximum(slope, 1e-12))
+    if kind == _CYLINDER:
+        across = np.hypot(points[:, 0], points[:, 1]) - size[0]
+        outside = np.stack([across, np.abs(points[:, 2]) - size[1]], axis=1)
+    else:
+        box = mj.geom_aabb[geom]
+        outside = np.abs(points - box[:3]) - box[3:]
+    away = np.linalg.norm(np.maximum(outside, 0), axis=1)
+    return np.asarray(away + np.minimum(outside.max(axis=1), 0))
 
 
 def _bodies_below(mj: mujoco.MjModel, top: int) -> list[int]:
-    found = [int(top)]
-    for body in range(int(top) + 1, mj.nbody):  # parents come first
+    found = [top]
+    for body in range(top + 1, mj.nbody):  # parents come first
         if int(mj.body_parentid[body]) in found:
             found.append(body)
     return found
-
-
-def _samples(mj: mujoco.MjModel, geom: int) -> tuple[Float64, float]:
-    """Points (N, 3) in a geom's frame and a radius; balls around them cover the geom's surface."""
-    kind, size = int(mj.geom_type[geom]), mj.geom_size[geom]
-    if kind in _ROUND:
-        half = float(size[1]) if kind == _ROUND[0] else 0.0
-        count = int(np.ceil(2 * half / _AXIS_SPACING_M)) + 1
-        points = np.zeros((count, 3))
-        points[:, 2] = np.linspace(-half, half, count)
-        return points, float(size[0])
-    solid = solid_of(mj, geom)
-    vertices, _ = trimesh.remesh.subdivide_to_size(solid.vertices, solid.faces, _FLAT_SPACING_M)
-    return np.unique(np.round(vertices, 6), axis=0), 0.5 * _FLAT_SPACING_M

@@ -5,17 +5,24 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from ms_slam_env.benchmark.arm_truth import FAR_M, ArmTruth, Furniture
+from ms_slam_env.benchmark.arm_truth import (
+    ArmTruth,
+    Cloud,
+    column_cloud,
+    furniture_cloud,
+    signed_distance,
+)
 from ms_slam_env.geometry import make_pose
 from ms_slam_env.robot.arm import load_arm
 from ms_slam_env.robot.arm.chain import segment_distance
 
 CAPSULE = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
+NOWHERE = Cloud(np.full((1, 3), 1e3))
 
 
 @pytest.fixture(scope="module")
 def furniture(box_scene):
-    return Furniture(box_scene)
+    return furniture_cloud(box_scene)
 
 
 def floor_of(scene):
@@ -23,23 +30,31 @@ def floor_of(scene):
 
 
 def free_corner(scene, furniture):
-    """A place above free floor, at least FAR_M from everything else."""
+    """A place above free floor, far from everything else."""
     points, _ = scene.surface_points(0.05)
     low, high = points.min(axis=0) + 0.5, points.max(axis=0) - 0.5
     rng = np.random.default_rng(0)
     while True:
         place = rng.uniform(low, high)
-        column = np.tile(place, (20, 1))
-        column[:, 2] = np.linspace(floor_of(scene) + 1.2 * FAR_M, high[2], 20)
-        if furniture.distance(column).min() >= FAR_M:
+        above = np.tile(place, (20, 1))
+        above[:, 2] = np.linspace(floor_of(scene) + 0.3, high[2], 20)
+        if furniture.at_least(above).min() > 0.2:
             return place
 
 
-def test_distance_to_the_floor(box_scene, furniture):
-    place = free_corner(box_scene, furniture)
-    for height in (0.001, 0.02, 0.05, 0.14):
-        point = np.array([[place[0], place[1], floor_of(box_scene) + height]])
-        assert_allclose(furniture.distance(point), height, atol=0.004 if height < 0.01 else 0.0007)
+def test_cloud_finds_what_is_near():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1, 1, (3000, 3))
+    cloud = Cloud(points)
+    places = rng.uniform(-1.5, 1.5, (50, 3))
+    distance = np.linalg.norm(points - places[:, None], axis=2)
+    bound = cloud.at_least(places)
+    assert (bound <= distance.min(axis=1)).all()
+    assert (bound > distance.min(axis=1) - 0.08).all()
+    for place, row in zip(places, distance, strict=True):
+        near = cloud.around(place, 0.3)
+        assert len(near) == (row <= 0.3).sum()
+        assert (np.linalg.norm(near - place, axis=1) <= 0.3).all()
 
 
 ONE_LINK = """<mujoco><worldbody><body name="b" pos="0 0 0.5">
@@ -63,11 +78,12 @@ def test_gap_of_a_link_that_hangs_over_the_floor(box_scene, furniture, tmp_path,
     path.write_text(ONE_LINK.format(geom=geom))
     arm = load_arm(str(path))
     place = free_corner(box_scene, furniture)
-    for expected in (0.03, 0.1):
+    for expected in (0.02, 0.09):
         base = [place[0], place[1], floor_of(box_scene) + below - 0.5 + expected]
         truth = ArmTruth(arm, furniture, make_pose(np.eye(3), base))
         hanging = np.array([[np.pi / 2]])
-        assert_allclose(truth.gaps(hanging), expected, atol=0.0035)
+        [gap] = truth.gaps(hanging)
+        assert gap == pytest.approx(expected, abs=0.0005) or ("ellipsoid" in geom and gap > 0)
     sunk = make_pose(np.eye(3), np.array(base) - [0, 0, expected + 0.01])
     assert ArmTruth(arm, furniture, sunk).gaps(hanging)[0] < 0
 
@@ -75,7 +91,7 @@ def test_gap_of_a_link_that_hangs_over_the_floor(box_scene, furniture, tmp_path,
 def test_self_contact_is_that_of_the_capsules():
     """All colliding geoms of the Mico but the camera are capsules: distances are closed form."""
     arm = load_arm("mico")
-    truth = ArmTruth(arm, Furniture.__new__(Furniture), np.eye(4))
+    truth = ArmTruth(arm, NOWHERE, np.eye(4))
     rng = np.random.default_rng(2)
     q = rng.uniform(arm.chain.lower, arm.chain.upper, (300, 6))
     found = truth.touches_itself(q)
@@ -105,16 +121,51 @@ def test_self_contact_is_that_of_the_capsules():
     assert not found[~expected & ~unsure].any()
 
 
+SHAPES = {
+    "sphere": "0.05",
+    "capsule": "0.03 0.1",
+    "cylinder": "0.04 0.07",
+    "box": "0.05 0.02 0.08",
+}
+
+
+@pytest.mark.parametrize("kind", SHAPES)
+def test_signed_distance_is_mujocos(kind):
+    """MuJoCo measures from a tiny ball."""
+    mj = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><worldbody><geom type="{kind}" size="{SHAPES[kind]}"/>
+        <body name="probe" mocap="true"><geom type="sphere" size="1e-4"/></body>
+        </worldbody></mujoco>"""
+    )
+    data = mujoco.MjData(mj)
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.2, 0.2, (200, 3))
+    found = signed_distance(mj, 0, points)
+    expected = np.empty(len(points))
+    for i, point in enumerate(points):
+        data.mocap_pos[0] = point
+        mujoco.mj_kinematics(mj, data)
+        expected[i] = mujoco.mj_geomDistance(mj, data, 0, 1, 1.0, None) + 1e-4
+    outside = found > 0.001
+    assert outside.sum() > 100
+    assert_allclose(found[outside], expected[outside], atol=1e-5)
+    assert (expected[~outside] < 0.0012).all()
+
+
 def test_column_is_touched_from_the_side():
     arm = load_arm("mico")
-    truth = ArmTruth(arm, Furniture.__new__(Furniture), np.eye(4), column=(0.08, 0.7))
-    without = ArmTruth(arm, Furniture.__new__(Furniture), np.eye(4))
+    truth = ArmTruth(arm, NOWHERE, np.eye(4), column_cloud(0.08, 0.7))
+    without = ArmTruth(arm, NOWHERE, np.eye(4))
     rng = np.random.default_rng(3)
-    q = rng.uniform(arm.chain.lower, arm.chain.upper, (300, 6))
+    q = rng.uniform(arm.chain.lower, arm.chain.upper, (200, 6))
     only_column = truth.touches_itself(q) & ~without.touches_itself(q)
     assert only_column.any()
     ends, radius = arm.chain.capsules(q), arm.chain.capsule_radius
     column = np.array([[0, 0, -0.08], [0, 0, -0.7]])
-    near = segment_distance(ends, column) < radius + 0.08
-    near[:, arm.chain.capsule_link == 0] = False
-    assert near.any(axis=1)[only_column].all()
+    gap = segment_distance(ends, column) - radius - 0.08
+    gap[:, arm.chain.capsule_link == 0] = 1
+    assert (gap.min(axis=1)[only_column] < 0).all()
+    capsule = np.flatnonzero(arm.mj.geom_contype)
+    round_only = arm.mj.geom_type[capsule] == CAPSULE
+    surely = gap[:, round_only].min(axis=1) < -0.001
+    assert truth.touches_itself(q)[surely].all()
