@@ -8,8 +8,6 @@ noise of a structured-light sensor is uniform in it.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,6 +16,7 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.launches import Launches
 from ms_slam_env.slam.surfel.memory import fetch, put
+from ms_slam_env.slam.surfel.mirror import Mirror
 from ms_slam_env.slam.surfel.types import LiveFrame
 
 
@@ -204,14 +203,6 @@ def _surface(
             i += 1
 
 
-def copy_in(target: wp.array, values: NDArray[Any]) -> None:
-    """Copy values of the same shape into an array; ``assign`` costs four times as much on a CPU."""
-    if target.device is not None and target.device.is_cpu:
-        np.copyto(target.numpy(), values)
-    else:
-        target.assign(values)
-
-
 class Preprocessor:
     """Owns the device buffers of the live frames and fills them."""
 
@@ -223,10 +214,11 @@ class Preprocessor:
         self.config = config
         self.device = device
         shape = (batch, *intrinsics.shape)
-        self._raw_color = wp.zeros((*shape, 3), dtype=wp.uint8, device=device)
+        self._raw_color = Mirror((*shape, 3), wp.uint8, device)
+        self._raw_depth = Mirror(shape, wp.float32, device)
         self._inverse_depth = wp.zeros(shape, dtype=wp.float32, device=device)
         self.frame = LiveFrame(
-            raw_depth=wp.zeros(shape, dtype=wp.float32, device=device),
+            raw_depth=self._raw_depth.array,
             depth=wp.zeros(shape, dtype=wp.float32, device=device),
             vertices=wp.zeros(shape, dtype=wp.vec3, device=device),
             normals=wp.zeros(shape, dtype=wp.vec3, device=device),
@@ -252,8 +244,8 @@ class Preprocessor:
         The frame's buffers are those of the last call.
         """
         frame = self.frame
-        copy_in(self._raw_color, color)
-        copy_in(frame.raw_depth, depth)
+        self._raw_color.write(color)
+        self._raw_depth.write(depth)
         if not self._launches.replay("convert"):
             self._record()
             return frame
@@ -272,7 +264,7 @@ class Preprocessor:
             dim,
             [
                 frame.raw_depth.flatten(),
-                self._raw_color.flatten(),
+                self._raw_color.array.flatten(),
                 config.depth_cutoff_m,
                 *size[1:],
             ],

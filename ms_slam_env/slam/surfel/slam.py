@@ -21,7 +21,8 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose, invert
 from ms_slam_env.slam.base import Float64, TrackResult
 from ms_slam_env.slam.surfel.config import SurfelConfig
-from ms_slam_env.slam.surfel.preprocess import Preprocessor, copy_in
+from ms_slam_env.slam.surfel.mirror import Mirror
+from ms_slam_env.slam.surfel.preprocess import Preprocessor
 from ms_slam_env.slam.surfel.seeds import NUM_SEEDS, relocalisation_seeds, tracking_seeds
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.tracking import Alignment, Tracker, model_stride
@@ -53,10 +54,10 @@ class BatchedSurfelSlam:
         stride = model_stride(intrinsics, config)
         self.tracker = Tracker(batch, NUM_SEEDS, intrinsics, config, device, stride)
         self.map = SurfelMap(batch, intrinsics, config, device, stride)
-        self._device_poses = wp.zeros(batch, dtype=wp.mat44, device=device)
-        self._device_time = wp.zeros(batch, dtype=wp.int32, device=device)
-        self._device_weight = wp.zeros(batch, dtype=wp.float32, device=device)
-        self._device_mask = wp.zeros(batch, dtype=wp.int32, device=device)
+        self._device_poses = Mirror(batch, wp.mat44, device)
+        self._device_time = Mirror(batch, wp.int32, device)
+        self._device_weight = Mirror(batch, wp.float32, device)
+        self._device_mask = Mirror(batch, wp.int32, device)
         self.poses: Float64 = np.tile(np.eye(4), (batch, 1, 1))
         self._motions: Float64 = np.tile(np.eye(4), (batch, 1, 1))
         self._started = np.zeros(batch, dtype=bool)
@@ -251,12 +252,16 @@ class BatchedSurfelSlam:
         if not good.any():
             self._time += 1
             return
-        copy_in(self._device_poses, self.poses)
-        copy_in(self._device_time, self._time)
-        copy_in(self._device_weight, motion_weight(self._motions))
-        copy_in(self._device_mask, good)
+        self._device_poses.write(self.poses)
+        self._device_time.write(self._time)
+        self._device_weight.write(motion_weight(self._motions))
+        self._device_mask.write(good)
         self.map.fuse(
-            live, self._device_poses, self._device_time, self._device_weight, self._device_mask
+            live,
+            self._device_poses.array,
+            self._device_time.array,
+            self._device_weight.array,
+            self._device_mask.array,
         )
         self._time += 1
         self._view_poses = None
@@ -264,8 +269,8 @@ class BatchedSurfelSlam:
     def _render(self, poses: Float64) -> ModelView:
         """Render the maps from ``poses`` (B, 4, 4), unless that view is at hand."""
         if self._view_poses is None or not np.array_equal(self._view_poses, poses):
-            copy_in(self._device_poses, poses)
-            self._view = self.map.render_model(self._device_poses)
+            self._device_poses.write(poses)
+            self._view = self.map.render_model(self._device_poses.array)
             self._view_poses = poses.copy()
         return self._view
 

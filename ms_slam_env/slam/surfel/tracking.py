@@ -18,6 +18,7 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.launches import Launches
+from ms_slam_env.slam.surfel.mirror import Mirror
 from ms_slam_env.slam.surfel.normal_equations import (
     NUM_SUMS,
     OFF,
@@ -25,7 +26,6 @@ from ms_slam_env.slam.surfel.normal_equations import (
     Weights,
     accumulate,
 )
-from ms_slam_env.slam.surfel.preprocess import copy_in
 from ms_slam_env.slam.surfel.pyramid import Level, Pyramid
 from ms_slam_env.slam.surfel.solve import gauss_newton_step, reduce_sums
 from ms_slam_env.slam.surfel.types import LiveFrame, ModelView
@@ -95,8 +95,9 @@ class _Hypotheses:
     """Device buffers of K poses per env: pose, state, sums and partial sums."""
 
     def __init__(self, batch: int, k: int, slots: int, device: str) -> None:
-        self.pose = wp.zeros((batch, k), dtype=wp.mat44d, device=device)
-        self.active = wp.zeros((batch, k), dtype=wp.int32, device=device)
+        self.poses = Mirror((batch, k), wp.mat44d, device)
+        self.states = Mirror((batch, k), wp.int32, device)
+        self.pose, self.active = self.poses.array, self.states.array
         self.sums = wp.zeros((batch, k, NUM_SUMS), dtype=wp.float64, device=device)
         self.partial = wp.zeros((batch, k, slots, NUM_SUMS), dtype=wp.float32, device=device)
         is_cpu = wp.get_device(device).is_cpu
@@ -150,11 +151,11 @@ class Tracker:
         self._launches = Launches(device)
         self._seen: tuple[LiveFrame | None, ModelView | None] = (None, None)
         self.good_score = GOOD_SCORE
-        self._limits = wp.zeros(batch, dtype=Limits, device=device)
-        self._T_world_model = wp.zeros(batch, dtype=wp.mat44d, device=device)
-        self._T_world_live = wp.zeros(batch, dtype=wp.mat44d, device=device)
-        self.verdict = wp.zeros(batch, dtype=wp.int32, device=device)
-        self._stats = wp.zeros((batch, NUM_STATS), dtype=wp.float64, device=device)
+        self._limits = Mirror(batch, Limits, device)
+        self._T_world_model = Mirror(batch, wp.mat44d, device)
+        self._T_world_live = Mirror(batch, wp.mat44d, device)
+        self._verdict = Mirror(batch, wp.int32, device)
+        self._stats = Mirror((batch, NUM_STATS), wp.float64, device)
         self._live_levels: list[Level] = []
         self._weights = [_weights(config, level) for level in range(num_levels)]
 
@@ -196,8 +197,8 @@ class Tracker:
         levels = [images[index] for index in self._model_level]
         one = self._one
         self._start_from(seeds, T_world_model, guesses)
-        copy_in(self._T_world_model, T_world_model)
-        self._limits.assign(limits)
+        self._T_world_model.write(T_world_model)
+        self._limits.write(limits)
         coarsest = len(levels) - 1
         self._search(levels, coarsest)
         for level in range(coarsest, -1, -1):
@@ -213,27 +214,29 @@ class Tracker:
                 "judge",
                 judge,
                 self.batch,
-                [one.sums, one.pose, self._limits, self._T_world_model],
-                [self._T_world_live, self.verdict, self._stats],
+                [one.sums, one.pose, self._limits.array, self._T_world_model.array],
+                [self._T_world_live.array, self._verdict.array, self._stats.array],
             )
         return Alignment(
-            T_world_live=self._T_world_live.numpy().copy(),
-            T_model_live=one.pose.numpy()[:, 0].copy(),
-            verdict=self.verdict.numpy().copy(),
-            stats=self._stats.numpy().copy(),
+            T_world_live=self._T_world_live.read(),
+            T_model_live=one.poses.read()[:, 0],
+            verdict=self._verdict.read(),
+            stats=self._stats.read(),
         )
 
     def _start_from(self, seeds: Float64, T_world_model: Float64, guesses: Float64 | None) -> None:
         """Set the poses of all hypotheses; an env without a guess leaves that one out."""
-        if guesses is None:
-            guesses = np.full((self.batch, 4, 4), np.nan)
-        given = np.isfinite(guesses[:, 0, 0])
-        relative = np.where(given[:, None, None], invert(T_world_model) @ guesses, np.eye(4))
-        active = np.full((self.batch, NUM_FIRST + 1), RUNNING, dtype=np.int32)
-        active[:, NUM_FIRST] = np.where(given, RUNNING, OFF)
-        copy_in(self._first.pose, np.concatenate([seeds[:, :NUM_FIRST], relative[:, None]], axis=1))
-        copy_in(self._first.active, active)
-        copy_in(self._more.pose, seeds[:, NUM_FIRST:])
+        first, states = self._first, np.full((self.batch, NUM_FIRST + 1), OFF, dtype=np.int32)
+        states[:, :NUM_FIRST] = RUNNING
+        starts = np.zeros((self.batch, NUM_FIRST + 1, 4, 4))
+        starts[:, :NUM_FIRST] = seeds[:, :NUM_FIRST]
+        if guesses is not None:
+            given = np.isfinite(guesses[:, 0, 0])
+            starts[given, NUM_FIRST] = (invert(T_world_model) @ guesses)[given]
+            states[given, NUM_FIRST] = RUNNING
+        first.poses.write(starts)
+        first.states.write(states)
+        self._more.poses.write(seeds[:, NUM_FIRST:])
 
     def _expect(self, live: LiveFrame | None, model: ModelView | None) -> None:
         """Forget the recorded launches if these are not the images that they were made for."""

@@ -183,6 +183,9 @@ def judge(
     stats[b, 6] = cost
 
 
+_LIMITS_DTYPE = Limits.numpy_dtype()  # type: ignore[attr-defined]
+
+
 def make_limits(strict: NDArray[np.bool_], lost: NDArray[np.int32]) -> NDArray[Any]:
     """Limits (B,) of ordinary tracking, or ``strict`` ones where a wide search found the pose.
 
@@ -193,7 +196,7 @@ def make_limits(strict: NDArray[np.bool_], lost: NDArray[np.int32]) -> NDArray[A
     iteration are aligned since then, and the share was not counted again. The self-similar carpet
     fits itself at wrong places but for its cost, which is 1.5 there and below 1.3 at right ones.
     """
-    limits = np.zeros(len(strict), dtype=Limits.numpy_dtype())  # type: ignore[attr-defined]
+    limits = np.zeros(len(strict), dtype=_LIMITS_DTYPE)
     limits["points"] = 100.0
     limits["overlap"] = np.where(strict, 0.4, 0.3)
     limits["inliers"] = np.where(strict, 0.7, 0.65)
