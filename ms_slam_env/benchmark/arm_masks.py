@@ -57,7 +57,9 @@ class WalkSpec:
         scene: a scene's name.
         seed: of the scene, the start pose, the arm's errors and the walk.
         states: how often the walk stops to attempt all motions.
-        moves: random permitted motions between two stops.
+        moves: permitted motions between two stops.
+        approach: share of them that go where the camera comes nearest to furniture; the others
+            are random.
         step_m: translation of a motion.
         step_deg: rotation of a motion.
         arm: options of the arm.
@@ -67,6 +69,7 @@ class WalkSpec:
     seed: int
     states: int = 8
     moves: int = 3
+    approach: float = 0.5
     step_m: float = DEFAULT_STEP_M
     step_deg: float = DEFAULT_STEP_DEG
     arm: dict[str, Any] = field(default_factory=dict)
@@ -83,7 +86,9 @@ class Arguments:
     states: int = 8
     """Places of a walk at which all 49 motions are attempted."""
     moves: int = 3
-    """Random permitted motions before each of them."""
+    """Permitted motions before each of them."""
+    approach: float = 0.5
+    """Share of those that go where the camera comes nearest to furniture; the others are random."""
     step_m: float = DEFAULT_STEP_M
     """Translation of a motion, metres."""
     step_deg: float = DEFAULT_STEP_DEG
@@ -104,6 +109,7 @@ class Arguments:
                 raise unknown("scene", name, SCENES)
         check_range(self, "states", 1, 10_000)
         check_range(self, "moves", 0, 10_000)
+        check_range(self, "approach", 0, 1)
         check_range(self, "step_m", 0, 1)
         check_range(self, "step_deg", 0, 90)
 
@@ -118,6 +124,7 @@ class Arguments:
                 seed,
                 self.states,
                 self.moves,
+                self.approach,
                 self.step_m,
                 self.step_deg,
                 options.get("arm", {}),
@@ -168,7 +175,7 @@ def run_walk(spec: WalkSpec) -> dict[str, Any]:
     states: dict[str, list[Any]] = {}
     for state in range(spec.states):
         for _ in range(spec.moves):
-            arm.move(int(rng.choice(np.flatnonzero(arm.action_masks()))))
+            arm.move(choose_move(arm, spec.approach, rng))
         _append(states, at_rest(arm, T_world_kinematic @ arm.T_world_camera_kinematic))
         reason = arm.probe().reason
         for action in range(arm.num_actions):
@@ -195,6 +202,16 @@ def start_arm(
             continue
         return arm
     raise UnreachableError(f"scene {scene.name!r}: no start pose that the arm can hold")
+
+
+def choose_move(arm: DynamicArm, approach: float, rng: np.random.Generator) -> int:
+    """A permitted motion: with probability ``approach`` the one nearest to furniture."""
+    allowed = np.flatnonzero(arm.action_masks())
+    if rng.random() >= approach:
+        return int(rng.choice(allowed))
+    targets = (arm.T_world_camera @ arm.motions[allowed])[:, :3, 3]
+    nearness = -arm.scene.clearance(targets)
+    return int(rng.choice(allowed[nearness == nearness.max()]))
 
 
 def judge(arm: DynamicArm, truth: ArmTruth, action: int) -> dict[str, Any]:

@@ -29,7 +29,7 @@ _ELLIPSOID = int(mujoco.mjtGeom.mjGEOM_ELLIPSOID)
 
 
 class Cloud:
-    """Points (N, 3) of a surface, 5 mm apart, to be found by place."""
+    """Points (N, 3) of a surface, to be found by place."""
 
     def __init__(self, points: Float64) -> None:
         self._points = np.asarray(points, dtype=np.float64)
@@ -46,9 +46,9 @@ class Cloud:
         return self._points[self._tree.query_ball_point(place, radius)]
 
 
-def furniture_cloud(scene: Scene) -> Cloud:
+def furniture_cloud(scene: Scene, spacing_m: float = _SPACING_M) -> Cloud:
     """The true surface of a scene."""
-    return Cloud(scene.surface_points(_SPACING_M)[0])
+    return Cloud(scene.surface_points(spacing_m)[0])
 
 
 def column_cloud(radius: float, depth: float) -> Cloud:

@@ -22,7 +22,7 @@ NOWHERE = Cloud(np.full((1, 3), 1e3))
 
 @pytest.fixture(scope="module")
 def furniture(box_scene):
-    return furniture_cloud(box_scene)
+    return furniture_cloud(box_scene, spacing_m=0.01)
 
 
 def floor_of(scene):
@@ -83,7 +83,7 @@ def test_gap_of_a_link_that_hangs_over_the_floor(box_scene, furniture, tmp_path,
         truth = ArmTruth(arm, furniture, make_pose(np.eye(3), base))
         hanging = np.array([[np.pi / 2]])
         [gap] = truth.gaps(hanging)
-        assert gap == pytest.approx(expected, abs=0.0005) or ("ellipsoid" in geom and gap > 0)
+        assert gap == pytest.approx(expected, abs=0.002) or ("ellipsoid" in geom and gap > 0)
     sunk = make_pose(np.eye(3), np.array(base) - [0, 0, expected + 0.01])
     assert ArmTruth(arm, furniture, sunk).gaps(hanging)[0] < 0
 
