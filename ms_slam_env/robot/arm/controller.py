@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ms_slam_env.robot.arm.chain import Chain
 from ms_slam_env.robot.arm.clearance import Clearance, ClearanceLimit
 from ms_slam_env.robot.arm.config import ArmConfig
 from ms_slam_env.robot.arm.model import ArmModel
@@ -68,14 +69,25 @@ class Controller:
     legal.
     """
 
-    def __init__(self, model: ArmModel, surroundings: Surroundings, config: ArmConfig) -> None:
+    def __init__(
+        self, model: ArmModel, chain: Chain, surroundings: Surroundings, config: ArmConfig
+    ) -> None:
+        """Control an arm.
+
+        Args:
+            model: the arm.
+            chain: the model's, with what else its links must not touch.
+            surroundings: furniture around it.
+            config: speeds, rate and clearance.
+        """
         self._model = model
+        self._chain = chain
         self._config = config
         self._configuration = mink.Configuration(model.mj)
         self._task = mink.FrameTask(model.camera_site, "site", 1.0, 1.0)
-        self.clearance = Clearance(model.chain, surroundings, config.clearance_m)
-        self._lower = model.chain.lower + LIMIT_MARGIN_RAD
-        self._upper = model.chain.upper - LIMIT_MARGIN_RAD
+        self.clearance = Clearance(chain, surroundings, config.clearance_m)
+        self._lower = chain.lower + LIMIT_MARGIN_RAD
+        self._upper = chain.upper - LIMIT_MARGIN_RAD
         self._up, self._down = np.zeros(model.mj.nv), np.zeros(model.mj.nv)
         self._no_rows = np.zeros((0, model.mj.nv))
         self._links = ClearanceLimit(self.clearance, model.qpos, model.dof, _GAIN)
@@ -87,7 +99,7 @@ class Controller:
         """
         config = self._config
         path = CameraPath(
-            self._model.chain.camera_pose(q),
+            self._chain.camera_pose(q),
             T_base_target,
             config.speed_m_s,
             config.speed_rad_s,
@@ -141,7 +153,7 @@ class Controller:
         configuration, model = self._configuration, self._model
         problem = mink.build_ik(configuration, [self._task], tick_s, _DAMPING, limits)
         q = configuration.data.qpos[model.qpos]
-        most = model.chain.speed * tick_s
+        most = self._chain.speed * tick_s
         self._up[model.dof] = np.minimum(np.maximum(self._upper - q, 0.0), most)
         self._down[model.dof] = -np.minimum(np.maximum(q - self._lower, 0.0), most)
         rows, up, down = self._no_rows, self._up, self._down

@@ -14,6 +14,7 @@ from ms_slam_env.robot.arm.config import ArmConfig
 from ms_slam_env.robot.arm.controller import Controller, Plan, checked_ticks
 from ms_slam_env.robot.arm.dynamics import ArmDynamics, Motion
 from ms_slam_env.robot.arm.imperfections import Imperfections
+from ms_slam_env.robot.arm.reach import MOST_STRETCH
 from ms_slam_env.robot.base import Movement
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.timings import Timings
@@ -69,7 +70,7 @@ class DynamicArm(ArmEmbodiment):
     def stand_at(self, T_world_base: Float64) -> None:
         """Move the base to a pose (4, 4) and look around from there."""
         super().stand_at(T_world_base)
-        self.controller = Controller(self.model, self.surroundings, self.config)
+        self.controller = Controller(self.model, self.chain, self.surroundings, self.config)
 
     def start_at(self, q: Float64, rng: np.random.Generator) -> None:
         """Hold the arm at joint angles (n,) until it has settled under its load."""
@@ -85,7 +86,7 @@ class DynamicArm(ArmEmbodiment):
 
     def planning_state(self) -> tuple[Float64, Float64]:
         """The commanded joint angles and the camera there."""
-        return self.q_command, self.model.chain.camera_pose(self.q_command)
+        return self.q_command, self.chain.camera_pose(self.q_command)
 
     def move(self, action: int) -> Movement:
         """Make motion ``action`` if the mask allows it, else hold still for a frame."""
@@ -97,11 +98,14 @@ class DynamicArm(ArmEmbodiment):
         return self._execute(plan)[0]
 
     def attempt(self, action: int) -> Attempt:
-        """Try motion ``action`` whatever the mask says, then take everything back."""
+        """Try motion ``action`` whatever the mask says, then take everything back.
+
+        A motion that the mask forbids gets all the time that the mask would grant.
+        """
         before, probe = self._moving_state(), self.probe()
-        plan = self._plan(action)
+        plan = self._plan(action, 1.0 if probe.ok[action] else MOST_STRETCH)
         _, stopped, q_link = self._execute(plan)
-        wanted = self.T_world_base @ self.model.chain.camera_pose(plan.q[-1])
+        wanted = self.T_world_base @ self.chain.camera_pose(plan.q[-1])
         error_m = float(np.linalg.norm(self.T_world_camera[:3, 3] - wanted[:3, 3]))
         error_rad = relative_angle(self.T_world_camera[:3, :3], wanted[:3, :3])
         self._restore(before)
@@ -117,10 +121,10 @@ class DynamicArm(ArmEmbodiment):
         self.stand_at(state["T_world_base"])
         self._restore(state)
 
-    def _plan(self, action: int) -> Plan:
+    def _plan(self, action: int, stretch: float = 1.0) -> Plan:
         probe = self.probe()
         q, T_base_camera = self.planning_state()
-        least_s = float(probe.duration_s[action])
+        least_s = stretch * float(probe.duration_s[action])
         with self.timings.stage("ik"):
             return self.controller.plan(q, T_base_camera @ self.motions[action], least_s)
 
@@ -155,7 +159,7 @@ class DynamicArm(ArmEmbodiment):
             timestep = self.dynamics.timestep_s
             speed = np.vstack([np.diff(q_command, axis=0), np.zeros((1, q_command.shape[1]))])
             tick = (np.arange(steps) * timestep / tick_s).astype(np.int64)
-            share = speed[np.minimum(tick, len(speed) - 1)] / tick_s / self.model.chain.speed
+            share = speed[np.minimum(tick, len(speed) - 1)] / tick_s / self.chain.speed
             disturbance = self.imperfections.torques(share, timestep)
         motion = self.dynamics.run(q_command, tick_s, steps, disturbance)
         return motion, self.imperfections.link_angles(motion.q)
@@ -186,7 +190,7 @@ class DynamicArm(ArmEmbodiment):
     def _settle_at(self, q_motor: Float64, q_link: Float64) -> tuple[Float64, Float64]:
         """Be at the last of joint angles (k, n); the camera's poses (k, 4, 4), true and read."""
         readings = self.imperfections.readings(q_motor)
-        both = self.T_world_base @ self.model.chain.camera_pose(np.stack([q_link, readings]))
+        both = self.T_world_base @ self.chain.camera_pose(np.stack([q_link, readings]))
         kinematic = both[1] @ self.imperfections.T_camera_assumed
         self._be_at(q_link[-1], both[0, -1], kinematic[-1])
         return both[0], kinematic

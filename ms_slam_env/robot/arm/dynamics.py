@@ -88,7 +88,7 @@ class ArmDynamics:
             disturbance: (t, n) torque on the joints, Nm.
         """
         model, mj = self._model, self._model.mj
-        times = self.timestep_s * np.arange(1.0, steps + 1.0)
+        times = self.timestep_s * np.arange(float(steps))  # when the steps begin
         q, velocity = smooth(q_command, tick_s, times)
         inputs = np.zeros((1, steps, mj.nu + mj.nv))
         inputs[0, :, : mj.nu] = self._rest
