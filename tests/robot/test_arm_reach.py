@@ -1,5 +1,7 @@
 """The mask's kernel against a slow version, and the distances that it uses."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from arm_reference import follow
@@ -208,6 +210,45 @@ def test_the_column_below_the_base_is_not_touched(arm):
     column = len(chain.capsule_radius) - 1
     assert (chain.self_pairs == column).any()
     assert (chain.self_gap > 0).all()
+
+
+ROLLING = """
+<mujoco>
+  <worldbody><body><geom size="0.05"/><body pos="0 0 0.5">
+    <joint name="roll" axis="0 0 1" range="-170 170"/>
+    <inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>
+    <site name="camera" pos="0 0 0.1"/>
+  </body></body></worldbody>
+  <actuator><position joint="roll" kp="10"/></actuator>
+</mujoco>
+"""
+
+
+def test_one_joint_along_the_view_can_only_roll(tmp_path):
+    path = tmp_path / "roll.xml"
+    path.write_text(ROLLING)
+    chain = load_arm(str(path)).chain
+    reach = Reach(chain, Surroundings(_Nothing(), np.eye(4), 1.0), CONFIG)
+    result = reach.probe(np.zeros(1), chain.camera_pose(np.zeros(1)) @ MOTIONS)
+    np.testing.assert_array_equal(np.flatnonzero(result.ok), [0, 1, 2])  # none, right, left
+    assert {REASONS[r] for r in result.reason[3:]} == {"unreachable"}
+    np.testing.assert_allclose(np.abs(result.q[1:3, -1, 0]), np.radians(12), atol=2e-3)
+
+
+def test_a_redundant_arm_keeps_its_limits_and_speeds():
+    second = load_arm(str(Path(__file__).with_name("second_arm.xml")), "lens")
+    chain = second.chain
+    reach = Reach(chain, Surroundings(_Nothing(), np.eye(4), 2.0), CONFIG)
+    targets = chain.camera_pose(second.home) @ MOTIONS
+    result = reach.probe(second.home, targets)
+    assert result.ok.sum() > 30
+    ends = chain.camera_pose(result.q[result.ok, -1])
+    np.testing.assert_allclose(ends, targets[result.ok], atol=1.8e-3)
+    assert chain.within_limits(result.q[result.ok]).all()
+    moving = result.ok & (result.duration_s > 0)
+    steps = np.abs(np.diff(result.q, axis=1)) * (result.q.shape[1] - 1) * 1.25
+    speed = steps[moving] / result.duration_s[moving, None, None]
+    assert (speed <= chain.speed * (1 + 1e-4)).all()
 
 
 # -- distances -------------------------------------------------------------------------------
