@@ -13,6 +13,7 @@ from ms_slam_env.sensor import (
     EmbreeSingleRayCaster,
     RGBDSensor,
     WarpRayCaster,
+    casters,
 )
 
 SMALL = xtion("80x60")
@@ -77,6 +78,14 @@ def test_packets_meet_what_single_rays_meet(box_scene: BoxScene, size: tuple[int
         assert (a.labels == b.labels).mean() > 0.999  # on a shared edge either face is right
         noisy = packets.capture(T, seed), single.capture(T, seed)
         assert (noisy[0].depth == noisy[1].depth).mean() > 0.999
+
+
+def test_without_packets_single_rays_do(box_scene: BoxScene, monkeypatch) -> None:
+    assert isinstance(casters.make_caster(box_scene.mesh, "cpu"), EmbreeRayCaster)
+    monkeypatch.setattr(casters, "embree_library", lambda: None)
+    assert isinstance(casters.make_caster(box_scene.mesh, "cpu"), EmbreeSingleRayCaster)
+    with pytest.raises(OSError, match="ray packets"):
+        EmbreeRayCaster(box_scene.mesh)
 
 
 def test_truth_is_consistent(sensors, box_scene: BoxScene) -> None:
