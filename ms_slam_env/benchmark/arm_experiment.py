@@ -178,8 +178,6 @@ def _save_picture(world: ActiveSlamEnv, judged: JudgedMap, spec: RunSpec, folder
     name = spec.planner.replace("/", "_").replace(":", "_")
     save_map_picture(
         judged,
-        world.slam.surface_points(),
-        world.slam.surface_colors(),
         world.trajectory_estimate[:, :3, 3],
         folder / f"{Path(spec.scene).stem}_{name}_{spec.seed}.png",
         f"{Path(spec.scene).stem}, {spec.planner}, seed {spec.seed}",

@@ -6,18 +6,18 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.benchmark.map_truth import SURFACE_SPACING_M
 from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.env.worlds import get_scene
-from ms_slam_env.metrics import voxel_thin
 from ms_slam_env.metrics.consistency import (
     ConsistencyRule,
     MapConsistency,
     ObjectConsistency,
     judge_consistency,
 )
+from ms_slam_env.metrics.reconstruction import voxel_firsts
 from ms_slam_env.metrics.sightings import LabelledView, count_votes, distinct_placements
 from ms_slam_env.scenes.sampling import sample_surface
 from ms_slam_env.sensor import RGBDSensor
@@ -34,11 +34,13 @@ class JudgedMap:
 
     Attributes:
         points: (N, 3) of the map that were judged, world frame.
+        colors: (N, 3) uint8, theirs.
         consistency: the verdict.
         labels: names of the scene's objects.
     """
 
     points: Float64
+    colors: NDArray[np.uint8]
     consistency: MapConsistency
     labels: tuple[str, ...]
 
@@ -56,7 +58,9 @@ def judge_episode(world: ActiveSlamEnv, rule: ConsistencyRule | None = None) -> 
     picked = frames[np.unique(np.linspace(0, len(frames) - 1, MOST_VIEWS).astype(int))]
     truth, estimate = world.trajectory_truth, world.trajectory_estimate
     views = [labelled_view(world.sensor, truth[k], estimate[k]) for k in picked]
-    return judge_map(world.slam.map_points(), views, world.sensor, rule)
+    return judge_map(
+        world.slam.surface_points(), world.slam.surface_colors(), views, world.sensor, rule
+    )
 
 
 def labelled_view(
@@ -64,25 +68,29 @@ def labelled_view(
 ) -> LabelledView:
     """What a frame from a true pose (4, 4) showed, for SLAM that put it at an estimated one."""
     view = sensor.ground_truth(T_world_camera)
-    return LabelledView(T_world_camera, T_world_camera_estimate, view.depth, view.labels)
+    return LabelledView(
+        T_world_camera, T_world_camera_estimate, view.color, view.depth, view.labels
+    )
 
 
 def judge_map(
-    map_points: Float64,
+    map_points: ArrayLike,
+    map_colors: ArrayLike,
     views: list[LabelledView],
     sensor: RGBDSensor,
     rule: ConsistencyRule | None = None,
 ) -> JudgedMap:
-    """Judge a map (N, 3) that was made of ``views`` of the sensor's scene."""
+    """Judge a map, points (N, 3) and colours (N, 3), made of ``views`` of the sensor's scene."""
     rule = rule or ConsistencyRule()
     scene = sensor.scene
     labels = scene.mesh.labels
-    points = voxel_thin(map_points, MAP_VOXEL_M)
-    votes = count_votes(points, views, sensor.intrinsics, len(labels))
+    kept = voxel_firsts(map_points, MAP_VOXEL_M)
+    points, colors = np.asarray(map_points)[kept], np.asarray(map_colors)[kept]
+    votes = count_votes(points, colors, views, sensor.intrinsics, len(labels))
     surface, owner = labelled_surface(scene.name, scene.seed)
     placements = distinct_placements(views, points, rule.apart_m / 2)
     verdict = judge_consistency(points, votes, surface, owner, rule, placements)
-    return JudgedMap(points, verdict, labels)
+    return JudgedMap(points, colors, verdict, labels)
 
 
 @lru_cache(maxsize=2)

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from ms_slam_env.benchmark.figures import caption, new_figure, save
 from ms_slam_env.benchmark.map_consistency import JudgedMap
@@ -24,26 +23,16 @@ _NEAREST_M = 0.35  # what hangs in front of the eye would hide the rest
 _DOT_M = 0.014  # the points are a centimetre apart
 
 
-def save_map_picture(
-    judged: JudgedMap,
-    map_points: ArrayLike,
-    map_colors: ArrayLike,
-    cameras: ArrayLike,
-    path: Path,
-    title: str,
-) -> Path:
+def save_map_picture(judged: JudgedMap, cameras: ArrayLike, path: Path, title: str) -> Path:
     """Draw a judged map twice, seen obliquely from behind the cameras that made it.
 
     Args:
         judged: the map and its verdict.
-        map_points: (M, 3) of the whole map.
-        map_colors: (M, 3) uint8, its colours.
         cameras: (K, 3) estimated positions of the camera.
         path: of the PNG.
         title: what map this is; the verdict is appended.
     """
-    nearest = cKDTree(np.asarray(map_points)).query(judged.points)[1]
-    colors = np.asarray(map_colors)[nearest]
+    colors = judged.colors
     pose = overview_pose(judged.points, np.asarray(cameras))
     marked = (0.35 * colors + 0.65 * 235).astype(np.uint8)
     marked[judged.consistency.apart] = RED

@@ -63,6 +63,16 @@ def voxel_thin(points: ArrayLike, voxel_m: float) -> Float64:
         InputError: bad points, or a voxel size that is not positive.
     """
     values = check_points(points, "points")
+    return values[voxel_firsts(values, voxel_m)]
+
+
+def voxel_firsts(points: ArrayLike, voxel_m: float) -> NDArray[np.int64]:
+    """Indices (K,), ascending, of the first point in each occupied voxel of side ``voxel_m``.
+
+    Raises:
+        InputError: bad points, or a voxel size that is not positive.
+    """
+    values = check_points(points, "points")
     if not voxel_m > 0:
         raise InputError(f"voxel_m must be > 0, got {voxel_m}")
     index = np.floor(values / voxel_m).astype(np.int64)
@@ -70,7 +80,7 @@ def voxel_thin(points: ArrayLike, voxel_m: float) -> Float64:
     size = index.max(axis=0) + 1
     key = (index[:, 0] * size[1] + index[:, 1]) * size[2] + index[:, 2]
     _, first = np.unique(key, return_index=True)
-    return values[np.sort(first)]
+    return np.sort(first)
 
 
 def nearest_distances(points: ArrayLike, truth: ArrayLike) -> Float64:

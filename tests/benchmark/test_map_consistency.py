@@ -26,10 +26,9 @@ from ms_slam_env.benchmark.map_consistency_picture import (
 from ms_slam_env.env.worlds import get_sensor
 from ms_slam_env.geometry import invert, make_pose, transform_points
 from ms_slam_env.metrics.consistency import MapConsistency, ObjectConsistency
-from ms_slam_env.slam.base import SlamBackend
 
 
-def map_with_offset(offset_m: float) -> tuple[SlamBackend, JudgedMap, np.ndarray]:
+def map_with_offset(offset_m: float) -> tuple[JudgedMap, np.ndarray]:
     """A table seen from two sides, the second time at poses that are off to the left."""
     sensor = get_sensor("table", 1001, "160x120", "kinect")
     start = sensor.scene.sample_start(np.random.default_rng(1001))
@@ -43,28 +42,21 @@ def map_with_offset(offset_m: float) -> tuple[SlamBackend, JudgedMap, np.ndarray
         slam.fuse(sensor.capture(truth, index=k, seed=0), estimate)
         views.append(labelled_view(sensor, truth, estimate))
     cameras = np.array([view.T_world_camera_estimate[:3, 3] for view in views])
-    return slam, judge_map(slam.map_points(), views, sensor), cameras
+    return judge_map(slam.surface_points(), slam.surface_colors(), views, sensor), cameras
 
 
 @pytest.mark.parametrize(("offset_m", "success"), [(0.0, True), (0.02, True), (0.15, False)])
 def test_a_map_fails_when_its_second_half_is_off(
     offset_m: float, success: bool, tmp_path: Path
 ) -> None:
-    slam, judged, cameras = map_with_offset(offset_m)
+    judged, cameras = map_with_offset(offset_m)
     assert judged.consistency.success is success
     assert len(judged.consistency.objects) > 5
     small = {judged.name(item) for item in judged.consistency.duplicated}
     if not success:
         # of what the map shows twice, most are things on the table
         assert len(small - {"floor", "ceiling", "table"}) >= 3
-    path = save_map_picture(
-        judged,
-        slam.surface_points(),
-        slam.surface_colors(),
-        cameras,
-        tmp_path / "map.png",
-        "a table",
-    )
+    path = save_map_picture(judged, cameras, tmp_path / "map.png", "a table")
     picture = cv2.imread(str(path))[..., ::-1]
     assert bool((picture == RED).all(axis=2).sum() > 500) is not success
 
@@ -114,9 +106,10 @@ def test_the_overview_looks_from_behind_and_above() -> None:
 def test_a_verdict_in_words() -> None:
     objects = tuple(ObjectConsistency(k, 200, 0.11 + 0.01 * k, 0.5, True) for k in range(7))
     labels = tuple(f"thing {k}" for k in range(7))
-    judged = JudgedMap(np.zeros((1, 3)), MapConsistency(objects, np.zeros(1, bool)), labels)
+    point, colour = np.zeros((1, 3)), np.zeros((1, 3), dtype=np.uint8)
+    judged = JudgedMap(point, colour, MapConsistency(objects, np.zeros(1, bool)), labels)
     text = describe(judged)
     assert text.startswith("failure, twice there: thing 6 (17 %), thing 5 (16 %)")
     assert text.endswith("and 2 more")
-    clean = JudgedMap(np.zeros((1, 3)), MapConsistency((), np.zeros(1, bool)), labels)
+    clean = JudgedMap(point, colour, MapConsistency((), np.zeros(1, bool)), labels)
     assert describe(clean).startswith("success")
