@@ -101,8 +101,8 @@ def _outside_pose(env: ActiveSlamEnv) -> Float64:
     start = env.trajectory_truth[0]
     heading = start[:3, 2] * [1, 1, 0]
     heading = heading / max(1e-9, float(np.linalg.norm(heading)))
-    centre = start[:3, 3] + 1.2 * heading - [0, 0, 0.4]
-    distance = 5.0
+    ahead, distance = (0.4, 2.8) if isinstance(env.embodiment, ArmEmbodiment) else (1.2, 5.0)
+    centre = start[:3, 3] + ahead * heading - [0, 0, 0.4]
     offset = -np.cos(_OUTSIDE_PITCH) * heading + np.sin(_OUTSIDE_PITCH) * np.array([0, 0, 1.0])
     return look_at(centre + distance * offset, centre)
 
