@@ -22,7 +22,23 @@ def _surfel(intrinsics: Intrinsics, device: str = "cpu", **params: Any) -> SlamB
     return SurfelSlam(intrinsics, from_dict(SurfelConfig, params, "slam_config"), device)
 
 
-BACKENDS: dict[str, Callable[..., SlamBackend]] = {"surfel": _surfel}
+def _odometry(intrinsics: Intrinsics, **params: Any) -> SlamBackend:
+    from ms_slam_env.slam.odometry import OdometryConfig, OdometrySlam
+
+    return OdometrySlam(intrinsics, from_dict(OdometryConfig, params, "slam_config"))
+
+
+def _volumetric(intrinsics: Intrinsics, **params: Any) -> SlamBackend:
+    from ms_slam_env.slam.volumetric import VolumetricConfig, VolumetricSlam
+
+    return VolumetricSlam(intrinsics, from_dict(VolumetricConfig, params, "slam_config"))
+
+
+BACKENDS: dict[str, Callable[..., SlamBackend]] = {
+    "surfel": _surfel,
+    "odometry": _odometry,
+    "volumetric": _volumetric,
+}
 """Name to maker; a maker takes the intrinsics and the backend's parameters."""
 
 

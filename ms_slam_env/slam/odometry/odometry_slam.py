@@ -1,0 +1,228 @@
+"""RGB-D odometry against keyframes, as a ``SlamBackend``.
+
+Every frame is aligned with the keyframe, failing that with the last good frame, failing that with
+the map's view from the caller's guess. The map holds the keyframes' readings at their estimated
+poses; it corrects no pose, so errors add up from keyframe to keyframe.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
+from ms_slam_env.geometry import check_pose, invert, relative_angle
+from ms_slam_env.slam.agreement import (
+    FEWEST_READINGS,
+    Agreement,
+    AgreementLimits,
+    DepthImage,
+    measure_agreement,
+)
+from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult, Views
+from ms_slam_env.slam.odometry.aligner import Aligner, PreparedImage
+from ms_slam_env.slam.odometry.config import OdometryConfig
+from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
+
+_NOTHING = Agreement(0.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """An image at a pose."""
+
+    T_world_image: Float64
+    prepared: PreparedImage
+
+
+class OdometrySlam(SlamBackend):
+    """Keyframe odometry through OpenCV, its keyframes fused into a surfel map."""
+
+    def __init__(self, intrinsics: Intrinsics, config: OdometryConfig | None = None) -> None:
+        """Start empty at the identity pose."""
+        self.intrinsics = intrinsics
+        self.config = config or OdometryConfig()
+        self._aligner = Aligner(intrinsics, self.config.depth_cutoff_m)
+        self._limits = AgreementLimits(
+            overlap=self.config.least_overlap,
+            inliers=self.config.least_inliers,
+            alike=self.config.least_alike,
+        )
+        self._map = SurfelSlam(
+            intrinsics,
+            SurfelConfig(
+                depth_cutoff_m=self.config.depth_cutoff_m, max_surfels=self.config.max_surfels
+            ),
+        )
+        self.reset()
+
+    def reset(self, T_world_camera: ArrayLike | None = None) -> None:
+        """Forget everything; the next frame is taken at ``T_world_camera`` (identity if None)."""
+        pose = np.eye(4) if T_world_camera is None else T_world_camera
+        self._pose = np.array(check_pose(pose, "T_world_camera"))
+        self._key: _Placed | None = None
+        self._last: _Placed | None = None
+        self._lost = False
+        self._map.reset(self._pose)
+
+    def track(self, frame: RGBDFrame, T_world_camera_guess: ArrayLike | None = None) -> TrackResult:
+        """Estimate the pose of ``frame``; a keyframe is fused into the map. See ``SlamBackend``.
+
+        Raises:
+            InputError: the frame's size is not that of the intrinsics, or the guess is no pose.
+        """
+        self.intrinsics.check_image(frame.depth, "frame")
+        guess = None
+        if T_world_camera_guess is not None:
+            guess = np.array(check_pose(T_world_camera_guess, "T_world_camera_guess"))
+        image = self._image(frame)
+        if self._key is None or self._last is None:
+            return self._start(frame, image)
+        if image.readings < FEWEST_READINGS:
+            return self._lose("the frame has too few depth readings", _NOTHING)
+        prepared = self._aligner.prepare(image)
+        reason, agreement = "", _NOTHING
+        for reference in self._references(self._key, self._last, guess):
+            T_reference_frame, agreement, reason = self._align(prepared, reference)
+            if not reason:
+                T_world_camera = reference.T_world_image @ T_reference_frame
+                return self._accept(frame, _Placed(T_world_camera, prepared), agreement)
+        return self._lose(reason, agreement)
+
+    def fuse(self, frame: RGBDFrame, T_world_camera: ArrayLike) -> TrackResult:
+        """Fuse ``frame`` as a keyframe at a known pose (4, 4), without tracking.
+
+        Raises:
+            InputError: the frame's size is not that of the intrinsics, or the pose is none.
+        """
+        self.intrinsics.check_image(frame.depth, "frame")
+        self._pose = np.array(check_pose(T_world_camera, "T_world_camera"))
+        image = self._image(frame)
+        if image.readings >= FEWEST_READINGS:  # nothing can be aligned with less
+            self._key = self._last = _Placed(self._pose, self._aligner.prepare(image))
+        self._map.fuse(frame, self._pose)
+        self._lost = False
+        return TrackResult(self._pose.copy(), True)
+
+    def _image(self, frame: RGBDFrame) -> DepthImage:
+        depth = frame.depth.astype(np.float32)
+        depth = np.where(depth <= self.config.depth_cutoff_m, depth, np.float32(0))
+        return DepthImage(depth, intensity_image(frame.color).astype(np.float32))
+
+    def _start(self, frame: RGBDFrame, image: DepthImage) -> TrackResult:
+        """Take the first frame at the given pose, if there is something in it."""
+        if image.readings < FEWEST_READINGS:
+            reason = "the first frame has too few depth readings"
+            return TrackResult(self._pose.copy(), False, inlier_fraction=0.0, reason=reason)
+        return self.fuse(frame, self._pose)
+
+    def _references(self, key: _Placed, last: _Placed, guess: Float64 | None) -> Iterator[_Placed]:
+        """Images to align a frame with, in the order in which they are tried."""
+        yield key
+        if last is not key:
+            yield last
+        if guess is not None:
+            view = self._map.predict(guess[None])
+            image = DepthImage(view.depth[0], view.intensity[0])
+            if image.readings >= FEWEST_READINGS:
+                yield _Placed(guess, self._aligner.prepare(image))
+
+    def _align(self, frame: PreparedImage, reference: _Placed) -> tuple[Float64, Agreement, str]:
+        """T_reference_frame, what it explains, and why it is not to be believed or nothing."""
+        T = self._aligner.align(frame, reference.prepared)
+        if T is None:
+            return np.eye(4), _NOTHING, "no motion aligns the frame with the view before it"
+        agreement = measure_agreement(frame.image, reference.prepared.image, T, self.intrinsics)
+        return T, agreement, self._limits.reason(agreement, T)
+
+    def _accept(self, frame: RGBDFrame, placed: _Placed, agreement: Agreement) -> TrackResult:
+        """Move on to a frame whose pose was found."""
+        assert self._key is not None
+        relocalised, self._lost = self._lost, False
+        self._pose = placed.T_world_image
+        self._last = placed
+        motion = invert(self._key.T_world_image) @ self._pose
+        moved = float(np.linalg.norm(motion[:3, 3]))
+        turned = relative_angle(np.eye(3), motion[:3, :3])
+        limit = np.radians(self.config.keyframe_deg)
+        if moved > self.config.keyframe_m or turned > limit:
+            self._key = placed
+            self._map.fuse(frame, self._pose)
+        return TrackResult(
+            T_world_camera=self._pose.copy(),
+            tracking_ok=True,
+            relocalised=relocalised,
+            inlier_fraction=agreement.inlier_fraction,
+            residual_m=agreement.residual_m,
+        )
+
+    def _lose(self, reason: str, agreement: Agreement) -> TrackResult:
+        """Hold the pose and the images that frames are aligned with."""
+        self._lost = True
+        return TrackResult(
+            T_world_camera=self._pose.copy(),
+            tracking_ok=False,
+            inlier_fraction=agreement.inlier_fraction,
+            residual_m=agreement.residual_m,
+            reason=reason,
+        )
+
+    def predict(self, poses: ArrayLike, scale: float = 1.0) -> Views:
+        """Render the map from ``poses`` (N, 4, 4) T_world_camera at ``scale`` times the size.
+
+        Raises:
+            InputError: poses of another shape, or a scale outside (0, 1].
+        """
+        return self._map.predict(poses, scale)
+
+    def surface_points(self) -> Float64:
+        """The keyframes' readings (M, 3), merged where they meet, world frame."""
+        return self._map.surface_points()
+
+    def surface_colors(self) -> NDArray[np.uint8]:
+        """Colours (M, 3) RGB of ``surface_points``."""
+        return self._map.surface_colors()
+
+    def map_attributes(self) -> dict[str, NDArray[Any]]:
+        """Colour, normal, radius and confidence of ``surface_points``."""
+        return self._map.map_attributes()
+
+    def get_state(self) -> dict[str, Any]:
+        """Everything needed to go on bit-exactly, as NumPy arrays."""
+        return {
+            "pose": self._pose.copy(),
+            "lost": self._lost,
+            "key": _save(self._key),
+            "last": "key" if self._last is self._key else _save(self._last),
+            "map": self._map.get_state(),
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state of an odometry of the same intrinsics and configuration."""
+        self._pose = state["pose"].copy()
+        self._lost = state["lost"]
+        self._key = self._restore(state["key"])
+        self._last = self._key if state["last"] == "key" else self._restore(state["last"])
+        self._map.set_state(state["map"])
+
+    def _restore(self, saved: dict[str, Any] | None) -> _Placed | None:
+        if saved is None:
+            return None
+        image = DepthImage(saved["depth"].copy(), saved["intensity"].copy())
+        return _Placed(saved["pose"].copy(), self._aligner.prepare(image))
+
+
+def _save(placed: _Placed | None) -> dict[str, Any] | None:
+    """An image and its pose as arrays; OpenCV's pyramids follow from them."""
+    if placed is None:
+        return None
+    image = placed.prepared.image
+    return {
+        "pose": placed.T_world_image.copy(),
+        "depth": image.depth.copy(),
+        "intensity": image.intensity.copy(),
+    }

@@ -1,0 +1,53 @@
+"""Aligns a frame with a view of the model through Open3D's odometry."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ms_slam_env.slam.agreement import DepthImage
+from ms_slam_env.slam.base import Float64
+from ms_slam_env.slam.volumetric.frame_to_model import FrameToModel
+from ms_slam_env.slam.volumetric.voxel_grid import CastView, VoxelGrid, camera_matrix
+
+_ITERATIONS = (10, 5, 3)  # coarse to fine; Open3D's dense SLAM does 6, 3 and 1
+
+
+class Open3DAlignment(FrameToModel):
+    """Open3D's hybrid odometry, as in its dense SLAM: point to plane and photometric at once.
+
+    Its sums over pixels are rounded differently in every run, even on one thread.
+    """
+
+    def __init__(self, grid: VoxelGrid) -> None:
+        """Take camera and parameters from the grid."""
+        self._grid = grid
+        self._rgbd_image = grid.open3d.t.geometry.RGBDImage
+        self._odometry = grid.open3d.t.pipelines.odometry
+        self._criteria = [
+            self._odometry.OdometryConvergenceCriteria(count) for count in _ITERATIONS
+        ]
+        self._loss = self._odometry.OdometryLossParams(grid.config.association_m)
+        self._start = grid.tensor(np.eye(4))
+
+    def align(self, frame: DepthImage, view: CastView) -> Float64 | None:
+        """T_model_camera (4, 4) of a frame against a view of the model, None if there is none."""
+        grid = self._grid
+        grey = np.repeat(frame.intensity[..., None] / np.float32(255), 3, axis=2)
+        source = self._rgbd_image(grid.image(grey), grid.image(frame.depth))
+        target = self._rgbd_image(grid.image(view.color), grid.image(view.depth))
+        try:
+            result = self._odometry.rgbd_odometry_multi_scale(
+                source,
+                target,
+                camera_matrix(grid, grid.intrinsics),
+                self._start,
+                1.0,
+                grid.config.depth_cutoff_m,
+                self._criteria,
+                self._odometry.Method.Hybrid,
+                self._loss,
+            )
+        except RuntimeError:  # a singular system
+            return None
+        T = result.transformation.numpy()
+        return np.array(T, dtype=np.float64) if np.isfinite(T).all() else None

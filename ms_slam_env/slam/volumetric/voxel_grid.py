@@ -1,0 +1,262 @@
+"""A sparse grid of signed distances: fuse frames, cast rays, extract the surface, save, restore.
+
+Curless and Levoy 1996, in blocks that a hash map finds (Niessner et al. 2013), by Open3D.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.geometry import invert
+from ms_slam_env.slam.base import Float32, Float64
+from ms_slam_env.slam.volumetric.config import VolumetricConfig
+from ms_slam_env.slam.volumetric.open3d_library import load_open3d
+
+DEPTH_SCALE = 5000.0  # 16-bit depth of 0.2 mm, well below the sensor's noise
+_NEAREST_M = 0.1
+_LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
+_SMOOTH_PX = 1.5  # width of the filter of cast depth
+_FRAGMENT_PX = 16  # edge of the pieces in which Open3D draws its blocks
+
+
+@dataclass(frozen=True)
+class CastView:
+    """An image cast from the grid.
+
+    Attributes:
+        depth: (H, W) float32 metres; 0 where the grid is empty.
+        color: (H, W, 3) float32 RGB in [0, 1].
+        normals: (H, W, 3) float32 unit vectors in the camera frame, towards the camera; 0 where
+            empty.
+    """
+
+    depth: Float32
+    color: Float32
+    normals: Float32
+
+    @property
+    def intensity(self) -> Float32:
+        """Grey values (H, W) float32 in [0, 255]."""
+        return np.asarray(self.color @ _LUMA * np.float32(255.0), dtype=np.float32)
+
+
+class VoxelGrid:
+    """The map of one camera.
+
+    Raises:
+        InputError: Open3D, or a system library that it needs, is not installed.
+    """
+
+    def __init__(self, intrinsics: Intrinsics, config: VolumetricConfig) -> None:
+        """Allocate an empty grid."""
+        self.open3d = load_open3d()
+        self.intrinsics = intrinsics
+        self.config = config
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget everything."""
+        core = self.open3d.core
+        self._grid = self.open3d.t.geometry.VoxelBlockGrid(
+            ["tsdf", "weight", "color"],
+            [core.float32, core.uint16, core.uint16],
+            [core.SizeVector([1]), core.SizeVector([1]), core.SizeVector([3])],
+            self.config.voxel_m,
+            self.config.block_voxels,
+            self.config.blocks,
+            core.Device("CPU:0"),
+        )
+        self._reserved = 0
+        self._forget_derived()
+
+    def _forget_derived(self) -> None:
+        self._keys: Any = None
+        self._surface: tuple[Float64, NDArray[np.uint8], Float32] | None = None
+
+    def tensor(self, array: NDArray[Any]) -> Any:
+        """Open3D's view of an array."""
+        return self.open3d.core.Tensor.from_numpy(np.ascontiguousarray(array))
+
+    def image(self, array: NDArray[Any]) -> Any:
+        """Open3D's image of an array (H, W) or (H, W, C)."""
+        full = array if array.ndim == 3 else array[..., None]
+        return self.open3d.t.geometry.Image(self.tensor(full))
+
+    def fuse(self, depth: NDArray[np.uint16], color: NDArray[np.uint8], pose: Float64) -> None:
+        """Fuse depth (H, W) in units of 1 / DEPTH_SCALE m and colour (H, W, 3) at a pose (4, 4)."""
+        depth_image, color_image = self.image(depth), self.image(color)
+        extrinsic = self.tensor(invert(pose))
+        limits = (DEPTH_SCALE, self.config.depth_cutoff_m, self.config.truncation_voxels)
+        blocks = self._grid.compute_unique_block_coordinates(
+            depth_image, camera_matrix(self, self.intrinsics), extrinsic, *limits
+        )
+        # Open3D finds a voxel's reading by cutting off the fraction of its pixel: with centres at
+        # integers that is half a pixel too low.
+        matrix = camera_matrix(self, self.intrinsics, 0.5)
+        self._grid.integrate(blocks, depth_image, color_image, matrix, matrix, extrinsic, *limits)
+        self._forget_derived()
+
+    def cast(self, pose: Float64, least_weight: float, intrinsics: Intrinsics) -> CastView:
+        """Cast the image seen from ``pose`` (4, 4), of voxels observed ``least_weight`` times."""
+        if self._block_keys() is None:
+            image = np.zeros((*intrinsics.shape, 3), dtype=np.float32)
+            return CastView(image[..., 0].copy(), image, image.copy())
+        self._reserve_fragments(intrinsics)
+        # Open3D looks distances up at the voxel below a point, on average half a voxel off along
+        # each axis, and interpolates colours and normals at the right place.
+        moved = pose.copy()
+        moved[:3, 3] += self.config.voxel_m / 2
+        distance = self._ray_cast(moved, least_weight, intrinsics, ["depth"])["depth"]
+        found = self._ray_cast(pose, least_weight, intrinsics, ["color", "normal"])
+        depth = distance.numpy()[..., 0] / np.float32(DEPTH_SCALE)
+        normals = -found["normal"].numpy()  # Open3D's point away from the camera
+        hit = (depth > 0) & (np.linalg.norm(normals, axis=-1) > 0.5)
+        return CastView(
+            depth=np.where(hit, smooth_depth(depth, hit, self.config.voxel_m), np.float32(0)),
+            color=np.where(hit[..., None], found["color"].numpy(), np.float32(0)),
+            normals=np.where(hit[..., None], normals, np.float32(0)),
+        )
+
+    def _ray_cast(
+        self, pose: Float64, least_weight: float, intrinsics: Intrinsics, names: list[str]
+    ) -> Any:
+        """Open3D's ray cast of the images ``names``, (H, W, channels) tensors."""
+        return self._grid.ray_cast(
+            self._keys,
+            camera_matrix(self, intrinsics),
+            self.tensor(invert(pose)),
+            intrinsics.width,
+            intrinsics.height,
+            names,
+            DEPTH_SCALE,
+            _NEAREST_M,
+            self.config.depth_cutoff_m,
+            least_weight - 0.5,  # the comparison is strict
+            self.config.truncation_voxels,
+            range_factor(intrinsics),
+        )
+
+    def _block_keys(self) -> Any:
+        """Coordinates (M, 3) of all blocks as a tensor, None if there are none."""
+        hashmap = self._grid.hashmap()
+        if self._keys is None and hashmap.size() > 0:
+            used = hashmap.active_buf_indices().to(self.open3d.core.int64)
+            self._keys = hashmap.key_tensor()[used]
+        return self._keys
+
+    def _reserve_fragments(self, intrinsics: Intrinsics) -> None:
+        """Make room for all pieces of blocks that a ray cast draws to bound its rays.
+
+        Open3D starts with room for 100, and a cast that needs more leaves out the others before
+        it makes room for the next cast. A cast of no interest, from far away with every block in
+        sight several times, keeps that from ours.
+        """
+        factor = range_factor(intrinsics)
+        pieces = math.ceil(intrinsics.width / factor / _FRAGMENT_PX) * math.ceil(
+            intrinsics.height / factor / _FRAGMENT_PX
+        )
+        keys = self._keys.numpy()
+        needed = pieces * len(keys) + 1
+        if needed <= self._reserved:
+            return
+        repeats = 2 * pieces
+        edge_m = self.config.voxel_m * self.config.block_voxels
+        low, high = keys.min(axis=0) * edge_m, (keys.max(axis=0) + 1) * edge_m
+        radius = float(np.linalg.norm(high - low)) / 2
+        pose = np.eye(4)
+        pose[:3, 3] = (low + high) / 2 - [0.0, 0.0, 4 * radius]
+        size = 8
+        camera = Intrinsics(float(size), float(size), (size - 1) / 2, (size - 1) / 2, size, size)
+        self._grid.ray_cast(
+            self.tensor(np.repeat(keys, repeats, axis=0)),
+            camera_matrix(self, camera),
+            self.tensor(invert(pose)),
+            size,
+            size,
+            ["depth"],
+            DEPTH_SCALE,
+            _NEAREST_M,
+            8 * radius,
+            0.5,
+            self.config.truncation_voxels,
+            1,
+        )
+        self._reserved = repeats * len(keys) - 1
+
+    def surface(self) -> tuple[Float64, NDArray[np.uint8], Float32]:
+        """Points (M, 3) metres, colours (M, 3) RGB and normals (M, 3) of the zero crossings.
+
+        Sorted by position: Open3D finds them in an order that changes from run to run.
+        """
+        if self._surface is None:
+            self._surface = self._extract_surface()
+        return self._surface
+
+    def _extract_surface(self) -> tuple[Float64, NDArray[np.uint8], Float32]:
+        nothing = np.zeros((0, 3))
+        if self._block_keys() is not None:
+            cloud = self._grid.extract_point_cloud(self.config.least_weight - 0.5).point
+            points = cloud.positions.numpy()
+            if len(points):
+                order = np.lexsort(points.T)
+                colors = np.clip(np.rint(cloud.colors.numpy()[order] * 255), 0, 255)
+                normals = cloud.normals.numpy()[order]
+                return points[order].astype(np.float64), colors.astype(np.uint8), normals
+        return nothing, nothing.astype(np.uint8), nothing.astype(np.float32)
+
+    def get_state(self) -> dict[str, NDArray[Any]]:
+        """Coordinates of the blocks and what their voxels hold."""
+        hashmap = self._grid.hashmap()
+        used = hashmap.active_buf_indices().numpy().astype(np.int64)
+        keys = hashmap.key_tensor().numpy()[used]
+        order = np.lexsort(keys.T)
+        state = {"keys": keys[order]}
+        for name in ("tsdf", "weight", "color"):
+            state[name] = self._blocks(name)[used[order]]
+        return state
+
+    def set_state(self, state: dict[str, NDArray[Any]]) -> None:
+        """Go on from a state of a grid of the same configuration."""
+        self.clear()
+        if len(state["keys"]) == 0:
+            return
+        indices, _ = self._grid.hashmap().activate(self.tensor(state["keys"]))
+        places = indices.numpy().astype(np.int64)
+        for name in ("tsdf", "weight", "color"):
+            self._blocks(name)[places] = state[name]
+
+    def _blocks(self, name: str) -> NDArray[Any]:
+        """Writable array (capacity, n, n, n, channels) of the voxels of all blocks."""
+        index = ("tsdf", "weight", "color").index(name)
+        array: NDArray[Any] = self._grid.hashmap().value_tensor(index).numpy()
+        return array
+
+
+def smooth_depth(depth: Float32, hit: NDArray[np.bool_], voxel_m: float) -> Float32:
+    """Take the steps of fractions of a voxel out of a depth image (H, W); edges stay."""
+    filled = np.where(hit, depth, np.float32(-100.0))  # far from every surface: of no weight
+    return np.asarray(cv2.bilateralFilter(filled, 5, voxel_m, _SMOOTH_PX), dtype=np.float32)
+
+
+def camera_matrix(grid: VoxelGrid, intrinsics: Intrinsics, shift_px: float = 0.0) -> Any:
+    """Camera matrix (3, 3) as a tensor, its centre shifted by some pixels."""
+    matrix = np.eye(3)
+    matrix[0, 0], matrix[1, 1] = intrinsics.fx, intrinsics.fy
+    matrix[0, 2], matrix[1, 2] = intrinsics.cx + shift_px, intrinsics.cy + shift_px
+    return grid.tensor(matrix)
+
+
+def range_factor(intrinsics: Intrinsics) -> int:
+    """Pixels of the image along a pixel of Open3D's map of ray bounds.
+
+    It must divide the image's size: with a remainder Open3D reads beyond that map, and a cast may
+    take for ever.
+    """
+    return math.gcd(8, intrinsics.width, intrinsics.height)
