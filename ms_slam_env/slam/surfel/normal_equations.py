@@ -52,8 +52,34 @@ RUNNING = wp.constant(1)
 RESTING = wp.constant(2)  # converged at its level, wakes at the next
 
 
-Row = wp.types.vector(length=8, dtype=wp.float32)
-"""Six numbers and one more, in as many as one instruction of a CPU works on."""
+System = wp.types.vector(length=48, dtype=wp.float32)
+"""Six rows of eight: a row of H, the component of g, and a zero that makes it eight."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    wp::vec_t<48, float> sum = system;
+    const float J[8] = {a.c[0], a.c[1], a.c[2], b.c[0], b.c[1], b.c[2], residual, 0.0f};
+    for (int i = 0; i < 6; ++i)
+        for (int k = 0; k < 8; ++k)
+            sum.c[8 * i + k] += weight * J[i] * J[k];
+    return sum;
+#else
+    typedef float eight __attribute__((vector_size(32), aligned(4)));
+    wp::vec_t<48, float> sum = system;
+    eight* rows = (eight*)sum.c;
+    const eight J = {a.c[0], a.c[1], a.c[2], b.c[0], b.c[1], b.c[2], residual, 0.0f};
+    rows[0] += weight * a.c[0] * J;
+    rows[1] += weight * a.c[1] * J;
+    rows[2] += weight * a.c[2] * J;
+    rows[3] += weight * b.c[0] * J;
+    rows[4] += weight * b.c[1] * J;
+    rows[5] += weight * b.c[2] * J;
+    return sum;
+#endif
+""")
+def add_point(system: System, a: wp.vec3, b: wp.vec3, residual: float, weight: float) -> System:
+    """Add weight J J^T and weight J residual for J = (a, b), a row in one instruction of a CPU."""
 
 
 @wp.struct
@@ -109,13 +135,7 @@ def accumulate(
     t_inverse = -(R_inverse * wp.vec3(float(T[0, 3]), float(T[1, 3]), float(T[2, 3])))
     u_limit = float(live_width - 1)
     v_limit = float(live_size[1] - 1)
-    zero = Row(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    H0 = Row(zero)  # rows of H, and the component of g in the seventh place
-    H1 = Row(zero)
-    H2 = Row(zero)
-    H3 = Row(zero)
-    H4 = Row(zero)
-    H5 = Row(zero)
+    system = System()
     cost = wp.float32(0.0)
     points = wp.float32(0.0)
     visible = wp.float32(0.0)
@@ -152,38 +172,31 @@ def accumulate(
         down = y - float(row)
         nearest = live_image + int(y + 0.5) * live_width + int(x + 0.5)
         live = fetch(live_vertices, nearest)
-        if live[2] > 0.0:
-            matched += 1.0
-            per_sigma = weights.per_depth_noise * per_z * per_z
-            gap = wp.abs(live[2] - q[2])
-            if gap * per_sigma > 8.0:
-                apart += 1.0
-            if gap > weights.distance_m:
-                cost += 3.0
-                continue  # another surface: neither its depth nor its colour is the model's
-            n = R_inverse * fetch(model_normals, i)
-            if wp.dot(n, fetch(live_normals, nearest)) > weights.cos_angle:
-                residual = wp.dot(n, live - q)
-                normalised = residual * per_sigma
-                ratio = normalised * weights.per_cauchy_icp
-                robust = 1.0 / (1.0 + ratio * ratio)
-                cost += 1.0 - robust
-                if wp.abs(normalised) < weights.inlier_sigmas:
-                    inliers += 1.0
-                    squared += residual * residual
-                turn = wp.cross(live, n)
-                weight = weights.icp * robust * per_sigma * per_sigma
-                J = Row(n[0], n[1], n[2], turn[0], turn[1], turn[2], residual, 0.0)
-                H0 += (weight * n[0]) * J
-                H1 += (weight * n[1]) * J
-                H2 += (weight * n[2]) * J
-                H3 += (weight * turn[0]) * J
-                H4 += (weight * turn[1]) * J
-                H5 += (weight * turn[2]) * J
-            else:
-                cost += 1.0
-        else:
-            cost += 0.5
+        # No branches from here on: noise would make each a guess, and a wrong one waits for all
+        # the loads above. What does not apply gets the weight 0.
+        per_sigma = weights.per_depth_noise * per_z * per_z
+        gap = wp.abs(live[2] - q[2])
+        is_matched = live[2] > 0.0
+        is_other = is_matched and gap > weights.distance_m  # another surface, of another colour
+        n = R_inverse * fetch(model_normals, i)
+        alignment = wp.dot(n, fetch(live_normals, nearest))
+        is_near = is_matched and not is_other and alignment > weights.cos_angle
+        residual = wp.dot(n, live - q)
+        normalised = residual * per_sigma
+        ratio = normalised * weights.per_cauchy_icp
+        robust = 1.0 / (1.0 + ratio * ratio)
+        matched += wp.where(is_matched, 1.0, 0.0)
+        apart += wp.where(is_matched and gap * per_sigma > 8.0, 1.0, 0.0)
+        cost += wp.where(
+            is_near,
+            1.0 - robust,
+            wp.where(is_other, 3.0, wp.where(is_matched, 1.0, 0.5)),
+        )
+        is_inlier = is_near and wp.abs(normalised) < weights.inlier_sigmas
+        inliers += wp.where(is_inlier, 1.0, 0.0)
+        squared += wp.where(is_inlier, residual * residual, 0.0)
+        weight = wp.where(is_near, weights.icp * robust * per_sigma * per_sigma, 0.0)
+        system = add_point(system, n, wp.cross(live, n), residual, weight)
         corner = live_image + row * live_width + column
         top_left = fetch(live_gradient, corner)
         top_right = fetch(live_gradient, corner + 1)
@@ -197,41 +210,22 @@ def accumulate(
         per_variance = 1.0 / (weights.grey_variance + weights.pixel_variance * slope_squared)
         ratio = residual * wp.sqrt(per_variance) * weights.per_cauchy_rgb
         robust = 1.0 / (1.0 + ratio * ratio)
-        cost += 2.0 * (1.0 - robust)
-        if wp.abs(seen[1]) + wp.abs(seen[2]) > weights.texture:
-            textured += 1.0
-            if wp.abs(residual) < weights.alike:
-                alike += 1.0
-            gx = seen[1] * focal[0] * per_z
-            gy = seen[2] * focal[1] * per_z
-            g = -wp.vec3(gx, gy, -(gx * q[0] + gy * q[1]) * per_z)
-            turn = wp.cross(q, g)
-            weight = weights.rgb * robust * per_variance
-            J = Row(g[0], g[1], g[2], turn[0], turn[1], turn[2], residual, 0.0)
-            H0 += (weight * g[0]) * J
-            H1 += (weight * g[1]) * J
-            H2 += (weight * g[2]) * J
-            H3 += (weight * turn[0]) * J
-            H4 += (weight * turn[1]) * J
-            H5 += (weight * turn[2]) * J
+        cost += wp.where(is_other, 0.0, 2.0 * (1.0 - robust))
+        slope = wp.abs(seen[1]) + wp.abs(seen[2])
+        is_textured = not is_other and slope > weights.texture
+        textured += wp.where(is_textured, 1.0, 0.0)
+        alike += wp.where(is_textured and wp.abs(residual) < weights.alike, 1.0, 0.0)
+        gx = seen[1] * focal[0] * per_z
+        gy = seen[2] * focal[1] * per_z
+        g = -wp.vec3(gx, gy, -(gx * q[0] + gy * q[1]) * per_z)
+        weight = wp.where(is_textured, weights.rgb * robust * per_variance, 0.0)
+        system = add_point(system, g, wp.cross(q, g), residual, weight)
     slot = row_index * ((width + columns - 1) // columns) + piece
-    for i in range(6):  # upper triangle by rows
-        partial[b, k, slot, i] = H0[i]
-        if i >= 1:
-            partial[b, k, slot, 5 + i] = H1[i]
-        if i >= 2:
-            partial[b, k, slot, 9 + i] = H2[i]
-        if i >= 3:
-            partial[b, k, slot, 12 + i] = H3[i]
-        if i >= 4:
-            partial[b, k, slot, 14 + i] = H4[i]
-    partial[b, k, slot, 20] = H5[5]
-    partial[b, k, slot, 21] = H0[6]
-    partial[b, k, slot, 22] = H1[6]
-    partial[b, k, slot, 23] = H2[6]
-    partial[b, k, slot, 24] = H3[6]
-    partial[b, k, slot, 25] = H4[6]
-    partial[b, k, slot, 26] = H5[6]
+    for i in range(6):
+        for j in range(6):
+            if j >= i:  # upper triangle by rows of six, five, four, ...
+                partial[b, k, slot, i * (11 - i) / 2 + j] = system[8 * i + j]
+        partial[b, k, slot, 21 + i] = system[8 * i + 6]
     partial[b, k, slot, 27] = cost
     partial[b, k, slot, 28] = points
     partial[b, k, slot, 29] = visible
