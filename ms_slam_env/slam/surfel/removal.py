@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
+from ms_slam_env.slam.surfel.memory import fetch, put
 from ms_slam_env.slam.surfel.surfel_arrays import Surfels
 
 
@@ -33,12 +34,25 @@ def list_survivors(
     oldest = time[b] - window
     if crowded:
         oldest = time[b]
-    for i in range(worker, count, workers):
-        confidence = surfels.confidence[b, i]
-        if confidence >= confidence_threshold or (
-            confidence > 0.0 and surfels.seen[b, i] >= oldest
-        ):
-            survivors[b, wp.atomic_add(kept, b, 1)] = i
+    i = int(worker)
+    while i < count:
+        confidence = fetch(surfels.confidence, b, i)
+        seen = fetch(surfels.seen, b, i)
+        if confidence >= confidence_threshold or (confidence > 0.0 and seen >= oldest):
+            put(survivors, b, wp.atomic_add(kept, b, 1), i)
+        i += workers
+
+
+@wp.func
+def copy_surfel(source: Surfels, target: Surfels, b: int, i: int, j: int):
+    """Copy slot i of one map to slot j of the other."""
+    put(target.position, b, j, fetch(source.position, b, i))
+    put(target.normal, b, j, fetch(source.normal, b, i))
+    put(target.color, b, j, fetch(source.color, b, i))
+    put(target.radius, b, j, fetch(source.radius, b, i))
+    put(target.confidence, b, j, fetch(source.confidence, b, i))
+    put(target.created, b, j, fetch(source.created, b, i))
+    put(target.seen, b, j, fetch(source.seen, b, i))
 
 
 @wp.kernel
@@ -49,39 +63,36 @@ def gather(
     kept: wp.array(dtype=wp.int32),
     workers: int,
 ) -> None:
-    """Copy the survivors to the front of ``target``."""
+    """Copy the survivors that must move to their new slots in ``target``."""
     b, worker = wp.tid()
-    for j in range(worker, kept[b], workers):
-        i = survivors[b, j]
-        target.position[b, j] = source.position[b, i]
-        target.normal[b, j] = source.normal[b, i]
-        target.color[b, j] = source.color[b, i]
-        target.radius[b, j] = source.radius[b, i]
-        target.confidence[b, j] = source.confidence[b, i]
-        target.created[b, j] = source.created[b, i]
-        target.seen[b, j] = source.seen[b, i]
+    count = kept[b]
+    j = int(worker)
+    while j < count:
+        i = fetch(survivors, b, j)
+        if i != j:
+            copy_surfel(source, target, b, i, j)
+        j += workers
 
 
 @wp.kernel
 def put_back(
     source: Surfels,
     target: Surfels,
+    survivors: wp.array2d(dtype=wp.int32),
     kept: wp.array(dtype=wp.int32),
     capacity: int,
     workers: int,
 ) -> None:
     """Copy the gathered survivors back and set the counters."""
     b, worker = wp.tid()
-    for j in range(worker, kept[b], workers):
-        target.position[b, j] = source.position[b, j]
-        target.normal[b, j] = source.normal[b, j]
-        target.color[b, j] = source.color[b, j]
-        target.radius[b, j] = source.radius[b, j]
-        target.confidence[b, j] = source.confidence[b, j]
-        target.created[b, j] = source.created[b, j]
-        target.seen[b, j] = source.seen[b, j]
+    count = kept[b]
+    j = int(worker)
+    while j < count:
+        if fetch(survivors, b, j) != j:
+            copy_surfel(source, target, b, j, j)
+        j += workers
     if worker == 0:
         target.count[b] = wp.min(target.count[b], capacity)
-        if kept[b] >= 0:
-            target.count[b] = kept[b]
+        if count >= 0:
+            target.count[b] = count
             target.dead[b] = 0

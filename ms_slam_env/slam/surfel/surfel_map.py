@@ -194,7 +194,7 @@ class SurfelMap:
             gather, [self.surfels, self._spare, self._survivors, self._kept, workers]
         )
         self._put_back = record(
-            put_back, [self._spare, self.surfels, self._kept, capacity, workers]
+            put_back, [self._spare, self.surfels, self._survivors, self._kept, capacity, workers]
         )
 
     def render_model(self, poses: wp.array) -> ModelView:
