@@ -143,7 +143,7 @@ def run(spec: RunSpec, pictures: Path | None = None) -> dict[str, Any]:
         planner = make_planner(spec.planner, world, spec.seed)
         played = play(env, planner, spec.seed, spec.seconds)
         judged = judge_episode(world, spec.rule)
-        if pictures is not None:
+        if pictures is not None and len(judged.points):
             _save_picture(world, judged, spec, pictures)
         return {
             **{name: played[name] for name in ("steps", "decision_ms", "time_s", "energy_j")},

@@ -80,10 +80,16 @@ def judge_map(
     sensor: RGBDSensor,
     rule: ConsistencyRule | None = None,
 ) -> JudgedMap:
-    """Judge a map, points (N, 3) and colours (N, 3), made of ``views`` of the sensor's scene."""
+    """Judge a map, points (N, 3) and colours (N, 3), made of ``views`` of the sensor's scene.
+
+    An empty map shows nothing twice.
+    """
     rule = rule or ConsistencyRule()
     scene = sensor.scene
     labels = scene.mesh.labels
+    if len(np.asarray(map_points)) == 0:
+        nothing = MapConsistency((), np.zeros(0, dtype=bool))
+        return JudgedMap(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), nothing, labels)
     kept = voxel_firsts(map_points, MAP_VOXEL_M)
     points, colors = np.asarray(map_points)[kept], np.asarray(map_colors)[kept]
     votes = count_votes(points, colors, views, sensor.intrinsics, len(labels))

@@ -61,6 +61,14 @@ def test_a_map_fails_when_its_second_half_is_off(
     assert bool((picture == RED).all(axis=2).sum() > 500) is not success
 
 
+def test_an_empty_map_shows_nothing_twice() -> None:
+    judged = judge_map(
+        np.zeros((0, 3)), np.zeros((0, 3)), [], get_sensor("table", 1001, "160x120", "kinect")
+    )
+    assert judged.consistency.success
+    assert judged.consistency.objects == ()
+
+
 def test_the_whole_surface_counts_as_true() -> None:
     points, owner = labelled_surface("table", 1001)
     mesh = get_sensor("table", 1001, "160x120", "kinect").scene.mesh
