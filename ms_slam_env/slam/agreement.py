@@ -68,8 +68,8 @@ class AgreementLimits:
     """
 
     overlap: float = 0.3
-    inliers: float = 0.7
-    alike: float = 0.6
+    inliers: float = 0.75
+    alike: float = 0.9
     motion_m: float = 0.3
     motion_rad: float = float(np.radians(30.0))
 

@@ -28,8 +28,8 @@ class OdometryConfig:
     keyframe_m: float = 0.04
     keyframe_deg: float = 3.0
     least_overlap: float = 0.3
-    least_inliers: float = 0.7
-    least_alike: float = 0.6
+    least_inliers: float = 0.75
+    least_alike: float = 0.9
     max_surfels: int = 400_000
 
     def __post_init__(self) -> None:

@@ -1,8 +1,8 @@
 """RGB-D odometry against keyframes, as a ``SlamBackend``.
 
-Every frame is aligned with the keyframe, failing that with the last good frame, failing that with
-the map's view from the caller's guess. The map holds the keyframes' readings at their estimated
-poses; it corrects no pose, so errors add up from keyframe to keyframe.
+Every frame is aligned with the keyframe; failing that with the last good frame; failing that with
+views of the map, from the caller's guess and from poses around the last one. The map holds the
+keyframes' readings at their estimated poses; errors add up from keyframe to keyframe.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from ms_slam_env.slam.agreement import (
 from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult, Views
 from ms_slam_env.slam.odometry.aligner import Aligner, PreparedImage
 from ms_slam_env.slam.odometry.config import OdometryConfig
+from ms_slam_env.slam.starts import start_poses
 from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
 
 _NOTHING = Agreement(0.0, 0.0, 0.0, 0.0)
@@ -66,6 +67,7 @@ class OdometrySlam(SlamBackend):
         self._pose = np.array(check_pose(pose, "T_world_camera"))
         self._key: _Placed | None = None
         self._last: _Placed | None = None
+        self._motion = np.eye(4)
         self._lost = False
         self._map.reset(self._pose)
 
@@ -105,6 +107,7 @@ class OdometrySlam(SlamBackend):
         if image.readings >= FEWEST_READINGS:  # nothing can be aligned with less
             self._key = self._last = _Placed(self._pose, self._aligner.prepare(image))
         self._map.fuse(frame, self._pose)
+        self._motion = np.eye(4)
         self._lost = False
         return TrackResult(self._pose.copy(), True)
 
@@ -126,10 +129,16 @@ class OdometrySlam(SlamBackend):
         if last is not key:
             yield last
         if guess is not None:
-            view = self._map.predict(guess[None])
-            image = DepthImage(view.depth[0], view.intensity[0])
+            yield from self._views(guess[None])
+        yield from self._views(start_poses(self._pose, self._motion))
+
+    def _views(self, poses: Float64) -> Iterator[_Placed]:
+        """Views of the map from poses (N, 4, 4), those with enough in them."""
+        views = self._map.predict(poses)
+        for pose, depth, intensity in zip(poses, views.depth, views.intensity, strict=True):
+            image = DepthImage(depth, intensity)
             if image.readings >= FEWEST_READINGS:
-                yield _Placed(guess, self._aligner.prepare(image))
+                yield _Placed(pose, self._aligner.prepare(image))
 
     def _align(self, frame: PreparedImage, reference: _Placed) -> tuple[Float64, Agreement, str]:
         """T_reference_frame, what it explains, and why it is not to be believed or nothing."""
@@ -143,6 +152,7 @@ class OdometrySlam(SlamBackend):
         """Move on to a frame whose pose was found."""
         assert self._key is not None
         relocalised, self._lost = self._lost, False
+        self._motion = np.eye(4) if relocalised else invert(self._pose) @ placed.T_world_image
         self._pose = placed.T_world_image
         self._last = placed
         motion = invert(self._key.T_world_image) @ self._pose
@@ -162,6 +172,7 @@ class OdometrySlam(SlamBackend):
 
     def _lose(self, reason: str, agreement: Agreement) -> TrackResult:
         """Hold the pose and the images that frames are aligned with."""
+        self._motion = np.eye(4)
         self._lost = True
         return TrackResult(
             T_world_camera=self._pose.copy(),
@@ -195,6 +206,7 @@ class OdometrySlam(SlamBackend):
         """Everything needed to go on bit-exactly, as NumPy arrays."""
         return {
             "pose": self._pose.copy(),
+            "motion": self._motion.copy(),
             "lost": self._lost,
             "key": _save(self._key),
             "last": "key" if self._last is self._key else _save(self._last),
@@ -204,6 +216,7 @@ class OdometrySlam(SlamBackend):
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state of an odometry of the same intrinsics and configuration."""
         self._pose = state["pose"].copy()
+        self._motion = state["motion"].copy()
         self._lost = state["lost"]
         self._key = self._restore(state["key"])
         self._last = self._key if state["last"] == "key" else self._restore(state["last"])

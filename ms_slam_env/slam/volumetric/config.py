@@ -40,8 +40,8 @@ class VolumetricConfig:
     association_m: float = 0.07
     least_weight: int = 1
     least_overlap: float = 0.3
-    least_inliers: float = 0.7
-    least_alike: float = 0.6
+    least_inliers: float = 0.75
+    least_alike: float = 0.9
 
     def __post_init__(self) -> None:
         """Refuse values outside the ranges."""

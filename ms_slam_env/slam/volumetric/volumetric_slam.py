@@ -7,6 +7,7 @@ fused. While tracking is lost the pose is held and nothing is fused.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import check_pose
+from ms_slam_env.geometry import check_pose, invert
 from ms_slam_env.slam.agreement import (
     FEWEST_READINGS,
     Agreement,
@@ -23,6 +24,7 @@ from ms_slam_env.slam.agreement import (
     measure_agreement,
 )
 from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult, Views
+from ms_slam_env.slam.starts import start_poses
 from ms_slam_env.slam.volumetric.config import VolumetricConfig
 from ms_slam_env.slam.volumetric.frame_to_model import FrameToModel
 from ms_slam_env.slam.volumetric.open3d_alignment import Open3DAlignment
@@ -62,6 +64,7 @@ class VolumetricSlam(SlamBackend):
         """Forget everything; the next frame is taken at ``T_world_camera`` (identity if None)."""
         pose = np.eye(4) if T_world_camera is None else T_world_camera
         self._pose = np.array(check_pose(pose, "T_world_camera"))
+        self._motion = np.eye(4)
         self._fused = 0
         self._lost = False
         self._view: CastView | None = None
@@ -72,7 +75,7 @@ class VolumetricSlam(SlamBackend):
     def track(self, frame: RGBDFrame, T_world_camera_guess: ArrayLike | None = None) -> TrackResult:
         """Estimate the pose of ``frame`` and fuse it into the grid; see ``SlamBackend``.
 
-        The guess is tried where the last pose leads nowhere.
+        Where the last pose leads nowhere, the guess and poses around the last one are tried.
 
         Raises:
             InputError: the frame's size is not that of the intrinsics, or the guess is no pose.
@@ -88,13 +91,32 @@ class VolumetricSlam(SlamBackend):
             return self._lose(f"the {which} has too few depth readings", _NOTHING)
         if self._fused == 0:
             return self.fuse(frame, self._pose)
-        T, agreement, reason = self._align(frame, depth, self._pose, self._model_view())
-        if reason and guess is not None:
-            view = self._cast(guess)
-            T, agreement, reason = self._align(frame, depth, guess, view)
-        if reason:
-            return self._lose(reason, agreement)
+        reason, agreement = "", _NOTHING
+        for pose, view in self._views(guess):
+            T, agreement, reason = self._align(frame, depth, pose, view)
+            if not reason and view is not self._view:  # from afar: once more, from close by
+                T, agreement, reason = self._align(frame, depth, T, self._cast(T))
+            if not reason:
+                return self._accept(frame, depth, T, agreement)
+        return self._lose(reason, agreement)
+
+    def _views(self, guess: Float64 | None) -> Iterator[tuple[Float64, CastView]]:
+        """Views to align a frame with and their poses, in the order in which they are tried."""
+        if self._view is None:
+            self._view = self._cast(self._pose)
+        yield self._pose, self._view
+        further = start_poses(self._pose, self._motion)
+        if guess is not None:
+            further = np.concatenate([guess[None], further])
+        for pose in further:
+            yield pose, self._cast(pose)
+
+    def _accept(
+        self, frame: RGBDFrame, depth: NDArray[np.uint16], T: Float64, agreement: Agreement
+    ) -> TrackResult:
+        """Move on to a frame whose pose T_world_camera was found."""
         relocalised, self._lost = self._lost, False
+        self._motion = np.eye(4) if relocalised else invert(self._pose) @ T
         self._pose = T
         self._fuse(frame, depth)
         return TrackResult(
@@ -113,6 +135,7 @@ class VolumetricSlam(SlamBackend):
         """
         self.intrinsics.check_image(frame.depth, "frame")
         self._pose = np.array(check_pose(T_world_camera, "T_world_camera"))
+        self._motion = np.eye(4)
         self._lost = False
         self._view = None
         depth = self._depth(frame)
@@ -136,12 +159,6 @@ class VolumetricSlam(SlamBackend):
         weight = min(self._fused, _FULL_WEIGHT)
         return self._grid.cast(pose, weight, self.intrinsics)
 
-    def _model_view(self) -> CastView:
-        """The view from the last good pose."""
-        if self._view is None:
-            self._view = self._cast(self._pose)
-        return self._view
-
     def _align(
         self, frame: RGBDFrame, depth: NDArray[np.uint16], pose: Float64, view: CastView
     ) -> tuple[Float64, Agreement, str]:
@@ -160,6 +177,7 @@ class VolumetricSlam(SlamBackend):
 
     def _lose(self, reason: str, agreement: Agreement) -> TrackResult:
         """Hold the pose."""
+        self._motion = np.eye(4)
         self._lost = self._fused > 0
         return TrackResult(
             T_world_camera=self._pose.copy(),
@@ -207,6 +225,7 @@ class VolumetricSlam(SlamBackend):
         """Everything needed to go on bit-exactly, as NumPy arrays."""
         return {
             "pose": self._pose.copy(),
+            "motion": self._motion.copy(),
             "fused": self._fused,
             "lost": self._lost,
             "grid": self._grid.get_state(),
@@ -215,6 +234,7 @@ class VolumetricSlam(SlamBackend):
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state of a SLAM of the same intrinsics and configuration."""
         self._pose = state["pose"].copy()
+        self._motion = state["motion"].copy()
         self._fused = state["fused"]
         self._lost = state["lost"]
         self._grid.set_state(state["grid"])

@@ -1,0 +1,86 @@
+"""Whether an alignment is believed, against closed-form views of a plane."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from surfel_scenes import ray_cast
+
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.geometry import make_pose, so3_exp
+from ms_slam_env.slam.agreement import AgreementLimits, DepthImage, measure_agreement
+from ms_slam_env.slam.starts import TURN_RAD, start_poses
+
+CAMERA = Intrinsics(fx=80.0, fy=84.0, cx=39.3, cy=29.8, width=80, height=60)
+REST = np.eye(4)
+MOVED = make_pose(so3_exp([0.01, 0.03, -0.02]), [0.04, -0.02, 0.03])
+
+
+def _view(T_world_camera: np.ndarray) -> DepthImage:
+    """A tilted textured wall."""
+    depth, _, color = ray_cast(T_world_camera, CAMERA, box=False)
+    return DepthImage(depth.astype(np.float32), color.mean(-1).astype(np.float32))
+
+
+def test_the_true_motion_explains_everything_that_is_in_view():
+    found = measure_agreement(_view(MOVED), _view(REST), MOVED, CAMERA)
+    assert found.overlap > 0.85
+    assert found.inlier_fraction == 1
+    assert found.alike_fraction == 1
+    assert found.residual_m < 1e-6  # the planes through neighbouring pixels are the wall
+    assert AgreementLimits().reason(found, MOVED) == ""
+
+
+@given(offset_m=st.floats(0.0, 0.05))
+def test_the_residual_is_the_distance_to_the_plane(offset_m):
+    depth = np.full(CAMERA.shape, 2.0, dtype=np.float32)
+    wall = DepthImage(depth, np.zeros_like(depth))
+    moved = make_pose(np.eye(3), [0.0, 0.0, offset_m])
+    found = measure_agreement(wall, wall, moved, CAMERA)
+    assert found.inlier_fraction == 1
+    assert found.residual_m == pytest.approx(offset_m, abs=1e-6)
+
+
+def test_a_darker_frame_agrees_and_another_texture_does_not():
+    reference = _view(REST)
+    darker = DepthImage(reference.depth, reference.intensity - 40)
+    assert measure_agreement(darker, reference, REST, CAMERA).alike_fraction == 1
+    noise = np.random.default_rng(0).uniform(0, 255, CAMERA.shape).astype(np.float32)
+    found = measure_agreement(DepthImage(reference.depth, noise), reference, REST, CAMERA)
+    assert found.inlier_fraction == 1
+    assert found.alike_fraction < 0.5
+    assert "intensity" in AgreementLimits().reason(found, REST)
+
+
+def test_what_does_not_fit_is_named():
+    reference = _view(REST)
+    away = make_pose(so3_exp([0.0, np.pi, 0.0]), np.zeros(3))
+    assert measure_agreement(reference, reference, away, CAMERA).overlap == 0
+    limits = AgreementLimits(motion_rad=4.0)
+    found = measure_agreement(reference, reference, away, CAMERA)
+    assert "overlaps" in limits.reason(found, away)
+    assert "implausibly" in AgreementLimits().reason(found, away)
+    near = DepthImage(reference.depth * np.float32(0.8), reference.intensity)
+    found = measure_agreement(near, reference, REST, CAMERA)
+    assert "depth" in AgreementLimits().reason(found, REST)
+
+
+def test_pixels_without_a_reading_count_neither_way():
+    reference, frame = _view(REST), _view(REST)
+    frame.depth[:, :40] = 0
+    reference.depth[:30] = 0
+    found = measure_agreement(frame, reference, REST, CAMERA)
+    assert found.overlap == pytest.approx(0.5, abs=0.05)
+    assert found.inlier_fraction == 1
+
+
+def test_starts_go_on_first_and_then_turn_all_ways():
+    starts = start_poses(MOVED, MOVED)
+    np.testing.assert_allclose(starts[0], MOVED @ MOVED)
+    turned = np.linalg.inv(MOVED) @ starts[1:]
+    np.testing.assert_allclose(turned[:, :3, 3], 0, atol=1e-12)
+    angles = np.arccos((np.trace(turned[:, :3, :3], axis1=1, axis2=2) - 1) / 2)
+    np.testing.assert_allclose(angles, TURN_RAD)
+    np.testing.assert_allclose(turned[::2] @ turned[1::2], np.tile(np.eye(4), (3, 1, 1)), atol=1e-9)

@@ -1,0 +1,92 @@
+"""The voxel grid against closed-form views, and Open3D being absent."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+from surfel_scenes import WALL_NORMAL, WALL_POINT, ray_cast
+
+from ms_slam_env import slam
+from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
+from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import make_pose, so3_exp
+
+# No multiple of 8: Open3D's default bounds of rays would be read out of range.
+CAMERA = Intrinsics(fx=150.0, fy=155.0, cx=74.3, cy=56.8, width=150, height=114)
+VOXEL_M = 0.02
+POSE = make_pose(so3_exp([0.05, -0.1, 0.2]), [0.1, 0.05, -0.1])
+
+
+@pytest.fixture(autouse=True)
+def _open3d():
+    pytest.importorskip("open3d", reason="Open3D is not installed", exc_type=ImportError)
+
+
+def _frame(pose: np.ndarray) -> RGBDFrame:
+    depth, _, color = ray_cast(pose, CAMERA, box=False)
+    return RGBDFrame(np.rint(color).astype(np.uint8), depth.astype(np.float32))
+
+
+def _mapped(count: int, **options: object) -> slam.SlamBackend:
+    backend = slam.make("volumetric", CAMERA, voxel_m=VOXEL_M, **options)
+    for _ in range(count):
+        backend.fuse(_frame(POSE), POSE)
+    return backend
+
+
+def test_one_frame_is_cast_whole_and_unbiased():
+    views = _mapped(1).predict(POSE[None])
+    depth, normals, color = ray_cast(POSE, CAMERA, box=False)
+    inner = np.zeros(CAMERA.shape, dtype=bool)
+    inner[4:-4, 4:-4] = True
+    hit = views.depth[0] > 0
+    assert hit[inner].mean() > 0.99
+    both = inner & hit
+    error = (views.depth[0] - depth)[both]
+    assert abs(np.median(error)) < 0.1 * VOXEL_M  # Open3D's own is half a voxel off
+    assert np.percentile(np.abs(error), 90) < 0.5 * VOXEL_M
+    grey = color @ [0.299, 0.587, 0.114]
+    assert np.median(np.abs(views.intensity[0] - grey)[both]) < 2
+    cosine = (views.normals[0] * normals).sum(-1)[both]
+    assert np.median(cosine) > 0.99
+
+
+def test_surface_points_lie_on_the_wall():
+    backend = _mapped(2)
+    points = backend.surface_points()
+    assert len(points) > 1000
+    assert np.median(np.abs((points - WALL_POINT) @ WALL_NORMAL)) < 0.15 * VOXEL_M
+    normals = backend.map_attributes()["normal"]
+    assert np.median(np.abs(normals @ WALL_NORMAL)) > 0.99
+    np.testing.assert_array_equal(points, _mapped(2).surface_points())
+
+
+def test_voxels_seen_less_often_than_asked_are_no_surface():
+    assert not _mapped(2, least_weight=3).predict(POSE[None]).depth.any()
+    assert len(_mapped(2, least_weight=3).surface_points()) == 0
+    assert _mapped(3, least_weight=3).predict(POSE[None]).depth.any()
+
+
+def test_the_grid_grows_when_its_blocks_are_used_up():
+    small, large = _mapped(1, blocks=100), _mapped(1, blocks=4000)
+    np.testing.assert_array_equal(small.surface_points(), large.surface_points())
+    np.testing.assert_array_equal(small.predict(POSE[None]).depth, large.predict(POSE[None]).depth)
+
+
+def test_open3d_can_align_too():
+    backend = _mapped(3, aligner="open3d")
+    moved = POSE @ make_pose(so3_exp([0.0, 0.005, 0.0]), [0.005, 0.0, 0.005])
+    result = backend.track(_frame(moved))
+    assert result.tracking_ok, result.reason
+    # A plane leaves three directions to the smooth texture alone.
+    assert abs((result.T_world_camera - moved)[:3, 3] @ WALL_NORMAL) < 0.005
+    with pytest.raises(InputError, match="valid choices: opencv, open3d"):
+        slam.make("volumetric", CAMERA, aligner="icp")
+
+
+def test_without_open3d_the_error_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    with pytest.raises(InputError, match=r"ms-slam-env\[open3d\].*libgl1"):
+        slam.make("volumetric", xtion("80x60"))
