@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ms_slam_env.robot.arm.chain import Chain, segment_distance
 from ms_slam_env.robot.arm.config import ArmConfig
+from ms_slam_env.robot.arm.path import progress
 from ms_slam_env.robot.arm.reach import LIMIT_MARGIN_RAD, MOST_STRETCH
 from ms_slam_env.robot.arm.surroundings import Surroundings
 
@@ -32,7 +33,7 @@ class SlowWay:
             self.off_m < 1e-3 + 0.1 * slack
             and self.off_rad < np.radians(0.1) + 0.1 * slack
             and self.limit_spare_rad > -slack
-            and self.stretch < MOST_STRETCH * (1 + slack)
+            and self.stretch < 1.05 * MOST_STRETCH * (1 + slack)
             and self.furniture_spare_m > -slack
             and self.self_spare_m > -slack
         )
@@ -63,7 +64,7 @@ def follow(
 ) -> SlowWay:
     """Follow the straight way to a camera pose (4, 4) with ``waypoints`` joint configurations."""
     start = chain.camera_pose(q)
-    share = np.linspace(0, 1, waypoints)
+    share = progress(np.linspace(0, 1, waypoints))
     turning = Slerp([0, 1], Rotation.from_matrix([start[:3, :3], target[:3, :3]]))
     angle = (turning(0.0).inv() * turning(1.0)).magnitude()
     distance = np.linalg.norm(target[:3, 3] - start[:3, 3])
@@ -79,7 +80,7 @@ def follow(
     joints = np.stack(ways)
     low, high = chain.lower + LIMIT_MARGIN_RAD, chain.upper - LIMIT_MARGIN_RAD
     limit = np.minimum(joints - low, high - joints)[1:].min()
-    speed = np.abs(np.diff(joints, axis=0)) * (waypoints - 1) * 1.25 / duration
+    speed = np.abs(np.diff(joints, axis=0)) * (waypoints - 1) / duration
     furniture, apart = spares(chain, surroundings, joints[1:], config.clearance_m)
     return SlowWay(
         joints,

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from ms_slam_env.robot.arm.arm_base import ArmEmbodiment, frame_times
 from ms_slam_env.robot.arm.inverse import solve_pose
-from ms_slam_env.robot.arm.path import progress
 from ms_slam_env.robot.base import Movement
 
 Float64 = NDArray[np.float64]
@@ -27,7 +26,7 @@ class KinematicArm(ArmEmbodiment):
         duration = float(probe.duration_s[action]) if made else 0.0
         times = frame_times(duration, self.config)
         if duration > 0:
-            q = self._along(probe.q[action], progress(times / duration))
+            q = self._along(probe.q[action], np.minimum(times / duration, 1.0))
         else:
             q = np.tile(self.q, (len(times), 1))
         if made and duration > 0:
@@ -38,9 +37,9 @@ class KinematicArm(ArmEmbodiment):
         return Movement(made, poses, poses.copy(), times)
 
     @staticmethod
-    def _along(waypoints: Float64, share_of_way: Float64) -> Float64:
-        """Joint angles (k, n) after shares (k,) of the way through waypoints (W, n)."""
-        place = share_of_way * (len(waypoints) - 1)
+    def _along(waypoints: Float64, share_of_time: Float64) -> Float64:
+        """Joint angles (k, n) after shares (k,) of the time through waypoints (W, n)."""
+        place = share_of_time * (len(waypoints) - 1)
         before = np.minimum(place.astype(np.int64), len(waypoints) - 2)
         part = (place - before)[:, None]
         return (1 - part) * waypoints[before] + part * waypoints[before + 1]

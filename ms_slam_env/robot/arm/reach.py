@@ -14,7 +14,7 @@ from ms_slam_env._warp import wp
 from ms_slam_env.geometry import invert
 from ms_slam_env.robot.arm.chain import Chain
 from ms_slam_env.robot.arm.config import ArmConfig
-from ms_slam_env.robot.arm.path import PEAK_SPEED
+from ms_slam_env.robot.arm.path import PEAK_SPEED, progress
 from ms_slam_env.robot.arm.reach_kernels import Arm, Grid, Scratch, follow, start_deficits
 from ms_slam_env.robot.arm.surroundings import Surroundings
 
@@ -27,16 +27,18 @@ REASONS = ("ok", "unreachable", "joint limit", "joint speed", "furniture", "self
 FEWEST_PARTS = 7
 """A way is cut into at least so many parts between waypoints."""
 
-LONGEST_PART_M = 0.02
-LONGEST_PART_RAD = np.radians(2.0)
+LONGEST_PART_M = 0.022
+LONGEST_PART_RAD = np.radians(2.2)
 """Longer ways into more, until the camera moves no more than this in each."""
 
-MOST_STRETCH = 3.0
-"""A way on which a joint would take more than this times the camera's duration is refused."""
+MOST_STRETCH = 4.0
+"""A way on which a joint would take more than this times the camera's duration is refused,
+but for 5 %: less than what the controller makes good within its tolerance of the way."""
 
 LIMIT_MARGIN_RAD = 0.02
 """Distance that planned joint angles keep from their limits."""
 
+_LEEWAY = 0.05
 _STILL_S = 1e-6  # duration given to a way without motion
 _SHORTEST_PART_M = 0.03  # of a capsule, between two balls that cover it
 
@@ -48,8 +50,8 @@ class ReachResult:
     Attributes:
         ok: (k,) the arm can make the motion.
         reason: (k,) index into ``REASONS``; 0 where ok.
-        q: (k, W, n) joint angles at equal parts of the way, the first at its start, the last at
-            its end; only the start is sure to be there where the motion is not ok.
+        q: (k, W, n) joint angles after equal parts of the duration, the first at the start of the
+            way, the last at its end; only the start is sure to be there where the motion is not ok.
         duration_s: (k,) of the motion; longer than the camera's own where a joint needs longer;
             0 without motion.
     """
@@ -66,8 +68,9 @@ class Reach:
     A way is possible if at each of its waypoints inverse kinematics finds joint angles within 1 mm
     and 0.1 degrees of it, limits are kept, capsules around the links stay ``clearance_m`` away
     from furniture (beyond the slack of ``Surroundings``) and from each other, and no joint needs
-    more than ``MOST_STRETCH`` times the duration of the camera's way. Between waypoints nothing is
-    checked: the camera moves at most 2 cm from one to the next, half of which the clearance covers.
+    more than ``MOST_STRETCH`` times the duration of the camera's way. Distances are checked at
+    places so close that no link moves more than 4 cm between two, half of which the clearance
+    covers.
     Pairs of links that are closer than the clearance at the arm's home need half that gap.
 
     An arm that stands too close already, by less than the clearance, may go on, though not closer:
@@ -128,8 +131,8 @@ class Reach:
                 buffers.duration,
                 buffers.deficit,
                 LIMIT_MARGIN_RAD,
-                MOST_STRETCH,
-                PEAK_SPEED,
+                (1 + _LEEWAY) * MOST_STRETCH,
+                buffers.share,
                 buffers.q,
                 buffers.stretch,
                 buffers.reason,
@@ -149,7 +152,7 @@ def _parts(step: Float64, turn: Float64) -> int:
     """How many parts the longest of ways with translations and rotations (k, 3) needs."""
     metres = np.linalg.norm(step, axis=1).max(initial=0.0) / LONGEST_PART_M
     radians = np.linalg.norm(turn, axis=1).max(initial=0.0) / LONGEST_PART_RAD
-    return max(FEWEST_PARTS, int(np.ceil(max(metres, radians) - 1e-6)))
+    return max(FEWEST_PARTS, int(np.ceil(PEAK_SPEED * max(metres, radians) - 1e-6)))
 
 
 class _Buffers:
@@ -167,10 +170,12 @@ class _Buffers:
         self.duration = array((k,), wp.float32)
         self.stretch = array((k,), wp.float32)
         self.reason = array((k,), wp.int32)
+        self.share = _array(progress(np.linspace(0, 1, w)), wp.float32, device)
         self.deficit = array((2,), wp.float32)
         self.scratch = Scratch()
         self.scratch.R = array((k, n + 2), wp.mat33)
         self.scratch.t = array((k, n + 2), wp.vec3)
+        self.scratch.q = array((k, 1, n), wp.float32)
         self.scratch.a = array((k, max(m, 1)), wp.vec3)
         self.scratch.b = array((k, max(m, 1)), wp.vec3)
         self._start = np.zeros((k, w, n), dtype=np.float32)

@@ -25,6 +25,7 @@ _CONVERGED_RAD = wp.constant(1.0e-4)
 _TOLERANCE_M = wp.constant(1.0e-3)
 _TOLERANCE_RAD = wp.constant(1.745e-3)
 _LARGEST_STEP_RAD = wp.constant(0.3)
+_CHECKED_M = wp.constant(0.04)
 
 vec6 = wp.types.vector(length=6, dtype=wp.float32)
 mat66 = wp.types.matrix(shape=(6, 6), dtype=wp.float32)
@@ -65,6 +66,7 @@ class Scratch:
 
     R: wp.array2d(dtype=wp.mat33)  # (k, n + 2) links, then the camera
     t: wp.array2d(dtype=wp.vec3)
+    q: wp.array3d(dtype=float)  # (k, 1, n) joint angles between two waypoints
     a: wp.array2d(dtype=wp.vec3)  # (k, m) ends of the capsules in the base frame
     b: wp.array2d(dtype=wp.vec3)
 
@@ -262,13 +264,60 @@ def self_deficit(arm: Arm, k: int, work: Scratch):
 
 @wp.func
 def place_capsules(arm: Arm, k: int, work: Scratch):
-    """Ends of the capsules in the base frame, from the links' poses."""
+    """Ends of the capsules in the base frame, from the links' poses; how far the farthest moved."""
+    farthest = float(0.0)
     for i in range(arm.capsule_link.shape[0]):
         link = arm.capsule_link[i]
         R = work.R[k, link]
         t = work.t[k, link]
-        work.a[k, i] = R * arm.capsule_a[i] + t
-        work.b[k, i] = R * arm.capsule_b[i] + t
+        a = R * arm.capsule_a[i] + t
+        b = R * arm.capsule_b[i] + t
+        farthest = wp.max(farthest, wp.length(a - work.a[k, i]))
+        farthest = wp.max(farthest, wp.length(b - work.b[k, i]))
+        work.a[k, i] = a
+        work.b[k, i] = b
+    return farthest
+
+
+@wp.func
+def collision(arm: Arm, grid: Grid, k: int, work: Scratch, deficit: wp.array(dtype=float)):
+    """The reason against the capsules where they are now, or ``OK``."""
+    if furniture_deficit(arm, grid, k, work) > deficit[0]:
+        return FURNITURE
+    if self_deficit(arm, k, work) > deficit[1]:
+        return SELF
+    return OK
+
+
+@wp.func
+def collision_on_part(
+    arm: Arm,
+    grid: Grid,
+    q: wp.array3d(dtype=float),
+    k: int,
+    w: int,
+    work: Scratch,
+    deficit: wp.array(dtype=float),
+):
+    """The reason against the part that ends at waypoint ``w``, or ``OK``.
+
+    Where a link moves far between two waypoints places between them are checked too.
+    """
+    moved = place_capsules(arm, k, work)
+    found = collision(arm, grid, k, work, deficit)
+    checks = int(wp.ceil(moved / _CHECKED_M))
+    for j in range(1, checks):
+        if found == OK:
+            share = float(j) / float(checks)
+            for i in range(arm.num_joints):
+                work.q[k, 0, i] = wp.lerp(q[k, w - 1, i], q[k, w, i], share)
+            forward(arm, work.q, k, 0, work)
+            place_capsules(arm, k, work)
+            found = collision(arm, grid, k, work, deficit)
+    if checks > 1 and found == OK:  # back to the waypoint, from where the next part begins
+        forward(arm, q, k, w, work)
+        place_capsules(arm, k, work)
+    return found
 
 
 @wp.kernel
@@ -300,27 +349,31 @@ def follow(
     deficit: wp.array(dtype=float),
     limit_margin: float,
     most_stretch: float,
-    peak_speed: float,
+    share: wp.array(dtype=float),
     q: wp.array3d(dtype=float),
     stretch: wp.array(dtype=float),
     reason: wp.array(dtype=int),
 ):
-    """Follow one candidate's way; ``q`` (k, W, n) holds the start in its first waypoint."""
+    """Follow one candidate's way; ``q`` (k, W, n) holds the start in its first waypoint.
+
+    ``share`` (W,) is how much of the way is made at each waypoint.
+    """
     k = wp.tid()
     n = arm.num_joints
     parts = q.shape[1] - 1
     angle = wp.length(turn[k])
     axis = wp.normalize(turn[k])
     slowest = float(1.0)
+    forward(arm, q, k, 0, work)
+    place_capsules(arm, k, work)
     for w in range(1, parts + 1):
-        share = float(w) / float(parts)
         for i in range(n):  # straight on in joint space is a close first guess
+            q[k, w, i] = q[k, w - 1, i]
             if w > 1:
-                q[k, w, i] = 2.0 * q[k, w - 1, i] - q[k, w - 2, i]
-            else:
-                q[k, w, i] = q[k, 0, i]
-        R_target = R_start * wp.quat_to_matrix(wp.quat_from_axis_angle(axis, share * angle))
-        if solve_waypoint(arm, R_target, t_start + share * step[k], q, k, w, work) == 0:
+                ahead = (share[w] - share[w - 1]) / (share[w - 1] - share[w - 2])
+                q[k, w, i] += ahead * (q[k, w - 1, i] - q[k, w - 2, i])
+        R_target = R_start * wp.quat_to_matrix(wp.quat_from_axis_angle(axis, share[w] * angle))
+        if solve_waypoint(arm, R_target, t_start + share[w] * step[k], q, k, w, work) == 0:
             reason[k] = UNREACHABLE
             return
         for i in range(n):
@@ -330,18 +383,15 @@ def follow(
                 reason[k] = JOINT_LIMIT
                 return
             moved = wp.abs(q[k, w, i] - q[k, w - 1, i])
-            needed_s = peak_speed * float(parts) * moved / arm.speed[i]
+            needed_s = float(parts) * moved / arm.speed[i]
             if needed_s > duration_s[k] * slowest:
                 slowest = needed_s / duration_s[k]
         if slowest > most_stretch:
             reason[k] = JOINT_SPEED
             return
-        place_capsules(arm, k, work)
-        if furniture_deficit(arm, grid, k, work) > deficit[0]:
-            reason[k] = FURNITURE
-            return
-        if self_deficit(arm, k, work) > deficit[1]:
-            reason[k] = SELF
+        found = collision_on_part(arm, grid, q, k, w, work, deficit)
+        if found != OK:
+            reason[k] = found
             return
     stretch[k] = slowest
     reason[k] = OK
