@@ -37,7 +37,7 @@ WITHOUT_FRAMES = ("free", "fixed-translation")
 class Arguments:
     """Decisions a second with random permitted actions, and milliseconds a step in each stage.
 
-    The clock runs during ``env.step`` alone; resets are not counted. Processor time is what the step
+    The clock runs during ``env.step`` alone; resets are not counted. Processor time is what a step
     would take on a core of its own, where the measured time suffers from a busy machine.
     """
 
@@ -97,8 +97,8 @@ def measure(args: Arguments, case: Case) -> dict[str, Any]:
 
     Returns:
         ``steps``; ``steps_per_s``; ``frames_per_step``; ``step_ms`` (mean), ``step_ms_95`` (95th
-        percentile); ``processor_ms`` (mean, of all threads); ``split_ms``: mean milliseconds a step that each stage took itself, without
-        those nested in it, and ``rest``.
+        percentile); ``processor_ms`` (mean, of all threads); ``split_ms``: mean milliseconds a
+        step that each stage took itself, without those nested in it, and ``rest``.
     """
     env = gym.make(
         "MSActiveSLAM-v0",
