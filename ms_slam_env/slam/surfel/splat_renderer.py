@@ -57,6 +57,40 @@ def every_nth(intrinsics: Intrinsics, n: int) -> Intrinsics:
     )
 
 
+class Culler:
+    """Lists the surfels that cameras can see, one camera for each of ``envs`` maps."""
+
+    def __init__(
+        self,
+        surfels: Surfels,
+        visible: VisibleList,
+        envs: int,
+        camera: SplatCamera,
+        workers: int,
+        device: str,
+    ) -> None:
+        self._visible = visible
+        self._arguments: tuple[Any, ...] = (0, wp.zeros(envs, dtype=wp.mat44, device=device), 0.0)
+        first_env, poses, margin_px = self._arguments
+        self._launch = wp.launch(
+            cull,
+            dim=(envs, workers),
+            inputs=[surfels, first_env, poses, camera, margin_px, workers, visible],
+            device=device,
+            record_cmd=True,
+        )
+
+    def __call__(self, poses: wp.array, first_env: int = 0, margin_px: float = 0.0) -> None:
+        """Fill the list for ``poses`` (envs,) T_world_camera of the envs from ``first_env`` on."""
+        self._visible.count.zero_()
+        changing = (first_env, poses, margin_px)
+        for index, new, old in zip((1, 2, 4), changing, self._arguments, strict=True):
+            if new is not old:
+                self._launch.set_param_at_index(index, new)
+        self._arguments = changing
+        self._launch.launch()
+
+
 class SplatRenderer:
     """Renders ``envs`` of the maps in ``surfels``, one pose each, at one image size.
 
@@ -98,22 +132,7 @@ class SplatRenderer:
         pixels = envs * intrinsics.width * intrinsics.height
         self._z_buffer = wp.zeros(pixels, dtype=wp.float32, device=device)
         self._sums = wp.zeros(pixels, dtype=Sums, device=device)
-        self._cull = wp.launch(
-            cull,
-            dim=(envs, workers),
-            inputs=[
-                surfels,
-                0,
-                wp.zeros(envs, dtype=wp.mat44, device=device),
-                self.camera,
-                0.0,
-                workers,
-                visible,
-            ],
-            device=device,
-            record_cmd=True,
-        )
-        self._cull_arguments: tuple[int | None, wp.array | None, float | None] = (None, None, None)
+        self._culler = Culler(surfels, visible, envs, self.camera, workers, device)
         self._splats = {id(visible): self._record_splats(surfels, visible)}
         self._first_env = {id(visible): 0}
         self._surfels = surfels
@@ -160,13 +179,7 @@ class SplatRenderer:
 
     def cull(self, poses: wp.array, first_env: int = 0, margin_px: float = 1.0) -> None:
         """List the surfels that the cameras at ``poses`` (envs,) T_world_camera can see."""
-        self._visible.count.zero_()
-        changing = (first_env, poses, margin_px)
-        for index, new, old in zip((1, 2, 4), changing, self._cull_arguments, strict=True):
-            if new is not old:
-                self._cull.set_param_at_index(index, new)
-        self._cull_arguments = changing
-        self._cull.launch()
+        self._culler(poses, first_env, margin_px)
 
     def splat(self, first_env: int = 0, listed: VisibleList | None = None) -> ModelView:
         """Draw the surfels that ``cull`` listed, or those of another list."""

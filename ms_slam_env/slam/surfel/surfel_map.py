@@ -22,7 +22,13 @@ from ms_slam_env.slam.surfel.fusion import (
 )
 from ms_slam_env.slam.surfel.prediction import DeviceViews, ViewPredictor
 from ms_slam_env.slam.surfel.removal import gather, list_survivors, put_back
-from ms_slam_env.slam.surfel.splat_renderer import SplatParameters, SplatRenderer, every_nth
+from ms_slam_env.slam.surfel.splat_renderer import (
+    Culler,
+    SplatParameters,
+    SplatRenderer,
+    every_nth,
+    splat_camera,
+)
 from ms_slam_env.slam.surfel.surfel_arrays import (
     ATTRIBUTES,
     COUNTERS,
@@ -80,25 +86,22 @@ class SurfelMap:
         self._fusion.radius_px = config.surfel_radius_px
         self._fusion.max_confidence = config.max_confidence
         parameters = SplatParameters(tolerance_m=config.fusion_distance_m)
-        self._renderer = SplatRenderer(
-            self.surfels, self._visible, discs, batch, intrinsics, parameters, self._workers, device
+        self._camera = splat_camera(intrinsics, parameters)
+        self._cull = Culler(self.surfels, self._visible, batch, self._camera, self._workers, device)
+        self._model_renderer = SplatRenderer(
+            self.surfels,
+            self._visible,
+            discs,
+            batch,
+            every_nth(intrinsics, model_stride),
+            replace(
+                parameters,
+                min_px=parameters.min_px / model_stride,
+                max_px=parameters.max_px / model_stride,
+            ),
+            self._workers,
+            device,
         )
-        self._model_renderer = self._renderer
-        if model_stride > 1:
-            self._model_renderer = SplatRenderer(
-                self.surfels,
-                self._visible,
-                discs,
-                batch,
-                every_nth(intrinsics, model_stride),
-                replace(
-                    parameters,
-                    min_px=parameters.min_px / model_stride,
-                    max_px=parameters.max_px / model_stride,
-                ),
-                self._workers,
-                device,
-            )
         self._predictor = ViewPredictor(
             self.surfels, self._visible, discs, intrinsics, parameters, self._workers, device
         )
@@ -131,7 +134,7 @@ class SurfelMap:
             weight: (B,) float32 in (0, 1], lower for a fast camera (Whelan et al., section 3).
             mask: (B,) int32, 0 leaves an env's map as it is.
         """
-        self._renderer.cull(poses, margin_px=0.0)
+        self._cull(poses)
         self._covered.zero_()
         self._kept.zero_()
         self._bind(live, poses, time, weight, mask)
@@ -167,7 +170,7 @@ class SurfelMap:
         depth = wp.zeros(pixels, dtype=wp.float32, device=self.device)
         image = wp.zeros(pixels, dtype=wp.vec3, device=self.device)
         radial = radial_weights(*self.intrinsics.shape).ravel()
-        frame = [poses, self._renderer.camera, integers, integers, floats, self._fusion, workers]
+        frame = [poses, self._camera, integers, integers, floats, self._fusion, workers]
         frame += [depth, image, image, wp.array(radial, device=self.device), self._covered]
 
         def record(kernel: Any, inputs: list[Any]) -> Any:
@@ -200,7 +203,8 @@ class SurfelMap:
     def render_model(self, poses: wp.array) -> ModelView:
         """Render every env's map from its pose (B,) mat44 T_world_camera.
 
-        The images are overwritten by the next call.
+        With every ``model_stride``-th row and column, from the first on. The images are
+        overwritten by the next call.
         """
         self._model_renderer.cull(poses)
         return self._model_renderer.splat()

@@ -32,6 +32,8 @@ class LiveFrame:
 class ModelView:
     """The map rendered from one pose per env, on the device.
 
+    The view may hold only every n-th row and column of the camera's image.
+
     Attributes:
         vertices: (B, H, W) vec3 camera frame of the rendering pose; z = 0 where the map is empty.
         normals: (B, H, W) vec3 unit normals, same frame, towards the camera; 0 where empty.
