@@ -46,10 +46,6 @@ class Clearance:
         ends = self._chain.capsules(q)
         return np.concatenate([self._furniture(ends), self._self(ends)], axis=-1)
 
-    def furniture(self, q: Float64) -> Float64:
-        """(k, b) metres to spare between every ball and furniture at joint angles (k, n)."""
-        return self._furniture(self._chain.capsules(q))
-
     def least(self, q: Float64) -> Float64:
         """(k,) the least of the gaps at joint angles (k, n), or 0 where all are above it."""
         ends = self._chain.capsules(q)
