@@ -32,18 +32,27 @@ def save_map_picture(judged: JudgedMap, cameras: ArrayLike, path: Path, title: s
         path: of the PNG.
         title: what map this is; the verdict is appended.
     """
-    colors = judged.colors
     pose = overview_pose(judged.points, np.asarray(cameras))
-    marked = (0.35 * colors + 0.65 * 235).astype(np.uint8)
-    marked[judged.consistency.apart] = RED
     figure: Figure = new_figure(2, width=5.0, height=4.3)
-    left, right = figure.subplots(1, 2)
-    for ax, colours, name in ((left, colors, "the map"), (right, marked, "second copies in red")):
-        ax.imshow(render_points(judged.points, colours, pose, CAMERA))
+    panels = {
+        "the map": render_points(judged.points, judged.colors, pose, CAMERA),
+        "second copies in red, seen through the rest": _marked(judged, pose),
+    }
+    for ax, (name, image) in zip(figure.subplots(1, 2), panels.items(), strict=True):
+        ax.imshow(image)
         ax.set_title(name, fontsize="small")
         ax.axis("off")
     caption(figure, f"{title}: {describe(judged)}")
     return save(figure, path)
+
+
+def _marked(judged: JudgedMap, pose: Float64) -> Image:
+    """The map, faded, with the second copies drawn over what hides them."""
+    faded = (0.35 * judged.colors + 0.65 * 235).astype(np.uint8)
+    image = render_points(judged.points, faded, pose, CAMERA)
+    copies = judged.points[judged.consistency.apart]
+    over = render_points(copies, np.tile(RED, (len(copies), 1)), pose, CAMERA)
+    return np.where((over == RED).all(axis=2, keepdims=True), over, image)
 
 
 def describe(judged: JudgedMap) -> str:
