@@ -30,6 +30,7 @@ from ms_slam_env.benchmark.planner_report import finished
 from ms_slam_env.benchmark.provenance import provenance
 from ms_slam_env.benchmark.records import write_json
 from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
+from ms_slam_env.camera import xtion
 from ms_slam_env.config import check_range, from_dict
 from ms_slam_env.env import EnvConfig
 from ms_slam_env.errors import InputError, UnreachableError, unknown
@@ -44,6 +45,7 @@ from ms_slam_env.timings import Timings
 PROGRAM = "python -m ms_slam_env.benchmark.arm_masks"
 DEFAULT_SCENES = ("window", "table", "wall", "carpet", "living_room")
 _START_TRIES = 20
+_RAY_STRIDE = 6  # pixels
 _JUDGED_POSTURES = 16  # along each attempted motion, its end included
 
 Float64 = NDArray[np.float64]
@@ -161,7 +163,8 @@ def run_walk(spec: WalkSpec) -> dict[str, Any]:
         ``gap_m`` to furniture and ``touches_itself`` as :class:`ArmTruth` finds, ``error_m`` and
         ``error_rad`` between command and end; ``states``: columns with one entry a stop: ``sag_m``
         by which the camera hangs below its command, ``offset_m`` its whole distance from it,
-        ``kinematic_m`` and ``kinematic_rad`` of the kinematic pose, tied to the true start.
+        ``kinematic_m`` and ``kinematic_rad`` of the kinematic pose, tied to the true start;
+        ``sees_itself``: the arm is in its camera's view, where the images do not show it.
     """
     config = from_dict(EnvConfig, {"arm": spec.arm}).arm
     scene = scene_library.make(spec.scene, spec.seed)
@@ -176,7 +179,8 @@ def run_walk(spec: WalkSpec) -> dict[str, Any]:
     for state in range(spec.states):
         for _ in range(spec.moves):
             arm.move(choose_move(arm, spec.approach, rng))
-        _append(states, at_rest(arm, T_world_kinematic @ arm.T_world_camera_kinematic))
+        stop = at_rest(arm, T_world_kinematic @ arm.T_world_camera_kinematic)
+        _append(states, {**stop, "sees_itself": truth.sees_itself(arm.q, _view_rays())})
         reason = arm.probe().reason
         for action in range(arm.num_actions):
             case = {"state": state, "action": action, "reason": REASONS[int(reason[action])]}
@@ -240,6 +244,12 @@ def at_rest(arm: DynamicArm, T_world_kinematic: Float64) -> dict[str, float]:
         "kinematic_m": round(float(np.linalg.norm(here[:3, 3] - T_world_kinematic[:3, 3])), 6),
         "kinematic_rad": round(float(relative_angle(here[:3, :3], T_world_kinematic[:3, :3])), 6),
     }
+
+
+def _view_rays() -> Float64:
+    """Directions (r, 3) all over the camera's view."""
+    rays = xtion("160x120").rays()[::_RAY_STRIDE, ::_RAY_STRIDE]
+    return np.asarray(rays.reshape(-1, 3), dtype=np.float64)
 
 
 def _column(scene: Scene, arm: DynamicArm) -> Cloud | None:

@@ -37,6 +37,7 @@ def summarise(rows: Sequence[Row]) -> Summary:
         "reasons": _reasons(cases),
         "wrongly_allowed": _wrongly_allowed(cases),
         "errors": _errors(cases, _joined(rows, "states")),
+        "sees_itself": asdict(share_interval(_joined(rows, "states")["sees_itself"])),
     }
 
 
@@ -168,6 +169,7 @@ def as_markdown(summary: Summary) -> str:
     )
     return (
         f"{masks}\n{reasons}\nCauses where it allowed wrongly: {causes}.\n\n{errors}\n"
+        f"The arm is in its own camera's view at {share(summary['sees_itself'], 2)} % of stops.\n"
         "Shares with 95 % Wilson intervals, as if motions were independent; `by walks` resamples "
         "whole walks instead.\n"
     )

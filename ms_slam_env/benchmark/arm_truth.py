@@ -78,7 +78,7 @@ class ArmTruth:
         T_world_base: Float64,
         column: Cloud | None = None,
     ) -> None:
-        self._mj, self._qpos = model.mj, model.qpos
+        self._mj, self._qpos, self._camera_site = model.mj, model.qpos, model.camera_site
         self._furniture, self._column = furniture, column
         self._T_world_base = np.array(T_world_base, dtype=np.float64)
         self._data = mujoco.MjData(model.mj)
@@ -111,6 +111,23 @@ class ArmTruth:
             if self._column is not None and not result[i]:
                 result[i] = self._gap(self._column, np.eye(4)) <= 0
         return result
+
+    def sees_itself(self, q: Float64, rays: Float64) -> bool:
+        """Whether the arm is in its own camera's view at joint angles (n,).
+
+        Args:
+            q: joint angles.
+            rays: (r, 3) directions in the camera's frame.
+        """
+        self._place(q)
+        data, mj, site = self._data, self._mj, self._camera_site
+        directions = rays @ data.site_xmat[site].reshape(3, 3).T
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        body, geom = int(mj.site_bodyid[site]), np.zeros(1, dtype=np.int32)
+        return any(
+            mujoco.mj_ray(mj, data, data.site_xpos[site], ray, None, 1, body, geom) >= 0
+            for ray in directions
+        )
 
     def _gap(self, cloud: Cloud, T_cloud_base: Float64) -> float:
         data, mj = self._data, self._mj

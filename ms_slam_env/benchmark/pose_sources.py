@@ -45,6 +45,7 @@ COLUMNS = (
     Column("rcm", "RCM [%]", 100),
 )
 EVERYWHERE = "all"
+_DIGITS = 9  # nanometres: what is left of zero after an alignment
 Summary = dict[str, dict[str, dict[str, dict[str, Any]]]]
 
 
@@ -161,16 +162,15 @@ def compare(rows: Sequence[Row], places: Sequence[str]) -> Summary:
 
 def _cell(episodes: list[dict[str, Any]], reference: list[dict[str, Any]] | None) -> dict[str, Any]:
     """Medians of one scene, planner and source as plain numbers."""
-    cell = {
-        column.metric: statistics.median_interval([e[column.metric] for e in episodes])
-        for column in COLUMNS
-    }
+
+    def values(metric: str, of: list[dict[str, Any]] = episodes) -> list[float]:
+        return [round(e[metric], _DIGITS) for e in of]
+
+    cell = {column.metric: statistics.median_interval(values(column.metric)) for column in COLUMNS}
     cell["lost"] = statistics.share_interval([e["lost"] for e in episodes])
     cell["ate_ratio"] = Interval(float("nan"), float("nan"), float("nan"))
     if reference:
-        cut = statistics.relative_cut(
-            [e["ate_m"] for e in episodes], [e["ate_m"] for e in reference]
-        )
+        cut = statistics.relative_cut(values("ate_m"), values("ate_m", reference))
         cell["ate_ratio"] = Interval(1 - cut.value, 1 - cut.high, 1 - cut.low)
     return {"episodes": len(episodes)} | {name: asdict(value) for name, value in cell.items()}
 

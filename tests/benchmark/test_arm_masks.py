@@ -45,8 +45,8 @@ def row(scene, seed, cases):
                 "error_rad": [0.01] * count,
             },
             "states": {
-                name: [0.002, 0.004]
-                for name in ("sag_m", "offset_m", "kinematic_m", "kinematic_rad")
+                **{name: [0.002, 0.004] for name in AT_REST},
+                "sees_itself": [False, False],
             },
         },
     }
@@ -77,6 +77,7 @@ def test_summary():
     }
     sag = summary["errors"]["camera below its command at rest (sag) [mm]"]
     assert (sag["count"], sag["median"]) == (4, pytest.approx(3))
+    assert summary["sees_itself"]["value"] == 0
     text = as_markdown(summary)
     assert "| table | 1 | 8 |" in text
     assert "| joint limit | 1 | 0 " in text

@@ -169,3 +169,23 @@ def test_column_is_touched_from_the_side():
     round_only = arm.mj.geom_type[capsule] == CAPSULE
     surely = gap[:, round_only].min(axis=1) < -0.001
     assert truth.touches_itself(q)[surely].all()
+
+
+def test_an_arm_that_folds_back_sees_itself():
+    arm = load_arm("mico")
+    truth = ArmTruth(arm, NOWHERE, np.eye(4))
+    straight = np.array([[0.0, 0.0, 1.0]])
+    assert not truth.sees_itself(arm.home, straight)
+    rng = np.random.default_rng(4)
+    q = rng.uniform(arm.chain.lower, arm.chain.upper, (300, 6))
+    found = np.array([truth.sees_itself(one, straight) for one in q])
+    poses = arm.chain.camera_pose(q)
+    ray = np.stack([poses[:, :3, 3], poses[:, :3, 3] + 2 * poses[:, :3, 2]], axis=1)
+    near = segment_distance(ray[:, None], arm.chain.capsules(q)) < arm.chain.capsule_radius
+    body = arm.mj.geom_bodyid[np.flatnonzero(arm.mj.geom_contype)]
+    near[:, body == arm.mj.body("camera_body").id] = False
+    hand = np.isin(body, [arm.mj.body("hand").id])
+    near[:, hand] = False  # behind the camera
+    capsules = arm.mj.geom_type[np.flatnonzero(arm.mj.geom_contype)] == CAPSULE
+    assert found[near[:, capsules].any(axis=1)].all()
+    assert found.any()
