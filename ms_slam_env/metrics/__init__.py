@@ -1,6 +1,12 @@
 """Errors of trajectories and maps."""
 
 from ms_slam_env.metrics.alignment import umeyama
+from ms_slam_env.metrics.consistency import (
+    ConsistencyRule,
+    MapConsistency,
+    ObjectConsistency,
+    judge_consistency,
+)
 from ms_slam_env.metrics.reconstruction import (
     MapMetrics,
     f_score,
@@ -12,6 +18,12 @@ from ms_slam_env.metrics.reconstruction import (
     recall,
     rer,
     voxel_thin,
+)
+from ms_slam_env.metrics.sightings import (
+    LabelledView,
+    SightingRule,
+    count_votes,
+    distinct_placements,
 )
 from ms_slam_env.metrics.trajectory import (
     ErrorStatistics,
@@ -25,13 +37,21 @@ from ms_slam_env.metrics.trajectory import (
 )
 
 __all__ = [
+    "ConsistencyRule",
     "ErrorStatistics",
+    "LabelledView",
+    "MapConsistency",
     "MapMetrics",
+    "ObjectConsistency",
+    "SightingRule",
     "absolute_errors",
     "ate_rmse",
     "ate_statistics",
+    "count_votes",
+    "distinct_placements",
     "f_score",
     "icp",
+    "judge_consistency",
     "map_metrics",
     "nearest_distances",
     "path_length",
