@@ -30,7 +30,7 @@ def _frame(pose: np.ndarray) -> RGBDFrame:
 
 
 def _mapped(count: int, **options: object) -> slam.SlamBackend:
-    backend = slam.make("volumetric", CAMERA, voxel_m=VOXEL_M, **options)
+    backend = slam.make("volumetric", CAMERA, **{"voxel_m": VOXEL_M, **options})
     for _ in range(count):
         backend.fuse(_frame(POSE), POSE)
     return backend
@@ -51,6 +51,24 @@ def test_one_frame_is_cast_whole_and_unbiased():
     assert np.median(np.abs(views.intensity[0] - grey)[both]) < 2
     cosine = (views.normals[0] * normals).sum(-1)[both]
     assert np.median(cosine) > 0.99
+
+
+def test_the_first_cast_of_a_thousand_blocks_is_whole():
+    depth = _mapped(1, voxel_m=0.01).predict(POSE[None]).depth[0]
+    assert (depth[4:-4, 4:-4] > 0).mean() > 0.98
+
+
+def test_colors_stay_at_their_pixels():
+    # Edges between black and white; half a pixel too far right or down would add half a pixel.
+    column, row = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
+    white = (column >= 70) ^ (row >= 60)
+    color = np.repeat(np.where(white, 255, 0)[..., None], 3, axis=2).astype(np.uint8)
+    depth = np.full(CAMERA.shape, 1.5, dtype=np.float32)
+    backend = slam.make("volumetric", CAMERA, voxel_m=0.007)
+    backend.fuse(RGBDFrame(color, depth), np.eye(4))
+    grey = backend.predict(np.eye(4)[None]).intensity[0] / 255
+    assert (1 - grey[20:40, 50:90]).sum(axis=1).mean() == pytest.approx(20, abs=0.25)
+    assert (1 - grey[40:80, 20:50]).sum(axis=0).mean() == pytest.approx(20, abs=0.25)
 
 
 def test_surface_points_lie_on_the_wall():
