@@ -72,6 +72,7 @@ def test_bad_input(fields, reason):
 def test_command(tmp_path, capsys):
     out = tmp_path / "results"
     words = "--sources slam ground_truth --planners random --scenes carpet --episodes 1 --steps 2"
+    words += " --env-id MSActiveSLAM-FreeCamera-v0"
     assert main([*words.split(), "--workers", "1", "--out", str(out)]) == 0
     table = capsys.readouterr().out
     assert (out / "table.md").read_text() in table
