@@ -6,7 +6,7 @@ is decided here, the same way for both.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,6 @@ from ms_slam_env.geometry import relative_angle
 from ms_slam_env.slam.base import Float32, Float64
 
 FEWEST_READINGS = 0.05  # share of a frame's pixels that must have depth
-_SAMPLES = 5000  # pixels looked at; more do not change the verdict
 _ALIKE_LEVELS = 20.0  # largest difference of grey values once their median is taken away
 
 
@@ -73,6 +72,11 @@ class AgreementLimits:
     motion_m: float = 0.3
     motion_rad: float = float(np.radians(30.0))
 
+    @property
+    def worth_another_look(self) -> AgreementLimits:
+        """Laxer limits, for an alignment that is repeated from close by before it is believed."""
+        return replace(self, inliers=0.8 * self.inliers, alike=0.7 * self.alike)
+
     def reason(self, agreement: Agreement, T_reference_frame: Float64) -> str:
         """Why the alignment is not believable; empty if it is."""
         motion_m = float(np.linalg.norm(T_reference_frame[:3, 3]))
@@ -89,15 +93,20 @@ class AgreementLimits:
 
 
 def measure_agreement(
-    frame: DepthImage, reference: DepthImage, T_reference_frame: Float64, intrinsics: Intrinsics
+    frame: DepthImage,
+    reference: DepthImage,
+    T_reference_frame: Float64,
+    intrinsics: Intrinsics,
+    samples: int = 5000,
 ) -> Agreement:
     """Compare a frame with a reference of the same camera by projective association.
 
     A reading is an inlier within 2 cm + 1 cm/m^2 of the reference's surface, the axial noise of
-    structured light growing with depth squared.
+    structured light growing with depth squared. About ``samples`` readings are looked at; more
+    than the default do not change a verdict.
     """
     v, u = np.nonzero(frame.depth > 0)
-    step = max(1, len(v) // _SAMPLES)
+    step = max(1, len(v) // samples)
     v, u = v[::step], u[::step]
     depth = frame.depth[v, u].astype(np.float64)
     points = _back_project(u, v, depth, intrinsics)

@@ -4,26 +4,47 @@ from __future__ import annotations
 
 import numpy as np
 
+from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import make_pose, so3_exp
+from ms_slam_env.slam.agreement import DepthImage, measure_agreement
 from ms_slam_env.slam.base import Float64
 
-TURN_RAD = np.radians(8.0)
-"""About twice the rotation from which OpenCV's odometry finds back at 160x120."""
+TURN_RAD = np.radians(10.0)
+STEP_M = 0.1
+_TRIALS = 6  # motions that are tried, of all that are compared
+_SAMPLES = 600  # readings that a motion is judged by
 
-_TURNS = np.stack(
+
+def _signed_axes(size: float) -> Float64:
+    """Vectors (7, 3): none, and both ways along each axis."""
+    return size * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+
+
+MOTIONS = np.stack(
     [
-        make_pose(so3_exp(sign * TURN_RAD * np.eye(3)[axis]), np.zeros(3))
-        for axis in (1, 0, 2)
-        for sign in (1.0, -1.0)
+        make_pose(so3_exp(turn), step)
+        for turn in _signed_axes(float(TURN_RAD))
+        for step in _signed_axes(STEP_M)
     ]
 )
+"""Motions (49, 4, 4): no turn or one of 10 degrees, with no step or one of 10 cm."""
 
 
-def start_poses(T_world_camera: Float64, T_last_camera: Float64) -> Float64:
-    """Poses (7, 4, 4) around the last good one ``T_world_camera`` (4, 4), in the order of trial.
+def start_motions(
+    frame: DepthImage, reference: DepthImage, T_last_camera: Float64, intrinsics: Intrinsics
+) -> Float64:
+    """Motions T_reference_frame (7, 4, 4) to search from, in the order of trial.
 
-    First the pose that the last motion ``T_last_camera`` leads to if it goes on, then pans, tilts
-    and rolls of 8 degrees. A turn stands for a sideways step too: both shift the image.
+    First the last motion ``T_last_camera`` (4, 4), should it go on; then the best of ``MOTIONS``,
+    judged by how well they lay the frame over the reference, in depth and intensity.
     """
-    motions = np.concatenate([T_last_camera[None], _TURNS])
-    return np.asarray(T_world_camera @ motions, dtype=np.float64)
+    scores = [_score(frame, reference, motion, intrinsics) for motion in MOTIONS]
+    best = np.argsort(-np.array(scores), kind="stable")[:_TRIALS]
+    return np.concatenate([T_last_camera[None], MOTIONS[best]])
+
+
+def _score(
+    frame: DepthImage, reference: DepthImage, motion: Float64, intrinsics: Intrinsics
+) -> float:
+    found = measure_agreement(frame, reference, motion, intrinsics, _SAMPLES)
+    return found.overlap * (found.inlier_fraction + found.alike_fraction)

@@ -26,7 +26,7 @@ from ms_slam_env.slam.agreement import (
 from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult, Views
 from ms_slam_env.slam.odometry.aligner import Aligner, PreparedImage
 from ms_slam_env.slam.odometry.config import OdometryConfig
-from ms_slam_env.slam.starts import start_poses
+from ms_slam_env.slam.starts import start_motions
 from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
 
 _NOTHING = Agreement(0.0, 0.0, 0.0, 0.0)
@@ -88,12 +88,20 @@ class OdometrySlam(SlamBackend):
             return self._lose("the frame has too few depth readings", _NOTHING)
         prepared = self._aligner.prepare(image)
         reason, agreement = "", _NOTHING
-        for reference in self._references(self._key, self._last, guess):
-            T_reference_frame, agreement, reason = self._align(prepared, reference)
+        for reference in self._sensed(self._key, self._last):
+            T, agreement, reason = self._align(prepared, reference, self._limits)
             if not reason:
-                T_world_camera = reference.T_world_image @ T_reference_frame
-                return self._accept(frame, _Placed(T_world_camera, prepared), agreement)
-        return self._lose(reason, agreement)
+                return self._accept(frame, _Placed(T, prepared), agreement)
+        for reference in self._rendered(image, self._last, guess):
+            lax = self._limits.worth_another_look
+            T, agreement, reason = self._align(prepared, reference, lax)
+            if reason:
+                continue
+            for closer in self._views(T[None]):
+                T, agreement, reason = self._align(prepared, closer, self._limits)
+                if not reason:
+                    return self._accept(frame, _Placed(T, prepared), agreement)
+        return self._lose(reason or "too little of the map is in view", agreement)
 
     def fuse(self, frame: RGBDFrame, T_world_camera: ArrayLike) -> TrackResult:
         """Fuse ``frame`` as a keyframe at a known pose (4, 4), without tracking.
@@ -123,14 +131,21 @@ class OdometrySlam(SlamBackend):
             return TrackResult(self._pose.copy(), False, inlier_fraction=0.0, reason=reason)
         return self.fuse(frame, self._pose)
 
-    def _references(self, key: _Placed, last: _Placed, guess: Float64 | None) -> Iterator[_Placed]:
-        """Images to align a frame with, in the order in which they are tried."""
+    def _sensed(self, key: _Placed, last: _Placed) -> Iterator[_Placed]:
+        """Earlier frames to align a frame with, in the order in which they are tried."""
         yield key
         if last is not key:
             yield last
+
+    def _rendered(
+        self, image: DepthImage, last: _Placed, guess: Float64 | None
+    ) -> Iterator[_Placed]:
+        """Views of the map to align ``image`` with where the earlier frames fail."""
         if guess is not None:
             yield from self._views(guess[None])
-        yield from self._views(start_poses(self._pose, self._motion))
+        seen = last.prepared.image
+        motions = start_motions(image, seen, self._motion, self.intrinsics)
+        yield from self._views(last.T_world_image @ motions)
 
     def _views(self, poses: Float64) -> Iterator[_Placed]:
         """Views of the map from poses (N, 4, 4), those with enough in them."""
@@ -140,13 +155,16 @@ class OdometrySlam(SlamBackend):
             if image.readings >= FEWEST_READINGS:
                 yield _Placed(pose, self._aligner.prepare(image))
 
-    def _align(self, frame: PreparedImage, reference: _Placed) -> tuple[Float64, Agreement, str]:
-        """T_reference_frame, what it explains, and why it is not to be believed or nothing."""
+    def _align(
+        self, frame: PreparedImage, reference: _Placed, limits: AgreementLimits
+    ) -> tuple[Float64, Agreement, str]:
+        """T_world_frame, what it explains, and why it is not to be believed or nothing."""
         T = self._aligner.align(frame, reference.prepared)
         if T is None:
-            return np.eye(4), _NOTHING, "no motion aligns the frame with the view before it"
+            reason = "no motion aligns the frame with the view before it"
+            return reference.T_world_image, _NOTHING, reason
         agreement = measure_agreement(frame.image, reference.prepared.image, T, self.intrinsics)
-        return T, agreement, self._limits.reason(agreement, T)
+        return reference.T_world_image @ T, agreement, limits.reason(agreement, T)
 
     def _accept(self, frame: RGBDFrame, placed: _Placed, agreement: Agreement) -> TrackResult:
         """Move on to a frame whose pose was found."""

@@ -24,7 +24,7 @@ from ms_slam_env.slam.agreement import (
     measure_agreement,
 )
 from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult, Views
-from ms_slam_env.slam.starts import start_poses
+from ms_slam_env.slam.starts import start_motions
 from ms_slam_env.slam.volumetric.config import VolumetricConfig
 from ms_slam_env.slam.volumetric.frame_to_model import FrameToModel
 from ms_slam_env.slam.volumetric.open3d_alignment import Open3DAlignment
@@ -92,23 +92,30 @@ class VolumetricSlam(SlamBackend):
         if self._fused == 0:
             return self.fuse(frame, self._pose)
         reason, agreement = "", _NOTHING
-        for pose, view in self._views(guess):
-            T, agreement, reason = self._align(frame, depth, pose, view)
-            if not reason and view is not self._view:  # from afar: once more, from close by
-                T, agreement, reason = self._align(frame, depth, T, self._cast(T))
+        grey = intensity_image(frame.color).astype(np.float32)
+        image = DepthImage((depth / np.float32(DEPTH_SCALE)).astype(np.float32), grey)
+        for pose, view in self._views(image, guess):
+            afar = view is not self._view
+            limits = self._limits.worth_another_look if afar else self._limits
+            T, agreement, reason = self._align(image, pose, view, limits)
+            if afar and not reason:
+                T, agreement, reason = self._align(image, T, self._cast(T), self._limits)
             if not reason:
                 return self._accept(frame, depth, T, agreement)
         return self._lose(reason, agreement)
 
-    def _views(self, guess: Float64 | None) -> Iterator[tuple[Float64, CastView]]:
-        """Views to align a frame with and their poses, in the order in which they are tried."""
+    def _views(
+        self, image: DepthImage, guess: Float64 | None
+    ) -> Iterator[tuple[Float64, CastView]]:
+        """Views to align ``image`` with and their poses, in the order in which they are tried."""
         if self._view is None:
             self._view = self._cast(self._pose)
         yield self._pose, self._view
-        further = start_poses(self._pose, self._motion)
         if guess is not None:
-            further = np.concatenate([guess[None], further])
-        for pose in further:
+            yield guess, self._cast(guess)
+        seen = DepthImage(self._view.depth, self._view.intensity)
+        for motion in start_motions(image, seen, self._motion, self.intrinsics):
+            pose = self._pose @ motion
             yield pose, self._cast(pose)
 
     def _accept(
@@ -160,20 +167,17 @@ class VolumetricSlam(SlamBackend):
         return self._grid.cast(pose, weight, self.intrinsics)
 
     def _align(
-        self, frame: RGBDFrame, depth: NDArray[np.uint16], pose: Float64, view: CastView
+        self, image: DepthImage, pose: Float64, view: CastView, limits: AgreementLimits
     ) -> tuple[Float64, Agreement, str]:
         """T_world_camera (4, 4), what it explains, and why it is not to be believed or nothing."""
         reference = DepthImage(view.depth, view.intensity)
         if reference.readings < FEWEST_READINGS:
             return pose, _NOTHING, "too little of the model is in view"
-        grey = intensity_image(frame.color).astype(np.float32)
-        image = DepthImage((depth / np.float32(DEPTH_SCALE)).astype(np.float32), grey)
         T_model_camera = self._aligner.align(image, view)
         if T_model_camera is None:
             return pose, _NOTHING, "no motion aligns the frame with the model"
         agreement = measure_agreement(image, reference, T_model_camera, self.intrinsics)
-        reason = self._limits.reason(agreement, T_model_camera)
-        return pose @ T_model_camera, agreement, reason
+        return pose @ T_model_camera, agreement, limits.reason(agreement, T_model_camera)
 
     def _lose(self, reason: str, agreement: Agreement) -> TrackResult:
         """Hold the pose."""

@@ -22,6 +22,7 @@ from ms_slam_env.slam.volumetric.open3d_library import load_open3d
 DEPTH_SCALE = 5000.0  # 16-bit depth of 0.2 mm, well below the sensor's noise
 _NEAREST_M = 0.1
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
+_FRAGMENT_PX = 16  # edge of the pieces in which Open3D draws its blocks
 _SMOOTH_PX = 1.5  # width of the filter of cast depth
 
 
@@ -72,6 +73,7 @@ class VoxelGrid:
             self.config.blocks,
             core.Device("CPU:0"),
         )
+        self._reserved = 0
         self._forget_derived()
 
     def _forget_derived(self) -> None:
@@ -106,6 +108,7 @@ class VoxelGrid:
         if self._block_keys() is None:
             image = np.zeros((*intrinsics.shape, 3), dtype=np.float32)
             return CastView(image[..., 0].copy(), image, image.copy())
+        self._reserve_fragments(intrinsics)
         # Open3D looks distances up at the voxel below a point, on average half a voxel off along
         # each axis, and interpolates colours and normals at the right place.
         moved = pose.copy()
@@ -147,6 +150,44 @@ class VoxelGrid:
             used = hashmap.active_buf_indices().to(self.open3d.core.int64)
             self._keys = hashmap.key_tensor()[used]
         return self._keys
+
+    def _reserve_fragments(self, intrinsics: Intrinsics) -> None:
+        """Make room for all pieces of blocks that a ray cast draws to bound its rays.
+
+        Open3D starts with room for about a hundred, and a cast that needs more leaves out the
+        others before it makes room, for the next cast. A cast of no interest, from far away with
+        every block in sight several times, keeps that from ours.
+        """
+        factor = range_factor(intrinsics)
+        pieces = math.ceil(intrinsics.width / factor / _FRAGMENT_PX) * math.ceil(
+            intrinsics.height / factor / _FRAGMENT_PX
+        )
+        keys = self._keys.numpy()
+        if pieces * len(keys) < self._reserved:
+            return
+        repeats = 2 * pieces
+        edge_m = self.config.voxel_m * self.config.block_voxels
+        low, high = keys.min(axis=0) * edge_m, (keys.max(axis=0) + 1) * edge_m
+        radius = float(np.linalg.norm(high - low)) / 2
+        pose = np.eye(4)
+        pose[:3, 3] = (low + high) / 2 - [0.0, 0.0, 4 * radius]
+        size = 8
+        camera = Intrinsics(float(size), float(size), (size - 1) / 2, (size - 1) / 2, size, size)
+        self._grid.ray_cast(
+            self.tensor(np.repeat(keys, repeats, axis=0)),
+            camera_matrix(self, camera),
+            self.tensor(invert(pose)),
+            size,
+            size,
+            ["depth"],
+            DEPTH_SCALE,
+            _NEAREST_M,
+            8 * radius,
+            0.5,
+            self.config.truncation_voxels,
+            1,
+        )
+        self._reserved = repeats * len(keys) - 1
 
     def surface(self) -> tuple[Float64, NDArray[np.uint8], Float32]:
         """Points (M, 3) metres, colours (M, 3) RGB and normals (M, 3) of the zero crossings.
