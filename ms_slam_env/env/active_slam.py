@@ -113,6 +113,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
             self.config.slam, self.intrinsics, **self.config.slam_config
         )
         self._embodiment_type = EMBODIMENTS[embodiment]
+        self._embodiment_type.check(self.config)
         self._pose_source = POSE_SOURCES[self.config.pose]()
         self._measure = make_divergence(self.config.divergence, self.intrinsics)
         self._lookahead = Lookahead(self.config.lookahead, self.config.divergence, self.intrinsics)

@@ -13,6 +13,7 @@ from ms_slam_env.robot import (
     FixedTranslation,
     FreeCamera,
 )
+from ms_slam_env.robot.arm import load_arm
 from ms_slam_env.robot.arm.dynamic_arm import DynamicArm
 from ms_slam_env.robot.arm.kinematic_arm import KinematicArm
 from ms_slam_env.scenes.base import Scene
@@ -21,10 +22,14 @@ from ms_slam_env.timings import Timings
 
 @dataclass(frozen=True)
 class EmbodimentType:
-    """How many actions an embodiment has, and how to build it in a scene."""
+    """How many actions an embodiment has, and how to build it in a scene.
+
+    ``check`` raises an InputError if the configuration cannot be built anywhere.
+    """
 
     num_actions: int
     build: Callable[[Scene, EnvConfig, Timings], Embodiment]
+    check: Callable[[EnvConfig], None]
 
 
 def _free(scene: Scene, config: EnvConfig, timings: Timings) -> Embodiment:
@@ -43,10 +48,19 @@ def _arm_kinematic(scene: Scene, config: EnvConfig, timings: Timings) -> Embodim
     return KinematicArm(scene, config.arm, config.step_m, config.step_rad, timings)
 
 
+def _needs_nothing(config: EnvConfig) -> None:
+    """A camera without carrier can be built anywhere."""
+
+
+def _needs_an_arm(config: EnvConfig) -> None:
+    """Read the arm's file, so that a bad one is refused before the first reset."""
+    load_arm(config.arm.model, config.arm.camera_site, config.arm.joint_speed_rad_s)
+
+
 EMBODIMENTS = {
-    "arm": EmbodimentType(NUM_MOTIONS, _arm),
-    "arm-kinematic": EmbodimentType(NUM_MOTIONS, _arm_kinematic),
-    "free": EmbodimentType(NUM_MOTIONS, _free),
-    "fixed-translation": EmbodimentType(NUM_ROTATIONS, _fixed_translation),
+    "arm": EmbodimentType(NUM_MOTIONS, _arm, _needs_an_arm),
+    "arm-kinematic": EmbodimentType(NUM_MOTIONS, _arm_kinematic, _needs_an_arm),
+    "free": EmbodimentType(NUM_MOTIONS, _free, _needs_nothing),
+    "fixed-translation": EmbodimentType(NUM_ROTATIONS, _fixed_translation, _needs_nothing),
 }
 """Name of the option ``embodiment`` to type."""

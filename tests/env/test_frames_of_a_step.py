@@ -51,7 +51,7 @@ def slow(monkeypatch):
     def build(scene, config, timings):
         return SlowCamera(scene, config.step_m, config.step_rad)
 
-    monkeypatch.setitem(EMBODIMENTS, "slow", EmbodimentType(49, build))
+    monkeypatch.setitem(EMBODIMENTS, "slow", EmbodimentType(49, build, lambda config: None))
     return "slow"
 
 
@@ -158,7 +158,7 @@ def test_an_embodiment_that_cannot_start_says_why(monkeypatch):
     def build(scene, config, timings):
         return Stuck(scene, 0.1, 0.1)
 
-    monkeypatch.setitem(EMBODIMENTS, "stuck", EmbodimentType(49, build))
+    monkeypatch.setitem(EMBODIMENTS, "stuck", EmbodimentType(49, build, lambda config: None))
     env = ActiveSlamEnv("stuck", **OPTIONS)
     with pytest.raises(InputError, match="drawn start poses: the arm is in its box"):
         env.reset(seed=0)
