@@ -77,6 +77,11 @@ class AgreementLimits:
         """Laxer limits, for an alignment that is repeated from close by before it is believed."""
         return replace(self, inliers=0.8 * self.inliers, alike=0.7 * self.alike)
 
+    @property
+    def confirmation(self) -> AgreementLimits:
+        """Limits of the repetition, which must hardly move the pose; wrong poses drift on."""
+        return replace(self, alike=0.93 * self.alike, motion_m=0.03, motion_rad=np.radians(3.0))
+
     def reason(self, agreement: Agreement, T_reference_frame: Float64) -> str:
         """Why the alignment is not believable; empty if it is."""
         motion_m = float(np.linalg.norm(T_reference_frame[:3, 3]))

@@ -10,7 +10,12 @@ from surfel_scenes import ray_cast
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import make_pose, relative_angle, so3_exp
-from ms_slam_env.slam.agreement import AgreementLimits, DepthImage, measure_agreement
+from ms_slam_env.slam.agreement import (
+    Agreement,
+    AgreementLimits,
+    DepthImage,
+    measure_agreement,
+)
 from ms_slam_env.slam.starts import start_motions
 
 CAMERA = Intrinsics(fx=80.0, fy=84.0, cx=39.3, cy=29.8, width=80, height=60)
@@ -88,3 +93,13 @@ def test_starts_go_on_first_and_then_from_near_the_motion():
     angles = [np.degrees(relative_angle(start[:3, :3], turn)) for start in starts[1:]]
     steps = [np.linalg.norm(start[:3, 3] - step) for start in starts[1:]]
     assert any(angle < 2 and step < 0.12 for angle, step in zip(angles, steps, strict=True))
+
+
+def test_a_repetition_must_hardly_move_but_may_look_less_alike():
+    limits = AgreementLimits()
+    likeness = 0.95 * limits.alike
+    found = Agreement(overlap=0.9, inlier_fraction=1.0, alike_fraction=likeness, residual_m=0.0)
+    assert "intensity" in limits.reason(found, REST)
+    assert limits.worth_another_look.reason(found, MOVED) == ""
+    assert limits.confirmation.reason(found, REST) == ""
+    assert "implausibly" in limits.confirmation.reason(found, MOVED)

@@ -239,6 +239,16 @@ def test_a_guess_finds_a_distant_pose(name, frames, box_scene):
     assert np.linalg.norm(result.T_world_camera[:3, 3] - jump[:3, 3]) < 0.03
 
 
+def test_a_step_of_the_environment_is_tracked(name, frames, box_scene):
+    backend = _new(name)
+    for frame in frames[:3]:
+        backend.track(frame)
+    step = make_pose(so3_exp(np.radians([0, -12, 0])), [0.12, 0.0, 0.0])
+    result = backend.track(_capture(box_scene, PATH[2] @ step))
+    assert result.tracking_ok, result.reason
+    assert np.linalg.norm(result.T_world_camera[:3, 3] - (PATH[2] @ step)[:3, 3]) < 0.03
+
+
 def test_bad_input_is_refused(name):
     backend = _new(name)
     small = RGBDFrame(np.zeros((60, 80, 3), dtype=np.uint8), np.zeros((60, 80), dtype=np.float32))

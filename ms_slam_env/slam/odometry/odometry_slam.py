@@ -98,7 +98,7 @@ class OdometrySlam(SlamBackend):
             if reason:
                 continue
             for closer in self._views(T[None]):
-                T, agreement, reason = self._align(prepared, closer, self._limits)
+                T, agreement, reason = self._align(prepared, closer, self._limits.confirmation)
                 if not reason:
                     return self._accept(frame, _Placed(T, prepared), agreement)
         return self._lose(reason or "too little of the map is in view", agreement)

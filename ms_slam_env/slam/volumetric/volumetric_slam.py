@@ -99,7 +99,9 @@ class VolumetricSlam(SlamBackend):
             limits = self._limits.worth_another_look if afar else self._limits
             T, agreement, reason = self._align(image, pose, view, limits)
             if afar and not reason:
-                T, agreement, reason = self._align(image, T, self._cast(T), self._limits)
+                T, agreement, reason = self._align(
+                    image, T, self._cast(T), self._limits.confirmation
+                )
             if not reason:
                 return self._accept(frame, depth, T, agreement)
         return self._lose(reason, agreement)
