@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from ms_slam_env.robot.arm.chain import Chain, segment_distance
 from ms_slam_env.robot.arm.config import ArmConfig
 from ms_slam_env.robot.arm.path import progress
-from ms_slam_env.robot.arm.reach import LIMIT_MARGIN_RAD, MOST_STRETCH
+from ms_slam_env.robot.arm.reach import DAMPING, LIMIT_MARGIN_RAD, MOST_STRETCH
 from ms_slam_env.robot.arm.surroundings import Surroundings
 
 
@@ -22,36 +22,39 @@ class SlowWay:
     q: np.ndarray  # (W, n)
     off_m: float
     off_rad: float
-    limit_spare_rad: float
     stretch: float
     furniture_spare_m: float  # beyond the radius of the links
     self_spare_m: float  # beyond radii and what the pair needs
 
-    def ok(self, slack: float) -> bool:
-        """Whether all is kept; ``slack`` > 0 forgives, < 0 asks for more."""
-        return (
-            self.off_m < 1e-3 + 0.1 * slack
-            and self.off_rad < np.radians(0.1) + 0.1 * slack
-            and self.limit_spare_rad > -slack
-            and self.stretch < 1.05 * MOST_STRETCH * (1 + slack)
-            and self.furniture_spare_m > -slack
-            and self.self_spare_m > -slack
-        )
+    def broken(self, slack: float) -> set[str]:
+        """What is not kept; ``slack`` > 0 forgives, < 0 asks for more."""
+        off = max(self.off_m / 1e-3, self.off_rad / np.radians(0.1))
+        kept = {
+            "way": off < 1 + 10 * slack,
+            "joint speed": self.stretch < 1.05 * MOST_STRETCH * (1 + slack),
+            "furniture": self.furniture_spare_m > -slack,
+            "self-collision": self.self_spare_m > -slack,
+        }
+        return {name for name, value in kept.items() if not value}
 
 
-def solve(chain: Chain, q: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """Inverse kinematics near ``q`` by SciPy, without our Newton steps."""
+def solve(
+    chain: Chain, q: np.ndarray, target: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> tuple[np.ndarray, float, float]:
+    """Inverse kinematics between limits near ``q`` by SciPy, without our Newton steps."""
+    still = np.sqrt(DAMPING) * np.eye(len(q))
 
     def error(angles: np.ndarray) -> np.ndarray:
         T = chain.camera_pose(angles)
         turn = Rotation.from_matrix(target[:3, :3] @ T[:3, :3].T).as_rotvec()
-        return np.concatenate([target[:3, 3] - T[:3, 3], turn])
+        return np.concatenate([target[:3, 3] - T[:3, 3], turn, still @ (angles - q)])
 
     def slope(angles: np.ndarray) -> np.ndarray:
-        return -chain.camera_jacobian(angles)
+        return np.concatenate([-chain.camera_jacobian(angles), still])
 
-    found = least_squares(error, q, jac=slope, method="trf", xtol=1e-12, ftol=1e-12, gtol=1e-12)
-    return found.x, np.linalg.norm(found.fun[:3]), np.linalg.norm(found.fun[3:])
+    inside = np.clip(q, low + 1e-9, high - 1e-9)
+    found = least_squares(error, inside, slope, (low, high), xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    return found.x, np.linalg.norm(found.fun[:3]), np.linalg.norm(found.fun[3:6])
 
 
 def follow(
@@ -69,24 +72,23 @@ def follow(
     angle = (turning(0.0).inv() * turning(1.0)).magnitude()
     distance = np.linalg.norm(target[:3, 3] - start[:3, 3])
     duration = 1.25 * max(distance / config.speed_m_s, angle / config.speed_rad_s)
+    low = np.minimum(chain.lower + LIMIT_MARGIN_RAD, q)
+    high = np.maximum(chain.upper - LIMIT_MARGIN_RAD, q)
     ways, off_m, off_rad = [q], 0.0, 0.0
     for s in share[1:]:
         T = np.eye(4)
         T[:3, :3] = turning(s).as_matrix()
         T[:3, 3] = (1 - s) * start[:3, 3] + s * target[:3, 3]
-        angles, metres, radians = solve(chain, ways[-1], T)
+        angles, metres, radians = solve(chain, ways[-1], T, low, high)
         ways.append(angles)
         off_m, off_rad = max(off_m, metres), max(off_rad, radians)
     joints = np.stack(ways)
-    low, high = chain.lower + LIMIT_MARGIN_RAD, chain.upper - LIMIT_MARGIN_RAD
-    limit = np.minimum(joints - low, high - joints)[1:].min()
     speed = np.abs(np.diff(joints, axis=0)) * (waypoints - 1) / duration
     furniture, apart = spares(chain, surroundings, joints[1:], config.clearance_m)
     return SlowWay(
         joints,
         off_m,
         off_rad,
-        float(limit),
         float((speed / chain.speed).max()),
         furniture - config.clearance_m,
         apart,

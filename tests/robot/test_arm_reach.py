@@ -1,7 +1,5 @@
 """The mask's kernel against a slow version, and the distances that it uses."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from arm_reference import follow
@@ -66,7 +64,7 @@ def test_it_agrees_with_the_slow_version(arm, furnished):
             way = follow(arm.chain, furnished, CONFIG, q, targets[k], result.q.shape[1])
             reasons.add(REASONS[result.reason[k]])
             if result.ok[k]:
-                assert way.ok(slack=1e-3), (k, way)
+                assert not way.broken(slack=1e-3), (k, way)
                 np.testing.assert_allclose(result.q[k], way.q, atol=5e-3)
                 camera = 1.25 * max(
                     np.linalg.norm(MOTIONS[k, :3, 3]) / CONFIG.speed_m_s,
@@ -76,7 +74,9 @@ def test_it_agrees_with_the_slow_version(arm, furnished):
                     camera * max(1.0, way.stretch), rel=0.02
                 )
             else:  # the balls that cover a capsule stand out from it by less than 12 mm
-                assert not way.ok(slack=-0.012), (k, REASONS[result.reason[k]], way)
+                why = REASONS[result.reason[k]]
+                why = "way" if why in ("unreachable", "joint limit") else why
+                assert why in way.broken(slack=-0.012), (k, why, way)
     assert {"ok", "furniture", "joint speed"} <= reasons
 
 
@@ -231,22 +231,6 @@ def test_one_joint_along_the_view_can_only_roll(tmp_path):
     np.testing.assert_array_equal(np.flatnonzero(result.ok), [0, 1, 2])  # none, right, left
     assert {REASONS[r] for r in result.reason[3:]} == {"unreachable"}
     np.testing.assert_allclose(np.abs(result.q[1:3, -1, 0]), np.radians(12), atol=2e-3)
-
-
-def test_a_redundant_arm_keeps_its_limits_and_speeds():
-    second = load_arm(str(Path(__file__).with_name("second_arm.xml")), "lens")
-    chain = second.chain
-    reach = Reach(chain, Surroundings(_Nothing(), np.eye(4), 2.0), CONFIG)
-    targets = chain.camera_pose(second.home) @ MOTIONS
-    result = reach.probe(second.home, targets)
-    assert result.ok.sum() > 30
-    ends = chain.camera_pose(result.q[result.ok, -1])
-    np.testing.assert_allclose(ends, targets[result.ok], atol=1.8e-3)
-    assert chain.within_limits(result.q[result.ok]).all()
-    moving = result.ok & (result.duration_s > 0)
-    steps = np.abs(np.diff(result.q, axis=1)) * (result.q.shape[1] - 1)
-    speed = steps[moving] / result.duration_s[moving, None, None]
-    assert (speed <= chain.speed * (1 + 1e-4)).all()
 
 
 # -- distances -------------------------------------------------------------------------------

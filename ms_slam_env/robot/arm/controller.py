@@ -16,6 +16,7 @@ from ms_slam_env.robot.arm.clearance import Clearance, ClearanceLimit
 from ms_slam_env.robot.arm.config import ArmConfig
 from ms_slam_env.robot.arm.model import ArmModel
 from ms_slam_env.robot.arm.path import CameraPath
+from ms_slam_env.robot.arm.reach import DAMPING, LIMIT_MARGIN_RAD
 from ms_slam_env.robot.arm.surroundings import Surroundings
 
 Float64 = NDArray[np.float64]
@@ -23,11 +24,7 @@ Float64 = NDArray[np.float64]
 REACHED_M, REACHED_RAD = 0.002, np.radians(0.2)
 """Furthest that commanded poses may be from their way."""
 
-LIMIT_MARGIN_RAD = 0.02
-"""Distance that commanded joint angles keep from their limits."""
-
 _SOLVED = 1  # exit flag of daqp
-_DAMPING = 1e-5  # in square metres and radians: keeps steps small where the arm is nearly singular
 _GAIN = 0.5  # share of a gap to furniture or to another link that one step may use up
 _LEEWAY_M = 0.002  # gaps are checked oftener here than by the mask
 _NO_BOUND = 1e30  # daqp's infinity
@@ -151,7 +148,7 @@ class Controller:
         directly: 0.06 ms, where mink's solve_ik with its limits of range and speed takes 0.2.
         """
         configuration, model = self._configuration, self._model
-        problem = mink.build_ik(configuration, [self._task], tick_s, _DAMPING, limits)
+        problem = mink.build_ik(configuration, [self._task], tick_s, DAMPING, limits)
         q = configuration.data.qpos[model.qpos]
         most = self._chain.speed * tick_s
         self._up[model.dof] = np.minimum(np.maximum(self._upper - q, 0.0), most)

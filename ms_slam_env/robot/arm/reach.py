@@ -15,7 +15,8 @@ from ms_slam_env.geometry import invert
 from ms_slam_env.robot.arm.chain import Chain
 from ms_slam_env.robot.arm.config import ArmConfig
 from ms_slam_env.robot.arm.path import PEAK_SPEED, progress
-from ms_slam_env.robot.arm.reach_kernels import Arm, Grid, Scratch, follow, start_deficits
+from ms_slam_env.robot.arm.reach_inverse import Arm, Scratch, vec6
+from ms_slam_env.robot.arm.reach_kernels import Grid, follow, start_deficits
 from ms_slam_env.robot.arm.surroundings import Surroundings
 
 Float64 = NDArray[np.float64]
@@ -36,7 +37,11 @@ MOST_STRETCH = 4.0
 but for 5 %: less than what the controller makes good within its tolerance of the way."""
 
 LIMIT_MARGIN_RAD = 0.02
-"""Distance that planned joint angles keep from their limits."""
+"""Distance that planned and commanded joint angles keep from their limits."""
+
+DAMPING = 1e-5
+"""Weight of squared joint steps beside squared metres and radians of the camera's error: mask and
+controller minimise the same, so that they bend a redundant arm the same way."""
 
 _LEEWAY = 0.05
 _STILL_S = 1e-6  # duration given to a way without motion
@@ -65,12 +70,13 @@ class ReachResult:
 class Reach:
     """Follows straight ways of the camera with the joints and says which are possible.
 
-    A way is possible if at each of its waypoints inverse kinematics finds joint angles within 1 mm
-    and 0.1 degrees of it, limits are kept, capsules around the links stay ``clearance_m`` away
-    from furniture (beyond the slack of ``Surroundings``) and from each other, and no joint needs
-    more than ``MOST_STRETCH`` times the duration of the camera's way. Distances are checked at
-    places so close that no link moves more than 4 cm between two, half of which the clearance
-    covers.
+    A way is possible if at each of its waypoints inverse kinematics between the joints' limits
+    finds joint angles within 1 mm and 0.1 degrees of it, capsules around the links stay
+    ``clearance_m`` away from furniture (beyond the slack of ``Surroundings``) and from each other,
+    and no joint needs more than ``MOST_STRETCH`` times the duration of the camera's way. Of the
+    joint angles that an arm with spare joints has for a waypoint, those nearest to the waypoint
+    before are taken. Distances are checked at places so close that no link moves more than 4 cm
+    between two, half of which the clearance covers.
     Pairs of links that are closer than the clearance at the arm's home need half that gap.
 
     An arm that stands too close already, by less than the clearance, may go on, though not closer:
@@ -130,6 +136,7 @@ class Reach:
                 buffers.turn,
                 buffers.duration,
                 buffers.deficit,
+                DAMPING,
                 LIMIT_MARGIN_RAD,
                 (1 + _LEEWAY) * MOST_STRETCH,
                 buffers.share,
@@ -176,6 +183,11 @@ class _Buffers:
         self.scratch.R = array((k, n + 2), wp.mat33)
         self.scratch.t = array((k, n + 2), wp.vec3)
         self.scratch.q = array((k, 1, n), wp.float32)
+        self.scratch.low = array((k, n), wp.float32)
+        self.scratch.high = array((k, n), wp.float32)
+        self.scratch.J = array((k, n), vec6)
+        self.scratch.step = array((k, n), wp.float32)
+        self.scratch.held = array((k, n), wp.int32)
         self.scratch.a = array((k, max(m, 1)), wp.vec3)
         self.scratch.b = array((k, max(m, 1)), wp.vec3)
         self._start = np.zeros((k, w, n), dtype=np.float32)

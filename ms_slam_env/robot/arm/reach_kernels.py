@@ -1,15 +1,15 @@
-# ruff: noqa: UP018, RUF046
+# ruff: noqa: UP018
 # Warp code: float(0.0) declares a variable that changes.
 """Warp kernel that follows the camera's straight way to every candidate with the joints.
 
 One thread follows one candidate: inverse kinematics from waypoint to waypoint, then the checks,
-in the order of ``REASONS`` of :mod:`ms_slam_env.robot.arm.reach`. Joint axes are the z axes of the
-joint frames here. Joint angles and axes live in arrays of one row a candidate.
+in the order of ``REASONS`` of :mod:`ms_slam_env.robot.arm.reach`.
 """
 
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
+from ms_slam_env.robot.arm.reach_inverse import Arm, Scratch, forward, solve_waypoint
 
 OK = wp.constant(0)
 UNREACHABLE = wp.constant(1)
@@ -18,37 +18,8 @@ JOINT_SPEED = wp.constant(3)
 FURNITURE = wp.constant(4)
 SELF = wp.constant(5)
 
-_ITERATIONS = wp.constant(5)
-_DAMPING = wp.constant(0.005)  # metres and radians
-_CONVERGED_M = wp.constant(1.0e-4)
-_CONVERGED_RAD = wp.constant(1.0e-4)
-_TOLERANCE_M = wp.constant(1.0e-3)
-_TOLERANCE_RAD = wp.constant(1.745e-3)
-_LARGEST_STEP_RAD = wp.constant(0.3)
+_AT_LIMIT = wp.constant(1.0e-4)
 _CHECKED_M = wp.constant(0.04)
-
-vec6 = wp.types.vector(length=6, dtype=wp.float32)
-mat66 = wp.types.matrix(shape=(6, 6), dtype=wp.float32)
-
-
-@wp.struct
-class Arm:
-    """Geometry of a chain with n joints, m capsules and p pairs of capsules."""
-
-    num_joints: int
-    joint_R: wp.array(dtype=wp.mat33)  # (n + 1,) each joint in the link before, then the camera
-    joint_t: wp.array(dtype=wp.vec3)  # (n + 1,)
-    lower: wp.array(dtype=float)  # (n,)
-    upper: wp.array(dtype=float)  # (n,)
-    speed: wp.array(dtype=float)  # (n,)
-    capsule_link: wp.array(dtype=int)  # (m,) 0 is the base
-    capsule_a: wp.array(dtype=wp.vec3)  # (m,)
-    capsule_b: wp.array(dtype=wp.vec3)  # (m,)
-    capsule_parts: wp.array(dtype=int)  # (m,) pieces that its axis is cut into
-    capsule_need: wp.array(dtype=float)  # (m,) distance of the axis to furniture
-    capsule_cover: wp.array(dtype=float)  # (m,) the same for the balls that cover it
-    pair: wp.array(dtype=wp.vec2i)  # (p,)
-    pair_need: wp.array(dtype=float)  # (p,) distance of their axes
 
 
 @wp.struct
@@ -60,117 +31,14 @@ class Grid:
     t_grid_base: wp.vec3
 
 
-@wp.struct
-class Scratch:
-    """Working memory of each candidate."""
-
-    R: wp.array2d(dtype=wp.mat33)  # (k, n + 2) links, then the camera
-    t: wp.array2d(dtype=wp.vec3)
-    q: wp.array3d(dtype=float)  # (k, 1, n) joint angles between two waypoints
-    a: wp.array2d(dtype=wp.vec3)  # (k, m) ends of the capsules in the base frame
-    b: wp.array2d(dtype=wp.vec3)
-
-
 @wp.func
-def forward(arm: Arm, q: wp.array3d(dtype=float), k: int, w: int, work: Scratch):
-    """Poses of links and camera at waypoint ``w``."""
-    R = wp.identity(n=3, dtype=float)
-    t = wp.vec3(0.0, 0.0, 0.0)
-    work.R[k, 0] = R
-    work.t[k, 0] = t
+def why_missed(arm: Arm, q: wp.array3d(dtype=float), k: int, w: int, work: Scratch):
+    """The reason why a waypoint is not reached: a joint at its limit, or else the distance."""
+    found = int(UNREACHABLE)
     for i in range(arm.num_joints):
-        t = t + R * arm.joint_t[i]
-        F = R * arm.joint_R[i]
-        c = wp.cos(q[k, w, i])
-        s = wp.sin(q[k, w, i])
-        R = wp.mat33(
-            F[0, 0] * c + F[0, 1] * s,
-            F[0, 1] * c - F[0, 0] * s,
-            F[0, 2],
-            F[1, 0] * c + F[1, 1] * s,
-            F[1, 1] * c - F[1, 0] * s,
-            F[1, 2],
-            F[2, 0] * c + F[2, 1] * s,
-            F[2, 1] * c - F[2, 0] * s,
-            F[2, 2],
-        )
-        work.R[k, i + 1] = R
-        work.t[k, i + 1] = t
-    work.t[k, arm.num_joints + 1] = t + R * arm.joint_t[arm.num_joints]
-    work.R[k, arm.num_joints + 1] = R * arm.joint_R[arm.num_joints]
-
-
-@wp.func
-def cholesky_solve(M: mat66, e: vec6):
-    """Solution of M x = e for a symmetric positive definite M."""
-    L = mat66(0.0)
-    x = vec6(0.0)
-    for i in range(6):
-        for j in range(i + 1):
-            total = M[i, j]
-            for c in range(j):
-                total = total - L[i, c] * L[j, c]
-            if i == j:
-                L[i, i] = wp.sqrt(wp.max(total, 1.0e-12))
-            else:
-                L[i, j] = total / L[j, j]
-    for i in range(6):
-        total = e[i]
-        for c in range(i):
-            total = total - L[i, c] * x[c]
-        x[i] = total / L[i, i]
-    for r in range(6):
-        i = 5 - r
-        total = x[i]
-        for c in range(i + 1, 6):
-            total = total - L[c, i] * x[c]
-        x[i] = total / L[i, i]
-    return x
-
-
-@wp.func
-def column(axis: wp.vec3, lever: wp.vec3):
-    """Column of the geometric Jacobian of a hinge."""
-    v = wp.cross(axis, lever)
-    return vec6(v[0], v[1], v[2], axis[0], axis[1], axis[2])
-
-
-@wp.func
-def solve_waypoint(
-    arm: Arm,
-    R_target: wp.mat33,
-    t_target: wp.vec3,
-    q: wp.array3d(dtype=float),
-    k: int,
-    w: int,
-    work: Scratch,
-):
-    """Damped Newton steps from the guess in ``q``; whether the camera is within tolerance."""
-    n = arm.num_joints
-    close = int(0)
-    for iteration in range(_ITERATIONS):
-        forward(arm, q, k, w, work)
-        t = work.t[k, n + 1]
-        E = R_target * wp.transpose(work.R[k, n + 1])
-        dt = t_target - t
-        # the rotation vector to first order: what is left of it shrinks with every step
-        dr = 0.5 * wp.vec3(E[2, 1] - E[1, 2], E[0, 2] - E[2, 0], E[1, 0] - E[0, 1])
-        off_m = wp.length(dt)
-        off_rad = wp.length(dr)
-        close = wp.where(off_m < _TOLERANCE_M and off_rad < _TOLERANCE_RAD, 1, 0)
-        if (off_m < _CONVERGED_M and off_rad < _CONVERGED_RAD) or iteration == _ITERATIONS - 1:
-            break
-        M = _DAMPING * _DAMPING * wp.identity(n=6, dtype=float)
-        for i in range(n):
-            axis = work.R[k, i + 1] * wp.vec3(0.0, 0.0, 1.0)
-            J = column(axis, t - work.t[k, i + 1])
-            M += wp.outer(J, J)
-        y = cholesky_solve(M, vec6(dt[0], dt[1], dt[2], dr[0], dr[1], dr[2]))
-        for i in range(n):
-            axis = work.R[k, i + 1] * wp.vec3(0.0, 0.0, 1.0)
-            step = wp.dot(column(axis, t - work.t[k, i + 1]), y)
-            q[k, w, i] = q[k, w, i] + wp.clamp(step, -_LARGEST_STEP_RAD, _LARGEST_STEP_RAD)
-    return close
+        if q[k, w, i] <= work.low[k, i] + _AT_LIMIT or q[k, w, i] >= work.high[k, i] - _AT_LIMIT:
+            found = JOINT_LIMIT
+    return found
 
 
 @wp.func
@@ -347,6 +215,7 @@ def follow(
     turn: wp.array(dtype=wp.vec3),
     duration_s: wp.array(dtype=float),
     deficit: wp.array(dtype=float),
+    damping: float,
     limit_margin: float,
     most_stretch: float,
     share: wp.array(dtype=float),
@@ -364,6 +233,9 @@ def follow(
     angle = wp.length(turn[k])
     axis = wp.normalize(turn[k])
     slowest = float(1.0)
+    for i in range(n):  # who starts beyond a limit's margin may stay there
+        work.low[k, i] = wp.min(arm.lower[i] + limit_margin, q[k, 0, i])
+        work.high[k, i] = wp.max(arm.upper[i] - limit_margin, q[k, 0, i])
     forward(arm, q, k, 0, work)
     place_capsules(arm, k, work)
     for w in range(1, parts + 1):
@@ -373,15 +245,11 @@ def follow(
                 ahead = (share[w] - share[w - 1]) / (share[w - 1] - share[w - 2])
                 q[k, w, i] += ahead * (q[k, w - 1, i] - q[k, w - 2, i])
         R_target = R_start * wp.quat_to_matrix(wp.quat_from_axis_angle(axis, share[w] * angle))
-        if solve_waypoint(arm, R_target, t_start + share[w] * step[k], q, k, w, work) == 0:
-            reason[k] = UNREACHABLE
+        t_target = t_start + share[w] * step[k]
+        if solve_waypoint(arm, R_target, t_target, damping, q, k, w, work) == 0:
+            reason[k] = why_missed(arm, q, k, w, work)
             return
         for i in range(n):
-            low = wp.min(arm.lower[i] + limit_margin, q[k, 0, i])
-            high = wp.max(arm.upper[i] - limit_margin, q[k, 0, i])
-            if q[k, w, i] < low or q[k, w, i] > high:
-                reason[k] = JOINT_LIMIT
-                return
             moved = wp.abs(q[k, w, i] - q[k, w - 1, i])
             needed_s = float(parts) * moved / arm.speed[i]
             if needed_s > duration_s[k] * slowest:
