@@ -69,6 +69,5 @@ def test_the_picture_shows_the_arm(env):
 
 
 def test_a_site_that_is_not_there_is_one_clear_error():
-    env = gym.make("MSActiveSLAM-v0", arm={"model": SECOND_ARM}, **OPTIONS)
     with pytest.raises(InputError, match="no site named 'camera'; its sites: lens, mark"):
-        env.reset(seed=0)
+        gym.make("MSActiveSLAM-v0", arm={"model": SECOND_ARM}, **OPTIONS)

@@ -1,5 +1,7 @@
 """The arm without physics: motions, frames, mask, state, and the environment with it."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
@@ -10,11 +12,18 @@ from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.geometry import look_at, relative_angle
 from ms_slam_env.robot.arm import ArmConfig
 from ms_slam_env.robot.arm.arm_base import frame_times
+from ms_slam_env.robot.arm.controller import Controller
 from ms_slam_env.robot.arm.kinematic_arm import KinematicArm
 from ms_slam_env.timings import Timings
 
 START = look_at([0.0, -0.8, 1.2], [1.2, 0.2, 0.7])
 STEP_M, STEP_RAD = 0.12, np.radians(12)
+
+
+SECOND_ARM = {
+    "model": str(Path(__file__).with_name("second_arm.xml")),
+    "camera_site": "lens",
+}
 
 
 def make_arm(scene, **options):
@@ -30,8 +39,9 @@ def random_walk(arm, steps, seed=0):
         yield action, arm.move(action)
 
 
-def test_possible_motions_are_made_exactly(box_scene):
-    arm = make_arm(box_scene)
+@pytest.mark.parametrize("options", [{}, SECOND_ARM])
+def test_possible_motions_are_made_exactly(box_scene, options):
+    arm = make_arm(box_scene, **options)
     before = arm.T_world_camera
     np.testing.assert_allclose(before, START, atol=1e-9)
     for action, movement in random_walk(arm, 30):
@@ -40,7 +50,20 @@ def test_possible_motions_are_made_exactly(box_scene):
         np.testing.assert_allclose(movement.T_world_camera[-1], expected, atol=1e-7)
         np.testing.assert_array_equal(movement.T_world_camera[-1], arm.T_world_camera)
         np.testing.assert_array_equal(movement.T_world_camera, movement.T_world_camera_kinematic)
+        assert arm.chain.within_limits(arm.q)
         before = arm.T_world_camera
+
+
+def test_a_redundant_arm_goes_where_the_controller_would_send_it(box_scene):
+    arm = make_arm(box_scene, **SECOND_ARM)
+    for _ in range(12):
+        action = int(np.flatnonzero(arm.action_masks())[-1])
+        controller = Controller(arm.model, arm.chain, arm.surroundings, arm.config)
+        target = arm.chain.camera_pose(arm.q) @ arm.motions[action]
+        plan = controller.plan(arm.q, target, float(arm.probe().duration_s[action]))
+        arm.move(action)
+        assert plan.followed
+        np.testing.assert_allclose(arm.q, plan.q[-1], atol=0.02)
 
 
 def test_frames_lie_on_the_way_at_the_cameras_rate(box_scene):
