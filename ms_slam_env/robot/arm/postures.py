@@ -121,7 +121,7 @@ def effort(chain: Chain, q: Float64, speed_m_s: float, speed_rad_s: float) -> Fl
     (too slow, or out of control).
     """
     rates = _camera_rates(speed_m_s, speed_rad_s)
-    # few at a time stay in the processor's cache: a third of the time
+    # few at a time stay in the processor's cache, which is faster
     some = [_effort(chain, q[i : i + _AT_ONCE], rates) for i in range(0, len(q), _AT_ONCE)]
     return np.concatenate([np.zeros(0), *some])
 

@@ -75,8 +75,10 @@ class Reach:
     ``clearance_m`` away from furniture (beyond the slack of ``Surroundings``) and from each other,
     and no joint needs more than ``MOST_STRETCH`` times the duration of the camera's way. Of the
     joint angles that an arm with spare joints has for a waypoint, those nearest to the waypoint
-    before are taken. Distances are checked at places so close that no link moves more than 4 cm
-    between two, half of which the clearance covers.
+    before are taken: spare joints bend around limits as in the controller, but not around
+    furniture or other links as there, so that a few motions are refused that it could make.
+    Distances are checked at places so close that no link moves more than 4 cm between two, half of
+    which the clearance covers.
     Pairs of links that are closer than the clearance at the arm's home need half that gap.
 
     An arm that stands too close already, by less than the clearance, may go on, though not closer:
