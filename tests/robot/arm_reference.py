@@ -28,10 +28,10 @@ class SlowWay:
 
     def broken(self, slack: float) -> set[str]:
         """What is not kept; ``slack`` > 0 forgives, < 0 asks for more."""
-        off = max(self.off_m / 1e-3, self.off_rad / np.radians(0.1))
+        off = max(self.off_m / 1.8e-3, self.off_rad / np.radians(0.18))
         kept = {
             "way": off < 1 + 10 * slack,
-            "joint speed": self.stretch < 1.05 * MOST_STRETCH * (1 + slack),
+            "joint speed": self.stretch < 1.15 * MOST_STRETCH * (1 + slack),
             "furniture": self.furniture_spare_m > -slack,
             "self-collision": self.self_spare_m > -slack,
         }

@@ -34,7 +34,7 @@ LONGEST_PART_RAD = np.radians(2.2)
 
 MOST_STRETCH = 4.0
 """A way on which a joint would take more than this times the camera's duration is refused,
-but for 5 %: less than what the controller makes good within its tolerance of the way."""
+but for 15 %: what the controller makes good within its tolerance of the way, and in late ticks."""
 
 LIMIT_MARGIN_RAD = 0.02
 """Distance that planned and commanded joint angles keep from their limits."""
@@ -43,7 +43,7 @@ DAMPING = 1e-5
 """Weight of squared joint steps beside squared metres and radians of the camera's error: mask and
 controller minimise the same, so that they bend a redundant arm the same way."""
 
-_LEEWAY = 0.05
+_LEEWAY = 0.15
 _STILL_S = 1e-6  # duration given to a way without motion
 _SHORTEST_PART_M = 0.03  # of a capsule, between two balls that cover it
 
@@ -71,12 +71,13 @@ class Reach:
     """Follows straight ways of the camera with the joints and says which are possible.
 
     A way is possible if at each of its waypoints inverse kinematics between the joints' limits
-    finds joint angles within 1 mm and 0.1 degrees of it, capsules around the links stay
-    ``clearance_m`` away from furniture (beyond the slack of ``Surroundings``) and from each other,
-    and no joint needs more than ``MOST_STRETCH`` times the duration of the camera's way. Of the
-    joint angles that an arm with spare joints has for a waypoint, those nearest to the waypoint
-    before are taken: spare joints bend around limits as in the controller, but not around
-    furniture or other links as there, so that a few motions are refused that it could make.
+    finds joint angles within 1.8 mm and 0.18 degrees of it (the controller allows itself 2 mm and
+    0.2), capsules around the links stay ``clearance_m`` away from furniture (beyond the slack of
+    ``Surroundings``) and from each other, and no joint needs more than ``MOST_STRETCH`` times the
+    duration of the camera's way. Of the joint angles that an arm with spare joints has for a
+    waypoint, those nearest to the waypoint before are taken: spare joints bend around limits as in
+    the controller, but not around furniture or other links as there, so that a few motions are
+    refused that it could make.
     Distances are checked at places so close that no link moves more than 4 cm between two, half of
     which the clearance covers.
     Pairs of links that are closer than the clearance at the arm's home need half that gap.

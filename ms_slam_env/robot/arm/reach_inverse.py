@@ -13,8 +13,8 @@ from ms_slam_env._warp import wp
 _ITERATIONS = wp.constant(8)
 _CONVERGED_M = wp.constant(1.0e-4)
 _CONVERGED_RAD = wp.constant(1.0e-4)
-_TOLERANCE_M = wp.constant(1.0e-3)
-_TOLERANCE_RAD = wp.constant(1.745e-3)
+_TOLERANCE_M = wp.constant(1.8e-3)
+_TOLERANCE_RAD = wp.constant(3.14e-3)
 _LARGEST_STEP_RAD = wp.constant(0.3)
 
 vec6 = wp.types.vector(length=6, dtype=wp.float32)
