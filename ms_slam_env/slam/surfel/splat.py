@@ -17,6 +17,7 @@ from ms_slam_env._warp import wp
 from ms_slam_env.slam.surfel.discs import Discs, SplatCamera, floor_int
 from ms_slam_env.slam.surfel.memory import fetch, put, raise_to
 from ms_slam_env.slam.surfel.surfel_arrays import (
+    SeenWindow,
     Surfels,
     VisibleList,
     depth_tolerance,
@@ -36,9 +37,10 @@ def cull(
     camera: SplatCamera,
     margin_px: float,
     workers: int,
+    window: SeenWindow,
     visible: VisibleList,
 ) -> None:
-    """List the living surfels in front of the camera, facing it, within its frustum.
+    """List the living surfels of a window in front of the camera, facing it, within its frustum.
 
     ``poses[k]`` is T_world_camera of env ``first_env + k``.
     """
@@ -52,6 +54,8 @@ def cull(
     high_v = (float(camera.height) - 0.5 + margin_px - camera.centre[1]) / camera.focal[1]
     z_near = camera.z_near
     z_far = camera.z_far
+    seen_from = fetch(window.seen_from, b)
+    seen_to = fetch(window.seen_to, b)
     forward = wp.vec3(R[2, 0], R[2, 1], R[2, 2])
     count = surfels.count[b]
     i = int(worker)
@@ -62,7 +66,9 @@ def cull(
             p = R * world + t
             if p[0] > low_u * z and p[0] < high_u * z and p[1] > low_v * z and p[1] < high_v * z:
                 n = R * fetch(surfels.normal, b, i)
-                if wp.dot(n, p) < 0.0 and fetch(surfels.confidence, b, i) > 0.0:
+                seen = fetch(surfels.seen, b, i)
+                is_alive = fetch(surfels.confidence, b, i) > 0.0
+                if wp.dot(n, p) < 0.0 and is_alive and seen >= seen_from and seen <= seen_to:
                     slot = wp.atomic_add(visible.count, k, 1)
                     put(visible.index, k, slot, i)
                     put(visible.position, k, slot, p)

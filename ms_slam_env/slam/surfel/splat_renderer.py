@@ -16,7 +16,12 @@ from ms_slam_env.slam.surfel.splat import (
     splat_attributes,
     splat_depth,
 )
-from ms_slam_env.slam.surfel.surfel_arrays import Surfels, VisibleList
+from ms_slam_env.slam.surfel.surfel_arrays import (
+    SeenWindow,
+    Surfels,
+    VisibleList,
+    any_time,
+)
 from ms_slam_env.slam.surfel.types import ModelView
 
 
@@ -58,7 +63,10 @@ def every_nth(intrinsics: Intrinsics, n: int) -> Intrinsics:
 
 
 class Culler:
-    """Lists the surfels that cameras can see, one camera for each of ``envs`` maps."""
+    """Lists the surfels that cameras can see, one camera for each of ``envs`` maps.
+
+    Only those last seen within ``window``, whose times may be set anew at any moment; None: all.
+    """
 
     def __init__(
         self,
@@ -68,14 +76,16 @@ class Culler:
         camera: SplatCamera,
         workers: int,
         device: str,
+        window: SeenWindow | None = None,
     ) -> None:
         self._visible = visible
+        window = window or any_time(surfels.count.shape[0], device)
         self._arguments: tuple[Any, ...] = (0, wp.zeros(envs, dtype=wp.mat44, device=device), 0.0)
         first_env, poses, margin_px = self._arguments
         self._launch = wp.launch(
             cull,
             dim=(envs, workers),
-            inputs=[surfels, first_env, poses, camera, margin_px, workers, visible],
+            inputs=[surfels, first_env, poses, camera, margin_px, workers, window, visible],
             device=device,
             record_cmd=True,
         )
@@ -105,6 +115,7 @@ class SplatRenderer:
         parameters: how discs are drawn.
         workers: threads per env; 1 on the CPU, where they would run one after the other.
         device: Warp device.
+        window: draw the surfels last seen within it; None: all.
 
     Attributes:
         view: the images, overwritten by every call of ``splat``.
@@ -120,6 +131,7 @@ class SplatRenderer:
         parameters: SplatParameters,
         workers: int,
         device: str,
+        window: SeenWindow | None = None,
     ) -> None:
         self.envs = envs
         self.intrinsics = intrinsics
@@ -132,7 +144,7 @@ class SplatRenderer:
         pixels = envs * intrinsics.width * intrinsics.height
         self._z_buffer = wp.zeros(pixels, dtype=wp.float32, device=device)
         self._sums = wp.zeros(pixels, dtype=Sums, device=device)
-        self._culler = Culler(surfels, visible, envs, self.camera, workers, device)
+        self._culler = Culler(surfels, visible, envs, self.camera, workers, device, window)
         self._splats = {id(visible): self._record_splats(surfels, visible)}
         self._first_env = {id(visible): 0}
         self._surfels = surfels

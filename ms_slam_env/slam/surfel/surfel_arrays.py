@@ -49,6 +49,32 @@ class VisibleList:
     count: wp.array(dtype=wp.int32)
 
 
+@wp.struct
+class SeenWindow:
+    """Which surfels of B maps take part, by the frame that saw them last.
+
+    Attributes:
+        seen_from: (B,) first frame.
+        seen_to: (B,) last frame.
+    """
+
+    seen_from: wp.array(dtype=wp.int32)
+    seen_to: wp.array(dtype=wp.int32)
+
+
+EARLIEST = -(2**31)
+LATEST = 2**31 - 1
+"""Bounds of a ``SeenWindow`` that leaves out nothing."""
+
+
+def any_time(batch: int, device: str) -> SeenWindow:
+    """Window that leaves out no surfel of ``batch`` maps."""
+    window = SeenWindow()
+    window.seen_from = wp.full(batch, EARLIEST, dtype=wp.int32, device=device)
+    window.seen_to = wp.full(batch, LATEST, dtype=wp.int32, device=device)
+    return window
+
+
 def allocate_surfels(batch: int, capacity: int, device: str) -> Surfels:
     """Empty maps of ``batch`` envs with ``capacity`` slots each."""
     surfels = Surfels()

@@ -32,8 +32,10 @@ from ms_slam_env.slam.surfel.splat_renderer import (
 from ms_slam_env.slam.surfel.surfel_arrays import (
     ATTRIBUTES,
     COUNTERS,
+    SeenWindow,
     allocate_surfels,
     allocate_visible,
+    any_time,
 )
 from ms_slam_env.slam.surfel.types import LiveFrame, ModelView
 
@@ -55,6 +57,8 @@ class SurfelMap:
 
     Attributes:
         surfels: the maps on the device.
+        active: ``fuse`` and ``render_model`` work on the surfels last seen within this window; all
+            unless its times are set.
     """
 
     def __init__(
@@ -74,7 +78,8 @@ class SurfelMap:
         self.surfels = allocate_surfels(batch, capacity, device)
         self._spare = allocate_surfels(batch, capacity, device)
         self._visible = allocate_visible(batch, capacity, device)
-        discs = allocate_discs(batch, capacity, device)
+        self._discs = allocate_discs(batch, capacity, device)
+        self.active = any_time(batch, device)
         self._survivors = wp.zeros((batch, capacity), dtype=wp.int32, device=device)
         self._kept = wp.zeros(batch, dtype=wp.int32, device=device)
         pixels = batch * intrinsics.width * intrinsics.height
@@ -85,28 +90,47 @@ class SurfelMap:
         self._fusion.coverage_px = config.coverage_px
         self._fusion.radius_px = config.surfel_radius_px
         self._fusion.max_confidence = config.max_confidence
-        parameters = SplatParameters(tolerance_m=config.fusion_distance_m)
-        self._camera = splat_camera(intrinsics, parameters)
-        self._cull = Culler(self.surfels, self._visible, batch, self._camera, self._workers, device)
-        self._model_renderer = SplatRenderer(
+        self._parameters = SplatParameters(tolerance_m=config.fusion_distance_m)
+        self._camera = splat_camera(intrinsics, self._parameters)
+        self._cull = Culler(
             self.surfels,
             self._visible,
-            discs,
             batch,
-            every_nth(intrinsics, model_stride),
-            replace(
-                parameters,
-                min_px=parameters.min_px / model_stride,
-                max_px=parameters.max_px / model_stride,
-            ),
+            self._camera,
+            self._workers,
+            device,
+            self.active,
+        )
+        self._model_renderer = self.model_renderer(model_stride, self.active)
+        self._predictor = ViewPredictor(
+            self.surfels,
+            self._visible,
+            self._discs,
+            intrinsics,
+            self._parameters,
             self._workers,
             device,
         )
-        self._predictor = ViewPredictor(
-            self.surfels, self._visible, discs, intrinsics, parameters, self._workers, device
-        )
         self._bound: tuple[Any, ...] = (None,) * 5
         self._record_launches()
+
+    def model_renderer(self, stride: int, window: SeenWindow) -> SplatRenderer:
+        """Renders every ``stride``-th row and column of what was last seen within ``window``."""
+        return SplatRenderer(
+            self.surfels,
+            self._visible,
+            self._discs,
+            self.batch,
+            every_nth(self.intrinsics, stride),
+            replace(
+                self._parameters,
+                min_px=self._parameters.min_px / stride,
+                max_px=self._parameters.max_px / stride,
+            ),
+            self._workers,
+            self.device,
+            window,
+        )
 
     def clear(self, env: int | None = None) -> None:
         """Forget the map of one env, or of all."""
