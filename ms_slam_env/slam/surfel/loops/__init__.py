@@ -1,0 +1,1 @@
+"""Loop closure of the surfel SLAM."""

@@ -1,0 +1,220 @@
+"""The energy of a deformation graph, and its minimum by sparse Gauss-Newton.
+
+ElasticFusion (Whelan et al., RSS 2015, section V-B), from Sumner et al. (2007):
+
+    E_rot = sum_l |R_l^T R_l - I|^2                                                  equation 10
+    E_reg = sum_l sum_n |R_l (g_n - g_l) + g_l + t_l - (g_n + t_n)|^2                equation 11
+    E_con = sum_p |phi(source_p) - target_p|^2                                       equation 12
+
+Pins are constraints whose target is their source; a relative constraint has phi(target_p) in place
+of target_p (equation 14). All but E_rot is linear in the unknowns, which are for every node the
+nine numbers of R row by row, then t.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from ms_slam_env.slam.surfel.loops.deformation_graph import (
+    Deformation,
+    DeformationGraph,
+    identity,
+)
+
+Float64 = NDArray[np.float64]
+
+UNKNOWNS = 12  # of a node
+W_ROT, W_REG, W_CON = 1.0, 10.0, 100.0
+DAMPING = 1e-9  # share of the mean diagonal, for what the constraints leave free
+SMALLEST_STEP = 1e-7
+_ROWS, _COLUMNS = np.triu_indices(3)
+_DOUBLED = np.where(_ROWS == _COLUMNS, 1.0, np.sqrt(2.0))  # R^T R is symmetric
+
+
+@dataclass(frozen=True)
+class Constraints:
+    """Points of the map and where they should go.
+
+    Attributes:
+        sources: (C, 3) points.
+        source_times: (C,) when they were created.
+        targets: (C, 3) where they belong.
+        target_times: (C,) when the surface at the target was created; NaN: the target is fixed,
+            otherwise it moves with the deformation.
+    """
+
+    sources: Float64
+    source_times: Float64
+    targets: Float64
+    target_times: Float64
+
+    def __len__(self) -> int:
+        """Number of constraints C."""
+        return len(self.sources)
+
+    def errors(self, deformation: Deformation) -> Float64:
+        """Distances (C,) that remain, metres."""
+        relative = np.isfinite(self.target_times)
+        targets = self.targets.copy()
+        if relative.any():
+            targets[relative] = deformation.points(targets[relative], self.target_times[relative])
+        moved = deformation.points(self.sources, self.source_times)
+        return np.linalg.norm(moved - targets, axis=1)
+
+
+def join(parts: list[Constraints]) -> Constraints:
+    """All constraints of several sets."""
+    names = ("sources", "source_times", "targets", "target_times")
+    return Constraints(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+def no_constraints() -> Constraints:
+    """An empty set."""
+    return Constraints(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), np.zeros(0))
+
+
+class Energy:
+    """The weighted residuals of a graph under constraints."""
+
+    def __init__(self, graph: DeformationGraph, constraints: Constraints) -> None:
+        """Work out the linear part, which does not change."""
+        self.graph = graph
+        edges = _edge_rows(graph, W_REG**0.5)
+        points = _constraint_rows(graph, constraints, W_CON**0.5)
+        self._matrix = sparse.vstack([edges[0], points[0]], format="csr")
+        self._offset = np.concatenate([edges[1], points[1]])
+        self._normal = (self._matrix.T @ self._matrix).tocsc()
+
+    def residuals(self, x: Float64) -> Float64:
+        """All residuals at unknowns x (12 M,); their squares sum to the energy."""
+        return np.concatenate([self._matrix @ x + self._offset, self._rotation_residuals(x)])
+
+    def jacobian(self, x: Float64) -> sparse.csr_matrix:
+        """Derivatives of ``residuals``."""
+        return sparse.vstack([self._matrix, self._rotation_jacobian(x)], format="csr")
+
+    def _rotation_residuals(self, x: Float64) -> Float64:
+        R = x.reshape(-1, UNKNOWNS)[:, :9].reshape(-1, 3, 3)
+        excess = np.swapaxes(R, 1, 2) @ R - np.eye(3)
+        return (W_ROT**0.5 * _DOUBLED * excess[:, _ROWS, _COLUMNS]).ravel()
+
+    def _rotation_jacobian(self, x: Float64) -> sparse.csr_matrix:
+        """d (column_i . column_j) = column_j . d column_i + column_i . d column_j."""
+        count = len(self.graph)
+        R = x.reshape(-1, UNKNOWNS)[:, :9].reshape(-1, 3, 3)
+        blocks = np.zeros((count, 6, 3, 3))  # residual, row of R, column of R
+        for residual, (i, j) in enumerate(zip(_ROWS, _COLUMNS, strict=True)):
+            blocks[:, residual, :, i] += R[:, :, j]
+            blocks[:, residual, :, j] += R[:, :, i]
+        values = W_ROT**0.5 * _DOUBLED[:, None] * blocks.reshape(count, 6, 9)
+        rows = np.broadcast_to(np.arange(6 * count).reshape(count, 6, 1), values.shape)
+        columns = UNKNOWNS * np.arange(count)[:, None, None] + np.arange(9)
+        columns = np.broadcast_to(columns, values.shape)
+        shape = (6 * count, UNKNOWNS * count)
+        return sparse.csr_matrix((values.ravel(), (rows.ravel(), columns.ravel())), shape=shape)
+
+    def step(self, x: Float64) -> Float64:
+        """The Gauss-Newton step at x."""
+        rotation = self._rotation_jacobian(x)
+        H = (self._normal + rotation.T @ rotation).tocsc()
+        H = H + DAMPING * H.diagonal().mean() * sparse.identity(len(x), format="csc")
+        gradient = self._matrix.T @ (self._matrix @ x + self._offset)
+        gradient += rotation.T @ self._rotation_residuals(x)
+        factors = splu(
+            H,
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
+        return -factors.solve(gradient)
+
+
+def optimise(
+    graph: DeformationGraph, constraints: Constraints, iterations: int = 10
+) -> Deformation:
+    """The deformation of least energy, by Gauss-Newton from rest."""
+    if not len(constraints):
+        return identity(graph)
+    energy = Energy(graph, constraints)
+    x = pack(identity(graph))
+    for _ in range(iterations):
+        step = energy.step(x)
+        x = x + step
+        if np.abs(step).max() < SMALLEST_STEP:
+            break
+    return unpack(graph, x)
+
+
+def pack(deformation: Deformation) -> Float64:
+    """The unknowns (12 M,) of a deformation."""
+    count = len(deformation.graph)
+    return np.concatenate([deformation.R.reshape(count, 9), deformation.t], axis=1).ravel()
+
+
+def unpack(graph: DeformationGraph, x: Float64) -> Deformation:
+    """The deformation of unknowns (12 M,)."""
+    nodes = x.reshape(len(graph), UNKNOWNS)
+    return Deformation(graph, nodes[:, :9].reshape(-1, 3, 3).copy(), nodes[:, 9:].copy())
+
+
+def _edge_rows(graph: DeformationGraph, weight: float) -> tuple[sparse.csr_matrix, Float64]:
+    """E_reg: three rows an edge (l, n): R_l (g_n - g_l) + t_l - t_n + (g_l - g_n)."""
+    edges = graph.edges()
+    own, other = edges[:, 0], edges[:, 1]
+    offsets = graph.positions[other] - graph.positions[own]  # (E, 3)
+    ones = np.ones((len(edges), 1))
+    values = np.concatenate([offsets, ones, -ones], axis=1)  # (E, 5), the same for each axis
+    linear = UNKNOWNS * own[:, None, None] + 3 * np.arange(3)[:, None] + np.arange(3)  # (E, 3, 3)
+    axis = np.arange(3)[:, None]
+    shift = UNKNOWNS * own[:, None, None] + 9 + axis
+    back = UNKNOWNS * other[:, None, None] + 9 + axis
+    columns = np.concatenate([linear, shift, back], axis=2)  # (E, 3, 5)
+    return _rows(weight * values[:, None], columns, len(graph)), -weight * offsets.ravel()
+
+
+def _constraint_rows(
+    graph: DeformationGraph, constraints: Constraints, weight: float
+) -> tuple[sparse.csr_matrix, Float64]:
+    """E_con: three rows a constraint."""
+    rows, offset = _point_rows(graph, constraints.sources, constraints.source_times)
+    relative = np.isfinite(constraints.target_times)
+    times = np.where(relative, constraints.target_times, 0.0)
+    target_rows, target_offset = _point_rows(graph, constraints.targets, times)
+    moves = np.repeat(relative.astype(float), 3)
+    rows = rows - sparse.diags(moves) @ target_rows
+    fixed = constraints.targets.ravel()
+    offset = offset - np.where(moves > 0, target_offset, fixed)
+    return (weight * rows).tocsr(), weight * offset
+
+
+def _point_rows(
+    graph: DeformationGraph, points: Float64, times: Float64
+) -> tuple[sparse.csr_matrix, Float64]:
+    """phi(points) = matrix @ x + offset, three rows a point."""
+    nodes, weights = graph.influence(points, times)  # (C, k)
+    centres = graph.positions[nodes]
+    offsets = np.concatenate([points[:, None] - centres, np.ones((*nodes.shape, 1))], axis=2)
+    values = weights[..., None] * offsets  # (C, k, 4)
+    axis = np.arange(3)
+    linear = 3 * axis[:, None] + np.arange(3)  # (3, 3): row of R, its columns
+    within = np.concatenate([linear, 9 + axis[:, None]], axis=1)  # (3, 4)
+    columns = UNKNOWNS * nodes[:, None, :, None] + within[:, None]  # (C, 3, k, 4)
+    count = len(points)
+    shared = np.broadcast_to(values[:, None], columns.shape).reshape(count, 3, -1)
+    matrix = _rows(shared, columns.reshape(count, 3, -1), len(graph))
+    return matrix, np.einsum("nk,nki->ni", weights, centres).ravel()
+
+
+def _rows(values: Float64, columns: NDArray[np.int64], nodes: int) -> sparse.csr_matrix:
+    """Sparse rows (N * 3, 12 M) of values and columns (N, 3, entries)."""
+    values = np.broadcast_to(values, columns.shape)
+    count, entries = columns.shape[0] * 3, columns.shape[2]
+    starts = np.arange(count + 1) * entries
+    return sparse.csr_matrix(
+        (values.ravel(), columns.ravel(), starts), shape=(count, UNKNOWNS * nodes)
+    )
