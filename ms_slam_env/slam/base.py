@@ -26,6 +26,8 @@ class TrackResult:
         inlier_fraction: share of the frame's valid pixels that the alignment explained.
         residual_m: RMS point-to-plane residual of the inliers, metres.
         reason: why tracking failed, in words; empty when it did not.
+        loop_closed: whether this frame closed a loop: the map was bent, and the pose jumped by the
+            drift that was taken back.
     """
 
     T_world_camera: Float64
@@ -34,6 +36,7 @@ class TrackResult:
     inlier_fraction: float = 1.0
     residual_m: float = 0.0
     reason: str = ""
+    loop_closed: bool = False
 
 
 @dataclass(frozen=True)

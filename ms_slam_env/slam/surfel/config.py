@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from ms_slam_env.config import check_range
+from ms_slam_env.config import check_choice, check_range
 from ms_slam_env.errors import InputError
+from ms_slam_env.slam.surfel.loops.config import LoopConfig
+
+LOOP_CLOSURES = ("none", "deformation")
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,9 @@ class SurfelConfig:
         refuse_bad_fits: whether a frame that fits the map badly counts as lost and stays out of the
             map. If not, every frame is fused at the pose that alignment found, as in ElasticFusion
             without relocalisation, and a map may show things twice.
+        loop_closure: "none": frames are aligned with all of the map, however old; "deformation":
+            with its recent part, and where that meets the old part again the map is bent to fit.
+        loops: parameters of the latter.
 
     Raises:
         InputError: a value outside its range.
@@ -77,6 +83,8 @@ class SurfelConfig:
     lateral_noise_px: float = 0.3
     points_per_level: int = 5000
     refuse_bad_fits: bool = True
+    loop_closure: str = "none"
+    loops: LoopConfig = field(default_factory=LoopConfig)
 
     def __post_init__(self) -> None:
         """Refuse values outside the ranges."""
@@ -115,3 +123,4 @@ class SurfelConfig:
             raise InputError(
                 f"SurfelConfig.refuse_bad_fits = {self.refuse_bad_fits!r} must be true or false"
             )
+        check_choice(self, "loop_closure", LOOP_CLOSURES)

@@ -1,6 +1,6 @@
 """The surfel SLAM: preprocess, render the map, track the frame against that view, fuse.
 
-ElasticFusion (Whelan et al., RSS 2015, figure 2) without loop closure. While tracking is lost the
+ElasticFusion (Whelan et al., RSS 2015, figure 2). While tracking is lost the
 pose is held, nothing is fused, and every frame is tried against the map around the last good pose.
 The view that frames are tracked against shows living surfels of every age: with steps of
 centimetres a view seldom lasts until its surfels are stable.
@@ -21,6 +21,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose, invert
 from ms_slam_env.slam.base import Float64, TrackResult
 from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.loops.make import make_loop_closure
 from ms_slam_env.slam.surfel.mirror import Mirror
 from ms_slam_env.slam.surfel.preprocess import Preprocessor
 from ms_slam_env.slam.surfel.seeds import NUM_SEEDS, relocalisation_seeds, tracking_seeds
@@ -54,6 +55,7 @@ class BatchedSurfelSlam:
         stride = model_stride(intrinsics, config)
         self.tracker = Tracker(batch, NUM_SEEDS, intrinsics, config, device, stride)
         self.map = SurfelMap(batch, intrinsics, config, device, stride)
+        self.loops = make_loop_closure(self.map, config, device)
         self._device_poses = Mirror(batch, wp.mat44, device)
         self._device_time = Mirror(batch, wp.int32, device)
         self._device_weight = Mirror(batch, wp.float32, device)
@@ -75,6 +77,7 @@ class BatchedSurfelSlam:
         self._lost[env] = 0
         self._time[env] = 0
         self.map.clear(env)
+        self.loops.reset(env)
         self._view_poses = None
 
     def track(
@@ -94,10 +97,11 @@ class BatchedSurfelSlam:
         self._check_images(color, depth)
         guesses = self._check_guesses(T_world_camera_guess)
         live = self.preprocess(color, depth)
+        self._select_surfels(self._lost)
         results = self._locate(live, guesses)
         good = np.array([result.tracking_ok for result in results])
         self._fuse(live, good)
-        return results
+        return self._close_loops(live, results)
 
     def fuse(
         self, color: NDArray[np.uint8], depth: NDArray[np.float32], T_world_camera: Float64
@@ -110,6 +114,7 @@ class BatchedSurfelSlam:
         self._check_images(color, depth)
         poses = self._check_poses(T_world_camera)
         live = self.preprocess(color, depth)
+        self._select_surfels(np.ones(self.batch, dtype=np.int32))  # known poses: old and new fit
         for env in range(self.batch):
             moves_on = self._started[env] and not self._lost[env]
             motion = invert(self.poses[env]) @ poses[env]
@@ -252,6 +257,7 @@ class BatchedSurfelSlam:
         if not good.any():
             self._time += 1
             return
+        self.loops.record(self.poses, self._time, good)
         self._device_poses.write(self.poses)
         self._device_time.write(self._time)
         self._device_weight.write(motion_weight(self._motions))
@@ -265,6 +271,21 @@ class BatchedSurfelSlam:
         )
         self._time += 1
         self._view_poses = None
+
+    def _select_surfels(self, lost: NDArray[np.int32]) -> None:
+        """Let loop closure choose what frames are aligned with and fused into."""
+        if self.loops.select(self._time, lost):
+            self._view_poses = None
+
+    def _close_loops(self, live: LiveFrame, results: list[TrackResult]) -> list[TrackResult]:
+        """Close loops after fusion; a closed one corrects the map and the pose."""
+        tracked = np.array([result.tracking_ok for result in results])
+        closed = self.loops.close(live, self.poses, self._time - 1, tracked)
+        for env in np.flatnonzero(closed):
+            results[env] = replace(
+                results[env], T_world_camera=self.poses[env].copy(), loop_closed=True
+            )
+        return results
 
     def _render(self, poses: Float64) -> ModelView:
         """Render the maps from ``poses`` (B, 4, 4), unless that view is at hand."""
@@ -283,6 +304,7 @@ class BatchedSurfelSlam:
             "lost": self._lost.copy(),
             "time": self._time.copy(),
             "map": self.map.get_state(),
+            "loops": self.loops.get_state(),
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
@@ -293,6 +315,7 @@ class BatchedSurfelSlam:
         self._lost = state["lost"].copy()
         self._time = state["time"].copy()
         self.map.set_state(state["map"])
+        self.loops.set_state(state["loops"])
         self._view_poses = None
 
 

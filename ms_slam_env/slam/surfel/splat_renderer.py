@@ -119,6 +119,7 @@ class SplatRenderer:
 
     Attributes:
         view: the images, overwritten by every call of ``splat``.
+        visible: the list that ``cull`` fills, overwritten by other renderers of the map.
     """
 
     def __init__(
@@ -139,7 +140,7 @@ class SplatRenderer:
         self.workers = workers
         self.camera = splat_camera(intrinsics, parameters)
         self.view = self._new_view()
-        self._visible = visible
+        self.visible = visible
         self._discs = discs
         pixels = envs * intrinsics.width * intrinsics.height
         self._z_buffer = wp.zeros(pixels, dtype=wp.float32, device=device)
@@ -195,7 +196,7 @@ class SplatRenderer:
 
     def splat(self, first_env: int = 0, listed: VisibleList | None = None) -> ModelView:
         """Draw the surfels that ``cull`` listed, or those of another list."""
-        listed = self._visible if listed is None else listed
+        listed = self.visible if listed is None else listed
         if id(listed) not in self._splats:
             self._splats[id(listed)] = self._record_splats(self._surfels, listed)
             self._first_env[id(listed)] = 0
@@ -218,6 +219,6 @@ class SplatRenderer:
         wp.launch(
             list_hidden,
             dim=(self.envs, self.workers),
-            inputs=[self._visible, self.camera, self.workers, self._z_buffer, hidden],
+            inputs=[self.visible, self.camera, self.workers, self._z_buffer, hidden],
             device=self.device,
         )
