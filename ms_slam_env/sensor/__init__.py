@@ -7,11 +7,12 @@ from ms_slam_env.sensor.casters import (
     WarpRayCaster,
 )
 from ms_slam_env.sensor.noise import NOISE_MODELS, NoiseConfig, NoNoise
-from ms_slam_env.sensor.rgbd import FRAME_RATE_HZ, RGBDSensor, TrueView
+from ms_slam_env.sensor.rgbd import FRAME_RATE_HZ, ROLLING_ROWS, RGBDSensor, TrueView
 
 __all__ = [
     "FRAME_RATE_HZ",
     "NOISE_MODELS",
+    "ROLLING_ROWS",
     "EmbreeRayCaster",
     "EmbreeSingleRayCaster",
     "NoNoise",

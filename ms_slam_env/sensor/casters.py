@@ -45,6 +45,8 @@ class RayCaster(ABC):
     def bind(self, poses: wp.array, camera: Pinhole, hits: Hits) -> Callable[[], None]:
         """Return a function that casts the rays of poses (B,) mat44 and overwrites ``hits``.
 
+        Where ``camera.rows`` rows share a pose there are as many poses an image as that makes; an
+        even number, because two rows are cast together.
         It reads the poses anew at each call.
         """
 

@@ -8,7 +8,7 @@ from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.sensor.noise import NATIVE_WIDTH, NoiseConfig
 from ms_slam_env.sensor.random_numbers import PCG
-from ms_slam_env.sensor.rays import Pinhole
+from ms_slam_env.sensor.rays import Pinhole, pose_of_row
 from ms_slam_env.sensor.spans import VECTOR_FLAGS, VECTORISE
 
 _MAX_LATERAL_ANGLE = math.radians(80.0)  # the published fit ends there
@@ -215,7 +215,7 @@ def _measure_span(
 
 @wp.kernel
 def measure_depth(
-    T_world_camera: wp.array(dtype=wp.mat44),  # (B,)
+    T_world_camera: wp.array(dtype=wp.mat44),  # (B * poses an image,)
     camera: Pinhole,
     span: int,
     hit_t: wp.array(dtype=wp.float32),  # (B * H * W,)
@@ -232,7 +232,7 @@ def measure_depth(
     b, y, part = wp.tid()
     x = part * span
     _measure_span(
-        T_world_camera[b],
+        T_world_camera[pose_of_row(camera, b, y)],
         camera,
         b * camera.height * camera.width,
         y,

@@ -73,7 +73,10 @@ class Images:
         exposure: float,
         device: str,
     ) -> None:
-        """Allocate the arrays for images (B, H, W) and record the launches."""
+        """Allocate the arrays for images (B, H, W) and record the launches.
+
+        ``camera.rows`` says how many rows of an image have a pose of their own.
+        """
         self._device = device
         self._shape = shape
         self._camera = camera
@@ -82,7 +85,8 @@ class Images:
         count = batch * height * width
         span = span_of(width, device)
         parts = (batch, height, width // span)
-        self._poses = wp.zeros(batch, dtype=wp.mat44, device=device)
+        poses = batch * -(-height // int(camera.rows))
+        self._poses = wp.zeros(poses, dtype=wp.mat44, device=device)
         self._keys = wp.zeros((batch, 2), dtype=wp.uint32, device=device)
         self._hits = hits = Hits(shape, device)
         self._shadow = wp.zeros(count, dtype=wp.uint8, device=device)
@@ -128,6 +132,13 @@ class Images:
             command.launch()
         colors = self._color.numpy().reshape(*self._shape, 3)
         return colors, self._depth.numpy().reshape(self._shape)
+
+    def ideal_colors(self, poses: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """Noise-free colour (B, H, W, 3) from poses (B, 4, 4)."""
+        self._poses.assign(poses.astype(np.float32))
+        self._cast()
+        self._shade_ideal.launch()
+        return self._color.numpy().reshape(*self._shape, 3)
 
     def true_depth(self) -> NDArray[np.float32]:
         """True depth (B, H, W) of the last capture, metres; 0 = no surface."""

@@ -7,7 +7,7 @@ not on the batch.
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
-from ms_slam_env.sensor.rays import Pinhole
+from ms_slam_env.sensor.rays import Pinhole, pose_of_row
 from ms_slam_env.sensor.spans import VECTOR_FLAGS
 
 wp.set_module_options(VECTOR_FLAGS)
@@ -88,7 +88,7 @@ def _cast_tile(
 def cast_tiles(
     intersect: wp.uint64,  # address of rtcIntersect8
     scene: wp.uint64,  # address of the RTCScene
-    T_world_camera: wp.array(dtype=wp.mat44),  # (B,)
+    T_world_camera: wp.array(dtype=wp.mat44),  # (B * poses an image,)
     camera: Pinhole,
     t: wp.array(dtype=wp.float32),  # (B * H * W,)
     u: wp.array(dtype=wp.float32),
@@ -97,4 +97,5 @@ def cast_tiles(
 ):
     """First hit of the ray of each pixel; face -1 where there is none; one thread a tile."""
     b, y, x = wp.tid()
-    _cast_tile(intersect, scene, T_world_camera[b], camera, b, y, x, t, u, v, face)
+    T = T_world_camera[pose_of_row(camera, b, 2 * y)]  # the rows of a tile share their pose
+    _cast_tile(intersect, scene, T, camera, b, y, x, t, u, v, face)

@@ -10,7 +10,7 @@ from ms_slam_env.camera import Intrinsics
 
 @wp.struct
 class Pinhole:
-    """Intrinsics for kernels, in pixels."""
+    """Intrinsics for kernels, in pixels, and how many rows of an image share a pose."""
 
     fx: wp.float32
     fy: wp.float32
@@ -18,15 +18,23 @@ class Pinhole:
     cy: wp.float32
     width: wp.int32
     height: wp.int32
+    rows: wp.int32  # that share a pose; ``height`` unless the shutter rolls
 
 
-def make_pinhole(intrinsics: Intrinsics) -> Pinhole:
-    """Copy intrinsics into the struct."""
+def make_pinhole(intrinsics: Intrinsics, rows: int | None = None) -> Pinhole:
+    """Copy intrinsics into the struct; every ``rows`` rows have a pose, by default all one."""
     pinhole = Pinhole()
     pinhole.fx, pinhole.fy = intrinsics.fx, intrinsics.fy
     pinhole.cx, pinhole.cy = intrinsics.cx, intrinsics.cy
     pinhole.width, pinhole.height = intrinsics.width, intrinsics.height
+    pinhole.rows = intrinsics.height if rows is None else rows
     return pinhole
+
+
+@wp.func
+def pose_of_row(camera: Pinhole, b: int, y: int) -> int:
+    """Index of the pose of row ``y`` of image ``b``."""
+    return b * ((camera.height + camera.rows - 1) // camera.rows) + y // camera.rows
 
 
 @wp.func
@@ -53,14 +61,14 @@ def camera_centre(T: wp.mat44) -> wp.vec3:
 
 @wp.kernel
 def generate_rays(
-    T_world_camera: wp.array(dtype=wp.mat44),  # (B,)
+    T_world_camera: wp.array(dtype=wp.mat44),  # (B * poses an image,)
     camera: Pinhole,
     origins: wp.array(dtype=wp.vec3),  # (B * H * W,)
     directions: wp.array(dtype=wp.vec3),  # (B * H * W,)
 ):
     """One ray per pixel."""
     b, y, x = wp.tid()
-    T = T_world_camera[b]
+    T = T_world_camera[pose_of_row(camera, b, y)]
     i = (b * camera.height + y) * camera.width + x
     origins[i] = camera_centre(T)
     directions[i] = world_ray(T, camera, float(x), float(y))
@@ -69,7 +77,7 @@ def generate_rays(
 @wp.kernel
 def cast_rays(
     mesh: wp.uint64,
-    T_world_camera: wp.array(dtype=wp.mat44),  # (B,)
+    T_world_camera: wp.array(dtype=wp.mat44),  # (B * poses an image,)
     camera: Pinhole,
     t: wp.array(dtype=wp.float32),  # (B * H * W,)
     u: wp.array(dtype=wp.float32),
@@ -78,7 +86,7 @@ def cast_rays(
 ):
     """First hit of the ray of each pixel; face -1 where there is none."""
     b, y, x = wp.tid()
-    T = T_world_camera[b]
+    T = T_world_camera[pose_of_row(camera, b, y)]
     i = (b * camera.height + y) * camera.width + x
     ray = world_ray(T, camera, float(x), float(y))
     query = wp.mesh_query_ray(mesh, camera_centre(T), ray, 1.0e6)

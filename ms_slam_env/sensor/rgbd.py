@@ -24,6 +24,9 @@ from ms_slam_env.sensor.rays import make_pinhole
 FRAME_RATE_HZ = 30.0
 """Rate of the simulated sensor; gives a frame its time stamp when the caller does not."""
 
+ROLLING_ROWS = 2
+"""Rows of an image that a rolling shutter exposes together."""
+
 
 @dataclass(frozen=True)
 class TrueView:
@@ -51,7 +54,7 @@ class _OfThread(threading.local):
     """What each thread has of a sensor for itself."""
 
     def __init__(self) -> None:
-        self.images: dict[int, Images] = {}  # by number of images
+        self.images: dict[tuple[int, bool], Images] = {}  # by number of images, rolling or not
         self.last: Images | None = None
 
 
@@ -95,7 +98,10 @@ class RGBDSensor:
         frame_key(seed, 0)
         self.device = device
         self._caster = caster or make_caster(scene.mesh, device)
-        self._camera = make_pinhole(intrinsics)
+        self._cameras = {
+            False: make_pinhole(intrinsics),
+            True: make_pinhole(intrinsics, ROLLING_ROWS),
+        }
         self._depth_noise = make_depth_noise(self.noise, intrinsics)
         self._surfaces = upload_surfaces(scene.mesh, device)
         self._tables = Tables(device)
@@ -155,6 +161,64 @@ class RGBDSensor:
         self._of_thread.last = images
         return [RGBDFrame(colors[b].copy(), depths[b].copy(), time) for b, time in enumerate(times)]
 
+    @property
+    def rolling_poses(self) -> int:
+        """Number of poses of an image whose shutter rolls: one for every two rows."""
+        return -(-self.intrinsics.height // ROLLING_ROWS)
+
+    def capture_rolling(
+        self,
+        T_world_camera: ArrayLike,
+        index: int,
+        timestamp: float | None = None,
+        seed: int | None = None,
+    ) -> RGBDFrame:
+        """Take frame ``index`` with a rolling shutter: every two rows have a pose of their own.
+
+        With equal poses it is the frame of ``capture``, bit for bit.
+
+        Args:
+            T_world_camera: (rolling_poses, 4, 4), from the top row to the bottom.
+            index: counter of the noise.
+            timestamp: seconds; index / 30 Hz by default.
+            seed: of the noise, in place of the sensor's own.
+
+        Raises:
+            InputError: another number of poses, a pose that is not a finite rigid motion, or a bad
+                index, seed or time stamp.
+        """
+        poses = self._check_rolling(np.asarray(T_world_camera, dtype=np.float64)[None])
+        keys = frame_key(self.seed if seed is None else seed, index)[None]
+        time = _frame_times([index], None if timestamp is None else [timestamp])[0]
+        images = self._images(1, is_rolling=True)
+        colors, depths = images.capture(poses, keys)
+        self._of_thread.last = images
+        return RGBDFrame(colors[0].copy(), depths[0].copy(), time)
+
+    def ideal_colors(self, T_world_camera: ArrayLike) -> NDArray[np.uint8]:
+        """Noise-free colour (B, H, W, 3) from poses (B, rolling_poses, 4, 4).
+
+        One pose for every two rows, as in ``capture_rolling``.
+
+        Raises:
+            InputError: another shape, or a pose that is not a finite rigid motion.
+        """
+        poses = np.asarray(T_world_camera, dtype=np.float64)
+        flat = self._check_rolling(poses)
+        return self._images(len(poses), is_rolling=True).ideal_colors(flat).copy()
+
+    def _check_rolling(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Poses (B * rolling_poses, 4, 4) of poses (B, rolling_poses, 4, 4)."""
+        if poses.ndim != 4 or poses.shape[1:] != (self.rolling_poses, 4, 4) or len(poses) == 0:
+            raise InputError(
+                f"a rolling shutter of {self.intrinsics.height} rows needs poses "
+                f"({self.rolling_poses}, 4, 4), got shape {poses.shape[1:]}"
+            )
+        flat = poses.reshape(-1, 4, 4)
+        for pose in flat:
+            check_pose(pose, "T_world_camera")
+        return flat
+
     def last_true_depth(self) -> NDArray[np.float32]:
         """True depth (H, W) of the frame that this thread captured last, metres; 0 = no surface.
 
@@ -177,14 +241,14 @@ class RGBDSensor:
         color, depth, normals, labels, points = self._images(1).truth(pose[None])
         return TrueView(color[0], depth[0], normals[0], labels[0], points[0])
 
-    def _images(self, batch: int) -> Images:
+    def _images(self, batch: int, is_rolling: bool = False) -> Images:
         """This thread's buffers for ``batch`` images."""
-        images = self._of_thread.images.get(batch)
+        images = self._of_thread.images.get((batch, is_rolling))
         if images is None:
             with _RECORDING:
                 images = Images(
                     (batch, *self.intrinsics.shape),
-                    self._camera,
+                    self._cameras[is_rolling],
                     self._caster,
                     self._surfaces,
                     self._tables,
@@ -196,7 +260,7 @@ class RGBDSensor:
             kept = self._of_thread.images
             if len(kept) == _BATCH_SIZES_KEPT:
                 kept.pop(next(iter(kept)))
-            kept[batch] = images
+            kept[batch, is_rolling] = images
         return images
 
 

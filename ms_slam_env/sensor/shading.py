@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from ms_slam_env._warp import wp
 from ms_slam_env.sensor.random_numbers import PCG
-from ms_slam_env.sensor.rays import Pinhole, camera_centre, world_ray
+from ms_slam_env.sensor.rays import Pinhole, camera_centre, pose_of_row, world_ray
 from ms_slam_env.sensor.spans import VECTOR_FLAGS, VECTORISE
 from ms_slam_env.sensor.textures import ENCODE_STEPS
 
@@ -190,7 +190,7 @@ def _shade_span(
 
 @wp.kernel
 def shade(
-    T_world_camera: wp.array(dtype=wp.mat44),  # (B,)
+    T_world_camera: wp.array(dtype=wp.mat44),  # (B * poses an image,)
     camera: Pinhole,
     span: int,
     hit_t: wp.array(dtype=wp.float32),  # (B * H * W,)
@@ -213,7 +213,7 @@ def shade(
     x = part * span
     count = wp.min(span, camera.width - x)
     _shade_span(
-        T_world_camera[b],
+        T_world_camera[pose_of_row(camera, b, y)],
         camera,
         first,
         y,
@@ -238,7 +238,7 @@ def shade(
 
 @wp.kernel
 def true_geometry(
-    T_world_camera: wp.array(dtype=wp.mat44),  # (B,)
+    T_world_camera: wp.array(dtype=wp.mat44),  # (B * poses an image,)
     camera: Pinhole,
     hit_t: wp.array(dtype=wp.float32),  # (B * H * W,)
     hit_face: wp.array(dtype=wp.int32),
@@ -257,7 +257,7 @@ def true_geometry(
     normals[i] = wp.vec3(0.0, 0.0, 0.0)
     points[i] = wp.vec3(0.0, 0.0, 0.0)
     if face >= 0:
-        T = T_world_camera[b]
+        T = T_world_camera[pose_of_row(camera, b, y)]
         ray = world_ray(T, camera, float(x), float(y))
         normal = surfaces.normal[face]
         if wp.dot(normal, ray) > 0.0:

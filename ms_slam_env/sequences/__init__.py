@@ -1,14 +1,60 @@
-"""RGB-D sequences: hand-held trajectories, rendering, trajectory files."""
+"""RGB-D sequences: hand-held trajectories, rendering with perturbations, files.
+
+Rendered, streamed and reproducible bit for bit::
+
+    poses = handheld_trajectory(scene, frames=300, seed=1)
+    sequence = render_sequence(
+        scene, poses, intrinsics, noise="kinect", seed=1,
+        perturbations=(RollingShutter(0.03), ExposureJumps(gain=1.5), DepthDropout(0.1)),
+    )
+    for frame, T_world_camera in sequence: ...   # or sequence.frames[k], sequence.poses[k]
+    sequence.frames.truth(k)                     # TrueView: depth, normals, labels, points
+
+A perturbation is one of ``RollingShutter, MotionBlur, Misregistration, ExposureRamp,
+ExposureJumps, AutoExposure, BlackFrames, DepthDropout, DepthQuantisation, FrameSkipping``, or
+``make_perturbation("rolling-shutter", {"readout_s": 0.02})``.
+"""
 
 from ms_slam_env.sequences.association import associate
-from ms_slam_env.sequences.sequence import Sequence, render_sequence
+from ms_slam_env.sequences.perturbations import (
+    PERTURBATIONS,
+    AutoExposure,
+    BlackFrames,
+    DepthDropout,
+    DepthQuantisation,
+    ExposureJumps,
+    ExposureRamp,
+    FrameSkipping,
+    Misregistration,
+    MotionBlur,
+    Perturbation,
+    RollingShutter,
+    make_perturbation,
+)
+from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
+from ms_slam_env.sequences.sequence import RenderedSequence, Sequence, render_sequence
 from ms_slam_env.sequences.trajectories import handheld_trajectory, repeated_trajectory
 from ms_slam_env.sequences.tum import read_trajectory, write_trajectory
 
 __all__ = [
+    "PERTURBATIONS",
+    "AutoExposure",
+    "BlackFrames",
+    "DepthDropout",
+    "DepthQuantisation",
+    "ExposureJumps",
+    "ExposureRamp",
+    "FrameSkipping",
+    "Misregistration",
+    "MotionBlur",
+    "Perturbation",
+    "PoseInterpolation",
+    "RenderedSequence",
+    "RollingShutter",
     "Sequence",
     "associate",
     "handheld_trajectory",
+    "make_perturbation",
     "read_trajectory",
     "render_sequence",
     "repeated_trajectory",

@@ -1,0 +1,101 @@
+"""What a perturbation of a rendered sequence may change, and what it may ask.
+
+Three kinds, applied in this order: which frames there are, how they are taken, what is in them.
+"""
+
+from __future__ import annotations
+
+import zlib
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.camera import Intrinsics, RGBDFrame
+from ms_slam_env.errors import InputError
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+
+def random_numbers(*keys: int, name: str) -> np.random.Generator:
+    """Generator that depends on the integers >= 0 ``keys`` and on ``name`` alone.
+
+    Raises:
+        InputError: a key that is not an integer >= 0.
+    """
+    for key in keys:
+        if isinstance(key, bool) or not isinstance(key, (int, np.integer)) or key < 0:
+            raise InputError(f"a seed must be an integer >= 0, got {key!r}")
+    return np.random.default_rng([*map(int, keys), zlib.crc32(name.encode())])
+
+
+@dataclass(frozen=True)
+class Optics:
+    """How a frame is taken.
+
+    Attributes:
+        color: intrinsics of the colour camera; its image has the size of the depth image.
+        T_depth_color: (4, 4) pose of the colour camera in the depth camera's frame.
+        readout_s: time from the first row to the last; 0 = all rows at once.
+        exposure_s: time over which colour is integrated; 0 = an instant.
+        exposure_samples: instants whose mean stands for the integral.
+    """
+
+    color: Intrinsics
+    T_depth_color: Float64 = field(default_factory=lambda: np.eye(4))
+    readout_s: float = 0.0
+    exposure_s: float = 0.0
+    exposure_samples: int = 1
+
+
+@dataclass(frozen=True)
+class Moment:
+    """What a perturbation may know of a frame.
+
+    Attributes:
+        index: of the frame on the trajectory, before any frame was skipped.
+        count: poses of the trajectory.
+        timestamp: seconds.
+        intrinsics: of the frames.
+        seed: of the sequence.
+        brightness: gives the mean intensity (count,) in [0, 255] of what is seen from every pose
+            of the trajectory; computed at the first call.
+    """
+
+    index: int
+    count: int
+    timestamp: float
+    intrinsics: Intrinsics
+    seed: int
+    brightness: Callable[[], Float64]
+
+
+class Perturbation(ABC):  # noqa: B024 - its three kinds share a name and no method
+    """One imperfection of a camera or of a recording. Leave it out of the list to switch it off."""
+
+
+class FrameSelection(Perturbation):
+    """Decides which frames of the trajectory there are."""
+
+    @abstractmethod
+    def keep(self, count: int, seed: int) -> Int64:
+        """Indices kept of ``count`` frames, increasing; ``seed`` is that of the sequence."""
+
+
+class OpticalPerturbation(Perturbation):
+    """Changes how frames are taken."""
+
+    @abstractmethod
+    def alter(self, optics: Optics) -> Optics:
+        """Return the changed optics."""
+
+
+class ImagePerturbation(Perturbation):
+    """Changes the images of a frame that was taken."""
+
+    @abstractmethod
+    def apply(self, frame: RGBDFrame, moment: Moment) -> RGBDFrame:
+        """Return the changed frame; a function of the two arguments alone."""
