@@ -34,10 +34,17 @@ def _volumetric(intrinsics: Intrinsics, **params: Any) -> SlamBackend:
     return VolumetricSlam(intrinsics, from_dict(VolumetricConfig, params, "slam_config"))
 
 
+def _sparse(intrinsics: Intrinsics, **params: Any) -> SlamBackend:
+    from ms_slam_env.slam.sparse import SparseConfig, SparseSlam
+
+    return SparseSlam(intrinsics, from_dict(SparseConfig, params, "slam_config"))
+
+
 BACKENDS: dict[str, Callable[..., SlamBackend]] = {
     "surfel": _surfel,
     "odometry": _odometry,
     "volumetric": _volumetric,
+    "sparse": _sparse,
 }
 """Name to maker; a maker takes the intrinsics and the backend's parameters."""
 

@@ -22,8 +22,9 @@ COUNT = 12
 OPTIONS = {
     "surfel": {"max_surfels": 60_000, "depth_cutoff_m": 4.0},
     "odometry": {"max_surfels": 60_000},
+    "sparse": {"max_surfels": 60_000},
 }
-ACCURACY_M = {"surfel": 0.008, "odometry": 0.02, "volumetric": 0.015}
+ACCURACY_M = {"surfel": 0.008, "odometry": 0.02, "volumetric": 0.015, "sparse": 0.01}
 """Largest error of position on the noisy path of 0.11 m."""
 
 
@@ -64,6 +65,8 @@ def frames(box_scene: BoxScene) -> list[RGBDFrame]:
 def name(request: pytest.FixtureRequest) -> str:
     if request.param == "volumetric":
         pytest.importorskip("open3d", reason="Open3D is not installed", exc_type=ImportError)
+    if request.param == "sparse":
+        pytest.importorskip("gtsam", reason="GTSAM is not installed", exc_type=ImportError)
     return str(request.param)
 
 

@@ -1,0 +1,98 @@
+"""The depth of keyframes, merged into one surface that can be rendered."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ms_slam_env.camera import Intrinsics, RGBDFrame
+from ms_slam_env.geometry import relative_angle
+from ms_slam_env.slam.base import Float64, Views
+from ms_slam_env.slam.sparse.config import SparseConfig
+from ms_slam_env.slam.sparse.sparse_map import Keyframe
+from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
+
+
+class DenseMap:
+    """Surfels fused from keyframes at their poses; made anew when a pose has changed.
+
+    Args:
+        intrinsics: of the keyframes.
+        config: parameters.
+    """
+
+    def __init__(self, intrinsics: Intrinsics, config: SparseConfig) -> None:
+        self._config = config
+        self._surfels = SurfelSlam(
+            intrinsics,
+            SurfelConfig(
+                depth_cutoff_m=config.depth_cutoff_m,
+                max_surfels=config.max_surfels,
+                unstable_window=100_000,  # keyframes are few, and each of them counts
+            ),
+        )
+        self._poses: list[Float64] = []  # where each keyframe is in the map
+        self._fused = 0  # how many of them are fused
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._surfels.reset()
+        self._poses = []
+        self._fused = 0
+
+    def place(self, keyframes: Sequence[Keyframe]) -> None:
+        """Decide where these keyframes are in the map; nothing is fused before it is looked at."""
+        pairs = zip(self._poses, keyframes, strict=False)
+        if any(self._has_moved(placed, keyframe) for placed, keyframe in pairs):
+            self.clear()
+        for keyframe in keyframes[len(self._poses) :]:
+            self._poses.append(keyframe.T_world_camera.copy())
+
+    def update(self, keyframes: Sequence[Keyframe]) -> None:
+        """Fuse the keyframes that were placed; to be called before the map is looked at."""
+        for keyframe, pose in zip(
+            keyframes[self._fused :], self._poses[self._fused :], strict=True
+        ):
+            self._surfels.fuse(RGBDFrame(keyframe.color, keyframe.depth), pose)
+            self._fused += 1
+
+    def _has_moved(self, placed: Float64, keyframe: Keyframe) -> bool:
+        pose = keyframe.T_world_camera
+        if np.array_equal(placed, pose):
+            return False
+        moved_m = float(np.linalg.norm(placed[:3, 3] - pose[:3, 3]))
+        turned = np.degrees(relative_angle(placed[:3, :3], pose[:3, :3]))
+        return moved_m > self._config.remap_m or turned > self._config.remap_deg
+
+    def predict(self, poses: ArrayLike, scale: float) -> Views:
+        """Render from ``poses`` (N, 4, 4); see ``SlamBackend``."""
+        return self._surfels.predict(poses, scale)
+
+    def points(self) -> Float64:
+        """Points (M, 3) of the surface, world frame."""
+        return self._surfels.surface_points()
+
+    def colors(self) -> NDArray[np.uint8]:
+        """Colours (M, 3) RGB of ``points``."""
+        return self._surfels.surface_colors()
+
+    def attributes(self) -> dict[str, NDArray[Any]]:
+        """Colour, normal, radius and confidence of ``points``."""
+        return self._surfels.map_attributes()
+
+    def get_state(self) -> dict[str, Any]:
+        """The surfels, and where the keyframes are."""
+        return {
+            "surfels": self._surfels.get_state(),
+            "poses": np.array(self._poses).reshape(-1, 4, 4),
+            "fused": self._fused,
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state."""
+        self._surfels.set_state(state["surfels"])
+        self._poses = list(state["poses"].copy())
+        self._fused = state["fused"]

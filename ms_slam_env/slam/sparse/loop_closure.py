@@ -1,0 +1,128 @@
+"""Recognises a place, and makes the map agree with it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ms_slam_env.geometry import invert, relative_angle
+from ms_slam_env.slam.base import Float64
+from ms_slam_env.slam.sparse.config import SparseConfig
+from ms_slam_env.slam.sparse.localisation import Fix, LiveFrame, Localiser
+from ms_slam_env.slam.sparse.pose_graph import Edge, optimise_poses
+from ms_slam_env.slam.sparse.retrieval import most_alike
+from ms_slam_env.slam.sparse.sparse_map import SparseMap
+from ms_slam_env.slam.sparse.verification import Verifier
+
+_CANDIDATES = 3  # keyframes that are looked at
+_SHARED_POINTS = 30  # of an edge between keyframes
+_SMALL_M, _SMALL_RAD = 0.003, 0.002  # loops off by less need no pose graph
+
+
+class LoopCloser:
+    """Closes loops of a map.
+
+    Args:
+        sparse_map: keyframes and points.
+        localiser: places images in it.
+        verifier: judges a place.
+        config: parameters.
+    """
+
+    def __init__(
+        self,
+        sparse_map: SparseMap,
+        localiser: Localiser,
+        verifier: Verifier,
+        config: SparseConfig,
+    ) -> None:
+        self._map = sparse_map
+        self._localiser = localiser
+        self._verifier = verifier
+        self._config = config
+        self.edges: list[Edge] = []  # of all loops closed so far
+
+    def close(self, keyframe: int, frame: LiveFrame) -> bool:
+        """Close a loop at the keyframe made of ``frame``; whether there was one."""
+        for candidate in self._candidates(keyframe):
+            T = self._localiser.by_looks(frame, candidate)
+            fix = None if T is None else self._localiser.near(frame, T, candidate)
+            if fix is None or self._verifier.judge(fix, frame).reason:
+                continue
+            self._join(keyframe, fix)
+            return True
+        return False
+
+    def _candidates(self, keyframe: int) -> list[int]:
+        """Old keyframes that look like one and do not see its points already."""
+        old = keyframe - self._config.loop_gap
+        if old < 1:
+            return []
+        frames = self._map.keyframes
+        known = set(self._map.neighbours(keyframe, len(frames)))
+        near = {k for other in list(known) for k in self._map.neighbours(other, 10)}
+        rest = [k for k in range(old) if k not in known and k not in near]
+        looks = [frames[k].thumbnail for k in rest]
+        alike = most_alike(frames[keyframe].thumbnail, looks, _CANDIDATES)
+        return [rest[index] for index in alike]
+
+    def _join(self, keyframe: int, fix: Fix) -> None:
+        """Bend the trajectory so that the loop closes, then let both ends see the same points."""
+        frames = self._map.keyframes
+        known = frames[fix.reference].T_world_camera
+        motion = invert(known) @ fix.T_world_camera
+        error = invert(frames[keyframe].T_world_camera) @ fix.T_world_camera
+        self.edges.append(Edge(fix.reference, keyframe, motion))
+        is_off = (
+            np.linalg.norm(error[:3, 3]) > _SMALL_M
+            or relative_angle(np.eye(3), error[:3, :3]) > _SMALL_RAD
+        )
+        if is_off:
+            self._bend()
+        self._share_points(keyframe, fix)
+
+    def _bend(self) -> None:
+        frames = self._map.keyframes
+        poses = np.stack([frame.T_world_camera for frame in frames])
+        fixed = np.array([frame.known for frame in frames])
+        if not fixed.any():
+            fixed[0] = True
+        optimised = optimise_poses(poses, [*self._edges_of(poses), *self.edges], fixed)
+        moved = np.flatnonzero((optimised != poses).any(axis=(1, 2)))
+        self._map.move({int(k): optimised[k] for k in moved})
+
+    def _edges_of(self, poses: Float64) -> list[Edge]:
+        """Motions between keyframes as they are now: consecutive ones, and those sharing points."""
+        edges = []
+        for b in range(1, len(poses)):
+            near = self._map.neighbours(b, 10, _SHARED_POINTS)
+            for a in sorted({b - 1, *(k for k in near if k < b)}):
+                if not any((edge.a, edge.b) in ((a, b), (b, a)) for edge in self.edges):
+                    edges.append(Edge(a, b, invert(poses[a]) @ poses[b]))
+        return edges
+
+    def _share_points(self, keyframe: int, fix: Fix) -> None:
+        """Merge the keyframe's points with those of the old ones that it shows as well."""
+        end = self._map.keyframes[keyframe]
+        mine = end.point_ids[fix.features]
+        new = mine < 0
+        double = ~new & (mine != fix.point_ids)
+        already = np.isin(fix.point_ids, end.seen_points())
+        end.point_ids[fix.features[new & ~already]] = fix.point_ids[new & ~already]
+        double &= ~already
+        self._map.merge(fix.point_ids[double], mine[double])
+
+    def get_state(self) -> dict[str, Any]:
+        """The loops closed so far."""
+        return {
+            "ends": np.array([(edge.a, edge.b) for edge in self.edges], dtype=np.int64),
+            "motions": np.array([edge.T_a_b for edge in self.edges]).reshape(-1, 4, 4),
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state."""
+        ends = state["ends"].reshape(-1, 2).tolist()
+        self.edges = [
+            Edge(a, b, T.copy()) for (a, b), T in zip(ends, state["motions"], strict=True)
+        ]

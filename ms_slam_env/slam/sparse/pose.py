@@ -1,0 +1,164 @@
+"""The pose of a frame from points of the map and where it sees them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.geometry import invert, make_pose, se3_exp, transform_points
+from ms_slam_env.slam.base import Float64
+
+# 95 % quantiles of the chi-squared distribution with two and three degrees of freedom.
+CHI2_PIXEL, CHI2_PIXEL_AND_DEPTH = 5.991, 7.815
+_ITERATIONS = 4  # a round; outliers are told anew between rounds
+_SMALL_STEP = 1e-5  # metres and radians
+_LEAST_DEPTH_M = 0.05
+_RANSAC_ITERATIONS = 200
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """Where an image shows points.
+
+    Attributes:
+        pixels: (N, 2) measured positions.
+        inverse_depth: (N,) measured, 1/m; 0 = not known.
+        sigma_px: (N,) standard deviation of the positions, pixels.
+        sigma_inverse_depth: standard deviation of the inverse depth, 1/m.
+    """
+
+    pixels: Float64
+    inverse_depth: Float64
+    sigma_px: Float64
+    sigma_inverse_depth: float
+
+    def __len__(self) -> int:
+        """Return the number of sightings."""
+        return len(self.pixels)
+
+
+def residuals(
+    T_camera_world: Float64, points: Float64, seen: Sightings, intrinsics: Intrinsics
+) -> tuple[Float64, Float64]:
+    """Residuals (N, 3) of u, v and inverse depth in standard deviations, and points (N, 3).
+
+    The points are in the camera frame; one behind the camera has infinite residuals. Where the
+    depth was not measured its residual is 0.
+    """
+    p = transform_points(T_camera_world, points)
+    z = np.maximum(p[:, 2], _LEAST_DEPTH_M)
+    r = np.empty((len(points), 3))
+    r[:, 0] = (intrinsics.fx * p[:, 0] / z + intrinsics.cx - seen.pixels[:, 0]) / seen.sigma_px
+    r[:, 1] = (intrinsics.fy * p[:, 1] / z + intrinsics.cy - seen.pixels[:, 1]) / seen.sigma_px
+    r[:, 2] = (1.0 / z - seen.inverse_depth) / seen.sigma_inverse_depth
+    r[seen.inverse_depth == 0, 2] = 0.0
+    r[p[:, 2] < _LEAST_DEPTH_M] = np.inf
+    return r, p
+
+
+def refine_pose(
+    T_world_camera: Float64,
+    points: Float64,
+    seen: Sightings,
+    intrinsics: Intrinsics,
+    rounds: int = 3,
+) -> tuple[Float64, NDArray[np.bool_]]:
+    """Pose that explains the sightings best, and which of them (N,) it explains.
+
+    Gauss-Newton with Huber's weights, and outliers left out by the 95 % quantile of chi-squared
+    between rounds, as in ORB-SLAM2 (Mur-Artal and Tardos, TRO 2017, section III-C), here with the
+    inverse depth as third measurement.
+
+    Args:
+        T_world_camera: (4, 4) where to start.
+        points: (N, 3) world frame.
+        seen: where the frame shows them.
+        intrinsics: of the frame.
+        rounds: of iterations.
+    """
+    limit = np.where(seen.inverse_depth > 0, CHI2_PIXEL_AND_DEPTH, CHI2_PIXEL)
+    T = invert(T_world_camera)
+    inlier = np.ones(len(points), dtype=bool)
+    for _ in range(rounds):
+        for _ in range(_ITERATIONS):
+            step = _gauss_newton_step(T, points, seen, inlier, limit, intrinsics)
+            T = se3_exp(step) @ T
+            if np.abs(step).max() < _SMALL_STEP:
+                break
+        squares = (residuals(T, points, seen, intrinsics)[0] ** 2).sum(axis=1)
+        inlier = squares <= limit
+        if inlier.sum() < 6:
+            break
+    return orthonormal(invert(T)), inlier
+
+
+def _gauss_newton_step(
+    T: Float64,
+    points: Float64,
+    seen: Sightings,
+    used: NDArray[np.bool_],
+    limit: Float64,
+    intrinsics: Intrinsics,
+) -> Float64:
+    """Twist (6,) by which to move the camera frame."""
+    r, p = residuals(T, points, seen, intrinsics)
+    used = used & np.isfinite(r[:, 0])
+    r, p, limit, sigma = r[used], p[used], limit[used], seen.sigma_px[used]
+    if len(r) < 6:
+        return np.zeros(6)
+    squares = (r**2).sum(axis=1)
+    weight = np.sqrt(np.minimum(1.0, np.sqrt(limit / np.maximum(squares, 1e-12))))
+    x, y, z = p.T
+    J = np.zeros((len(r), 3, 6))
+    a, b = intrinsics.fx / (z * sigma), intrinsics.fy / (z * sigma)
+    J[:, 0, 0], J[:, 0, 2] = a, -a * x / z
+    J[:, 1, 1], J[:, 1, 2] = b, -b * y / z
+    measured = seen.inverse_depth[used] > 0
+    J[:, 2, 2] = np.where(measured, -1.0 / (z**2 * seen.sigma_inverse_depth), 0.0)
+    # d(p) / d(phi) = -hat(p)
+    J[:, :, 3] = J[:, :, 2] * y[:, None] - J[:, :, 1] * z[:, None]
+    J[:, :, 4] = J[:, :, 0] * z[:, None] - J[:, :, 2] * x[:, None]
+    J[:, :, 5] = J[:, :, 1] * x[:, None] - J[:, :, 0] * y[:, None]
+    A = (J * weight[:, None, None]).reshape(-1, 6)
+    H = A.T @ A
+    H[np.diag_indices(6)] *= 1 + 1e-9
+    H[np.diag_indices(6)] += 1e-9
+    return np.linalg.solve(H, -A.T @ (r * weight[:, None]).ravel())
+
+
+def pose_from_matches(
+    points: Float64, pixels: Float64, intrinsics: Intrinsics, error_px: float
+) -> tuple[Float64, NDArray[np.bool_]] | None:
+    """Pose (4, 4) T_points_camera by PnP and RANSAC, and its inliers (N,); None if there is none.
+
+    OpenCV's RANSAC starts from the same random number in every call.
+    """
+    if len(points) < 6:
+        return None
+    matrix = np.array(
+        [[intrinsics.fx, 0, intrinsics.cx], [0, intrinsics.fy, intrinsics.cy], [0, 0, 1.0]]
+    )
+    found, turn, shift, kept = cv2.solvePnPRansac(
+        points,
+        pixels,
+        matrix,
+        None,
+        iterationsCount=_RANSAC_ITERATIONS,
+        reprojectionError=error_px,
+        flags=cv2.SOLVEPNP_AP3P,
+    )
+    if not found or kept is None or not np.isfinite(turn).all():
+        return None
+    inlier = np.zeros(len(points), dtype=bool)
+    inlier[kept.ravel()] = True
+    return invert(make_pose(cv2.Rodrigues(turn)[0], shift.ravel())), inlier
+
+
+def orthonormal(T: Float64) -> Float64:
+    """The rigid motion next to a matrix (4, 4) that many products have worn."""
+    U, _, Vt = np.linalg.svd(T[:3, :3])
+    return make_pose(U @ Vt, T[:3, 3])

@@ -1,0 +1,33 @@
+"""Which keyframes look like an image: small, blurred pictures compared by correlation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.slam.base import Float32
+
+_SIZE = (16, 12)  # of a thumbnail, pixels
+
+
+def thumbnail(grey: NDArray[np.uint8], depth: Float32) -> Float32:
+    """Unit vector (D,) of an image's looks: its brightness and its nearness, coarsely."""
+    nearness = np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0)
+    parts = []
+    for image in (grey.astype(np.float32), nearness):
+        small = cv2.resize(image, _SIZE, interpolation=cv2.INTER_AREA)
+        small = cv2.GaussianBlur(small, (0, 0), 1.0)
+        small = small - small.mean()
+        parts.append(small.ravel() / max(float(np.linalg.norm(small)), 1e-6))
+    return np.concatenate(parts).astype(np.float32) / np.float32(np.sqrt(2.0))
+
+
+def most_alike(wanted: Float32, others: Sequence[Float32], count: int) -> list[int]:
+    """Indices of the ``count`` thumbnails that resemble one most, best first."""
+    if not len(others):
+        return []
+    scores = np.stack(others) @ wanted
+    return [int(index) for index in np.argsort(-scores, kind="stable")[:count]]

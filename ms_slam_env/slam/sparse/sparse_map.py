@@ -1,0 +1,175 @@
+"""Keyframes and the points that they see."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.geometry import invert, transform_points
+from ms_slam_env.slam.agreement import DepthImage
+from ms_slam_env.slam.base import Float32, Float64
+from ms_slam_env.slam.sparse.features import Features
+from ms_slam_env.slam.sparse.matching import Int64
+
+_TRIED_FRAMES = 8  # frames after which a point that is hardly ever found again is dropped
+_FOUND_SHARE = 0.25  # as in ORB-SLAM
+
+
+@dataclass
+class Keyframe:
+    """An image that the map is made of.
+
+    Attributes:
+        T_world_camera: (4, 4) its pose; optimisation moves it.
+        known: whether the pose was given; optimisation leaves it.
+        features: N features.
+        point_ids: (N,) the point that each shows; -1 = none.
+        color: (H, W, 3) uint8.
+        grey: (H, W) uint8.
+        depth: (H, W) float32 metres; 0 = no reading.
+        thumbnail: (D,) unit vector of its looks.
+    """
+
+    T_world_camera: Float64
+    known: bool
+    features: Features
+    point_ids: Int64
+    color: NDArray[np.uint8]
+    grey: NDArray[np.uint8]
+    depth: Float32
+    thumbnail: Float32
+
+    def image(self) -> DepthImage:
+        """What frames are compared with."""
+        return DepthImage(self.depth, self.grey.astype(np.float32))
+
+    def seen_points(self) -> Int64:
+        """Ids of the points that it shows."""
+        return self.point_ids[self.point_ids >= 0]
+
+
+class SparseMap:
+    """Keyframes, points, and which keyframe sees which point."""
+
+    def __init__(self, intrinsics: Intrinsics) -> None:
+        """Start empty."""
+        self.intrinsics = intrinsics
+        self.keyframes: list[Keyframe] = []
+        self.positions: Float64 = np.zeros((0, 3))
+        self.descriptors: NDArray[np.uint64] = np.zeros((0, 4), dtype=np.uint64)
+        self.hosts: Int64 = np.zeros(0, dtype=np.int64)  # the keyframe that made each point
+        self.alive: NDArray[np.bool_] = np.zeros(0, dtype=bool)
+        self._tried: Int64 = np.zeros(0, dtype=np.int64)
+        self._found: Int64 = np.zeros(0, dtype=np.int64)
+
+    def add(self, keyframe: Keyframe) -> int:
+        """Add a keyframe and a point for each of its features that has depth and none yet."""
+        index = len(self.keyframes)
+        self.keyframes.append(keyframe)
+        features = keyframe.features
+        new = np.flatnonzero((keyframe.point_ids < 0) & (features.inverse_depth > 0))
+        keyframe.point_ids[new] = len(self.positions) + np.arange(len(new))
+        points = features.points(self.intrinsics)[new]
+        points = transform_points(keyframe.T_world_camera, points)
+        self.positions = np.concatenate([self.positions, points])
+        self.descriptors = np.concatenate([self.descriptors, features.descriptors[new]])
+        self.hosts = np.concatenate([self.hosts, np.full(len(new), index)])
+        self.alive = np.concatenate([self.alive, np.ones(len(new), dtype=bool)])
+        zeros = np.zeros(len(new), dtype=np.int64)
+        self._tried = np.concatenate([self._tried, zeros])
+        self._found = np.concatenate([self._found, zeros])
+        return index
+
+    def shared(self, point_ids: Int64, keyframes: Iterable[int]) -> Int64:
+        """How many of some points each of the keyframes sees."""
+        wanted = np.zeros(len(self.positions), dtype=bool)
+        wanted[point_ids] = True
+        counts = [wanted[self.keyframes[k].seen_points()].sum() for k in keyframes]
+        return np.array(counts, dtype=np.int64)
+
+    def neighbours(self, keyframe: int, count: int, least: int = 15) -> list[int]:
+        """The keyframes, ``count`` at most, that share most points with one; ``least`` each."""
+        everyone = range(len(self.keyframes))
+        counts = self.shared(self.keyframes[keyframe].seen_points(), everyone)
+        counts[keyframe] = 0
+        order = np.argsort(-counts, kind="stable")[:count]
+        return [int(k) for k in order if counts[k] >= least]
+
+    def points_of(self, keyframes: Iterable[int]) -> Int64:
+        """Ids, sorted, of the living points that some keyframes see."""
+        wanted = np.zeros(len(self.positions), dtype=bool)
+        for k in keyframes:
+            wanted[self.keyframes[k].seen_points()] = True
+        return np.flatnonzero(wanted & self.alive)
+
+    def count_sightings(self, tried: Int64, found: Int64) -> None:
+        """Note points that a frame should have shown, and did; drop those never found again."""
+        self._tried[tried] += 1
+        self._found[found] += 1
+        often = self._tried[tried] >= _TRIED_FRAMES
+        rare = self._found[tried] < _FOUND_SHARE * self._tried[tried]
+        self.alive[tried[often & rare]] = False
+
+    def move(self, poses: dict[int, Float64]) -> None:
+        """Give keyframes new poses; each takes the points along that it made."""
+        motions = np.tile(np.eye(4), (len(self.keyframes), 1, 1))
+        for k, pose in poses.items():
+            motions[k] = pose @ invert(self.keyframes[k].T_world_camera)
+            self.keyframes[k].T_world_camera = pose
+        of_point = motions[self.hosts]
+        turned = np.einsum("nij,nj->ni", of_point[:, :3, :3], self.positions)
+        self.positions = turned + of_point[:, :3, 3]
+
+    def merge(self, kept: Int64, dropped: Int64) -> None:
+        """Let each of the ``dropped`` points (M,) be the one in ``kept`` (M,) beside it."""
+        replacement = np.arange(len(self.positions) + 1)  # the last stays for "none", -1
+        replacement[dropped] = kept
+        replacement[-1] = -1
+        self.alive[dropped] = False
+        for keyframe in self.keyframes:
+            keyframe.point_ids = replacement[keyframe.point_ids]
+
+    def get_state(self) -> dict[str, Any]:
+        """Everything, as arrays."""
+        return {
+            "keyframes": [_save(keyframe) for keyframe in self.keyframes],
+            "positions": self.positions.copy(),
+            "descriptors": self.descriptors.copy(),
+            "hosts": self.hosts.copy(),
+            "alive": self.alive.copy(),
+            "tried": self._tried.copy(),
+            "found": self._found.copy(),
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state."""
+        self.keyframes = [_restore(saved) for saved in state["keyframes"]]
+        self.positions = state["positions"].copy()
+        self.descriptors = state["descriptors"].copy()
+        self.hosts = state["hosts"].copy()
+        self.alive = state["alive"].copy()
+        self._tried = state["tried"].copy()
+        self._found = state["found"].copy()
+
+
+_OF_KEYFRAME = ("T_world_camera", "point_ids", "color", "grey", "depth", "thumbnail")
+_OF_FEATURES = ("pixels", "inverse_depth", "descriptors", "scale")
+
+
+def _save(keyframe: Keyframe) -> dict[str, Any]:
+    saved: dict[str, Any] = {name: getattr(keyframe, name).copy() for name in _OF_KEYFRAME}
+    saved["known"] = keyframe.known
+    for name in _OF_FEATURES:
+        saved[name] = getattr(keyframe.features, name).copy()
+    return saved
+
+
+def _restore(saved: dict[str, Any]) -> Keyframe:
+    features = Features(**{name: saved[name].copy() for name in _OF_FEATURES})
+    own = {name: saved[name].copy() for name in _OF_KEYFRAME}
+    return Keyframe(known=saved["known"], features=features, **own)
