@@ -53,6 +53,8 @@ class SurfelConfig:
         loop_closure: "none": frames are aligned with all of the map, however old; "deformation":
             with its recent part, and where that meets the old part again the map is bent to fit.
         loops: parameters of the latter.
+        relocalisation: where a lost frame is searched besides around the last good pose: "ferns",
+            at keyframes that resemble it, or "local", nowhere.
 
     Raises:
         InputError: a value outside its range.
@@ -83,12 +85,14 @@ class SurfelConfig:
     lateral_noise_px: float = 0.3
     points_per_level: int = 5000
     refuse_bad_fits: bool = True
+    relocalisation: str = "ferns"
     loop_closure: str = "none"
     loops: LoopConfig = field(default_factory=LoopConfig)
 
     def __post_init__(self) -> None:
         """Refuse values outside the ranges."""
         check_range(self, "depth_cutoff_m", 0.0, 10.0)
+        check_choice(self, "relocalisation", ("ferns", "local"))
         check_range(self, "icp_rgb_weight", 0.0, 1.0)
         check_range(self, "confidence_threshold", 0.0, 12.0)
         are_counts = isinstance(self.iterations, (tuple, list)) and all(
