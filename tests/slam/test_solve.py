@@ -8,15 +8,29 @@ from hypothesis import strategies as st
 
 from ms_slam_env._warp import wp
 from ms_slam_env.geometry import se3_exp
-from ms_slam_env.slam.surfel.normal_equations import NUM_SUMS, OFF, RESTING, RUNNING
+from ms_slam_env.slam.surfel.normal_equations import (
+    NUM_SUMS,
+    OFF,
+    RESTING,
+    RUNNING,
+    SUM_PHOTOMETRIC,
+    Photometry,
+)
+from ms_slam_env.slam.surfel.photometry import same_exposure
 from ms_slam_env.slam.surfel.solve import gauss_newton_step, reduce_sums
 
 
 def _sums(H: np.ndarray, g: np.ndarray) -> np.ndarray:
+    """A system that is a quarter geometric and three quarters photometric."""
+    system = np.concatenate([H[np.triu_indices(6)], g])
     sums = np.zeros(NUM_SUMS)
-    sums[:21] = H[np.triu_indices(6)]
-    sums[21:27] = g
+    sums[:27] = 0.25 * system
+    sums[SUM_PHOTOMETRIC:] = 0.75 * system
     return sums
+
+
+def _lights() -> wp.array:
+    return wp.array(same_exposure(1)[:, None], dtype=Photometry)
 
 
 def _step(H, g, T, state=RUNNING, last=0, smallest=1e-9, damping=0.0):
@@ -24,8 +38,8 @@ def _step(H, g, T, state=RUNNING, last=0, smallest=1e-9, damping=0.0):
     active = wp.array([[state]], dtype=wp.int32)
     sums = wp.array(_sums(H, g)[None, None], dtype=wp.float64)
     wp.launch(
-        gauss_newton_step, dim=(1, 1), inputs=[sums, damping, smallest, last],
-        outputs=[pose, active],
+        gauss_newton_step, dim=(1, 1), inputs=[sums, damping, smallest, last, 1.0],
+        outputs=[pose, _lights(), active],
     )  # fmt: skip
     return pose.numpy()[0, 0], int(active.numpy()[0, 0])
 

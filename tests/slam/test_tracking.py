@@ -12,6 +12,7 @@ from ms_slam_env.geometry import invert, look_at, relative_angle, se3_exp
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.surfel import normal_equations as ne
 from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.photometry import same_exposure
 from ms_slam_env.slam.surfel.preprocess import Preprocessor
 from ms_slam_env.slam.surfel.seeds import NUM_SEEDS, tracking_seeds
 from ms_slam_env.slam.surfel.solve import reduce_sums
@@ -29,6 +30,10 @@ SMALL = Intrinsics(fx=24.0, fy=24.0, cx=15.5, cy=11.5, width=32, height=24)
 T_WORLD_MODEL = look_at([-0.8, -0.8, 1.2], [1.2, 0.1, 0.5])
 
 
+LIGHT = same_exposure(1)
+LIGHT["gain"], LIGHT["bias"], LIGHT["scale"], LIGHT["trust"] = 0.9, 9.0, 1.7, 0.6
+
+
 def _weights(icp: float = 1.0, rgb: float = 1.0) -> ne.Weights:
     weights = ne.Weights()
     weights.icp, weights.rgb = icp, rgb
@@ -37,6 +42,7 @@ def _weights(icp: float = 1.0, rgb: float = 1.0) -> ne.Weights:
     weights.grey_variance, weights.pixel_variance = 0.25, 0.09
     weights.distance_m, weights.cos_angle = 0.1, 0.7
     weights.inlier_sigmas, weights.texture, weights.alike = 4.0, 4.0, 20.0
+    weights.least_scale = 1.0
     return weights
 
 
@@ -62,7 +68,7 @@ def _synthetic(seed: int = 0) -> dict[str, np.ndarray]:
     }  # fmt: skip
 
 
-def _device_sums(data, T, weights, stride=1, columns=1 << 20):
+def _device_sums(data, T, weights, stride=1, columns=1 << 20, light=LIGHT):
     kinds = [wp.vec3, wp.vec3, wp.float32, wp.vec3, wp.vec3, wp.vec3]
     images = [
         wp.array(a.astype(np.float32), dtype=k).flatten()
@@ -79,7 +85,8 @@ def _device_sums(data, T, weights, stride=1, columns=1 << 20):
         dim=(1, 1, rows, pieces),
         inputs=[
             *images, size, size, wp.vec2(SMALL.fx, SMALL.fy), wp.vec2(SMALL.cx, SMALL.cy), weights,
-            stride, columns, wp.array(T[None, None], dtype=wp.mat44d), active,
+            stride, columns, wp.array(T[None, None], dtype=wp.mat44d),
+            wp.array(light[:, None], dtype=ne.Photometry), active,
         ],
         outputs=[partial],
     )  # fmt: skip
@@ -119,20 +126,22 @@ def _residuals(data, T, weights):
         seen = _bilinear(data["live_gradient"], x, y)
         if abs(seen[1]) + abs(seen[2]) > weights.texture:
             sigma = np.sqrt(0.25 + 0.09 * (seen[1] ** 2 + seen[2] ** 2))
-            rgb.append((seen[0] - data["model_intensity"][v, u], sigma, seen, (v, u)))
+            expected = np.clip(0.9 * data["model_intensity"][v, u] + 9.0, 0, 255)
+            rgb.append((seen[0] - expected, sigma, seen, (v, u)))
     return icp, rgb
 
 
 def _expected_system(data, T, weights):
-    """H and g with the Jacobians of the module's text."""
+    """H (2, 6, 6) and g (2, 6) of both terms with the Jacobians of the module's text."""
     inverse = invert(T)
-    H, g = np.zeros((6, 6)), np.zeros(6)
+    H, g = np.zeros((2, 6, 6)), np.zeros((2, 6))
     icp, rgb = _residuals(data, T, weights)
     for r, sigma, near, pixel in icp:
         n = inverse[:3, :3] @ data["model_normals"][pixel]
         J = np.concatenate([n, np.cross(data["live_vertices"][near], n)])
         w = weights.icp / sigma**2 / (1 + (r / sigma / 2) ** 2)
-        H, g = H + w * np.outer(J, J), g + w * J * r
+        H[0] += w * np.outer(J, J)
+        g[0] += w * J * r
     for r, sigma, seen, pixel in rgb:
         q = inverse[:3, :3] @ data["model_vertices"][pixel] + inverse[:3, 3]
         to_q = np.array(
@@ -141,8 +150,9 @@ def _expected_system(data, T, weights):
         )  # fmt: skip
         slope = -seen[1:] @ to_q
         J = np.concatenate([slope, np.cross(q, slope)])
-        w = weights.rgb / sigma**2 / (1 + (r / sigma) ** 2)
-        H, g = H + w * np.outer(J, J), g + w * J * r
+        w = weights.rgb * 0.6 / 1.7**2 / sigma**2 / (1 + (r / sigma / 1.7) ** 2)
+        H[1] += w * np.outer(J, J)
+        g[1] += w * J * r
     return H, g, len(icp), len(rgb)
 
 
@@ -154,14 +164,16 @@ def test_normal_equations_equal_the_loop_over_points(columns):
     H, g, num_icp, num_rgb = _expected_system(data, T, weights)
     assert num_icp > 300
     assert num_rgb == sums[ne.SUM_TEXTURED]
-    scale = np.sqrt(np.diag(H))
-    actual = np.zeros((6, 6))
-    actual[np.triu_indices(6)] = sums[:21]
-    actual = np.triu(actual) + np.triu(actual, 1).T
-    np.testing.assert_allclose(
-        actual / np.outer(scale, scale), H / np.outer(scale, scale), atol=2e-4
-    )
-    np.testing.assert_allclose(sums[21:27] / scale, g / scale, atol=2e-3 * np.abs(g / scale).max())
+    for term, first in enumerate((0, ne.SUM_PHOTOMETRIC)):
+        scale = np.sqrt(np.diag(H[term]))
+        actual = np.zeros((6, 6))
+        actual[np.triu_indices(6)] = sums[first : first + 21]
+        actual = np.triu(actual) + np.triu(actual, 1).T
+        both = np.outer(scale, scale)
+        np.testing.assert_allclose(actual / both, H[term] / both, atol=2e-4)
+        expected = g[term] / scale
+        actual = sums[first + 21 : first + 27] / scale
+        np.testing.assert_allclose(actual, expected, atol=2e-3 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("term", ["icp", "rgb"])

@@ -5,7 +5,7 @@ runs over the points p of the *model* (denoised by fusion) and looks them up in 
 
     q     = T^-1 p                 in the live camera, T = T_model_live; n_q = R^T n
     r_icp = n_q . (v - q)          metres; v is the live vertex in the pixel that q falls into
-    r_rgb = I_live(pi(q)) - I_p    grey levels; I_live is interpolated bilinearly
+    r_rgb = I_live(pi(q)) - (gain I_p + bias)    grey levels; I_live is interpolated bilinearly
 
 With the right perturbation T <- T exp(xi), xi = (rho, phi):
 
@@ -27,6 +27,13 @@ where rho(r) = c^2/2 log(1 + (r/c)^2) is Cauchy's loss: w = 0 is geometry alone,
 alone. Errors of neighbouring depths are alike (filter, quantisation, map), those of grey values
 are not: 50 depths count as one independent reading. The number was chosen so that the default
 w = 0.1 is about the best on noisy sequences.
+
+Gain and bias follow the camera's exposure: each step solves for them too, by regression of the
+residual on I_p, weighted by rho's weights over s_rgb^2, so that flat regions decide, which
+misalignment leaves alone. The photometric c is the maximum-likelihood scale of Cauchy's
+distribution, where the mean weight is 1/2, but at least ``cauchy_rgb``. The term is divided by
+(c / least c)^2: images that are blurred or badly registered count less. ``Photometry.trust`` is
+one more factor.
 """
 
 from __future__ import annotations
@@ -34,8 +41,11 @@ from __future__ import annotations
 from ms_slam_env._warp import wp
 from ms_slam_env.slam.surfel.memory import fetch
 
-NUM_SUMS = 36
-"""Sums of a pass: 21 of H (upper triangle by rows), 6 of g = J^T W r, then the statistics."""
+NUM_SUMS = 69
+"""Sums of a pass: geometric term, statistics, exposure, photometric term.
+
+A term has 21 sums of H (upper triangle by rows) and 6 of g = J^T W r.
+"""
 SUM_COST = 27  # truncated robust cost of the visible points, in [0, 3] each
 SUM_POINTS = 28  # model points looked at
 SUM_VISIBLE = 29  # of those, inside the live image
@@ -45,6 +55,9 @@ SUM_SQUARED_M2 = 32  # squared point-to-plane residuals of the inliers, m^2
 SUM_TEXTURED = 33  # visible, with a marked intensity gradient
 SUM_ALIKE = 34  # of those, with a small photometric residual
 SUM_APART = 35  # matched, but the live surface is clearly nearer or farther than the model's
+SUM_EXPOSURE = 36  # sums of w, w m, w m^2, w r, w m r over exposed points, m = I_p - 128
+SUM_ROUGH = 41  # of the textured: 1 - robust weight; half their number at the right scale
+SUM_PHOTOMETRIC = 42  # the photometric term's
 
 
 OFF = wp.constant(0)  # states of a hypothesis, in ``active``: takes no part
@@ -98,6 +111,18 @@ class Weights:
     inlier_sigmas: float
     texture: float  # grey levels per pixel
     alike: float  # grey levels
+    least_scale: float  # least c of photometric residuals, in sigmas
+
+
+@wp.struct
+class Photometry:
+    """How the live grey values relate to the model's: I_live ~ gain I_model + bias."""
+
+    gain: float
+    bias: float  # grey levels
+    scale: float  # c of the photometric loss, in sigmas: half of all textured residuals exceed it
+    reference: float  # the same as it usually is, over its least value; the unit of the verdict
+    trust: float  # weight of the photometric term, [0, 1]
 
 
 @wp.kernel
@@ -116,6 +141,7 @@ def accumulate(
     stride: wp.int32,
     columns: wp.int32,  # of the image, per thread
     pose: wp.array2d(dtype=wp.mat44d),  # T_model_live (B, K)
+    photometry: wp.array2d(dtype=Photometry),
     active: wp.array2d(dtype=wp.int32),
     partial: wp.array4d(dtype=wp.float32),  # (B, K, rows * pieces, NUM_SUMS)
 ):
@@ -136,6 +162,7 @@ def accumulate(
     u_limit = float(live_width - 1)
     v_limit = float(live_size[1] - 1)
     system = System()
+    photometric = System()
     cost = wp.float32(0.0)
     points = wp.float32(0.0)
     visible = wp.float32(0.0)
@@ -145,6 +172,20 @@ def accumulate(
     textured = wp.float32(0.0)
     alike = wp.float32(0.0)
     apart = wp.float32(0.0)
+    sum_w = wp.float32(0.0)
+    sum_wm = wp.float32(0.0)
+    sum_wmm = wp.float32(0.0)
+    sum_wr = wp.float32(0.0)
+    sum_wmr = wp.float32(0.0)
+    rough = wp.float32(0.0)
+    light = photometry[b, k]
+    gain = light.gain
+    bias = light.bias
+    per_scale = 1.0 / wp.max(light.scale, weights.least_scale)
+    narrowing = weights.least_scale * per_scale
+    rgb = weights.rgb * light.trust * narrowing * narrowing
+    per_reference = weights.per_cauchy_rgb / light.reference
+    alike_limit = weights.alike * wp.min(light.reference, 2.0)
     v = row_index * stride
     # Neighbouring rows sample different columns, like a chessboard.
     start = piece * columns + (row_index % 2) * (stride // 2)
@@ -205,27 +246,40 @@ def accumulate(
         top = top_left + right * (top_right - top_left)
         low = low_left + right * (low_right - low_left)
         seen = top + down * (low - top)  # (I, dI/du, dI/dv)
-        residual = seen[0] - fetch(model_intensity, i)
+        grey = fetch(model_intensity, i)
+        residual = seen[0] - wp.clamp(gain * grey + bias, 0.0, 255.0)
         slope_squared = seen[1] * seen[1] + seen[2] * seen[2]
         per_variance = 1.0 / (weights.grey_variance + weights.pixel_variance * slope_squared)
-        ratio = residual * wp.sqrt(per_variance) * weights.per_cauchy_rgb
-        robust = 1.0 / (1.0 + ratio * ratio)
-        cost += wp.where(is_other, 0.0, 2.0 * (1.0 - robust))
+        squared_sigmas = residual * residual * per_variance
+        robust = 1.0 / (1.0 + squared_sigmas * per_scale * per_scale)
+        usual = 1.0 / (1.0 + squared_sigmas * per_reference * per_reference)
+        cost += wp.where(is_other, 0.0, 2.0 * (1.0 - usual))
         slope = wp.abs(seen[1]) + wp.abs(seen[2])
         is_textured = not is_other and slope > weights.texture
         textured += wp.where(is_textured, 1.0, 0.0)
-        alike += wp.where(is_textured and wp.abs(residual) < weights.alike, 1.0, 0.0)
+        rough += wp.where(is_textured, 1.0 - robust, 0.0)
+        alike += wp.where(is_textured and wp.abs(residual) < alike_limit, 1.0, 0.0)
+        is_exposed = not is_other and seen[0] > 2.0 and seen[0] < 250.0
+        weight = wp.where(is_exposed, robust * per_variance, 0.0)
+        centred = grey - 128.0
+        sum_w += weight
+        sum_wm += weight * centred
+        sum_wmm += weight * centred * centred
+        sum_wr += weight * residual
+        sum_wmr += weight * centred * residual
         gx = seen[1] * focal[0] * per_z
         gy = seen[2] * focal[1] * per_z
         g = -wp.vec3(gx, gy, -(gx * q[0] + gy * q[1]) * per_z)
-        weight = wp.where(is_textured, weights.rgb * robust * per_variance, 0.0)
-        system = add_point(system, g, wp.cross(q, g), residual, weight)
+        weight = wp.where(is_textured, rgb * robust * per_variance, 0.0)
+        photometric = add_point(photometric, g, wp.cross(q, g), residual, weight)
     slot = row_index * ((width + columns - 1) // columns) + piece
     for i in range(6):
         for j in range(6):
             if j >= i:  # upper triangle by rows of six, five, four, ...
                 partial[b, k, slot, i * (11 - i) / 2 + j] = system[8 * i + j]
+                partial[b, k, slot, 42 + i * (11 - i) / 2 + j] = photometric[8 * i + j]
         partial[b, k, slot, 21 + i] = system[8 * i + 6]
+        partial[b, k, slot, 63 + i] = photometric[8 * i + 6]
     partial[b, k, slot, 27] = cost
     partial[b, k, slot, 28] = points
     partial[b, k, slot, 29] = visible
@@ -235,3 +289,9 @@ def accumulate(
     partial[b, k, slot, 33] = textured
     partial[b, k, slot, 34] = alike
     partial[b, k, slot, 35] = apart
+    partial[b, k, slot, 36] = sum_w
+    partial[b, k, slot, 37] = sum_wm
+    partial[b, k, slot, 38] = sum_wmm
+    partial[b, k, slot, 39] = sum_wr
+    partial[b, k, slot, 40] = sum_wmr
+    partial[b, k, slot, 41] = rough

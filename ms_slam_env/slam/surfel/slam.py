@@ -23,18 +23,26 @@ from ms_slam_env.slam.base import Float64, TrackResult
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.loops.make import make_loop_closure
 from ms_slam_env.slam.surfel.mirror import Mirror
+from ms_slam_env.slam.surfel.photometry import (
+    ExposureCorrection,
+    follow,
+    same_exposure,
+    without_trust,
+)
 from ms_slam_env.slam.surfel.preprocess import Preprocessor
-from ms_slam_env.slam.surfel.relocalisation import make_relocalisation
 from ms_slam_env.slam.surfel.seeds import NUM_SEEDS, relocalisation_seeds, tracking_seeds
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
-from ms_slam_env.slam.surfel.tracking import Alignment, Tracker, model_stride
+from ms_slam_env.slam.surfel.tracking import NUM_FIRST, Alignment, Tracker, model_stride
 from ms_slam_env.slam.surfel.types import LiveFrame, ModelView
 from ms_slam_env.slam.surfel.verdict import (
+    APPEARANCE,
     FEW_POINTS,
     OK,
     REASONS,
+    STAT_CONFLICT,
     STAT_INLIER_FRACTION,
     STAT_RESIDUAL_M,
+    geometric_limits,
     make_limits,
 )
 
@@ -57,15 +65,14 @@ class BatchedSurfelSlam:
         self.tracker = Tracker(batch, NUM_SEEDS, intrinsics, config, device, stride)
         self.map = SurfelMap(batch, intrinsics, config, device, stride)
         self.loops = make_loop_closure(self.map, config, device)
-        self.relocalisation = make_relocalisation(
-            config.relocalisation, batch, intrinsics, config.depth_cutoff_m
-        )
         self._device_poses = Mirror(batch, wp.mat44, device)
         self._device_time = Mirror(batch, wp.int32, device)
         self._device_weight = Mirror(batch, wp.float32, device)
         self._device_mask = Mirror(batch, wp.int32, device)
         self.poses: Float64 = np.tile(np.eye(4), (batch, 1, 1))
         self._motions: Float64 = np.tile(np.eye(4), (batch, 1, 1))
+        self._photometry = same_exposure(batch)
+        self._correct_exposure = ExposureCorrection(batch, intrinsics, device)
         self._started = np.zeros(batch, dtype=bool)
         self._lost = np.zeros(batch, dtype=np.int32)  # frames since tracking was lost
         self._time = np.zeros(batch, dtype=np.int32)
@@ -77,11 +84,11 @@ class BatchedSurfelSlam:
         pose = np.eye(4) if T_world_camera is None else T_world_camera
         self.poses[env] = check_pose(pose, "T_world_camera")
         self._motions[env] = np.eye(4)
+        self._photometry[env] = same_exposure(1)[0]
         self._started[env] = False
         self._lost[env] = 0
         self._time[env] = 0
         self.map.clear(env)
-        self.relocalisation.clear(env)
         self.loops.reset(env)
         self._view_poses = None
 
@@ -103,9 +110,9 @@ class BatchedSurfelSlam:
         guesses = self._check_guesses(T_world_camera_guess)
         live = self.preprocess(color, depth)
         self._select_surfels(self._lost)
-        results = self._locate(live, guesses, color, depth)
+        results = self._locate(live, guesses)
         good = np.array([result.tracking_ok for result in results])
-        self.relocalisation.remember(color, depth, self.poses, self._time, good)
+        self._correct_exposure(live, self._photometry)
         self._fuse(live, good)
         return self._close_loops(live, results)
 
@@ -130,7 +137,6 @@ class BatchedSurfelSlam:
         self.poses = poses
         self._lost[:] = 0
         good = np.ones(self.batch, dtype=bool)
-        self.relocalisation.remember(color, depth, poses, self._time, good)
         self._fuse(live, good)
         return [TrackResult(pose.copy(), True) for pose in poses]
 
@@ -168,13 +174,7 @@ class BatchedSurfelSlam:
             ]
         )
 
-    def _locate(
-        self,
-        live: LiveFrame,
-        guesses: Float64 | None,
-        color: NDArray[np.uint8],
-        depth: NDArray[np.float32],
-    ) -> list[TrackResult]:
+    def _locate(self, live: LiveFrame, guesses: Float64 | None) -> list[TrackResult]:
         """Poses of the live frames: given for the first, tracked or searched for the others."""
         self.tracker.set_frame(live)
         lost = self._lost > 0
@@ -188,17 +188,37 @@ class BatchedSurfelSlam:
         )
         limits = make_limits(lost, self._lost)
         view = self._render(self.poses)
-        alignment = self.tracker.align(view, self.poses, seeds, limits, guesses)
+        alignment = self.tracker.align(view, self.poses, seeds, limits, guesses, self._photometry)
+        alignment = self._without_color(view, seeds, alignment)
         if not self.config.refuse_bad_fits:
             alignment = accept_any_fit(alignment)
         if guesses is not None:
             alignment = self._search_at_guess(alignment, guesses)
         alignment = self._search_again(alignment)
-        alignment = self._search_elsewhere(alignment, color, depth)
         return [
             self._accept(env, alignment) if self._started[env] else self._start(env, live)
             for env in range(self.batch)
         ]
+
+    def _without_color(self, view: ModelView, seeds: Float64, alignment: Alignment) -> Alignment:
+        """Align the envs whose grey values do not fit by geometry alone, from the nearest seeds.
+
+        Lights are switched, cameras glare, and a recording's colour may not be registered with its
+        depth. Geometry must then constrain the pose without help, near to where it is expected.
+        """
+        failed = self._failed(alignment) & (alignment.verdict == APPEARANCE)
+        if not failed.any():
+            return alignment
+        near = np.repeat(seeds[:, :1], NUM_SEEDS, axis=1)
+        near[:, :NUM_FIRST] = seeds[:, :NUM_FIRST]
+        again = self.tracker.align(
+            view,
+            self.poses,
+            near,
+            geometric_limits(self._lost),
+            photometry=without_trust(self._photometry),
+        )
+        return alignment.replace(failed & (again.verdict == OK), again)
 
     def _search_at_guess(self, alignment: Alignment, guesses: Float64) -> Alignment:
         """Align the envs that failed with the view from their guess, under stricter limits.
@@ -211,7 +231,8 @@ class BatchedSurfelSlam:
         origins = np.where(failed[:, None, None], guesses, self.poses)
         seeds = np.tile(tracking_seeds(np.eye(4)), (self.batch, 1, 1, 1))
         limits = make_limits(np.ones(self.batch, dtype=bool), self._lost)
-        again = self.tracker.align(self._render(origins), origins, seeds, limits)
+        view, lights = self._render(origins), self._photometry
+        again = self.tracker.align(view, origins, seeds, limits, photometry=lights)
         again = replace(again, T_model_live=invert(self.poses) @ again.T_world_live)
         return alignment.replace(failed & (again.verdict == 0), again)
 
@@ -226,25 +247,14 @@ class BatchedSurfelSlam:
                 [relocalisation_seeds(attempt + RETRIES * int(lost)) for lost in self._lost]
             )
             again = self.tracker.align(
-                self._render(self.poses), self.poses, seeds, make_limits(strict, self._lost)
+                self._render(self.poses),
+                self.poses,
+                seeds,
+                make_limits(strict, self._lost),
+                photometry=self._photometry,
             )
             alignment = alignment.replace(failed & (again.verdict == 0), again)
         return alignment
-
-    def _search_elsewhere(
-        self, alignment: Alignment, color: NDArray[np.uint8], depth: NDArray[np.float32]
-    ) -> Alignment:
-        """Let the relocalisation find the envs that were lost before and still are."""
-        lost = self._failed(alignment) & (self._lost > 0)
-        found = self.relocalisation.search(color, depth, lost, self._align_from)
-        if found is None:
-            return alignment
-        where, again = found
-        again = replace(again, T_model_live=invert(self.poses) @ again.T_world_live)
-        return alignment.replace(where, again)
-
-    def _align_from(self, origins: Float64, seeds: Float64, limits: NDArray[np.void]) -> Alignment:
-        return self.tracker.align(self._render(origins), origins, seeds, limits)
 
     def _failed(self, alignment: Alignment) -> NDArray[np.bool_]:
         return self._started & (alignment.verdict != 0)
@@ -270,6 +280,12 @@ class BatchedSurfelSlam:
             # Across a gap the motion is not one frame's.
             self._motions[env] = np.eye(4) if relocalised else alignment.T_model_live[env]
             self._lost[env] = 0
+            self._photometry[env] = follow(
+                self._photometry[env],
+                alignment.photometry[env],
+                float(alignment.stats[env, STAT_CONFLICT]),
+                self.config.cauchy_rgb,
+            )
         else:
             self._motions[env] = np.eye(4)
             self._lost[env] += 1
@@ -312,7 +328,6 @@ class BatchedSurfelSlam:
         tracked = np.array([result.tracking_ok for result in results])
         closed = self.loops.close(live, self.poses, self._time - 1, tracked)
         for env in np.flatnonzero(closed):
-            self.relocalisation.move(int(env), *self.loops.trajectory(int(env)))
             results[env] = replace(
                 results[env], T_world_camera=self.poses[env].copy(), loop_closed=True
             )
@@ -331,11 +346,11 @@ class BatchedSurfelSlam:
         return {
             "poses": self.poses.copy(),
             "motions": self._motions.copy(),
+            "photometry": self._photometry.copy(),
             "started": self._started.copy(),
             "lost": self._lost.copy(),
             "time": self._time.copy(),
             "map": self.map.get_state(),
-            "relocalisation": self.relocalisation.get_state(),
             "loops": self.loops.get_state(),
         }
 
@@ -343,11 +358,11 @@ class BatchedSurfelSlam:
         """Go on from a state of a SLAM of the same batch, intrinsics and configuration."""
         self.poses = state["poses"].copy()
         self._motions = state["motions"].copy()
+        self._photometry = state["photometry"].copy()
         self._started = state["started"].copy()
         self._lost = state["lost"].copy()
         self._time = state["time"].copy()
         self.map.set_state(state["map"])
-        self.relocalisation.set_state(state["relocalisation"])
         self.loops.set_state(state["loops"])
         self._view_poses = None
 

@@ -7,7 +7,7 @@ Lie theory" (2018), equations (172) and (174).
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
-from ms_slam_env.slam.surfel.normal_equations import RESTING, RUNNING
+from ms_slam_env.slam.surfel.normal_equations import RESTING, RUNNING, Photometry
 
 mat66d = wp.types.matrix(shape=(6, 6), dtype=wp.float64)
 vec6d = wp.types.vector(length=6, dtype=wp.float64)
@@ -31,10 +31,10 @@ def reduce_sums(
 
 
 @wp.func
-def load_hessian(sums: wp.array3d(dtype=wp.float64), b: int, k: int):
-    """Symmetric H of the 21 sums."""
+def load_hessian(sums: wp.array3d(dtype=wp.float64), b: int, k: int, first: int):
+    """Symmetric H of 21 sums from ``first`` on."""
     H = mat66d()
-    index = wp.int32(0)
+    index = wp.int32(first)
     for i in range(6):
         for j in range(6):
             if j >= i:
@@ -132,22 +132,53 @@ def orthonormalise(T: wp.mat44d):
     )  # fmt: skip
 
 
+@wp.func
+def update_photometry(
+    sums: wp.array3d(dtype=wp.float64), b: int, k: int, light: Photometry, least_scale: float
+):
+    """Gain and bias by regression on the sums of a pass; scale by a step to its fixed point.
+
+    At the scale c of Cauchy's distribution the mean weight is 1/2; from far away, c^2 is off by
+    about the ratio of (1 - weight) and weight.
+    """
+    weight = sums[b, k, 36]
+    if weight > wp.float64(0.0):
+        mean = sums[b, k, 37] / weight
+        mean_residual = sums[b, k, 39] / weight
+        variance = sums[b, k, 38] / weight - mean * mean
+        covariance = sums[b, k, 40] / weight - mean * mean_residual
+        # Without contrast, well below 5 grey levels, the gain stays.
+        slope = wp.float32(covariance / (variance + wp.float64(25.0)))
+        gain = wp.clamp(light.gain + slope, 0.2, 5.0)
+        light.bias += wp.float32(mean_residual) - (gain - light.gain) * (wp.float32(mean) + 128.0)
+        light.gain = gain
+    textured = sums[b, k, 33]
+    if textured > wp.float64(50.0):
+        rough = sums[b, k, 41] / textured
+        ratio = wp.sqrt(rough / wp.max(wp.float64(1.0) - rough, wp.float64(1.0e-3)))
+        light.scale = wp.clamp(wp.max(light.scale, least_scale) * wp.float32(ratio), 0.1, 100.0)
+    return light
+
+
 @wp.kernel
 def gauss_newton_step(
     sums: wp.array3d(dtype=wp.float64),
     damping: wp.float64,
     smallest_step: wp.float64,  # metres and radians; below it the level has converged
     last: wp.int32,  # 1: last iteration of its level, so the next level may go on
+    least_scale: wp.float32,
     pose: wp.array2d(dtype=wp.mat44d),
+    photometry: wp.array2d(dtype=Photometry),
     active: wp.array2d(dtype=wp.int32),
 ):
     """Move every active hypothesis by the solution of H xi = -g; stop those that converged."""
     b, k = wp.tid()
     if active[b, k] == RUNNING:
-        H = load_hessian(sums, b, k)
+        photometry[b, k] = update_photometry(sums, b, k, photometry[b, k], least_scale)
+        H = load_hessian(sums, b, k, 0) + load_hessian(sums, b, k, 42)
         right = vec6d()
         for i in range(6):
-            right[i] = -sums[b, k, 21 + i]
+            right[i] = -sums[b, k, 21 + i] - sums[b, k, 63 + i]
             H[i, i] = H[i, i] * (wp.float64(1.0) + damping)
         L = cholesky(H)
         if L[0, 0] > wp.float64(0.0):

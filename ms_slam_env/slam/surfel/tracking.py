@@ -23,9 +23,11 @@ from ms_slam_env.slam.surfel.normal_equations import (
     NUM_SUMS,
     OFF,
     RUNNING,
+    Photometry,
     Weights,
     accumulate,
 )
+from ms_slam_env.slam.surfel.photometry import same_exposure
 from ms_slam_env.slam.surfel.pyramid import Level, Pyramid
 from ms_slam_env.slam.surfel.solve import gauss_newton_step, reduce_sums
 from ms_slam_env.slam.surfel.types import LiveFrame, ModelView
@@ -59,12 +61,14 @@ class Alignment:
         T_model_live: (B, 4, 4) the same, relative to the pose of the model view.
         verdict: (B,) codes of ``verdict.REASONS``; 0 = tracked.
         stats: (B, NUM_STATS) figures behind the verdict.
+        photometry: (B,) how the live grey values relate to the model's, ``Photometry`` each.
     """
 
     T_world_live: Float64
     T_model_live: Float64
     verdict: NDArray[np.int32]
     stats: Float64
+    photometry: NDArray[Any]
 
     def replace(self, where: NDArray[np.bool_], other: Alignment) -> Alignment:
         """Take the envs ``where`` (B,) from ``other``."""
@@ -73,6 +77,7 @@ class Alignment:
             T_model_live=np.where(where[:, None, None], other.T_model_live, self.T_model_live),
             verdict=np.where(where, other.verdict, self.verdict),
             stats=np.where(where[:, None], other.stats, self.stats),
+            photometry=np.where(where, other.photometry, self.photometry),
         )
 
 
@@ -97,7 +102,9 @@ class _Hypotheses:
     def __init__(self, batch: int, k: int, slots: int, device: str) -> None:
         self.poses = Mirror((batch, k), wp.mat44d, device)
         self.states = Mirror((batch, k), wp.int32, device)
+        self.lights = Mirror((batch, k), Photometry, device)
         self.pose, self.active = self.poses.array, self.states.array
+        self.light = self.lights.array
         self.sums = wp.zeros((batch, k, NUM_SUMS), dtype=wp.float64, device=device)
         self.partial = wp.zeros((batch, k, slots, NUM_SUMS), dtype=wp.float32, device=device)
         is_cpu = wp.get_device(device).is_cpu
@@ -181,6 +188,7 @@ class Tracker:
         seeds: Float64,
         limits: NDArray[np.void],
         guesses: Float64 | None = None,
+        photometry: NDArray[Any] | None = None,
     ) -> Alignment:
         """Align the frames set before with ``model``.
 
@@ -191,6 +199,7 @@ class Tracker:
             limits: (B,) structured array of ``verdict.Limits``.
             guesses: (B, 4, 4) one more starting pose T_world_live, NaN for an env without; None
                 if no env has one.
+            photometry: (B,) ``Photometry`` to start from; exposed like the model if None.
         """
         self._expect(self._seen[0], model)
         images = self._model.build(model.vertices, model.normals, model.intensity)
@@ -199,6 +208,9 @@ class Tracker:
         self._start_from(seeds, T_world_model, guesses)
         self._T_world_model.write(T_world_model)
         self._limits.write(limits)
+        lights = same_exposure(self.batch) if photometry is None else photometry
+        for state in (self._first, self._more):
+            state.lights.write(lights[:, None])
         coarsest = len(levels) - 1
         self._search(levels, coarsest)
         for level in range(coarsest, -1, -1):
@@ -222,6 +234,7 @@ class Tracker:
             T_model_live=one.poses.read()[:, 0],
             verdict=self._verdict.read(),
             stats=self._stats.read(),
+            photometry=one.lights.read()[:, 0],
         )
 
     def _start_from(self, seeds: Float64, T_world_model: Float64, guesses: Float64 | None) -> None:
@@ -266,8 +279,8 @@ class Tracker:
                 "choose",
                 choose,
                 self.batch,
-                [first.sums, first.pose, more.sums, more.pose],
-                [one.pose, one.active],
+                [first.sums, first.pose, first.light, more.sums, more.pose, more.light],
+                [one.pose, one.light, one.active],
             )
 
     def _settle(self, levels: list[Level], coarsest: int, state: _Hypotheses) -> None:
@@ -313,6 +326,7 @@ class Tracker:
                 stride,
                 min(self._columns, width),
                 state.pose,
+                state.light,
                 state.active,
             ],
             [state.partial],
@@ -334,8 +348,8 @@ class Tracker:
                 key,
                 gauss_newton_step,
                 state.pose.shape,
-                [state.sums, DAMPING, smallest, int(last)],
-                [state.pose, state.active],
+                [state.sums, DAMPING, smallest, int(last), self._weights[level].least_scale],
+                [state.pose, state.light, state.active],
             )
 
 
@@ -360,4 +374,5 @@ def _weights(config: SurfelConfig, level: int) -> Weights:
     weights.inlier_sigmas = 4.0
     weights.texture = 4.0
     weights.alike = 20.0
+    weights.least_scale = config.cauchy_rgb * widening
     return weights

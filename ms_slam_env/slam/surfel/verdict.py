@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env._warp import wp
-from ms_slam_env.slam.surfel.normal_equations import OFF, RUNNING
+from ms_slam_env.slam.surfel.normal_equations import OFF, RUNNING, Photometry
 from ms_slam_env.slam.surfel.solve import (
     cholesky,
     cholesky_solve,
     load_hessian,
+    mat66d,
     orthonormalise,
     vec6d,
 )
@@ -41,7 +42,8 @@ STAT_ALIKE_FRACTION = 3
 STAT_APART_FRACTION = 4
 STAT_SIGMA = 5  # standard deviation of the worst translation or rotation component
 STAT_COST = 6  # mean truncated cost of the visible points, in [0, 3]
-NUM_STATS = 7
+STAT_CONFLICT = 7  # chi squared between the poses that the two terms ask for
+NUM_STATS = 8
 
 
 @wp.struct
@@ -96,27 +98,63 @@ def widen_search(
 def choose(
     first_sums: wp.array3d(dtype=wp.float64),
     first_pose: wp.array2d(dtype=wp.mat44d),
+    first_light: wp.array2d(dtype=Photometry),
     more_sums: wp.array3d(dtype=wp.float64),
     more_pose: wp.array2d(dtype=wp.mat44d),
+    more_light: wp.array2d(dtype=Photometry),
     pose: wp.array2d(dtype=wp.mat44d),  # (B, 1)
+    photometry: wp.array2d(dtype=Photometry),  # (B, 1)
     active: wp.array2d(dtype=wp.int32),  # (B, 1)
 ):
     """Go on with the seed whose points fit best; it becomes the one hypothesis."""
     b = wp.tid()
     best = first_pose[b, 0]
+    light = first_light[b, 0]
     best_score = _score(first_sums, b, 0)
     for k in range(1, first_pose.shape[1]):
         score = _score(first_sums, b, k)
         if score < best_score:
             best_score = score
             best = first_pose[b, k]
+            light = first_light[b, k]
     for k in range(more_pose.shape[1]):
         score = _score(more_sums, b, k)
         if score < best_score:
             best_score = score
             best = more_pose[b, k]
+            light = more_light[b, k]
     pose[b, 0] = best
+    photometry[b, 0] = light
     active[b, 0] = RUNNING
+
+
+@wp.func
+def _squared_norm(H: mat66d, g: vec6d):
+    """Value of g^T H^-1 g."""
+    L = cholesky(H)
+    total = wp.float64(0.0)
+    if L[0, 0] > wp.float64(0.0):
+        x = cholesky_solve(L, g)
+        for i in range(6):
+            total += x[i] * g[i]
+    return total
+
+
+@wp.func
+def _conflict(A: mat66d, B: mat66d, sums: wp.array3d(dtype=wp.float64), b: int):
+    """Chi squared of the difference between the minima of the geometric and photometric terms.
+
+    min (x - x_a)^T A (x - x_a) + (x - x_b)^T B (x - x_b): what the joint minimum costs more than
+    each term at its own. A prior of 5 cm and 0.05 rad keeps a term without information at home.
+    """
+    g_a = vec6d()
+    g_b = vec6d()
+    for i in range(6):
+        g_a[i] = sums[b, 0, 21 + i]
+        g_b[i] = sums[b, 0, 63 + i]
+        A[i, i] += wp.float64(400.0)
+        B[i, i] += wp.float64(400.0)
+    return _squared_norm(A, g_a) + _squared_norm(B, g_b) - _squared_norm(A + B, g_a + g_b)
 
 
 @wp.kernel
@@ -146,7 +184,9 @@ def judge(
     cost = sums[b, 0, 27] / wp.max(visible, one)
 
     sigma = wp.float64(1.0e9)
-    L = cholesky(load_hessian(sums, b, 0))
+    A = load_hessian(sums, b, 0, 0)
+    B = load_hessian(sums, b, 0, 42)
+    L = cholesky(A + B)
     if L[0, 0] > wp.float64(0.0):
         sigma = wp.float64(0.0)
         for i in range(6):
@@ -181,6 +221,7 @@ def judge(
     stats[b, 4] = apart_fraction
     stats[b, 5] = sigma
     stats[b, 6] = cost
+    stats[b, 7] = _conflict(A, B, sums, b)
 
 
 _LIMITS_DTYPE = Limits.numpy_dtype()  # type: ignore[attr-defined]
@@ -206,4 +247,12 @@ def make_limits(strict: NDArray[np.bool_], lost: NDArray[np.int32]) -> NDArray[A
     limits["sigma"] = 0.02
     limits["motion_m"] = np.minimum(1.0, 0.3 + 0.1 * lost)
     limits["motion_cos"] = np.cos(np.radians(np.minimum(60.0, 30.0 + 10.0 * lost)))
+    return limits
+
+
+def geometric_limits(lost: NDArray[np.int32]) -> NDArray[Any]:
+    """Limits (B,) of an alignment by geometry alone near the expected pose."""
+    limits = make_limits(np.ones(len(lost), dtype=bool), lost)
+    limits["alike"], limits["cost"] = 0.0, np.inf
+    limits["motion_m"], limits["motion_cos"] = 0.15, np.cos(np.radians(10.0))
     return limits

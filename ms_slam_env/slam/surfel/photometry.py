@@ -1,0 +1,132 @@
+"""How a live image's grey values relate to the map's: exposure, scale of residuals, trust.
+
+All of it is estimated while tracking, see ``normal_equations`` and ``solve``, and carried from
+frame to frame here.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env._warp import wp
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.slam.surfel.launches import Launches
+from ms_slam_env.slam.surfel.memory import fetch, put
+from ms_slam_env.slam.surfel.mirror import Mirror
+from ms_slam_env.slam.surfel.normal_equations import Photometry
+from ms_slam_env.slam.surfel.types import LiveFrame
+
+DTYPE: np.dtype[Any] = Photometry.numpy_dtype()  # type: ignore[attr-defined]
+SMALL_GAIN = 0.04  # a gain and a bias this near to none are left alone: a systematic error of
+SMALL_BIAS = 4.0  # theirs, applied frame after frame, would bleach or darken the map
+MIDDLE_GREY = 128.0  # about which gain and bias are nearly independent
+LARGEST_CONFLICT = 1.0  # 95 % of the frames of registered images have less
+TRUST_FALLS = 0.2  # by this factor a frame at most
+TRUST_GROWS = 1.03
+LEAST_TRUST = 1.0e-4
+USUAL_SCALE = 1.4  # a frame's residuals may have 1.4 times the scale estimated for the last ones
+SCALE_FALLS = 0.1  # share of the way to a smaller scale, a frame
+
+
+def same_exposure(batch: int) -> NDArray[Any]:
+    """Photometry (B,) of images exposed like the map, with full trust."""
+    lights = np.zeros(batch, dtype=DTYPE)
+    for name in ("gain", "scale", "reference", "trust"):
+        lights[name] = 1.0
+    return lights
+
+
+def without_trust(lights: NDArray[Any]) -> NDArray[Any]:
+    """The same (B,) for an alignment by geometry alone."""
+    blind = lights.copy()
+    blind["trust"] = 0.0
+    return blind
+
+
+def follow(before: np.void, frame: np.void, conflict: float, least_scale: float) -> np.void:
+    """Photometry of an env after a frame was tracked with ``before`` and ended as ``frame``.
+
+    ``conflict`` is chi squared between the poses that depth and grey values ask for. A recording
+    whose colour and depth are not registered has much of it, again and again; its grey values are
+    trusted less until the two agree within what is left of the photometric term's certainty.
+    """
+    after = frame.copy()
+    share = max(1.0, USUAL_SCALE * float(frame["scale"]) / least_scale)
+    usual = float(before["reference"])
+    after["reference"] = share if share > usual else usual + SCALE_FALLS * (share - usual)
+    trust = float(before["trust"])
+    if frame["trust"] > 0.0:  # else grey values had no say, and nothing was learnt about them
+        falls = max(TRUST_FALLS, LARGEST_CONFLICT / max(conflict, LARGEST_CONFLICT))
+        trust *= falls if conflict > LARGEST_CONFLICT else TRUST_GROWS
+    after["trust"] = min(1.0, max(LEAST_TRUST, trust))
+    return after
+
+
+def correction(lights: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Gain (B,) and bias (B,) that colours are freed from; exactly 1 and 0 if they are small."""
+    gain = np.exp(_shrink(np.log(lights["gain"].astype(np.float64)), SMALL_GAIN))
+    shift = lights["bias"] + MIDDLE_GREY * (lights["gain"].astype(np.float64) - 1.0)
+    return gain, _shrink(shift, SMALL_BIAS) - MIDDLE_GREY * (gain - 1.0)
+
+
+def _shrink(values: NDArray[np.float64], threshold: float) -> NDArray[np.float64]:
+    """Soft thresholding: nearer to zero by ``threshold``, and continuous."""
+    return np.sign(values) * np.maximum(np.abs(values) - threshold, 0.0)
+
+
+@wp.kernel
+def _correct(
+    per_gain: wp.array(dtype=wp.float32),  # (B,)
+    bias: wp.array(dtype=wp.float32),
+    height: wp.int32,
+    width: wp.int32,
+    columns: wp.int32,  # per thread
+    color: wp.array(dtype=wp.vec3),
+):
+    """(colour - bias) / gain, in [0, 255]."""
+    row, piece = wp.tid()
+    b = row / height
+    scale = per_gain[b]
+    offset = -bias[b] * scale
+    i = row * width + piece * columns
+    end = row * width + wp.min((piece + 1) * columns, width)
+    while i < end:
+        c = fetch(color, i)
+        red = wp.clamp(c[0] * scale + offset, 0.0, 255.0)
+        green = wp.clamp(c[1] * scale + offset, 0.0, 255.0)
+        blue = wp.clamp(c[2] * scale + offset, 0.0, 255.0)
+        put(color, i, wp.vec3(red, green, blue))
+        i += 1
+
+
+class ExposureCorrection:
+    """Brings the live colours back to the map's exposure, so that fusing them leaves no stripes."""
+
+    def __init__(self, batch: int, intrinsics: Intrinsics, device: str) -> None:
+        """Allocate for ``batch`` envs with one camera model."""
+        self._size = intrinsics.shape
+        # The CPU runs one thread after another: whole rows. A GPU wants many threads.
+        self._columns = 1 if wp.get_device(device).is_cuda else intrinsics.width
+        self._dim = (batch * intrinsics.height, -(-intrinsics.width // self._columns))
+        self._per_gain = Mirror(batch, wp.float32, device)
+        self._bias = Mirror(batch, wp.float32, device)
+        self._launches = Launches(device)
+
+    def __call__(self, live: LiveFrame, lights: NDArray[Any]) -> None:
+        """Change ``live.color`` in place where ``lights`` (B,) differ from the map's exposure."""
+        gain, bias = correction(lights)
+        if (gain == 1.0).all() and (bias == 0.0).all():
+            return
+        self._per_gain.write(1.0 / gain)
+        self._bias.write(bias)
+        if not self._launches.replay("correct"):
+            self._launches.record(
+                "correct",
+                _correct,
+                self._dim,
+                [self._per_gain.array, self._bias.array, *self._size, self._columns],
+                [live.color.flatten()],
+            )
