@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 import ms_slam_env
 from ms_slam_env import metrics
 from ms_slam_env.benchmark.map_truth import reference_of, true_surface
-from ms_slam_env.benchmark.planners import make_planner, parse_planner, planner_class
+from ms_slam_env.benchmark.options import parse_named
+from ms_slam_env.benchmark.planners import make_planner, planner_class
 from ms_slam_env.config import check_choice, check_range
 from ms_slam_env.env import ActiveSlamEnv, Planner
 from ms_slam_env.errors import InputError
@@ -114,7 +115,7 @@ def check_episodes(specs: Sequence[EpisodeSpec]) -> None:
 
 def make_env(spec: EpisodeSpec) -> gym.Env[Any, Any]:
     """The environment of an episode."""
-    planner_type = planner_class(parse_planner(spec.planner)[0])
+    planner_type = planner_class(parse_named(spec.planner, "planner")[0])
     return gym.make(
         spec.env_id,
         max_episode_steps=spec.steps,

@@ -28,6 +28,26 @@ def parse_value(text: str, name: str) -> Any:
         raise InputError(f"option {name!r}: {text!r} is not a YAML value") from None
 
 
+def parse_named(text: str, kind: str) -> tuple[str, dict[str, Any]]:
+    """Split ``NAME,option=value,...`` into the name and the options; values are YAML scalars.
+
+    Args:
+        text: to be split.
+        kind: of thing that has this name, for the error message.
+
+    Raises:
+        InputError: an option without ``=``, or a value that is not YAML.
+    """
+    name, *parts = text.split(",")
+    options = {}
+    for part in parts:
+        option, equals, value = part.partition("=")
+        if not equals or not option.isidentifier():
+            raise InputError(f"{kind} {text!r}: {part!r} is not option=value")
+        options[option] = parse_value(value, option)
+    return name, options
+
+
 def nested_options(texts: Sequence[str]) -> dict[str, Any]:
     """Nested mapping from texts ``name.name=value``; values are YAML.
 

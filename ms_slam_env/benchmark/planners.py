@@ -9,7 +9,7 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from ms_slam_env.benchmark.options import parse_value
+from ms_slam_env.benchmark.options import parse_named
 from ms_slam_env.env.planner import Planner
 from ms_slam_env.errors import InputError, unknown
 
@@ -19,22 +19,6 @@ GROUP = "ms_slam_env.planners"
 def planner_names() -> tuple[str, ...]:
     """Names of the installed planners, sorted."""
     return tuple(sorted({entry.name for entry in entry_points(group=GROUP)}))
-
-
-def parse_planner(text: str) -> tuple[str, dict[str, Any]]:
-    """Split ``NAME,option=value,...`` into the name and the options; values are YAML scalars.
-
-    Raises:
-        InputError: an option without ``=``, or a value that is not YAML.
-    """
-    name, *parts = text.split(",")
-    options = {}
-    for part in parts:
-        option, equals, value = part.partition("=")
-        if not equals or not option.isidentifier():
-            raise InputError(f"planner {text!r}: {part!r} is not option=value")
-        options[option] = parse_value(value, option)
-    return name, options
 
 
 def planner_class(name: str) -> type[Planner]:
@@ -69,7 +53,7 @@ def make_planner(text: str, env: Any, seed: int = 0) -> Planner:
     Raises:
         InputError: an unknown planner or option, or a value that the planner refuses.
     """
-    name, options = parse_planner(text)
+    name, options = parse_named(text, "planner")
     cls = planner_class(name)
     check_options(name, cls, options)
     return cls(env, seed=seed, **options)
@@ -81,7 +65,7 @@ def check_planner(text: str) -> None:
     Raises:
         InputError: an unknown planner or option.
     """
-    name, options = parse_planner(text)
+    name, options = parse_named(text, "planner")
     check_options(name, planner_class(name), options)
 
 

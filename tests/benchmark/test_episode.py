@@ -17,9 +17,9 @@ from ms_slam_env.benchmark.frame_skipping import (
     run_sequence,
     suggest_targets,
 )
+from ms_slam_env.benchmark.options import parse_named
 from ms_slam_env.benchmark.planners import (
     make_planner,
-    parse_planner,
     planner_class,
     planner_names,
 )
@@ -81,7 +81,7 @@ def test_planner_by_module_and_class_takes_options() -> None:
     text = "ms_slam_baselines.greedy:GreedyDivergence,rho_I=0.25,depth_weight=2"
     planner: Any = make_planner(text, World())
     assert (planner.targets.rho_I, planner.targets.depth_weight) == (0.25, 2.0)
-    assert parse_planner("policy,path=runs/a.zip,deterministic=true")[1] == {
+    assert parse_named("policy,path=runs/a.zip,deterministic=true", "planner")[1] == {
         "path": "runs/a.zip",
         "deterministic": True,
     }

@@ -1,0 +1,203 @@
+"""One SLAM backend on one sequence, in a process of its own.
+
+``python -m ms_slam_env.benchmark.compare_run`` reads a specification as JSON from its input and
+writes what it measured as JSON to its output. A new process for every run, because peak memory is
+one number for the life of a process.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import json
+import os
+import subprocess
+import sys
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ms_slam_env.errors import InputError
+
+if TYPE_CHECKING:
+    from ms_slam_env.benchmark.compare_inputs import Input
+    from ms_slam_env.slam import SlamBackend
+
+WARM_UP = 5  # frames left out of the timing: buffers grow, kernels are loaded
+THRESHOLDS_M = (0.02, 0.05)
+_NAME = "compare_run"
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+@dataclass(frozen=True)
+class CompareSpec:
+    """A backend on a sequence.
+
+    Attributes:
+        sequence: a folder, or ``scene:seed[:noise]``.
+        backend: its name.
+        image_size: such as 160x120.
+        params: of the backend.
+        frames: of a rendered sequence.
+        speed_m: largest translation from frame to frame of a rendered sequence.
+        rot_deg: largest rotation.
+        threads: cores that the backend may use.
+        repeat: runs of one specification are told apart by this number.
+    """
+
+    sequence: str
+    backend: str
+    image_size: str
+    params: dict[str, Any] = field(default_factory=dict)
+    frames: int = 200
+    speed_m: float = 0.03
+    rot_deg: float = 2.0
+    threads: int = 1
+    repeat: int = 0
+
+
+def run_apart(spec: CompareSpec) -> dict[str, Any]:
+    """Run ``spec`` in a new process and return what ``run_here`` measured there.
+
+    Raises:
+        InputError: bad input, as the process said.
+        RuntimeError: it failed otherwise; the last line of its complaint.
+    """
+    environment = os.environ | dict.fromkeys(_THREAD_VARIABLES, str(spec.threads))
+    done = subprocess.run(
+        [sys.executable, "-m", "ms_slam_env.benchmark.compare_run"],
+        input=json.dumps(asdict(spec)),
+        capture_output=True,
+        text=True,
+        env=environment,
+        check=False,
+    )
+    if done.returncode == 0:
+        return json.loads(done.stdout.splitlines()[-1])
+    complaint = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
+    complaint = complaint.removeprefix(f"{_NAME}: error: ")
+    raise (InputError if done.returncode == 2 else RuntimeError)(complaint)
+
+
+def run_here(spec: CompareSpec) -> dict[str, Any]:
+    """Track the sequence from its true first pose and measure.
+
+    Returns:
+        ``ate_m`` and ``ate_max_m`` (SE(3)-aligned), ``ate_unaligned_m``, ``rpe_m`` and ``rpe_rad``
+        (frame to frame), ``lost`` (share of the frames), ``cpu_ms`` and ``cpu_ms_p95`` (processor
+        time of all threads a frame), ``ms`` (by the clock), ``memory_mb`` (peak, what the backend
+        alone needs of libraries included, frames not; None where the system does not tell),
+        ``precision_2cm`` and so on of the map against the surface that the true trajectory saw,
+        ``map_error_mm`` (median distance of a map point to it), ``points``, ``path_m``, ``frames``.
+    """
+    from ms_slam_env import metrics, slam
+    from ms_slam_env.benchmark import compare_inputs
+
+    given = compare_inputs.load(
+        spec.sequence, spec.image_size, spec.frames, spec.speed_m, spec.rot_deg
+    )
+    before = forget_peak_memory()
+    system = slam.make(spec.backend, given.intrinsics, **spec.params)
+    estimates, tracked, processor_s, clock_s = _track(system, given)
+    peak = memory_mb("VmHWM")
+    ate = metrics.ate_statistics(estimates, given.poses)
+    return {
+        "frames": len(estimates),
+        "path_m": metrics.path_length(given.poses),
+        "ate_m": ate.rmse,
+        "ate_max_m": ate.max,
+        "ate_unaligned_m": metrics.ate_rmse(estimates, given.poses, align="none"),
+        "rpe_m": metrics.rpe_rmse(estimates, given.poses),
+        "rpe_rad": metrics.rpe_rmse(estimates, given.poses, kind="rotation"),
+        "lost": 1.0 - float(np.mean(tracked)),
+        "cpu_ms": 1e3 * float(np.median(processor_s[WARM_UP:])),
+        "cpu_ms_p95": 1e3 * float(np.percentile(processor_s[WARM_UP:], 95)),
+        "ms": 1e3 * float(np.median(clock_s[WARM_UP:])),
+        "memory_mb": None if peak is None or before is None else max(0.0, peak - before),
+        **_map_quality(system.surface_points(), given.surface),
+    }
+
+
+def _track(
+    system: SlamBackend, given: Input
+) -> tuple[np.ndarray, list[bool], list[float], list[float]]:
+    """Poses (N, 4, 4), whether tracked, processor time and clock time (s) a frame."""
+    system.reset(given.poses[0])
+    estimates, tracked, processor_s, clock_s = [], [], [], []
+    for frame in given.frames:
+        start, processor_start = time.perf_counter(), time.process_time()
+        result = system.track(frame)
+        processor_s.append(time.process_time() - processor_start)
+        clock_s.append(time.perf_counter() - start)
+        estimates.append(result.T_world_camera)
+        tracked.append(result.tracking_ok)
+    return np.stack(estimates), tracked, processor_s, clock_s
+
+
+def _map_quality(points: np.ndarray, surface: np.ndarray) -> dict[str, Any]:
+    """Errors of the map where its estimated poses placed it; None for an empty map."""
+    from ms_slam_env.metrics import reconstruction
+
+    names = [f"{kind}_{round(100 * t)}cm" for t in THRESHOLDS_M for kind in ("precision", "f")]
+    if len(points) == 0:
+        return {"points": 0, "map_error_mm": None, **dict.fromkeys(names)}
+    found = reconstruction.map_metrics(points, surface, THRESHOLDS_M, registration="none")
+    distances = reconstruction.nearest_distances(reconstruction.voxel_thin(points, 0.01), surface)
+    values = [of[t] for t in THRESHOLDS_M for of in (found.precision, found.f_score)]
+    return {
+        "points": len(points),
+        "map_error_mm": 1e3 * float(np.median(distances)),
+        **dict(zip(names, values, strict=True)),
+    }
+
+
+def memory_mb(name: str) -> float | None:
+    """Figure ``name`` of this process from Linux's status file, megabytes; None elsewhere."""
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+    except OSError:
+        return None
+    for line in lines:
+        if line.startswith(f"{name}:"):
+            return int(line.split()[1]) / 1024
+    return None
+
+
+def forget_peak_memory() -> float | None:
+    """Let the peak begin anew at what is in use now; return that, megabytes (proc(5)).
+
+    Memory that was freed is handed back first: what is taken from it again would not be counted.
+    """
+    gc.collect()
+    try:
+        ctypes.CDLL(None).malloc_trim(0)
+        Path("/proc/self/clear_refs").write_text("5")
+    except (OSError, AttributeError):  # no Linux, or no glibc
+        return None
+    return memory_mb("VmRSS")
+
+
+def limit_threads(threads: int) -> None:
+    """Keep this process on so many cores, whatever its libraries think."""
+    import cv2
+
+    cv2.setNumThreads(threads)
+    if hasattr(os, "sched_setaffinity"):  # pools that ignore the variables (TBB) obey this
+        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:threads])
+
+
+def main() -> int:
+    """Run the specification on the input."""
+    spec = CompareSpec(**json.load(sys.stdin))
+    limit_threads(spec.threads)
+    print(json.dumps(run_here(spec)))
+    return 0
+
+
+if __name__ == "__main__":
+    from ms_slam_env.benchmark.command_line import exit_code
+
+    sys.exit(exit_code(main, _NAME))
