@@ -30,6 +30,7 @@ from ms_slam_env.slam.surfel.photometry import (
     without_trust,
 )
 from ms_slam_env.slam.surfel.preprocess import Preprocessor
+from ms_slam_env.slam.surfel.relocalisation import make_relocalisation
 from ms_slam_env.slam.surfel.seeds import NUM_SEEDS, relocalisation_seeds, tracking_seeds
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.tracking import NUM_FIRST, Alignment, Tracker, model_stride
@@ -65,6 +66,9 @@ class BatchedSurfelSlam:
         self.tracker = Tracker(batch, NUM_SEEDS, intrinsics, config, device, stride)
         self.map = SurfelMap(batch, intrinsics, config, device, stride)
         self.loops = make_loop_closure(self.map, config, device)
+        self.relocalisation = make_relocalisation(
+            config.relocalisation, batch, intrinsics, config.depth_cutoff_m
+        )
         self._device_poses = Mirror(batch, wp.mat44, device)
         self._device_time = Mirror(batch, wp.int32, device)
         self._device_weight = Mirror(batch, wp.float32, device)
@@ -89,6 +93,7 @@ class BatchedSurfelSlam:
         self._lost[env] = 0
         self._time[env] = 0
         self.map.clear(env)
+        self.relocalisation.clear(env)
         self.loops.reset(env)
         self._view_poses = None
 
@@ -110,9 +115,10 @@ class BatchedSurfelSlam:
         guesses = self._check_guesses(T_world_camera_guess)
         live = self.preprocess(color, depth)
         self._select_surfels(self._lost)
-        results = self._locate(live, guesses)
+        results = self._locate(live, guesses, color, depth)
         good = np.array([result.tracking_ok for result in results])
         self._correct_exposure(live, self._photometry)
+        self.relocalisation.remember(color, depth, self.poses, self._time, good)
         self._fuse(live, good)
         return self._close_loops(live, results)
 
@@ -137,6 +143,7 @@ class BatchedSurfelSlam:
         self.poses = poses
         self._lost[:] = 0
         good = np.ones(self.batch, dtype=bool)
+        self.relocalisation.remember(color, depth, poses, self._time, good)
         self._fuse(live, good)
         return [TrackResult(pose.copy(), True) for pose in poses]
 
@@ -174,7 +181,13 @@ class BatchedSurfelSlam:
             ]
         )
 
-    def _locate(self, live: LiveFrame, guesses: Float64 | None) -> list[TrackResult]:
+    def _locate(
+        self,
+        live: LiveFrame,
+        guesses: Float64 | None,
+        color: NDArray[np.uint8],
+        depth: NDArray[np.float32],
+    ) -> list[TrackResult]:
         """Poses of the live frames: given for the first, tracked or searched for the others."""
         self.tracker.set_frame(live)
         lost = self._lost > 0
@@ -195,6 +208,7 @@ class BatchedSurfelSlam:
         if guesses is not None:
             alignment = self._search_at_guess(alignment, guesses)
         alignment = self._search_again(alignment)
+        alignment = self._search_elsewhere(alignment, color, depth)
         return [
             self._accept(env, alignment) if self._started[env] else self._start(env, live)
             for env in range(self.batch)
@@ -255,6 +269,22 @@ class BatchedSurfelSlam:
             )
             alignment = alignment.replace(failed & (again.verdict == 0), again)
         return alignment
+
+    def _search_elsewhere(
+        self, alignment: Alignment, color: NDArray[np.uint8], depth: NDArray[np.float32]
+    ) -> Alignment:
+        """Let the relocalisation find the envs that were lost before and still are."""
+        lost = self._failed(alignment) & (self._lost > 0)
+        found = self.relocalisation.search(color, depth, lost, self._align_from)
+        if found is None:
+            return alignment
+        where, again = found
+        again = replace(again, T_model_live=invert(self.poses) @ again.T_world_live)
+        return alignment.replace(where, again)
+
+    def _align_from(self, origins: Float64, seeds: Float64, limits: NDArray[np.void]) -> Alignment:
+        view, lights = self._render(origins), self._photometry
+        return self.tracker.align(view, origins, seeds, limits, photometry=lights)
 
     def _failed(self, alignment: Alignment) -> NDArray[np.bool_]:
         return self._started & (alignment.verdict != 0)
@@ -328,6 +358,7 @@ class BatchedSurfelSlam:
         tracked = np.array([result.tracking_ok for result in results])
         closed = self.loops.close(live, self.poses, self._time - 1, tracked)
         for env in np.flatnonzero(closed):
+            self.relocalisation.move(int(env), *self.loops.trajectory(int(env)))
             results[env] = replace(
                 results[env], T_world_camera=self.poses[env].copy(), loop_closed=True
             )
@@ -351,6 +382,7 @@ class BatchedSurfelSlam:
             "lost": self._lost.copy(),
             "time": self._time.copy(),
             "map": self.map.get_state(),
+            "relocalisation": self.relocalisation.get_state(),
             "loops": self.loops.get_state(),
         }
 
@@ -363,6 +395,7 @@ class BatchedSurfelSlam:
         self._lost = state["lost"].copy()
         self._time = state["time"].copy()
         self.map.set_state(state["map"])
+        self.relocalisation.set_state(state["relocalisation"])
         self.loops.set_state(state["loops"])
         self._view_poses = None
 
