@@ -102,17 +102,3 @@ def put(values: wp.array2d(dtype=wp.vec3), row: int, i: int, value: wp.vec3):
 @wp.func_native("wp::atomic_max(values.data + i, value);")
 def raise_to(values: wp.array(dtype=wp.float32), i: int, value: wp.float32):
     """Make value ``i`` at least ``value``, also when other threads do so at the same time."""
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-if (condition) values.data[i] = 1;
-#else
-values.data[i] |= condition;
-#endif
-""")
-def mark(values: wp.array(dtype=wp.int32), i: int, condition: bool):
-    """Set value ``i`` to 1 if the condition holds; values are 0 or 1.
-
-    On the CPU without a branch, which noise would make a guess.
-    """

@@ -15,11 +15,10 @@ from ms_slam_env.slam.base import Views
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.discs import allocate_discs
 from ms_slam_env.slam.surfel.fusion import (
-    FusionParameters,
     add_surfels,
     radial_weights,
-    update_surfels,
 )
+from ms_slam_env.slam.surfel.fusion_update import FusionParameters, update_surfels
 from ms_slam_env.slam.surfel.prediction import DeviceViews, ViewPredictor
 from ms_slam_env.slam.surfel.removal import gather, list_survivors, put_back
 from ms_slam_env.slam.surfel.splat_renderer import (
