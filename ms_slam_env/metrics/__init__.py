@@ -19,6 +19,7 @@ from ms_slam_env.metrics.reconstruction import (
     rer,
     voxel_thin,
 )
+from ms_slam_env.metrics.relocalisation import mean_relocalisation_time, relocalisation_times
 from ms_slam_env.metrics.sightings import (
     LabelledView,
     SightingRule,
@@ -53,12 +54,14 @@ __all__ = [
     "icp",
     "judge_consistency",
     "map_metrics",
+    "mean_relocalisation_time",
     "nearest_distances",
     "path_length",
     "precision",
     "rcm",
     "recall",
     "relative_errors",
+    "relocalisation_times",
     "rer",
     "rpe_rmse",
     "rpe_statistics",
