@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose, invert
 from ms_slam_env.slam.base import Float64, TrackResult
 from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.inputs import check_guesses, check_images, check_poses
 from ms_slam_env.slam.surfel.loops.make import make_loop_closure
 from ms_slam_env.slam.surfel.mirror import Mirror
 from ms_slam_env.slam.surfel.photometry import (
@@ -111,8 +111,8 @@ class BatchedSurfelSlam:
             InputError: another batch or image size; NaN, infinite or negative depth; a guess
                 that is no pose.
         """
-        self._check_images(color, depth)
-        guesses = self._check_guesses(T_world_camera_guess)
+        check_images(color, depth, self.batch, self.intrinsics)
+        guesses = check_guesses(T_world_camera_guess, self.batch)
         live = self.preprocess(color, depth)
         self._select_surfels(self._lost)
         results = self._locate(live, guesses, color, depth)
@@ -130,8 +130,8 @@ class BatchedSurfelSlam:
         Raises:
             InputError: another batch or image size; NaN, infinite or negative depth; no poses.
         """
-        self._check_images(color, depth)
-        poses = self._check_poses(T_world_camera)
+        check_images(color, depth, self.batch, self.intrinsics)
+        poses = check_poses(T_world_camera, self.batch)
         live = self.preprocess(color, depth)
         self._select_surfels(np.ones(self.batch, dtype=np.int32))  # known poses: old and new fit
         for env in range(self.batch):
@@ -146,40 +146,6 @@ class BatchedSurfelSlam:
         self.relocalisation.remember(color, depth, poses, self._time, good)
         self._fuse(live, good)
         return [TrackResult(pose.copy(), True) for pose in poses]
-
-    def _check_images(self, color: NDArray[np.uint8], depth: NDArray[np.float32]) -> None:
-        size = (self.batch, *self.intrinsics.shape)
-        if color.shape != (*size, 3) or depth.shape != size:
-            raise InputError(
-                f"colour {color.shape} and depth {depth.shape} must be {(*size, 3)} and {size}"
-            )
-        if not (depth.min() >= 0 and depth.max() < np.inf):
-            raise InputError("depth holds NaN, infinite or negative values; 0 means no reading")
-
-    def _check_poses(self, poses: Float64) -> Float64:
-        if np.ndim(poses) != 3 or len(poses) != self.batch:
-            raise InputError(
-                f"T_world_camera must have shape {(self.batch, 4, 4)}, got {np.shape(poses)}"
-            )
-        return np.stack([check_pose(pose, "T_world_camera") for pose in poses])
-
-    def _check_guesses(self, guesses: Sequence[ArrayLike | None] | None) -> Float64 | None:
-        """Guesses (B, 4, 4), NaN where an env has none; None if none has."""
-        if guesses is None:
-            return None
-        if len(guesses) != self.batch:
-            raise InputError(
-                f"T_world_camera_guess must hold {self.batch} poses or None, got {len(guesses)}"
-            )
-        if all(guess is None for guess in guesses):
-            return None
-        none = np.full((4, 4), np.nan)
-        return np.stack(
-            [
-                none if guess is None else check_pose(guess, "T_world_camera_guess")
-                for guess in guesses
-            ]
-        )
 
     def _locate(
         self,
