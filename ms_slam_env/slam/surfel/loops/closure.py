@@ -37,7 +37,12 @@ from ms_slam_env.slam.surfel.loops.deformation_graph import (
     sample_graph,
 )
 from ms_slam_env.slam.surfel.loops.energy import Constraints, optimise
-from ms_slam_env.slam.surfel.loops.kernels import Nodes, deform_surfels, reactivate
+from ms_slam_env.slam.surfel.loops.kernels import (
+    Nodes,
+    deform_surfels,
+    merge,
+    reactivate,
+)
 from ms_slam_env.slam.surfel.mirror import Mirror
 from ms_slam_env.slam.surfel.seeds import NUM_SEEDS, tracking_seeds
 from ms_slam_env.slam.surfel.splat_renderer import SplatRenderer
@@ -70,6 +75,8 @@ class DeformationLoopClosure(LoopClosure):
         intrinsics = surfel_map.intrinsics
         stride = model_stride(intrinsics, config)
         self._tolerance_m = config.fusion_distance_m
+        self._stable = config.confidence_threshold
+        self._min_cosine = float(np.cos(np.radians(config.fusion_angle_deg)))
         self._inactive = any_time(self.batch, device)
         self._old = surfel_map.model_renderer(stride, self._inactive)
         self._new = surfel_map.model_renderer(stride, surfel_map.active)
@@ -173,7 +180,9 @@ class DeformationLoopClosure(LoopClosure):
             if not self._believed(constraints, deformation):
                 return False
             self._apply(env, deformation, time_of)
-        self._reactivate(env, corrected)
+        seen_from = poses.copy()
+        seen_from[env] = corrected
+        self._join(env, seen_from)
         return bool(bends)
 
     def _believed(self, constraints: Constraints, deformation: Deformation) -> bool:
@@ -228,27 +237,44 @@ class DeformationLoopClosure(LoopClosure):
         moved = deformation.poses(np.stack(past.poses), np.array(past.frames) + 0.5)
         past.poses = list(moved)
 
-    def _reactivate(self, env: int, pose: Float64) -> None:
-        """Make the inactive surfels that are in view from ``pose`` active again."""
-        poses = np.tile(pose, (self.batch, 1, 1))
+    def _join(self, env: int, poses: Float64) -> None:
+        """Make one surface of the two parts in view from ``poses``, and both active."""
         self._poses.write(poses)
         self._old.cull(self._poses.array)
         view = self._old.splat()
-        count = int(self._old.visible.count.numpy()[env])
-        if count:
-            wp.launch(
-                reactivate,
-                dim=count,
-                inputs=[
-                    self.map.surfels,
-                    env,
-                    self._old.visible,
-                    self._old.camera,
-                    view.vertices,
-                    int(self._last[env]),
-                ],
-                device=self.device,
-            )
+        visible, surfels = self._old.visible, self.map.surfels
+        count = int(visible.count.numpy()[env])
+        seen = surfels.seen[env].numpy()[visible.index[env, :count].numpy()]
+        self._new.cull(self._poses.array)
+        wp.launch(
+            merge,
+            dim=int(visible.count.numpy()[env]),
+            inputs=[
+                surfels,
+                env,
+                visible,
+                self._old.camera,
+                view.vertices,
+                view.normals,
+                self._min_cosine,
+                self._stable,
+            ],
+            device=self.device,
+        )
+        # What was seen about the same time hangs together with what was matched.
+        reach = self.config.window // 2
+        wp.launch(
+            reactivate,
+            dim=int(surfels.count.numpy()[env]),
+            inputs=[
+                surfels,
+                env,
+                int(np.quantile(seen, 0.1)) - reach,
+                int(np.quantile(seen, 0.9)) + reach,
+                int(self._last[env]),
+            ],
+            device=self.device,
+        )
 
     def trajectory(self, env: int) -> tuple[Int32, Float64]:
         """Tracked frames (N,) and their poses (N, 4, 4), bent by the closures since."""

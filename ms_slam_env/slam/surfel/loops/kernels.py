@@ -68,22 +68,48 @@ def deform_surfels(
     surfels.normal[b, i] = wp.normalize(turned)
 
 
+@wp.func
+def pixel_of(p: wp.vec3, camera: SplatCamera):
+    """Pixel (u, v) of the image nearest to the projection of a point."""
+    u = floor_int(camera.focal[0] * p[0] / p[2] + camera.centre[0] + 0.5)
+    v = floor_int(camera.focal[1] * p[1] / p[2] + camera.centre[1] + 0.5)
+    return wp.vec2i(wp.clamp(u, 0, camera.width - 1), wp.clamp(v, 0, camera.height - 1))
+
+
 @wp.kernel
 def reactivate(
     surfels: Surfels,
     b: int,
-    visible: VisibleList,
-    camera: SplatCamera,
-    view: wp.array3d(dtype=wp.vec3),  # vertices of the image of those surfels
+    seen_from: int,
+    seen_to: int,
     now: int,
 ) -> None:
-    """Count the visible surfels of env b that are not hidden as seen now."""
+    """Count the surfels of env b that were last seen within these frames as seen now."""
+    i = wp.tid()
+    seen = surfels.seen[b, i]
+    if seen >= seen_from and seen <= seen_to:
+        surfels.seen[b, i] = now
+
+
+@wp.kernel
+def merge(
+    surfels: Surfels,
+    b: int,
+    visible: VisibleList,  # of the active surfels
+    camera: SplatCamera,
+    vertices: wp.array3d(dtype=wp.vec3),  # image of the inactive surfels
+    normals: wp.array3d(dtype=wp.vec3),
+    min_cosine: float,
+    stable: float,  # confidence
+) -> None:
+    """Remove the unstable active surfels of env b that lie on a surface mapped before."""
     j = wp.tid()
     p = visible.position[b, j]
-    u = floor_int(camera.focal[0] * p[0] / p[2] + camera.centre[0] + 0.5)
-    v = floor_int(camera.focal[1] * p[1] / p[2] + camera.centre[1] + 0.5)
-    u = wp.clamp(u, 0, camera.width - 1)
-    v = wp.clamp(v, 0, camera.height - 1)
-    front = view[b, v, u][2]
-    if front == 0.0 or p[2] < front + 2.0 * depth_tolerance(camera.tolerance_m, front):
-        surfels.seen[b, visible.index[b, j]] = now
+    pixel = pixel_of(p, camera)
+    front = vertices[b, pixel[1], pixel[0]][2]
+    if front > 0.0 and wp.abs(p[2] - front) < depth_tolerance(camera.tolerance_m, front):
+        i = visible.index[b, j]
+        alike = wp.dot(visible.normal[b, j], normals[b, pixel[1], pixel[0]]) > min_cosine
+        if alike and surfels.confidence[b, i] < stable:
+            surfels.confidence[b, i] = 0.0
+            wp.atomic_add(surfels.dead, b, 1)
