@@ -47,6 +47,9 @@ SETTINGS: dict[str, Setting] = {
     "far": Setting(0.40, 30.0, 0.5),
     "black": Setting(0.05, 4.0, 0.6, (5, 20)),
 }
+FOREIGN = "foreign"
+"""One more kind: the camera reappears in another scene, and nothing there may be recognised."""
+ALL_SETTINGS = (*SETTINGS, FOREIGN)
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,7 @@ class Interruption:
     Attributes:
         black: number of black frames before the camera sees again.
         poses: (N, 4, 4) true poses from then on.
-        source: index of the mapped pose that the first of them is near.
+        source: index of the mapped pose that the first of them is near; -1 for none.
         mapped: share of the first view's readings that lie in mapped space.
     """
 
@@ -139,6 +142,11 @@ def draw_interruption(
         if share >= setting.mapped:
             return Interruption(black, poses, source, share)
     return None
+
+
+def foreign_interruption(other: Scene, after: int, seed: int) -> Interruption:
+    """The camera reappears on a path of its own in scene ``other``."""
+    return Interruption(0, handheld_trajectory(other, after, seed), -1, 0.0)
 
 
 def _random_motion(setting: Setting, rng: np.random.Generator) -> Float64:

@@ -1,6 +1,7 @@
 """How long a SLAM needs to find its pose again after it saw nothing.
 
-USME ("unified SLAM evaluation", 2021), section 1.3 (2), equation 11.
+Qu, Zhang, Yang, Dong, "USME" (in Chinese), Navigation Positioning and Timing, 2021, section 1.3
+(2), equation 11.
 """
 
 from __future__ import annotations
