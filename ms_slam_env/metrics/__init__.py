@@ -1,12 +1,22 @@
 """Errors of trajectories and maps."""
 
 from ms_slam_env.metrics.alignment import umeyama
+from ms_slam_env.metrics.cloud import (
+    CloudDistance,
+    cloud_distance,
+    hausdorff_distance,
+    noise_ratio,
+    point_spacing,
+    statistical_inliers,
+)
 from ms_slam_env.metrics.consistency import (
     ConsistencyRule,
     MapConsistency,
     ObjectConsistency,
     judge_consistency,
 )
+from ms_slam_env.metrics.initialisation import Initialisation, initialisation, local_scales
+from ms_slam_env.metrics.multi_robot import mean_path_length, task_time, team_ate, team_rpe
 from ms_slam_env.metrics.reconstruction import (
     MapMetrics,
     f_score,
@@ -20,6 +30,11 @@ from ms_slam_env.metrics.reconstruction import (
     voxel_thin,
 )
 from ms_slam_env.metrics.relocalisation import mean_relocalisation_time, relocalisation_times
+from ms_slam_env.metrics.robustness import (
+    TrackingRobustness,
+    tracked_segments,
+    tracking_robustness,
+)
 from ms_slam_env.metrics.sightings import (
     LabelledView,
     SightingRule,
@@ -38,25 +53,35 @@ from ms_slam_env.metrics.trajectory import (
 )
 
 __all__ = [
+    "CloudDistance",
     "ConsistencyRule",
     "ErrorStatistics",
+    "Initialisation",
     "LabelledView",
     "MapConsistency",
     "MapMetrics",
     "ObjectConsistency",
     "SightingRule",
+    "TrackingRobustness",
     "absolute_errors",
     "ate_rmse",
     "ate_statistics",
+    "cloud_distance",
     "count_votes",
     "distinct_placements",
     "f_score",
+    "hausdorff_distance",
     "icp",
+    "initialisation",
     "judge_consistency",
+    "local_scales",
     "map_metrics",
+    "mean_path_length",
     "mean_relocalisation_time",
     "nearest_distances",
+    "noise_ratio",
     "path_length",
+    "point_spacing",
     "precision",
     "rcm",
     "recall",
@@ -65,6 +90,12 @@ __all__ = [
     "rer",
     "rpe_rmse",
     "rpe_statistics",
+    "statistical_inliers",
+    "task_time",
+    "team_ate",
+    "team_rpe",
+    "tracked_segments",
+    "tracking_robustness",
     "umeyama",
     "voxel_thin",
 ]

@@ -32,7 +32,7 @@ class ErrorStatistics:
     max: float
 
 
-def _positions(trajectory: ArrayLike, name: str) -> Float64:
+def check_positions(trajectory: ArrayLike, name: str) -> Float64:
     """Positions (N, 3) of poses (N, 4, 4) or positions (N, 3), checked."""
     values = np.asarray(trajectory, dtype=np.float64)
     if values.ndim == 3 and values.shape[1:] == (4, 4):
@@ -58,7 +58,8 @@ def _poses(trajectory: ArrayLike, name: str) -> Float64:
     return values
 
 
-def _check_lengths(estimate: Float64, truth: Float64) -> None:
+def check_lengths(estimate: Float64, truth: Float64) -> None:
+    """Refuse trajectories that cannot correspond by row."""
     if len(estimate) != len(truth):
         raise InputError(
             f"estimate has {len(estimate)} poses and truth {len(truth)}; they must correspond"
@@ -78,8 +79,11 @@ def absolute_errors(estimate: ArrayLike, truth: ArrayLike, align: str = "se3") -
     """
     if align not in ALIGNMENTS:
         raise unknown("alignment", align, ALIGNMENTS)
-    positions, true_positions = _positions(estimate, "estimate"), _positions(truth, "truth")
-    _check_lengths(positions, true_positions)
+    positions, true_positions = (
+        check_positions(estimate, "estimate"),
+        check_positions(truth, "truth"),
+    )
+    check_lengths(positions, true_positions)
     if align != "none":
         R, t, scale = umeyama(positions, true_positions, with_scale=align == "sim3")
         positions = scale * positions @ R.T + t
@@ -88,7 +92,7 @@ def absolute_errors(estimate: ArrayLike, truth: ArrayLike, align: str = "se3") -
 
 def ate_statistics(estimate: ArrayLike, truth: ArrayLike, align: str = "se3") -> ErrorStatistics:
     """Statistics of the absolute trajectory error in metres; arguments of `absolute_errors`."""
-    return _statistics(absolute_errors(estimate, truth, align))
+    return statistics_of(absolute_errors(estimate, truth, align))
 
 
 def ate_rmse(estimate: ArrayLike, truth: ArrayLike, align: str = "se3") -> float:
@@ -111,7 +115,7 @@ def relative_errors(
     if kind not in RPE_KINDS:
         raise unknown("kind of relative error", kind, RPE_KINDS)
     poses, true_poses = _poses(estimate, "estimate"), _poses(truth, "truth")
-    _check_lengths(poses, true_poses)
+    check_lengths(poses, true_poses)
     if isinstance(delta, bool) or not isinstance(delta, (int, np.integer)) or delta < 1:
         raise InputError(f"delta must be an integer >= 1, got {delta!r}")
     if len(poses) <= delta:
@@ -128,7 +132,7 @@ def rpe_statistics(
     estimate: ArrayLike, truth: ArrayLike, delta: int = 1, kind: str = "translation"
 ) -> ErrorStatistics:
     """Statistics of the relative pose error (m or rad); arguments of `relative_errors`."""
-    return _statistics(relative_errors(estimate, truth, delta, kind))
+    return statistics_of(relative_errors(estimate, truth, delta, kind))
 
 
 def rpe_rmse(
@@ -144,7 +148,7 @@ def path_length(trajectory: ArrayLike) -> float:
     Raises:
         InputError: wrong shape, no poses, NaN.
     """
-    positions = _positions(trajectory, "trajectory")
+    positions = check_positions(trajectory, "trajectory")
     return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
 
 
@@ -156,7 +160,8 @@ def _rotation_angles(R: Float64) -> Float64:
     return np.arctan2(np.linalg.norm(vector, axis=1), np.trace(R, axis1=1, axis2=2) - 1.0)
 
 
-def _statistics(errors: Float64) -> ErrorStatistics:
+def statistics_of(errors: Float64) -> ErrorStatistics:
+    """Statistics of errors (N,), N >= 1."""
     return ErrorStatistics(
         rmse=float(np.sqrt(np.mean(errors**2))),
         mean=float(errors.mean()),

@@ -1,0 +1,111 @@
+"""Several robots: their trajectories judged as one system.
+
+Source: Qu, Zhang, Yang, Dong, "USME: unified SLAM measurement and evaluation", Navigation
+Positioning and Timing 2021, equations (14) to (20).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ms_slam_env.errors import InputError
+from ms_slam_env.metrics.trajectory import (
+    ErrorStatistics,
+    absolute_errors,
+    check_lengths,
+    check_positions,
+    path_length,
+    relative_errors,
+    statistics_of,
+)
+
+Float64 = NDArray[np.float64]
+
+
+def team_ate(
+    estimates: Sequence[ArrayLike], truths: Sequence[ArrayLike], align: str = "se3"
+) -> ErrorStatistics:
+    """Absolute trajectory error in metres of M robots, USME equations (14) and (15).
+
+    One alignment for all: what counts is one common world. Its RMSE is (15).
+
+    Args:
+        estimates: M trajectories T_world_camera (N_i, 4, 4) or positions (N_i, 3), one world.
+        truths: likewise.
+        align: ``se3``, ``sim3`` or ``none``.
+
+    Raises:
+        InputError: no robot, numbers or lengths that differ, bad poses, unknown alignment.
+    """
+    _check_team(estimates, truths)
+    pairs = []
+    for k, (estimate, truth) in enumerate(zip(estimates, truths, strict=True)):
+        own, true = (
+            check_positions(estimate, f"estimate of robot {k}"),
+            check_positions(truth, f"truth of robot {k}"),
+        )
+        check_lengths(own, true)
+        pairs.append((own, true))
+    own, true = (np.concatenate(side) for side in zip(*pairs, strict=True))
+    return statistics_of(absolute_errors(own, true, align))
+
+
+def team_rpe(
+    estimates: Sequence[ArrayLike],
+    truths: Sequence[ArrayLike],
+    delta: int = 1,
+    kind: str = "translation",
+) -> ErrorStatistics:
+    """Relative pose error (m or rad) of M robots, USME equations (16) and (17).
+
+    Every robot's motions over ``delta`` frames count alike; arguments of `relative_errors`.
+
+    Raises:
+        InputError: no robot, numbers that differ, or as `relative_errors`.
+    """
+    _check_team(estimates, truths)
+    errors = [
+        relative_errors(estimate, truth, delta, kind)
+        for estimate, truth in zip(estimates, truths, strict=True)
+    ]
+    return statistics_of(np.concatenate(errors))
+
+
+def task_time(times: Sequence[ArrayLike]) -> float:
+    """Seconds from the first robot's start to the last one's end, USME equation (18).
+
+    Args:
+        times: of each robot (N_i,), seconds, increasing.
+
+    Raises:
+        InputError: no robot, one without time, times that are not finite or do not increase.
+    """
+    if len(times) == 0:
+        raise InputError("no robot given")
+    arrays = [np.asarray(t, dtype=np.float64) for t in times]
+    for k, array in enumerate(arrays):
+        increases = array.ndim == 1 and len(array) > 0 and (np.diff(array) > 0).all()
+        if not (increases and np.isfinite(array).all()):
+            raise InputError(f"times of robot {k} must be (N,), finite and increase")
+    return float(max(array[-1] for array in arrays) - min(array[0] for array in arrays))
+
+
+def mean_path_length(trajectories: Sequence[ArrayLike]) -> float:
+    """Mean length in metres of M robots' paths, USME equations (19) and (20).
+
+    Raises:
+        InputError: no robot, or bad poses.
+    """
+    if len(trajectories) == 0:
+        raise InputError("no robot given")
+    return float(np.mean([path_length(trajectory) for trajectory in trajectories]))
+
+
+def _check_team(estimates: Sequence[ArrayLike], truths: Sequence[ArrayLike]) -> None:
+    if len(estimates) == 0:
+        raise InputError("no robot given")
+    if len(estimates) != len(truths):
+        raise InputError(f"{len(estimates)} estimates but {len(truths)} true trajectories")

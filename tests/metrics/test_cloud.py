@@ -1,0 +1,82 @@
+"""Outliers, noise ratio, spacing and distances of point clouds against Open3D, SciPy, grids."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.distance import directed_hausdorff
+
+from ms_slam_env.errors import InputError
+from ms_slam_env.metrics import (
+    cloud_distance,
+    hausdorff_distance,
+    noise_ratio,
+    point_spacing,
+    statistical_inliers,
+)
+
+
+def cloud(seed: int, count: int = 400) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=(count, 3))
+
+
+@pytest.mark.parametrize(("neighbours", "std_ratio"), [(5, 1.0), (20, 2.0), (8, 0.5)])
+def test_outliers_are_those_of_open3d(neighbours: int, std_ratio: float) -> None:
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        pytest.skip(f"Open3D cannot run here: {error}")
+    points = np.concatenate([cloud(0), 10 * cloud(1, 30)])
+    reference = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+    _, kept = reference.remove_statistical_outlier(neighbours, std_ratio)
+    found = np.flatnonzero(statistical_inliers(points, neighbours, std_ratio))
+    np.testing.assert_array_equal(found, np.sort(kept))
+    assert 0 < len(found) < len(points)
+
+
+def test_noise_ratio_is_the_share_of_far_points() -> None:
+    grid = np.stack(np.meshgrid(*[np.arange(10.0)] * 3), -1).reshape(-1, 3)
+    far = 100.0 * np.arange(1, 6)[:, None] * np.ones(3)
+    assert noise_ratio(np.concatenate([grid, far]), 8) == pytest.approx(5 / 1005)
+
+
+def test_spacing_of_a_grid() -> None:
+    grid = 0.25 * np.stack(np.meshgrid(*[np.arange(6.0)] * 3), -1).reshape(-1, 3)
+    assert point_spacing(grid) == pytest.approx(0.25)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10_000), st.integers(1, 60), st.integers(1, 60))
+def test_hausdorff_is_scipys(seed: int, n: int, m: int) -> None:
+    a, b = cloud(seed, n), cloud(seed + 1, m)
+    there, back = directed_hausdorff(a, b)[0], directed_hausdorff(b, a)[0]
+    assert hausdorff_distance(a, b, symmetric=False) == pytest.approx(there)
+    assert hausdorff_distance(a, b) == pytest.approx(max(there, back))
+    assert hausdorff_distance(a, b) == pytest.approx(hausdorff_distance(b, a))
+    assert hausdorff_distance(a, a) == 0
+
+
+def test_distance_of_a_shifted_plane() -> None:
+    plane = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0), [0.0]), -1).reshape(-1, 3)
+    found = cloud_distance(plane + np.array([0, 0, 0.3]), plane)
+    assert (found.mean, found.rms, found.max) == pytest.approx((0.3, 0.3, 0.3))
+    assert found.std == pytest.approx(0, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: statistical_inliers(cloud(0), 1), "neighbours must be an integer >= 2"),
+        (lambda: statistical_inliers(cloud(0, 5), 20), "20 neighbours need as many points, got 5"),
+        (lambda: statistical_inliers(cloud(0), 5, 0.0), "std_ratio"),
+        (lambda: point_spacing(cloud(0, 1)), "at least 2"),
+        (lambda: hausdorff_distance(np.zeros((0, 3)), cloud(0)), "points is empty"),
+        (lambda: cloud_distance(np.full((3, 3), np.nan), cloud(0)), "not finite"),
+        (lambda: noise_ratio(np.zeros((9, 2))), r"must be \(N, 3\)"),
+    ],
+)
+def test_bad_input(call, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        call()

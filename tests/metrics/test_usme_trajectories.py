@@ -1,0 +1,162 @@
+"""USME's measures of trajectories: robustness (9-10), initialisation (12-13), teams (14-20)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+
+from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import hat, make_pose, se3_exp, se3_log, so3_exp
+from ms_slam_env.metrics import (
+    ate_rmse,
+    initialisation,
+    local_scales,
+    mean_path_length,
+    rpe_rmse,
+    task_time,
+    team_ate,
+    team_rpe,
+    tracked_segments,
+    tracking_robustness,
+)
+from ms_slam_env.metrics.robustness import similarity_log
+
+TIMES = np.arange(60) / 10
+
+
+def winding(count: int = 60, seed: int = 0) -> np.ndarray:
+    """Poses along a curve in space."""
+    rng = np.random.default_rng(seed)
+    steps = [se3_exp(rng.normal(scale=[0.05] * 3 + [0.1] * 3)) for _ in range(count)]
+    poses = [np.eye(4)]
+    for step in steps[1:]:
+        poses.append(poses[-1] @ step)
+    return np.stack(poses)
+
+
+def straight(count: int = 60) -> np.ndarray:
+    return np.stack([make_pose(np.eye(3), (0.1 * k, 0, 0)) for k in range(count)])
+
+
+LOST = (TIMES >= 2) & (TIMES < 2.5)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 100_000))
+def test_similarity_log_inverts_expm(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rho, phi, sigma = rng.normal(size=3), rng.normal(size=3), rng.normal()
+    phi *= min(1.0, 3.0 / np.linalg.norm(phi))
+    generator = np.zeros((4, 4))
+    generator[:3, :3] = hat(phi) + sigma * np.eye(3)
+    generator[:3, 3] = rho
+    np.testing.assert_allclose(
+        similarity_log(expm(generator)), [*rho, *phi, sigma], atol=1e-8, rtol=1e-8
+    )
+
+
+@pytest.mark.parametrize("poses", [winding(), straight()])
+def test_pieces_that_moved_apart_are_found(poses: np.ndarray) -> None:
+    offset = make_pose(so3_exp([0.0, 0.1, 0.2]), (0.3, 0.0, -0.1))
+    estimate = poses.copy()
+    estimate[TIMES >= 2.5] = np.linalg.inv(offset) @ poses[TIMES >= 2.5]
+    found = tracking_robustness(estimate, poses, ~LOST)
+    assert found.error == pytest.approx(np.linalg.norm(se3_log(offset)))
+    assert found.rotation_rad == pytest.approx(np.hypot(0.1, 0.2))
+    assert found.lost == pytest.approx(5 / 60)
+    np.testing.assert_array_equal(found.segments, [[0, 20], [25, 60]])
+
+
+def test_a_common_world_costs_nothing_and_neither_does_the_choice_of_it() -> None:
+    poses, world = winding(), se3_exp([1, 2, 3, 0.3, 0.2, 0.1])
+    assert tracking_robustness(poses, poses, ~LOST).error == pytest.approx(0, abs=1e-6)
+    assert tracking_robustness(world @ poses, poses, ~LOST).error == pytest.approx(0, abs=1e-6)
+    assert tracking_robustness(poses, poses, np.ones(60, bool)).error == 0  # one piece
+
+
+def test_scale_that_changes_between_pieces() -> None:
+    poses = winding()
+    estimate = poses.copy()
+    estimate[TIMES >= 2.5, :3, 3] *= 0.5
+    found = tracking_robustness(estimate, poses, ~LOST, align="sim3")
+    assert found.log_scale == pytest.approx(np.log(2))
+    assert found.translation_m == pytest.approx(0, abs=1e-6)
+
+
+def test_segments() -> None:
+    flags = np.array([1, 1, 1, 0, 1, 1, 0, 0, 1, 1, 1, 1], dtype=bool)
+    np.testing.assert_array_equal(tracked_segments(flags), [[0, 3], [8, 12]])
+    np.testing.assert_array_equal(tracked_segments(flags, 1), [[0, 3], [4, 6], [8, 12]])
+
+
+def test_scale_that_settles_after_two_seconds() -> None:
+    truth = winding(200)[:, :3, 3]
+    times = np.arange(200) / 20
+    step = np.diff(truth, axis=0)
+    growth = np.where(times[1:] < 2.0, 1 + (2.0 - times[1:]), 1.0)
+    estimate = np.concatenate([truth[:1], truth[0] + np.cumsum(step * growth[:, None], axis=0)])
+    found = initialisation(times, estimate / 1.25, truth, global_scale=1.0)
+    assert found.time_s == pytest.approx(2.0, abs=0.5)
+    assert found.scale == pytest.approx(1.25, rel=0.05)
+    ratio = found.scale
+    assert found.scale_error == pytest.approx((abs(1 / ratio - 1) + abs(ratio - 1)) / 2)
+    scales = local_scales(times, truth / 3, truth, 1.0)
+    np.testing.assert_allclose(scales, 3.0)
+    at_once = initialisation(times, truth / 3, truth)
+    assert (at_once.time_s, at_once.scale_error) == pytest.approx((0, 0))
+
+
+def test_scale_that_never_settles() -> None:
+    truth = straight(100)[:, :3, 3]
+    estimate = truth * np.linspace(1, 30, 100)[:, None] ** 2
+    found = initialisation(np.arange(100) / 10, estimate, truth)
+    assert (found.time_s, found.scale, found.scale_error) == (None, None, None)
+
+
+def test_one_robot_is_judged_as_before_and_two_in_one_world() -> None:
+    a, b = winding(60, 1), winding(40, 2)
+    noisy = [
+        T @ np.stack([se3_exp(x) for x in np.random.default_rng(k).normal(0, 0.01, (len(T), 6))])
+        for k, T in enumerate((a, b))
+    ]
+    assert team_ate(noisy[:1], [a]).rmse == pytest.approx(ate_rmse(noisy[0], a))
+    assert team_rpe(noisy[:1], [a]).rmse == pytest.approx(rpe_rmse(noisy[0], a))
+    joined = np.concatenate(noisy)[:, :3, 3], np.concatenate([a, b])[:, :3, 3]
+    assert team_ate(noisy, [a, b]).rmse == pytest.approx(ate_rmse(*joined))
+    squares = 59 * rpe_rmse(noisy[0], a) ** 2 + 39 * rpe_rmse(noisy[1], b) ** 2
+    assert team_rpe(noisy, [a, b]).rmse == pytest.approx(np.sqrt(squares / 98))
+    # Each alone fits its truth, but they disagree about the world.
+    apart = [a, se3_exp([1, 0, 0, 0, 0, 0]) @ b]
+    assert ate_rmse(apart[1], b) == pytest.approx(0, abs=1e-9)
+    assert team_ate(apart, [a, b]).rmse > 0.2
+
+
+def test_time_and_way_of_a_team() -> None:
+    assert task_time([[3.0, 4.0, 9.0], [1.0, 5.0]]) == 8.0
+    assert mean_path_length([straight(11), straight(31)]) == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: tracking_robustness(winding(), winding(), np.zeros(60, bool)), "no piece"),
+        (lambda: tracking_robustness(winding(), winding(), np.ones(60)), "bool"),
+        (lambda: tracking_robustness(winding(), winding(9), np.ones(60, bool)), "correspond"),
+        (lambda: tracking_robustness(winding(), winding(), ~LOST, align="x"), "se3, sim3"),
+        (lambda: tracking_robustness(winding(), winding(), ~LOST, lever_m=-1), "lever_m"),
+        (lambda: initialisation(TIMES[::-1], winding(), winding()), "increase"),
+        (lambda: initialisation(TIMES, winding(), winding(), threshold=0), "threshold"),
+        (lambda: local_scales(TIMES, winding(), winding(), 0), "window_s"),
+        (lambda: team_ate([], []), "no robot"),
+        (lambda: team_rpe([winding()], []), "1 estimates but 0"),
+        (lambda: team_ate([winding()], [winding(9)]), "must correspond"),
+        (lambda: task_time([[1.0, 1.0]]), "robot 0"),
+        (lambda: mean_path_length([]), "no robot"),
+    ],
+)
+def test_bad_input(call, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        call()
