@@ -7,6 +7,8 @@ into operations on eight surfels. On a GPU every thread takes one surfel at a ti
 and arrays vanish.
 """
 
+# mypy: disable-error-code="empty-body"
+
 from __future__ import annotations
 
 from ms_slam_env._warp import wp

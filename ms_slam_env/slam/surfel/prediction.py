@@ -12,6 +12,7 @@ from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert
+from ms_slam_env.slam.surfel.blocks import Blocks
 from ms_slam_env.slam.surfel.discs import Discs
 from ms_slam_env.slam.surfel.prediction_kernels import (
     EMPTY,
@@ -128,6 +129,7 @@ class ViewPredictor:
 
     Args:
         surfels: the maps.
+        blocks: their blocks.
         visible: working list shared with the map's other renderers.
         discs: working memory shared likewise.
         intrinsics: of the live camera.
@@ -139,6 +141,7 @@ class ViewPredictor:
     def __init__(
         self,
         surfels: Surfels,
+        blocks: Blocks,
         visible: VisibleList,
         discs: Discs,
         intrinsics: Intrinsics,
@@ -147,6 +150,7 @@ class ViewPredictor:
         device: str,
     ) -> None:
         self.surfels = surfels
+        self.blocks = blocks
         self.visible = visible
         self.discs = discs
         self.intrinsics = intrinsics
@@ -248,6 +252,7 @@ class ViewPredictor:
     def _renderer(self, envs: int, intrinsics: Intrinsics) -> SplatRenderer:
         return SplatRenderer(
             self.surfels,
+            self.blocks,
             self.visible,
             self.discs,
             envs,

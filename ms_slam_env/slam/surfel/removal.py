@@ -1,44 +1,105 @@
-"""Kernels that remove surfels and close the gaps they leave."""
+"""Kernels that remove surfels and close the gaps they leave.
+
+A removed surfel is dead: it keeps its slot, and nothing sees it. The gaps are closed when they are
+many.
+"""
 
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
+from ms_slam_env.slam.surfel.blocks import BLOCK, Blocks, num_blocks
 from ms_slam_env.slam.surfel.memory import fetch, put
 from ms_slam_env.slam.surfel.surfel_arrays import Surfels
+
+BLOCK_SIZE = wp.constant(BLOCK)
+
+
+@wp.struct
+class Removal:
+    """When surfels go.
+
+    Attributes:
+        capacity: slots of a map.
+        interval: frames between two removals of unstable surfels.
+        window: frames for which an unstable surfel may stay unseen.
+        confidence_threshold: at which a surfel is stable.
+    """
+
+    capacity: int
+    interval: int
+    window: int
+    confidence_threshold: float
+
+
+@wp.func
+def is_crowded(slots: int, capacity: int):
+    """Whether nine tenths of a map's slots are taken."""
+    return slots > capacity - capacity / 10
+
+
+@wp.kernel
+def expire(
+    surfels: Surfels,
+    blocks: Blocks,
+    removal: Removal,
+    mask: wp.array(dtype=wp.int32),
+    time: wp.array(dtype=wp.int32),
+    workers: int,
+    expired: wp.array(dtype=wp.int32),
+) -> None:
+    """Let the unstable surfels die that were not seen for long, every ``interval`` frames.
+
+    In a map whose living surfels take nine tenths of the slots, at once and whatever their age
+    those that are not in view. Only the blocks are looked at that hold such surfels.
+    """
+    b, worker = wp.tid()
+    count = wp.min(surfels.count[b], removal.capacity)
+    crowded = is_crowded(count - surfels.dead[b], removal.capacity)
+    if mask[b] == 0 or (time[b] % removal.interval != 0 and not crowded):
+        return
+    oldest = time[b] - wp.where(crowded, 0, removal.window)
+    block = int(worker)
+    while block < num_blocks(count):
+        if blocks.expiry[b, block] < oldest:
+            i = block * BLOCK_SIZE
+            end = wp.min(i + BLOCK_SIZE, count)
+            while i < end:
+                confidence = fetch(surfels.confidence, b, i)
+                is_unstable = confidence > 0.0 and confidence < removal.confidence_threshold
+                if is_unstable and fetch(surfels.seen, b, i) < oldest:
+                    put(surfels.confidence, b, i, 0.0)
+                    wp.atomic_add(expired, b, 1)
+                i += 1
+        block += workers
 
 
 @wp.kernel
 def list_survivors(
     surfels: Surfels,
-    capacity: int,
+    removal: Removal,
     mask: wp.array(dtype=wp.int32),
     time: wp.array(dtype=wp.int32),
-    interval: int,
-    confidence_threshold: float,
-    window: int,
     workers: int,
+    expired: wp.array(dtype=wp.int32),
     survivors: wp.array2d(dtype=wp.int32),
     kept: wp.array(dtype=wp.int32),
 ) -> None:
     """List the slots to keep of every env whose compaction is due; ``kept`` -1: not due.
 
-    Compaction is due every ``interval`` frames, and at once when nine tenths of the slots are
-    taken; then every surfel that is unstable and not in view goes, whatever its age.
+    It is due when an eighth of the slots are dead, so that its cost follows the number of deaths,
+    or when a crowded map has any.
     """
     b, worker = wp.tid()
-    count = wp.min(surfels.count[b], capacity)
-    crowded = count > capacity - capacity / 10
-    if mask[b] == 0 or (time[b] % interval != 0 and not crowded):
+    count = wp.min(surfels.count[b], removal.capacity)
+    dead = surfels.dead[b] + expired[b]
+    many = 8 * dead > count and time[b] % removal.interval == 0
+    needed = dead > 0 and is_crowded(count, removal.capacity)
+    if mask[b] == 0 or not (many or needed):
         kept[b] = -1
         return
-    oldest = time[b] - window
-    if crowded:
-        oldest = time[b]
     i = int(worker)
     while i < count:
-        confidence = fetch(surfels.confidence, b, i)
-        seen = fetch(surfels.seen, b, i)
-        if confidence >= confidence_threshold or (confidence > 0.0 and seen >= oldest):
+        if fetch(surfels.confidence, b, i) > 0.0:
             put(survivors, b, wp.atomic_add(kept, b, 1), i)
         i += workers
 
@@ -78,7 +139,9 @@ def gather(
 def put_back(
     source: Surfels,
     target: Surfels,
+    blocks: Blocks,
     survivors: wp.array2d(dtype=wp.int32),
+    expired: wp.array(dtype=wp.int32),
     kept: wp.array(dtype=wp.int32),
     capacity: int,
     workers: int,
@@ -93,6 +156,8 @@ def put_back(
         j += workers
     if worker == 0:
         target.count[b] = wp.min(target.count[b], capacity)
+        target.dead[b] = target.dead[b] + expired[b]
         if count >= 0:
             target.count[b] = count
             target.dead[b] = 0
+            blocks.bounded[b] = 0

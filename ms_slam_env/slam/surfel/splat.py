@@ -11,27 +11,96 @@ keeps the camera in registers. Image buffers are flat, which saves most of their
 arithmetic.
 """
 
+# mypy: disable-error-code="empty-body"
+
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
+from ms_slam_env.slam.surfel.blocks import BLOCK, Blocks, Frustum, frustum_of
 from ms_slam_env.slam.surfel.discs import Discs, SplatCamera, floor_int
 from ms_slam_env.slam.surfel.memory import fetch, put, raise_to
-from ms_slam_env.slam.surfel.surfel_arrays import (
-    SeenWindow,
-    Surfels,
-    VisibleList,
-    depth_tolerance,
-    rotation_of,
-    translation_of,
-)
+from ms_slam_env.slam.surfel.surfel_arrays import SeenWindow, Surfels, VisibleList, depth_tolerance
 
+BLOCK_SIZE = wp.constant(BLOCK)
 Sums = wp.types.vector(length=8, dtype=wp.float32)
 """Weighted sums of a pixel: normal (3), weight, colour (3), depth."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+constexpr int LANES = 1;  // surfels at a time
+#else
+constexpr int LANES = 64;
+#endif
+const int n = end - first < LANES ? end - first : LANES;
+const size_t start = size_t(b) * surfels.radius.shape[1] + first;
+const float* positions = (const float*)surfels.position.data + 3 * start;
+const float* normals = (const float*)surfels.normal.data + 3 * start;
+const float* confidence = surfels.confidence.data + start;
+const int* seen = surfels.seen.data + start;
+const wp::mat33 R = frustum.R;
+const wp::vec3 t = frustum.t;
+float x[LANES], y[LANES], z[LANES];
+int inside[LANES];
+int found = 0;
+for (int k = 0; k < n; ++k) {
+    const float px = positions[3 * k], py = positions[3 * k + 1], pz = positions[3 * k + 2];
+    x[k] = R.data[0][0] * px + R.data[0][1] * py + R.data[0][2] * pz + t[0];
+    y[k] = R.data[1][0] * px + R.data[1][1] * py + R.data[1][2] * pz + t[1];
+    z[k] = R.data[2][0] * px + R.data[2][1] * py + R.data[2][2] * pz + t[2];
+    inside[k] = (z[k] > frustum.z_near) & (z[k] < frustum.z_far)
+        & (x[k] > frustum.low_u * z[k]) & (x[k] < frustum.high_u * z[k])
+        & (y[k] > frustum.low_v * z[k]) & (y[k] < frustum.high_v * z[k])
+        & (confidence[k] > 0.0f) & (seen[k] >= seen_from) & (seen[k] <= seen_to);
+    found += inside[k];
+}
+if (found == 0) return n;
+float nx[LANES], ny[LANES], nz[LANES];
+for (int k = 0; k < n; ++k) {
+    const float px = normals[3 * k], py = normals[3 * k + 1], pz = normals[3 * k + 2];
+    nx[k] = R.data[0][0] * px + R.data[0][1] * py + R.data[0][2] * pz;
+    ny[k] = R.data[1][0] * px + R.data[1][1] * py + R.data[1][2] * pz;
+    nz[k] = R.data[2][0] * px + R.data[2][1] * py + R.data[2][2] * pz;
+    inside[k] &= nx[k] * x[k] + ny[k] * y[k] + nz[k] * z[k] < 0.0f;
+}
+int which[LANES];
+found = 0;
+for (int k = 0; k < n; ++k) {
+    which[found] = k;
+    found += inside[k];
+}
+const size_t place = size_t(row) * visible.index.shape[1]
+    + wp::atomic_add(visible.count.data + row, found);
+for (int m = 0; m < found; ++m) {
+    const int k = which[m];
+    visible.index.data[place + m] = first + k;
+    visible.position.data[place + m] = wp::vec3(x[k], y[k], z[k]);
+    visible.normal.data[place + m] = wp::vec3(nx[k], ny[k], nz[k]);
+    visible.radius.data[place + m] = surfels.radius.data[start + k];
+}
+return n;
+""")
+def list_some(
+    surfels: Surfels,
+    b: int,
+    first: int,
+    end: int,
+    frustum: Frustum,
+    seen_from: int,
+    seen_to: int,
+    row: int,
+    visible: VisibleList,
+) -> int:
+    """List the visible ones of the surfels from ``first`` on; how many were looked at.
+
+    Several at a time on the CPU, at most to ``end``; a thread of a GPU looks at one.
+    """
 
 
 @wp.kernel
 def cull(
     surfels: Surfels,
+    blocks: Blocks,
     first_env: int,
     poses: wp.array(dtype=wp.mat44),
     camera: SplatCamera,
@@ -42,39 +111,25 @@ def cull(
 ) -> None:
     """List the living surfels of a window in front of the camera, facing it, within its frustum.
 
-    ``poses[k]`` is T_world_camera of env ``first_env + k``.
+    Those of the blocks that ``list_blocks`` listed; ``poses[k]`` is T_world_camera of env
+    ``first_env + k``. A single worker, as on the CPU, keeps the order of the map.
     """
     k, worker = wp.tid()
     b = first_env + k
-    R = wp.transpose(rotation_of(poses[k]))
-    t = -(R * translation_of(poses[k]))
-    low_u = (-0.5 - margin_px - camera.centre[0]) / camera.focal[0]
-    high_u = (float(camera.width) - 0.5 + margin_px - camera.centre[0]) / camera.focal[0]
-    low_v = (-0.5 - margin_px - camera.centre[1]) / camera.focal[1]
-    high_v = (float(camera.height) - 0.5 + margin_px - camera.centre[1]) / camera.focal[1]
-    z_near = camera.z_near
-    z_far = camera.z_far
-    seen_from = fetch(window.seen_from, b)
-    seen_to = fetch(window.seen_to, b)
-    forward = wp.vec3(R[2, 0], R[2, 1], R[2, 2])
+    frustum = frustum_of(poses[k], camera, margin_px)
     count = surfels.count[b]
-    i = int(worker)
-    while i < count:
-        world = fetch(surfels.position, b, i)
-        z = wp.dot(forward, world) + t[2]
-        if z > z_near and z < z_far:
-            p = R * world + t
-            if p[0] > low_u * z and p[0] < high_u * z and p[1] > low_v * z and p[1] < high_v * z:
-                n = R * fetch(surfels.normal, b, i)
-                seen = fetch(surfels.seen, b, i)
-                is_alive = fetch(surfels.confidence, b, i) > 0.0
-                if wp.dot(n, p) < 0.0 and is_alive and seen >= seen_from and seen <= seen_to:
-                    slot = wp.atomic_add(visible.count, k, 1)
-                    put(visible.index, k, slot, i)
-                    put(visible.position, k, slot, p)
-                    put(visible.normal, k, slot, n)
-                    put(visible.radius, k, slot, fetch(surfels.radius, b, i))
-        i += workers
+    seen_from = window.seen_from[b]
+    seen_to = window.seen_to[b]
+    slots = blocks.num_listed[k] * BLOCK_SIZE
+    j = int(worker)
+    while j < slots:
+        block = j / BLOCK_SIZE
+        i = blocks.listed[k, block] * BLOCK_SIZE + j - block * BLOCK_SIZE
+        looked_at = 1
+        if i < count:
+            end = wp.min((i / BLOCK_SIZE + 1) * BLOCK_SIZE, count)
+            looked_at = list_some(surfels, b, i, end, frustum, seen_from, seen_to, k, visible)
+        j += wp.where(workers == 1, looked_at, workers)
 
 
 @wp.func

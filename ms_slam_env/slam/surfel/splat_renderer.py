@@ -7,6 +7,7 @@ from typing import Any
 
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
+from ms_slam_env.slam.surfel.blocks import Blocks, list_blocks
 from ms_slam_env.slam.surfel.discs import Discs, SplatCamera, project_discs
 from ms_slam_env.slam.surfel.splat import (
     Sums,
@@ -71,6 +72,7 @@ class Culler:
     def __init__(
         self,
         surfels: Surfels,
+        blocks: Blocks,
         visible: VisibleList,
         envs: int,
         camera: SplatCamera,
@@ -78,27 +80,29 @@ class Culler:
         device: str,
         window: SeenWindow | None = None,
     ) -> None:
+        self._blocks = blocks
         self._visible = visible
         window = window or any_time(surfels.count.shape[0], device)
         self._arguments: tuple[Any, ...] = (0, wp.zeros(envs, dtype=wp.mat44, device=device), 0.0)
         first_env, poses, margin_px = self._arguments
-        self._launch = wp.launch(
-            cull,
-            dim=(envs, workers),
-            inputs=[surfels, first_env, poses, camera, margin_px, workers, window, visible],
-            device=device,
-            record_cmd=True,
-        )
+        shared = [surfels, blocks, first_env, poses, camera, margin_px, workers]
+        self._launches = [
+            wp.launch(kernel, (envs, workers), inputs, device=device, record_cmd=True)
+            for kernel, inputs in ((list_blocks, shared), (cull, [*shared, window, visible]))
+        ]
 
     def __call__(self, poses: wp.array, first_env: int = 0, margin_px: float = 0.0) -> None:
         """Fill the list for ``poses`` (envs,) T_world_camera of the envs from ``first_env`` on."""
+        self._blocks.num_listed.zero_()
         self._visible.count.zero_()
         changing = (first_env, poses, margin_px)
-        for index, new, old in zip((1, 2, 4), changing, self._arguments, strict=True):
+        for index, new, old in zip((2, 3, 5), changing, self._arguments, strict=True):
             if new is not old:
-                self._launch.set_param_at_index(index, new)
+                for launch in self._launches:
+                    launch.set_param_at_index(index, new)
         self._arguments = changing
-        self._launch.launch()
+        for launch in self._launches:
+            launch.launch()
 
 
 class SplatRenderer:
@@ -108,6 +112,7 @@ class SplatRenderer:
 
     Args:
         surfels: the maps.
+        blocks: their blocks.
         visible: working list of the surfels in view, shared by all renderers of a map.
         discs: working memory for such a list, shared likewise.
         envs: number of images rendered at once.
@@ -125,6 +130,7 @@ class SplatRenderer:
     def __init__(
         self,
         surfels: Surfels,
+        blocks: Blocks,
         visible: VisibleList,
         discs: Discs,
         envs: int,
@@ -145,7 +151,7 @@ class SplatRenderer:
         pixels = envs * intrinsics.width * intrinsics.height
         self._z_buffer = wp.zeros(pixels, dtype=wp.float32, device=device)
         self._sums = wp.zeros(pixels, dtype=Sums, device=device)
-        self._culler = Culler(surfels, visible, envs, self.camera, workers, device, window)
+        self._culler = Culler(surfels, blocks, visible, envs, self.camera, workers, device, window)
         self._splats = {id(visible): self._record_splats(surfels, visible)}
         self._first_env = {id(visible): 0}
         self._surfels = surfels

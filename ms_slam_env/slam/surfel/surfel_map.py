@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.base import Views
+from ms_slam_env.slam.surfel.blocks import allocate_blocks, bound_blocks, set_bounded
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.discs import allocate_discs
 from ms_slam_env.slam.surfel.fusion import (
@@ -20,7 +21,13 @@ from ms_slam_env.slam.surfel.fusion import (
 )
 from ms_slam_env.slam.surfel.fusion_update import FusionParameters, update_surfels
 from ms_slam_env.slam.surfel.prediction import DeviceViews, ViewPredictor
-from ms_slam_env.slam.surfel.removal import gather, list_survivors, put_back
+from ms_slam_env.slam.surfel.removal import (
+    Removal,
+    expire,
+    gather,
+    list_survivors,
+    put_back,
+)
 from ms_slam_env.slam.surfel.splat_renderer import (
     Culler,
     SplatParameters,
@@ -76,11 +83,13 @@ class SurfelMap:
         capacity = config.max_surfels
         self.surfels = allocate_surfels(batch, capacity, device)
         self._spare = allocate_surfels(batch, capacity, device)
+        self._blocks = allocate_blocks(batch, capacity, device)
         self._visible = allocate_visible(batch, capacity, device)
         self._discs = allocate_discs(batch, capacity, device)
         self.active = any_time(batch, device)
         self._survivors = wp.zeros((batch, capacity), dtype=wp.int32, device=device)
         self._kept = wp.zeros(batch, dtype=wp.int32, device=device)
+        self._expired = wp.zeros(batch, dtype=wp.int32, device=device)
         pixels = batch * intrinsics.width * intrinsics.height
         self._covered = wp.zeros(pixels, dtype=wp.int32, device=device)
         self._fusion = FusionParameters()
@@ -93,6 +102,7 @@ class SurfelMap:
         self._camera = splat_camera(intrinsics, self._parameters)
         self._cull = Culler(
             self.surfels,
+            self._blocks,
             self._visible,
             batch,
             self._camera,
@@ -103,6 +113,7 @@ class SurfelMap:
         self._model_renderer = self.model_renderer(model_stride, self.active)
         self._predictor = ViewPredictor(
             self.surfels,
+            self._blocks,
             self._visible,
             self._discs,
             intrinsics,
@@ -110,13 +121,14 @@ class SurfelMap:
             self._workers,
             device,
         )
-        self._bound: tuple[Any, ...] = (None,) * 5
+        self._arguments: tuple[Any, ...] = (None,) * 5
         self._record_launches()
 
     def model_renderer(self, stride: int, window: SeenWindow) -> SplatRenderer:
         """Renders every ``stride``-th row and column of what was last seen within ``window``."""
         return SplatRenderer(
             self.surfels,
+            self._blocks,
             self._visible,
             self._discs,
             self.batch,
@@ -133,8 +145,8 @@ class SurfelMap:
 
     def clear(self, env: int | None = None) -> None:
         """Forget the map of one env, or of all."""
-        for name in COUNTERS:
-            counter = getattr(self.surfels, name)
+        counters = [getattr(self.surfels, name) for name in COUNTERS]
+        for counter in (*counters, self._blocks.bounded):
             if env is None:
                 counter.zero_()
             else:
@@ -160,27 +172,35 @@ class SurfelMap:
         self._cull(poses)
         self._covered.zero_()
         self._kept.zero_()
+        self._expired.zero_()
         self._bind(live, poses, time, weight, mask)
         self._update.launch()
         self._add.launch()
-        self._list_survivors.launch()
-        self._gather.launch()
-        self._put_back.launch()
+        for launch in (*self._removal, *self._bound):
+            launch.launch()
+
+    def surfels_moved(self) -> None:
+        """Look at all surfels anew: something else than ``fuse`` has changed them."""
+        self._blocks.bounded.zero_()
+        self._blocks.num_listed.zero_()
+        for launch in self._bound:
+            launch.launch()
 
     def _bind(
         self, live: LiveFrame, poses: wp.array, time: wp.array, weight: wp.array, mask: wp.array
     ) -> None:
         """Make these the arguments of the recorded launches, if they are not already."""
         arguments = (live, poses, time, weight, mask)
-        if all(new is old for new, old in zip(arguments, self._bound, strict=True)):
+        if all(new is old for new, old in zip(arguments, self._arguments, strict=True)):
             return
-        self._bound = arguments
+        self._arguments = arguments
         images = (live.depth.flatten(), live.normals.flatten(), live.color.flatten())
         for command in (self._update, self._add):
             for name, value in zip(_CHANGING, (poses, mask, time, weight, *images), strict=True):
                 command.set_param_by_name(name, value)
-        self._list_survivors.set_param_by_name("mask", mask)
-        self._list_survivors.set_param_by_name("time", time)
+        for command in self._removal[:2]:
+            command.set_param_by_name("mask", mask)
+            command.set_param_by_name("time", time)
 
     def _record_launches(self) -> None:
         """Record the launches of ``fuse``; what changes with the frame is set there."""
@@ -201,27 +221,31 @@ class SurfelMap:
 
         self._update = record(update_surfels, [self.surfels, self._visible, *frame])
         self._add = record(add_surfels, [self.surfels, capacity, *frame])
-        self._list_survivors = record(
-            list_survivors,
-            [
-                self.surfels,
-                capacity,
-                integers,
-                integers,
-                config.compaction_interval,
-                config.confidence_threshold,
-                config.unstable_window,
-                workers,
-                self._survivors,
-                self._kept,
-            ],
-        )
-        self._gather = record(
-            gather, [self.surfels, self._spare, self._survivors, self._kept, workers]
-        )
-        self._put_back = record(
-            put_back, [self._spare, self.surfels, self._survivors, self._kept, capacity, workers]
-        )
+        removal = Removal()
+        removal.capacity = capacity
+        removal.interval = config.compaction_interval
+        removal.window = config.unstable_window
+        removal.confidence_threshold = config.confidence_threshold
+        surfels, spare, blocks = self.surfels, self._spare, self._blocks
+        survivors, kept, expired = self._survivors, self._kept, self._expired
+        due = [removal, integers, integers, workers, expired]
+        self._removal = [
+            record(expire, [surfels, blocks, *due]),
+            record(list_survivors, [surfels, *due, survivors, kept]),
+            record(gather, [surfels, spare, survivors, kept, workers]),
+            record(put_back, [spare, surfels, blocks, survivors, expired, kept, capacity, workers]),
+        ]
+        threshold = config.confidence_threshold
+        self._bound = [
+            record(bound_blocks, [surfels, blocks, capacity, threshold, workers]),
+            wp.launch(
+                set_bounded,
+                self.batch,
+                [surfels, blocks, capacity],
+                device=self.device,
+                record_cmd=True,
+            ),
+        ]
 
     def render_model(self, poses: wp.array) -> ModelView:
         """Render every env's map from its pose (B,) mat44 T_world_camera.
@@ -307,3 +331,4 @@ class SurfelMap:
                 used = len(arrays[name])
                 if used:
                     getattr(self.surfels, name)[env, :used].assign(arrays[name])
+        self.surfels_moved()

@@ -233,6 +233,7 @@ class DeformationLoopClosure(LoopClosure):
             ],
             device=self.device,
         )
+        self.map.surfels_moved()
         past = self._past[env]
         moved = deformation.poses(np.stack(past.poses), np.array(past.frames) + 0.5)
         past.poses = list(moved)
@@ -275,6 +276,7 @@ class DeformationLoopClosure(LoopClosure):
             ],
             device=self.device,
         )
+        self.map.surfels_moved()
 
     def trajectory(self, env: int) -> tuple[Int32, Float64]:
         """Tracked frames (N,) and their poses (N, 4, 4), bent by the closures since."""
