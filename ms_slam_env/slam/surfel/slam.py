@@ -19,6 +19,7 @@ from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import check_pose, invert
 from ms_slam_env.slam.base import Float64, TrackResult
+from ms_slam_env.slam.surfel.blank import BLANK, REASON, BlankFrames
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.inputs import check_guesses, check_images, check_poses
 from ms_slam_env.slam.surfel.loops.make import make_loop_closure
@@ -69,6 +70,7 @@ class BatchedSurfelSlam:
         self.relocalisation = make_relocalisation(
             config.relocalisation, batch, intrinsics, config.depth_cutoff_m
         )
+        self._blank_frames = BlankFrames(batch)
         self._device_poses = Mirror(batch, wp.mat44, device)
         self._device_time = Mirror(batch, wp.int32, device)
         self._device_weight = Mirror(batch, wp.float32, device)
@@ -134,6 +136,7 @@ class BatchedSurfelSlam:
         poses = check_poses(T_world_camera, self.batch)
         live = self.preprocess(color, depth)
         self._select_surfels(np.ones(self.batch, dtype=np.int32))  # known poses: old and new fit
+        self._blank_frames.find(color, self._started)
         for env in range(self.batch):
             moves_on = self._started[env] and not self._lost[env]
             motion = invert(self.poses[env]) @ poses[env]
@@ -168,6 +171,8 @@ class BatchedSurfelSlam:
         limits = make_limits(lost, self._lost)
         view = self._render(self.poses)
         alignment = self.tracker.align(view, self.poses, seeds, limits, guesses, self._photometry)
+        blank = self._blank_frames.find(color, self._started)
+        alignment = replace(alignment, verdict=np.where(blank, BLANK, alignment.verdict))
         alignment = self._without_color(view, seeds, alignment)
         if not self.config.refuse_bad_fits:
             alignment = accept_any_fit(alignment)
@@ -253,7 +258,7 @@ class BatchedSurfelSlam:
         return self.tracker.align(view, origins, seeds, limits, photometry=lights)
 
     def _failed(self, alignment: Alignment) -> NDArray[np.bool_]:
-        return self._started & (alignment.verdict != 0)
+        return self._started & (alignment.verdict != OK) & (alignment.verdict != BLANK)
 
     def _readings(self, env: int, live: LiveFrame) -> float:
         """Share of a frame's pixels that have depth."""
@@ -291,7 +296,7 @@ class BatchedSurfelSlam:
             relocalised=relocalised,
             inlier_fraction=float(alignment.stats[env, STAT_INLIER_FRACTION]),
             residual_m=float(alignment.stats[env, STAT_RESIDUAL_M]),
-            reason=REASONS[code],
+            reason=REASON if code == BLANK else REASONS[code],
         )
 
     def _fuse(self, live: LiveFrame, good: NDArray[np.bool_]) -> None:
@@ -345,6 +350,7 @@ class BatchedSurfelSlam:
             "motions": self._motions.copy(),
             "photometry": self._photometry.copy(),
             "started": self._started.copy(),
+            "colorless": self._blank_frames.colorless.copy(),
             "lost": self._lost.copy(),
             "time": self._time.copy(),
             "map": self.map.get_state(),
@@ -358,6 +364,7 @@ class BatchedSurfelSlam:
         self._motions = state["motions"].copy()
         self._photometry = state["photometry"].copy()
         self._started = state["started"].copy()
+        self._blank_frames.colorless = state["colorless"].copy()
         self._lost = state["lost"].copy()
         self._time = state["time"].copy()
         self.map.set_state(state["map"])
@@ -368,9 +375,10 @@ class BatchedSurfelSlam:
 
 def accept_any_fit(alignment: Alignment) -> Alignment:
     """The same with a good verdict wherever there was something to align at all."""
-    usable = alignment.verdict != FEW_POINTS
+    usable = (alignment.verdict != FEW_POINTS) & (alignment.verdict != BLANK)
     usable &= np.isfinite(alignment.T_world_live).all(axis=(1, 2))
-    return replace(alignment, verdict=np.where(usable, OK, FEW_POINTS).astype(np.int32))
+    unusable = np.where(alignment.verdict == BLANK, BLANK, FEW_POINTS)
+    return replace(alignment, verdict=np.where(usable, OK, unusable).astype(np.int32))
 
 
 def motion_weight(motions: Float64) -> NDArray[np.float32]:
