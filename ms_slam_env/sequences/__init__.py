@@ -2,7 +2,8 @@
 
 Rendered, streamed and reproducible bit for bit::
 
-    poses = handheld_trajectory(scene, frames=300, seed=1)
+    poses = HandheldPath(frames=600, loop=True).poses(scene, seed=1)  # or handheld_trajectory,
+    # repeated_trajectory, place_trajectory(scene, *read_trajectory(file)[1:]).poses
     sequence = render_sequence(
         scene, poses, intrinsics, noise="kinect", seed=1,
         perturbations=(RollingShutter(0.03), ExposureJumps(gain=1.5), DepthDropout(0.1)),
@@ -16,6 +17,7 @@ ExposureJumps, AutoExposure, BlackFrames, DepthDropout, DepthQuantisation, Frame
 """
 
 from ms_slam_env.sequences.association import associate
+from ms_slam_env.sequences.handheld_path import HandheldPath
 from ms_slam_env.sequences.perturbations import (
     PERTURBATIONS,
     AutoExposure,
@@ -31,6 +33,7 @@ from ms_slam_env.sequences.perturbations import (
     RollingShutter,
     make_perturbation,
 )
+from ms_slam_env.sequences.placement import Placement, place_trajectory
 from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
 from ms_slam_env.sequences.sequence import RenderedSequence, Sequence, render_sequence
 from ms_slam_env.sequences.trajectories import handheld_trajectory, repeated_trajectory
@@ -45,9 +48,11 @@ __all__ = [
     "ExposureJumps",
     "ExposureRamp",
     "FrameSkipping",
+    "HandheldPath",
     "Misregistration",
     "MotionBlur",
     "Perturbation",
+    "Placement",
     "PoseInterpolation",
     "RenderedSequence",
     "RollingShutter",
@@ -55,6 +60,7 @@ __all__ = [
     "associate",
     "handheld_trajectory",
     "make_perturbation",
+    "place_trajectory",
     "read_trajectory",
     "render_sequence",
     "repeated_trajectory",

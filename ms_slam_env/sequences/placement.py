@@ -1,0 +1,107 @@
+"""A recorded camera motion moved into a scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import check_pose, make_pose, so3_exp
+from ms_slam_env.scenes.base import Scene
+
+Float64 = NDArray[np.float64]
+
+SCALES = tuple(round(1.0 - 0.05 * k, 2) for k in range(19))
+"""Scales tried, from the largest to the smallest."""
+
+_RADIUS_M = 0.15  # free space kept around the camera
+_PLACES = 400  # tried at each scale
+_FIRST_CHECKED = 40  # poses that rule out most places
+
+
+@dataclass(frozen=True)
+class Placement:
+    """A motion in a scene.
+
+    Attributes:
+        poses: (N, 4, 4) T_world_camera.
+        scale: factor on the translations.
+        T_scene_recording: (4, 4) where the recording's world, scaled, lies in the scene.
+    """
+
+    poses: Float64
+    scale: float
+    T_scene_recording: Float64
+
+
+def upright(poses: Float64) -> Float64:
+    """Rotation (3, 3) that turns the world axis nearest to the cameras' mean up into +z."""
+    up = -poses[:, :3, 1].mean(axis=0)
+    axis = int(np.abs(up).argmax())
+    up_axis = np.zeros(3)
+    up_axis[axis] = np.sign(up[axis])
+    if axis == 2:
+        return np.eye(3) if up_axis[2] > 0 else np.diag([1.0, -1.0, -1.0])
+    x = np.cross(up_axis, [0.0, 0.0, 1.0])  # any right-handed frame whose z is up will do
+    return np.stack([x, np.cross(up_axis, x), up_axis])
+
+
+def place_trajectory(
+    scene: Scene, poses: ArrayLike, seed: int = 0, scale: float | None = None
+) -> Placement:
+    """Turn a motion upright and put it into free space of a scene, as large as fits.
+
+    Args:
+        scene: where to.
+        poses: (N, 4, 4) T_world_camera; the world axis nearest to the cameras' up becomes z.
+        seed: of the places tried.
+        scale: factor on the translations; by default the largest of ``SCALES`` that fits.
+
+    Raises:
+        InputError: no pose, a pose that is no rigid motion, a scale that is not positive, or no
+            place where the motion fits.
+    """
+    given = np.asarray(poses, dtype=np.float64)
+    if given.ndim != 3 or len(given) == 0:
+        raise InputError(f"a trajectory must have shape (N, 4, 4), got {given.shape}")
+    for index, pose in enumerate(given):
+        check_pose(pose, f"pose {index} of the trajectory")
+    if scale is not None and not (np.isfinite(scale) and scale > 0):
+        raise InputError(f"scale = {scale} must be finite and above 0")
+    R_up = upright(given)
+    rng = np.random.default_rng([seed, 79])
+    eyes = given[:, :3, 3] @ R_up.T
+    centre = 0.5 * (eyes.min(axis=0) + eyes.max(axis=0))
+    for factor in SCALES if scale is None else (scale,):
+        for _ in range(_PLACES):
+            yaw = so3_exp([0.0, 0.0, rng.uniform(-np.pi, np.pi)])
+            place = _place(scene, rng)
+            moved = factor * (eyes - centre) @ yaw.T + place
+            if not _is_free(scene, moved):
+                continue
+            R = yaw @ R_up
+            result = np.repeat(np.eye(4)[None], len(given), axis=0)
+            result[:, :3, :3] = R @ given[:, :3, :3]
+            result[:, :3, 3] = moved
+            return Placement(result, factor, make_pose(R, place - factor * yaw @ centre))
+    raise InputError(
+        f"the trajectory fits nowhere into scene {scene.name!r}, seed {scene.seed}, "
+        + ("at any scale" if scale is None else f"at scale {scale:g}")
+    )
+
+
+def _place(scene: Scene, rng: np.random.Generator) -> Float64:
+    """A point (3,) within the scene's bounds at about the height of a start pose."""
+    low, high = scene.mesh.vertices.min(0), scene.mesh.vertices.max(0)
+    point = rng.uniform(low, high)
+    point[2] = scene.sample_start(rng)[2, 3] + rng.uniform(-0.2, 0.2)
+    return point
+
+
+def _is_free(scene: Scene, eyes: Float64) -> bool:
+    few = eyes[:: max(1, len(eyes) // _FIRST_CHECKED)]
+    return bool(
+        (scene.clearance(few) > _RADIUS_M).all() and (scene.clearance(eyes) > _RADIUS_M).all()
+    )
