@@ -70,6 +70,12 @@ class Relocalisation(ABC):
         """
 
     @abstractmethod
+    def similar(
+        self, env: int, color: NDArray[np.uint8], depth: NDArray[np.float32], before: int
+    ) -> list[Candidate]:
+        """The best few keyframes from before a time that resemble a frame, best first."""
+
+    @abstractmethod
     def move(self, env: int, time: NDArray[np.int32], poses: Float64) -> None:
         """Follow a map that was bent: frames ``time`` (N,) were taken at ``poses`` (N, 4, 4)."""
 
@@ -108,6 +114,12 @@ class LocalSearch(Relocalisation):
     ) -> tuple[Bool, Alignment] | None:
         """Nowhere else to search."""
         return None
+
+    def similar(
+        self, env: int, color: NDArray[np.uint8], depth: NDArray[np.float32], before: int
+    ) -> list[Candidate]:
+        """No keyframes."""
+        return []
 
     def move(self, env: int, time: NDArray[np.int32], poses: Float64) -> None:
         """Nothing to move."""
@@ -203,6 +215,13 @@ class FernRelocalisation(Relocalisation):
         origins = np.where(np.isfinite(starts), starts, np.eye(4))
         limits = make_limits(np.ones(batch, dtype=bool), np.full(batch, reach, dtype=np.int32))
         return align(origins, np.tile(seeds, (batch, 1, 1, 1)), limits)
+
+    def similar(
+        self, env: int, color: NDArray[np.uint8], depth: NDArray[np.float32], before: int
+    ) -> list[Candidate]:
+        """At most ``CANDIDATES``, apart from each other."""
+        near = self.databases[env].candidates(color, depth, _LOOKED_AT, before)
+        return _spread(near)[:CANDIDATES]
 
     def move(self, env: int, time: NDArray[np.int32], poses: Float64) -> None:
         """Put the keyframes where their frames are now."""

@@ -19,6 +19,7 @@ from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import check_pose, invert
 from ms_slam_env.slam.base import Float64, TrackResult
+from ms_slam_env.slam.ferns import Candidate
 from ms_slam_env.slam.surfel.blank import BLANK, REASON, BlankFrames
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.inputs import check_guesses, check_images, check_poses
@@ -122,7 +123,7 @@ class BatchedSurfelSlam:
         self._correct_exposure(live, self._photometry)
         self.relocalisation.remember(color, depth, self.poses, self._time, good)
         self._fuse(live, good)
-        return self._close_loops(live, results)
+        return self._close_loops(live, results, color, depth)
 
     def fuse(
         self, color: NDArray[np.uint8], depth: NDArray[np.float32], T_world_camera: Float64
@@ -321,13 +322,23 @@ class BatchedSurfelSlam:
 
     def _select_surfels(self, lost: NDArray[np.int32]) -> None:
         """Let loop closure choose what frames are aligned with and fused into."""
-        if self.loops.select(self._time, lost):
+        if self.loops.select(lost):
             self._view_poses = None
 
-    def _close_loops(self, live: LiveFrame, results: list[TrackResult]) -> list[TrackResult]:
+    def _close_loops(
+        self,
+        live: LiveFrame,
+        results: list[TrackResult],
+        color: NDArray[np.uint8],
+        depth: NDArray[np.float32],
+    ) -> list[TrackResult]:
         """Close loops after fusion; a closed one corrects the map and the pose."""
+
+        def similar(env: int, before: int) -> list[Candidate]:
+            return self.relocalisation.similar(env, color[env], depth[env], before)
+
         tracked = np.array([result.tracking_ok for result in results])
-        closed = self.loops.close(live, self.poses, self._time - 1, tracked)
+        closed = self.loops.close(live, self.poses, self._time - 1, tracked, similar)
         for env in np.flatnonzero(closed):
             self.relocalisation.move(int(env), *self.loops.trajectory(int(env)))
             results[env] = replace(

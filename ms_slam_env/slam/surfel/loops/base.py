@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env.slam.ferns import Candidate
 from ms_slam_env.slam.surfel.types import LiveFrame
 
 Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
 Bool = NDArray[np.bool_]
+
+
+class SimilarViews(Protocol):
+    """Finds keyframes that resemble the frame just tracked."""
+
+    def __call__(self, env: int, before: int) -> list[Candidate]:
+        """Those of one env that were taken before a frame, the most similar first."""
 
 
 class LoopClosure(ABC):
@@ -23,11 +31,10 @@ class LoopClosure(ABC):
         """Forget one env."""
 
     @abstractmethod
-    def select(self, time: Int32, lost: Int32) -> bool:
+    def select(self, lost: Int32) -> bool:
         """Choose the surfels that the next frames are tracked against and fused into.
 
         Args:
-            time: (B,) number of the frame to come.
             lost: (B,) frames since tracking was lost; 0 = tracked.
 
         Returns:
@@ -45,7 +52,9 @@ class LoopClosure(ABC):
         """
 
     @abstractmethod
-    def close(self, live: LiveFrame, poses: Float64, time: Int32, tracked: Bool) -> Bool:
+    def close(
+        self, live: LiveFrame, poses: Float64, time: Int32, tracked: Bool, similar: SimilarViews
+    ) -> Bool:
         """Look for loops after frames were fused and recorded; correct maps and ``poses`` in place.
 
         Args:
@@ -53,6 +62,7 @@ class LoopClosure(ABC):
             poses: (B, 4, 4) T_world_camera; those of closed loops are overwritten.
             time: (B,) numbers of the frames.
             tracked: (B,) whether the frame was tracked and fused.
+            similar: finds the keyframes that resemble an env's frame.
 
         Returns:
             (B,) which envs closed a loop.
@@ -84,14 +94,16 @@ class NoLoopClosure(LoopClosure):
     def reset(self, env: int) -> None:
         """There is nothing to forget."""
 
-    def select(self, time: Int32, lost: Int32) -> bool:
+    def select(self, lost: Int32) -> bool:
         """All surfels, always."""
         return False
 
     def record(self, poses: Float64, time: Int32, fused: Bool) -> None:
         """Nothing is kept."""
 
-    def close(self, live: LiveFrame, poses: Float64, time: Int32, tracked: Bool) -> Bool:
+    def close(
+        self, live: LiveFrame, poses: Float64, time: Int32, tracked: Bool, similar: SimilarViews
+    ) -> Bool:
         """Never."""
         return self._never
 

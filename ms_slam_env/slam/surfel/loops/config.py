@@ -23,8 +23,12 @@ class LoopConfig:
         inliers: least share of matched points that the registration explains.
         largest_m: largest correction of the camera's position that is believed.
         largest_deg: largest correction of its rotation.
-        smallest_m: a correction that moves no matched point further bends nothing: the inactive
-            surfels are taken back as they are.
+        smallest_m: a correction that moves a point at 1 m less than this bends nothing: the
+            inactive surfels are taken back as they are.
+        global_interval: frames between two looks at keyframes; a multiple of ``interval``.
+        dissimilarity: of a frame and a keyframe that may show the same place, share of the ferns.
+        drift_share: a keyframe's place is believed if it is no further away than this share of the
+            way since.
         surfels_per_node: of the deformation graph.
         max_nodes: of the deformation graph.
         constraint_columns: the image is divided into so many columns, with rows as high as they
@@ -44,6 +48,9 @@ class LoopConfig:
     largest_m: float = 0.3
     largest_deg: float = 20.0
     smallest_m: float = 0.002
+    global_interval: int = 10
+    dissimilarity: float = 0.5
+    drift_share: float = 0.15
     surfels_per_node: int = 400
     max_nodes: int = 200
     constraint_columns: int = 16
@@ -60,6 +67,9 @@ class LoopConfig:
         check_range(self, "largest_m", 0.0, 100.0)
         check_range(self, "largest_deg", 0.0, 180.0)
         check_range(self, "smallest_m", 0.0, 1.0)
+        check_range(self, "global_interval", 1, 10_000)
+        check_range(self, "dissimilarity", 0.0, 1.0)
+        check_range(self, "drift_share", 0.0, 10.0)
         check_range(self, "surfels_per_node", 10, 1_000_000)
         check_range(self, "max_nodes", 10, 10_000)
         check_range(self, "constraint_columns", 2, 100)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import transform_points
@@ -94,3 +95,16 @@ def surface_constraints(
     )
     holds = Constraints(inactive.world, inactive.times, inactive.world, np.full(pins, np.nan))
     return join([moves, holds])
+
+
+def relative_to(
+    constraints: Constraints, active: VisiblePoints, inactive: VisiblePoints
+) -> Constraints:
+    """The moves among ``surface_constraints`` as relative ones, which later loops must respect.
+
+    A target is as old as the nearest pin.
+    """
+    count = len(active.world)
+    targets = constraints.targets[:count]
+    _, nearest = cKDTree(inactive.world).query(targets)
+    return Constraints(active.world, active.times, targets, inactive.times[nearest])

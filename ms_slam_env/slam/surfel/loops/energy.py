@@ -13,7 +13,7 @@ nine numbers of R row by row, then t.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,12 +59,26 @@ class Constraints:
 
     def errors(self, deformation: Deformation) -> Float64:
         """Distances (C,) that remain, metres."""
+        moved = self.moved_by(deformation)
+        return np.linalg.norm(moved.sources - moved.targets, axis=1)
+
+    def moved_by(self, deformation: Deformation) -> Constraints:
+        """The same after a deformation of the map; fixed targets stay."""
         relative = np.isfinite(self.target_times)
         targets = self.targets.copy()
-        if relative.any():
-            targets[relative] = deformation.points(targets[relative], self.target_times[relative])
-        moved = deformation.points(self.sources, self.source_times)
-        return np.linalg.norm(moved - targets, axis=1)
+        targets[relative] = deformation.points(targets[relative], self.target_times[relative])
+        sources = deformation.points(self.sources, self.source_times)
+        return replace(self, sources=sources, targets=targets)
+
+    def last(self, count: int) -> Constraints:
+        """The newest ``count`` of them."""
+        first = max(0, len(self) - count)
+        return Constraints(
+            self.sources[first:],
+            self.source_times[first:],
+            self.targets[first:],
+            self.target_times[first:],
+        )
 
 
 def join(parts: list[Constraints]) -> Constraints:
