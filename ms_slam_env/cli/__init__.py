@@ -9,6 +9,7 @@ from importlib import import_module
 COMMANDS = {
     "benchmark": "run planners on scenes with SLAM in the loop and compare them",
     "compare": "run SLAM backends over the same sequences and compare them",
+    "divergence": "measure how hard recorded sequences are, from frame to frame",
     "evaluate": "compare an estimated trajectory with the truth (TUM files)",
     "run": "run a SLAM backend over a recorded RGB-D sequence",
     "train": "train an agent with one of the installed training scripts",

@@ -1,0 +1,60 @@
+"""``ms-slam divergence``."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import tyro
+
+from ms_slam_env.benchmark.command_line import parse
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """How hard recorded sequences are: divergence from frame to frame, as in the paper's Table I.
+
+    Layouts are those of ms-slam run. Writes divergence.json, table.md and divergence.png.
+    """
+
+    sequences: tyro.conf.Positional[tuple[Path, ...]]
+    """Folders of sequences."""
+    image_size: str = "native"
+    """Reduce the images to this size, such as 160x120."""
+    layout: str = "auto"
+    """auto, tum, icl-nuim, 7-scenes or folder."""
+    every: int = 1
+    """Take every n-th frame."""
+    paper: bool = False
+    """The paper's histograms (256 levels, no smoothing) in place of this package's defaults."""
+    out: Path = Path("results/divergence")
+    """Folder of the results."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Measure, write and print the table."""
+    args = parse(Arguments, arguments, "ms-slam divergence")
+    from ms_slam_env.benchmark import sequence_divergence as measure
+    from ms_slam_env.benchmark.provenance import provenance
+    from ms_slam_env.benchmark.records import write_json
+    from ms_slam_env.divergence import DivergenceConfig
+    from ms_slam_env.errors import InputError
+    from ms_slam_env.sequences.recording import open_recording
+
+    if not args.sequences:
+        raise InputError("no sequence given")
+    config = DivergenceConfig.paper() if args.paper else DivergenceConfig()
+    recordings = [open_recording(path, args.layout) for path in args.sequences]
+    sized = [recording.at_size(args.image_size) for recording in recordings]
+    measured = [measure.sequence_divergence(recording, config, args.every) for recording in sized]
+    settings = {"divergence": asdict(config), "image_size": args.image_size, "every": args.every}
+    sequences = measure.content(measured)
+    write_json(args.out / "divergence.json", {**provenance(), **settings, "sequences": sequences})
+    text = measure.table(measured)
+    (args.out / "table.md").write_text(text, encoding="utf-8")
+    measure.save_figure(measured, args.out / "divergence.png")
+    print(text)
+    print(f"written: {args.out}/divergence.json, table.md, divergence.png", file=sys.stderr)
+    return 0
