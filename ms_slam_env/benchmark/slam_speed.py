@@ -135,10 +135,12 @@ def run_child(arguments: dict[str, Any], checkout: Path | None) -> list[dict[str
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         environment[variable] = "1"
     root = checkout or Path(__file__).resolve().parents[2]
-    environment["PYTHONPATH"] = str(root.resolve())
+    root = root.resolve()
+    environment["PYTHONPATH"] = str(root)
     # Not as a script: its folder, first on the path then, would hide modules of Python.
     words = [sys.executable, "-c", _START, str(slam_speed_child.__file__), json.dumps(arguments)]
-    done = subprocess.run(words, env=environment, capture_output=True, text=True)
+    # In the checkout: the current folder comes before PYTHONPATH.
+    done = subprocess.run(words, env=environment, cwd=root, capture_output=True, text=True)
     if done.returncode != 0:
         lines = done.stderr.strip().splitlines() or ["no message"]
         raise RuntimeError(f"the measurement in {root} failed: {lines[-1]}")
@@ -158,7 +160,7 @@ def run(config: SlamSpeedConfig) -> SpeedReport:
         versions[OLD] = config.against
     shared = {"warm_up": config.warm_up, "stored": list(config.stored)}
     shared["backend"] = backend_parameters(config.backend)
-    paths = {size: str(store_sequence(config, size)) for size in config.sizes}
+    paths = {size: str(store_sequence(config, size).resolve()) for size in config.sizes}
     rounds = [(repeat, size) for repeat in range(config.repeats) for size in config.sizes]
     for repeat, size in tqdm(rounds, desc="measurements", file=sys.stderr):
         for version, checkout in versions.items():

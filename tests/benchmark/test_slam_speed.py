@@ -5,7 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from ms_slam_env.benchmark.slam_speed import SlamSpeedConfig, backend_parameters, main
+from ms_slam_env.benchmark.slam_speed import (
+    SlamSpeedConfig,
+    backend_parameters,
+    main,
+    run_child,
+)
 from ms_slam_env.benchmark.slam_speed_child import APART_M, with_far_places
 from ms_slam_env.benchmark.slam_speed_report import summarise
 from ms_slam_env.errors import InputError
@@ -28,6 +33,14 @@ def test_stages_add_up_and_stored_surfels_are_as_asked(tmp_path, capsys):
     assert (tmp_path / "slam_speed.png").stat().st_size > 1000
     header, _, *lines = capsys.readouterr().out.strip().splitlines()
     assert {line.count("|") for line in lines} == {header.count("|")}
+
+
+def test_the_package_of_the_other_checkout_is_used(tmp_path):
+    package = tmp_path / "ms_slam_env"
+    package.mkdir()
+    (package / "__init__.py").write_text("raise RuntimeError('another package')")
+    with pytest.raises(RuntimeError, match="another package"):
+        run_child({}, tmp_path)
 
 
 def test_far_places_are_older_stable_and_out_of_sight():
