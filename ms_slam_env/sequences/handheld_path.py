@@ -17,7 +17,7 @@ from ms_slam_env.sequences.trajectories import RADIUS_M, free_path
 
 Float64 = NDArray[np.float64]
 
-_STARTS = 3
+_STARTS = 5
 _CLOSED_PATHS = 4  # to choose among, per start
 _PACE_PERIODS_S = (2.3, 5.1, 11.7)
 

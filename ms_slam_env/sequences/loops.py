@@ -24,11 +24,11 @@ _REACH_M = 0.7  # between places that are joined
 _HEIGHT_M = 0.25  # places lie so far above or below the start
 _DETOUR = 4.0  # a way that was taken already counts as so many times its length
 _FEWEST_WAYPOINTS = 12  # 30 degrees of the turn between two of them
-_SWEEP_RAD = np.radians(35.0)  # off the evenly turning direction
-_TURN_RAD = np.radians(60.0)  # between the viewing directions of two waypoints
-_FARTHEST_M = 3.5
-_DESTINATIONS = 60  # tried for one start
-_NEAREST_DESTINATION_M = 0.6
+_SWEEP_RAD = np.radians(45.0)  # off the evenly turning direction
+_TURN_RAD = np.radians(70.0)  # between the viewing directions of two waypoints
+_FARTHEST_M = 4.5
+_DESTINATIONS = 120  # tried for one start
+_NEAR_M = 0.6  # destinations nearer than this are tried last
 
 
 @dataclass(frozen=True)
@@ -117,8 +117,9 @@ def closed_paths(scene: Scene, rng: np.random.Generator, radius_m: float) -> Ite
     heading = unit(start[:3, 2] * (1.0, 1.0, 0.0))
     gaze = Gaze(scene)
     distance = np.linalg.norm(roadmap.places - roadmap.places[0], axis=1)
-    others = np.flatnonzero(distance > _NEAREST_DESTINATION_M)
-    for destination in rng.permutation(others)[:_DESTINATIONS]:
+    others = 1 + rng.permutation(len(distance) - 1)
+    far_first = others[np.argsort(distance[others] < _NEAR_M, kind="stable")]
+    for destination in far_first[:_DESTINATIONS]:
         eyes = _round_trip(roadmap, int(destination))
         targets = _sweep(eyes, heading, gaze, rng) if eyes else None
         if targets is None:
