@@ -1,0 +1,136 @@
+"""Several SLAMs in one batch do bit for bit what each does alone, whatever the others do."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import pytest
+from box_scene import BoxScene
+
+from ms_slam_env.camera import RGBDFrame, xtion
+from ms_slam_env.geometry import look_at, make_pose, so3_exp
+from ms_slam_env.sensor import RGBDSensor
+from ms_slam_env.slam.base import TrackResult
+from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
+
+CAMERA = xtion("80x60")
+CONFIG = SurfelConfig(
+    max_surfels=5000,  # so few that maps get crowded
+    depth_cutoff_m=4.0,
+    compaction_interval=3,
+    unstable_window=4,
+)
+STEPS = 13
+ENVS = 5
+FUSED = (4, 9)  # steps at known poses; at the others frames are tracked
+BLACK = {(1, 3), (1, 4), (1, 5), (3, 7), (4, 1)}  # (env, step) without a picture
+RESET = {(2, 6), (4, 8)}
+JUMP = (3, 8)  # env 3 is carried away; nothing there resembles what it has seen
+
+
+def start_of(env: int) -> np.ndarray:
+    eye = [-0.8 + 0.3 * env, -0.8, 1.2]
+    return look_at(eye, [1.2 - 0.5 * env, 0.4, 0.6])
+
+
+@pytest.fixture(scope="module")
+def sequences(box_scene: BoxScene) -> list[list[tuple[RGBDFrame, np.ndarray]]]:
+    """Frames and true poses of all envs, each with its own path and noise."""
+    result = []
+    for env in range(ENVS):
+        sensor = RGBDSensor(box_scene, CAMERA, noise="kinect", seed=env)
+        pose, rng, frames = start_of(env), np.random.default_rng(env), []
+        for step in range(STEPS):
+            pose = pose @ make_pose(so3_exp(rng.normal(0, 0.008, 3)), rng.normal(0, 0.008, 3))
+            if (env, step) == JUMP:
+                pose = look_at([0.0, 0.0, 1.5], [-2.0, -2.0, 0.5])
+            frame = sensor.capture(pose, step)
+            if (env, step) in BLACK:
+                frame = RGBDFrame(np.zeros_like(frame.color), np.zeros_like(frame.depth))
+            frames.append((frame, pose))
+        result.append(frames)
+    return result
+
+
+def run(sequences: list[list[tuple[RGBDFrame, np.ndarray]]], envs: list[int]) -> dict[str, Any]:
+    """Results of every step, and maps and views at the end, of some envs in one batch."""
+    slam = BatchedSurfelSlam(len(envs), CAMERA, CONFIG)
+    for row, env in enumerate(envs):
+        slam.reset(sequences[env][0][1], row)
+    results: list[list[TrackResult]] = []
+    for step in range(STEPS):
+        for row, env in enumerate(envs):
+            if (env, step) in RESET:
+                slam.reset(sequences[env][step][1], row)
+        color = np.stack([sequences[env][step][0].color for env in envs])
+        depth = np.stack([sequences[env][step][0].depth for env in envs])
+        poses = np.stack([sequences[env][step][1] for env in envs])
+        if step in FUSED:
+            results.append(slam.fuse(color, depth, poses))
+            continue
+        # Every other env has a good guess now and then; all at once have none in between.
+        guesses = [
+            pose if (env + step) % 2 == 0 and step % 3 == 0 else None
+            for env, pose in zip(envs, poses, strict=True)
+        ]
+        results.append(slam.track(color, depth, guesses if step % 3 == 0 else None))
+    motions = np.stack([make_pose(np.eye(3), [x, 0, 0]) for x in (-0.05, 0.05)])
+    return {
+        "results": results,
+        "maps": slam.map.get_state()["surfels"],
+        "counts": [slam.map.count(row) for row in range(len(envs))],
+        "views": [
+            slam.map.predict(slam.poses[row] @ motions, 0.5, row) for row in range(len(envs))
+        ],
+        "state": slam.get_state(),
+    }
+
+
+@pytest.fixture(scope="module")
+def alone(sequences) -> list[dict[str, Any]]:
+    return [run(sequences, [env]) for env in range(ENVS)]
+
+
+@pytest.mark.parametrize("envs", [[0, 1], [4, 2, 3, 1, 0]])
+def test_a_batch_does_what_its_envs_do_alone(sequences, alone, envs):
+    together = run(sequences, envs)
+    for row, env in enumerate(envs):
+        single = alone[env]
+        for step in range(STEPS):
+            expected = asdict(single["results"][step][0])
+            found = asdict(together["results"][step][row])
+            for name, value in expected.items():
+                message = f"{name} of env {env} in step {step}"
+                np.testing.assert_array_equal(found[name], value, err_msg=message)
+        assert together["counts"][row] == single["counts"][0]
+        for name, values in single["maps"][0].items():
+            np.testing.assert_array_equal(together["maps"][row][name], values, err_msg=name)
+        for name in ("intensity", "depth", "normals"):
+            found = getattr(together["views"][row], name)
+            np.testing.assert_array_equal(found, getattr(single["views"][0], name))
+        for name in ("poses", "motions", "started", "lost", "time"):
+            np.testing.assert_array_equal(
+                together["state"][name][row], single["state"][name][0], err_msg=name
+            )
+
+
+def test_the_envs_differ_in_what_they_do(alone):
+    """Otherwise the comparison would say little."""
+    ok = np.array([[step[0].tracking_ok for step in single["results"]] for single in alone])
+    assert ok[0].all()
+    assert not ok[1, 3]
+    assert not ok[3, 7:9].any()
+    assert (ok.mean(axis=1) > 0.5).all()
+    assert len({tuple(row) for row in ok}) >= 4
+    counts = [single["counts"][0] for single in alone]
+    assert min(counts) > 2000
+    assert max(counts) > 0.9 * CONFIG.max_surfels  # crowded: unstable surfels had to go at once
+
+
+def test_a_batch_of_one_repeats_itself(sequences, alone):
+    again = run(sequences, [1])
+    for step in range(STEPS):
+        pose = alone[1]["results"][step][0].T_world_camera
+        np.testing.assert_array_equal(again["results"][step][0].T_world_camera, pose)
