@@ -78,6 +78,7 @@ def run_sequence(
         "layout": recording.layout,
         "backend": backend,
         "params": params,
+        "registration": None if recording.registration is None else str(recording.registration),
         "image_size": f"{recording.intrinsics.width}x{recording.intrinsics.height}",
         **provenance(),
     }

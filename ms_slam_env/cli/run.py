@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,9 @@ class Arguments:
     """Reduce the images to this size, such as 160x120."""
     layout: str = "auto"
     """auto, tum, icl-nuim, 7-scenes or folder."""
+    register: bool | None = None
+    """Bring colour into the depth camera, as an uncalibrated Kinect needs it; by default only for
+    7-scenes."""
     params: tuple[str, ...] = ()
     """Parameters of the backend, as in icp_rgb_weight=0.2."""
     out: Path = Path("results/run")
@@ -40,7 +44,10 @@ def main(arguments: Sequence[str]) -> int:
     from ms_slam_env.benchmark.sequence_run import run_sequence
     from ms_slam_env.sequences.recording import open_recording
 
-    recording = open_recording(args.sequence, args.layout).at_size(args.image_size)
+    recording = open_recording(args.sequence, args.layout, register=args.register)
+    recording = recording.at_size(args.image_size)
+    if recording.registration is not None:
+        print(recording.registration, file=sys.stderr)
     result = run_sequence(recording, args.backend, nested_options(args.params), args.out)
     for name in ("frames", "lost_frames", "ms_median", "path_m", "ate_m", "rpe_m"):
         if name in result:

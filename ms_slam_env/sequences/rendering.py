@@ -107,6 +107,11 @@ class RenderedFrames(collections.abc.Sequence[RGBDFrame]):
             frame = perturbation.apply(frame, moment)
         return frame
 
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the objects in the scene, by the labels of ``truth``."""
+        return self._sensor.scene.mesh.labels
+
     def truth(self, index: int) -> TrueView:
         """Noise-free view (colour, depth, normals, labels, points) from the true pose of a frame.
 

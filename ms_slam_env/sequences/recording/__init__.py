@@ -2,5 +2,6 @@
 
 from ms_slam_env.sequences.recording.layouts import LAYOUTS, open_recording
 from ms_slam_env.sequences.recording.recording import Entry, Recording
+from ms_slam_env.sequences.recording.registration import Registration
 
-__all__ = ["LAYOUTS", "Entry", "Recording", "open_recording"]
+__all__ = ["LAYOUTS", "Entry", "Recording", "Registration", "open_recording"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -25,7 +26,9 @@ from ms_slam_env.sequences.recording.listings import (
     rows,
 )
 from ms_slam_env.sequences.recording.recording import Entry, Recording
+from ms_slam_env.sequences.recording.registration import Registration
 from ms_slam_env.sequences.tum import read_trajectory
+from ms_slam_env.sequences.writing import UNFINISHED
 
 Float64 = NDArray[np.float64]
 
@@ -130,14 +133,19 @@ def _listed(folder: Path, layout: str, camera: Calibration) -> Recording:
 
 
 def open_seven_scenes(folder: Path, intrinsics: Intrinsics | None) -> Recording:
-    """7-Scenes: ``frame-NNNNNN.color.png``, ``.depth.png`` in millimetres, ``.pose.txt``."""
+    """7-Scenes: ``frame-NNNNNN.color.png``, ``.depth.png`` in millimetres, ``.pose.txt``.
+
+    Colour and depth are the raw images of two cameras, so colour is registered by default, with
+    the numbers of ``Registration``.
+    """
     camera = _calibration_of(folder, intrinsics, SEVEN_SCENES_CAMERA)
     entries, poses = [], []
+    has_color = any(folder.glob("frame-*.color.png"))
     for depth in sorted(folder.glob("frame-*.depth.png")):
         stem = depth.name.removesuffix(".depth.png")
         color, pose = folder / f"{stem}.color.png", folder / f"{stem}.pose.txt"
         time = number(stem.removeprefix("frame-"), str(depth)) / FRAME_RATE_HZ
-        entries.append(Entry(time, depth, color, str(depth)))
+        entries.append(Entry(time, depth, color if has_color else None, str(depth)))
         if pose.is_file():
             poses.append((time, read_matrix(pose)))
     return Recording(
@@ -150,6 +158,7 @@ def open_seven_scenes(folder: Path, intrinsics: Intrinsics | None) -> Recording:
         no_reading=SEVEN_SCENES_NO_READING,
         truth_times=np.array([time for time, _ in poses]) if poses else None,
         truth=np.stack([T for _, T in poses]) if poses else None,
+        registration=Registration(),
     )
 
 
@@ -213,7 +222,10 @@ def _recognise(folder: Path) -> str:
 
 
 def open_recording(
-    path: str | Path, layout: str = "auto", intrinsics: Intrinsics | None = None
+    path: str | Path,
+    layout: str = "auto",
+    intrinsics: Intrinsics | None = None,
+    register: bool | Registration | None = None,
 ) -> Recording:
     """Open a recorded sequence; images are read later, frame by frame.
 
@@ -222,13 +234,23 @@ def open_recording(
         layout: ``auto`` or one of ``LAYOUTS``.
         intrinsics: of the images on disk; by default those of ``intrinsics.txt`` in the folder,
             else the published ones of the dataset.
+        register: whether to bring colour into the depth camera, with the numbers of an
+            uncalibrated Kinect or with those given; by default only the layout 7-Scenes does,
+            whose images are not registered.
 
     Raises:
-        InputError: no such folder or layout, intrinsics missing, a listing that does not parse.
+        InputError: no such folder or layout, a sequence that was not written to its end,
+            intrinsics missing, a listing that does not parse.
     """
     folder = Path(path).resolve()
     if not folder.is_dir():
         raise InputError(f"no sequence at {path}: not a folder")
     if layout != "auto" and layout not in LAYOUTS:
         raise unknown("layout", layout, ("auto", *LAYOUTS))
-    return LAYOUTS[_recognise(folder) if layout == "auto" else layout](folder, intrinsics)
+    if (folder / UNFINISHED).is_file():
+        raise InputError(f"{path} was not generated to its end: give its command again")
+    found = LAYOUTS[_recognise(folder) if layout == "auto" else layout](folder, intrinsics)
+    if register is None:
+        return found
+    given = register if isinstance(register, Registration) else Registration()
+    return dataclasses.replace(found, registration=given if register else None)

@@ -20,6 +20,9 @@ MAX_DIFFERENCE_S = 0.02
 """Colour and depth further apart in time are not one frame (the tolerance of the TUM tools)."""
 
 
+_ROUNDED = 1e-2  # as for the length of a quaternion
+
+
 @dataclass(frozen=True)
 class Listed:
     """A file with its time and the line that lists it."""
@@ -84,13 +87,19 @@ def listed_images(path: Path) -> list[Listed]:
 def read_matrix(path: Path) -> Float64:
     """Read a pose (4, 4) T_world_camera written as four rows of four numbers.
 
+    A rotation that is orthonormal but for rounding is made so exactly.
+
     Raises:
         InputError: another shape, NaN, or no rigid motion.
     """
     values = [[number(word, where) for word in words] for where, words in rows(path)]
     if [len(row) for row in values] != [4, 4, 4, 4]:
         raise InputError(f"{path}: expected 4 rows of 4 numbers")
-    return check_pose(np.array(values), str(path))
+    matrix = np.array(values)
+    if np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max() < _ROUNDED:
+        left, _, right = np.linalg.svd(matrix[:3, :3])  # the nearest orthonormal matrix
+        matrix[:3, :3] = left @ right
+    return check_pose(matrix, str(path))
 
 
 @dataclass(frozen=True)

@@ -3,20 +3,35 @@
 from __future__ import annotations
 
 import dataclasses
+import struct
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from ms_slam_env.camera import XTION_SIZES, Intrinsics, RGBDFrame
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.sequences.recording.reduction import reduce_color, reduce_depth
+from ms_slam_env.sequences.recording.registration import Registration
 
 Float64 = NDArray[np.float64]
+
+# What Pillow raises for files that are missing, truncated or damaged, format by format.
+_BROKEN_IMAGE = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    EOFError,
+    IndexError,
+    struct.error,
+    zlib.error,
+    Image.DecompressionBombError,
+)
 
 NATIVE = "native"
 """The image size that keeps the recording's own."""
@@ -53,6 +68,8 @@ class Recording:
         no_reading: value of a depth image, besides 0, that means no reading.
         truth_times: (M,) seconds, or None.
         truth: (M, 4, 4) true T_world_camera, or None.
+        registration: where the colour camera is, if colour has to be brought into the depth
+            camera; None where the recording has that done.
 
     Raises:
         InputError: no frame, or times that do not increase.
@@ -67,6 +84,7 @@ class Recording:
     no_reading: int | None = None
     truth_times: Float64 | None = None
     truth: Float64 | None = None
+    registration: Registration | None = None
 
     def __post_init__(self) -> None:
         """Refuse what cannot be a sequence."""
@@ -129,8 +147,11 @@ class Recording:
             color = self._read(entry.color, entry, "a colour image", ("RGB", "RGBA", "L", "P"))
         size = (self.intrinsics.width, self.intrinsics.height)
         if self.intrinsics.shape != self.source.shape:
-            color = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
-            depth = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST)
+            color = reduce_color(color, size)
+            depth = reduce_depth(depth, size)
+        if self.registration is not None and entry.color is not None:
+            factor = self.intrinsics.width / self.source.width
+            color = self.registration.register(color, depth, self.intrinsics, factor)
         return RGBDFrame(np.ascontiguousarray(color), np.ascontiguousarray(depth), entry.timestamp)
 
     def __iter__(self) -> Iterator[RGBDFrame]:
@@ -144,7 +165,10 @@ class Recording:
                 if image.mode not in modes:
                     raise InputError(f"{entry.where}: {path} is not {kind}, mode {image.mode}")
                 pixels = np.asarray(image.convert("RGB") if modes[0] == "RGB" else image)
-        except OSError as error:
-            raise InputError(f"{entry.where}: cannot read {path}: {error}") from None
+        except InputError:
+            raise
+        except _BROKEN_IMAGE as error:
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise InputError(f"{entry.where}: cannot read {path}: {reason}") from None
         self.source.check_image(pixels, f"{entry.where}: {path}")
         return pixels

@@ -1,0 +1,96 @@
+"""``ms-slam generate``."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ms_slam_env.benchmark.command_line import parse
+from ms_slam_env.sequences.handheld_path import HandheldPath
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Render an RGB-D sequence with true poses, in the TUM layout that ms-slam run reads.
+
+    An interrupted run goes on from where it was when the same command is given again; until it is
+    done the folder's name ends in .partial.
+    """
+
+    scene: str = "living_room"
+    """Name of a scene, or a mesh file."""
+    seed: int = 0
+    """Of the scene, the path, the noise and the perturbations."""
+    path: HandheldPath = field(default_factory=HandheldPath)
+    """Seeded hand-held path; not used with --trajectory."""
+    trajectory: Path | None = None
+    """Camera motion to place into the scene instead (TUM file)."""
+    scale: float | None = None
+    """Factor on that motion; by default the largest up to 1 that fits."""
+    image_size: str = "320x240"
+    """Size of the images."""
+    noise: str = "kinect"
+    """Noise of the sensor: kinect or none."""
+    perturbations: tuple[str, ...] = ()
+    """NAME, options appended as in motion-blur,exposure_s=0.02,samples=8."""
+    truth: bool = False
+    """Also write true depth and object labels."""
+    out: Path = Path("results/sequence")
+    """Folder of the sequence."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Render and write."""
+    args = parse(Arguments, arguments, "ms-slam generate")
+    from ms_slam_env import __version__, scenes
+    from ms_slam_env.benchmark.options import parse_named
+    from ms_slam_env.camera import xtion
+    from ms_slam_env.sensor.noise import noise_config
+    from ms_slam_env.sequences import make_perturbation, read_trajectory, render_sequence
+    from ms_slam_env.sequences.writing import write_sequence
+
+    named = [parse_named(text, "perturbation") for text in args.perturbations]
+    perturbations = [make_perturbation(name, options) for name, options in named]
+    intrinsics = xtion(args.image_size)
+    noise = noise_config(args.noise)
+    recorded = None if args.trajectory is None else read_trajectory(args.trajectory)
+    scene = scenes.make(args.scene, args.seed)
+    times, poses, placed = _motion(args, recorded, scene)
+    sequence = render_sequence(
+        scene,
+        poses,
+        intrinsics,
+        noise,
+        args.seed,
+        args.out.name,
+        perturbations=perturbations,
+        timestamps=times,
+    )
+    strengths = [
+        {"name": name, **vars(made)} for (name, _), made in zip(named, perturbations, strict=True)
+    ]
+    description = {
+        "version": __version__,
+        **{name: value for name, value in asdict(args).items() if name != "out"},
+        "trajectory": None if args.trajectory is None else str(args.trajectory),
+        "perturbations": strengths,
+        **placed,
+    }
+    is_new = write_sequence(sequence, args.out, description, args.truth)
+    print(f"{len(sequence)} frames in {args.out}" + ("" if is_new else ", written before"))
+    return 0
+
+
+def _motion(args: Arguments, recorded: Any, scene: Any) -> tuple[Any, Any, dict[str, Any]]:
+    """Times (N,), poses (N, 4, 4), and what to tell of a placed trajectory."""
+    from ms_slam_env.sequences import place_trajectory
+
+    if recorded is None:
+        return args.path.timestamps, args.path.poses(scene, args.seed), {}
+    times, poses = recorded
+    placement = place_trajectory(scene, poses, args.seed, args.scale)
+    print(f"{args.trajectory}: placed at scale {placement.scale:g}", file=sys.stderr)
+    return times, placement.poses, {"placed_at_scale": placement.scale}

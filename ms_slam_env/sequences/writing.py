@@ -1,0 +1,160 @@
+"""A sequence as a folder in the TUM layout, which appears only when it is whole."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.errors import InputError
+from ms_slam_env.sequences.sequence import RenderedSequence
+from ms_slam_env.sequences.tum import write_trajectory
+
+DEPTH_SCALE = 5000.0
+"""Value of a depth image for one metre, as in the TUM RGB-D benchmark."""
+
+DESCRIPTION = "sequence.json"
+"""What made a sequence; in a folder that is being written it is called ``UNFINISHED``."""
+
+UNFINISHED = "incomplete.json"
+
+
+def working_folder(folder: Path) -> Path:
+    """Where a sequence grows until it is whole."""
+    return folder.with_name(folder.name + ".partial")
+
+
+def write_sequence(
+    sequence: RenderedSequence,
+    folder: str | Path,
+    description: Mapping[str, Any],
+    with_truth: bool = False,
+) -> bool:
+    """Write a rendered sequence in the TUM layout; show progress.
+
+    ``rgb/TIME.png``, ``depth/TIME.png`` (16 bits, 5000 a metre, 0 = no reading or beyond 13.1 m),
+    ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``, ``intrinsics.txt`` and ``sequence.json``.
+    Everything grows in ``FOLDER.partial``, image by image, each appearing when it is whole, and
+    the folder gets its name at the end. A second call with the same description goes on where an
+    interrupted one stopped, and ends with the same files.
+
+    Args:
+        sequence: what to write.
+        folder: must not exist, or hold the same sequence.
+        description: what makes the sequence, for ``sequence.json``; two sequences with equal
+            descriptions are taken for the same.
+        with_truth: also write ``depth_true/TIME.png``, the noise-free depth from the true pose,
+            ``labels/TIME.png``, the object there (16 bits, 0 = none), and ``objects.txt``.
+
+    Returns:
+        whether anything was left to write.
+
+    Raises:
+        InputError: the folder, or the unfinished one, holds something else.
+    """
+    target = Path(folder)
+    content = json.loads(json.dumps(dict(description)))
+    if _is_there(target, content):
+        return False
+    partial = working_folder(target)
+    _begin(partial, content)
+    names = [f"{time:.6f}" for time in sequence.frames.timestamps]
+    for index, name in enumerate(tqdm(names, desc=sequence.name, unit="frame")):
+        _write_frame(partial, name, sequence, index, with_truth)
+    for kind in ("rgb", "depth", *(("depth_true", "labels") if with_truth else ())):
+        lines = "".join(f"{name} {kind}/{name}.png\n" for name in names)
+        (partial / f"{kind}.txt").write_text(f"# timestamp filename\n{lines}", encoding="utf-8")
+    if with_truth:
+        objects = enumerate(sequence.frames.labels, start=1)
+        lines = "".join(f"{value} {label}\n" for value, label in objects)
+        (partial / "objects.txt").write_text(f"# value object\n{lines}", encoding="utf-8")
+    write_trajectory(partial / "groundtruth.txt", sequence.frames.timestamps, sequence.poses)
+    (partial / "intrinsics.txt").write_text(_intrinsics(sequence.intrinsics), encoding="utf-8")
+    os.replace(partial / UNFINISHED, partial / DESCRIPTION)
+    os.replace(partial, target)
+    return True
+
+
+def _is_there(target: Path, content: dict[str, Any]) -> bool:
+    """Whether the folder holds the sequence already."""
+    if not target.exists() or (target.is_dir() and not any(target.iterdir())):
+        return False
+    if not (target / DESCRIPTION).is_file():
+        raise InputError(f"{target} exists and is no generated sequence; choose another folder")
+    if _read(target / DESCRIPTION) != content:
+        raise InputError(f"{target} holds another sequence, see its {DESCRIPTION}")
+    return True
+
+
+def _begin(partial: Path, content: dict[str, Any]) -> None:
+    """Make the working folder, or check that it is the beginning of the same sequence."""
+    if partial.exists():
+        if (partial / DESCRIPTION).is_file():  # interrupted between the last two steps
+            os.replace(partial / DESCRIPTION, partial / UNFINISHED)
+        is_same = (partial / UNFINISHED).is_file() and _read(partial / UNFINISHED) == content
+        if not is_same and any(partial.iterdir()):
+            raise InputError(
+                f"{partial} holds the beginning of another sequence; delete it or choose another "
+                "folder"
+            )
+    partial.mkdir(parents=True, exist_ok=True)
+    _replace(partial / UNFINISHED, (json.dumps(content, indent=1) + "\n").encode())
+
+
+def _read(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read {path}: {error}") from None
+
+
+def _write_frame(
+    partial: Path, name: str, sequence: RenderedSequence, index: int, with_truth: bool
+) -> None:
+    """Write what is missing of a frame."""
+    rgb, depth = partial / f"rgb/{name}.png", partial / f"depth/{name}.png"
+    if not (rgb.exists() and depth.exists()):
+        frame = sequence.frames[index]
+        _write_image(rgb, frame.color[:, :, ::-1])
+        _write_image(depth, depth_values(frame.depth))
+    if not with_truth:
+        return
+    true_depth, labels = partial / f"depth_true/{name}.png", partial / f"labels/{name}.png"
+    if not (true_depth.exists() and labels.exists()):
+        view = sequence.frames.truth(index)
+        _write_image(true_depth, depth_values(view.depth))
+        _write_image(labels, (view.labels + 1).astype(np.uint16))
+
+
+def depth_values(depth: NDArray[np.float32]) -> NDArray[np.uint16]:
+    """Values (H, W) of a 16-bit depth image; what is too far for them is no reading."""
+    values = np.rint(depth.astype(np.float64) * DEPTH_SCALE)
+    return np.where(values <= np.iinfo(np.uint16).max, values, 0).astype(np.uint16)
+
+
+def _intrinsics(K: Intrinsics) -> str:
+    numbers = (K.fx, K.fy, K.cx, K.cy, K.width, K.height, DEPTH_SCALE)
+    return (
+        "# fx fy cx cy width height depth_scale\n" + " ".join(f"{n:.10g}" for n in numbers) + "\n"
+    )
+
+
+def _write_image(path: Path, pixels: NDArray[Any]) -> None:
+    path.parent.mkdir(exist_ok=True)
+    _, data = cv2.imencode(".png", np.ascontiguousarray(pixels))
+    _replace(path, data.tobytes())
+
+
+def _replace(path: Path, data: bytes) -> None:
+    """Write a file that appears when it is whole."""
+    partial = path.with_name(path.name + ".partial")
+    partial.write_bytes(data)
+    os.replace(partial, path)

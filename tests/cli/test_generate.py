@@ -1,0 +1,105 @@
+"""``ms-slam generate``: a folder that ``ms-slam run`` reads."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ms_slam_env.cli import main
+from ms_slam_env.sequences import read_trajectory, write_trajectory
+from ms_slam_env.sequences.recording import open_recording
+
+SMALL = ["--scene", "table", "--seed", "4", "--image-size", "80x60"]
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_generate_then_run(tmp_path, capsys) -> None:
+    out = tmp_path / "sequence"
+    perturbations = ["--perturbations", "rolling-shutter,readout_s=0.02", "exposure-jumps,every=3"]
+    command = ["generate", *SMALL, "--path.frames", "6", *perturbations, "--out", str(out)]
+    assert main(command) == 0
+    assert "6 frames" in capsys.readouterr().out
+    about = json.loads((out / "sequence.json").read_text())
+    assert about["perturbations"][0] == {"name": "rolling-shutter", "readout_s": 0.02}
+    assert main(command) == 0
+    assert "written before" in capsys.readouterr().out
+    assert main(["run", str(out), "--out", str(tmp_path / "run")]) == 0
+    metrics = json.loads((tmp_path / "run/metrics.json").read_text())
+    assert metrics["complete"]
+    assert (metrics["compared"], metrics["registration"]) == (6, None)
+    assert metrics["ate_m"] < 0.02
+
+
+def test_a_given_trajectory_is_placed(tmp_path, capsys) -> None:
+    poses = np.repeat(np.eye(4)[None], 5, axis=0)
+    poses[:, 0, 3] = 0.01 * np.arange(5)
+    write_trajectory(tmp_path / "given.txt", 3.0 + 0.1 * np.arange(5), poses)
+    out = tmp_path / "sequence"
+    given = ["--trajectory", str(tmp_path / "given.txt"), "--scale", "2.0"]
+    assert main(["generate", *SMALL, *given, "--truth", "--out", str(out)]) == 0
+    assert "placed at scale 2" in capsys.readouterr().err
+    times, placed = read_trajectory(out / "groundtruth.txt")
+    np.testing.assert_allclose(times, 3.0 + 0.1 * np.arange(5))
+    np.testing.assert_allclose(np.linalg.norm(np.diff(placed[:, :3, 3], axis=0), axis=1), 0.02)
+    assert (out / "depth_true/3.000000.png").is_file()
+    assert len(open_recording(out)) == 5
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends SIGINT")
+def test_an_interrupted_command_goes_on_to_the_same_files(tmp_path) -> None:
+    options = [*SMALL, "--path.frames", "40", "--perturbations", "motion-blur,samples=32"]
+    assert main(["generate", *options, "--out", str(tmp_path / "whole")]) == 0
+    target = tmp_path / "stopped"
+    call = "import sys; from ms_slam_env.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", call, "generate", *options, "--out", str(target)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    partial = tmp_path / "stopped.partial"
+    deadline = time.monotonic() + 120
+    while len(list(partial.glob("depth/*.png"))) < 2 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate()
+    assert process.returncode == 130
+    assert errors.strip().splitlines()[-1].endswith("interrupted; finished work is kept")
+    assert not target.exists()
+    assert 2 <= len(list(partial.glob("depth/*.png"))) < 40
+    assert main(["generate", *options, "--out", str(target)]) == 0
+    assert files(target) == files(tmp_path / "whole")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--scene", "mars"], "unknown scene 'mars'"),
+        (["--image-size", "1x1"], "unknown image size '1x1'"),
+        (["--noise", "loud"], "unknown noise model 'loud'"),
+        (
+            ["--perturbations", "rain"],
+            "unknown perturbation 'rain'; valid choices: rolling-shutter",
+        ),
+        (["--perturbations", "motion-blur,time=1"], "unknown option of MotionBlur"),
+        (["--perturbations", "motion-blur,samples"], "'samples' is not option=value"),
+        (["--perturbations", "motion-blur,samples=x"], "MotionBlur.samples = 'x' is outside"),
+        (["--path.frames", "1"], "HandheldPath.frames = 1 is outside"),
+        (["--trajectory", "none.txt"], "cannot read trajectory none.txt"),
+        (["--seed", "-1"], "scene seed -1 must be an integer"),
+    ],
+)
+def test_bad_input_is_one_line(arguments, message, tmp_path, capsys) -> None:
+    command = ["generate", "--scene", "table", *arguments, "--out", str(tmp_path / "out")]
+    assert main(command) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1, lines
+    assert message in lines[0]
+    assert not list(tmp_path.iterdir())
