@@ -41,7 +41,7 @@ from ms_slam_env.metrics import ate_rmse, relocalisation_times
 from ms_slam_env.scenes import SCENES, Scene
 from ms_slam_env.sensor import FRAME_RATE_HZ, RGBDSensor
 from ms_slam_env.slam import SlamBackend
-from ms_slam_env.slam.surfel.relocalisation import RELOCALISATIONS
+from ms_slam_env.slam.surfel.config import RELOCALISATIONS
 
 Float64 = NDArray[np.float64]
 

@@ -8,6 +8,7 @@ from ms_slam_env.config import check_choice, check_range
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.surfel.loops.config import LoopConfig
 
+RELOCALISATIONS = ("ferns", "local")
 LOOP_CLOSURES = ("none", "deformation")
 
 
@@ -92,7 +93,7 @@ class SurfelConfig:
     def __post_init__(self) -> None:
         """Refuse values outside the ranges."""
         check_range(self, "depth_cutoff_m", 0.0, 10.0)
-        check_choice(self, "relocalisation", ("ferns", "local"))
+        check_choice(self, "relocalisation", RELOCALISATIONS)
         check_range(self, "icp_rgb_weight", 0.0, 1.0)
         check_range(self, "confidence_threshold", 0.0, 12.0)
         are_counts = isinstance(self.iterations, (tuple, list)) and all(

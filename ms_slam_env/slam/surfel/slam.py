@@ -32,7 +32,7 @@ from ms_slam_env.slam.surfel.photometry import (
     without_trust,
 )
 from ms_slam_env.slam.surfel.preprocess import Preprocessor
-from ms_slam_env.slam.surfel.relocalisation import make_relocalisation
+from ms_slam_env.slam.surfel.relocalisation import Images, make_relocalisation
 from ms_slam_env.slam.surfel.seeds import NUM_SEEDS, relocalisation_seeds, tracking_seeds
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.tracking import NUM_FIRST, Alignment, Tracker, model_stride
@@ -68,9 +68,7 @@ class BatchedSurfelSlam:
         self.tracker = Tracker(batch, NUM_SEEDS, intrinsics, config, device, stride)
         self.map = SurfelMap(batch, intrinsics, config, device, stride)
         self.loops = make_loop_closure(self.map, config, device)
-        self.relocalisation = make_relocalisation(
-            config.relocalisation, batch, intrinsics, config.depth_cutoff_m
-        )
+        self.relocalisation = make_relocalisation(batch, intrinsics, config)
         self._blank_frames = BlankFrames(batch)
         self._device_poses = Mirror(batch, wp.mat44, device)
         self._device_time = Mirror(batch, wp.int32, device)
@@ -118,12 +116,13 @@ class BatchedSurfelSlam:
         guesses = check_guesses(T_world_camera_guess, self.batch)
         live = self.preprocess(color, depth)
         self._select_surfels(self._lost)
-        results = self._locate(live, guesses, color, depth)
+        frames = Images(color, depth)
+        results = self._locate(live, guesses, frames)
         good = np.array([result.tracking_ok for result in results])
         self._correct_exposure(live, self._photometry)
-        self.relocalisation.remember(color, depth, self.poses, self._time, good)
+        self.relocalisation.remember(frames, self.poses, self._time, good)
         self._fuse(live, good)
-        return self._close_loops(live, results, color, depth)
+        return self._close_loops(live, results, frames)
 
     def fuse(
         self, color: NDArray[np.uint8], depth: NDArray[np.float32], T_world_camera: Float64
@@ -147,16 +146,12 @@ class BatchedSurfelSlam:
         self.poses = poses
         self._lost[:] = 0
         good = np.ones(self.batch, dtype=bool)
-        self.relocalisation.remember(color, depth, poses, self._time, good)
+        self.relocalisation.remember(Images(color, depth), poses, self._time, good)
         self._fuse(live, good)
         return [TrackResult(pose.copy(), True) for pose in poses]
 
     def _locate(
-        self,
-        live: LiveFrame,
-        guesses: Float64 | None,
-        color: NDArray[np.uint8],
-        depth: NDArray[np.float32],
+        self, live: LiveFrame, guesses: Float64 | None, frames: Images
     ) -> list[TrackResult]:
         """Poses of the live frames: given for the first, tracked or searched for the others."""
         self.tracker.set_frame(live)
@@ -170,9 +165,9 @@ class BatchedSurfelSlam:
             ]
         )
         limits = make_limits(lost, self._lost)
-        view = self._render(self.poses)
+        view = self.render(self.poses)
         alignment = self.tracker.align(view, self.poses, seeds, limits, guesses, self._photometry)
-        blank = self._blank_frames.find(color, self._started)
+        blank = self._blank_frames.find(frames.color, self._started)
         alignment = replace(alignment, verdict=np.where(blank, BLANK, alignment.verdict))
         alignment = self._without_color(view, seeds, alignment)
         if not self.config.refuse_bad_fits:
@@ -180,7 +175,8 @@ class BatchedSurfelSlam:
         if guesses is not None:
             alignment = self._search_at_guess(alignment, guesses)
         alignment = self._search_again(alignment)
-        alignment = self._search_elsewhere(alignment, color, depth)
+        if self.config.refuse_bad_fits:
+            alignment = self._search_elsewhere(alignment, frames)
         return [
             self._accept(env, alignment) if self._started[env] else self._start(env, live)
             for env in range(self.batch)
@@ -217,7 +213,7 @@ class BatchedSurfelSlam:
         origins = np.where(failed[:, None, None], guesses, self.poses)
         seeds = np.tile(tracking_seeds(np.eye(4)), (self.batch, 1, 1, 1))
         limits = make_limits(np.ones(self.batch, dtype=bool), self._lost)
-        view, lights = self._render(origins), self._photometry
+        view, lights = self.render(origins), self._photometry
         again = self.tracker.align(view, origins, seeds, limits, photometry=lights)
         again = replace(again, T_model_live=invert(self.poses) @ again.T_world_live)
         return alignment.replace(failed & (again.verdict == 0), again)
@@ -233,7 +229,7 @@ class BatchedSurfelSlam:
                 [relocalisation_seeds(attempt + RETRIES * int(lost)) for lost in self._lost]
             )
             again = self.tracker.align(
-                self._render(self.poses),
+                self.render(self.poses),
                 self.poses,
                 seeds,
                 make_limits(strict, self._lost),
@@ -242,20 +238,23 @@ class BatchedSurfelSlam:
             alignment = alignment.replace(failed & (again.verdict == 0), again)
         return alignment
 
-    def _search_elsewhere(
-        self, alignment: Alignment, color: NDArray[np.uint8], depth: NDArray[np.float32]
-    ) -> Alignment:
-        """Let the relocalisation find the envs that were lost before and still are."""
-        lost = self._failed(alignment) & (self._lost > 0)
-        found = self.relocalisation.search(color, depth, lost, self._align_from)
+    def _search_elsewhere(self, alignment: Alignment, frames: Images) -> Alignment:
+        """Let the relocalisation judge and find the envs that were lost before."""
+        lost = self._lost > 0
+        again = lost & (alignment.verdict == OK)
+        believed = self.relocalisation.believes(frames, alignment.T_world_live, again, self)
+        wrong = again & ~believed
+        alignment = replace(alignment, verdict=np.where(wrong, APPEARANCE, alignment.verdict))
+        found = self.relocalisation.search(frames, lost & self._failed(alignment), self)
         if found is None:
             return alignment
-        where, again = found
-        again = replace(again, T_model_live=invert(self.poses) @ again.T_world_live)
-        return alignment.replace(where, again)
+        where, elsewhere = found
+        motions = invert(self.poses) @ elsewhere.T_world_live
+        return alignment.replace(where, replace(elsewhere, T_model_live=motions))
 
-    def _align_from(self, origins: Float64, seeds: Float64, limits: NDArray[np.void]) -> Alignment:
-        view, lights = self._render(origins), self._photometry
+    def align_from(self, origins: Float64, seeds: Float64, limits: NDArray[np.void]) -> Alignment:
+        """Align the current frames with the maps as seen from ``origins`` (B, 4, 4)."""
+        view, lights = self.render(origins), self._photometry
         return self.tracker.align(view, origins, seeds, limits, photometry=lights)
 
     def _failed(self, alignment: Alignment) -> NDArray[np.bool_]:
@@ -326,16 +325,12 @@ class BatchedSurfelSlam:
             self._view_poses = None
 
     def _close_loops(
-        self,
-        live: LiveFrame,
-        results: list[TrackResult],
-        color: NDArray[np.uint8],
-        depth: NDArray[np.float32],
+        self, live: LiveFrame, results: list[TrackResult], frames: Images
     ) -> list[TrackResult]:
         """Close loops after fusion; a closed one corrects the map and the pose."""
 
         def similar(env: int, before: int) -> list[Candidate]:
-            return self.relocalisation.similar(env, color[env], depth[env], before)
+            return self.relocalisation.similar(env, frames, before)
 
         tracked = np.array([result.tracking_ok for result in results])
         closed = self.loops.close(live, self.poses, self._time - 1, tracked, similar)
@@ -346,7 +341,7 @@ class BatchedSurfelSlam:
             )
         return results
 
-    def _render(self, poses: Float64) -> ModelView:
+    def render(self, poses: Float64) -> ModelView:
         """Render the maps from ``poses`` (B, 4, 4), unless that view is at hand."""
         if self._view_poses is None or not np.array_equal(self._view_poses, poses):
             self._device_poses.write(poses)

@@ -1,0 +1,229 @@
+"""Relocalisation from keyframes that resemble the lost frame."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.geometry import make_pose, relative_angle, so3_exp
+from ms_slam_env.slam.base import Float64
+from ms_slam_env.slam.ferns import Candidate, FernConfig, FernDatabase
+from ms_slam_env.slam.surfel.relocalisation.base import (
+    Bool,
+    Images,
+    Int32,
+    Relocalisation,
+    Searcher,
+)
+from ms_slam_env.slam.surfel.relocalisation.likeness import LikenessLimits, measure_likeness
+from ms_slam_env.slam.surfel.seeds import NUM_SEEDS, tracking_seeds
+from ms_slam_env.slam.surfel.tracking import Alignment
+from ms_slam_env.slam.surfel.verdict import OK, STAT_COST, make_limits
+
+TRIALS = 3  # keyframes tried a frame
+ROUNDS = 3  # frames until the same ones are tried again
+REFINEMENTS = 3  # alignments with the view from the pose found so far
+HOPELESS_COST = 2.45  # an alignment with a keyframe's view that costs more is no start
+GOOD_COST = 1.6  # with one that costs less the other keyframes are left untried
+_LOOKED_AT = 40  # keyframes among which those tried are chosen
+_APART_M, _APART_RAD = 0.10, np.radians(10.0)  # two of them differ by at least so much
+
+
+def _turn(pan_deg: float, tilt_deg: float, roll_deg: float = 0.0) -> Float64:
+    return make_pose(so3_exp(np.radians([tilt_deg, pan_deg, roll_deg])), np.zeros(3))
+
+
+_HERE = np.eye(4)
+_AXES = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
+_TURNS_DEG = (  # pan, tilt, roll
+    [14 * np.array(axis) for axis in _AXES],
+    [(12, 12, 0), (12, -12, 0), (-12, 12, 0), (-12, -12, 0), (25, 0, 0), (-25, 0, 0)],
+    [22 * np.array(axis) for axis in _AXES],
+)
+SEEDS = np.stack([[_HERE, _HERE, *(_turn(*turn) for turn in turns)] for turns in _TURNS_DEG])
+"""Starts (3, 8, 4, 4) relative to a keyframe, in turns; a turn stands for a sideways step too."""
+
+_AT_REST = np.tile(_HERE, (NUM_SEEDS, 1, 1))
+_STRICT = make_limits(np.ones(1, dtype=bool), np.zeros(1, dtype=np.int32))
+
+
+def _lax_limits() -> NDArray[Any]:
+    """Limits of an alignment that is repeated and checked before it is believed.
+
+    A keyframe's view hides what the camera sees from elsewhere, so that even a perfect alignment
+    with it leaves much unexplained.
+    """
+    limits = make_limits(np.ones(1, dtype=bool), np.full(1, 7, dtype=np.int32))
+    for name, value in {"overlap": 0.3, "inliers": 0.35, "alike": 0.35, "apart": 0.6}.items():
+        limits[name] = value
+    limits["cost"] = HOPELESS_COST
+    return limits
+
+
+_LAX = _lax_limits()
+
+
+class FernRelocalisation(Relocalisation):
+    """Searches from the keyframes that resemble the lost frame (Glocker et al., TVCG 2015).
+
+    The best of a few alignments is refined, and believed if the map's view from there is like the
+    frame (``likeness``) and the next frame is found close by. Only then is anything fused.
+    """
+
+    def __init__(self, batch: int, intrinsics: Intrinsics, depth_cutoff_m: float) -> None:
+        """Start without keyframes."""
+        config = FernConfig(far_m=max(depth_cutoff_m, 2 * FernConfig.near_m))
+        self.databases = [FernDatabase(intrinsics, config) for _ in range(batch)]
+        self.limits = LikenessLimits()
+        self._cutoff_m = depth_cutoff_m
+        self._tentative: Float64 = np.full((batch, 4, 4), np.nan)  # to be confirmed; NaN: none
+        self._attempts = np.zeros(batch, dtype=np.int32)  # since tracking was lost
+
+    def remember(self, frames: Images, poses: Float64, time: Int32, tracked: Bool) -> None:
+        """Keep the tracked frames that resemble no keyframe."""
+        self._tentative[tracked] = np.nan
+        self._attempts[tracked] = 0
+        for env in np.flatnonzero(tracked):
+            color, depth = frames.color[env], frames.depth[env]
+            self.databases[env].observe(color, depth, poses[env], int(time[env]))
+
+    def believes(self, frames: Images, poses: Float64, found: Bool, searcher: Searcher) -> Bool:
+        """Those that are like the map's view from there."""
+        if not found.any():
+            return found
+        view = searcher.render(np.where(found[:, None, None], poses, np.eye(4)))
+        intensity, depth = view.intensity.numpy(), view.vertices.numpy()[..., 2]
+        believed = found.copy()
+        for env in np.flatnonzero(found):
+            likeness = measure_likeness(
+                frames.color[env], frames.depth[env], intensity[env], depth[env], self._cutoff_m
+            )
+            believed[env] = self.limits.accept(likeness)
+        return believed
+
+    def search(
+        self, frames: Images, lost: Bool, searcher: Searcher
+    ) -> tuple[Bool, Alignment] | None:
+        """Confirm the poses that the last frames were found at, or find poses to confirm."""
+        if not lost.any():
+            return None
+        found, alignment = np.zeros(len(lost), dtype=bool), None
+        expected = lost & _has_pose(self._tentative)
+        if expected.any():
+            seeds = tracking_seeds(np.eye(4))
+            alignment = _align(searcher, self._tentative, seeds, _STRICT)
+            found = expected & (alignment.verdict == OK)
+            found = self.believes(frames, alignment.T_world_live, found, searcher)
+        self._tentative[lost] = np.nan
+        missing = lost & ~found
+        if missing.any():
+            self._refine(frames, self._find(frames, missing, searcher), searcher)
+            self._attempts[missing] += 1
+        return (found, alignment) if alignment is not None and found.any() else None
+
+    def _find(self, frames: Images, lost: Bool, searcher: Searcher) -> Float64:
+        """Poses (B, 4, 4) that the best alignments with keyframes' views lead to; NaN: none."""
+        seeds = SEEDS[self._attempts % len(SEEDS)]
+        best = np.full((len(lost), 4, 4), np.nan)
+        cost = np.full(len(lost), np.inf)
+        for starts in self._keyframes_to_try(frames, lost):
+            wanted = _has_pose(starts) & (cost > GOOD_COST)
+            if not wanted.any():
+                break
+            found = _align(searcher, starts, seeds, _LAX)
+            better = wanted & (found.verdict == OK) & (found.stats[:, STAT_COST] < cost)
+            best[better] = found.T_world_live[better]
+            cost[better] = found.stats[better, STAT_COST]
+        return best
+
+    def _refine(self, frames: Images, poses: Float64, searcher: Searcher) -> None:
+        """Align again with the views from ``poses`` (B, 4, 4); keep what is like them."""
+        for _ in range(REFINEMENTS):
+            wanted = _has_pose(poses)
+            if not wanted.any():
+                return
+            again = _align(searcher, poses, _AT_REST, _LAX)
+            wanted &= again.verdict == OK
+            believed = self.believes(frames, again.T_world_live, wanted, searcher)
+            self._tentative[believed] = again.T_world_live[believed]
+            going_on = wanted & ~believed
+            poses = np.where(going_on[:, None, None], again.T_world_live, np.nan)
+
+    def _keyframes_to_try(self, frames: Images, lost: Bool) -> Float64:
+        """Poses (TRIALS, B, 4, 4) of keyframes, NaN for none; others at every attempt."""
+        poses = np.full((TRIALS, len(lost), 4, 4), np.nan)
+        for env in np.flatnonzero(lost):
+            near = self.databases[env].candidates(frames.color[env], frames.depth[env], _LOOKED_AT)
+            first = TRIALS * int(self._attempts[env] % ROUNDS)
+            apart = _spread(near, first + TRIALS)
+            chosen = apart[first:] or apart[:TRIALS]
+            for rank, candidate in enumerate(chosen):
+                poses[rank, env] = candidate.T_world_camera
+        return poses
+
+    def similar(self, env: int, frames: Images, before: int) -> list[Candidate]:
+        """At most ``TRIALS``, apart from each other."""
+        color, depth = frames.color[env], frames.depth[env]
+        return _spread(self.databases[env].candidates(color, depth, _LOOKED_AT, before), TRIALS)
+
+    def move(self, env: int, time: Int32, poses: Float64) -> None:
+        """Put the keyframes where their frames are now."""
+        database = self.databases[env]
+        moved = database.poses
+        index = np.searchsorted(time, database.times)
+        known = (index < len(time)) & (time[np.minimum(index, len(time) - 1)] == database.times)
+        moved[known] = poses[index[known]]
+        database.move(moved)
+
+    def clear(self, env: int) -> None:
+        """Forget the keyframes of one env."""
+        self.databases[env].clear()
+        self._tentative[env] = np.nan
+        self._attempts[env] = 0
+
+    def get_state(self) -> dict[str, Any]:
+        """Keyframes and poses to confirm."""
+        return {
+            "databases": [database.get_state() for database in self.databases],
+            "tentative": self._tentative.copy(),
+            "attempts": self._attempts.copy(),
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from there."""
+        for database, kept in zip(self.databases, state["databases"], strict=True):
+            database.set_state(kept)
+        self._tentative = state["tentative"].copy()
+        self._attempts = state["attempts"].copy()
+
+
+def _has_pose(poses: Float64) -> Bool:
+    """Which of ``poses`` (B, 4, 4) are not NaN."""
+    return np.isfinite(poses[:, 0, 0])
+
+
+def _align(searcher: Searcher, starts: Float64, seeds: Float64, limits: NDArray[Any]) -> Alignment:
+    """Align from ``starts`` (B, 4, 4); what comes out where those are NaN means nothing."""
+    batch = len(starts)
+    origins = np.where(np.isfinite(starts), starts, np.eye(4))
+    seeds = np.broadcast_to(seeds, (batch, NUM_SEEDS, 4, 4))
+    return searcher.align_from(origins, seeds, np.repeat(limits, batch))
+
+
+def _spread(candidates: list[Candidate], count: int) -> list[Candidate]:
+    """The first ``count`` that lie apart from all better ones."""
+    chosen: list[Candidate] = []
+    for one in candidates:
+        if len(chosen) == count:
+            break
+        if not any(_is_close(one.T_world_camera, other.T_world_camera) for other in chosen):
+            chosen.append(one)
+    return chosen
+
+
+def _is_close(a: Float64, b: Float64) -> bool:
+    near = np.linalg.norm(a[:3, 3] - b[:3, 3]) <= _APART_M
+    return bool(near and relative_angle(a[:3, :3], b[:3, :3]) <= _APART_RAD)
