@@ -21,13 +21,19 @@ from ms_slam_env.scenes import SCENES
 
 DEFAULT_SEQUENCES = (
     "living_room:2000:none",
-    "living_room:2000",
-    "table:2000",
-    "window:2000",
-    "corridor:2000",
-    "carpet:2000",
-    "wall:2000",
+    *(f"{scene}:2000" for scene in SCENES),
+    *(
+        f"living_room:2000:kinect+{name}"
+        for name in (
+            "rolling-shutter",
+            "misregistration",
+            "auto-exposure",
+            "depth-dropout",
+            "rolling-shutter+misregistration+auto-exposure+depth-dropout+depth-quantisation",
+        )
+    ),
 )
+"""A clean and a noisy room, every scene, and what recordings suffer from, alone and together."""
 
 
 @dataclass(frozen=True)
@@ -35,12 +41,12 @@ class Comparison:
     """What is compared.
 
     Attributes:
-        sequences: folders, or ``scene:seed[:noise]``.
+        sequences: folders, or ``scene:seed[:noise[+perturbation ...]]``.
         backends: ``NAME`` or ``NAME,parameter=value,...``.
         image_sizes: such as 160x120.
         frames: of a rendered sequence.
-        speed_m: largest translation from frame to frame of a rendered sequence.
-        rot_deg: largest rotation.
+        speed_m_s: mean speed of the camera of a rendered sequence, where it does not turn.
+        turn_deg_s: mean speed of rotation, where it turns.
         threads: cores that a backend may use.
         repeats: runs of each; the table shows the median time.
 
@@ -52,8 +58,8 @@ class Comparison:
     backends: tuple[str, ...] = tuple(slam.BACKENDS)
     image_sizes: tuple[str, ...] = ("160x120", "320x240")
     frames: int = 200
-    speed_m: float = 0.015
-    rot_deg: float = 1.0
+    speed_m_s: float = 0.5
+    turn_deg_s: float = 30.0
     threads: int = 1
     repeats: int = 1
 
@@ -88,8 +94,8 @@ class Comparison:
                 image_size=size,
                 params=params,
                 frames=self.frames,
-                speed_m=self.speed_m,
-                rot_deg=self.rot_deg,
+                speed_m_s=self.speed_m_s,
+                turn_deg_s=self.turn_deg_s,
                 threads=self.threads,
                 repeat=repeat,
             )

@@ -11,10 +11,16 @@ from numpy.typing import NDArray
 
 from ms_slam_env import scenes
 from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
-from ms_slam_env.errors import InputError
+from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.metrics.reconstruction import voxel_thin
-from ms_slam_env.sensor import NOISE_MODELS, RGBDSensor
-from ms_slam_env.sequences import associate, handheld_trajectory, render_sequence
+from ms_slam_env.sensor import NOISE_MODELS
+from ms_slam_env.sequences import (
+    PERTURBATIONS,
+    HandheldPath,
+    associate,
+    make_perturbation,
+    render_sequence,
+)
 from ms_slam_env.sequences.recording import Recording, open_recording
 
 Float64 = NDArray[np.float64]
@@ -26,17 +32,19 @@ _MAX_DIFFERENCE_S = 0.02
 
 @dataclass(frozen=True)
 class SequenceName:
-    """A rendered sequence ``scene:seed[:noise]``.
+    """A rendered sequence ``scene:seed[:noise[+perturbation ...]]``.
 
     Attributes:
-        scene: its name.
-        seed: of scene, trajectory and noise.
+        scene: its name, or a mesh file.
+        seed: of scene, path, noise and perturbations.
         noise: of the sensor.
+        perturbations: at their default strengths.
     """
 
     scene: str
     seed: int
     noise: str
+    perturbations: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -57,36 +65,31 @@ class Input:
 
 
 def parse_sequence(text: str) -> SequenceName | Path:
-    """What ``text`` names: a folder, or a rendered sequence ``scene:seed[:noise]``.
+    """What ``text`` names: a folder, or a rendered sequence.
 
     Raises:
-        InputError: neither; an unknown noise model. Scenes are checked where they are made.
+        InputError: neither; an unknown noise model or perturbation. Scenes are checked where they
+            are made.
     """
     if Path(text).is_dir():
         return Path(text)
     scene, *rest = text.split(":")
     if not 1 <= len(rest) <= 2 or not rest[0].isdigit():
         raise InputError(
-            f"sequence {text!r} is neither a folder nor scene:seed[:noise], "
-            "such as table:2000 or table:2000:none"
+            f"sequence {text!r} is neither a folder nor scene:seed[:noise[+perturbation ...]], "
+            "such as table:2000, table:2000:none or table:2000:kinect+rolling-shutter"
         )
-    noise = rest[1] if len(rest) == 2 else "kinect"
+    noise, *perturbations = (rest[1] if len(rest) == 2 else "kinect").split("+")
     if noise not in NOISE_MODELS:
-        raise InputError(
-            f"sequence {text!r}: unknown noise {noise!r}; valid choices: {', '.join(NOISE_MODELS)}"
-        )
-    return SequenceName(scene, int(rest[0]), noise)
+        raise unknown(f"noise of sequence {text!r}", noise, NOISE_MODELS)
+    for name in perturbations:
+        if name not in PERTURBATIONS:
+            raise unknown(f"perturbation of sequence {text!r}", name, PERTURBATIONS)
+    return SequenceName(scene, int(rest[0]), noise, tuple(perturbations))
 
 
-def load(text: str, image_size: str, frames: int, speed_m: float, rot_deg: float) -> Input:
-    """The sequence that ``text`` names, at ``image_size``.
-
-    Args:
-        text: see ``parse_sequence``.
-        image_size: such as 160x120.
-        frames: of a rendered sequence; a recording is taken whole.
-        speed_m: largest translation from frame to frame of a rendered sequence.
-        rot_deg: largest rotation.
+def load(text: str, image_size: str, path: HandheldPath) -> Input:
+    """The sequence that ``text`` names, at ``image_size``; ``path`` is that of rendered ones.
 
     Raises:
         InputError: a sequence that cannot be made or read, or a recording without truth.
@@ -94,18 +97,24 @@ def load(text: str, image_size: str, frames: int, speed_m: float, rot_deg: float
     named = parse_sequence(text)
     if isinstance(named, Path):
         return _recorded(open_recording(named).at_size(image_size))
-    return _rendered(named, xtion(image_size), frames, speed_m, rot_deg)
+    return _rendered(named, xtion(image_size), path)
 
 
-def _rendered(
-    named: SequenceName, intrinsics: Intrinsics, frames: int, speed_m: float, rot_deg: float
-) -> Input:
+def _rendered(named: SequenceName, intrinsics: Intrinsics, path: HandheldPath) -> Input:
     scene = scenes.make(named.scene, named.seed)
-    poses = handheld_trajectory(scene, frames, named.seed, speed_m, rot_deg)
-    sequence = render_sequence(scene, poses, intrinsics, named.noise, named.seed)
-    sensor = RGBDSensor(scene, intrinsics, noise="none", seed=0)
-    views = ((T, sensor.ground_truth(T).depth) for T in poses[_some(len(poses))])
-    return Input(tuple(sequence.frames), poses, intrinsics, seen_surface(views, intrinsics))
+    sequence = render_sequence(
+        scene,
+        path.poses(scene, named.seed),
+        intrinsics,
+        named.noise,
+        named.seed,
+        perturbations=[make_perturbation(name) for name in named.perturbations],
+        timestamps=path.timestamps,
+    )
+    picked = _some(len(sequence))
+    views = ((sequence.poses[k], sequence.frames.truth(int(k)).depth) for k in picked)
+    surface = seen_surface(views, intrinsics)
+    return Input(tuple(sequence.frames), sequence.poses, intrinsics, surface)
 
 
 def _recorded(recording: Recording) -> Input:

@@ -37,13 +37,13 @@ class CompareSpec:
     """A backend on a sequence.
 
     Attributes:
-        sequence: a folder, or ``scene:seed[:noise]``.
+        sequence: a folder, or ``scene:seed[:noise[+perturbation ...]]``.
         backend: its name.
         image_size: such as 160x120.
         params: of the backend.
         frames: of a rendered sequence.
-        speed_m: largest translation from frame to frame of a rendered sequence.
-        rot_deg: largest rotation.
+        speed_m_s: mean speed of the camera of a rendered sequence, where it does not turn.
+        turn_deg_s: mean speed of rotation, where it turns.
         threads: cores that the backend may use.
         repeat: runs of one specification are told apart by this number.
     """
@@ -53,8 +53,8 @@ class CompareSpec:
     image_size: str
     params: dict[str, Any] = field(default_factory=dict)
     frames: int = 200
-    speed_m: float = 0.03
-    rot_deg: float = 2.0
+    speed_m_s: float = 0.5
+    turn_deg_s: float = 30.0
     threads: int = 1
     repeat: int = 0
 
@@ -95,10 +95,10 @@ def run_here(spec: CompareSpec) -> dict[str, Any]:
     """
     from ms_slam_env import metrics, slam
     from ms_slam_env.benchmark import compare_inputs
+    from ms_slam_env.sequences import HandheldPath
 
-    given = compare_inputs.load(
-        spec.sequence, spec.image_size, spec.frames, spec.speed_m, spec.rot_deg
-    )
+    path = HandheldPath(spec.frames, speed_m_s=spec.speed_m_s, turn_deg_s=spec.turn_deg_s)
+    given = compare_inputs.load(spec.sequence, spec.image_size, path)
     before = forget_peak_memory()
     system = slam.make(spec.backend, given.intrinsics, **spec.params)
     estimates, tracked, processor_s, clock_s = _track(system, given)

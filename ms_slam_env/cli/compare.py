@@ -21,17 +21,17 @@ class Arguments:
     """
 
     sequences: tuple[str, ...] = DEFAULT_SEQUENCES
-    """Folders of recordings with truth, or scene:seed[:noise] to be rendered."""
+    """Folders of recordings with truth, or scene:seed[:noise[+perturbation ...]] to be rendered."""
     backends: tuple[str, ...] = tuple(slam.BACKENDS)
     """Backends, parameters appended as in surfel,icp_rgb_weight=0.2."""
     image_sizes: tuple[str, ...] = ("160x120", "320x240")
     """Sizes of the images."""
     frames: int = 200
     """Length of a rendered sequence."""
-    speed_m: float = 0.015
-    """Largest translation from frame to frame of a rendered sequence, metres."""
-    rot_deg: float = 1.0
-    """Largest rotation from frame to frame of a rendered sequence, degrees."""
+    speed_m_s: float = 0.5
+    """Mean speed of the camera of a rendered sequence where it does not turn, m/s at 30 Hz."""
+    turn_deg_s: float = 30.0
+    """Mean speed of rotation where it turns, degrees/s."""
     threads: int = 1
     """Cores that a backend may use."""
     repeats: int = 1
@@ -50,8 +50,8 @@ def main(arguments: Sequence[str]) -> int:
         backends=args.backends,
         image_sizes=args.image_sizes,
         frames=args.frames,
-        speed_m=args.speed_m,
-        rot_deg=args.rot_deg,
+        speed_m_s=args.speed_m_s,
+        turn_deg_s=args.turn_deg_s,
         threads=args.threads,
         repeats=args.repeats,
     )

@@ -16,6 +16,7 @@ from ms_slam_env.benchmark.compare_run import CompareSpec, forget_peak_memory, m
 from ms_slam_env.camera import xtion
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
+from ms_slam_env.sequences import HandheldPath
 
 RESULT = dict.fromkeys(
     [
@@ -43,8 +44,11 @@ def row(sequence: str, backend: str, value: float | None, error: str | None = No
 
 
 def test_names_of_sequences(tmp_path: Path) -> None:
-    assert parse_sequence("table:7") == SequenceName("table", 7, "kinect")
-    assert parse_sequence("table:7:none") == SequenceName("table", 7, "none")
+    assert parse_sequence("table:7") == SequenceName("table", 7, "kinect", ())
+    assert parse_sequence("table:7:none") == SequenceName("table", 7, "none", ())
+    assert parse_sequence("table:7:none+motion-blur+depth-dropout") == SequenceName(
+        "table", 7, "none", ("motion-blur", "depth-dropout")
+    )
     assert parse_sequence(str(tmp_path)) == tmp_path
 
 
@@ -53,7 +57,8 @@ def test_names_of_sequences(tmp_path: Path) -> None:
     [
         ("sequences", ("table",), "neither a folder nor scene:seed"),
         ("sequences", ("table:x",), "neither a folder nor scene:seed"),
-        ("sequences", ("table:1:fog",), "unknown noise 'fog'; valid choices: kinect, none"),
+        ("sequences", ("table:1:fog",), "'fog'; valid choices: kinect, none"),
+        ("sequences", ("table:1:none+fog",), "'fog'; valid choices: rolling-shutter"),
         ("sequences", ("attic:1",), "valid choices: living_room"),
         ("sequences", (), "Comparison.sequences is empty"),
         ("backends", ("lidar",), "valid choices: surfel"),
@@ -72,7 +77,7 @@ def test_bad_input_is_refused_before_anything_runs(
 
 def test_a_folder_without_truth_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError):
-        load(str(tmp_path), "160x120", 10, 0.01, 1.0)
+        load(str(tmp_path), "160x120", HandheldPath(10))
 
 
 def test_seen_surface_of_a_plane() -> None:
@@ -90,10 +95,10 @@ def test_seen_surface_of_a_plane() -> None:
 
 
 def test_a_run_in_a_process_of_its_own_and_its_table(tmp_path: Path) -> None:
-    config = Comparison(("table:1000:none",), ("surfel",), ("80x60",), frames=12)
+    config = Comparison(("table:1000:none+exposure-ramp",), ("surfel",), ("80x60",), frames=12)
     text, failed = run_comparison(config, tmp_path, workers=1)
     assert failed == []
-    assert text.count("| table:1000:none | surfel |") == 1
+    assert text.count("| table:1000:none+exposure-ramp | surfel |") == 1
     content = json.loads((tmp_path / "compare.json").read_text())
     result = content["runs"][0]["result"]
     assert result["frames"] == 12
