@@ -22,6 +22,7 @@ from ms_slam_env.slam.sparse.pose import (
 _BASELINE_M = 0.1  # of the imagined second camera; the result does not depend on it
 _FIXED_SIGMA = 1e-6  # of a pose that stays where it is, metres and radians
 _ITERATIONS = 5
+_ERROR_TOLERANCE = 1e-3  # a smaller relative gain ends the iterations
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,7 @@ def adjust_bundle(bundle: Bundle, intrinsics: Intrinsics) -> tuple[Float64, Floa
         graph.add(factor)
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(_ITERATIONS)
+    parameters.setRelativeErrorTol(_ERROR_TOLERANCE)
     parameters.setlambdaInitial(1e-4)
     result = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
     poses = bundle.poses.copy()

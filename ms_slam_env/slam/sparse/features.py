@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,8 +16,9 @@ from ms_slam_env.slam.sparse.config import SparseConfig
 
 SCALE = 1.2  # between levels of the pyramid, as in ORB-SLAM
 _EDGE_PX = 8  # of the magnified image; ORB itself continues the image by reflection
-_CANDIDATES = 3  # corners found per corner kept
+_CANDIDATES = 2  # corners found per corner kept
 _CELLS = (8, 6)  # across and down, in which corners are kept in equal numbers
+_SLOPE_PX = 2.0  # half the distance over which a slope is measured
 _EDGE_PER_M = 0.03  # a step of inverse depth between neighbours that is an edge, 1/m
 
 
@@ -28,7 +30,8 @@ class Features:
         pixels: (N, 2) float64 positions (u, v).
         inverse_depth: (N,) float64, 1/m; 0 = not known.
         descriptors: (N, 4) uint64, the 256 bits of ORB.
-        scale: (N,) float64 pixels of the image along a pixel of the level it was found on, >= 1.
+        scale: (N,) float64 error of the position, in units of that of a corner of the full image:
+            pixels of the image along a pixel of the level that it was found on.
     """
 
     pixels: Float64
@@ -39,6 +42,15 @@ class Features:
     def __len__(self) -> int:
         """Return the number of features."""
         return len(self.pixels)
+
+    def chosen(self, which: NDArray[Any]) -> Features:
+        """Some of the features."""
+        return Features(
+            self.pixels[which],
+            self.inverse_depth[which],
+            self.descriptors[which],
+            self.scale[which],
+        )
 
     def points(self, intrinsics: Intrinsics) -> Float64:
         """Points (N, 3) in the camera frame; NaN where the depth is not known."""
@@ -69,8 +81,8 @@ class FeatureExtractor:
             fastThreshold=config.fast_threshold,
         )
 
-    def __call__(self, grey: NDArray[np.uint8], depth: Float32) -> Features:
-        """Features of an image (H, W) with its depth (H, W) in metres, 0 = no reading."""
+    def __call__(self, grey: NDArray[np.uint8], inverse_depth: InverseDepth) -> Features:
+        """Features of an image (H, W) uint8 with its inverse depth."""
         n = self._magnify
         size = (n * grey.shape[1], n * grey.shape[0])
         image = cv2.resize(grey, size, interpolation=cv2.INTER_CUBIC) if n > 1 else grey
@@ -85,7 +97,7 @@ class FeatureExtractor:
         scale = SCALE ** np.array([corner.octave for corner in found], dtype=np.float64)
         return Features(
             pixels,
-            sample_inverse_depth(depth, pixels),
+            inverse_depth.at(pixels),
             np.ascontiguousarray(described).view(np.uint64),
             np.maximum(scale / n, 1.0),
         )
@@ -107,22 +119,43 @@ class FeatureExtractor:
         return [corners[index] for index in kept]
 
 
-def sample_inverse_depth(depth: Float32, pixels: Float64) -> Float64:
-    """Inverse depth (N,) in 1/m at pixels (N, 2), smoothed over 3x3; 0 at edges and holes.
+class InverseDepth:
+    """The inverse depth of an image, smoothed over 3x3 pixels, for points between pixels.
 
     The inverse depth of a plane is linear in the image, so the mean is that of the centre.
+
+    Args:
+        depth: (H, W) float32 metres; 0 = no reading.
     """
-    known = (depth > 0).astype(np.float32)
-    inverse = np.divide(known, depth, out=np.zeros_like(known), where=depth > 0)
-    count = cv2.boxFilter(known, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    total = cv2.boxFilter(inverse, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    kernel = np.ones((3, 3), dtype=np.uint8)
-    largest = cv2.dilate(inverse, kernel)
-    smallest = cv2.erode(np.where(depth > 0, inverse, np.float32(1e3)), kernel)
-    smooth = (count >= 5) & (largest - smallest < 2 * _EDGE_PER_M)
-    mean = np.where(smooth, total / np.maximum(count, 1), np.float32(0))
-    u, v = pixels.astype(np.float32).T[:, None]
-    border = cv2.BORDER_REPLICATE
-    value = cv2.remap(mean, u, v, cv2.INTER_LINEAR, borderMode=border)[0]
-    whole = cv2.remap(smooth.astype(np.float32), u, v, cv2.INTER_LINEAR, borderMode=border)[0]
-    return np.where(whole > 0.999, value, 0.0).astype(np.float64)
+
+    def __init__(self, depth: Float32) -> None:
+        known = (depth > 0).astype(np.float32)
+        inverse = np.divide(known, depth, out=np.zeros_like(known), where=depth > 0)
+        border = cv2.BORDER_CONSTANT
+        count = cv2.boxFilter(known, -1, (3, 3), normalize=False, borderType=border)
+        total = cv2.boxFilter(inverse, -1, (3, 3), normalize=False, borderType=border)
+        kernel = np.ones((3, 3), dtype=np.uint8)
+        largest = cv2.dilate(inverse, kernel)
+        smallest = cv2.erode(np.where(depth > 0, inverse, np.float32(1e3)), kernel)
+        smooth = (count >= 5) & (largest - smallest < 2 * _EDGE_PER_M)
+        self._mean = np.where(smooth, total / np.maximum(count, 1), np.float32(0))
+        self._smooth = smooth.astype(np.float32)
+
+    def at(self, pixels: Float64) -> Float64:
+        """Inverse depth (N,) in 1/m at pixels (N, 2); 0 at edges and holes."""
+        if len(pixels) == 0:
+            return np.zeros(0)
+        u, v = pixels.astype(np.float32).T[:, None]
+        border = cv2.BORDER_REPLICATE
+        value = cv2.remap(self._mean, u, v, cv2.INTER_LINEAR, borderMode=border)[0]
+        whole = cv2.remap(self._smooth, u, v, cv2.INTER_LINEAR, borderMode=border)[0]
+        return np.where(whole > 0.999, value, 0.0).astype(np.float64)
+
+    def slope(self, pixels: Float64) -> Float64:
+        """Change (N, 2) of inverse depth from pixel to pixel, across and down; 0 at edges."""
+        slopes = []
+        for step in np.eye(2) * _SLOPE_PX:
+            before, after = self.at(pixels - step), self.at(pixels + step)
+            known = (before > 0) & (after > 0)
+            slopes.append(np.where(known, after - before, 0.0) / (2 * _SLOPE_PX))
+        return np.stack(slopes, axis=1)

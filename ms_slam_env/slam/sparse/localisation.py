@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, transform_points
 from ms_slam_env.slam.agreement import DepthImage
-from ms_slam_env.slam.base import Float64
+from ms_slam_env.slam.base import Float32, Float64
 from ms_slam_env.slam.sparse.config import SparseConfig
-from ms_slam_env.slam.sparse.features import Features
+from ms_slam_env.slam.sparse.features import Features, InverseDepth
 from ms_slam_env.slam.sparse.matching import Int64, match_anywhere, match_near
+from ms_slam_env.slam.sparse.patches import Patches, find_patches
 from ms_slam_env.slam.sparse.pose import (
     Sightings,
     pose_from_matches,
@@ -23,12 +22,12 @@ from ms_slam_env.slam.sparse.pose import (
 )
 from ms_slam_env.slam.sparse.sparse_map import SparseMap
 
-_FAR, _NEAR = 0.045, 0.015  # search radii, shares of the image's width
+_SAME_PX = 1.0  # corners closer than this to a point's place are that point
+_RADIUS = 0.045  # of the search for a point, share of the image's width
 _NEIGHBOURS = 6  # keyframes, besides the reference, whose points are looked for
 _RANSAC_SIGMAS = 3.0
-_SHARP_WINDOW = (9, 9)  # of the patches that are registered, pixels
-_SHARP_SHIFT_PX = 1.5  # largest correction of a position
-_SHARP_CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.01)
+_CORNER_SHIFT_PX = 1.5  # largest correction of a corner
+_PATCH_SHIFT_PX = 3.0  # largest distance of a patch from where its point projects to
 
 
 @dataclass(frozen=True)
@@ -37,15 +36,20 @@ class LiveFrame:
 
     Attributes:
         image: its depth and intensity.
-        grey: (H, W) uint8.
+        inverse_depth: its depth for points between pixels.
         features: its features.
         tree: of the features' pixels; None if there are none.
     """
 
     image: DepthImage
-    grey: NDArray[np.uint8]
+    inverse_depth: InverseDepth
     features: Features
     tree: cKDTree | None
+
+    def showing(self, features: Features) -> LiveFrame:
+        """The same frame with other features."""
+        tree = cKDTree(features.pixels) if len(features) else None
+        return replace(self, features=features, tree=tree)
 
 
 @dataclass(frozen=True)
@@ -55,18 +59,18 @@ class Fix:
     Attributes:
         T_world_camera: (4, 4) pose.
         reference: the keyframe that shares most of its points.
-        features: (M,) features of the frame that show points where the pose has them.
-        point_ids: (M,) these points.
-        pixels: (M, 2) where the features are, to a fraction of a pixel.
+        point_ids: (M,) points that the frame shows where the pose has them.
+        features: (M,) features of the frame that show them; -1 where a patch does.
+        seen: where the frame shows them, to a fraction of a pixel.
         matches: how many matches there were, M of which the pose explains.
         visible: (V,) points that should be in the image.
     """
 
     T_world_camera: Float64
     reference: int
-    features: Int64
     point_ids: Int64
-    pixels: Float64
+    features: Int64
+    seen: Sightings
     matches: int
     visible: Int64
 
@@ -82,45 +86,50 @@ class Localiser:
     def __init__(self, sparse_map: SparseMap, config: SparseConfig) -> None:
         self._map = sparse_map
         self._config = config
+        self._least = config.least_matches
         self._intrinsics: Intrinsics = sparse_map.intrinsics
 
     def near(self, frame: LiveFrame, T_world_camera: Float64, reference: int) -> Fix | None:
         """Place a frame that is near a pose and sees what the reference keyframe sees.
 
-        The points are sought where they project to, first in a wide circle, then in a narrow one.
+        The points are sought among the features near where they project to; then as patches of
+        the keyframe, to a fraction of a pixel.
         """
-        if frame.tree is None:
-            return None
         keyframes = [reference, *self._map.neighbours(reference, _NEIGHBOURS)]
         candidates = self._map.points_of(keyframes)
-        T, sighted = T_world_camera, None
-        for radius in (_FAR, _NEAR):
-            visible, projected = self._project(candidates, T)
-            point, feature = match_near(
-                projected,
-                self._map.descriptors[visible],
-                frame.tree,
-                frame.features.descriptors,
-                radius * self._intrinsics.width,
-                self._config.hamming,
-            )
-            if len(point) < self._config.least_matches:
-                return None
-            ids = visible[point]
-            seen = self.sightings(frame.features, feature)
-            sighted = (ids, feature, seen)
-            T, inlier = refine_pose(T, self._map.positions[ids], seen, self._intrinsics, 2)
-            if inlier.sum() < self._config.least_matches:
-                return None
-        assert sighted is not None
-        ids, feature, seen = sighted
-        counts = self._map.shared(ids[inlier], keyframes)
-        reference = keyframes[int(counts.argmax())]
-        seen = self._sharpen(frame, reference, ids, seen)
-        T, inlier = refine_pose(T, self._map.positions[ids], seen, self._intrinsics, 2)
+        T = T_world_camera
+        ids, features = self._match(frame, candidates, T)
+        if len(ids) >= self._least:
+            seen = self._sightings(frame.features, features)
+            T, inlier = refine_pose(T, self._map.positions[ids], seen, self._intrinsics)
+            ids, features = ids[inlier], features[inlier]
+            counts = self._map.shared(ids, keyframes)
+            reference = keyframes[int(counts.argmax())]
+        visible, projected = self._project(candidates, T)
+        ids, features, seen = self._register(frame, T, visible, projected, ids, features)
+        if len(ids) < self._least:
+            return None
+        T, inlier = refine_pose(T, self._map.positions[ids], seen, self._intrinsics)
         return Fix(
-            T, reference, feature[inlier], ids[inlier], seen.pixels[inlier], len(ids), visible
+            T, reference, ids[inlier], features[inlier], seen.chosen(inlier), len(ids), visible
         )
+
+    def _match(
+        self, frame: LiveFrame, candidates: Int64, T_world_camera: Float64
+    ) -> tuple[Int64, Int64]:
+        """Points, of the candidates, and features that match near where they project to."""
+        visible, projected = self._project(candidates, T_world_camera)
+        if frame.tree is None or len(visible) == 0:
+            return visible[:0], visible[:0]
+        points, features = match_near(
+            projected,
+            self._map.descriptors[visible],
+            frame.tree,
+            frame.features.descriptors,
+            _RADIUS * self._intrinsics.width,
+            self._config.hamming,
+        )
+        return visible[points], features
 
     def by_looks(self, frame: LiveFrame, keyframe: int) -> Float64 | None:
         """A pose of a frame that shows what a keyframe shows, wherever that was."""
@@ -129,18 +138,18 @@ class Localiser:
         a, b = match_anywhere(
             other.features.descriptors[theirs], frame.features.descriptors, self._config.hamming
         )
-        if len(a) < self._config.least_matches:
+        if len(a) < self._least:
             return None
         points = self._map.positions[other.point_ids[theirs[a]]]
         error_px = _RANSAC_SIGMAS * self._config.pixel_noise * 1.5
         found = pose_from_matches(points, frame.features.pixels[b], self._intrinsics, error_px)
-        if found is None or found[1].sum() < self._config.least_matches * 2 // 3:
+        if found is None or found[1].sum() < self._least * 2 // 3:
             return None
         T, inlier = found
-        seen = self.sightings(frame.features, b[inlier])
+        seen = self._sightings(frame.features, b[inlier])
         return refine_pose(T, points[inlier], seen, self._intrinsics)[0]
 
-    def sightings(self, features: Features, which: Int64) -> Sightings:
+    def _sightings(self, features: Features, which: Int64) -> Sightings:
         """Measurements of some features."""
         return Sightings(
             features.pixels[which],
@@ -159,32 +168,92 @@ class Localiser:
         inside = ((pixels > 0) & (pixels < np.array(size) - 1)).all(axis=1)
         return point_ids[inside], pixels[inside]
 
-    def _sharpen(
-        self, frame: LiveFrame, reference: int, point_ids: Int64, seen: Sightings
-    ) -> Sightings:
-        """Register patches with the reference keyframe: ORB's corners lie on whole pixels."""
-        keyframe = self._map.keyframes[reference]
-        place = np.full(len(self._map.positions), -1)
-        theirs = np.flatnonzero(keyframe.point_ids >= 0)
-        place[keyframe.point_ids[theirs]] = theirs
-        here = np.flatnonzero(place[point_ids] >= 0)
-        if len(here) == 0:
-            return seen
-        start = keyframe.features.pixels[place[point_ids[here]]].astype(np.float32)
-        moved, found, _ = cv2.calcOpticalFlowPyrLK(
-            keyframe.grey,
-            frame.grey,
-            start,
-            seen.pixels[here].astype(np.float32),
-            winSize=_SHARP_WINDOW,
-            maxLevel=0,
-            criteria=_SHARP_CRITERIA,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    def _register(
+        self,
+        frame: LiveFrame,
+        T_world_camera: Float64,
+        visible: Int64,
+        projected: Float64,
+        ids: Int64,
+        features: Int64,
+    ) -> tuple[Int64, Int64, Sightings]:
+        """Points, features (-1 where there is none) and sightings, from matches and patches."""
+        feature_of = np.full(len(self._map.positions), -1)
+        feature_of[ids] = features
+        matched = feature_of[visible] >= 0
+        shift = np.zeros_like(projected)
+        places = frame.features.pixels[feature_of[visible[matched]]]
+        shift[matched] = places - projected[matched]
+        patches, squares = self._patches(visible, shift, T_world_camera)
+        image = frame.image.intensity
+        pixels, found = find_patches(image, squares, patches, self._intrinsics)
+        moved = np.abs(pixels - projected - shift).max(axis=1, initial=0)
+        found &= moved < np.where(matched, _CORNER_SHIFT_PX, _PATCH_SHIFT_PX)
+        sharp, pixels = visible[found], pixels[found]
+        rest = ~np.isin(ids, sharp)
+        other = self._sightings(frame.features, features[rest])
+        sigma = np.full(len(sharp), self._config.patch_noise)
+        seen = Sightings(
+            np.concatenate([pixels, other.pixels]),
+            np.concatenate([frame.inverse_depth.at(pixels), other.inverse_depth]),
+            np.concatenate([sigma, other.sigma_px]),
+            self._config.inverse_depth_noise,
         )
-        moved = moved.astype(np.float64)
-        shift = np.abs(moved - seen.pixels[here]).max(axis=1)
-        limit = _SHARP_SHIFT_PX * np.maximum(1.0, seen.sigma_px[here] / self._config.pixel_noise)
-        good = (found.ravel() == 1) & (shift < limit)
-        pixels = seen.pixels.copy()
-        pixels[here[good]] = moved[good]
-        return replace(seen, pixels=pixels)
+        all_ids = np.concatenate([sharp, ids[rest]])
+        return all_ids, feature_of[all_ids], seen
+
+    def _patches(
+        self, ids: Int64, shift: Float64, T_world_camera: Float64
+    ) -> tuple[Patches, Float32]:
+        """The patches of points in the keyframes that made them, and their squares."""
+        T_camera_world = invert(T_world_camera)
+        pixels, slope = np.empty((len(ids), 2)), np.empty((len(ids), 2))
+        inverse, motion = np.empty(len(ids)), np.empty((len(ids), 4, 4))
+        squares = []
+        hosts = self._map.hosts[ids]
+        order = np.argsort(hosts, kind="stable")
+        for host in np.unique(hosts).tolist():
+            here = np.flatnonzero(hosts == host)
+            keyframe = self._map.keyframes[host]
+            place = self._map.host_features[ids[here]]
+            pixels[here] = keyframe.features.pixels[place]
+            slope[here] = keyframe.slopes[place]
+            pose = keyframe.T_world_camera
+            motion[here] = T_camera_world @ pose
+            points = transform_points(invert(pose), self._map.positions[ids[here]])
+            inverse[here] = 1.0 / np.maximum(points[:, 2], 0.05)
+            squares.append(keyframe.squares[place])
+        stacked = np.concatenate(squares) if squares else np.zeros((0, 9, 9), dtype=np.float32)
+        sorted_squares = np.empty_like(stacked)
+        sorted_squares[order] = stacked
+        return Patches(pixels, inverse, slope, motion, shift), sorted_squares
+
+
+def keyframe_features(
+    frame: LiveFrame, fix: Fix | None, sparse_map: SparseMap, pixel_noise: float
+) -> tuple[Features, Int64]:
+    """Features of a frame that becomes a keyframe, and the point (N,) that each shows or -1.
+
+    Points that were found come first, where they were found; corners beside them are left out.
+    """
+    features = frame.features
+    if fix is None:
+        return features, np.full(len(features), -1, dtype=np.int64)
+    taken = np.zeros(len(features), dtype=bool)
+    taken[fix.features[fix.features >= 0]] = True
+    if frame.tree is not None:
+        for near in frame.tree.query_ball_point(fix.seen.pixels, _SAME_PX):
+            taken[near] = True
+    rest = features.chosen(~taken)
+    descriptors = sparse_map.descriptors[fix.point_ids]
+    own = fix.features >= 0
+    descriptors[own] = features.descriptors[fix.features[own]]
+    return (
+        Features(
+            np.concatenate([fix.seen.pixels, rest.pixels]),
+            np.concatenate([fix.seen.inverse_depth, rest.inverse_depth]),
+            np.concatenate([descriptors, rest.descriptors]),
+            np.concatenate([fix.seen.sigma_px / pixel_noise, rest.scale]),
+        ),
+        np.concatenate([fix.point_ids, np.full(len(rest), -1, dtype=np.int64)]),
+    )

@@ -105,13 +105,12 @@ class LoopCloser:
     def _share_points(self, keyframe: int, fix: Fix) -> None:
         """Merge the keyframe's points with those of the old ones that it shows as well."""
         end = self._map.keyframes[keyframe]
-        mine = end.point_ids[fix.features]
+        is_corner = (fix.features >= 0) & ~np.isin(fix.point_ids, end.seen_points())
+        features, theirs = fix.features[is_corner], fix.point_ids[is_corner]
+        mine = end.point_ids[features]
         new = mine < 0
-        double = ~new & (mine != fix.point_ids)
-        already = np.isin(fix.point_ids, end.seen_points())
-        end.point_ids[fix.features[new & ~already]] = fix.point_ids[new & ~already]
-        double &= ~already
-        self._map.merge(fix.point_ids[double], mine[double])
+        end.point_ids[features[new]] = theirs[new]
+        self._map.merge(theirs[~new], mine[~new])
 
     def get_state(self) -> dict[str, Any]:
         """The loops closed so far."""

@@ -12,7 +12,7 @@ from ms_slam_env.slam.base import Float64
 Int64 = NDArray[np.int64]
 Descriptors = NDArray[np.uint64]
 
-_NEIGHBOURS = 12  # features compared with a projected point at most
+_NEIGHBOURS = 8  # features compared with a projected point at most
 _RATIO = 0.9  # the best match must be this much better than the second best
 
 

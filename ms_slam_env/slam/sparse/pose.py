@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from ms_slam_env.slam.base import Float64
 # 95 % quantiles of the chi-squared distribution with two and three degrees of freedom.
 CHI2_PIXEL, CHI2_PIXEL_AND_DEPTH = 5.991, 7.815
 _ITERATIONS = 4  # a round; outliers are told anew between rounds
-_SMALL_STEP = 1e-5  # metres and radians
+_SMALL_STEP = 3e-5  # metres and radians
 _LEAST_DEPTH_M = 0.05
 _RANSAC_ITERATIONS = 200
 
@@ -40,6 +41,15 @@ class Sightings:
         """Return the number of sightings."""
         return len(self.pixels)
 
+    def chosen(self, which: NDArray[Any]) -> Sightings:
+        """Some of the sightings."""
+        return Sightings(
+            self.pixels[which],
+            self.inverse_depth[which],
+            self.sigma_px[which],
+            self.sigma_inverse_depth,
+        )
+
 
 def residuals(
     T_camera_world: Float64, points: Float64, seen: Sightings, intrinsics: Intrinsics
@@ -50,14 +60,32 @@ def residuals(
     depth was not measured its residual is 0.
     """
     p = transform_points(T_camera_world, points)
+    return weighted_residuals(p, seen, intrinsics), p
+
+
+def weighted_residuals(p: Float64, seen: Sightings, intrinsics: Intrinsics) -> Float64:
+    """Residuals (N, 3) of points ``p`` (N, 3) of the camera frame; see ``residuals``."""
     z = np.maximum(p[:, 2], _LEAST_DEPTH_M)
-    r = np.empty((len(points), 3))
+    r = np.empty((len(p), 3))
     r[:, 0] = (intrinsics.fx * p[:, 0] / z + intrinsics.cx - seen.pixels[:, 0]) / seen.sigma_px
     r[:, 1] = (intrinsics.fy * p[:, 1] / z + intrinsics.cy - seen.pixels[:, 1]) / seen.sigma_px
     r[:, 2] = (1.0 / z - seen.inverse_depth) / seen.sigma_inverse_depth
     r[seen.inverse_depth == 0, 2] = 0.0
     r[p[:, 2] < _LEAST_DEPTH_M] = np.inf
-    return r, p
+    return r
+
+
+def residual_jacobian(p: Float64, seen: Sightings, intrinsics: Intrinsics) -> Float64:
+    """Derivatives (N, 3, 3) of ``weighted_residuals`` with respect to ``p``."""
+    x, y = p[:, 0], p[:, 1]
+    z = np.maximum(p[:, 2], _LEAST_DEPTH_M)
+    J = np.zeros((len(p), 3, 3))
+    a, b = intrinsics.fx / (z * seen.sigma_px), intrinsics.fy / (z * seen.sigma_px)
+    J[:, 0, 0], J[:, 0, 2] = a, -a * x / z
+    J[:, 1, 1], J[:, 1, 2] = b, -b * y / z
+    measured = seen.inverse_depth > 0
+    J[:, 2, 2] = np.where(measured, -1.0 / (z**2 * seen.sigma_inverse_depth), 0.0)
+    return J
 
 
 def refine_pose(
@@ -107,18 +135,14 @@ def _gauss_newton_step(
     """Twist (6,) by which to move the camera frame."""
     r, p = residuals(T, points, seen, intrinsics)
     used = used & np.isfinite(r[:, 0])
-    r, p, limit, sigma = r[used], p[used], limit[used], seen.sigma_px[used]
+    r, p, limit = r[used], p[used], limit[used]
     if len(r) < 6:
         return np.zeros(6)
     squares = (r**2).sum(axis=1)
     weight = np.sqrt(np.minimum(1.0, np.sqrt(limit / np.maximum(squares, 1e-12))))
     x, y, z = p.T
-    J = np.zeros((len(r), 3, 6))
-    a, b = intrinsics.fx / (z * sigma), intrinsics.fy / (z * sigma)
-    J[:, 0, 0], J[:, 0, 2] = a, -a * x / z
-    J[:, 1, 1], J[:, 1, 2] = b, -b * y / z
-    measured = seen.inverse_depth[used] > 0
-    J[:, 2, 2] = np.where(measured, -1.0 / (z**2 * seen.sigma_inverse_depth), 0.0)
+    J = np.empty((len(r), 3, 6))
+    J[:, :, :3] = residual_jacobian(p, seen.chosen(used), intrinsics)
     # d(p) / d(phi) = -hat(p)
     J[:, :, 3] = J[:, :, 2] * y[:, None] - J[:, :, 1] * z[:, None]
     J[:, :, 4] = J[:, :, 0] * z[:, None] - J[:, :, 2] * x[:, None]

@@ -6,19 +6,20 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ms_slam_env.slam.agreement import DepthImage
 from ms_slam_env.slam.base import Float32
 
 _SIZE = (16, 12)  # of a thumbnail, pixels
 
 
-def thumbnail(grey: NDArray[np.uint8], depth: Float32) -> Float32:
+def thumbnail(image: DepthImage) -> Float32:
     """Unit vector (D,) of an image's looks: its brightness and its nearness, coarsely."""
+    depth = image.depth
     nearness = np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0)
     parts = []
-    for image in (grey.astype(np.float32), nearness):
-        small = cv2.resize(image, _SIZE, interpolation=cv2.INTER_AREA)
+    for picture in (image.intensity, nearness):
+        small = cv2.resize(picture, _SIZE, interpolation=cv2.INTER_AREA)
         small = cv2.GaussianBlur(small, (0, 0), 1.0)
         small = small - small.mean()
         parts.append(small.ravel() / max(float(np.linalg.norm(small)), 1e-6))

@@ -30,9 +30,11 @@ class Keyframe:
         features: N features.
         point_ids: (N,) the point that each shows; -1 = none.
         color: (H, W, 3) uint8.
-        grey: (H, W) uint8.
+        intensity: (H, W) float32 in [0, 255].
         depth: (H, W) float32 metres; 0 = no reading.
         thumbnail: (D,) unit vector of its looks.
+        squares: (N, 9, 9) float32 intensity around each feature.
+        slopes: (N, 2) change of inverse depth from pixel to pixel at each feature, 1/m.
     """
 
     T_world_camera: Float64
@@ -40,13 +42,15 @@ class Keyframe:
     features: Features
     point_ids: Int64
     color: NDArray[np.uint8]
-    grey: NDArray[np.uint8]
+    intensity: Float32
     depth: Float32
     thumbnail: Float32
+    squares: Float32
+    slopes: Float64
 
     def image(self) -> DepthImage:
         """What frames are compared with."""
-        return DepthImage(self.depth, self.grey.astype(np.float32))
+        return DepthImage(self.depth, self.intensity)
 
     def seen_points(self) -> Int64:
         """Ids of the points that it shows."""
@@ -63,6 +67,7 @@ class SparseMap:
         self.positions: Float64 = np.zeros((0, 3))
         self.descriptors: NDArray[np.uint64] = np.zeros((0, 4), dtype=np.uint64)
         self.hosts: Int64 = np.zeros(0, dtype=np.int64)  # the keyframe that made each point
+        self.host_features: Int64 = np.zeros(0, dtype=np.int64)  # and the feature it shows it as
         self.alive: NDArray[np.bool_] = np.zeros(0, dtype=bool)
         self._tried: Int64 = np.zeros(0, dtype=np.int64)
         self._found: Int64 = np.zeros(0, dtype=np.int64)
@@ -72,6 +77,8 @@ class SparseMap:
         index = len(self.keyframes)
         self.keyframes.append(keyframe)
         features = keyframe.features
+        known = keyframe.point_ids >= 0
+        self.descriptors[keyframe.point_ids[known]] = features.descriptors[known]  # the latest look
         new = np.flatnonzero((keyframe.point_ids < 0) & (features.inverse_depth > 0))
         keyframe.point_ids[new] = len(self.positions) + np.arange(len(new))
         points = features.points(self.intrinsics)[new]
@@ -79,6 +86,7 @@ class SparseMap:
         self.positions = np.concatenate([self.positions, points])
         self.descriptors = np.concatenate([self.descriptors, features.descriptors[new]])
         self.hosts = np.concatenate([self.hosts, np.full(len(new), index)])
+        self.host_features = np.concatenate([self.host_features, new])
         self.alive = np.concatenate([self.alive, np.ones(len(new), dtype=bool)])
         zeros = np.zeros(len(new), dtype=np.int64)
         self._tried = np.concatenate([self._tried, zeros])
@@ -141,6 +149,7 @@ class SparseMap:
             "positions": self.positions.copy(),
             "descriptors": self.descriptors.copy(),
             "hosts": self.hosts.copy(),
+            "host_features": self.host_features.copy(),
             "alive": self.alive.copy(),
             "tried": self._tried.copy(),
             "found": self._found.copy(),
@@ -152,12 +161,22 @@ class SparseMap:
         self.positions = state["positions"].copy()
         self.descriptors = state["descriptors"].copy()
         self.hosts = state["hosts"].copy()
+        self.host_features = state["host_features"].copy()
         self.alive = state["alive"].copy()
         self._tried = state["tried"].copy()
         self._found = state["found"].copy()
 
 
-_OF_KEYFRAME = ("T_world_camera", "point_ids", "color", "grey", "depth", "thumbnail")
+_OF_KEYFRAME = (
+    "T_world_camera",
+    "point_ids",
+    "color",
+    "intensity",
+    "depth",
+    "thumbnail",
+    "squares",
+    "slopes",
+)
 _OF_FEATURES = ("pixels", "inverse_depth", "descriptors", "scale")
 
 

@@ -8,7 +8,6 @@ neighbours, and close loops. What a frame shows beyond its corners is the busine
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,11 +20,17 @@ from ms_slam_env.slam.agreement import FEWEST_READINGS, Agreement, DepthImage
 from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult, Views
 from ms_slam_env.slam.sparse.config import SparseConfig
 from ms_slam_env.slam.sparse.dense_map import DenseMap
-from ms_slam_env.slam.sparse.features import FeatureExtractor, sample_inverse_depth
+from ms_slam_env.slam.sparse.features import FeatureExtractor, InverseDepth
 from ms_slam_env.slam.sparse.gtsam_library import load_gtsam
 from ms_slam_env.slam.sparse.local_mapping import adjust_around
-from ms_slam_env.slam.sparse.localisation import Fix, LiveFrame, Localiser
+from ms_slam_env.slam.sparse.localisation import (
+    Fix,
+    LiveFrame,
+    Localiser,
+    keyframe_features,
+)
 from ms_slam_env.slam.sparse.loop_closure import LoopCloser
+from ms_slam_env.slam.sparse.patches import cut
 from ms_slam_env.slam.sparse.retrieval import most_alike, thumbnail
 from ms_slam_env.slam.sparse.sparse_map import Keyframe, SparseMap
 from ms_slam_env.slam.sparse.verification import NOTHING, Verifier
@@ -120,9 +125,11 @@ class SparseSlam(SlamBackend):
         depth = frame.depth.astype(np.float32)
         depth = np.where(depth <= self.config.depth_cutoff_m, depth, np.float32(0))
         grey = intensity_image(frame.color)
-        features = self._extract(grey, depth)
+        inverse_depth = InverseDepth(depth)
+        features = self._extract(grey, inverse_depth)
         tree = cKDTree(features.pixels) if len(features) else None
-        return LiveFrame(DepthImage(depth, grey.astype(np.float32)), grey, features, tree)
+        image = DepthImage(depth, grey.astype(np.float32))
+        return LiveFrame(image, inverse_depth, features, tree)
 
     def _start(self, frame: RGBDFrame, live: LiveFrame) -> TrackResult:
         """Take the first frame at the given pose, if there is something in it."""
@@ -155,7 +162,7 @@ class SparseSlam(SlamBackend):
     def _candidates(self, live: LiveFrame, guess: Float64 | None) -> list[int]:
         """Keyframes that the frame may look like, each once."""
         looks = [keyframe.thumbnail for keyframe in self._map.keyframes]
-        wanted = thumbnail(live.grey, live.image.depth)
+        wanted = thumbnail(live.image)
         candidates = [self._reference]
         if guess is not None:
             candidates += self._nearest(guess, _BESIDE)
@@ -201,27 +208,22 @@ class SparseSlam(SlamBackend):
 
     def _insert(self, frame: RGBDFrame, live: LiveFrame, fix: Fix | None, known: bool) -> None:
         """Make a frame a keyframe, adjust the map around it, and close a loop if there is one."""
-        point_ids = np.full(len(live.features), -1, dtype=np.int64)
-        features = live.features
-        if fix is not None:
-            point_ids[fix.features] = fix.point_ids
-            pixels = features.pixels.copy()
-            pixels[fix.features] = fix.pixels
-            inverse = sample_inverse_depth(live.image.depth, pixels)
-            features = replace(features, pixels=pixels, inverse_depth=inverse)
+        features, point_ids = keyframe_features(live, fix, self._map, self.config.pixel_noise)
         keyframe = Keyframe(
             T_world_camera=self._pose,
             known=known,
             features=features,
             point_ids=point_ids,
             color=frame.color.copy(),
-            grey=live.grey,
+            intensity=live.image.intensity,
             depth=live.image.depth,
-            thumbnail=thumbnail(live.grey, live.image.depth),
+            thumbnail=thumbnail(live.image),
+            squares=cut(live.image.intensity, features.pixels),
+            slopes=live.inverse_depth.slope(features.pixels),
         )
         self._reference = index = self._map.add(keyframe)
         adjust_around(self._map, index, self.config)
-        if self.config.loops and self._loops.close(index, live):
+        if self.config.loops and self._loops.close(index, live.showing(features)):
             adjust_around(self._map, index, self.config)
         self._pose = keyframe.T_world_camera.copy()
         self._dense.place(self._map.keyframes)
