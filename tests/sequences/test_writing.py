@@ -95,11 +95,12 @@ def test_an_interrupted_writing_goes_on_to_the_same_files(
     with pytest.raises(InputError, match="was not generated to its end"):
         open_recording(working_folder(target))
     again = []
-    monkeypatch.setattr(
-        RenderedFrames,
-        "__getitem__",
-        lambda frames, index: again.append(index) or take(frames, index),
-    )
+
+    def recorded(frames, index):
+        again.append(index)
+        return take(frames, index)
+
+    monkeypatch.setattr(RenderedFrames, "__getitem__", recorded)
     assert write_sequence(sequence, target, ABOUT, with_truth=True)
     assert again == list(range(stop_after, 4))  # nothing is rendered twice
     assert contents(target) == contents(tmp_path / "whole")
