@@ -1,0 +1,219 @@
+"""Kidnapped cameras find their pose again from keyframes, and no wrong one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from box_scene import BoxScene
+from surfel_scenes import ray_cast
+
+from ms_slam_env import slam
+from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
+from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import look_at, make_pose, relative_angle, so3_exp
+from ms_slam_env.sensor import RGBDSensor
+from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
+from ms_slam_env.slam.surfel.relocalisation import FernRelocalisation, Images
+from ms_slam_env.slam.surfel.relocalisation.likeness import LikenessLimits, measure_likeness
+
+CAMERA = xtion("160x120")
+OPTIONS = {"max_surfels": 120_000, "depth_cutoff_m": 4.0}
+EYE = np.array([-0.8, -0.8, 1.2])
+FRAMES = 45
+
+
+def _path() -> np.ndarray:
+    """The camera turns through 90 degrees, 2 a frame, and steps 1 cm a frame sideways."""
+    angles = np.radians(np.linspace(0, 90, FRAMES))
+    eyes = EYE + np.outer(np.arange(FRAMES), [0.005, 0.008, 0.0])
+    aims = np.stack([np.cos(angles), np.sin(angles), np.full(FRAMES, -0.35)], axis=1)
+    return np.stack([look_at(eye, eye + aim) for eye, aim in zip(eyes, aims, strict=True)])
+
+
+@pytest.fixture(scope="module")
+def sensor(box_scene: BoxScene) -> RGBDSensor:
+    return RGBDSensor(box_scene, CAMERA, noise="kinect", seed=0)
+
+
+@pytest.fixture(scope="module")
+def frames(sensor) -> list[RGBDFrame]:
+    return [sensor.capture(pose, index) for index, pose in enumerate(_path())]
+
+
+@pytest.fixture(scope="module")
+def mapped(frames) -> dict:
+    """State of a SLAM that has tracked the whole path."""
+    backend = slam.make("surfel", CAMERA, **OPTIONS)
+    backend.reset(_path()[0])
+    for frame in frames:
+        assert backend.track(frame).tracking_ok
+    return backend.get_state()
+
+
+def _resume(state: dict) -> slam.SlamBackend:
+    backend = slam.make("surfel", CAMERA, **OPTIONS)
+    backend.set_state(state)
+    return backend
+
+
+def _kidnapped() -> np.ndarray:
+    """Poses near the begin of the path, not on it: 12 cm and 9 degrees off, moving on."""
+    offset = make_pose(so3_exp(np.radians([3.0, 8.0, 2.0])), [0.08, -0.04, 0.08])
+    return _path()[3:13] @ offset
+
+
+@pytest.fixture(scope="module")
+def elsewhere(sensor) -> list[RGBDFrame]:
+    return [sensor.capture(pose, 1000 + index) for index, pose in enumerate(_kidnapped())]
+
+
+def test_a_kidnapped_camera_finds_its_pose_and_fuses_nothing_before(mapped, elsewhere):
+    backend = _resume(mapped)
+    count = len(backend.surface_points())
+    results = []
+    for frame, truth in zip(elsewhere, _kidnapped(), strict=True):
+        result = backend.track(frame)
+        results.append(result)
+        if not result.tracking_ok:
+            assert len(backend.surface_points()) == count
+            continue
+        assert np.linalg.norm(result.T_world_camera[:3, 3] - truth[:3, 3]) < 0.02
+        assert relative_angle(result.T_world_camera[:3, :3], truth[:3, :3]) < np.radians(1.5)
+    tracked = [result.tracking_ok for result in results]
+    first = tracked.index(True)
+    assert 2 <= first <= 5  # lost, found, confirmed
+    assert all(tracked[first:])
+    assert [result.relocalised for result in results].index(True) == first
+
+
+def test_a_pose_to_be_confirmed_is_part_of_the_state(mapped, elsewhere):
+    backend = _resume(mapped)
+    backend.track(elsewhere[0])
+    backend.track(elsewhere[1])
+    state = backend.get_state()
+    expected = [backend.track(frame) for frame in elsewhere[2:6]]
+    other = _resume(state)
+    for frame, result in zip(elsewhere[2:6], expected, strict=True):
+        again = other.track(frame)
+        np.testing.assert_array_equal(again.T_world_camera, result.T_world_camera)
+        assert again.tracking_ok == result.tracking_ok
+    assert expected[0].tracking_ok
+    np.testing.assert_array_equal(other.surface_points(), backend.surface_points())
+
+
+def test_another_scene_is_never_recognised(mapped):
+    sensor = RGBDSensor(BoxScene(seed=7), CAMERA, noise="kinect", seed=3)
+    backend = _resume(mapped)
+    rng = np.random.default_rng(0)
+    for index in range(8):
+        pose = look_at(EYE + rng.normal(0, 0.1, 3), rng.uniform([0, 0, 0.2], [2, 2, 1.2]))
+        assert not backend.track(sensor.capture(pose, index)).tracking_ok
+
+
+def test_the_local_search_stays_lost(frames, elsewhere):
+    backend = slam.make("surfel", CAMERA, relocalisation="local", **OPTIONS)
+    backend.reset(_path()[0])
+    for frame in frames:
+        backend.track(frame)
+    assert not any(backend.track(frame).tracking_ok for frame in elsewhere[:5])
+
+
+def test_kidnapping_one_env_leaves_the_other_alone(frames, elsewhere):
+    config = SurfelConfig(**OPTIONS)
+    mapped = frames[::2]
+    orders = ([*mapped, *elsewhere[:4]], [*mapped, *mapped[::-1][:4]])
+    together, alone = BatchedSurfelSlam(2, CAMERA, config), []
+    for env in range(2):
+        together.reset(_path()[0], env)
+        alone.append(BatchedSurfelSlam(1, CAMERA, config))
+        alone[env].reset(_path()[0])
+    found = False
+    for pair in zip(*orders, strict=True):
+        both = np.stack([f.color for f in pair]), np.stack([f.depth for f in pair])
+        for env, result in enumerate(together.track(*both)):
+            single = alone[env].track(pair[env].color[None], pair[env].depth[None])[0]
+            assert single.tracking_ok == result.tracking_ok
+            np.testing.assert_array_equal(single.T_world_camera, result.T_world_camera)
+            found |= result.relocalised
+    assert found
+
+
+def test_keyframes_follow_a_bent_map():
+    ferns = FernRelocalisation(1, CAMERA, 3.0)
+    rng = np.random.default_rng(0)
+    depth = np.ones((1, *CAMERA.shape), dtype=np.float32)
+    for time in (3, 5, 9):
+        color = np.kron(rng.integers(0, 256, (1, 6, 8, 3)), np.ones((1, 20, 20, 1)))
+        frames = Images(color.astype(np.uint8), depth)
+        pose = make_pose(np.eye(3), [time, 0.0, 0.0])
+        ferns.remember(frames, pose[None], np.array([time]), np.array([True]))
+    bent = np.stack([make_pose(so3_exp([0, 0, 0.1]), [10.0 * time, 1.0, 0.0]) for time in (5, 9)])
+    ferns.move(0, np.array([5, 9], dtype=np.int32), bent)
+    poses = ferns.databases[0].poses
+    assert poses[0, 0, 3] == 3  # of a frame that the closure does not know
+    np.testing.assert_array_equal(poses[1:], bent)
+
+
+def test_an_unknown_variant_is_refused():
+    with pytest.raises(InputError, match="ferns, local"):
+        slam.make("surfel", CAMERA, relocalisation="sift")
+
+
+VIEW = Intrinsics(fx=80.0, fy=84.0, cx=39.3, cy=29.8, width=80, height=60)
+
+
+def _view(T_world_camera: np.ndarray, checks: float = 40.0) -> tuple[np.ndarray, np.ndarray]:
+    """Colour and depth of a tilted wall with a fine random texture, by ray casting."""
+    depth, _, color = ray_cast(T_world_camera, VIEW, box=False)
+    rays = VIEW.rays() @ T_world_camera[:3, :3].T
+    points = T_world_camera[:3, 3] + depth[..., None] * rays
+    cells = np.floor(points[..., :2] / 0.08).astype(int)
+    fine = (np.sin(cells[..., 0] * 12.9898 + cells[..., 1] * 78.233) * 43758.5453) % 1.0
+    color = np.clip(color + checks * (fine[..., None] - 0.5), 0, 255)
+    return color.astype(np.uint8), depth.astype(np.float32)
+
+
+def _likeness(frame, view):
+    grey = view[0].astype(np.float32) @ np.float32([0.299, 0.587, 0.114])
+    return measure_likeness(*frame, grey, view[1], cutoff_m=10.0)
+
+
+def test_a_frame_is_like_the_view_from_its_pose_only():
+    limits, frame = LikenessLimits(), _view(np.eye(4))
+    same = _likeness(frame, _view(np.eye(4)))
+    assert same.overlap == same.inliers == 1
+    assert same.correlation == pytest.approx(1, abs=1e-3)
+    assert limits.accept(same)
+    # Along the wall: depth is the same there, the texture is not.
+    tangent = np.cross([0.3, -0.2, -1.0], [0.0, 1.0, 0.0])
+    along = make_pose(np.eye(3), 0.3 * tangent / np.linalg.norm(tangent))
+    shifted = _likeness(frame, _view(along))
+    assert shifted.inliers == 1
+    assert shifted.correlation < 0.3
+    assert not limits.accept(shifted)
+    ahead = _likeness(frame, _view(make_pose(np.eye(3), [0.0, 0.0, 0.3])))
+    assert ahead.inliers < 0.05
+    assert not limits.accept(ahead)
+
+
+def test_likeness_asks_neither_for_exposure_nor_for_texture():
+    color, depth = _view(np.eye(4))
+    dark = (0.5 * color + 10).astype(np.uint8)
+    assert _likeness((dark, depth), (color, depth)).correlation > 0.98
+    plain = np.full_like(color, 90)
+    found = _likeness((plain, depth), (plain, depth))
+    assert found.texture < 1
+    assert LikenessLimits().accept(found)
+    assert not LikenessLimits().accept(_likeness((plain, depth * np.float32(1.1)), (plain, depth)))
+
+
+def test_what_does_not_overlap_is_not_alike():
+    color, depth = _view(np.eye(4))
+    hidden = depth.copy()
+    hidden[:, 20:] = 0
+    found = _likeness((color, depth), (color, hidden))
+    assert found.overlap == pytest.approx(0.25, abs=0.01)
+    assert not LikenessLimits().accept(found)
+    nothing = _likeness((color, np.zeros_like(depth)), (color, depth))
+    assert nothing.overlap == 0
+    assert not LikenessLimits().accept(nothing)
