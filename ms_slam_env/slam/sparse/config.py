@@ -20,8 +20,7 @@ class SparseConfig:
         detection_width: smaller images are magnified to this width before features are sought:
             ORB describes a patch of 31 pixels, a fifth of an image of 160.
         hamming: largest distance of matching descriptors, bits of 256.
-        pixel_noise: standard deviation of a corner's position, pixels,
-        patch_noise: and of that of a patch that was registered.
+        pixel_noise: standard deviation of a corner's position, pixels.
         inverse_depth_noise: standard deviation of the inverse of its depth, 1/m. Structured light
             errs by a constant one, so that the error of depth grows with depth squared.
         least_matches: matches that a pose must explain to be believed.
@@ -49,7 +48,6 @@ class SparseConfig:
     detection_width: int = 320
     hamming: int = 60
     pixel_noise: float = 0.7
-    patch_noise: float = 0.3
     inverse_depth_noise: float = 0.004
     least_matches: int = 15
     least_overlap: float = 0.3
@@ -74,7 +72,6 @@ class SparseConfig:
         check_range(self, "detection_width", 1, 4000)
         check_range(self, "hamming", 1, 256)
         check_range(self, "pixel_noise", 0.01, 10.0)
-        check_range(self, "patch_noise", 0.01, 10.0)
         check_range(self, "inverse_depth_noise", 0.0001, 1.0)
         check_range(self, "least_matches", 6, 1000)
         check_range(self, "least_overlap", 0.0, 1.0)

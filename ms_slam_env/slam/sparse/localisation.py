@@ -10,11 +10,11 @@ from scipy.spatial import cKDTree
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, transform_points
 from ms_slam_env.slam.agreement import DepthImage
-from ms_slam_env.slam.base import Float32, Float64
+from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.sparse.config import SparseConfig
 from ms_slam_env.slam.sparse.features import Features, InverseDepth
 from ms_slam_env.slam.sparse.matching import Int64, match_anywhere, match_near
-from ms_slam_env.slam.sparse.patches import Patches, find_patches
+from ms_slam_env.slam.sparse.patches import Patches, Templates, find_patches
 from ms_slam_env.slam.sparse.pose import (
     Sightings,
     pose_from_matches,
@@ -26,6 +26,7 @@ _SAME_PX = 1.0  # corners closer than this to a point's place are that point
 _RADIUS = 0.045  # of the search for a point, share of the image's width
 _NEIGHBOURS = 6  # keyframes, besides the reference, whose points are looked for
 _RANSAC_SIGMAS = 3.0
+_SIGMA_STEP_PX = 0.1
 _CORNER_SHIFT_PX = 1.5  # largest correction of a corner
 _PATCH_SHIFT_PX = 3.0  # largest distance of a patch from where its point projects to
 
@@ -184,15 +185,16 @@ class Localiser:
         shift = np.zeros_like(projected)
         places = frame.features.pixels[feature_of[visible[matched]]]
         shift[matched] = places - projected[matched]
-        patches, squares = self._patches(visible, shift, T_world_camera)
+        patches, templates = self._patches(visible, shift, T_world_camera)
         image = frame.image.intensity
-        pixels, found = find_patches(image, squares, patches, self._intrinsics)
+        pixels, sigma = find_patches(image, templates, patches, self._intrinsics)
         moved = np.abs(pixels - projected - shift).max(axis=1, initial=0)
-        found &= moved < np.where(matched, _CORNER_SHIFT_PX, _PATCH_SHIFT_PX)
+        found = np.isfinite(sigma) & (moved < np.where(matched, _CORNER_SHIFT_PX, _PATCH_SHIFT_PX))
         sharp, pixels = visible[found], pixels[found]
         rest = ~np.isin(ids, sharp)
         other = self._sightings(frame.features, features[rest])
-        sigma = np.full(len(sharp), self._config.patch_noise)
+        # Rounded up: adjustment keeps one model of the noise for each value.
+        sigma = np.ceil(sigma[found] / _SIGMA_STEP_PX) * _SIGMA_STEP_PX
         seen = Sightings(
             np.concatenate([pixels, other.pixels]),
             np.concatenate([frame.inverse_depth.at(pixels), other.inverse_depth]),
@@ -204,29 +206,26 @@ class Localiser:
 
     def _patches(
         self, ids: Int64, shift: Float64, T_world_camera: Float64
-    ) -> tuple[Patches, Float32]:
-        """The patches of points in the keyframes that made them, and their squares."""
+    ) -> tuple[Patches, Templates]:
+        """The patches of points in the keyframes that made them."""
         T_camera_world = invert(T_world_camera)
         pixels, slope = np.empty((len(ids), 2)), np.empty((len(ids), 2))
-        inverse, motion = np.empty(len(ids)), np.empty((len(ids), 4, 4))
-        squares = []
+        motion = np.empty((len(ids), 4, 4))
+        inverse = np.empty(len(ids))
+        templates = Templates.empty(len(ids))
         hosts = self._map.hosts[ids]
-        order = np.argsort(hosts, kind="stable")
         for host in np.unique(hosts).tolist():
             here = np.flatnonzero(hosts == host)
             keyframe = self._map.keyframes[host]
             place = self._map.host_features[ids[here]]
             pixels[here] = keyframe.features.pixels[place]
             slope[here] = keyframe.slopes[place]
+            templates.put(here, keyframe.templates.chosen(place))
             pose = keyframe.T_world_camera
             motion[here] = T_camera_world @ pose
             points = transform_points(invert(pose), self._map.positions[ids[here]])
             inverse[here] = 1.0 / np.maximum(points[:, 2], 0.05)
-            squares.append(keyframe.squares[place])
-        stacked = np.concatenate(squares) if squares else np.zeros((0, 9, 9), dtype=np.float32)
-        sorted_squares = np.empty_like(stacked)
-        sorted_squares[order] = stacked
-        return Patches(pixels, inverse, slope, motion, shift), sorted_squares
+        return Patches(pixels, inverse, slope, motion, shift), templates
 
 
 def keyframe_features(

@@ -9,6 +9,7 @@ do not add up from keyframe to keyframe.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,11 +20,13 @@ from ms_slam_env.slam.base import Float32, Float64
 
 _HALF = 3  # pixels on each side of the patch's centre
 _MARGIN = 6.0  # pixels to the border
-_ITERATIONS = 5
+_ITERATIONS = 4
 _LARGEST_ZOOM = 2.0  # between the two images, areas
-_LEVELS = 12.0  # largest RMS difference of a patch that was found, grey levels
+_UNLIKE = 0.6  # largest RMS difference of a patch that was found, of its contrast
 _LEAST_NOISE = 1.0  # grey levels
-_LARGEST_SIGMA_PX = 0.6  # a patch that fixes its place less well is on an edge, or blank
+_SMALLEST_GRADIENT = 1e-2  # keeps blank patches solvable; nothing else feels it
+_LEAST_SIGMA_PX = 0.2  # what warping as a plane, and by a pose not yet exact, leaves
+_LARGEST_SIGMA_PX = 0.7  # a patch that fixes its place less well is on an edge, or blank
 
 
 @dataclass(frozen=True)
@@ -65,22 +68,68 @@ def warp(patches: Patches, intrinsics: Intrinsics) -> tuple[Float64, Float64]:
     return centre, np.swapaxes(projected[:, 1:] - centre[:, None], 1, 2) / _HALF
 
 
-def cut(image: Float32, pixels: Float64) -> Float32:
-    """Squares (N, 2 h + 3, 2 h + 3) around pixels (N, 2) of an image, h = 3, one pixel wider."""
+@dataclass(frozen=True)
+class Templates:
+    """What patches look like, and how they respond to a shift.
+
+    Attributes:
+        wanted: (N, K) intensity of their pixels less its mean.
+        step: (N, 2, K) shift, pixels of their image, that a difference of intensity speaks for.
+        contrast: (N,) standard deviation of their intensity, levels.
+        spread: (N, 2, 2) covariance of the place found, for noise of one level, pixels squared.
+    """
+
+    wanted: Float32
+    step: Float32
+    contrast: Float32
+    spread: Float32
+
+    @classmethod
+    def empty(cls, count: int) -> Templates:
+        """Room for templates."""
+        pixels = (2 * _HALF + 1) ** 2
+        shapes = (count, pixels), (count, 2, pixels), (count,), (count, 2, 2)
+        return cls(*(np.empty(shape, dtype=np.float32) for shape in shapes))
+
+    def put(self, where: NDArray[Any], others: Templates) -> None:
+        """Put other templates into some places."""
+        for name in ("wanted", "step", "contrast", "spread"):
+            getattr(self, name)[where] = getattr(others, name)
+
+    def chosen(self, which: NDArray[Any]) -> Templates:
+        """Some of the templates."""
+        return Templates(
+            self.wanted[which], self.step[which], self.contrast[which], self.spread[which]
+        )
+
+
+def cut(image: Float32, pixels: Float64) -> Templates:
+    """Templates around pixels (N, 2) of an image (H, W)."""
     side = np.arange(-_HALF - 1, _HALF + 2)
     u = pixels[:, 0, None, None] + np.broadcast_to(side[None, :], (len(side), len(side)))
     v = pixels[:, 1, None, None] + np.broadcast_to(side[:, None], (len(side), len(side)))
-    return _sample(image, u, v)
+    square = _sample(image, u, v)
+    inner = square[:, 1:-1, 1:-1].reshape(len(square), -1)
+    across = (square[:, 1:-1, 2:] - square[:, 1:-1, :-2]).reshape(inner.shape) / 2
+    down = (square[:, 2:, 1:-1] - square[:, :-2, 1:-1]).reshape(inner.shape) / 2
+    J = np.stack([across, down], axis=1)
+    J -= J.mean(axis=2, keepdims=True)  # a change of brightness is no difference
+    H = J @ np.swapaxes(J, 1, 2) + np.float32(_SMALLEST_GRADIENT) * np.eye(2, dtype=np.float32)
+    spread = np.linalg.inv(H)
+    wanted = inner - inner.mean(axis=1, keepdims=True)
+    return Templates(wanted, spread @ J, wanted.std(axis=1), spread)
 
 
 def find_patches(
-    image: Float32, squares: Float32, patches: Patches, intrinsics: Intrinsics
-) -> tuple[Float64, NDArray[np.bool_]]:
-    """Where (N, 2) patches are in an image (H, W), and whether (N,) they are there.
+    image: Float32, templates: Templates, patches: Patches, intrinsics: Intrinsics
+) -> tuple[Float64, Float64]:
+    """Where (N, 2) patches are in an image (H, W), and how surely (N,): 1 sigma, pixels.
+
+    Infinite where a patch was not found.
 
     Args:
         image: intensity, levels.
-        squares: of the patches, from ``cut``.
+        templates: of the patches.
         patches: where they come from.
         intrinsics: of all images.
     """
@@ -90,49 +139,37 @@ def find_patches(
     size = np.array([intrinsics.width, intrinsics.height])
     good = (zoom > 1 / _LARGEST_ZOOM) & (zoom < _LARGEST_ZOOM)
     good &= ((start > _MARGIN) & (start < size - 1 - _MARGIN)).all(axis=1)
-    found = np.full_like(start, np.nan)
-    if good.any():
-        where = np.flatnonzero(good)
-        found[where], fits = _shift_until_fit(image, squares[where], start[where], A[where])
-        good[where] = fits
-    return found, good
+    where = np.flatnonzero(good)
+    found, sigma = start.copy(), np.full(len(start), np.inf)
+    if len(where):
+        found[where], sigma[where] = _shift_until_fit(
+            image, templates.chosen(where), start[where], A[where]
+        )
+    return found, sigma
 
 
 def _shift_until_fit(
-    image: Float32, squares: Float32, start: Float64, A: Float64
-) -> tuple[Float64, NDArray[np.bool_]]:
+    image: Float32, templates: Templates, start: Float64, A: Float64
+) -> tuple[Float64, Float64]:
     """Gauss-Newton over the two coordinates of every patch, with the patch's own gradients."""
-    inner = squares[:, 1:-1, 1:-1].reshape(len(squares), -1)
-    gradient = np.stack(
-        [
-            (squares[:, 1:-1, 2:] - squares[:, 1:-1, :-2]).reshape(inner.shape) / 2,
-            (squares[:, 2:, 1:-1] - squares[:, :-2, 1:-1]).reshape(inner.shape) / 2,
-        ],
-        axis=-1,
-    )
-    J = gradient @ np.linalg.inv(A)  # chain rule: offsets of the patch to pixels of the image
-    J -= J.mean(axis=1, keepdims=True)  # a change of brightness is no difference
-    H = np.swapaxes(J, 1, 2) @ J
-    trace, det = H[:, 0, 0] + H[:, 1, 1], np.linalg.det(H)
-    least = trace / 2 - np.sqrt(np.maximum(trace**2 / 4 - det, 0))
-    H[least < 1e-3] = np.eye(2)  # a blank patch: of no consequence, below
-    solve = np.linalg.inv(H) @ np.swapaxes(J, 1, 2)
-    wanted = inner - inner.mean(axis=1, keepdims=True)
     offset = np.stack(np.meshgrid(*[np.arange(-_HALF, _HALF + 1)] * 2), axis=-1).reshape(-1, 2)
-    warped = np.einsum("nij,kj->nki", A, offset)
-    at = start.copy()
+    warped = np.swapaxes(A @ offset.T, 1, 2).astype(np.float32)
+    A, at = A.astype(np.float32), start.astype(np.float32)
+    step = A @ templates.step  # from pixels of the patch's image to pixels of this one
     for _ in range(_ITERATIONS):
-        pixels = at[:, None] + warped
-        seen = _sample(image, pixels[..., 0], pixels[..., 1])
-        difference = seen - seen.mean(axis=1, keepdims=True) - wanted
-        at -= np.einsum("nik,nk->ni", solve, difference)
-        at = np.clip(at, start - _MARGIN, start + _MARGIN)
-    rms = np.sqrt((difference**2).mean(axis=1))
-    sigma = np.maximum(rms, _LEAST_NOISE) / np.sqrt(np.maximum(least, 1e-9))
-    return at, (rms < _LEVELS) & (sigma < _LARGEST_SIGMA_PX)
+        seen = _sample(image, at[:, :1] + warped[..., 0], at[:, 1:] + warped[..., 1])
+        difference = seen - seen.mean(axis=1, keepdims=True) - templates.wanted
+        at = at - (step @ difference[:, :, None])[:, :, 0]
+    rms = difference.std(axis=1)
+    covariance = A @ templates.spread @ np.swapaxes(A, 1, 2)
+    variance = np.trace(covariance, axis1=1, axis2=2) * np.maximum(rms, _LEAST_NOISE) ** 2
+    sigma = np.sqrt(variance + _LEAST_SIGMA_PX**2).astype(np.float64)
+    unlike = rms > _UNLIKE * templates.contrast
+    sigma[unlike | (sigma > _LARGEST_SIGMA_PX)] = np.inf
+    return at.astype(np.float64), sigma
 
 
-def _sample(image: Float32, u: Float64, v: Float64) -> Float32:
+def _sample(image: Float32, u: NDArray[Any], v: NDArray[Any]) -> Float32:
     """Bilinear values at places of any shape (N, ...)."""
     flat = (len(u), -1)
     x, y = (np.ascontiguousarray(c.reshape(flat), dtype=np.float32) for c in (u, v))

@@ -13,8 +13,10 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, transform_points
 from ms_slam_env.slam.agreement import DepthImage
 from ms_slam_env.slam.base import Float32, Float64
-from ms_slam_env.slam.sparse.features import Features
+from ms_slam_env.slam.sparse.features import Features, InverseDepth
 from ms_slam_env.slam.sparse.matching import Int64
+from ms_slam_env.slam.sparse.patches import Templates, cut
+from ms_slam_env.slam.sparse.retrieval import thumbnail
 
 _TRIED_FRAMES = 8  # frames after which a point that is hardly ever found again is dropped
 _FOUND_SHARE = 0.25  # as in ORB-SLAM
@@ -33,7 +35,7 @@ class Keyframe:
         intensity: (H, W) float32 in [0, 255].
         depth: (H, W) float32 metres; 0 = no reading.
         thumbnail: (D,) unit vector of its looks.
-        squares: (N, 9, 9) float32 intensity around each feature.
+        templates: the patch around each feature.
         slopes: (N, 2) change of inverse depth from pixel to pixel at each feature, 1/m.
     """
 
@@ -45,7 +47,7 @@ class Keyframe:
     intensity: Float32
     depth: Float32
     thumbnail: Float32
-    squares: Float32
+    templates: Templates
     slopes: Float64
 
     def image(self) -> DepthImage:
@@ -55,6 +57,30 @@ class Keyframe:
     def seen_points(self) -> Int64:
         """Ids of the points that it shows."""
         return self.point_ids[self.point_ids >= 0]
+
+
+def make_keyframe(
+    T_world_camera: Float64,
+    known: bool,
+    features: Features,
+    point_ids: Int64,
+    color: NDArray[np.uint8],
+    intensity: Float32,
+    depth: Float32,
+) -> Keyframe:
+    """A keyframe, with what follows from its image; see ``Keyframe``."""
+    return Keyframe(
+        T_world_camera=T_world_camera,
+        known=known,
+        features=features,
+        point_ids=point_ids,
+        color=color,
+        intensity=intensity,
+        depth=depth,
+        thumbnail=thumbnail(DepthImage(depth, intensity)),
+        templates=cut(intensity, features.pixels),
+        slopes=InverseDepth(depth).slope(features.pixels),
+    )
 
 
 class SparseMap:
@@ -191,4 +217,4 @@ def _save(keyframe: Keyframe) -> dict[str, Any]:
 def _restore(saved: dict[str, Any]) -> Keyframe:
     features = Features(**{name: saved[name].copy() for name in _OF_FEATURES})
     own = {name: saved[name].copy() for name in _OF_KEYFRAME}
-    return Keyframe(known=saved["known"], features=features, **own)
+    return make_keyframe(known=saved["known"], features=features, **own)

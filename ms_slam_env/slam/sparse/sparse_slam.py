@@ -30,9 +30,8 @@ from ms_slam_env.slam.sparse.localisation import (
     keyframe_features,
 )
 from ms_slam_env.slam.sparse.loop_closure import LoopCloser
-from ms_slam_env.slam.sparse.patches import cut
 from ms_slam_env.slam.sparse.retrieval import most_alike, thumbnail
-from ms_slam_env.slam.sparse.sparse_map import Keyframe, SparseMap
+from ms_slam_env.slam.sparse.sparse_map import SparseMap, make_keyframe
 from ms_slam_env.slam.sparse.verification import NOTHING, Verifier
 
 _LOOKALIKES = 4  # keyframes in which a lost camera is sought
@@ -209,7 +208,7 @@ class SparseSlam(SlamBackend):
     def _insert(self, frame: RGBDFrame, live: LiveFrame, fix: Fix | None, known: bool) -> None:
         """Make a frame a keyframe, adjust the map around it, and close a loop if there is one."""
         features, point_ids = keyframe_features(live, fix, self._map, self.config.pixel_noise)
-        keyframe = Keyframe(
+        keyframe = make_keyframe(
             T_world_camera=self._pose,
             known=known,
             features=features,
@@ -217,9 +216,6 @@ class SparseSlam(SlamBackend):
             color=frame.color.copy(),
             intensity=live.image.intensity,
             depth=live.image.depth,
-            thumbnail=thumbnail(live.image),
-            squares=cut(live.image.intensity, features.pixels),
-            slopes=live.inverse_depth.slope(features.pixels),
         )
         self._reference = index = self._map.add(keyframe)
         adjust_around(self._map, index, self.config)
