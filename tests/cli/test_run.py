@@ -1,6 +1,9 @@
 """``ms-slam run``: what it writes, and what an unfinished run leaves."""
 
 import json
+import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -12,6 +15,7 @@ from ms_slam_env.cli import main
 from ms_slam_env.geometry import look_at
 from ms_slam_env.metrics import ate_rmse
 from ms_slam_env.sequences import read_trajectory, render_sequence, write_trajectory
+from ms_slam_env.sequences.recording import Recording
 
 FRAMES = 8
 
@@ -77,8 +81,6 @@ def test_reduced_images_and_parameters(sequence, tmp_path):
 
 
 def test_a_run_that_fails_keeps_the_trajectory_so_far(sequence, tmp_path, capsys):
-    import shutil
-
     broken = tmp_path / "broken"
     shutil.copytree(sequence, broken)
     image = broken / "depth/5.png"
@@ -95,6 +97,68 @@ def test_a_run_that_fails_keeps_the_trajectory_so_far(sequence, tmp_path, capsys
     assert not written["complete"]
     assert written["frames"] == 5
     assert "5.png" in written["error"]
+
+
+def test_an_interrupted_run_keeps_the_trajectory_so_far(sequence, tmp_path, capsys, monkeypatch):
+    decode = Recording.frame
+
+    def frame(recording, index):
+        if index == 4:
+            raise KeyboardInterrupt  # what Ctrl-C raises
+        return decode(recording, index)
+
+    out = tmp_path / "out"
+    assert main(["run", str(sequence), "--out", str(out)]) == 0
+    whole = (out / "trajectory.txt").read_text().splitlines()
+    monkeypatch.setattr(Recording, "frame", frame)
+    assert main(["run", str(sequence), "--out", str(out)]) == 130
+    assert capsys.readouterr().err.strip().splitlines()[-1].startswith("ms-slam: interrupted")
+    # Nothing of the earlier, finished run is left to be taken for this one's.
+    assert sorted(path.name for path in out.iterdir()) == [
+        "metrics.json",
+        "trajectory.incomplete.txt",
+    ]
+    assert (out / "trajectory.incomplete.txt").read_text().splitlines() == whole[:5]
+    written = json.loads((out / "metrics.json").read_text())
+    assert (written["complete"], written["frames"]) == (False, 4)
+    assert written["error"] == "KeyboardInterrupt"
+
+
+def test_a_killed_run_keeps_the_trajectory_so_far(sequence, tmp_path):
+    """Nothing can be done at SIGKILL; what was written frame by frame is there."""
+    code = """
+import os, sys
+from ms_slam_env.cli import main
+from ms_slam_env.sequences.recording import Recording
+decode = Recording.frame
+Recording.frame = lambda recording, k: os._exit(9) if k == 3 else decode(recording, k)
+main(sys.argv[1:])
+"""
+    out = tmp_path / "out"
+    command = [sys.executable, "-c", code, "run", str(sequence), "--out", str(out)]
+    assert subprocess.run(command, capture_output=True).returncode == 9
+    times, _ = read_trajectory(out / "trajectory.incomplete.txt")
+    assert len(times) == 3
+    assert not (out / "trajectory.txt").exists()
+
+
+def test_says_what_registration_it_assumes(sequence, tmp_path, capsys):
+    folder = tmp_path / "seq-01"
+    folder.mkdir()
+    for index in range(3):
+        depth = np.asarray(Image.open(sequence / f"depth/{index}.png")) // 5
+        Image.fromarray(depth.astype(np.uint16)).save(folder / f"frame-00000{index}.depth.png")
+        shutil.copy(sequence / f"rgb/{index}.png", folder / f"frame-00000{index}.color.png")
+    shutil.copy(sequence / "intrinsics.txt", folder)
+    out = tmp_path / "out"
+    assert main(["run", str(folder), "--out", str(out)]) == 0
+    assert "colour brought into the depth camera: focal ratio 0.8974, baseline 2.5 cm" in (
+        capsys.readouterr().err
+    )
+    assert "focal ratio" in json.loads((out / "metrics.json").read_text())["registration"]
+    assert main(["run", str(folder), "--register", "False", "--out", str(out)]) == 0
+    assert "focal ratio" not in capsys.readouterr().err
+    assert json.loads((out / "metrics.json").read_text())["registration"] is None
 
 
 @pytest.mark.parametrize(

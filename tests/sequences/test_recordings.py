@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from PIL import Image
 
 from ms_slam_env.camera import Intrinsics
@@ -180,6 +182,30 @@ CASES = {
         lambda f: broken(f, "groundtruth.txt", "0 nan 0 0 0 0 0 1\n"),
         r"groundtruth\.txt, line 1: a number is not finite",
     ),
+    "NaN time": (
+        lambda f: broken(f, "depth.txt", "nan depth/0.png\n"),
+        r"depth\.txt:1: nan is not finite",
+    ),
+    "NaN intrinsics": (
+        lambda f: broken(f, "intrinsics.txt", "30 nan 15.5 11.5 32 24\n"),
+        r"intrinsics\.txt:1: nan is not finite",
+    ),
+    "no focal length": (
+        lambda f: broken(f, "intrinsics.txt", "0 30 15.5 11.5 32 24\n"),
+        r"intrinsics\.txt:1: focal lengths",
+    ),
+    "depth scale of zero": (
+        lambda f: broken(f, "intrinsics.txt", f"{INTRINSICS} 0\n"),
+        r"intrinsics\.txt:1: depth_scale",
+    ),
+    "unsorted poses": (
+        lambda f: broken(f, "groundtruth.txt", "1 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n"),
+        r"groundtruth\.txt, line 2: timestamp 0\.0 does not come after 1\.0",
+    ),
+    "no text": (
+        lambda f: (f / "depth.txt").write_bytes(b"\xff\xfe\x00\x81"),
+        r"cannot read .*depth\.txt",
+    ),
     "times that never meet": (
         lambda f: broken(f, "rgb.txt", "100 rgb/0.png\n"),
         r"no image of rgb\.txt is as old",
@@ -215,7 +241,133 @@ def test_broken_images(tum, case):
     recording.frame(0)
     with pytest.raises(InputError, match=message) as caught:
         recording.frame(1)
-    assert re.search(r"depth\.txt:2: .*1\.png", str(caught.value))
+    assert re.search(r"depth\.txt:2: .*depth/1\.png", str(caught.value))
+    assert "\n" not in str(caught.value)
+
+
+COLOR_IMAGES = {
+    "missing": (lambda p: p.unlink(), "No such file"),
+    "truncated": (lambda p: p.write_bytes(p.read_bytes()[:60]), "truncated|cannot identify|broken"),
+    "empty": (lambda p: p.write_bytes(b""), "cannot identify"),
+    "another size": (
+        lambda p: Image.fromarray(colors(0)[:, :16]).save(p),
+        "is 16x24 but the intrinsics say 32x24",
+    ),
+    "depth for colour": (lambda p: Image.fromarray(depth_values(0)).save(p), "not a colour image"),
+}
+
+
+@pytest.mark.parametrize("case", COLOR_IMAGES)
+def test_broken_colour_images(tum, case):
+    breaks, message = COLOR_IMAGES[case]
+    breaks(tum / "rgb/1.png")
+    recording = open_recording(tum)
+    recording.frame(0)
+    with pytest.raises(InputError, match=message) as caught:
+        recording.frame(1)
+    assert re.search(r"depth\.txt:2: .*rgb/1\.png", str(caught.value))
+    assert "\n" not in str(caught.value)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(0, 2**32), st.sampled_from(["cut", "flip", "insert"]))
+def test_a_damaged_file_gives_an_image_or_one_clear_error(tmp_path_factory, seed, damage):
+    rng = np.random.default_rng(seed)
+    folder = tmp_path_factory.getbasetemp() / "damaged"
+    if not folder.exists():
+        write_images(folder, 1)
+        (folder / "intrinsics.txt").write_text(INTRINSICS)
+        (folder / "whole.bin").write_bytes((folder / "depth/0.png").read_bytes())
+    data = bytearray((folder / "whole.bin").read_bytes())
+    where = int(rng.integers(0, len(data)))
+    if damage == "cut":
+        del data[where:]
+    elif damage == "flip":
+        for k in rng.integers(0, len(data), 4):
+            data[k] ^= int(rng.integers(1, 256))
+    else:
+        data[where:where] = rng.bytes(7)
+    (folder / "depth/0.png").write_bytes(bytes(data))
+    recording = open_recording(folder)
+    complaint = "depth/0.png"
+    try:
+        assert recording.frame(0).depth.shape == (HEIGHT, WIDTH)
+    except InputError as error:
+        complaint = str(error)
+    assert "depth/0.png" in complaint
+    assert "\n" not in complaint
+
+
+def test_unsorted_and_duplicate_associations(tum):
+    lines = ["0 depth/0.png 0 rgb/0.png", "1 depth/1.png 1 rgb/1.png"]
+    for order in ([1, 0], [0, 0]):
+        (tum / "associations.txt").write_text("\n".join(lines[k] for k in order))
+        with pytest.raises(InputError, match=r"associations\.txt:2: timestamp .* does not come"):
+            open_recording(tum)
+    (tum / "associations.txt").write_text("0 depth/0.png 0")
+    with pytest.raises(InputError, match=r"associations\.txt:1: expected 'time file time file'"):
+        open_recording(tum)
+    (tum / "associations.txt").write_text("# nothing\n")
+    with pytest.raises(InputError, match=r"associations\.txt lists no image"):
+        open_recording(tum)
+
+
+POSES = {
+    "NaN": ("1 0 0 nan\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", r"pose\.txt:1: nan is not finite"),
+    "word": ("1 0 0 0\n0 1 0 x\n0 0 1 0\n0 0 0 1\n", r"pose\.txt:2: 'x' is not a number"),
+    "three rows": ("1 0 0 0\n0 1 0 0\n0 0 1 0\n", "expected 4 rows of 4 numbers"),
+    "empty": ("", "expected 4 rows of 4 numbers"),
+    "no rotation": ("2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "is not a rigid motion"),
+    "mirror": ("-1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "is not a rigid motion"),
+}
+
+
+@pytest.mark.parametrize("case", POSES)
+def test_broken_poses_of_seven_scenes(tmp_path, case):
+    folder = tmp_path / "seq-01"
+    write_images(folder, 2, "frame-00000{}.depth.png", "frame-00000{}.color.png")
+    (folder / "intrinsics.txt").write_text(INTRINSICS)
+    text, message = POSES[case]
+    (folder / "frame-000001.pose.txt").write_text(text)
+    with pytest.raises(InputError, match=message) as caught:
+        open_recording(folder)
+    assert "frame-000001.pose.txt" in str(caught.value)
+
+
+def test_a_rounded_rotation_is_made_orthonormal(tmp_path):
+    folder = tmp_path / "seq-01"
+    write_images(folder, 1, "frame-00000{}.depth.png", "frame-00000{}.color.png")
+    (folder / "intrinsics.txt").write_text(INTRINSICS)
+    exact = make_pose(so3_exp([0.4, -0.2, 0.7]), [1, 2, 3])
+    np.savetxt(folder / "frame-000000.pose.txt", exact, fmt="%.3f")
+    T = open_recording(folder).truth[0]
+    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(T, exact, atol=2e-3)
+
+
+def test_seven_scenes_without_colour(tmp_path):
+    folder = tmp_path / "seq-01"
+    write_images(folder, 2, "frame-00000{}.depth.png", "frame-00000{}.color.png")
+    (folder / "intrinsics.txt").write_text(INTRINSICS)
+    (folder / "frame-000000.color.png").unlink()
+    with pytest.raises(InputError, match=r"No such file.*frame-000000\.color\.png"):
+        open_recording(folder).frame(0)
+    (folder / "frame-000001.color.png").unlink()
+    recording = open_recording(folder)
+    assert not recording.has_color
+    assert not recording.frame(0).color.any()
+
+
+def test_empty_and_unequal_folders(tmp_path):
+    folder = tmp_path / "mine"
+    (folder / "depth").mkdir(parents=True)
+    (folder / "intrinsics.txt").write_text(INTRINSICS)
+    with pytest.raises(InputError, match=r"mine/depth holds no image"):
+        open_recording(folder)
+    write_images(folder, 2)
+    (folder / "rgb/1.png").unlink()
+    with pytest.raises(InputError, match="2 depth images but 1 colour images"):
+        open_recording(folder)
 
 
 def test_unknown_choices(tum):

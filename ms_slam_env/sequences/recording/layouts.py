@@ -95,6 +95,8 @@ def _associations(path: Path) -> list[Entry]:
         d, c = (0, 2) if first_is_depth else (2, 0)
         time = number(words[d], where)
         entries.append(Entry(time, path.parent / words[d + 1], path.parent / words[c + 1], where))
+    if not entries:
+        raise InputError(f"{path} lists no image")
     return entries
 
 
@@ -193,6 +195,8 @@ def _images(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder of images")
     found = [path for path in folder.iterdir() if path.suffix.lower() in IMAGES]
+    if not found:
+        raise InputError(f"{folder} holds no image; valid kinds: {', '.join(IMAGES)}")
     return sorted(found, key=lambda path: [int(n) for n in re.findall(r"\d+", path.stem)])
 
 

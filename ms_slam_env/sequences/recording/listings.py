@@ -130,7 +130,10 @@ def read_intrinsics(path: Path) -> Calibration:
                 f"{where}: expected 'fx fy cx cy width height [depth_scale]', "
                 f"got {' '.join(words)!r}"
             )
-        return calibration(*values)
+        try:
+            return calibration(*values)
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
     raise InputError(f"{path} holds no intrinsics: 'fx fy cx cy width height [depth_scale]'")
 
 
