@@ -91,37 +91,64 @@ def frustum_of(T_world_camera: wp.mat44, camera: SplatCamera, margin_px: float):
     return frustum
 
 
-@wp.func
-def reaches_inside(inwards: wp.vec3, distance: float, half: wp.vec3):
-    """Whether a box, its centre ``distance`` inside of a plane, is not wholly outside of it.
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+constexpr int LANES = 1;  // blocks at a time
+#else
+constexpr int LANES = 64;
+#endif
+const int n = end - first < LANES ? end - first : LANES;
+const size_t start = size_t(b) * blocks.low.shape[1] + first;
+const float* low = (const float*)blocks.low.data + 3 * start;
+const float* high = (const float*)blocks.high.data + 3 * start;
+// The planes of the frustum: a point p of the camera's frame is inside where m . p + d > 0.
+const wp::mat33 R = frustum.R;
+const wp::vec3 t = frustum.t;
+const float inwards[6][3] = {
+    {0.0f, 0.0f, 1.0f}, {0.0f, 0.0f, -1.0f},
+    {1.0f, 0.0f, -frustum.low_u}, {-1.0f, 0.0f, frustum.high_u},
+    {0.0f, 1.0f, -frustum.low_v}, {0.0f, -1.0f, frustum.high_v}};
+int seen[LANES];
+for (int k = 0; k < n; ++k) seen[k] = 1;
+for (int plane = 0; plane < 6; ++plane) {
+    const float* m = inwards[plane];
+    const float ax = m[0] * R.data[0][0] + m[1] * R.data[1][0] + m[2] * R.data[2][0];
+    const float ay = m[0] * R.data[0][1] + m[1] * R.data[1][1] + m[2] * R.data[2][1];
+    const float az = m[0] * R.data[0][2] + m[1] * R.data[1][2] + m[2] * R.data[2][2];
+    const float d = m[0] * t[0] + m[1] * t[1] + m[2] * t[2]
+        + (plane == 0 ? -frustum.z_near : plane == 1 ? frustum.z_far : 0.0f);
+    // Room for rounding, which grows with the numbers that are added.
+    const float size = fabsf(ax) + fabsf(ay) + fabsf(az);
+    const float shift = fabsf(m[0] * t[0]) + fabsf(m[1] * t[1]) + fabsf(m[2] * t[2]);
+    for (int k = 0; k < n; ++k) {
+        const float x = 0.5f * (low[3 * k] + high[3 * k]);
+        const float y = 0.5f * (low[3 * k + 1] + high[3 * k + 1]);
+        const float z = 0.5f * (low[3 * k + 2] + high[3 * k + 2]);
+        const float reach = fabsf(ax) * (high[3 * k] - x) + fabsf(ay) * (high[3 * k + 1] - y)
+            + fabsf(az) * (high[3 * k + 2] - z);
+        const float room = 1.0e-5f * (size * (1.0f + fabsf(x) + fabsf(y) + fabsf(z)) + shift);
+        seen[k] &= ax * x + ay * y + az * z + d + reach + room >= 0.0f;
+    }
+}
+int which[LANES];
+int found = 0;
+for (int k = 0; k < n; ++k) {
+    which[found] = k;
+    found += seen[k];
+}
+if (found == 0) return n;
+int* listed = blocks.listed.data + size_t(row) * blocks.listed.shape[1]
+    + wp::atomic_add(blocks.num_listed.data + row, found);
+for (int m = 0; m < found; ++m) listed[m] = first + which[m];
+return n;
+""")
+def list_some_blocks(
+    blocks: Blocks, b: int, first: int, end: int, frustum: Frustum, row: int
+) -> int:
+    """List those of the blocks from ``first`` on that reach into a frustum; how many were tested.
 
-    ``inwards`` is the plane's normal of any length, ``half`` the box's half size, both in the same
-    frame.
+    A block is left out only if its box is wholly outside of one plane of the frustum.
     """
-    reach = wp.abs(inwards[0]) * half[0] + wp.abs(inwards[1]) * half[1]
-    return distance + reach + wp.abs(inwards[2]) * half[2] >= 0.0
-
-
-@wp.func
-def may_see(frustum: Frustum, low: wp.vec3, high: wp.vec3):
-    """Whether a point of a box may be inside a frustum; never false if one is."""
-    centre = 0.5 * (low + high)
-    # Room for rounding, which grows with the coordinates.
-    size = wp.abs(centre[0]) + wp.abs(centre[1]) + wp.abs(centre[2])
-    room = 1.0e-5 * (1.0 + size)
-    half = 0.5 * (high - low) + wp.vec3(room, room, room)
-    p = frustum.R * centre + frustum.t
-    right = wp.vec3(frustum.R[0, 0], frustum.R[0, 1], frustum.R[0, 2])
-    down = wp.vec3(frustum.R[1, 0], frustum.R[1, 1], frustum.R[1, 2])
-    forward = wp.vec3(frustum.R[2, 0], frustum.R[2, 1], frustum.R[2, 2])
-    return (
-        reaches_inside(forward, p[2] - frustum.z_near, half)
-        and reaches_inside(forward, frustum.z_far - p[2], half)
-        and reaches_inside(right - frustum.low_u * forward, p[0] - frustum.low_u * p[2], half)
-        and reaches_inside(frustum.high_u * forward - right, frustum.high_u * p[2] - p[0], half)
-        and reaches_inside(down - frustum.low_v * forward, p[1] - frustum.low_v * p[2], half)
-        and reaches_inside(frustum.high_v * forward - down, frustum.high_v * p[2] - p[1], half)
-    )
 
 
 @wp.kernel
@@ -144,9 +171,8 @@ def list_blocks(
     count = num_blocks(surfels.count[b])
     block = int(worker)
     while block < count:
-        if may_see(frustum, blocks.low[b, block], blocks.high[b, block]):
-            blocks.listed[k, wp.atomic_add(blocks.num_listed, k, 1)] = block
-        block += workers
+        tested = list_some_blocks(blocks, b, block, count, frustum, k)
+        block += wp.where(workers == 1, tested, workers)
 
 
 @wp.func_native(
