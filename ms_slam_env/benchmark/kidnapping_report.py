@@ -14,6 +14,9 @@ from ms_slam_env.benchmark.statistics import Interval, median_interval, share_in
 from ms_slam_env.benchmark.table import format_interval, format_number, markdown_table
 
 
+EVERY = "all"
+
+
 @dataclass(frozen=True)
 class Cell:
     """All attempts of one image size, setting and variant.
@@ -44,12 +47,19 @@ class Cell:
 
 
 def summarise(rows: Sequence[Row]) -> list[Cell]:
-    """One cell for each image size, setting and variant, in the order of their appearance."""
+    """One cell for each image size, setting and variant, in the order of their appearance.
+
+    If there are several settings, ``EVERY`` stands for all together.
+    """
     cells: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
+    together: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
     for row in finished(rows):
         for attempt in row["result"]["attempts"]:
-            key = (row["spec"]["size"], attempt["setting"], attempt["variant"])
-            cells.setdefault(key, []).append(attempt)
+            size, variant = row["spec"]["size"], attempt["variant"]
+            cells.setdefault((size, attempt["setting"], variant), []).append(attempt)
+            together.setdefault((size, EVERY, variant), []).append(attempt)
+    if len({setting for _, setting, _ in cells}) > 1:
+        cells |= together
     sizes = list(dict.fromkeys(size for size, _, _ in cells))
     settings = list(dict.fromkeys(setting for _, setting, _ in cells))
     order = sorted(cells, key=lambda key: (sizes.index(key[0]), settings.index(key[1])))

@@ -144,6 +144,14 @@ def test_shares_and_times_of_known_attempts():
     assert cell.black_tracked == 4
     assert as_table([cell]).splitlines()[2].startswith("| 160x120 near ferns | 4 | 50.0 [")
     assert about_the_maps(rows).startswith("1 of 2 maps were used")
+    rows[1]["result"]["attempts"][0]["setting"] = "foreign"
+    near, foreign, every = summarise(rows)
+    assert [(c.setting, c.attempts) for c in (near, foreign, every)] == [
+        ("near", 3),
+        ("foreign", 1),
+        ("all", 4),
+    ]
+    assert every.wrong == cell.wrong
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ COLOUR_BITS = 7  # red 1, green 2, blue 4
 DEPTH_BIT = 8
 MEAN_LEVEL = 128.0  # frames are made this bright, on average, before they are tested
 _THRESHOLDS = (32.0, 224.0)  # on colours, after that
+_AVERAGED = 4  # rows and columns of the image, at least, that a reduced pixel is the mean of
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,7 @@ class FernEncoder:
         columns = min(config.columns, width)
         rows = max(1, round(height * columns / width))
         self._size = (columns, rows)
+        self._step = max(1, min(height // rows, width // columns) // _AVERAGED)
         self._blur_px = config.blur_px
         column = rng.integers(0, columns, config.num_ferns)
         row = rng.integers(0, rows, config.num_ferns)
@@ -65,7 +67,8 @@ class FernEncoder:
         Colours are divided by the frame's mean brightness: a change of exposure changes no bit,
         but where it saturates.
         """
-        small = cv2.resize(color, self._size, interpolation=cv2.INTER_AREA)
+        thinned = np.ascontiguousarray(color[:: self._step, :: self._step])
+        small = cv2.resize(thinned, self._size, interpolation=cv2.INTER_AREA)
         small = cv2.GaussianBlur(small, (0, 0), self._blur_px)
         tested = small.reshape(-1, 3)[self._color_place]
         brightness = max(float(np.mean(small)), 1.0)
