@@ -114,8 +114,8 @@ def cut(image: Float32, pixels: Float64) -> Templates:
     down = (square[:, 2:, 1:-1] - square[:, :-2, 1:-1]).reshape(inner.shape) / 2
     J = np.stack([across, down], axis=1)
     J -= J.mean(axis=2, keepdims=True)  # a change of brightness is no difference
-    H = J @ np.swapaxes(J, 1, 2) + np.float32(_SMALLEST_GRADIENT) * np.eye(2, dtype=np.float32)
-    spread = np.linalg.inv(H)
+    H = J @ np.swapaxes(J, 1, 2) + _SMALLEST_GRADIENT * np.eye(2)
+    spread = np.linalg.inv(H).astype(np.float32)
     wanted = inner - inner.mean(axis=1, keepdims=True)
     return Templates(wanted, spread @ J, wanted.std(axis=1), spread)
 

@@ -193,16 +193,7 @@ class SparseMap:
         self._found = state["found"].copy()
 
 
-_OF_KEYFRAME = (
-    "T_world_camera",
-    "point_ids",
-    "color",
-    "intensity",
-    "depth",
-    "thumbnail",
-    "squares",
-    "slopes",
-)
+_OF_KEYFRAME = ("T_world_camera", "point_ids", "color", "intensity", "depth")
 _OF_FEATURES = ("pixels", "inverse_depth", "descriptors", "scale")
 
 
