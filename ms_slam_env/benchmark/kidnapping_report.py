@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from ms_slam_env.benchmark.kidnapping_scenarios import FOREIGN
 from ms_slam_env.benchmark.planner_report import finished
 from ms_slam_env.benchmark.records import Row
 from ms_slam_env.benchmark.statistics import Interval, median_interval, share_interval
 from ms_slam_env.benchmark.table import format_interval, format_number, markdown_table
-
 
 EVERY = "all"
 
@@ -26,7 +26,8 @@ class Cell:
         setting: kind of interruption.
         variant: of the relocalisation.
         attempts: their number.
-        found: share in which the true pose was found, with its Wilson interval.
+        found: share in which the true pose was found, with its Wilson interval; of those in the
+            scene that was mapped.
         wrong: share in which a wrong pose was given.
         first: median number of frames before the first pose, of the attempts that gave one.
         relocalisation_s: mean relocalisation time of those (USME equation 11), seconds.
@@ -67,12 +68,13 @@ def summarise(rows: Sequence[Row]) -> list[Cell]:
 
 
 def _cell(key: tuple[str, str, str], attempts: list[dict[str, Any]]) -> Cell:
+    findable = [attempt for attempt in attempts if attempt["setting"] != FOREIGN]
     given = [attempt for attempt in attempts if attempt["first"] is not None]
     seconds = [attempt["relocalisation_s"] for attempt in given]
     return Cell(
         *key,
         attempts=len(attempts),
-        found=share_interval([attempt["found"] for attempt in attempts]),
+        found=share_interval([attempt["found"] for attempt in findable]),
         wrong=share_interval([attempt["wrong"] for attempt in attempts]),
         first=median_interval([attempt["first"] for attempt in given]),
         relocalisation_s=float(np.mean(seconds)) if seconds else float("nan"),

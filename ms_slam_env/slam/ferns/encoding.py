@@ -23,7 +23,7 @@ COLOUR_BITS = 7  # red 1, green 2, blue 4
 DEPTH_BIT = 8
 MEAN_LEVEL = 128.0  # frames are made this bright, on average, before they are tested
 _THRESHOLDS = (32.0, 224.0)  # on colours, after that
-_AVERAGED = 4  # rows and columns of the image, at least, that a reduced pixel is the mean of
+_AVERAGED = 8  # rows and columns of the image, at least, that a reduced pixel is the mean of
 
 
 @dataclass(frozen=True)
