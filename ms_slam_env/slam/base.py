@@ -28,6 +28,8 @@ class TrackResult:
         reason: why tracking failed, in words; empty when it did not.
         loop_closed: whether this frame closed a loop: the map was bent, and the pose jumped by the
             drift that was taken back.
+        degenerate_directions: number of directions of the pose, of six, that the view does not
+            constrain, as in front of a blank wall; along them the pose is only predicted.
     """
 
     T_world_camera: Float64
@@ -36,6 +38,12 @@ class TrackResult:
     inlier_fraction: float = 1.0
     residual_m: float = 0.0
     reason: str = ""
+    degenerate_directions: int = 0
+
+    @property
+    def degenerate(self) -> bool:
+        """Whether the view left a direction of the pose unconstrained."""
+        return self.degenerate_directions > 0
     loop_closed: bool = False
 
 

@@ -25,7 +25,7 @@ def _sums(H: np.ndarray, g: np.ndarray) -> np.ndarray:
     system = np.concatenate([H[np.triu_indices(6)], g])
     sums = np.zeros(NUM_SUMS)
     sums[:27] = 0.25 * system
-    sums[SUM_PHOTOMETRIC:] = 0.75 * system
+    sums[SUM_PHOTOMETRIC : SUM_PHOTOMETRIC + 27] = 0.75 * system
     return sums
 
 
@@ -58,11 +58,13 @@ def test_step_solves_and_applies_the_exponential(seed, size):
     np.testing.assert_allclose(result[:3, :3] @ result[:3, :3].T, np.eye(3), atol=1e-12)
 
 
-def test_a_singular_system_moves_nothing_and_rests():
+def test_a_singular_system_moves_only_where_it_is_regular():
     H = np.diag([1.0, 1, 1, 1, 1, 0])
     T = se3_exp([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
-    result, state = _step(H, np.ones(6), T)
-    np.testing.assert_array_equal(result, T)
+    result, _ = _step(H, [-0.01, 0, 0, 0.02, 0, 1], T)
+    np.testing.assert_allclose(result, T @ se3_exp([0.01, 0, 0, -0.02, 0, 0]), atol=1e-12)
+    result, state = _step(np.zeros((6, 6)), np.ones(6), T)
+    np.testing.assert_allclose(result, T, atol=1e-15)
     assert state == RESTING
 
 

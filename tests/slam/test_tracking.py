@@ -22,7 +22,6 @@ from ms_slam_env.slam.surfel.verdict import (
     APPEARANCE,
     FEW_POINTS,
     REASONS,
-    UNCONSTRAINED,
     make_limits,
 )
 
@@ -271,14 +270,6 @@ def test_a_frame_without_depth_has_too_few_points(pair):
     black = np.zeros((1, *pair.camera.shape, 3), dtype=np.uint8)
     live = pair.preprocessors[1](black, np.zeros((1, *pair.camera.shape), dtype=np.float32))
     assert pair.align(model, live).verdict[0] == FEW_POINTS
-
-
-def test_a_blank_wall_does_not_constrain_the_pose(pair):
-    blank = np.full((1, *pair.camera.shape, 3), 128, dtype=np.uint8)
-    wall = np.full((1, *pair.camera.shape), 1.5, dtype=np.float32)
-    model = pair.preprocessors[0](blank, wall)
-    live = pair.preprocessors[1](blank, wall)
-    assert pair.align(model, live).verdict[0] == UNCONSTRAINED
 
 
 def test_foreign_colours_do_not_fit(pair):

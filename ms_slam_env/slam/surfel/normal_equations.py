@@ -41,7 +41,7 @@ from __future__ import annotations
 from ms_slam_env._warp import wp
 from ms_slam_env.slam.surfel.memory import fetch
 
-NUM_SUMS = 69
+NUM_SUMS = 70
 """Sums of a pass: geometric term, statistics, exposure, photometric term.
 
 A term has 21 sums of H (upper triangle by rows) and 6 of g = J^T W r.
@@ -58,6 +58,7 @@ SUM_APART = 35  # matched, but the live surface is clearly nearer or farther tha
 SUM_EXPOSURE = 36  # sums of w, w m, w m^2, w r, w m r over exposed points, m = I_p - 128
 SUM_ROUGH = 41  # of the textured: 1 - robust weight; half their number at the right scale
 SUM_PHOTOMETRIC = 42  # the photometric term's
+SUM_TILTED = 69  # geometric weights times 1 - cosine of the angle between the normals
 
 
 OFF = wp.constant(0)  # states of a hypothesis, in ``active``: takes no part
@@ -178,6 +179,7 @@ def accumulate(
     sum_wr = wp.float32(0.0)
     sum_wmr = wp.float32(0.0)
     rough = wp.float32(0.0)
+    tilted = wp.float32(0.0)
     light = photometry[b, k]
     gain = light.gain
     bias = light.bias
@@ -237,6 +239,7 @@ def accumulate(
         inliers += wp.where(is_inlier, 1.0, 0.0)
         squared += wp.where(is_inlier, residual * residual, 0.0)
         weight = wp.where(is_near, weights.icp * robust * per_sigma * per_sigma, 0.0)
+        tilted += weight * (1.0 - alignment)
         system = add_point(system, n, wp.cross(live, n), residual, weight)
         corner = live_image + row * live_width + column
         top_left = fetch(live_gradient, corner)
@@ -295,3 +298,4 @@ def accumulate(
     partial[b, k, slot, 39] = sum_wr
     partial[b, k, slot, 40] = sum_wmr
     partial[b, k, slot, 41] = rough
+    partial[b, k, slot, 69] = tilted

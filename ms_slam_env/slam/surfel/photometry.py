@@ -25,21 +25,21 @@ SMALL_BIAS = 4.0  # theirs, applied frame after frame, would bleach or darken th
 MIDDLE_GREY = 128.0  # about which gain and bias are nearly independent
 LARGEST_CONFLICT = 1.0  # 95 % of the frames of registered images have less
 TRUST_FALLS = 0.2  # by this factor a frame at most
-TRUST_GROWS = 1.03
+TRUST_GROWS = 1.15
 LEAST_TRUST = 1.0e-4
 USUAL_SCALE = 1.4  # a frame's residuals may have 1.4 times the scale estimated for the last ones
 SCALE_FALLS = 0.1  # share of the way to a smaller scale, a frame
 
 
 def same_exposure(batch: int) -> NDArray[Any]:
-    """Photometry (B,) of images exposed like the map, with full trust."""
+    """Photometry (B,) of images exposed like the map, full trust."""
     lights = np.zeros(batch, dtype=DTYPE)
     for name in ("gain", "scale", "reference", "trust"):
         lights[name] = 1.0
     return lights
 
 
-def without_trust(lights: NDArray[Any]) -> NDArray[Any]:
+def geometry_only(lights: NDArray[Any]) -> NDArray[Any]:
     """The same (B,) for an alignment by geometry alone."""
     blind = lights.copy()
     blind["trust"] = 0.0

@@ -25,11 +25,12 @@ from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.inputs import check_guesses, check_images, check_poses
 from ms_slam_env.slam.surfel.loops.make import make_loop_closure
 from ms_slam_env.slam.surfel.mirror import Mirror
+from ms_slam_env.slam.surfel.motions import damped, motion_weight
 from ms_slam_env.slam.surfel.photometry import (
     ExposureCorrection,
     follow,
+    geometry_only,
     same_exposure,
-    without_trust,
 )
 from ms_slam_env.slam.surfel.preprocess import Preprocessor
 from ms_slam_env.slam.surfel.relocalisation import Images, make_relocalisation
@@ -43,6 +44,7 @@ from ms_slam_env.slam.surfel.verdict import (
     OK,
     REASONS,
     STAT_CONFLICT,
+    STAT_DEGENERATE,
     STAT_INLIER_FRACTION,
     STAT_RESIDUAL_M,
     geometric_limits,
@@ -198,7 +200,7 @@ class BatchedSurfelSlam:
             self.poses,
             near,
             geometric_limits(self._lost),
-            photometry=without_trust(self._photometry),
+            photometry=geometry_only(self._photometry),
         )
         return alignment.replace(failed & (again.verdict == OK), again)
 
@@ -279,7 +281,10 @@ class BatchedSurfelSlam:
         if code == 0:
             self.poses[env] = alignment.T_world_live[env]
             # Across a gap the motion is not one frame's.
-            self._motions[env] = np.eye(4) if relocalised else alignment.T_model_live[env]
+            motion = np.eye(4) if relocalised else alignment.T_model_live[env]
+            # What a degenerate view leaves open was predicted itself: let it die away.
+            is_degenerate = alignment.stats[env, STAT_DEGENERATE] > 0
+            self._motions[env] = damped(motion) if is_degenerate else motion
             self._lost[env] = 0
             self._photometry[env] = follow(
                 self._photometry[env],
@@ -297,6 +302,7 @@ class BatchedSurfelSlam:
             inlier_fraction=float(alignment.stats[env, STAT_INLIER_FRACTION]),
             residual_m=float(alignment.stats[env, STAT_RESIDUAL_M]),
             reason=REASON if code == BLANK else REASONS[code],
+            degenerate_directions=int(alignment.stats[env, STAT_DEGENERATE]),
         )
 
     def _fuse(self, live: LiveFrame, good: NDArray[np.bool_]) -> None:
@@ -385,14 +391,3 @@ def accept_any_fit(alignment: Alignment) -> Alignment:
     usable &= np.isfinite(alignment.T_world_live).all(axis=(1, 2))
     unusable = np.where(alignment.verdict == BLANK, BLANK, FEW_POINTS)
     return replace(alignment, verdict=np.where(usable, OK, unusable).astype(np.int32))
-
-
-def motion_weight(motions: Float64) -> NDArray[np.float32]:
-    """Weights (B,) in [0.5, 1] of frames reached by ``motions`` (B, 4, 4).
-
-    Readings of a fast camera are blurred and skewed; 1 at rest, 0.5 from 0.1 m or 0.1 rad a frame.
-    """
-    distance = np.linalg.norm(motions[:, :3, 3], axis=1)
-    cosine = (np.trace(motions[:, :3, :3], axis1=1, axis2=2) - 1) / 2
-    size = np.maximum(distance, np.arccos(np.clip(cosine, -1, 1)))
-    return np.maximum(0.5, 1 - size / 0.2).astype(np.float32)

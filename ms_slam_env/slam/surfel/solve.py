@@ -7,10 +7,15 @@ Lie theory" (2018), equations (172) and (174).
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
+from ms_slam_env.slam.surfel.degeneracy import (
+    gradient_in_metres,
+    in_metres,
+    mat66d,
+    remapped_step,
+    turning_length,
+    vec6d,
+)
 from ms_slam_env.slam.surfel.normal_equations import RESTING, RUNNING, Photometry
-
-mat66d = wp.types.matrix(shape=(6, 6), dtype=wp.float64)
-vec6d = wp.types.vector(length=6, dtype=wp.float64)
 
 
 @wp.kernel
@@ -42,6 +47,24 @@ def load_hessian(sums: wp.array3d(dtype=wp.float64), b: int, k: int, first: int)
                 H[j, i] = sums[b, k, index]
                 index += 1
     return H
+
+
+@wp.func
+def load_terms(sums: wp.array3d(dtype=wp.float64), b: int, k: int):
+    """Both terms' H and g for a rotation times a length, and that length in metres."""
+    A = load_hessian(sums, b, k, 0)
+    B = load_hessian(sums, b, k, 42)
+    g_a = vec6d()
+    g_b = vec6d()
+    for i in range(6):
+        g_a[i] = sums[b, k, 21 + i]
+        g_b[i] = sums[b, k, 63 + i]
+    length = turning_length(A + B)
+    A = in_metres(A, length)
+    B = in_metres(B, length)
+    g_a = gradient_in_metres(g_a, length)
+    g_b = gradient_in_metres(g_b, length)
+    return A, B, g_a, g_b, length
 
 
 @wp.func
@@ -171,25 +194,20 @@ def gauss_newton_step(
     photometry: wp.array2d(dtype=Photometry),
     active: wp.array2d(dtype=wp.int32),
 ):
-    """Move every active hypothesis by the solution of H xi = -g; stop those that converged."""
+    """Move every active hypothesis where the data constrain it; stop those that converged."""
     b, k = wp.tid()
     if active[b, k] == RUNNING:
-        photometry[b, k] = update_photometry(sums, b, k, photometry[b, k], least_scale)
-        H = load_hessian(sums, b, k, 0) + load_hessian(sums, b, k, 42)
-        right = vec6d()
+        light = photometry[b, k]
+        photometry[b, k] = update_photometry(sums, b, k, light, least_scale)
+        A, B, g_a, g_b, length = load_terms(sums, b, k)
+        xi = remapped_step(A, B, g_a + g_b, sums[b, k, 69], sums[b, k, 30], damping)
+        for i in range(3, 6):
+            xi[i] = xi[i] / length
+        size = wp.float64(0.0)
         for i in range(6):
-            right[i] = -sums[b, k, 21 + i] - sums[b, k, 63 + i]
-            H[i, i] = H[i, i] * (wp.float64(1.0) + damping)
-        L = cholesky(H)
-        if L[0, 0] > wp.float64(0.0):
-            xi = cholesky_solve(L, right)
-            size = wp.float64(0.0)
-            for i in range(6):
-                size = wp.max(size, wp.abs(xi[i]))
-            pose[b, k] = orthonormalise(pose[b, k] * se3_exp(xi))
-            if size < smallest_step:
-                active[b, k] = RESTING
-        else:
+            size = wp.max(size, wp.abs(xi[i]))
+        pose[b, k] = orthonormalise(pose[b, k] * se3_exp(xi))
+        if size < smallest_step:
             active[b, k] = RESTING
     if last != 0 and active[b, k] == RESTING:
         active[b, k] = RUNNING

@@ -8,14 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env._warp import wp
+from ms_slam_env.slam.surfel.degeneracy import (
+    eigen,
+    is_constrained,
+    mat66d,
+    vec6d,
+)
 from ms_slam_env.slam.surfel.normal_equations import OFF, RUNNING, Photometry
 from ms_slam_env.slam.surfel.solve import (
     cholesky,
     cholesky_solve,
-    load_hessian,
-    mat66d,
+    load_terms,
     orthonormalise,
-    vec6d,
 )
 
 OK = 0
@@ -43,7 +47,8 @@ STAT_APART_FRACTION = 4
 STAT_SIGMA = 5  # standard deviation of the worst translation or rotation component
 STAT_COST = 6  # mean truncated cost of the visible points, in [0, 3]
 STAT_CONFLICT = 7  # chi squared between the poses that the two terms ask for
-NUM_STATS = 8
+STAT_DEGENERATE = 8  # number of directions that are not constrained
+NUM_STATS = 9
 
 
 @wp.struct
@@ -56,7 +61,8 @@ class Limits:
     alike: wp.float64
     apart: wp.float64
     cost: wp.float64
-    sigma: wp.float64
+    sigma: wp.float64  # metres, in the worst of the constrained directions
+    degenerate: wp.int32  # most directions that may be unconstrained
     motion_m: wp.float64
     motion_cos: wp.float64
 
@@ -141,17 +147,13 @@ def _squared_norm(H: mat66d, g: vec6d):
 
 
 @wp.func
-def _conflict(A: mat66d, B: mat66d, sums: wp.array3d(dtype=wp.float64), b: int):
+def _conflict(A: mat66d, B: mat66d, g_a: vec6d, g_b: vec6d):
     """Chi squared of the difference between the minima of the geometric and photometric terms.
 
     min (x - x_a)^T A (x - x_a) + (x - x_b)^T B (x - x_b): what the joint minimum costs more than
-    each term at its own. A prior of 5 cm and 0.05 rad keeps a term without information at home.
+    each term at its own. A prior of 5 cm keeps a term without information at home.
     """
-    g_a = vec6d()
-    g_b = vec6d()
     for i in range(6):
-        g_a[i] = sums[b, 0, 21 + i]
-        g_b[i] = sums[b, 0, 63 + i]
         A[i, i] += wp.float64(400.0)
         B[i, i] += wp.float64(400.0)
     return _squared_norm(A, g_a) + _squared_norm(B, g_b) - _squared_norm(A + B, g_a + g_b)
@@ -183,17 +185,15 @@ def judge(
     overlap = visible / wp.max(points, one)
     cost = sums[b, 0, 27] / wp.max(visible, one)
 
-    sigma = wp.float64(1.0e9)
-    A = load_hessian(sums, b, 0, 0)
-    B = load_hessian(sums, b, 0, 42)
-    L = cholesky(A + B)
-    if L[0, 0] > wp.float64(0.0):
-        sigma = wp.float64(0.0)
-        for i in range(6):
-            unit = vec6d()
-            unit[i] = one
-            column = cholesky_solve(L, unit)
-            sigma = wp.max(sigma, wp.sqrt(column[i]))
+    A, B, g_a, g_b, _length = load_terms(sums, b, 0)
+    E = eigen(A + B)
+    sigma = wp.float64(0.0)
+    degenerate = wp.int32(0)
+    for k in range(6):
+        if is_constrained(E, k, A, sums[b, 0, 69], matched):
+            sigma = wp.max(sigma, one / wp.sqrt(E[6, k]))
+        else:
+            degenerate += 1
 
     T = T_model_live[b, 0]
     distance = wp.sqrt(T[0, 3] * T[0, 3] + T[1, 3] * T[1, 3] + T[2, 3] * T[2, 3])
@@ -204,7 +204,7 @@ def judge(
         code = 1
     elif overlap < limit.overlap:
         code = 2
-    elif sigma > limit.sigma:
+    elif sigma > limit.sigma or degenerate > limit.degenerate:
         code = 3
     elif inlier_fraction < limit.inliers or apart_fraction > limit.apart:
         code = 4
@@ -221,7 +221,8 @@ def judge(
     stats[b, 4] = apart_fraction
     stats[b, 5] = sigma
     stats[b, 6] = cost
-    stats[b, 7] = _conflict(A, B, sums, b)
+    stats[b, 8] = wp.float64(degenerate)
+    stats[b, 7] = _conflict(A, B, g_a, g_b)
 
 
 _LIMITS_DTYPE = Limits.numpy_dtype()  # type: ignore[attr-defined]
@@ -244,7 +245,8 @@ def make_limits(strict: NDArray[np.bool_], lost: NDArray[np.int32]) -> NDArray[A
     limits["alike"] = np.where(strict, 0.75, 0.7)
     limits["apart"] = np.where(strict, 0.12, 0.15)
     limits["cost"] = np.where(strict, 1.3, 1.4)
-    limits["sigma"] = 0.02
+    limits["sigma"] = 0.04
+    limits["degenerate"] = np.where(strict, 0, 5)
     limits["motion_m"] = np.minimum(1.0, 0.3 + 0.1 * lost)
     limits["motion_cos"] = np.cos(np.radians(np.minimum(60.0, 30.0 + 10.0 * lost)))
     return limits
@@ -253,6 +255,6 @@ def make_limits(strict: NDArray[np.bool_], lost: NDArray[np.int32]) -> NDArray[A
 def geometric_limits(lost: NDArray[np.int32]) -> NDArray[Any]:
     """Limits (B,) of an alignment by geometry alone near the expected pose."""
     limits = make_limits(np.ones(len(lost), dtype=bool), lost)
-    limits["alike"], limits["cost"] = 0.0, np.inf
+    limits["alike"], limits["cost"], limits["degenerate"] = 0.0, np.inf, 3
     limits["motion_m"], limits["motion_cos"] = 0.15, np.cos(np.radians(10.0))
     return limits
