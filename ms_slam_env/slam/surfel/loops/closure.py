@@ -35,6 +35,7 @@ from ms_slam_env.slam.surfel.tracking import model_stride
 from ms_slam_env.slam.surfel.types import LiveFrame
 
 KEPT_CONSTRAINTS = 1000  # relative ones, of the newest loops
+VIEW_APART_M, VIEW_APART_DEG = 1.0, 60.0  # views of one place differ by less
 
 
 @dataclass
@@ -126,11 +127,14 @@ class DeformationLoopClosure(LoopClosure):
         for candidate in similar(env, past.last - self.config.window):
             if candidate.dissimilarity > self.config.dissimilarity:
                 break
+            allowed_m = self.config.drift_share * past.path_m(candidate.time)
+            if not _may_be_the_same(poses[env], candidate.T_world_camera, allowed_m):
+                continue
             starts = np.full((self.batch, 4, 4), np.nan)
             starts[env] = candidate.T_world_camera
             found, there = self._registration.from_keyframes(starts)
             drift = np.linalg.norm(there[env, :3, 3] - poses[env, :3, 3])
-            if found[env] and drift <= self.config.drift_share * past.path_m(candidate.time):
+            if found[env] and drift <= allowed_m:
                 return self._close(env, poses, there[env])
         return False
 
@@ -185,3 +189,10 @@ class DeformationLoopClosure(LoopClosure):
             )
             for last, (frames, poses), joined in parts
         ]
+
+
+def _may_be_the_same(pose: Float64, keyframe: Float64, drift_m: float) -> bool:
+    """Whether a keyframe may show what is in view from ``pose``, which has drifted."""
+    apart = np.linalg.norm(pose[:3, 3] - keyframe[:3, 3])
+    angle = relative_angle(pose[:3, :3], keyframe[:3, :3])
+    return bool(apart <= VIEW_APART_M + drift_m and angle <= np.radians(VIEW_APART_DEG))

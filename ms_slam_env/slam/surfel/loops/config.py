@@ -40,19 +40,19 @@ class LoopConfig:
         InputError: a value outside its range.
     """
 
-    window: int = 100
+    window: int = 50
     interval: int = 5
     coverage: float = 0.25
-    sigma: float = 0.01
+    sigma: float = 0.005
     inliers: float = 0.7
     largest_m: float = 0.3
     largest_deg: float = 20.0
-    smallest_m: float = 0.002
-    global_interval: int = 10
-    dissimilarity: float = 0.5
+    smallest_m: float = 0.008
+    global_interval: int = 20
+    dissimilarity: float = 0.3
     drift_share: float = 0.15
     surfels_per_node: int = 400
-    max_nodes: int = 200
+    max_nodes: int = 100
     constraint_columns: int = 16
     error_m: float = 0.01
     error_share: float = 0.3
