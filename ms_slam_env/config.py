@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import numbers
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any, TypeVar, get_origin, get_type_hints
 
@@ -12,12 +13,22 @@ from ms_slam_env.errors import InputError, unknown
 T = TypeVar("T")
 
 
+class Named(ABC):
+    """A dataclass of which some values have a name that can stand for them."""
+
+    @classmethod
+    @abstractmethod
+    def named(cls) -> Mapping[str, Named]:
+        """The values by name."""
+
+
 def from_dict(cls: type[T], values: Mapping[str, Any], path: str = "") -> T:
     """Build dataclass ``cls`` from a nested mapping.
 
     Args:
         cls: a dataclass; fields that are themselves dataclasses take nested mappings.
-        values: field name to value; missing fields keep their default.
+        values: field name to value; missing fields keep their default, and a :class:`Named`
+            field may be given by name.
         path: dotted prefix used in error messages.
 
     Raises:
@@ -33,14 +44,25 @@ def from_dict(cls: type[T], values: Mapping[str, Any], path: str = "") -> T:
             raise unknown(f"option of {cls.__name__}", where, fields)
         hint = hints[key]
         nested = isinstance(hint, type) and dataclasses.is_dataclass(hint)
+        names = hint.named() if nested and issubclass(hint, Named) else {}
         if nested and isinstance(value, Mapping):
             value = from_dict(hint, value, where)
+        elif isinstance(value, str) and value in names:
+            value = names[value]
         elif (nested and not isinstance(value, hint)) or (
             get_origin(hint) is dict and not isinstance(value, Mapping)
         ):
-            raise InputError(f"{where} = {value!r} must be a mapping of options")
+            raise _no_mapping(where, value, hint, names)
         arguments[key] = value
     return cls(**arguments)
+
+
+def _no_mapping(where: str, value: Any, hint: Any, names: Mapping[str, Any]) -> InputError:
+    choices = " or ".join([*map(repr, names), "a mapping of options"])
+    known = ""
+    if dataclasses.is_dataclass(hint):
+        known = ": " + ", ".join(field.name for field in dataclasses.fields(hint))
+    return InputError(f"{where} = {value!r} must be {choices}{known}")
 
 
 def check_range(owner: object, name: str, low: float, high: float) -> None:

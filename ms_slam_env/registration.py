@@ -33,6 +33,18 @@ class InProcessVectorEnv(SyncVectorEnv):
         super().__init__([make] * num_envs)
 
 
+def make_env(**options: Any) -> gymnasium.Env[Any, Any]:
+    """Entry point: one environment."""
+    from ms_slam_env.env.active_slam import ActiveSlamEnv
+
+    return ActiveSlamEnv(**options)
+
+
+# Without "human" Gymnasium would warn, wrap the environment and fail at the first reset for want of
+# pygame; with it the environment itself is asked, and refuses in one line.
+make_env.metadata = {"render_modes": ["rgb_array", "human"]}  # type: ignore[attr-defined]
+
+
 def register_all() -> None:
     """Register the ids with Gymnasium; a second call changes nothing."""
     for env_id, embodiment in _EMBODIMENT_OF_ID.items():
@@ -40,7 +52,7 @@ def register_all() -> None:
             continue
         gymnasium.register(
             env_id,
-            entry_point="ms_slam_env.env.active_slam:ActiveSlamEnv",
+            entry_point="ms_slam_env.registration:make_env",
             vector_entry_point="ms_slam_env.registration:InProcessVectorEnv",
             max_episode_steps=MAX_EPISODE_STEPS,
             kwargs={"embodiment": embodiment},

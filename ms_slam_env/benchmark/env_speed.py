@@ -100,10 +100,11 @@ def measure(args: Arguments, case: Case) -> dict[str, Any]:
         percentile); ``processor_ms`` (mean, of all threads); ``split_ms``: mean milliseconds a
         step that each stage took itself, without those nested in it, and ``rest``.
     """
+    has_arm = case.embodiment not in WITHOUT_FRAMES
     env = gym.make(
         "MSActiveSLAM-v0",
         embodiment=case.embodiment,
-        arm={"frames_per_action": case.frames_per_action},
+        arm={"frames_per_action": case.frames_per_action} if has_arm else {},
         scene=args.scene,
         scene_seed=args.scene_seed,
         image_size=args.image_size,

@@ -7,13 +7,16 @@ from typing import Any
 
 import yaml
 
-from ms_slam_env.config import from_dict
-from ms_slam_env.env import EnvConfig
+from ms_slam_env.env.config import make_config
+from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.slam import BACKENDS
 
-OWN_OPTIONS = ("scene", "scene_seed", "split", "observation", "step_m", "step_rad")
-"""Fields of ``EnvConfig`` that an episode has other options for, or that its planner decides."""
+OWN_OPTIONS = (
+    *("scene", "scene_seed", "split", "observation", "step_m", "step_rad"),
+    *("render_mode", "max_episode_steps"),
+)
+"""Options of ``gym.make`` that an episode has other options for, or that its planner decides."""
 
 
 def parse_value(text: str, name: str) -> Any:
@@ -70,7 +73,9 @@ def nested_options(texts: Sequence[str]) -> dict[str, Any]:
 
 
 def parse_options(texts: Sequence[str]) -> dict[str, Any]:
-    """Nested mapping of ``EnvConfig`` from texts ``name.name=value``; values are YAML.
+    """Nested mapping of ``EnvConfig``, and ``embodiment``, from texts ``name.name=value``.
+
+    Values are YAML.
 
     Raises:
         InputError: no ``=``, an unknown name (the message lists the valid ones), a value out of
@@ -80,7 +85,11 @@ def parse_options(texts: Sequence[str]) -> dict[str, Any]:
     for name in result:
         if name in OWN_OPTIONS:
             raise InputError(f"option {name!r} is not free: the benchmark sets it")
-    backend = from_dict(EnvConfig, result).slam
+    embodiment = result.get("embodiment", next(iter(EMBODIMENTS)))
+    if embodiment not in EMBODIMENTS:
+        raise unknown("embodiment", embodiment, EMBODIMENTS)
+    configured = {name: value for name, value in result.items() if name != "embodiment"}
+    backend = make_config(configured, ("embodiment",), OWN_OPTIONS).slam
     if backend not in BACKENDS:
         raise unknown("SLAM backend", backend, BACKENDS)
     return result

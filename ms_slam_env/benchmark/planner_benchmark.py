@@ -23,7 +23,7 @@ from ms_slam_env.benchmark.records import Row, write_json
 from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.scenes import SCENES, SEED_SPLITS
-from ms_slam_env.scenes.registry import MESH_SUFFIXES
+from ms_slam_env.scenes.registry import check_name
 from ms_slam_env.scenes.triangle_soup import load_soup
 
 DEFAULT_PLANNERS = ("random", "stationary", "greedy", "max-information")
@@ -97,9 +97,7 @@ def check_names(planners: Sequence[str], scenes: Sequence[str]) -> None:
     for scene in scenes:
         if scene in SCENES:
             continue
-        if Path(scene).suffix.lower() not in MESH_SUFFIXES:
-            formats = ", ".join(MESH_SUFFIXES)
-            raise unknown("scene", scene, (*SCENES, f"the path of a mesh file ({formats})"))
+        check_name(scene)
         load_soup(Path(scene))
 
 

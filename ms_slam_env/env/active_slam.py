@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from ms_slam_env import slam as slam_backends
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image, xtion
-from ms_slam_env.config import from_dict
 from ms_slam_env.divergence import Histograms, make_divergence
-from ms_slam_env.env.config import EnvConfig
+from ms_slam_env.env.config import make_config
 from ms_slam_env.env.coverage import CoverageGrid
 from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.env.lookahead import Lookahead
@@ -101,11 +100,14 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
         self, embodiment: str = "free", render_mode: str | None = None, **options: Any
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
-            raise InputError(f"unknown render_mode {render_mode!r}; valid choices: None, rgb_array")
+            raise InputError(
+                f"unknown render_mode {render_mode!r}; valid choices: None, rgb_array "
+                "(render() returns a picture; no window is opened)"
+            )
         if embodiment not in EMBODIMENTS:
             raise unknown("embodiment", embodiment, EMBODIMENTS)
         self._options = {"embodiment": embodiment, "render_mode": render_mode, **options}
-        self.config = from_dict(EnvConfig, options)
+        self.config = make_config(options)
         self.render_mode = render_mode
         self.intrinsics: Intrinsics = xtion(self.config.image_size)
         self.timings = Timings()
@@ -161,7 +163,11 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
                     break
         if why:
             self._episode = None
-            where = "drawn start poses" if given is None else "reset option T_world_camera"
+            where = "reset option T_world_camera"
+            if given is None:
+                where = f"none of {_START_TRIES} drawn start poses can be used, the last"
+                if self.config.arm.base is not None:
+                    why += "; give one with reset(options={'T_world_camera': ...})"
             raise InputError(f"{where}: {why}")
         return self._build_observation(), self._info()
 

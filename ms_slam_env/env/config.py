@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import XTION_SIZES
-from ms_slam_env.config import check_choice, check_range
+from ms_slam_env.config import check_choice, check_range, from_dict
 from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.env.observations import OBSERVATIONS
 from ms_slam_env.env.pose_sources import POSE_SOURCES
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.robot.arm import ArmConfig
-from ms_slam_env.scenes import SCENES, SEED_SPLITS
+from ms_slam_env.scenes import SEED_SPLITS
+from ms_slam_env.scenes.registry import check_name
+
+OTHER_OPTIONS = ("embodiment", "render_mode", "max_episode_steps")
+"""Options of ``gym.make`` beside the fields of ``EnvConfig``; the last is Gymnasium's own."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +129,7 @@ class EnvConfig:
         arm: the arm, where the embodiment is one.
         pose: where the estimated pose comes from: ``slam``, ``slam-kinematics`` (SLAM that starts
             its search from the arm's forward kinematics), ``kinematics`` (noisy forward kinematics
-            alone; SLAM only maps) or ``ground_truth``. A free camera's kinematics are exact.
+            alone; SLAM only maps) or ``ground_truth``. Kinematics need an arm.
         slam: SLAM backend.
         slam_config: options of the backend.
         observation: ``rgbd``, ``features`` or ``lookahead``.
@@ -175,10 +182,30 @@ class EnvConfig:
         if not is_names or not all(isinstance(name, str) for name in self.scenes):
             raise InputError(f"EnvConfig.scene = {self.scene!r} must be a name or several")
         for name in self.scenes:
-            if name not in SCENES and "." not in name:
-                raise unknown("scene", name, (*SCENES, "or the path of a .glb, .obj or .ply mesh"))
+            check_name(name)
 
     @property
     def scenes(self) -> tuple[str, ...]:
         """The scenes to draw from."""
         return (self.scene,) if isinstance(self.scene, str) else tuple(self.scene)
+
+
+def make_config(
+    options: Mapping[str, Any], others: Sequence[str] = OTHER_OPTIONS, taken: Sequence[str] = ()
+) -> EnvConfig:
+    """Build the configuration from the options that an environment was given.
+
+    Args:
+        options: fields of :class:`EnvConfig`; nested ones as dataclass or mapping.
+        others: options that are valid beside them, for the error message.
+        taken: fields that are not to be named there.
+
+    Raises:
+        InputError: an unknown option (the message lists the valid ones), or a bad value.
+    """
+    fields = [field.name for field in dataclasses.fields(EnvConfig)]
+    for name in options:
+        if name not in fields:
+            valid = [*others, *(field for field in fields if field not in taken)]
+            raise unknown("option of the environment", name, valid)
+    return from_dict(EnvConfig, options)

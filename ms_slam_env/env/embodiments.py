@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ms_slam_env.env.config import EnvConfig
+from ms_slam_env.env.pose_sources import KINEMATIC_SOURCES
+from ms_slam_env.errors import InputError
 from ms_slam_env.robot import (
     NUM_MOTIONS,
     NUM_ROTATIONS,
@@ -13,7 +15,7 @@ from ms_slam_env.robot import (
     FixedTranslation,
     FreeCamera,
 )
-from ms_slam_env.robot.arm import load_arm
+from ms_slam_env.robot.arm import ArmConfig, load_arm
 from ms_slam_env.robot.arm.dynamic_arm import DynamicArm
 from ms_slam_env.robot.arm.kinematic_arm import KinematicArm
 from ms_slam_env.scenes.base import Scene
@@ -48,8 +50,13 @@ def _arm_kinematic(scene: Scene, config: EnvConfig, timings: Timings) -> Embodim
     return KinematicArm(scene, config.arm, config.step_m, config.step_rad, timings)
 
 
-def _needs_nothing(config: EnvConfig) -> None:
-    """A camera without carrier can be built anywhere."""
+def _has_no_arm(config: EnvConfig) -> None:
+    """Refuse what only an arm has."""
+    hint = "needs an arm: embodiment='arm' or 'arm-kinematic', as MSActiveSLAM-v0 has"
+    if config.pose in KINEMATIC_SOURCES:
+        raise InputError(f"pose={config.pose!r} {hint}; nothing holds a free camera")
+    if config.arm != ArmConfig():
+        raise InputError(f"option 'arm' {hint}; nothing holds a free camera")
 
 
 def _needs_an_arm(config: EnvConfig) -> None:
@@ -60,7 +67,7 @@ def _needs_an_arm(config: EnvConfig) -> None:
 EMBODIMENTS = {
     "arm": EmbodimentType(NUM_MOTIONS, _arm, _needs_an_arm),
     "arm-kinematic": EmbodimentType(NUM_MOTIONS, _arm_kinematic, _needs_an_arm),
-    "free": EmbodimentType(NUM_MOTIONS, _free, _needs_nothing),
-    "fixed-translation": EmbodimentType(NUM_ROTATIONS, _fixed_translation, _needs_nothing),
+    "free": EmbodimentType(NUM_MOTIONS, _free, _has_no_arm),
+    "fixed-translation": EmbodimentType(NUM_ROTATIONS, _fixed_translation, _has_no_arm),
 }
 """Name of the option ``embodiment`` to type."""

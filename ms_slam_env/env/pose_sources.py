@@ -87,3 +87,6 @@ POSE_SOURCES: dict[str, type[PoseSource]] = {
     "ground_truth": TruePose,
 }
 """Name of the option ``pose`` to variant."""
+
+KINEMATIC_SOURCES = ("slam-kinematics", "kinematics")
+"""Those that read joints."""

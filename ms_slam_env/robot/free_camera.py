@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ms_slam_env.errors import UnreachableError
 from ms_slam_env.geometry import invert
 from ms_slam_env.robot.base import Embodiment, Movement
+from ms_slam_env.robot.free_room import outside, words
 from ms_slam_env.robot.motions import (
     NUM_ROTATIONS,
     NUM_TRANSLATIONS,
@@ -31,9 +32,10 @@ def check_room(scene: Scene, T_world_camera: Float64) -> Float64:
     """
     position = T_world_camera[:3, 3]
     if scene.clearance(position[None])[0] < CAMERA_RADIUS_M:
+        where = outside(scene, position)
         raise UnreachableError(
-            f"no free space of {CAMERA_RADIUS_M} m around {np.round(position, 3).tolist()} "
-            f"in scene {scene.name}"
+            f"no free space of {CAMERA_RADIUS_M} m around {words(position)} in scene {scene.name}"
+            + (f": it lies {where}" if where else "")
         )
     return np.array(T_world_camera, dtype=np.float64)
 

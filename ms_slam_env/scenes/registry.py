@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ms_slam_env.errors import InputError
+from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.corridor import corridor
 from ms_slam_env.scenes.living_room import living_room
@@ -44,6 +44,21 @@ def split_of(seed: int) -> str | None:
     return next((name for name, seeds in SEED_SPLITS.items() if seed in seeds), None)
 
 
+def check_name(name: str) -> None:
+    """Refuse what is neither a scene's name nor a mesh file that is there.
+
+    Raises:
+        InputError: listing the valid choices.
+    """
+    if name in _MAKERS:
+        return
+    if Path(name).suffix.lower() not in MESH_SUFFIXES:
+        formats = ", ".join(MESH_SUFFIXES)
+        raise unknown("scene", name, (*_MAKERS, f"or the path of a mesh file ({formats})"))
+    if not Path(name).is_file():
+        raise InputError(f"mesh file {name!r} does not exist")
+
+
 def make(name: str | Path = "living_room", seed: int = 0) -> Scene:
     """Build a scene; the same name and seed give the same scene, bit for bit.
 
@@ -61,11 +76,5 @@ def make(name: str | Path = "living_room", seed: int = 0) -> Scene:
     key = str(name)
     if key in _MAKERS:
         return _MAKERS[key](int(seed))
-    path = Path(key)
-    if path.suffix.lower() in MESH_SUFFIXES:
-        return from_file(path, int(seed))
-    formats = ", ".join(MESH_SUFFIXES)
-    raise InputError(
-        f"unknown scene {key!r}; valid choices: {', '.join(SCENES)}, or the path of a mesh file "
-        f"({formats})"
-    )
+    check_name(key)
+    return from_file(Path(key), int(seed))

@@ -34,7 +34,7 @@ def one_line(text: str) -> str:
         (["benchmark", "--scenes", "mars"], "unknown scene 'mars'; valid choices: living_room"),
         (["benchmark", "--scenes", "missing.glb"], "mesh file 'missing.glb' does not exist"),
         (["benchmark", "--options", "slam=orb"], "unknown SLAM backend 'orb'; valid choices:"),
-        (["benchmark", "--options", "foo=1"], "unknown option of EnvConfig 'foo'"),
+        (["benchmark", "--options", "foo=1"], "unknown option of the environment 'foo'"),
         (["benchmark", "--options", "slam_config.foo=1"], "SurfelConfig 'slam_config.foo'; valid"),
         (["benchmark", "--planners", "policy,path=none.zip"], "no policy file 'none.zip'"),
         (["benchmark", "--planners", "greedy,rho_I=x"], "rho_I = 'x' is outside"),

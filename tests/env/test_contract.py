@@ -276,7 +276,10 @@ def test_use_before_reset_says_so():
         ({"scene": ()}, "must be a name or several"),
         ({"slam": "orb"}, "valid choices: .*surfel"),
         ({"observation": "pixels"}, "valid choices: rgbd, features, lookahead"),
-        ({"steps": 3}, "unknown option of EnvConfig 'steps'; valid choices: scene"),
+        (
+            {"steps": 3},
+            "'steps'; valid choices: embodiment, render_mode, max_episode_steps, scene, scene_seed",
+        ),
         ({"targets": {"M_X": 1}}, "unknown option of TargetConfig 'targets.M_X'"),
         ({"reward": {"lost": -1}}, r"RewardConfig.lost = -1 is outside \[0"),
         ({"slam_config": {"depth": 1}}, "depth_cutoff_m"),
@@ -293,7 +296,9 @@ def test_use_before_reset_says_so():
         ({"embodiment": "boat"}, "unknown embodiment 'boat'; valid choices: arm, arm-kinematic"),
         ({"slam": ["surfel"]}, "valid choices: .*surfel"),
         ({"slam_config": {"device": "tpu"}}, "unknown device 'tpu'; valid choices: cpu"),
-        ({"scene": "missing.glb"}, "missing.glb"),
+        ({"scene": "missing.glb"}, "mesh file 'missing.glb' does not exist"),
+        ({"scene": "foo.txt"}, ".glb, .gltf, .obj, .ply, .stl, .off"),
+        ({"scene": "."}, ".glb, .gltf, .obj, .ply, .stl, .off"),
     ],
 )
 def test_bad_option_gives_one_clear_line(options, message):

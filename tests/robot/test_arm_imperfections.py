@@ -1,5 +1,7 @@
 """Backlash, vibration and sensor errors against their definitions."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,7 +9,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.testing import assert_allclose, assert_array_equal
 
-from ms_slam_env.robot.arm import ArmNoise
+from ms_slam_env.config import from_dict
+from ms_slam_env.errors import InputError
+from ms_slam_env.robot.arm import ArmConfig, ArmNoise
 from ms_slam_env.robot.arm.imperfections import VIBRATION_PERIOD_S, Imperfections, play
 
 PERFECT = ArmNoise(0, 0, 0, 0, 0, 0)
@@ -97,3 +101,17 @@ def test_it_goes_on_from_a_saved_state(moved):
         assert_array_equal(make(first), make(second))
     assert_array_equal(first.torques(q, 0.005), second.torques(q, 0.005))
     assert_array_equal(first.T_camera_assumed, second.T_camera_assumed)
+
+
+def test_noise_has_names():
+    perfect = from_dict(ArmConfig, {"noise": "none"}).noise
+    assert set(dataclasses.asdict(perfect).values()) == {0.0}
+    assert from_dict(ArmConfig, {"noise": "default"}) == ArmConfig()
+    flawless = imperfections(perfect)
+    q = np.linspace(0, 1, 12).reshape(4, 3)
+    assert_array_equal(flawless.link_angles(q), q)
+    assert_array_equal(flawless.readings(q), q)
+    assert_array_equal(flawless.T_camera_assumed, np.eye(4))
+    assert not flawless.torques(np.ones((4, 3)), 0.01).any()
+    with pytest.raises(InputError, match="must be an ArmNoise"):
+        ArmConfig(noise="none")

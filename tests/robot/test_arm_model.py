@@ -245,10 +245,10 @@ def test_bad_file_is_one_clear_error(tmp_path, content, reason):
 
 
 def test_missing_file_lists_the_arms():
-    with pytest.raises(InputError, match=r"unknown arm 'mica'; valid choices: mico, or the path"):
+    with pytest.raises(InputError, match=r"arm.model 'mica': no such file; valid choices: mico"):
         load_arm("mica")
 
 
 def test_missing_camera_site_lists_the_sites():
-    with pytest.raises(InputError, match=r"no site named 'camera'; its sites: lens, mark$"):
+    with pytest.raises(InputError, match=r"no site named 'camera'; its sites: lens, mark; set"):
         load_arm(str(SECOND_ARM))

@@ -1,12 +1,15 @@
 """Where an arm stands when an episode begins, and what is refused."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ms_slam_env.env.worlds import get_scene
-from ms_slam_env.errors import UnreachableError
+from ms_slam_env.errors import InputError, UnreachableError
 from ms_slam_env.geometry import invert, look_at, make_pose, so3_exp, transform_points
 from ms_slam_env.robot.arm import ArmConfig, load_arm
 from ms_slam_env.robot.arm.placement import COLUMN_RADIUS_M, place_arm, reach_m, standing_chain
@@ -99,6 +102,20 @@ def test_postures_have_their_pitch_and_no_roll_and_stand_apart(arm):
         assert apart.min() >= 0.06
 
 
+@pytest.mark.filterwarnings("error")
+def test_hinges_without_limits_are_bent_at_most_half_a_turn(box_scene, tmp_path):
+    text = (Path(__file__).parent / "second_arm.xml").read_text()
+    hinges, *finger = re.split(r'(?=<body name="finger")', text)
+    file = tmp_path / "unlimited.xml"
+    file.write_text(re.sub(r' range="[^"]*"', "", hinges) + "".join(finger))
+    model = load_arm(str(file), "lens")
+    assert np.isinf(model.chain.lower).all()
+    T = look_at([0.1, -0.8, 1.2], [1.2, 0.0, 0.6])
+    T_world_base, q = place_arm(model, box_scene, T, CONFIG)
+    np.testing.assert_allclose(T_world_base @ model.chain.camera_pose(q), T, atol=1e-9)
+    assert (np.abs(q) <= np.pi).all()
+
+
 def test_turning_upright_says_where_it_fails(arm):
     q, done = turn_upright(arm.chain, arm.home[None], np.array([0.0, 0.0, 1.0]))
     up = arm.chain.camera_pose(q)[:, 2, :3]
@@ -109,10 +126,11 @@ def test_a_place_without_floor_is_refused_in_one_line(arm, box_scene):
     inside_a_box = make_pose(np.eye(3), [1.2, 0.0, 0.4])
     in_a_corner = look_at([1.95, 1.95, 2.4], [1.95, 1.95, 2.0])
     for T in (inside_a_box, in_a_corner):
-        with pytest.raises(UnreachableError, match="arm mico cannot hold the camera at") as error:
+        with pytest.raises(UnreachableError) as error:
             place_arm(arm, box_scene, T, CONFIG)
         assert "\n" not in str(error.value)
         assert "scene box" in str(error.value)
+    assert "arm mico cannot hold the camera at" in str(error.value)
 
 
 # -- a given base ----------------------------------------------------------------------------
@@ -136,12 +154,19 @@ def test_a_base_on_top_of_furniture_is_fine(arm, box_scene):
 
 
 @pytest.mark.parametrize(
-    "base", [(1.25, 0.05, 0.4, 0.0), (1.25, 0.05, 0.0, 0.0), (9.0, 0.0, 0.5, 0.0)]
+    ("base", "message"),
+    [
+        ((1.25, 0.05, 0.4, 0.0), r"arm inside furniture: arm.base at .* has .* needs"),
+        ((1.25, 0.05, 0.0, 0.0), r"arm inside furniture: arm.base at .* has .* needs"),
+        ((9.0, 0.0, 0.5, 0.0), r"lies outside scene box, which spans -2.00 to 2.00 x -2.00 to"),
+        ((0.0, 0.0, -0.5, 0.0), r"lies below the floor of scene box, which is at z = 0.00 m"),
+    ],
 )
-def test_a_base_inside_furniture_or_outside_is_refused(arm, box_scene, base):
+def test_a_base_inside_furniture_or_outside_is_refused(arm, box_scene, base, message):
     T = make_pose(np.eye(3), base[:3]) @ arm.chain.camera_pose(arm.home)
-    with pytest.raises(UnreachableError, match=r"arm inside furniture: base at .* has .* needs"):
+    with pytest.raises(InputError, match=message) as error:
         place_arm(arm, box_scene, T, ArmConfig(base=base))
+    assert not isinstance(error.value, UnreachableError)  # another start pose would not help
 
 
 def test_why_a_start_pose_cannot_be_held_is_said(arm, box_scene):
@@ -154,8 +179,10 @@ def test_why_a_start_pose_cannot_be_held_is_said(arm, box_scene):
 
     assert "unreachable for arm mico from base" in why(make_pose(np.eye(3), [1.5, 1.5, 1.5]))
     angles = arm.home + rng().uniform(-1.5, 1.5, (500, 6))
-    deepest = arm.chain.camera_pose(angles[arm.chain.within_limits(angles)])
-    deepest = deepest[np.argmin(deepest[:, 2, 3])]
-    low = make_pose(np.eye(3), [-0.5, -0.8, 0.1]) @ deepest
-    assert low[2, 3] < 0
+    cameras = arm.chain.camera_pose(angles[arm.chain.within_limits(angles)])
+    cameras = make_pose(np.eye(3), [-0.5, -0.8, 0.1]) @ cameras
+    cameras = cameras[np.abs(cameras[:, 2, 3] - 0.03) < 0.02]
+    low = max(cameras, key=lambda T: float(np.linalg.norm(T[:2, 3] - [-0.5, -0.8])))
     assert "touch furniture" in why(low)
+    low[2, 3] = -0.03
+    assert "lies below the floor of scene box" in why(low)

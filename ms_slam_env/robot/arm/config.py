@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from ms_slam_env.config import check_range
+from ms_slam_env.config import Named, check_range
 from ms_slam_env.errors import InputError
 
 
 @dataclass(frozen=True)
-class ArmNoise:
+class ArmNoise(Named):
     """Imperfections of an arm beyond the sag and lag that follow from its physics.
 
     Drawn once an episode: zero offsets of the joint sensors, hand-eye calibration. Drawn all the
-    time: reading noise, vibration. All zero is a perfect arm.
+    time: reading noise, vibration. All zero is a perfect arm, the one named ``none``; these values
+    are named ``default``.
 
     The sizes are assumed, not measured on a Mico: Kinova publishes none of them. They are chosen so
     that kinematics is millimetres and tenths of a degree off, which is why the arm needs SLAM, and
@@ -36,6 +37,11 @@ class ArmNoise:
     hand_eye_rad: float = math.radians(0.3)
     backlash_rad: float = math.radians(0.1)
     vibration_nm: float = 1.0
+
+    @classmethod
+    def named(cls) -> dict[str, ArmNoise]:
+        """``none`` and ``default``."""
+        return {"none": cls(0.0, 0.0, 0.0, 0.0, 0.0, 0.0), "default": cls()}
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
@@ -63,7 +69,8 @@ class ArmConfig:
         joint_speed_rad_s: limit for every joint of a model that does not state its own.
         control_hz: rate at which the controller solves the differential inverse kinematics.
         clearance_m: distance that the links keep from furniture and from each other.
-        noise: imperfections.
+        noise: imperfections: ``none``, ``default``, or the fields of :class:`ArmNoise` that differ
+            from the default.
     """
 
     model: str = "mico"
@@ -88,6 +95,8 @@ class ArmConfig:
         check_range(self, "joint_speed_rad_s", 0.001, 20)
         check_range(self, "control_hz", 5, 500)
         check_range(self, "clearance_m", 0, 0.5)
+        if not isinstance(self.noise, ArmNoise):
+            raise InputError(f"ArmConfig.noise = {self.noise!r} must be an ArmNoise")
         if self.base is not None:
             numbers = isinstance(self.base, (tuple, list)) and len(self.base) == 4
             if not numbers or not all(

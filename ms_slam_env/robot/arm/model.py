@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -20,6 +21,8 @@ Int32 = NDArray[np.int32]
 
 ARM_MODELS = {"mico": Path(__file__).with_name("mico.xml")}
 """Arms that come with the package."""
+
+_ROBOT = re.compile(r"<robot[\s>]")  # root of a URDF
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +67,7 @@ def load_arm(model: str, camera_site: str = "camera", joint_speed_rad_s: float =
     mj = _compile(model, path)
     site = mujoco.mj_name2id(mj, mujoco.mjtObj.mjOBJ_SITE, camera_site)
     if site < 0:
-        sites = ", ".join(mj.site(i).name for i in range(mj.nsite)) or "none"
-        raise InputError(f"arm {path}: no site named {camera_site!r}; its sites: {sites}")
+        raise _no_site(mj, camera_site, path)
     joints = _joints_to(mj, int(mj.site_bodyid[site]), path)
     qpos = mj.jnt_qposadr[joints].astype(np.int32)
     key = mujoco.mj_name2id(mj, mujoco.mjtObj.mjOBJ_KEY, "home")
@@ -87,14 +89,31 @@ def load_arm(model: str, camera_site: str = "camera", joint_speed_rad_s: float =
 def _compile(model: str, path: Path) -> mujoco.MjModel:
     if not path.is_file():
         raise InputError(
-            f"unknown arm {model!r}; valid choices: {', '.join(ARM_MODELS)}, "
+            f"arm.model {model!r}: no such file; valid choices: {', '.join(ARM_MODELS)}, "
             "or the path of an MJCF file"
+        )
+    if path.suffix == ".urdf" or _ROBOT.search(path.read_text(errors="replace")):
+        raise InputError(
+            f"arm {path} is a URDF; an MJCF is needed: load the file in MuJoCo, save it with "
+            "mujoco.mj_saveLastXML, and add position actuators and a camera site"
         )
     try:
         return mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise InputError(f"arm {path}: MuJoCo cannot read it: {reason}") from None
+
+
+def _no_site(mj: mujoco.MjModel, wanted: str, path: Path) -> InputError:
+    """Why an arm has no camera, and how it gets one."""
+    sites = [mj.site(i).name for i in range(mj.nsite)]
+    choose = "set arm.camera_site to one of them, or " if sites else ""
+    cameras = "its <camera> elements do not count: " if mj.ncam else ""
+    return InputError(
+        f"arm {path}: no site named {wanted!r}; its sites: {', '.join(sites) or 'none'}; "
+        f'{choose}{cameras}add <site name="{wanted}" pos="..." quat="..."/> with the axes of a '
+        "camera (x right, y down, z forward) to the body that holds it"
+    )
 
 
 def _joints_to(mj: mujoco.MjModel, body: int, path: Path) -> Int32:

@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.errors import UnreachableError
+from ms_slam_env.errors import InputError, UnreachableError
 from ms_slam_env.geometry import invert, make_pose, so3_exp, transform_points
 from ms_slam_env.robot.arm.capsules import with_column
 from ms_slam_env.robot.arm.chain import Chain
@@ -28,6 +28,7 @@ from ms_slam_env.robot.arm.postures import (
 )
 from ms_slam_env.robot.arm.reach import LIMIT_MARGIN_RAD, Reach
 from ms_slam_env.robot.arm.surroundings import Surroundings
+from ms_slam_env.robot.free_room import enclosed, outside, words
 from ms_slam_env.robot.motions import decompose
 from ms_slam_env.scenes.base import Scene
 
@@ -58,7 +59,8 @@ def place_arm(
     possible. With ``config.base`` only the joint angles are free.
 
     Raises:
-        UnreachableError: no such place or joint angles; the message says why.
+        UnreachableError: no such place or joint angles for this camera pose; the message says why.
+        InputError: ``config.base`` is no place for an arm, whatever the camera's pose.
     """
     if config.base is None:
         return _stand_anywhere(model, scene, T_world_camera, config)
@@ -86,26 +88,41 @@ def _planning(config: ArmConfig) -> ArmConfig:
 
 def reach_m(chain: Chain) -> float:
     """Distance from the base that no part of the arm exceeds: the stretched chain."""
-    to_link = np.concatenate(
-        [[0.0], np.cumsum(np.linalg.norm(chain.T_parent_joint[:, :3, 3], axis=1))]
-    )
-    camera = to_link[-1] + np.linalg.norm(chain.T_last_camera[:3, 3])
+    to_link = _stretched(chain)
     ends = np.linalg.norm(chain.capsule_ends, axis=-1).max(axis=-1, initial=0.0)
     skin = to_link[chain.capsule_link] + ends + chain.capsule_radius
-    return float(max(camera, skin.max(initial=0.0)))
+    return float(max(camera_reach_m(chain), skin.max(initial=0.0)))
+
+
+def camera_reach_m(chain: Chain) -> float:
+    """Distance from the base that the camera does not exceed."""
+    return float(_stretched(chain)[-1] + np.linalg.norm(chain.T_last_camera[:3, 3]))
+
+
+def _stretched(chain: Chain) -> Float64:
+    """(n + 1,) distances along the chain from the base to each link."""
+    steps = np.linalg.norm(chain.T_parent_joint[:, :3, 3], axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def _stand_anywhere(
     model: ArmModel, scene: Scene, T_world_camera: Float64, config: ArmConfig
 ) -> tuple[Float64, Float64]:
     """Choose a posture with the camera's inclination; the base follows from it."""
+    _check_camera(scene, T_world_camera)
     chain = standing_chain(model, config)
     up = T_world_camera[2, :3]
     pitch = np.arcsin(np.clip(up[2], -1, 1))
     nearest = np.argsort(np.abs(PITCHES - pitch), kind="stable")[:_PITCHES_TRIED]
     postures = [postures_at(chain, tuple(model.home), _planning(config), int(i)) for i in nearest]
     motions = np.concatenate([some.motions for some in postures])
-    q, upright = turn_upright(chain, np.concatenate([some.q for some in postures]), up)
+    found = np.concatenate([some.q for some in postures])
+    if len(found) == 0:
+        raise UnreachableError(
+            f"arm {model.path.stem} has no posture that holds the camera upright and inclined by "
+            f"{np.degrees(PITCHES[nearest[0]]):.0f} degrees, as at {words(T_world_camera[:3, 3])}"
+        )
+    q, upright = turn_upright(chain, found, up)
     q = wrap_joints(chain, q)
     bendable = upright & chain.within_limits(q, LIMIT_MARGIN_RAD) & links_apart(chain, q)
     T_world_base = T_world_camera @ invert(chain.camera_pose(q))
@@ -115,7 +132,7 @@ def _stand_anywhere(
     if len(possible) == 0:
         raise UnreachableError(
             f"arm {model.path.stem} cannot hold the camera at "
-            f"{_words(T_world_camera[:3, 3])} in scene {scene.name}: of {len(q)} postures "
+            f"{words(T_world_camera[:3, 3])} in scene {scene.name}: of {len(q)} postures "
             f"{int((~bendable).sum())} do not reach that inclination, "
             f"{int((bendable & ~supported).sum())} have no free floor for the base, in "
             f"{int((bendable & supported & ~clear).sum())} the arm would touch furniture"
@@ -133,14 +150,19 @@ def _stand_on_base(
     x, y, z, yaw = config.base
     T_world_base = make_pose(so3_exp([0.0, 0.0, yaw]), [x, y, z])
     _check_base(model, scene, T_world_base)
+    _check_camera(scene, T_world_camera)
     samples = sample_joints(chain, tuple(model.home), _planning(config))
     target = invert(T_world_base) @ T_world_camera
     found = solve_pose(chain, _seeds(samples, model.home, target), target)
     reached = found.accurate()
-    where = f"start pose {_words(T_world_camera[:3, 3])}"
-    arm = f"arm {model.path.stem} from base {_words(T_world_base[:3, 3])}"
+    where = f"start pose {words(T_world_camera[:3, 3])}"
+    arm = f"arm {model.path.stem} from base {words(T_world_base[:3, 3])}"
     if not reached.any():
-        raise UnreachableError(f"{where} unreachable for {arm}")
+        distance, reach = float(np.linalg.norm(target[:3, 3])), camera_reach_m(chain)
+        raise UnreachableError(
+            f"{where} unreachable for {arm}: it is {distance:.2f} m away from the base, the arm "
+            f"holds its camera at most {reach:.2f} m away, and not in every direction there"
+        )
     q = wrap_joints(chain, found.q[reached])
     q = q[chain.within_limits(q, LIMIT_MARGIN_RAD)]
     if len(q) == 0:
@@ -186,12 +208,26 @@ def _seeds(samples: Samples, home: Float64, target: Float64) -> Float64:
     return np.concatenate([home[None], samples.q[nearest]])
 
 
-def _check_base(model: ArmModel, scene: Scene, T_world_base: Float64) -> None:
-    """Refuse a base that is in something, other than standing on it.
+def _check_camera(scene: Scene, T_world_camera: Float64) -> None:
+    """Refuse a camera in no free space.
 
     Raises:
-        UnreachableError: with the free space around it.
+        UnreachableError: saying where it lies.
     """
+    where = enclosed(scene, T_world_camera[:3, 3])
+    if where:
+        raise UnreachableError(f"start pose {words(T_world_camera[:3, 3])} lies {where}")
+
+
+def _check_base(model: ArmModel, scene: Scene, T_world_base: Float64) -> None:
+    """Refuse a base outside the scene, or in something other than standing on it.
+
+    Raises:
+        InputError: saying where it lies, or with the free space around it.
+    """
+    where = outside(scene, T_world_base[:3, 3])
+    if where:
+        raise InputError(f"arm.base at {words(T_world_base[:3, 3])} lies {where}")
     chain = model.chain
     fixed = np.flatnonzero(chain.capsule_link == 0)
     for index in fixed:
@@ -203,9 +239,10 @@ def _check_base(model: ArmModel, scene: Scene, T_world_base: Float64) -> None:
         free = scene.clearance(points)
         worst = int(np.argmax(need - free))
         if free[worst] < need[worst]:
-            raise UnreachableError(
-                f"arm inside furniture: base at {_words(T_world_base[:3, 3])} has "
-                f"{free[worst]:.3f} m of free space, needs {need[worst]:.3f} m"
+            raise InputError(
+                f"arm inside furniture: arm.base at {words(T_world_base[:3, 3])} has "
+                f"{free[worst]:.3f} m of free space in scene {scene.name}, "
+                f"needs {need[worst]:.3f} m"
             )
 
 
@@ -249,7 +286,3 @@ def _links_are_free(
     free = scene.clearance(world.reshape(-1, 3)).reshape(points.shape[:-1])
     need = chain.capsule_radius[moving] + clearance_m
     return np.asarray((free >= need[:, None]).all(axis=(1, 2)))
-
-
-def _words(position: Float64) -> str:
-    return str(np.round(position, 3).tolist())

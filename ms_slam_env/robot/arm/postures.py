@@ -197,7 +197,9 @@ def links_apart(chain: Chain, q: Float64) -> NDArray[np.bool_]:
 
 def wrap_joints(chain: Chain, q: Float64) -> Float64:
     """Joint angles (s, n) moved by whole turns towards the middle of their limits."""
-    middle = np.where(np.isfinite(chain.lower), 0.5 * (chain.lower + chain.upper), 0.0)
+    limited = np.isfinite(chain.lower) & np.isfinite(chain.upper)
+    low, high = np.where(limited, chain.lower, 0.0), np.where(limited, chain.upper, 0.0)
+    middle = 0.5 * (low + high)
     return middle + np.remainder(q - middle + np.pi, 2 * np.pi) - np.pi
 
 
