@@ -51,6 +51,11 @@ STAT_DEGENERATE = 8  # number of directions that are not constrained
 NUM_STATS = 9
 
 
+GUESS = wp.constant(2)  # index of the guess among the first seeds, after rest and constant velocity
+CLEARLY_BETTER = wp.constant(wp.float64(0.97))  # ratios of scores
+CLEARLY_WORSE = wp.constant(wp.float64(1.03))
+
+
 @wp.struct
 class Limits:
     """What a tracked frame must satisfy."""
@@ -112,20 +117,25 @@ def choose(
     photometry: wp.array2d(dtype=Photometry),  # (B, 1)
     active: wp.array2d(dtype=wp.int32),  # (B, 1)
 ):
-    """Go on with the seed whose points fit best; it becomes the one hypothesis."""
+    """Go on with the seed whose points fit best; it becomes the one hypothesis.
+
+    The first seeds are at rest, at constant velocity, and the guess.
+    """
     b = wp.tid()
-    best = first_pose[b, 0]
-    light = first_light[b, 0]
-    best_score = _score(first_sums, b, 0)
-    for k in range(1, first_pose.shape[1]):
+    # Where the view leaves directions open all starts fit alike: prefer what is predicted.
+    best = first_pose[b, 1]
+    light = first_light[b, 1]
+    best_score = _score(first_sums, b, 1)
+    for n in range(1, first_pose.shape[1]):
+        k = wp.where(n == 1, 0, n)
         score = _score(first_sums, b, k)
-        if score < best_score:
+        if score < best_score * wp.where(k == GUESS, CLEARLY_WORSE, CLEARLY_BETTER):
             best_score = score
             best = first_pose[b, k]
             light = first_light[b, k]
     for k in range(more_pose.shape[1]):
         score = _score(more_sums, b, k)
-        if score < best_score:
+        if score < best_score * CLEARLY_BETTER:
             best_score = score
             best = more_pose[b, k]
             light = more_light[b, k]
