@@ -122,3 +122,23 @@ def test_colors_belong_to_points() -> None:
     alive = surfels["confidence"] > 0
     np.testing.assert_array_equal(points, surfels["position"][alive].astype(float))
     np.testing.assert_array_equal(colors, np.rint(surfels["color"][alive]).astype(np.uint8))
+
+
+def test_many_workers_do_what_one_does() -> None:
+    """The threads of a GPU share the surfels of an env; here they run one after the other."""
+    poses = path(4, 6)
+    maps = [SurfelMap(1, SMALL, CONFIG, workers=workers) for workers in (1, 7)]
+    for t in range(6):
+        live = live_frame(poses[t][None], noise_m=0.004, rng=np.random.default_rng(t))
+        for surfel_map in maps:
+            fuse(surfel_map, live, poses[t][None], t)
+    one, seven = (m.get_state() for m in maps)
+    assert one["counters"]["count"] == seven["counters"]["count"]
+    order = [np.lexsort(s["surfels"][0]["position"].T) for s in (one, seven)]
+    assert not np.array_equal(*order)
+    for name, values in one["surfels"][0].items():
+        other = seven["surfels"][0][name]
+        np.testing.assert_array_equal(values[order[0]], other[order[1]], err_msg=name)
+    views = [m.render_model(device_poses(poses[:1])) for m in maps]
+    depth = [view.vertices.numpy()[..., 2] for view in views]
+    np.testing.assert_allclose(depth[0], depth[1], atol=1e-5)  # sums in another order

@@ -110,6 +110,7 @@ const float inwards[6][3] = {
     {0.0f, 1.0f, -frustum.low_v}, {0.0f, -1.0f, frustum.high_v}};
 int seen[LANES];
 for (int k = 0; k < n; ++k) seen[k] = 1;
+#pragma unroll
 for (int plane = 0; plane < 6; ++plane) {
     const float* m = inwards[plane];
     const float ax = m[0] * R.data[0][0] + m[1] * R.data[1][0] + m[2] * R.data[2][0];
@@ -171,7 +172,8 @@ def list_blocks(
     count = num_blocks(surfels.count[b])
     block = int(worker)
     while block < count:
-        tested = list_some_blocks(blocks, b, block, count, frustum, k)
+        end = wp.where(workers == 1, count, block + 1)
+        tested = list_some_blocks(blocks, b, block, end, frustum, k)
         block += wp.where(workers == 1, tested, workers)
 
 
@@ -181,21 +183,26 @@ const size_t start = size_t(b) * surfels.radius.shape[1] + first;
 const float* p = (const float*)surfels.position.data + 3 * start;
 const float* confidence = surfels.confidence.data + start;
 const int* seen = surfels.seen.data + start;
-// Eight surfels' coordinates at a time: 24 is a multiple of 3.
-float low[24], high[24];
-for (int k = 0; k < 24; ++k) low[k] = high[k] = p[k % 3];
+#if defined(__CUDA_ARCH__)
+constexpr int WIDE = 3;
+#else
+constexpr int WIDE = 24;  // the coordinates of eight surfels at a time
+#endif
+float low[WIDE], high[WIDE];
+for (int k = 0; k < WIDE; ++k) low[k] = high[k] = p[k % 3];
 int done = 0;
-for (; done + 24 <= 3 * n; done += 24) {
-    for (int k = 0; k < 24; ++k) {
+for (; done + WIDE <= 3 * n; done += WIDE) {
+    for (int k = 0; k < WIDE; ++k) {
         low[k] = p[done + k] < low[k] ? p[done + k] : low[k];
         high[k] = p[done + k] > high[k] ? p[done + k] : high[k];
     }
 }
-for (int k = 0; done + k < 3 * n; ++k) {
-    low[k] = p[done + k] < low[k] ? p[done + k] : low[k];
-    high[k] = p[done + k] > high[k] ? p[done + k] : high[k];
+for (int k = 0; k < WIDE; ++k) {
+    const int at = done + k < 3 * n ? done + k : k % 3;
+    low[k] = p[at] < low[k] ? p[at] : low[k];
+    high[k] = p[at] > high[k] ? p[at] : high[k];
 }
-for (int k = 3; k < 24; ++k) {
+for (int k = 3; k < WIDE; ++k) {
     low[k % 3] = low[k] < low[k % 3] ? low[k] : low[k % 3];
     high[k % 3] = high[k] > high[k % 3] ? high[k] : high[k % 3];
 }

@@ -280,16 +280,15 @@ def update_surfels(
     b, worker = wp.tid()
     if mask[b] == 0:
         return
-    share = (visible.count[b] + workers - 1) / workers
-    j = worker * share
-    end = wp.min(j + share, visible.count[b])
-    while j < end:
-        j += update_some(
+    count = visible.count[b]
+    j = int(worker)
+    while j < count:
+        updated = update_some(
             surfels,
             visible,
             b,
             j,
-            end,
+            wp.where(workers == 1, count, j + 1),
             poses[b],
             camera,
             time[b],
@@ -303,3 +302,4 @@ def update_surfels(
             radial,
             covered,
         )
+        j += wp.where(workers == 1, updated, workers)

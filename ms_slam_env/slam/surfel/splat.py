@@ -128,6 +128,7 @@ def cull(
         looked_at = 1
         if i < count:
             end = wp.min((i / BLOCK_SIZE + 1) * BLOCK_SIZE, count)
+            end = wp.where(workers == 1, end, i + 1)
             looked_at = list_some(surfels, b, i, end, frustum, seen_from, seen_to, k, visible)
         j += wp.where(workers == 1, looked_at, workers)
 

@@ -47,7 +47,8 @@ from ms_slam_env.slam.surfel.types import LiveFrame, ModelView
 
 Float64 = NDArray[np.float64]
 
-GPU_WORKERS = 8192  # threads that share one env's surfels
+GPU_THREADS = 1 << 20  # of a launch, about
+GPU_WORKERS = (256, 8192)  # fewest and most that share one env's surfels
 _CHANGING = ("poses", "mask", "time", "weight", "live_depth", "live_normals", "live_color")
 
 
@@ -60,6 +61,8 @@ class SurfelMap:
         config: parameters of fusion and removal.
         device: Warp device, ``"cpu"`` or ``"cuda"``.
         model_stride: ``render_model`` draws every so many-th row and column of the image.
+        workers: threads that share one env's surfels; None: 1 on the CPU, where they run one after
+            the other and the results keep the order of the map, many on a GPU.
 
     Attributes:
         surfels: the maps on the device.
@@ -74,12 +77,13 @@ class SurfelMap:
         config: SurfelConfig,
         device: str = "cpu",
         model_stride: int = 1,
+        workers: int | None = None,
     ) -> None:
         self.batch = batch
         self.intrinsics = intrinsics
         self.config = config
         self.device = device
-        self._workers = 1 if device == "cpu" else GPU_WORKERS
+        self._workers = default_workers(batch, device) if workers is None else workers
         capacity = config.max_surfels
         self.surfels = allocate_surfels(batch, capacity, device)
         self._spare = allocate_surfels(batch, capacity, device)
@@ -332,3 +336,11 @@ class SurfelMap:
                 if used:
                     getattr(self.surfels, name)[env, :used].assign(arrays[name])
         self.surfels_moved()
+
+
+def default_workers(batch: int, device: str) -> int:
+    """Threads that share one env's surfels."""
+    if wp.get_device(device).is_cpu:
+        return 1
+    fewest, most = GPU_WORKERS
+    return min(most, max(fewest, GPU_THREADS // batch))

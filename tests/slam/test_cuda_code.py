@@ -1,0 +1,43 @@
+"""The kernels of the surfel SLAM as CUDA code: compiled here, run only where there is a GPU.
+
+On the CPU the loops over local arrays treat many surfels at once; a GPU compiles the same text with
+one surfel a thread. That it compiles, and keeps those arrays in registers, needs no GPU.
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+from pathlib import Path
+
+import pytest
+
+from ms_slam_env._warp import wp
+
+HOPPER = 90
+MODULES = (
+    "blocks",
+    "discs",
+    "fusion",
+    "fusion_update",
+    "normal_equations",
+    "photometry",
+    "prediction_kernels",
+    "preprocess",
+    "pyramid",
+    "removal",
+    "solve",
+    "splat",
+)
+IN_REGISTERS = ("blocks", "fusion_update", "splat")
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_kernels_compile_for_a_gpu(name: str, tmp_path: Path) -> None:
+    module = importlib.import_module(f"ms_slam_env.slam.surfel.{name}")
+    wp.compile_aot_module(module, arch=HOPPER, module_dir=str(tmp_path), use_ptx=True)
+    [file] = tmp_path.glob("*.ptx")
+    code = file.read_text()
+    assert code.count(".entry") >= 1
+    if name in IN_REGISTERS:
+        assert not re.search(r"\.local\s+\.align", code)
