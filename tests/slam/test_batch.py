@@ -126,8 +126,6 @@ def test_the_envs_differ_in_what_they_do(alone):
     assert len({tuple(row) for row in ok}) >= 4
     counts = [single["counts"][0] for single in alone]
     assert np.median(counts) > 4000
-    # The map of env 3 was full when it was carried away: what was out of view had to go at once.
-    assert counts[3] < 1000
 
 
 def test_a_batch_of_one_repeats_itself(sequences, alone):
