@@ -140,6 +140,37 @@ def se3_exp(xi: vec6d):
 
 
 @wp.func
+def se3_log(T: wp.mat44d):
+    """Twist of a small rigid motion: exact in the rotation, to third order in the translation."""
+    half = wp.float64(0.5)
+    w = half * wp.vec3d(T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1])
+    sine = wp.length(w)
+    angle = wp.atan2(sine, half * (T[0, 0] + T[1, 1] + T[2, 2] - wp.float64(1.0)))
+    if sine > wp.float64(1.0e-9):
+        w = w * (angle / sine)
+    t = wp.vec3d(T[0, 3], T[1, 3], T[2, 3])
+    turned = wp.cross(w, t)
+    t = t - half * turned + wp.cross(w, turned) / wp.float64(12.0)
+    return vec6d(t[0], t[1], t[2], w[0], w[1], w[2])
+
+
+@wp.func
+def invert_rigid(T: wp.mat44d):
+    """Inverse of a rigid motion."""
+    zero = wp.float64(0.0)
+    x = wp.vec3d(T[0, 0], T[1, 0], T[2, 0])
+    y = wp.vec3d(T[0, 1], T[1, 1], T[2, 1])
+    z = wp.vec3d(T[0, 2], T[1, 2], T[2, 2])
+    t = wp.vec3d(T[0, 3], T[1, 3], T[2, 3])
+    return wp.mat44d(
+        x[0], x[1], x[2], -wp.dot(x, t),
+        y[0], y[1], y[2], -wp.dot(y, t),
+        z[0], z[1], z[2], -wp.dot(z, t),
+        zero, zero, zero, wp.float64(1.0),
+    )  # fmt: skip
+
+
+@wp.func
 def orthonormalise(T: wp.mat44d):
     """Rigid motion nearest to a product of rigid motions, by Gram-Schmidt on its columns."""
     x = wp.normalize(wp.vec3d(T[0, 0], T[1, 0], T[2, 0]))

@@ -160,6 +160,7 @@ class Tracker:
         self.good_score = GOOD_SCORE
         self._limits = Mirror(batch, Limits, device)
         self._T_world_model = Mirror(batch, wp.mat44d, device)
+        self._predicted = Mirror(batch, wp.mat44d, device)
         self._T_world_live = Mirror(batch, wp.mat44d, device)
         self._verdict = Mirror(batch, wp.int32, device)
         self._stats = Mirror((batch, NUM_STATS), wp.float64, device)
@@ -226,7 +227,13 @@ class Tracker:
                 "judge",
                 judge,
                 self.batch,
-                [one.sums, one.pose, self._limits.array, self._T_world_model.array],
+                [
+                    one.sums,
+                    one.pose,
+                    self._predicted.array,
+                    self._limits.array,
+                    self._T_world_model.array,
+                ],
                 [self._T_world_live.array, self._verdict.array, self._stats.array],
             )
         return Alignment(
@@ -247,6 +254,10 @@ class Tracker:
             given = np.isfinite(guesses[:, 0, 0])
             starts[given, NUM_FIRST] = (invert(T_world_model) @ guesses)[given]
             states[given, NUM_FIRST] = RUNNING
+        predicted = starts[:, NUM_FIRST - 1].copy()  # at constant velocity, or the guess
+        given = states[:, NUM_FIRST] == RUNNING
+        predicted[given] = starts[given, NUM_FIRST]
+        self._predicted.write(predicted)
         first.poses.write(starts)
         first.states.write(states)
         self._more.poses.write(seeds[:, NUM_FIRST:])

@@ -18,8 +18,11 @@ from ms_slam_env.slam.surfel.normal_equations import OFF, RUNNING, Photometry
 from ms_slam_env.slam.surfel.solve import (
     cholesky,
     cholesky_solve,
+    invert_rigid,
     load_terms,
     orthonormalise,
+    se3_exp,
+    se3_log,
 )
 
 OK = 0
@@ -169,17 +172,30 @@ def _conflict(A: mat66d, B: mat66d, g_a: vec6d, g_b: vec6d):
     return _squared_norm(A, g_a) + _squared_norm(B, g_b) - _squared_norm(A + B, g_a + g_b)
 
 
+@wp.func
+def in_metres_twist(xi: vec6d, length: wp.float64):
+    """Twist with its rotation times ``length``."""
+    scaled = xi
+    for i in range(3, 6):
+        scaled[i] = xi[i] * length
+    return scaled
+
+
 @wp.kernel
 def judge(
     sums: wp.array3d(dtype=wp.float64),
-    T_model_live: wp.array2d(dtype=wp.mat44d),
+    T_model_live: wp.array2d(dtype=wp.mat44d),  # in, and out where it is degenerate
+    predicted: wp.array(dtype=wp.mat44d),  # (B,) T_model_live
     limits: wp.array(dtype=Limits),  # (B,)
     T_world_model: wp.array(dtype=wp.mat44d),  # in: pose of the model view
     T_world_live: wp.array(dtype=wp.mat44d),  # out
     verdict: wp.array(dtype=wp.int32),
     stats: wp.array2d(dtype=wp.float64),
 ):
-    """Compare what the alignment explained with the limits; write verdict, figures and pose."""
+    """Compare what the alignment explained with the limits; write verdict, figures and pose.
+
+    Along directions that the view leaves open the pose is the predicted one.
+    """
     b = wp.tid()
     limit = limits[b]
     one = wp.float64(1.0)
@@ -195,7 +211,7 @@ def judge(
     overlap = visible / wp.max(points, one)
     cost = sums[b, 0, 27] / wp.max(visible, one)
 
-    A, B, g_a, g_b, _length = load_terms(sums, b, 0)
+    A, B, g_a, g_b, length = load_terms(sums, b, 0)
     E = eigen(A + B)
     sigma = wp.float64(0.0)
     degenerate = wp.int32(0)
@@ -206,6 +222,18 @@ def judge(
             degenerate += 1
 
     T = T_model_live[b, 0]
+    if degenerate > 0:
+        # Coarser levels may have moved along what turns out to be open.
+        deviation = in_metres_twist(se3_log(invert_rigid(predicted[b]) * T), length)
+        for k in range(6):
+            if not is_constrained(E, k, A, sums[b, 0, 69], matched):
+                along = wp.float64(0.0)
+                for i in range(6):
+                    along += E[i, k] * deviation[i]
+                for i in range(6):
+                    deviation[i] -= along * E[i, k]
+        T = predicted[b] * se3_exp(in_metres_twist(deviation, one / length))
+        T_model_live[b, 0] = T
     distance = wp.sqrt(T[0, 3] * T[0, 3] + T[1, 3] * T[1, 3] + T[2, 3] * T[2, 3])
     cosine = wp.float64(0.5) * (T[0, 0] + T[1, 1] + T[2, 2] - one)
 
