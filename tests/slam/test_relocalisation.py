@@ -201,10 +201,17 @@ def test_likeness_asks_neither_for_exposure_nor_for_texture():
     dark = (0.5 * color + 10).astype(np.uint8)
     assert _likeness((dark, depth), (color, depth)).correlation > 0.98
     plain = np.full_like(color, 90)
-    found = _likeness((plain, depth), (plain, depth))
-    assert found.texture < 1
+    wall = _likeness((plain, depth), (plain, depth))
+    assert wall.texture < 1
+    assert wall.relief_m < 1e-3
+    assert not LikenessLimits().accept(wall)  # any other wall looks the same
+    relief, _, _ = ray_cast(np.eye(4), VIEW)
+    box = relief.astype(np.float32)
+    found = _likeness((plain, box), (plain, box))
+    assert found.relief_m > 0.1
     assert LikenessLimits().accept(found)
-    assert not LikenessLimits().accept(_likeness((plain, depth * np.float32(1.1)), (plain, depth)))
+    assert not LikenessLimits().accept(_likeness((plain, box * np.float32(1.1)), (plain, box)))
+    assert not LikenessLimits().accept(_likeness((color, box), (plain, box)))  # the wrong texture
 
 
 def test_what_does_not_overlap_is_not_alike():
