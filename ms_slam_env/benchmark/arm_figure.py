@@ -16,13 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import scenes
-from ms_slam_env.benchmark.arm_mesh import (
-    LABEL,
-    arm_parts,
-    column_parts,
-    floor_below,
-    scene_with,
-)
+from ms_slam_env.benchmark.arm_mesh import LABEL, floor_below, scene_with
 from ms_slam_env.benchmark.command_line import exit_code, parse
 from ms_slam_env.camera import Intrinsics, xtion
 from ms_slam_env.config import check_range
@@ -31,6 +25,7 @@ from ms_slam_env.errors import InputError, UnreachableError
 from ms_slam_env.geometry import look_at
 from ms_slam_env.robot.arm import ArmConfig
 from ms_slam_env.robot.arm.kinematic_arm import KinematicArm
+from ms_slam_env.robot.arm.shape import arm_parts, column_parts
 from ms_slam_env.scenes import Scene
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.timings import Timings

@@ -265,6 +265,11 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
         return np.stack(self._current().frame_divergences)
 
     @property
+    def step_divergences(self) -> Float64:
+        """(S + 1, 2) ``info["divergence"]`` of the start and of each step."""
+        return np.stack(self._current().step_divergences)
+
+    @property
     def pose_errors(self) -> Float64:
         """(N,) distance between true and estimated position at each frame, metres."""
         return np.array(self._current().errors)

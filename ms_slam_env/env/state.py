@@ -22,7 +22,8 @@ class EpisodeState:
 
     One step brings one frame or several. ``truth``, ``kinematics``, ``estimates``, ``tracked``,
     ``times``, ``errors`` and ``frame_divergences`` (from the frame before) have an entry a frame;
-    the step's ``divergence`` compares its last frame with the last one of the step before.
+    the step's ``divergence`` compares its last frame with the last one of the step before, and
+    ``step_divergences`` has one for the start, zero, and for each step.
     """
 
     scene: str
@@ -43,6 +44,7 @@ class EpisodeState:
     times: list[float] = field(default_factory=list)
     frame_divergences: list[Float64] = field(default_factory=list)
     divergence: Float64 = field(default_factory=lambda: np.zeros(2))
+    step_divergences: list[Float64] = field(default_factory=list)
     errors: list[float] = field(default_factory=list)
     reward_terms: dict[str, float] = field(default_factory=dict)
     histograms: Histograms | None = None
@@ -72,6 +74,7 @@ class EpisodeState:
     def end_step(self, divergence: Float64, energy_j: float) -> None:
         """Close a step after its last frame; ``divergence`` (2,) is from the step before."""
         self.divergence = divergence
+        self.step_divergences.append(divergence)
         self.step_histograms = self.histograms
         self.energy_j += energy_j
         self.steps_lost = 0 if self.tracking_ok else self.steps_lost + 1

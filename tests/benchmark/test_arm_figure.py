@@ -9,16 +9,11 @@ import pytest
 from numpy.testing import assert_allclose
 
 from ms_slam_env.benchmark.arm_figure import main
-from ms_slam_env.benchmark.arm_mesh import (
-    LABEL,
-    arm_parts,
-    column_parts,
-    floor_below,
-    scene_with,
-)
+from ms_slam_env.benchmark.arm_mesh import LABEL, floor_below, scene_with
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import look_at, make_pose, so3_exp
 from ms_slam_env.robot.arm import load_arm
+from ms_slam_env.robot.arm.shape import arm_parts, column_parts
 from ms_slam_env.sensor import RGBDSensor
 
 SECOND_ARM = Path(__file__).parents[1] / "robot" / "second_arm.xml"

@@ -1,0 +1,141 @@
+"""The map, the arm and the paths from outside."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.env.dots import draw_dots, project
+from ms_slam_env.geometry import look_at, transform_points
+from ms_slam_env.robot.arm.arm_base import ArmEmbodiment
+from ms_slam_env.robot.arm.shape import arm_parts, column_parts, surface_dots
+
+if TYPE_CHECKING:
+    from ms_slam_env.env.active_slam import ActiveSlamEnv
+
+Image = NDArray[np.uint8]
+Float64 = NDArray[np.float64]
+
+TRUE_COLOR = (110, 215, 110)
+ESTIMATE_COLOR = (205, 0, 40)
+_OUTLINE = (20, 20, 20)
+_PITCH = 0.9  # radians below the horizon
+_MAP_DOT_M = 0.02
+_ARM_DOT_M = 0.006
+_HEADROOM_M = 0.5  # what is this much higher than the camera ever was would hide the rest
+_FAR_SHARE = 0.005  # of the points that may lie beyond each edge
+_EDGE = 26  # pixels left free all around
+_ROUND_M = 0.2  # the point of view moves in steps, so that a film of it does not tremble
+_LEAST_M = 1.0  # distance of the point of view
+_AMBIENT = 0.45
+_TO_LIGHT = np.array([0.35, -0.3, 0.89])
+_FRUSTUM_M = 0.15
+
+
+def draw_outside(env: ActiveSlamEnv, size: int) -> tuple[Image, int]:
+    """The picture (size, size, 3), and how many points the map has."""
+    points, colors = env.slam.surface_points(), env.slam.surface_colors()
+    truth, estimate = env.trajectory_truth, env.trajectory_estimate
+    arm_points, arm_colors = _arm(env)
+    ceiling = truth[:, 2, 3].max() + _HEADROOM_M
+    low = np.flatnonzero(points[:, 2] < ceiling)
+    must = np.concatenate([arm_points, truth[:, :3, 3], _frustum(truth[-1])])
+    camera = Intrinsics(size, size, 0.5 * (size - 1), 0.5 * (size - 1), size, size)
+    pose = _point_of_view(truth[0], points[low], must, camera)
+    picture = draw_dots(
+        camera,
+        pose,
+        np.concatenate([points[low], arm_points]),
+        np.concatenate([colors[low], arm_colors]),
+        np.repeat([_MAP_DOT_M, _ARM_DOT_M], [len(low), len(arm_points)]),
+    )
+    if len(arm_points) == 0:
+        for corner in _frustum(truth[-1])[1:]:
+            _draw_line(picture, camera, pose, np.stack([truth[-1, :3, 3], corner]), _OUTLINE, 1)
+        rim = _frustum(truth[-1])[[1, 2, 3, 4, 1]]
+        _draw_line(picture, camera, pose, rim, _OUTLINE, 1)
+    # the wide line stays visible on both sides of the narrow one where they run together
+    for path, color, width in ((truth, _OUTLINE, 7), (truth, TRUE_COLOR, 5)):
+        _draw_path(picture, camera, pose, path, color, width)
+    _draw_path(picture, camera, pose, estimate, ESTIMATE_COLOR, 2)
+    return picture, len(points)
+
+
+def _arm(env: ActiveSlamEnv) -> tuple[Float64, Image]:
+    """Shaded dots all over the arm and its column: points (N, 3), colours (N, 3); none without."""
+    arm = env.embodiment
+    if not isinstance(arm, ArmEmbodiment):
+        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    parts = arm_parts(arm.model, arm.q, arm.T_world_base)
+    if arm.config.base is None:
+        floor = float(env.scene.mesh.vertices[:, 2].min())
+        parts = parts + column_parts(arm.T_world_base[:3, 3], floor)
+    points, normals, rgb = surface_dots(parts, 0.7 * _ARM_DOT_M)
+    light = _AMBIENT + (1 - _AMBIENT) * np.clip(normals @ _TO_LIGHT, 0, 1)
+    return points, np.clip(255 * rgb * light[:, None], 0, 255).astype(np.uint8)
+
+
+def _point_of_view(start: Float64, points: Float64, must: Float64, camera: Intrinsics) -> Float64:
+    """From above and behind the start pose, as near as everything still fits in.
+
+    A point with coordinates (x, z) across and along the view is seen from (a, b) within the slope
+    k if |x - a| <= k (z - b): the largest and smallest x -+ k z bound a and b.
+    """
+    heading = start[:3, 2] * [1, 1, 0]
+    heading = heading / max(1e-9, float(np.linalg.norm(heading)))
+    forward = np.cos(_PITCH) * heading - np.sin(_PITCH) * np.array([0, 0, 1.0])
+    R = look_at(np.zeros(3), forward)[:3, :3]
+    slope = (0.5 * camera.width - _EDGE) / camera.fx
+    eye = np.zeros(3)
+    nearest = np.inf
+    seen, needed = points @ R, must @ R
+    for axis in (0, 1):
+        right = (seen[:, axis] - slope * seen[:, 2], needed[:, axis] - slope * needed[:, 2])
+        left = (seen[:, axis] + slope * seen[:, 2], needed[:, axis] + slope * needed[:, 2])
+        most, least = right[1].max(), left[1].min()
+        if len(points):
+            most = max(most, np.quantile(right[0], 1 - _FAR_SHARE))
+            least = min(least, np.quantile(left[0], _FAR_SHARE))
+        eye[axis] = 0.5 * (most + least)
+        nearest = min(nearest, 0.5 * (least - most) / slope)
+    nearest = min(nearest, needed[:, 2].min() - _LEAST_M)
+    eye[2] = _ROUND_M * np.floor(nearest / _ROUND_M)
+    eye[:2] = 0.5 * _ROUND_M * np.rint(eye[:2] / (0.5 * _ROUND_M))
+    return look_at(R @ eye, R @ eye + forward)
+
+
+def _frustum(T_world_camera: Float64) -> Float64:
+    """A camera's place and four corners (5, 3) of what it sees shortly before it."""
+    corners = np.array([(0, 0, 0), (-0.5, -0.4, 1), (0.5, -0.4, 1), (0.5, 0.4, 1), (-0.5, 0.4, 1)])
+    return transform_points(T_world_camera, _FRUSTUM_M * corners)
+
+
+def _draw_path(
+    picture: Image,
+    camera: Intrinsics,
+    T_world_camera: Float64,
+    poses: Float64,
+    color: tuple[int, int, int],
+    width: int,
+) -> None:
+    end = _draw_line(picture, camera, T_world_camera, poses[:, :3, 3], color, width)
+    cv2.circle(picture, end, 2 + width // 2, color, -1, cv2.LINE_AA)
+
+
+def _draw_line(
+    picture: Image,
+    camera: Intrinsics,
+    T_world_camera: Float64,
+    points: Float64,
+    color: tuple[int, int, int],
+    width: int,
+) -> tuple[int, int]:
+    """Draw a line through points (N, 3); return the pixel of its end."""
+    pixels, _ = project(camera, T_world_camera, points)
+    line = np.rint(pixels).astype(np.int32)
+    cv2.polylines(picture, [line], False, color, width, cv2.LINE_AA)
+    return int(line[-1, 0]), int(line[-1, 1])
