@@ -21,7 +21,7 @@ from ms_slam_env.slam.sparse.pose import (
 
 _BASELINE_M = 0.1  # of the imagined second camera; the result does not depend on it
 _FIXED_SIGMA = 1e-6  # of a pose that stays where it is, metres and radians
-_ITERATIONS = 5
+_ITERATIONS = 3
 _ERROR_TOLERANCE = 1e-3  # a smaller relative gain ends the iterations
 
 

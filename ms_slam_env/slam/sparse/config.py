@@ -42,7 +42,7 @@ class SparseConfig:
     """
 
     depth_cutoff_m: float = 4.0
-    features: int = 700
+    features: int = 600
     levels: int = 4
     fast_threshold: int = 7
     detection_width: int = 320
@@ -56,7 +56,7 @@ class SparseConfig:
     keyframe_m: float = 0.1
     keyframe_deg: float = 8.0
     enough_matches: int = 60
-    window: int = 6
+    window: int = 5
     loop_gap: int = 10
     loops: bool = True
     remap_m: float = 0.005

@@ -20,7 +20,7 @@ from ms_slam_env.slam.sparse.pose import (
 )
 from ms_slam_env.slam.sparse.sparse_map import SparseMap
 
-_MOST_FIXED = 6  # keyframes beyond the window that hold it in place
+_MOST_FIXED = 3  # keyframes beyond the window that hold it in place
 
 
 def adjust_around(sparse_map: SparseMap, keyframe: int, config: SparseConfig) -> None:

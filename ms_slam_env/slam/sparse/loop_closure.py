@@ -17,6 +17,8 @@ from ms_slam_env.slam.sparse.verification import Verifier
 
 _CANDIDATES = 3  # keyframes that are looked at
 _SHARED_POINTS = 30  # of an edge between keyframes
+# Surer than other edges, which stand for errors that add up, and of which many run side by side.
+_LOOP_M, _LOOP_RAD = 0.002, 0.001
 _SMALL_M, _SMALL_RAD = 0.003, 0.002  # loops off by less need no pose graph
 
 
@@ -73,7 +75,7 @@ class LoopCloser:
         known = frames[fix.reference].T_world_camera
         motion = invert(known) @ fix.T_world_camera
         error = invert(frames[keyframe].T_world_camera) @ fix.T_world_camera
-        self.edges.append(Edge(fix.reference, keyframe, motion))
+        self.edges.append(Edge(fix.reference, keyframe, motion, _LOOP_RAD, _LOOP_M))
         is_off = (
             np.linalg.norm(error[:3, 3]) > _SMALL_M
             or relative_angle(np.eye(3), error[:3, :3]) > _SMALL_RAD
@@ -123,5 +125,6 @@ class LoopCloser:
         """Go on from a state."""
         ends = state["ends"].reshape(-1, 2).tolist()
         self.edges = [
-            Edge(a, b, T.copy()) for (a, b), T in zip(ends, state["motions"], strict=True)
+            Edge(a, b, T.copy(), _LOOP_RAD, _LOOP_M)
+            for (a, b), T in zip(ends, state["motions"], strict=True)
         ]

@@ -51,7 +51,7 @@ class Patches:
 def warp(patches: Patches, intrinsics: Intrinsics) -> tuple[Float64, Float64]:
     """Where the motion puts the centres (N, 2), and how it distorts their surroundings (N, 2, 2).
 
-    A centre that comes behind the camera is NaN.
+    A centre that comes behind the camera is NaN, its distortion 0.
     """
     steps = np.array([[0.0, 0.0], [_HALF, 0.0], [0.0, _HALF]])
     pixels = patches.pixels[:, None] + steps
@@ -62,10 +62,13 @@ def warp(patches: Patches, intrinsics: Intrinsics) -> tuple[Float64, Float64]:
     # A point over its depth in the host: R ray + t / depth; the scale does not change its pixel.
     T = patches.T_frame_host
     there = np.einsum("nij,nkj->nki", T[:, :3, :3], rays) + inverse[..., None] * T[:, None, :3, 3]
-    there[~(there[..., 2] > 1e-3).all(axis=1)] = np.nan
+    behind = ~(there[..., 2] > 1e-3).all(axis=1)
+    there[behind] = 1.0
     projected = intrinsics.project(there)
     centre = projected[:, 0]
-    return centre, np.swapaxes(projected[:, 1:] - centre[:, None], 1, 2) / _HALF
+    distortion = np.swapaxes(projected[:, 1:] - centre[:, None], 1, 2) / _HALF
+    centre[behind], distortion[behind] = np.nan, 0.0
+    return centre, distortion
 
 
 @dataclass(frozen=True)
@@ -113,11 +116,12 @@ def cut(image: Float32, pixels: Float64) -> Templates:
     across = (square[:, 1:-1, 2:] - square[:, 1:-1, :-2]).reshape(inner.shape) / 2
     down = (square[:, 2:, 1:-1] - square[:, :-2, 1:-1]).reshape(inner.shape) / 2
     J = np.stack([across, down], axis=1)
-    J -= J.mean(axis=2, keepdims=True)  # a change of brightness is no difference
+    J = J - J.mean(axis=2, keepdims=True)  # a change of brightness is no difference
     H = J @ np.swapaxes(J, 1, 2) + _SMALLEST_GRADIENT * np.eye(2)
     spread = np.linalg.inv(H).astype(np.float32)
     wanted = inner - inner.mean(axis=1, keepdims=True)
-    return Templates(wanted, spread @ J, wanted.std(axis=1), spread)
+    step = np.asarray(spread @ J, dtype=np.float32)
+    return Templates(wanted, step, wanted.std(axis=1), spread)
 
 
 def find_patches(
