@@ -154,6 +154,25 @@ def test_keyframes_follow_a_bent_map():
     np.testing.assert_array_equal(poses[1:], bent)
 
 
+def test_a_camera_at_rest_is_not_encoded_again(monkeypatch):
+    ferns = FernRelocalisation(2, CAMERA, 3.0)
+    seen = []
+    for env, database in enumerate(ferns.databases):
+        monkeypatch.setattr(database, "observe", lambda *_, env=env: seen.append(env))
+    nothing = Images(np.zeros((2, 4, 5, 3), np.uint8), np.zeros((2, 4, 5), np.float32))
+    turns = np.radians([0.0, 2.0, 4.0, 5.0])  # of env 1
+    for step, turn in zip([0.0, 0.02, 0.04, 0.06], turns, strict=True):
+        poses = np.stack(
+            [make_pose(np.eye(3), [step, 0, 0]), make_pose(so3_exp([0, turn, 0]), [9, 9, 9])]
+        )
+        ferns.remember(nothing, poses, np.zeros(2, np.int32), np.array([True, True]))
+    assert seen == [0, 1, 0, 1]
+    ferns.remember(nothing, poses + 0, np.zeros(2, np.int32), np.array([True, False]))
+    ferns.clear(1)
+    ferns.remember(nothing, poses, np.zeros(2, np.int32), np.array([False, True]))
+    assert seen == [0, 1, 0, 1, 1]
+
+
 def test_an_unknown_variant_is_refused():
     with pytest.raises(InputError, match="ferns, local"):
         slam.make("surfel", CAMERA, relocalisation="sift")

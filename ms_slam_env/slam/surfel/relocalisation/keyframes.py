@@ -29,6 +29,7 @@ REFINEMENTS = 3  # alignments with the view from the pose found so far
 HOPELESS_COST = 2.45  # an alignment with a keyframe's view that costs more is no start
 GOOD_COST = 1.6  # with one that costs less the other keyframes are left untried
 _LOOKED_AT = 40  # keyframes among which those tried are chosen
+_STEP_M, _STEP_RAD = 0.03, np.radians(3.0)  # frames between such steps are no new keyframes
 _APART_M, _APART_RAD = 0.10, np.radians(10.0)  # two of them differ by at least so much
 
 
@@ -81,12 +82,15 @@ class FernRelocalisation(Relocalisation):
         self._cutoff_m = depth_cutoff_m
         self._tentative: Float64 = np.full((batch, 4, 4), np.nan)  # to be confirmed; NaN: none
         self._attempts = np.zeros(batch, dtype=np.int32)  # since tracking was lost
+        self._looked_from: Float64 = np.full((batch, 4, 4), np.nan)  # the last frame encoded
 
     def remember(self, frames: Images, poses: Float64, time: Int32, tracked: Bool) -> None:
-        """Keep the tracked frames that resemble no keyframe."""
+        """Keep the tracked frames that resemble no keyframe; look at one every few centimetres."""
         self._tentative[tracked] = np.nan
         self._attempts[tracked] = 0
-        for env in np.flatnonzero(tracked):
+        moved = tracked & _has_moved(self._looked_from, poses)
+        self._looked_from[moved] = poses[moved]
+        for env in np.flatnonzero(moved):
             color, depth = frames.color[env], frames.depth[env]
             self.databases[env].observe(color, depth, poses[env], int(time[env]))
 
@@ -183,6 +187,7 @@ class FernRelocalisation(Relocalisation):
         self.databases[env].clear()
         self._tentative[env] = np.nan
         self._attempts[env] = 0
+        self._looked_from[env] = np.nan
 
     def get_state(self) -> dict[str, Any]:
         """Keyframes and poses to confirm."""
@@ -190,6 +195,7 @@ class FernRelocalisation(Relocalisation):
             "databases": [database.get_state() for database in self.databases],
             "tentative": self._tentative.copy(),
             "attempts": self._attempts.copy(),
+            "looked_from": self._looked_from.copy(),
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
@@ -198,11 +204,21 @@ class FernRelocalisation(Relocalisation):
             database.set_state(kept)
         self._tentative = state["tentative"].copy()
         self._attempts = state["attempts"].copy()
+        self._looked_from = state["looked_from"].copy()
 
 
 def _has_pose(poses: Float64) -> Bool:
     """Which of ``poses`` (B, 4, 4) are not NaN."""
     return np.isfinite(poses[:, 0, 0])
+
+
+def _has_moved(before: Float64, now: Float64) -> Bool:
+    """Which poses (B, 4, 4) are a step away from those ``before``, or have none before."""
+    step = np.linalg.norm(now[:, :3, 3] - before[:, :3, 3], axis=1)
+    # The trace of R_before^T R_now is the sum of the products of all elements.
+    cosine = ((before[:, :3, :3] * now[:, :3, :3]).sum(axis=(1, 2)) - 1) / 2
+    near = (step <= _STEP_M) & (cosine >= np.cos(_STEP_RAD))
+    return ~near  # comparisons with NaN are false
 
 
 def _align(searcher: Searcher, starts: Float64, seeds: Float64, limits: NDArray[Any]) -> Alignment:
