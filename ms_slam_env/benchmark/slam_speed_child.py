@@ -21,7 +21,7 @@ from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
 
 STAGES = {
     "preprocess": (("preprocess",),),
-    "render": (("_render",),),
+    "render": (("map", "render_model"),),
     "track": (("tracker", "set_frame"), ("tracker", "align")),
     "fuse": (("map", "fuse"),),
 }
