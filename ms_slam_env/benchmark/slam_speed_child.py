@@ -95,7 +95,7 @@ def measure(
     """Time every frame after the warm-up, once for each number of stored surfels."""
     with np.load(sequence) as data:
         color, depth, poses = data["color"], data["depth"], data["poses"]
-    capacity = max(SurfelConfig.max_surfels, max(stored) + 20 * depth[0].size)
+    capacity = max(SurfelConfig.max_surfels, max(stored) + 8 * depth[0].size)
     config = SurfelConfig(**{"max_surfels": capacity, **backend})
     slam = BatchedSurfelSlam(1, xtion(size), config)
     slam.reset(poses[0])

@@ -164,13 +164,14 @@ def splat_depth(
         row = fetch(discs.top, k, j)
         bottom = fetch(discs.bottom, k, j)
         if left <= right and row <= bottom:
-            put(discs.drawn, k, wp.atomic_add(discs.num_drawn, k, 1), j)
             centre_u = fetch(discs.u, k, j)
             centre_v = fetch(discs.v, k, j)
             centre_inverse = fetch(discs.inverse, k, j)
             slope_u = fetch(discs.slope_u, k, j)
             slope_v = fetch(discs.slope_v, k, j)
             rim = fetch(discs.rim, k, j)
+            nearly_rim = rim * 1.00001  # ``splat_attributes`` rounds otherwise
+            hits = int(0)
             z = 1.0 / centre_inverse
             pixel_u = z / camera.focal[0]
             pixel_v = z / camera.focal[1]
@@ -181,10 +182,13 @@ def splat_depth(
                     du = float(u) - centre_u
                     offset = du * slope_u + dv * slope_v
                     squared = squared_offset(du * pixel_u, dv * pixel_v, z, offset)
+                    hits += wp.where(squared <= nearly_rim, 1, 0)
                     inverse = wp.where(squared <= rim, centre_inverse + offset, 0.0)
                     raise_to(z_buffer, image + row * width + u, inverse)
                     u += 1
                 row += 1
+            if hits > 0:
+                put(discs.drawn, k, wp.atomic_add(discs.num_drawn, k, 1), j)
         j += workers
 
 
