@@ -10,6 +10,7 @@ import numpy as np
 from ms_slam_baselines.greedy import distance_to_targets
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
+from tqdm import tqdm
 
 Actions = NDArray[np.int64]
 Choose = Callable[[NDArray[Any], NDArray[np.bool_]], Actions]  # observations, masks -> actions
@@ -36,13 +37,16 @@ class FixedEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         return self.env.reset(seed=seed, options=options)
 
 
-def evaluate(venv: VecEnv, num_episodes: int, choose: Choose) -> dict[str, Any]:
+def evaluate(
+    venv: VecEnv, num_episodes: int, choose: Choose, played_one: Callable[[], Any] | None = None
+) -> dict[str, Any]:
     """Play every validation episode once; means over episodes, and ``returns`` one by one.
 
     Args:
         venv: of ``FixedEpisodes``.
         num_episodes: in all environments together.
         choose: maps observations (B, k) and masks (B, n) to actions (B,).
+        played_one: called after each episode.
     """
     venv.env_method("restart")
     observations = np.asarray(venv.reset())
@@ -65,6 +69,8 @@ def evaluate(venv: VecEnv, num_episodes: int, choose: Choose) -> dict[str, Any]:
                 "tracked_share": tracked[i] / steps[i],
                 "lost_share": float(not infos[i]["TimeLimit.truncated"]),
             }
+            if played_one is not None:
+                played_one()
         played[dones] += 1
         returns[dones] = steps[dones] = tracked[dones] = 0
     ordered = [episodes[place] for place in range(num_episodes)]
@@ -105,4 +111,9 @@ def references(venv: VecEnv, num_episodes: int, seed: int) -> dict[str, dict[str
         return np.argmin(distance, axis=1)
 
     planners = {"random walk": random_walk, "stationary": stationary, "greedy": greedy}
-    return {name: evaluate(venv, num_episodes, choose) for name, choose in planners.items()}
+    results = {}
+    with tqdm(total=len(planners) * num_episodes, unit="episode") as bar:
+        for name, choose in planners.items():
+            bar.set_description(f"reference: {name}")
+            results[name] = evaluate(venv, num_episodes, choose, bar.update)
+    return results

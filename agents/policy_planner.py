@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 PATH_VARIABLE = "MS_SLAM_POLICY"
 
+_NAMES = {"lookahead": "policy", "features": "policy-features"}  # planners by observation
+
 
 class TrainedPolicy(Planner):
     """A policy trained by ``train_sb3`` on the observation variant ``lookahead``.
@@ -45,16 +47,16 @@ class TrainedPolicy(Planner):
         path = path or os.environ.get(PATH_VARIABLE)
         if not path:
             raise InputError(
-                f"{type(self).__name__} needs a policy file: option path=..., "
+                f"planner {_NAMES[self.observation]} needs a policy file: option path=..., "
                 f"or the environment variable {PATH_VARIABLE}"
             )
         self.deterministic = _truth(deterministic)
         trained_on = artefact.load_metadata(path).observation
         if trained_on != self.observation:
-            right = {"features": "TrainedFeaturesPolicy", "lookahead": "TrainedPolicy"}
+            right = f": use {_NAMES[trained_on]}" if trained_on in _NAMES else ""
             raise InputError(
-                f"{path!r} was trained on observation {trained_on!r}, {type(self).__name__} runs "
-                f"policies trained on {self.observation!r}: use {right.get(trained_on)}"
+                f"{path!r} was trained on observation {trained_on!r}, planner "
+                f"{_NAMES[self.observation]} runs policies trained on {self.observation!r}{right}"
             )
         self.policy = artefact.Policy.load(path)
         num_actions = int(env.action_space.n)  # type: ignore[attr-defined]

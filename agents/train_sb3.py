@@ -49,9 +49,10 @@ from stable_baselines3.common.vec_env import (
 )
 from tqdm import tqdm
 
+import ms_slam_env  # registers the ids, in a worker process too
 from ms_slam_env.benchmark.command_line import parse
 from ms_slam_env.config import check_range
-from ms_slam_env.errors import InputError
+from ms_slam_env.errors import InputError, unknown
 
 VALIDATION_SEED = 1_000_000  # of the first validation episode; training draws from small seeds
 
@@ -78,7 +79,9 @@ class Args:
         num_envs: parallel environments, one process and one thread each.
         seed: of network, training episodes and sampling.
         total_timesteps: environment steps, all runs of a resumed training together.
-        minutes: stop this run after so much wall-clock time; None: by steps alone.
+        minutes: stop this run after training for so much wall-clock time, the evaluations during
+            it included; the episodes of the references before, and the last evaluation after it,
+            come on top. None: by steps alone.
         eval_every: environment steps between evaluations; 0: only first and last.
         eval_episodes: validation episodes, the same at each evaluation.
         deterministic_eval: evaluate the most probable action instead of sampling.
@@ -142,8 +145,6 @@ class Args:
 
 def make_env(args: Args, split: str, seeds: Sequence[int]) -> gym.Env[Any, Any]:
     """Build one environment; with ``seeds`` it plays those episodes only."""
-    import ms_slam_env  # noqa: F401 -- registers the ids in a worker process
-
     if multiprocessing.parent_process() is not None:  # in a worker Ctrl-C is the main's to answer
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         torch.set_num_threads(1)
@@ -204,9 +205,15 @@ class Supervisor(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._start = time.monotonic()
-        self._bar = tqdm(
-            total=self.args.total_timesteps, initial=self.num_timesteps, unit="step", smoothing=0.1
-        )
+        if self.args.minutes is None:
+            self._bar = tqdm(
+                total=self.args.total_timesteps,
+                initial=self.num_timesteps,
+                unit="step",
+                smoothing=0.1,
+            )
+        else:
+            self._bar = tqdm(total=round(60 * self.args.minutes), unit="s")
         self._next_evaluation = self.num_timesteps
         if self.curve["points"] and self.curve["points"][-1]["timesteps"] == self.num_timesteps:
             self._plan_evaluation()  # resumed where it was evaluated
@@ -218,7 +225,7 @@ class Supervisor(BaseCallback):
             self._plan_evaluation()
 
     def _on_step(self) -> bool:
-        self._bar.update(self.training_env.num_envs)
+        self._show_progress()
         terms: dict[str, list[float]] = {}
         for info in self.locals["infos"]:
             for name, value in info["reward_terms"].items():
@@ -228,6 +235,15 @@ class Supervisor(BaseCallback):
         if self.args.minutes is not None and self.minutes >= self.args.minutes:
             self.stop("time is up")
         return not self.stop_reason
+
+    def _show_progress(self) -> None:
+        """Move the bar: it counts seconds where time ends the run, steps otherwise."""
+        if self.args.minutes is None:
+            self._bar.update(self.training_env.num_envs)
+            return
+        self._bar.set_postfix_str(f"{self.num_timesteps} steps", refresh=False)
+        seconds = min(round(60 * self.args.minutes), int(60 * self.minutes))
+        self._bar.update(seconds - self._bar.n)
 
     def _on_training_end(self) -> None:
         self.save("latest.zip")
@@ -362,6 +378,8 @@ def train(args: Args) -> int:
         raise InputError(f"{args.out} holds a training run already: add --resume, or change --out")
     try:
         make_env(args, "train", ()).close()  # bad options fail here, not in a worker process
+    except gym.error.UnregisteredEnv:
+        raise unknown("environment", args.env_id, ms_slam_env.ENV_IDS) from None
     except gym.error.Error as error:
         raise InputError(f"environment {args.env_id!r} cannot be made: {error}") from None
     args.out.mkdir(parents=True, exist_ok=True)
@@ -399,10 +417,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return train(parse(Args, argv, "ms-slam train"))
     except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"ms-slam train: error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("interrupted; what was trained before the last update is saved", file=sys.stderr)
+        print(
+            "ms-slam train: interrupted; what was trained before the last update is saved",
+            file=sys.stderr,
+        )
         return 130
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.ticker import LogLocator, NullFormatter
 
 from ms_slam_env.benchmark import figures
 from ms_slam_env.benchmark.records import Row
@@ -116,9 +115,7 @@ def save_figure(summary: Sequence[Cell], path: Path) -> Path:
         ax.set(xscale="log", yscale="log", xlabel="processor time [ms a frame]", title=size)
         ax.grid(alpha=0.3, which="both")
         for axis in (ax.xaxis, ax.yaxis):
-            axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-            axis.set_major_formatter("{x:g}")
-            axis.set_minor_formatter(NullFormatter())
+            figures.plain_log_ticks(axis)
     axes[0].set_ylabel("ATE [mm]")
     figures.legend_beside(figure, axes[0])
     return figures.save(figure, path)

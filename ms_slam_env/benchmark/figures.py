@@ -10,7 +10,9 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from ms_slam_env.benchmark.planner_report import Column, finished, summarise
 from ms_slam_env.benchmark.records import Row
@@ -52,6 +54,21 @@ def caption(figure: Figure, text: str) -> None:
 def legend_beside(figure: Figure, ax: Axes) -> None:
     """Put the legend of ``ax`` to the right of every panel, where it hides no data."""
     figure.legend(*ax.get_legend_handles_labels(), loc="outside right upper", fontsize="small")
+
+
+def plain_log_ticks(axis: Axis) -> None:
+    """Label a logarithmic axis, once its data are drawn, with few plain numbers that do not touch.
+
+    Matplotlib's own labels, 2 x 10^0 and the like, overlap where an axis is narrow.
+    """
+    low, high = axis.get_view_interval()
+    decades = np.log10(high / low)
+    fine = {0.7: None, 1.7: (1, 2, 5), 2.7: (1, 3)}
+    subs = next((subs for most, subs in fine.items() if decades < most), (1,))
+    locator = MaxNLocator(4) if subs is None else LogLocator(subs=subs)
+    axis.set_major_locator(locator)
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(NullFormatter())
 
 
 def save(figure: Figure, path: Path) -> Path:
@@ -130,7 +147,9 @@ def planners_figure(rows: Sequence[Row]) -> Figure:
             )
         ax.set_xlabel(panel.heading)
         ax.grid(axis="x", alpha=0.3)
-    axes[PANELS.index(next(p for p in PANELS if p.metric == "ate_m"))].set_xscale("log")
+    errors = axes[PANELS.index(next(p for p in PANELS if p.metric == "ate_m"))]
+    errors.set_xscale("log")
+    plain_log_ticks(errors.xaxis)
     axes[0].set_yticks(range(len(summary)), labels(summary).values())
     axes[0].invert_yaxis()
     caption(figure, "Small dots: episodes. Circle and bar: median and its 95 % interval.")
@@ -151,6 +170,7 @@ def scatter_figure(rows: Sequence[Row]) -> Figure:
         ax.plot(ate[~lost], f_score[~lost], "o", label=label_of[planner], **look)
         ax.plot(ate[lost], f_score[lost], "x", **look)
     ax.set_xscale("log")
+    plain_log_ticks(ax.xaxis)
     ax.set_xlabel("ATE [mm]")
     ax.set_ylabel("F-score at 5 cm [%]")
     ax.grid(alpha=0.3)
@@ -171,6 +191,7 @@ def ate_over_time_figure(rows: Sequence[Row]) -> Figure:
         ]
         draw_band(ax, series, label_of[planner], colour_of[planner])
     ax.set_yscale("log")
+    plain_log_ticks(ax.yaxis)
     ax.set_xlabel("step")
     ax.set_ylabel("running ATE, no alignment [mm]")
     ax.grid(alpha=0.3)

@@ -15,6 +15,8 @@ from ms_slam_env.errors import InputError, unknown
 
 GROUP = "ms_slam_env.planners"
 
+_TRAINING = ("torch", "stable_baselines3", "sb3_contrib")  # packages of the extra "train"
+
 
 def planner_names() -> tuple[str, ...]:
     """Names of the installed planners, sorted."""
@@ -40,6 +42,9 @@ def planner_class(name: str) -> type[Planner]:
     module_name, _, class_name = entry.value.partition(":")
     try:
         cls = getattr(import_module(module_name), class_name)
+    except ModuleNotFoundError as error:
+        hint = "; pip install 'ms-slam-env[train]'" if error.name in _TRAINING else ""
+        raise InputError(f"planner {name!r} cannot be loaded: {error}{hint}") from error
     except (ImportError, AttributeError, ValueError) as error:  # ValueError: no module named
         raise InputError(f"planner {name!r} cannot be loaded: {error}") from error
     if not (inspect.isclass(cls) and issubclass(cls, Planner)):

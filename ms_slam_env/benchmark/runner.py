@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from ms_slam_env.benchmark.records import RecordFile, Row, spec_key
 from ms_slam_env.errors import InputError
 
 RECORDS = "episodes.jsonl"
+_NAMING = ("planner", "scene", "sequence", "backend", "seed")  # what a person calls the work by
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 
@@ -74,6 +75,9 @@ def run_all(
     if todo:
         with tqdm(total=len(set(keys)), initial=done, desc=description, unit="") as bar:
             commit = git_commit()
+            name_of = names(
+                {key: dataclasses.asdict(spec) for key, spec in zip(keys, specs, strict=True)}
+            )
 
             def finish(row: Row) -> None:
                 row["commit"] = commit
@@ -81,7 +85,8 @@ def run_all(
                 rows[row["key"]] = row
                 bar.update()
                 if row["error"] is not None:
-                    bar.write(f"failed: {row['error']}", file=sys.stderr)
+                    name = name_of[row["key"]]
+                    bar.write(f"failed: {name}: {row['error']}", file=sys.stderr)
 
             _run_missing(todo, run, workers, finish)
     return [rows[key] for key in keys]
@@ -89,7 +94,26 @@ def run_all(
 
 def failures(rows: Sequence[Row]) -> list[str]:
     """The errors among ``rows``, one line each."""
-    return [f"{row['key']}: {row['error']}" for row in rows if row["error"] is not None]
+    name_of = names({row["key"]: row["spec"] for row in rows})
+    return [f"{name_of[row['key']]}: {row['error']}" for row in rows if row["error"] is not None]
+
+
+def names(specs: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
+    """Words for pieces of work, given and returned by key.
+
+    As in ``planner greedy, scene table, seed 2000``, then what else differs among them.
+    """
+    every = list(dict.fromkeys(name for spec in specs.values() for name in spec))
+    shown = [
+        name
+        for name in every
+        if name in _NAMING or len({str(spec.get(name)) for spec in specs.values()}) > 1
+    ]
+    shown.sort(key=lambda name: (name not in _NAMING, every.index(name)))
+    return {
+        key: ", ".join(f"{name} {spec[name]}" for name in shown if name in spec) or key
+        for key, spec in specs.items()
+    }
 
 
 def check_any_finished(rows: Sequence[Row]) -> None:

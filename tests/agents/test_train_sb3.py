@@ -279,6 +279,26 @@ def test_the_clock_ends_training(tmp_path):
     assert artefact.load_metadata(tmp_path / "latest.zip").timesteps == 1
 
 
+@pytest.mark.parametrize(("more", "ends"), [((), "64/64"), (("--minutes", "0.02"), "1/1 ")])
+def test_bars_count_reference_episodes_then_steps_or_seconds(tmp_path, capsys, more, ends):
+    steps = 10**6 if more else 64
+    assert train_sb3.main([*arguments(tmp_path, steps=steps), *more]) == 0
+    shown = capsys.readouterr().err
+    episodes = read_curve(tmp_path)["eval_episodes"]
+    assert f"{3 * episodes}/{3 * episodes}" in shown
+    assert "reference: greedy" in shown
+    assert ends in shown.replace("\r", "\n").splitlines()[-1]
+
+
+def test_an_unknown_environment_lists_the_known_ones(tmp_path, capsys):
+    words = arguments(tmp_path)
+    words[words.index(ENV_ID)] = "MSActiveSLAM-v9"
+    assert train_sb3.main(words) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("ms-slam train: error: unknown environment 'MSActiveSLAM-v9'; valid")
+    assert "MSActiveSLAM-v0, MSActiveSLAM-FreeCamera-v0" in error
+
+
 def test_a_run_is_not_overwritten(run, capsys):
     assert train_sb3.main(arguments(run.out, algorithm=run.algorithm)) == 2
     assert "--resume" in capsys.readouterr().err
@@ -310,7 +330,7 @@ def test_the_planner_refuses_what_it_cannot_run(run, tmp_path, monkeypatch):
         TrainedFeaturesPolicy(fake_env())
     with pytest.raises(InputError, match="no policy file"):
         TrainedFeaturesPolicy(fake_env(), path=str(tmp_path / "none.zip"))
-    with pytest.raises(InputError, match="use TrainedFeaturesPolicy"):
+    with pytest.raises(InputError, match=r"planner policy runs .* use policy-features"):
         TrainedPolicy(fake_env(), path=path)
     with pytest.raises(InputError, match="7 actions, the environment has 49"):
         TrainedFeaturesPolicy(fake_env(49), path=path)

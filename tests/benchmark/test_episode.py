@@ -72,6 +72,17 @@ def test_planner_is_found_in_the_current_folder(
     assert planner_class("my_planners_of_a_test:Mine").__name__ == "Mine"
 
 
+def test_a_trained_policy_without_its_extra_says_what_to_install(monkeypatch):
+    def missing(name):
+        raise ModuleNotFoundError("No module named 'torch'", name="torch")
+
+    monkeypatch.setattr("ms_slam_env.benchmark.planners.import_module", missing)
+    with pytest.raises(
+        InputError, match=r"No module named 'torch'; pip install 'ms-slam-env\[train"
+    ):
+        planner_class("policy")
+
+
 def test_planner_by_module_and_class_takes_options() -> None:
     from ms_slam_env.env.config import EnvConfig
 

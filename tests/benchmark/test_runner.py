@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import fake_work
@@ -18,8 +18,9 @@ from fake_work import Square, square
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ms_slam_env.benchmark.episode import EpisodeSpec
 from ms_slam_env.benchmark.records import RecordFile, spec_key, write_json
-from ms_slam_env.benchmark.runner import RECORDS, failures, run_all
+from ms_slam_env.benchmark.runner import RECORDS, failures, names, run_all
 from ms_slam_env.errors import InputError
 
 
@@ -53,11 +54,24 @@ def test_failures_are_rows_and_are_tried_again(tmp_path: Path) -> None:
     assert rows[0]["result"] is None
     assert "fake_work.py" in rows[0]["traceback"]
     assert rows[1]["result"]["square"] == 4
-    assert len(failures(rows)) == 1
+    assert failures(rows) == ["number -1: ValueError: no square of -1"]
     run_all([Square(-1), Square(2)], square, tmp_path, workers=1)
     lines = [json.loads(line) for line in (tmp_path / RECORDS).read_text().splitlines()]
     assert [line["spec"]["number"] for line in lines].count(-1) == 2
     assert [line["spec"]["number"] for line in lines].count(2) == 1
+
+
+def test_work_is_named_by_what_a_person_calls_it() -> None:
+    specs = {
+        "a1": EpisodeSpec("greedy", "table", 2000),
+        "b2": EpisodeSpec("greedy", "table", 2001, step_m=0.1),
+    }
+    named = names({key: asdict(spec) for key, spec in specs.items()})
+    assert named == {
+        "a1": "planner greedy, scene table, seed 2000, step_m 0.12",
+        "b2": "planner greedy, scene table, seed 2001, step_m 0.1",
+    }
+    assert names({"a1": asdict(Square(3))}) == {"a1": "a1"}
 
 
 def test_a_worker_that_dies_costs_only_its_own_work(tmp_path: Path) -> None:
