@@ -10,14 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.geometry import invert, make_pose, se3_exp, transform_points
+from ms_slam_env.geometry import invert, make_pose, transform_points
 from ms_slam_env.slam.base import Float64
 
 # 95 % quantiles of the chi-squared distribution with two and three degrees of freedom.
 CHI2_PIXEL, CHI2_PIXEL_AND_DEPTH = 5.991, 7.815
 _ITERATIONS = 4  # a round; outliers are told anew between rounds
-_SMALL_STEP = 3e-5  # metres and radians
+_SMALL_STEP = 1e-4  # metres and radians
 _LEAST_DEPTH_M = 0.05
+_FEWEST = 6  # sightings that a pose can be found from
+_DAMPING = 1e-9 * np.eye(6)
 _RANSAC_ITERATIONS = 200
 
 
@@ -112,46 +114,40 @@ def refine_pose(
     T = invert(T_world_camera)
     inlier = np.ones(len(points), dtype=bool)
     for _ in range(rounds):
-        for _ in range(_ITERATIONS):
-            step = _gauss_newton_step(T, points, seen, inlier, limit, intrinsics)
-            T = se3_exp(step) @ T
-            if np.abs(step).max() < _SMALL_STEP:
-                break
+        inlier &= points @ T[2, :3] + T[2, 3] > _LEAST_DEPTH_M
+        if inlier.sum() < _FEWEST:
+            break
+        used = np.flatnonzero(inlier)
+        T = _gauss_newton(T, points[used], seen.chosen(used), limit[used], intrinsics)
         squares = (residuals(T, points, seen, intrinsics)[0] ** 2).sum(axis=1)
         inlier = squares <= limit
-        if inlier.sum() < 6:
-            break
     return orthonormal(invert(T)), inlier
 
 
-def _gauss_newton_step(
-    T: Float64,
-    points: Float64,
-    seen: Sightings,
-    used: NDArray[np.bool_],
-    limit: Float64,
-    intrinsics: Intrinsics,
+def _gauss_newton(
+    T: Float64, points: Float64, seen: Sightings, limit: Float64, intrinsics: Intrinsics
 ) -> Float64:
-    """Twist (6,) by which to move the camera frame."""
-    r, p = residuals(T, points, seen, intrinsics)
-    used = used & np.isfinite(r[:, 0])
-    r, p, limit = r[used], p[used], limit[used]
-    if len(r) < 6:
-        return np.zeros(6)
-    squares = (r**2).sum(axis=1)
-    weight = np.sqrt(np.minimum(1.0, np.sqrt(limit / np.maximum(squares, 1e-12))))
-    x, y, z = p.T
-    J = np.empty((len(r), 3, 6))
-    J[:, :, :3] = residual_jacobian(p, seen.chosen(used), intrinsics)
-    # d(p) / d(phi) = -hat(p)
-    J[:, :, 3] = J[:, :, 2] * y[:, None] - J[:, :, 1] * z[:, None]
-    J[:, :, 4] = J[:, :, 0] * z[:, None] - J[:, :, 2] * x[:, None]
-    J[:, :, 5] = J[:, :, 1] * x[:, None] - J[:, :, 0] * y[:, None]
-    A = (J * weight[:, None, None]).reshape(-1, 6)
-    H = A.T @ A
-    H[np.diag_indices(6)] *= 1 + 1e-9
-    H[np.diag_indices(6)] += 1e-9
-    return np.linalg.solve(H, -A.T @ (r * weight[:, None]).ravel())
+    """T_camera_world (4, 4) after a few steps from ``T``."""
+    J = np.empty((len(points), 3, 6))
+    for _ in range(_ITERATIONS):
+        r, p = residuals(T, points, seen, intrinsics)
+        if not np.isfinite(r).all():
+            break
+        squares = np.einsum("nk,nk->n", r, r)
+        weight = np.sqrt(np.minimum(1.0, np.sqrt(limit / np.maximum(squares, 1e-12))))
+        x, y, z = p.T[:, :, None]
+        J[:, :, :3] = residual_jacobian(p, seen, intrinsics) * weight[:, None, None]
+        # d(p) / d(phi) = -hat(p)
+        J[:, :, 3] = J[:, :, 2] * y - J[:, :, 1] * z
+        J[:, :, 4] = J[:, :, 0] * z - J[:, :, 2] * x
+        J[:, :, 5] = J[:, :, 1] * x - J[:, :, 0] * y
+        A = J.reshape(-1, 6)
+        H = A.T @ A + _DAMPING
+        step = np.linalg.solve(H, -A.T @ (r * weight[:, None]).ravel())
+        T = make_pose(cv2.Rodrigues(step[3:])[0], step[:3]) @ T
+        if np.abs(step).max() < _SMALL_STEP:
+            break
+    return T
 
 
 def pose_from_matches(

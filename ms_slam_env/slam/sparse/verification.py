@@ -11,8 +11,8 @@ from ms_slam_env.slam.sparse.config import SparseConfig
 from ms_slam_env.slam.sparse.localisation import Fix, LiveFrame
 from ms_slam_env.slam.sparse.sparse_map import SparseMap
 
-_SAMPLES = 1500  # readings that a pose is judged by
-_LEAST_EXPLAINED = 0.4  # share of the matches
+_SAMPLES = 1000  # readings that a pose is judged by
+_LEAST_EXPLAINED = 0.25  # share of the matches
 NOTHING = Agreement(0.0, 0.0, 0.0, 0.0)
 
 
