@@ -28,6 +28,9 @@ class Arguments:
     """Reduce the images to this size, such as 160x120."""
     layout: str = "auto"
     """auto, tum, icl-nuim, 7-scenes or folder."""
+    intrinsics: str | None = None
+    """Of the images on disk: "fx fy cx cy width height [depth_scale]"; by default those of
+    intrinsics.txt in the folder, else the published ones of the dataset."""
     register: bool | None = None
     """Bring colour into the depth camera, as an uncalibrated Kinect needs it; by default only for
     7-scenes."""
@@ -42,9 +45,12 @@ def main(arguments: Sequence[str]) -> int:
     args = parse(Arguments, arguments, "ms-slam run")
     from ms_slam_env.benchmark.options import nested_options
     from ms_slam_env.benchmark.sequence_run import run_sequence
-    from ms_slam_env.sequences.recording import open_recording
+    from ms_slam_env.sequences.recording import open_recording, parse_calibration
 
-    recording = open_recording(args.sequence, args.layout, register=args.register)
+    given = None
+    if args.intrinsics is not None:
+        given = parse_calibration(args.intrinsics.replace(",", " ").split(), "--intrinsics")
+    recording = open_recording(args.sequence, args.layout, given, args.register)
     recording = recording.at_size(args.image_size)
     if recording.registration is not None:
         print(recording.registration, file=sys.stderr)

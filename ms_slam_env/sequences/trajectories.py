@@ -18,6 +18,7 @@ RADIUS_M = 0.25
 _HOP_M = (0.35, 0.7)  # distance between waypoints
 _MAX_TURN_RAD = np.radians(50.0)  # between the viewing directions of two waypoints
 _ATTEMPTS = 200
+_LEAP = 0.8
 
 
 class Wanderer:
@@ -84,15 +85,26 @@ def handheld_trajectory(
 
 
 def _wander(
-    scene: Scene, length: float, rng: np.random.Generator, speed_m: float, rot_rad: float
+    scene: Scene,
+    length: float,
+    rng: np.random.Generator,
+    speed_m: float,
+    rot_rad: float,
+    leap: float = 0.0,
 ) -> tuple[Float64, Float64]:
-    """A dense path and its frame times, up to ``length`` frames or a little more."""
+    """A dense path and its frame times, up to ``length`` frames or a little more.
+
+    ``leap`` is the share of the hops that seem to be missing that is taken before the path is drawn
+    anew; 0 = one hop, which takes time in the square of the length.
+    """
     wanderer = Wanderer(scene, rng)
     wanderer.hop()
     path = dense_path(wanderer.eyes, wanderer.targets)
     times = frame_times(path, speed_m, rot_rad)
     while times[-1] < length:
-        wanderer.hop()
+        missing = (length - times[-1]) / times[-1] * (len(wanderer.eyes) - 1)
+        for _ in range(max(1, int(leap * missing))):
+            wanderer.hop()
         path = dense_path(wanderer.eyes, wanderer.targets)
         times = frame_times(path, speed_m, rot_rad)
     return path, times
@@ -119,7 +131,7 @@ def free_path(
         InputError: no free path.
     """
     for _ in range(_ATTEMPTS):
-        path, times = _wander(scene, length, rng, speed_m, rot_rad)
+        path, times = _wander(scene, length, rng, speed_m, rot_rad, _LEAP)
         if _is_free(scene, path[: int(np.searchsorted(times, length)) + 1]):
             return path, times
     raise InputError(f"found no free trajectory in scene {scene.name!r}, seed {scene.seed}")

@@ -168,6 +168,9 @@ def test_says_what_registration_it_assumes(sequence, tmp_path, capsys):
         (["run", "SEQUENCE", "--backend", "orb"], "unknown SLAM backend 'orb'; valid choices: su"),
         (["run", "SEQUENCE", "--params", "speed"], "option 'speed' is not name=value"),
         (["run", "SEQUENCE", "--params", "speed=1"], "'slam_config.speed'; valid choices"),
+        (["run", "SEQUENCE", "--intrinsics", "1 2 3"], "--intrinsics: expected 'fx fy cx cy width"),
+        (["run", "SEQUENCE", "--intrinsics", "1 2 3 4 5 x"], "--intrinsics: 'x' is not a number"),
+        (["run", "SEQUENCE", "--intrinsics", "9 9 4 3 9 7"], "is 80x60 but the intrinsics say 9x7"),
         (["run", "SEQUENCE", "--image-size", "3x2"], "unknown image size '3x2'"),
     ],
 )

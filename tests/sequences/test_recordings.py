@@ -13,7 +13,7 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import make_pose, so3_exp
 from ms_slam_env.sequences import associate, write_trajectory
-from ms_slam_env.sequences.recording import open_recording
+from ms_slam_env.sequences.recording import open_recording, parse_calibration
 from ms_slam_env.sequences.recording.listings import flip_y
 
 LR_KT3 = Path(__file__).resolve().parents[3] / "shared/data/icl_nuim/lr_kt3_depth"
@@ -124,6 +124,22 @@ def test_plain_folder_pairs_by_number(tmp_path):
     assert recording.layout == "folder"
     assert [entry.depth.name for entry in recording.entries][-2:] == ["10.png", "11.png"]
     np.testing.assert_allclose(recording.frame(11).depth, depth_values(11) / 2000, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["rgbd_dataset_freiburg2_desk", "fr2_desk", "tum-fr2-xyz"])
+def test_published_calibrations_of_tum(tum, name):
+    (tum / "intrinsics.txt").unlink()
+    recording = open_recording(tum.rename(tum.with_name(name)))
+    assert recording.source == Intrinsics(520.9, 521.0, 325.1, 249.7, 640, 480)
+
+
+def test_given_intrinsics_come_first(tum):
+    given = parse_calibration(["31", "32", "15", "11", "32", "24", "2000"], "here")
+    recording = open_recording(tum, intrinsics=given)
+    assert recording.source == Intrinsics(31, 32, 15, 11, 32, 24)
+    np.testing.assert_allclose(recording.frame(0).depth, depth_values(0) / 2000, rtol=1e-6)
+    recording = open_recording(tum, intrinsics=Intrinsics(31, 32, 15, 11, 32, 24))
+    assert (recording.source.fx, recording.depth_scale) == (31, 5000)
 
 
 def test_depth_alone_has_black_colour(tum):

@@ -1,7 +1,16 @@
 """Recorded RGB-D sequences on disk: one class of recording, one file per folder layout."""
 
 from ms_slam_env.sequences.recording.layouts import LAYOUTS, open_recording
+from ms_slam_env.sequences.recording.listings import Calibration, parse_calibration
 from ms_slam_env.sequences.recording.recording import Entry, Recording
 from ms_slam_env.sequences.recording.registration import Registration
 
-__all__ = ["LAYOUTS", "Entry", "Recording", "Registration", "open_recording"]
+__all__ = [
+    "LAYOUTS",
+    "Calibration",
+    "Entry",
+    "Recording",
+    "Registration",
+    "open_recording",
+    "parse_calibration",
+]

@@ -38,9 +38,9 @@ IMAGES = (".png", ".pgm", ".jpg", ".jpeg", ".ppm", ".tif", ".tiff")
 # Published calibrations of the colour cameras, to which depth is registered, 640x480: TUM RGB-D
 # benchmark, "Intrinsic camera calibration of the Kinect"; ICL-NUIM page; 7-Scenes page (default).
 TUM_CAMERAS = {
-    "freiburg1": (517.3, 516.5, 318.6, 255.3),
-    "freiburg2": (520.9, 521.0, 325.1, 249.7),
-    "freiburg3": (535.4, 539.2, 320.1, 247.6),
+    r"(freiburg|fr)1": (517.3, 516.5, 318.6, 255.3),
+    r"(freiburg|fr)2": (520.9, 521.0, 325.1, 249.7),
+    r"(freiburg|fr)3": (535.4, 539.2, 320.1, 247.6),
 }
 ICL_NUIM_CAMERA = (481.2, -480.0, 319.5, 239.5)
 SEVEN_SCENES_CAMERA = (585.0, 585.0, 320.0, 240.0)
@@ -49,18 +49,18 @@ SEVEN_SCENES_NO_READING = 65535
 
 
 def _calibration_of(
-    folder: Path, given: Intrinsics | None, known: tuple[float, float, float, float] | None
+    folder: Path, given: Calibration | None, known: tuple[float, float, float, float] | None
 ) -> Calibration:
     """The user's, the folder's, or the published calibration of the dataset, in that order."""
     if given is not None:
-        return Calibration(given, False, None)
+        return given
     if (folder / "intrinsics.txt").is_file():
         return read_intrinsics(folder / "intrinsics.txt")
     if known is not None:
         return calibration(*known, 640, 480)
     raise InputError(
         f"intrinsics of {folder} are missing: write 'fx fy cx cy width height [depth_scale]' into "
-        f"{folder / 'intrinsics.txt'}"
+        f"{folder / 'intrinsics.txt'}, or give them with the command"
     )
 
 
@@ -109,13 +109,14 @@ def _trajectory(folder: Path, flipped: bool) -> tuple[Float64, Float64] | tuple[
     return None, None
 
 
-def open_tum(folder: Path, intrinsics: Intrinsics | None) -> Recording:
+def open_tum(folder: Path, intrinsics: Calibration | None) -> Recording:
     """TUM RGB-D benchmark: ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``; scale 5000."""
-    camera = next((TUM_CAMERAS[name] for name in TUM_CAMERAS if name in folder.name), None)
+    known = (camera for name, camera in TUM_CAMERAS.items() if re.search(name, folder.name))
+    camera = next(known, None)
     return _listed(folder, "tum", _calibration_of(folder, intrinsics, camera))
 
 
-def open_icl_nuim(folder: Path, intrinsics: Intrinsics | None) -> Recording:
+def open_icl_nuim(folder: Path, intrinsics: Calibration | None) -> Recording:
     """ICL-NUIM, TUM-compatible: ``associations.txt``, ``*.gt.freiburg``; y up in its poses."""
     return _listed(folder, "icl-nuim", _calibration_of(folder, intrinsics, ICL_NUIM_CAMERA))
 
@@ -134,7 +135,7 @@ def _listed(folder: Path, layout: str, camera: Calibration) -> Recording:
     )
 
 
-def open_seven_scenes(folder: Path, intrinsics: Intrinsics | None) -> Recording:
+def open_seven_scenes(folder: Path, intrinsics: Calibration | None) -> Recording:
     """7-Scenes: ``frame-NNNNNN.color.png``, ``.depth.png`` in millimetres, ``.pose.txt``.
 
     Colour and depth are the raw images of two cameras, so colour is registered by default, with
@@ -164,7 +165,7 @@ def open_seven_scenes(folder: Path, intrinsics: Intrinsics | None) -> Recording:
     )
 
 
-def open_folder(folder: Path, intrinsics: Intrinsics | None) -> Recording:
+def open_folder(folder: Path, intrinsics: Calibration | None) -> Recording:
     """Folders ``depth`` and, if there is colour, ``rgb`` or ``color``; files paired by order."""
     camera = _calibration_of(folder, intrinsics, None)
     depth = _images(folder / "depth")
@@ -200,7 +201,7 @@ def _images(folder: Path) -> list[Path]:
     return sorted(found, key=lambda path: [int(n) for n in re.findall(r"\d+", path.stem)])
 
 
-LAYOUTS: dict[str, Callable[[Path, Intrinsics | None], Recording]] = {
+LAYOUTS: dict[str, Callable[[Path, Calibration | None], Recording]] = {
     "tum": open_tum,
     "icl-nuim": open_icl_nuim,
     "7-scenes": open_seven_scenes,
@@ -228,7 +229,7 @@ def _recognise(folder: Path) -> str:
 def open_recording(
     path: str | Path,
     layout: str = "auto",
-    intrinsics: Intrinsics | None = None,
+    intrinsics: Intrinsics | Calibration | None = None,
     register: bool | Registration | None = None,
 ) -> Recording:
     """Open a recorded sequence; images are read later, frame by frame.
@@ -236,8 +237,9 @@ def open_recording(
     Args:
         path: its folder.
         layout: ``auto`` or one of ``LAYOUTS``.
-        intrinsics: of the images on disk; by default those of ``intrinsics.txt`` in the folder,
-            else the published ones of the dataset.
+        intrinsics: of the images on disk, with the scale of the depth images or without; by
+            default those of ``intrinsics.txt`` in the folder, else the published ones of the
+            dataset.
         register: whether to bring colour into the depth camera, with the numbers of an
             uncalibrated Kinect or with those given; by default only the layout 7-Scenes does,
             whose images are not registered.
@@ -253,6 +255,8 @@ def open_recording(
         raise unknown("layout", layout, ("auto", *LAYOUTS))
     if (folder / UNFINISHED).is_file():
         raise InputError(f"{path} was not generated to its end: give its command again")
+    if isinstance(intrinsics, Intrinsics):
+        intrinsics = Calibration(intrinsics, False, None)
     found = LAYOUTS[_recognise(folder) if layout == "auto" else layout](folder, intrinsics)
     if register is None:
         return found

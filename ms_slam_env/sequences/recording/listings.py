@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -124,17 +124,25 @@ def read_intrinsics(path: Path) -> Calibration:
         InputError: naming file and line.
     """
     for where, words in rows(path):
-        values = [number(word, where) for word in words]
-        if len(values) not in (6, 7):
-            raise InputError(
-                f"{where}: expected 'fx fy cx cy width height [depth_scale]', "
-                f"got {' '.join(words)!r}"
-            )
-        try:
-            return calibration(*values)
-        except InputError as error:
-            raise InputError(f"{where}: {error}") from None
+        return parse_calibration(words, where)
     raise InputError(f"{path} holds no intrinsics: 'fx fy cx cy width height [depth_scale]'")
+
+
+def parse_calibration(words: Sequence[str], where: str) -> Calibration:
+    """Calibration of the words ``fx fy cx cy width height [depth_scale]``.
+
+    Raises:
+        InputError: naming ``where`` they stand.
+    """
+    values = [number(word, where) for word in words]
+    if len(values) not in (6, 7):
+        raise InputError(
+            f"{where}: expected 'fx fy cx cy width height [depth_scale]', got {' '.join(words)!r}"
+        )
+    try:
+        return calibration(*values)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
 
 
 def calibration(
