@@ -30,6 +30,10 @@ class TrackResult:
             drift that was taken back.
         degenerate_directions: number of directions of the pose, of six, that the view does not
             constrain, as in front of a blank wall; along them the pose is only predicted.
+        covariance: (6, 6) of the pose relative to the map, whose own drift is not part of it: of
+            the twist xi = (rho, phi) in metres and radians, in the camera's frame, with the true
+            pose T_world_camera exp(xi). None where no pose was estimated, or by a backend that
+            does not know it.
     """
 
     T_world_camera: Float64
@@ -39,11 +43,13 @@ class TrackResult:
     residual_m: float = 0.0
     reason: str = ""
     degenerate_directions: int = 0
+    covariance: Float64 | None = None
 
     @property
     def degenerate(self) -> bool:
         """Whether the view left a direction of the pose unconstrained."""
         return self.degenerate_directions > 0
+
     loop_closed: bool = False
 
 

@@ -113,6 +113,12 @@ def test_views_say_how_many_directions_they_leave_open(kind, directions):
     assert sum(result.degenerate for result in results[2:]) >= (6 if directions else 0)
     assert directions or not any(result.degenerate for result in results)
     assert np.median([result.degenerate_directions for result in results[2:]]) == directions
+    for result in results[1:]:
+        np.testing.assert_array_equal(result.covariance, result.covariance.T)
+        assert np.linalg.eigvalsh(result.covariance).min() > 0
+    sigmas = np.sqrt(np.diag(results[-1].covariance))
+    # Centimetres where the pose is only predicted, a millimetre where it is measured.
+    assert (sigmas[:3] > 0.01).tolist() == [kind != "painted", kind == "blank", False]
     x, y, z = results[-1].T_world_camera[:3, 3]
     # What is constrained is right; what is not stays near where it was, at rest.
     assert abs(z) < 0.003

@@ -22,6 +22,9 @@ vec6d = wp.types.vector(length=6, dtype=wp.float64)
 
 NORMAL_NOISE = wp.constant(wp.float64(0.3))  # share of that mean that is worth nothing
 LEAST_INFORMATION = wp.constant(wp.float64(0.5))  # per matched point, 1/m^2: 2 cm of 5000 points
+OPEN_VARIANCE = wp.constant(wp.float64(0.03 * 0.03))  # m^2, of a frame's predicted motion
+GEOMETRIC_NOISE = wp.constant(wp.float64(0.022))  # covariance of the gradient over A or B;
+PHOTOMETRIC_NOISE = wp.constant(wp.float64(0.34))  # see benchmark/pose_covariance.py
 SINGULAR = wp.constant(wp.float64(1.0e-6))
 
 
@@ -142,3 +145,38 @@ def remapped_step(
             for i in range(6):
                 xi[i] += E[i, k] * along
     return xi
+
+
+@wp.func
+def pose_covariance(
+    E: mat76d,
+    A: mat66d,
+    B: mat66d,
+    tilted: wp.float64,
+    matched: wp.float64,
+    length: wp.float64,
+):
+    """Covariance H^-1 (a A + b B) H^-1 of the pose, metres and radians, H = A + B in metres.
+
+    The weights of the two terms were chosen for accuracy, so H^-1 is no covariance: a A and b B
+    are those of the gradients. Along directions that the view leaves open it is the prediction's.
+    """
+    inverse = mat66d()
+    C = mat66d()
+    for k in range(6):
+        is_open = not is_constrained(E, k, A, tilted, matched)
+        for i in range(6):
+            for j in range(6):
+                along = E[i, k] * E[j, k]
+                if is_open:
+                    C[i, j] += OPEN_VARIANCE * along
+                else:
+                    inverse[i, j] += along / E[6, k]
+    C += inverse * (GEOMETRIC_NOISE * A + PHOTOMETRIC_NOISE * B) * inverse
+    for i in range(6):
+        for j in range(6):
+            if i >= 3:
+                C[i, j] = C[i, j] / length
+            if j >= 3:
+                C[i, j] = C[i, j] / length
+    return wp.float64(0.5) * (C + wp.transpose(C))

@@ -20,6 +20,7 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import check_pose, invert
 from ms_slam_env.slam.base import Float64, TrackResult
 from ms_slam_env.slam.ferns import Candidate
+from ms_slam_env.slam.surfel.alignment import Alignment
 from ms_slam_env.slam.surfel.blank import BLANK, REASON, BlankFrames
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.inputs import check_guesses, check_images, check_poses
@@ -36,7 +37,7 @@ from ms_slam_env.slam.surfel.preprocess import Preprocessor
 from ms_slam_env.slam.surfel.relocalisation import Images, make_relocalisation
 from ms_slam_env.slam.surfel.seeds import NUM_SEEDS, relocalisation_seeds, tracking_seeds
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
-from ms_slam_env.slam.surfel.tracking import NUM_FIRST, Alignment, Tracker, model_stride
+from ms_slam_env.slam.surfel.tracking import NUM_FIRST, Tracker, model_stride
 from ms_slam_env.slam.surfel.types import LiveFrame, ModelView
 from ms_slam_env.slam.surfel.verdict import (
     APPEARANCE,
@@ -303,6 +304,7 @@ class BatchedSurfelSlam:
             residual_m=float(alignment.stats[env, STAT_RESIDUAL_M]),
             reason=REASON if code == BLANK else REASONS[code],
             degenerate_directions=int(alignment.stats[env, STAT_DEGENERATE]),
+            covariance=alignment.covariance[env] if code == 0 else None,
         )
 
     def _fuse(self, live: LiveFrame, good: NDArray[np.bool_]) -> None:

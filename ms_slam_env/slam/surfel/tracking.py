@@ -7,7 +7,6 @@ one that explains the frame best goes on. Nothing waits for the device before th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,9 @@ from numpy.typing import NDArray
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert
+from ms_slam_env.slam.surfel.alignment import Alignment
 from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.degeneracy import mat66d
 from ms_slam_env.slam.surfel.launches import Launches
 from ms_slam_env.slam.surfel.mirror import Mirror
 from ms_slam_env.slam.surfel.normal_equations import (
@@ -50,35 +51,6 @@ SMALLEST_STEP = (2.0e-4, 4.0e-4, 1.0e-3)  # metres and radians, per level, fines
 DAMPING = 1.0e-6
 COARSE_TOLERANCE = 2.5
 DEPTH_REDUNDANCY = 50.0  # see normal_equations
-
-
-@dataclass(frozen=True)
-class Alignment:
-    """What ``Tracker.align`` found for B envs.
-
-    Attributes:
-        T_world_live: (B, 4, 4) pose after alignment, good or not.
-        T_model_live: (B, 4, 4) the same, relative to the pose of the model view.
-        verdict: (B,) codes of ``verdict.REASONS``; 0 = tracked.
-        stats: (B, NUM_STATS) figures behind the verdict.
-        photometry: (B,) how the live grey values relate to the model's, ``Photometry`` each.
-    """
-
-    T_world_live: Float64
-    T_model_live: Float64
-    verdict: NDArray[np.int32]
-    stats: Float64
-    photometry: NDArray[Any]
-
-    def replace(self, where: NDArray[np.bool_], other: Alignment) -> Alignment:
-        """Take the envs ``where`` (B,) from ``other``."""
-        return Alignment(
-            T_world_live=np.where(where[:, None, None], other.T_world_live, self.T_world_live),
-            T_model_live=np.where(where[:, None, None], other.T_model_live, self.T_model_live),
-            verdict=np.where(where, other.verdict, self.verdict),
-            stats=np.where(where[:, None], other.stats, self.stats),
-            photometry=np.where(where, other.photometry, self.photometry),
-        )
 
 
 def model_stride(intrinsics: Intrinsics, config: SurfelConfig) -> int:
@@ -164,6 +136,7 @@ class Tracker:
         self._T_world_live = Mirror(batch, wp.mat44d, device)
         self._verdict = Mirror(batch, wp.int32, device)
         self._stats = Mirror((batch, NUM_STATS), wp.float64, device)
+        self._covariance = Mirror(batch, mat66d, device)
         self._live_levels: list[Level] = []
         self._weights = [_weights(config, level) for level in range(num_levels)]
 
@@ -234,7 +207,12 @@ class Tracker:
                     self._limits.array,
                     self._T_world_model.array,
                 ],
-                [self._T_world_live.array, self._verdict.array, self._stats.array],
+                [
+                    self._T_world_live.array,
+                    self._verdict.array,
+                    self._stats.array,
+                    self._covariance.array,
+                ],
             )
         return Alignment(
             T_world_live=self._T_world_live.read(),
@@ -242,6 +220,7 @@ class Tracker:
             verdict=self._verdict.read(),
             stats=self._stats.read(),
             photometry=one.lights.read()[:, 0],
+            covariance=self._covariance.read(),
         )
 
     def _start_from(self, seeds: Float64, T_world_model: Float64, guesses: Float64 | None) -> None:

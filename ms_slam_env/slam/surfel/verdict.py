@@ -12,6 +12,7 @@ from ms_slam_env.slam.surfel.degeneracy import (
     eigen,
     is_constrained,
     mat66d,
+    pose_covariance,
     vec6d,
 )
 from ms_slam_env.slam.surfel.normal_equations import OFF, RUNNING, Photometry
@@ -191,6 +192,7 @@ def judge(
     T_world_live: wp.array(dtype=wp.mat44d),  # out
     verdict: wp.array(dtype=wp.int32),
     stats: wp.array2d(dtype=wp.float64),
+    covariance: wp.array(dtype=mat66d),  # (B,) of the twist xi, T_world_live exp(xi)
 ):
     """Compare what the alignment explained with the limits; write verdict, figures and pose.
 
@@ -222,6 +224,7 @@ def judge(
             degenerate += 1
 
     T = T_model_live[b, 0]
+    covariance[b] = pose_covariance(E, A, B, sums[b, 0, 69], matched, length)
     if degenerate > 0:
         # Coarser levels may have moved along what turns out to be open.
         deviation = in_metres_twist(se3_log(invert_rigid(predicted[b]) * T), length)
