@@ -41,6 +41,7 @@ def summarise(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         summary.append(
             {
                 "size": size,
+                "target": target,
                 "surfels": round(group[0]["surfels"]),
                 "version": version,
                 "median_ms": float(np.median([np.median(row["frame_ms"]) for row in group])),
@@ -51,7 +52,7 @@ def summarise(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
                 "same_estimates": other and group[0]["estimates"] == other[0]["estimates"],
             }
         )
-    return sorted(summary, key=lambda row: (_pixels(row["size"]), row["surfels"], row["version"]))
+    return sorted(summary, key=lambda row: (_pixels(row["size"]), row["target"], row["version"]))
 
 
 def _mean(row: dict[str, Any]) -> float:

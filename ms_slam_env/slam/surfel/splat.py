@@ -1,3 +1,5 @@
+# ruff: noqa: UP018, RUF046
+# Warp code: int(0) declares a variable that changes.
 """Kernels that render surfels: cull, z-buffer of discs, average of the front surface, resolve.
 
 Two passes over the visible discs: the first finds the nearest surface of every pixel, the second
