@@ -39,7 +39,7 @@ class Candidate:
 class FernDatabase:
     """Keeps the frames that differ from all kept before, and finds those that resemble another.
 
-    Glocker et al., TVCG 2015, sections 3 and 4. The same seed draws the same ferns.
+    Glocker et al., TVCG 2015, see ``encoding``. The same seed draws the same ferns.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """Frames as codes of binary tests at random places.
 
 Glocker, Shotton, Criminisi, Izadi, "Real-Time RGB-D Camera Relocalization via Randomized Ferns for
-Keyframe Encoding", TVCG 2015, section 3: each fern compares red, green, blue and depth at one
+Keyframe Encoding", TVCG 2015: each fern compares red, green, blue and depth at one
 place of a small, smoothed image with a threshold each.
 """
 
@@ -83,7 +83,7 @@ class FernEncoder:
 def dissimilarities(code: FernCode, bits: UInt8, known: UInt8) -> Float64:
     """Share of ferns (K,) at which ``code`` differs from each of K codes (K, F).
 
-    The paper's block-wise Hamming distance (equation 3): a fern differs if any of its bits does.
+    The paper's block-wise Hamming distance: a fern differs if any of its bits does.
     Bits that either frame does not know are left out.
     """
     different = (bits ^ code.bits) & (known & code.known)

@@ -1,7 +1,8 @@
 """The surfel SLAM: preprocess, render the map, track the frame against that view, fuse.
 
 ElasticFusion (Whelan et al., RSS 2015, figure 2). While tracking is lost the
-pose is held, nothing is fused, and every frame is tried against the map around the last good pose.
+pose is held, nothing is fused, and every frame is tried against the map around the last good pose
+and around keyframes that resemble it (``relocalisation``).
 The view that frames are tracked against shows living surfels of every age: with steps of
 centimetres a view seldom lasts until its surfels are stable.
 """
