@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 from tqdm import tqdm
 
-from ms_slam_env import scenes, slam
+from ms_slam_env import slam
 from ms_slam_env.benchmark.command_line import exit_code, parse
 from ms_slam_env.benchmark.figures import caption, colour, new_figure, save
 from ms_slam_env.benchmark.provenance import provenance
@@ -28,6 +28,7 @@ from ms_slam_env.benchmark.records import write_json
 from ms_slam_env.benchmark.table import markdown_table
 from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.config import check_range
+from ms_slam_env.env.worlds import get_scene
 from ms_slam_env.geometry import invert, se3_log
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sequences import handheld_trajectory
@@ -148,7 +149,7 @@ def run(config: PoseCovarianceConfig) -> dict[str, Any]:
         (s, n, seed) for s, seeds in split_seeds.items() for n in config.scenes for seed in seeds
     ]
     for split, name, seed in tqdm(work, desc="sequences", file=sys.stderr):
-        scene = scenes.make(name, seed)
+        scene = get_scene(name, seed)
         poses = handheld_trajectory(scene, config.frames, seed, config.speed_m, config.rot_deg)
         sensor = RGBDSensor(scene, intrinsics, noise=config.noise, seed=seed)
         frames = [sensor.capture(pose, index) for index, pose in enumerate(poses)]

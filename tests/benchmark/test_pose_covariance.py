@@ -37,21 +37,21 @@ def test_the_factor_repairs_wrong_ones():
 def test_a_short_run_writes_table_and_picture_and_is_about_calibrated(tmp_path):
     config = pc.PoseCovarianceConfig(
         tmp_path,
-        scenes=("table",),
+        scenes=("wall",),
         validation_seeds=(1000,),
-        test_seeds=(1001,),
+        test_seeds=(1000,),
         size="80x60",
         frames=20,
     )
     report = pc.run(config)
     rows = {row["sequences"]: row for row in report["rows"]}
-    assert rows["test, table"]["frames"] == 15
+    assert rows["test, wall"]["frames"] == 15
     assert 0.1 < report["validation_factor"] < 4
-    assert rows["test, table"]["predicted_mm"] == pytest.approx(
-        rows["test, table"]["error_mm"], rel=0.7
+    assert rows["test, wall"]["predicted_mm"] == pytest.approx(
+        rows["test, wall"]["error_mm"], rel=0.7
     )
     assert json.loads((tmp_path / "pose_covariance.json").read_text())["rows"]
-    assert "| test, table | 15 |" in (tmp_path / "pose_covariance.md").read_text()
+    assert "| test, wall | 15 |" in (tmp_path / "pose_covariance.md").read_text()
     assert (tmp_path / "pose_covariance.png").stat().st_size > 5000
 
 
