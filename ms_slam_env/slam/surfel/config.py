@@ -61,7 +61,7 @@ class SurfelConfig:
         InputError: a value outside its range.
     """
 
-    depth_cutoff_m: float = 3.0
+    depth_cutoff_m: float = 4.0
     icp_rgb_weight: float = 0.1
     confidence_threshold: float = 10.0
     iterations: tuple[int, ...] = (4, 5, 10)
