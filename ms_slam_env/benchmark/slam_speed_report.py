@@ -103,7 +103,8 @@ def save_figure(summary: Sequence[dict[str, Any]], path: Path) -> Path:
     left.set_ylim(bottom=0)
     left.set_xlabel("surfels stored")
     left.set_ylabel("processor time [ms/frame]")
-    left.legend(fontsize="small")
+    handles, labels = left.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower left", ncols=4, fontsize="small")
     left.grid(alpha=0.3)
     smallest = [
         next(row for row in summary if (row["size"], row["version"]) == (size, "this"))

@@ -218,6 +218,9 @@ def test_unstable_surfels_expire_at_the_interval_and_gaps_close_when_many():
         if time % 4 == 0:
             old_and_unstable = (surfels["confidence"] < 10) & (surfels["seen"] < time - 6)
             expected &= ~old_and_unstable
+            used = -(-int(surfel_map.surfels.count.numpy()[0]) // BLOCK)
+            # No block is looked at again for what is gone already.
+            assert (surfel_map._blocks.expiry.numpy()[0, :used] >= time - 6).all()
         state = surfel_map.get_state()
         for name, values in surfels.items():
             found = surfel_map.attribute(name, stable=False)
@@ -230,3 +233,27 @@ def test_unstable_surfels_expire_at_the_interval_and_gaps_close_when_many():
         assert_boxes_hold(surfel_map)
     assert 0.5 < expected.mean() < 0.9
     assert 2 <= len(set(slots)) < 5  # few compactions for many removals
+
+
+def test_a_full_map_closes_its_gaps_now_and_then():
+    config = SurfelConfig(max_surfels=3000, compaction_interval=1000)
+    surfel_map = SurfelMap(1, SMALL, config)
+    rng = np.random.default_rng(2)
+    surfels = random_surfels(rng, 2990, 3.0)
+    surfels["position"][:, 2] -= 100  # behind the camera
+    surfels["confidence"] = np.full(2990, 20, dtype=np.float32)
+    surfels["confidence"][:100] = 1  # unstable: at once to go, seen in the frames 1, 2, 3, ...
+    surfels["seen"] = np.int32(np.arange(2990) // 10 + 1)
+    counters = {"count": np.int32([2990]), "dead": np.int32([0]), "dropped": np.int32([0])}
+    surfel_map.set_state({"counters": counters, "surfels": [surfels]})
+    nothing = live_frame(np.eye(4)[None])
+    nothing.depth.zero_()
+    nothing.normals.zero_()
+    slots = []
+    for time in range(1, 12):
+        fuse(surfel_map, nothing, np.eye(4)[None], time)
+        assert surfel_map.count() == 2990 - 10 * (time - 1)
+        slots.append(int(surfel_map.surfels.count.numpy()[0]))
+        assert_boxes_hold(surfel_map)
+    # First when a sixty-fourth is dead, again only when as many are dead as are free.
+    assert slots == [2990] * 5 + [2940] * 6

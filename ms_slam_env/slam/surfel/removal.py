@@ -12,6 +12,7 @@ from ms_slam_env.slam.surfel.memory import fetch, put
 from ms_slam_env.slam.surfel.surfel_arrays import Surfels
 
 BLOCK_SIZE = wp.constant(BLOCK)
+NEVER = wp.constant(2**31 - 1)
 
 
 @wp.struct
@@ -63,13 +64,18 @@ def expire(
         if blocks.expiry[b, block] < oldest:
             i = block * BLOCK_SIZE
             end = wp.min(i + BLOCK_SIZE, count)
+            expiry = int(NEVER)
             while i < end:
                 confidence = fetch(surfels.confidence, b, i)
-                is_unstable = confidence > 0.0 and confidence < removal.confidence_threshold
-                if is_unstable and fetch(surfels.seen, b, i) < oldest:
-                    put(surfels.confidence, b, i, 0.0)
-                    wp.atomic_add(expired, b, 1)
+                seen = fetch(surfels.seen, b, i)
+                if confidence > 0.0 and confidence < removal.confidence_threshold:
+                    if seen < oldest:
+                        put(surfels.confidence, b, i, 0.0)
+                        wp.atomic_add(expired, b, 1)
+                    else:
+                        expiry = wp.min(expiry, seen)
                 i += 1
+            blocks.expiry[b, block] = expiry
         block += workers
 
 
@@ -86,14 +92,15 @@ def list_survivors(
 ) -> None:
     """List the slots to keep of every env whose compaction is due; ``kept`` -1: not due.
 
-    It is due when an eighth of the slots are dead, so that its cost follows the number of deaths,
-    or when a crowded map has any.
+    It is due when many slots are dead, so that its cost follows the number of deaths: an eighth, or
+    in a crowded map a sixty-fourth and as many as are free.
     """
     b, worker = wp.tid()
     count = wp.min(surfels.count[b], removal.capacity)
     dead = surfels.dead[b] + expired[b]
     many = 8 * dead > count and time[b] % removal.interval == 0
-    needed = dead > 0 and is_crowded(count, removal.capacity)
+    crowded = is_crowded(count, removal.capacity)
+    needed = crowded and 64 * dead > count and dead > removal.capacity - count
     if mask[b] == 0 or not (many or needed):
         kept[b] = -1
         return
