@@ -18,6 +18,7 @@ SCALES = tuple(round(1.0 - 0.05 * k, 2) for k in range(19))
 
 _RADIUS_M = 0.15  # free space kept around the camera
 _PLACES = 400  # tried at each scale
+_HEIGHTS = 8  # of start poses, one of which the middle of the motion has
 _FIRST_CHECKED = 40  # poses that rule out most places
 
 
@@ -74,10 +75,11 @@ def place_trajectory(
     rng = np.random.default_rng([seed, 79])
     eyes = given[:, :3, 3] @ R_up.T
     centre = 0.5 * (eyes.min(axis=0) + eyes.max(axis=0))
+    heights = [scene.sample_start(rng)[2, 3] for _ in range(_HEIGHTS)]
     for factor in SCALES if scale is None else (scale,):
         for _ in range(_PLACES):
             yaw = so3_exp([0.0, 0.0, rng.uniform(-np.pi, np.pi)])
-            place = _place(scene, rng)
+            place = _place(scene, heights, rng)
             moved = factor * (eyes - centre) @ yaw.T + place
             if not _is_free(scene, moved):
                 continue
@@ -92,11 +94,11 @@ def place_trajectory(
     )
 
 
-def _place(scene: Scene, rng: np.random.Generator) -> Float64:
-    """A point (3,) within the scene's bounds at about the height of a start pose."""
+def _place(scene: Scene, heights: list[float], rng: np.random.Generator) -> Float64:
+    """A point (3,) within the scene's bounds at about one of the heights."""
     low, high = scene.mesh.vertices.min(0), scene.mesh.vertices.max(0)
     point = rng.uniform(low, high)
-    point[2] = scene.sample_start(rng)[2, 3] + rng.uniform(-0.2, 0.2)
+    point[2] = rng.choice(heights) + rng.uniform(-0.2, 0.2)
     return point
 
 

@@ -120,7 +120,7 @@ def test_a_placed_motion_is_the_same_motion(box_scene: BoxScene, axis: int, sign
 
 
 def test_a_large_motion_is_scaled_until_it_fits(box_scene: BoxScene) -> None:
-    given = recording(np.random.default_rng(0), np.array([0.0, 0.0, 1.0]), 4.0)
+    given = recording(np.random.default_rng(0), np.array([0.0, 0.0, 1.0]), 3.0)
     placed = place_trajectory(box_scene, given)
     assert 0.1 <= placed.scale < 1.0
     a = np.linalg.norm(np.diff(given[:, :3, 3], axis=0), axis=1)
