@@ -313,7 +313,6 @@ class BatchedSurfelSlam:
         if not good.any():
             self._time += 1
             return
-        self.loops.record(self.poses, self._time, good)
         self._device_poses.write(self.poses)
         self._device_time.write(self._time)
         self._device_weight.write(motion_weight(self._motions))
@@ -325,6 +324,7 @@ class BatchedSurfelSlam:
             self._device_weight.array,
             self._device_mask.array,
         )
+        self.loops.record(self.poses, self._time, good)
         self._time += 1
         self._view_poses = None
 

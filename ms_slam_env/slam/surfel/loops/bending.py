@@ -147,6 +147,7 @@ class MapBender:
             inputs=[self.map.surfels, env, nodes, first_device, graph.window],
             device=self.device,
         )
+        self.map.surfels_moved()
 
     def join_parts(self, env: int, pose: Float64, now: int) -> None:
         """Make one surface of both parts in view from ``pose`` (4, 4), and the old one active.
@@ -184,6 +185,7 @@ class MapBender:
             inputs=[self.map.surfels, env, first - reach, last + reach, now],
             device=self.device,
         )
+        self.map.surfels_moved()
 
 
 def _rms(distances: Float64) -> float:

@@ -18,7 +18,6 @@ A closed loop makes the estimated pose jump by the drift that it takes back.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -27,38 +26,15 @@ from ms_slam_env.geometry import invert, relative_angle
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.loops.base import Bool, Float64, Int32, LoopClosure, SimilarViews
 from ms_slam_env.slam.surfel.loops.bending import MapBender
-from ms_slam_env.slam.surfel.loops.energy import Constraints, join, no_constraints
-from ms_slam_env.slam.surfel.loops.registration import InactiveRegistration
+from ms_slam_env.slam.surfel.loops.past import Past, past_from_state
+from ms_slam_env.slam.surfel.loops.registration import InactiveRegistration, Placement
 from ms_slam_env.slam.surfel.surfel_arrays import EARLIEST, any_time
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.tracking import model_stride
 from ms_slam_env.slam.surfel.types import LiveFrame
 
-KEPT_CONSTRAINTS = 1000  # relative ones, of the newest loops
+SIGNIFICANT = 3.0  # drift, in standard deviations of the registration, that is worth bending for
 VIEW_APART_M, VIEW_APART_DEG = 1.0, 60.0  # views of one place differ by less
-
-
-@dataclass
-class _Past:
-    """What is remembered of one env.
-
-    Attributes:
-        last: the frame that was fused last; -1 at first.
-        frames: the frames fused.
-        poses: their poses, bent by every closure since.
-        joined: relative constraints of the loops closed.
-    """
-
-    last: int = -1
-    frames: list[int] = field(default_factory=list)
-    poses: list[Float64] = field(default_factory=list)
-    joined: Constraints = field(default_factory=no_constraints)
-
-    def path_m(self, frame: int) -> float:
-        """Length of the way since a frame."""
-        first = int(np.searchsorted(self.frames, frame))
-        positions = np.array([pose[:3, 3] for pose in self.poses[first:]]).reshape(-1, 3)
-        return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
 
 
 class DeformationLoopClosure(LoopClosure):
@@ -76,11 +52,11 @@ class DeformationLoopClosure(LoopClosure):
         self._registration = InactiveRegistration(surfel_map, inactive, config, device)
         self._bender = MapBender(surfel_map, inactive, active, config, device)
         self._seen_from = np.full(self.batch, EARLIEST, dtype=np.int32)
-        self._past = [_Past() for _ in range(self.batch)]
+        self._past = [Past() for _ in range(self.batch)]
 
     def reset(self, env: int) -> None:
         """Forget one env."""
-        self._past[env] = _Past()
+        self._past[env] = Past()
 
     def select(self, lost: Int32) -> bool:
         """The active surfels, or all while tracking is lost."""
@@ -95,10 +71,7 @@ class DeformationLoopClosure(LoopClosure):
     def record(self, poses: Float64, time: Int32, fused: Bool) -> None:
         """Remember the poses of the frames just fused."""
         for env in np.flatnonzero(fused):
-            past = self._past[env]
-            past.last = int(time[env])
-            past.frames.append(past.last)
-            past.poses.append(poses[env].copy())
+            self._past[env].record(self.map, int(env), int(time[env]), poses[env])
 
     def close(
         self, live: LiveFrame, poses: Float64, time: Int32, tracked: Bool, similar: SimilarViews
@@ -112,9 +85,9 @@ class DeformationLoopClosure(LoopClosure):
         self._registration.set_frame(live)
         near = self._registration.covered(poses, due)
         if near.any():
-            found, there = self._registration.near(poses)
-            for env in np.flatnonzero(near & found):
-                closed[env] = self._close(int(env), poses, there[env])
+            there = self._registration.near(poses)
+            for env in np.flatnonzero(near & there.found):
+                closed[env] = self._close(int(env), poses, there)
                 due[env] = False
         due &= time % self.config.global_interval == 0
         for env in np.flatnonzero(due):
@@ -132,63 +105,46 @@ class DeformationLoopClosure(LoopClosure):
                 continue
             starts = np.full((self.batch, 4, 4), np.nan)
             starts[env] = candidate.T_world_camera
-            found, there = self._registration.from_keyframes(starts)
-            drift = np.linalg.norm(there[env, :3, 3] - poses[env, :3, 3])
-            if found[env] and drift <= allowed_m:
-                return self._close(env, poses, there[env])
+            there = self._registration.from_keyframes(starts)
+            drift = np.linalg.norm(there.T_world_live[env, :3, 3] - poses[env, :3, 3])
+            if there.found[env] and drift <= allowed_m:
+                return self._close(env, poses, there)
         return False
 
-    def _close(self, env: int, poses: Float64, corrected: Float64) -> bool:
+    def _close(self, env: int, poses: Float64, there: Placement) -> bool:
         """Bend map, pose and past of one env; returns whether that was believed and done."""
-        past = self._past[env]
-        if self._moves(poses[env], corrected):
-            bent = self._bender.bend(env, poses[env], corrected, past.joined)
-            if bent is None:
-                return False
-            deformation, joined = bent
-            past.joined = join([past.joined.moved_by(deformation), joined]).last(KEPT_CONSTRAINTS)
-            moved = deformation.poses(np.stack(past.poses), np.array(past.frames) + 0.5)
-            past.poses = [*moved[:-1], corrected.copy()]
-            poses[env] = corrected
-            self._bender.join_parts(env, corrected, past.last)
-            return True
-        self._bender.join_parts(env, poses[env], past.last)
-        return False
-
-    def _moves(self, pose: Float64, corrected: Float64) -> bool:
-        """Whether the correction is worth bending the map for."""
-        T = invert(pose) @ corrected
-        angle = relative_angle(np.eye(3), T[:3, :3])
-        return bool(np.linalg.norm(T[:3, 3]) + angle >= self.config.smallest_m)
+        past, corrected = self._past[env], there.T_world_live[env]
+        drift = _size(invert(poses[env]) @ corrected)
+        if drift < self.config.smallest_m:
+            self._bender.join_parts(env, poses[env], past.last)
+            return False
+        if drift < SIGNIFICANT * there.sigma[env]:
+            return False
+        bent = self._bender.bend(env, poses[env], corrected, past.joined)
+        if bent is None:
+            return False
+        deformation, joined = bent
+        past.move(deformation, joined, corrected)
+        poses[env] = corrected
+        self._bender.join_parts(env, corrected, past.last)
+        return True
 
     def trajectory(self, env: int) -> tuple[Int32, Float64]:
         """Tracked frames (N,) and their poses (N, 4, 4), bent by the closures since."""
-        past = self._past[env]
-        return np.array(past.frames, dtype=np.int32), np.array(past.poses).reshape(-1, 4, 4)
+        return self._past[env].trajectory()
 
     def get_state(self) -> dict[str, Any]:
         """Everything needed to go on bit-exactly, as NumPy arrays."""
-        names = ("sources", "source_times", "targets", "target_times")
-        return {
-            "last": np.array([past.last for past in self._past]),
-            "trajectories": [self.trajectory(env) for env in range(self.batch)],
-            "joined": [
-                {name: getattr(past.joined, name).copy() for name in names} for past in self._past
-            ],
-        }
+        return {"past": [past.get_state() for past in self._past]}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state that ``get_state`` returned."""
-        parts = zip(state["last"], state["trajectories"], state["joined"], strict=True)
-        self._past = [
-            _Past(
-                int(last),
-                [int(frame) for frame in frames],
-                list(poses.copy()),
-                Constraints(**{name: array.copy() for name, array in joined.items()}),
-            )
-            for last, (frames, poses), joined in parts
-        ]
+        self._past = [past_from_state(past) for past in state["past"]]
+
+
+def _size(T: Float64) -> float:
+    """How far a motion moves points about 1 m away, at most: metres."""
+    return float(np.linalg.norm(T[:3, 3]) + relative_angle(np.eye(3), T[:3, :3]))
 
 
 def _may_be_the_same(pose: Float64, keyframe: Float64, drift_m: float) -> bool:

@@ -43,7 +43,7 @@ class LoopConfig:
     window: int = 50
     interval: int = 5
     coverage: float = 0.25
-    sigma: float = 0.005
+    sigma: float = 0.01
     inliers: float = 0.7
     largest_m: float = 0.3
     largest_deg: float = 20.0

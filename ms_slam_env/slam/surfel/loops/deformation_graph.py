@@ -14,8 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ms_slam_env.geometry import make_pose
-
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
@@ -114,26 +112,6 @@ class Deformation:
         offsets = points[:, None] - centres
         moved = np.einsum("nkij,nkj->nki", self.R[nodes], offsets) + centres + self.t[nodes]
         return np.einsum("nk,nki->ni", weights, moved)
-
-    def poses(self, poses: ArrayLike, times: ArrayLike) -> Float64:
-        """Where camera poses (N, 4, 4) of times (N,) go: with the nodes made about that time.
-
-        What a camera saw is metres away from it, so the nodes near it in time move it alike,
-        however near they are in space.
-        """
-        poses = np.asarray(poses, dtype=np.float64)
-        times = np.asarray(times, dtype=np.float64)
-        if not len(poses):
-            return poses
-        nodes = self.graph.first_candidates(times)[:, None] + np.arange(self.graph.window)
-        weights = np.full(nodes.shape, 1.0 / self.graph.window)
-        centres, R = self.graph.positions[nodes], self.R[nodes]
-        offsets = poses[:, None, :3, 3] - centres
-        moved = np.einsum("nkij,nkj->nki", R, offsets) + centres + self.t[nodes]
-        positions = np.einsum("nk,nki->ni", weights, moved)
-        U, _, Vt = np.linalg.svd(np.einsum("nk,nkij->nij", weights, R))
-        rotations = U @ Vt @ poses[:, :3, :3]
-        return np.stack([make_pose(R, t) for R, t in zip(rotations, positions, strict=True)])
 
 
 def identity(graph: DeformationGraph) -> Deformation:

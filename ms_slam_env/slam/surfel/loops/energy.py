@@ -7,8 +7,16 @@ ElasticFusion (Whelan et al., RSS 2015, section V-B), from Sumner et al. (2007):
     E_con = sum_p |phi(source_p) - target_p|^2                                       equation 12
 
 Pins are constraints whose target is their source; a relative constraint has phi(target_p) in place
-of target_p (equation 14). All but E_rot is linear in the unknowns, which are for every node the
-nine numbers of R row by row, then t.
+of target_p (equation 14). One term is added to the paper's:
+
+    E_twist = TWIST_M^2 sum_l sum_n |R_l - R_n|^2                     weighted like E_reg
+
+The k nodes next in time often lie along a line, about which E_reg lets R turn freely; long chains
+of nodes then fold up to make a gap of centimetres good. E_twist is E_reg for points TWIST_M beside
+the nodes.
+
+All but E_rot is linear in the unknowns, which are for every node the nine numbers of R row by row,
+then t.
 """
 
 from __future__ import annotations
@@ -30,6 +38,7 @@ Float64 = NDArray[np.float64]
 
 UNKNOWNS = 12  # of a node
 W_ROT, W_REG, W_CON = 1.0, 10.0, 100.0
+TWIST_M = 0.3
 DAMPING = 1e-9  # share of the mean diagonal, for what the constraints leave free
 SMALLEST_STEP = 1e-7
 _ROWS, _COLUMNS = np.triu_indices(3)
@@ -98,10 +107,11 @@ class Energy:
     def __init__(self, graph: DeformationGraph, constraints: Constraints) -> None:
         """Work out the linear part, which does not change."""
         self.graph = graph
-        edges = _edge_rows(graph, W_REG**0.5)
-        points = _constraint_rows(graph, constraints, W_CON**0.5)
-        self._matrix = sparse.vstack([edges[0], points[0]], format="csr")
-        self._offset = np.concatenate([edges[1], points[1]])
+        edges, edge_offset = _edge_rows(graph, W_REG**0.5)
+        twist = _twist_rows(graph, TWIST_M * W_REG**0.5)
+        points, point_offset = _constraint_rows(graph, constraints, W_CON**0.5)
+        self._matrix = sparse.vstack([edges, twist, points], format="csr")
+        self._offset = np.concatenate([edge_offset, np.zeros(twist.shape[0]), point_offset])
         self._normal = (self._matrix.T @ self._matrix).tocsc()
 
     def residuals(self, x: Float64) -> Float64:
@@ -189,6 +199,15 @@ def _edge_rows(graph: DeformationGraph, weight: float) -> tuple[sparse.csr_matri
     back = UNKNOWNS * other[:, None, None] + 9 + axis
     columns = np.concatenate([linear, shift, back], axis=2)  # (E, 3, 5)
     return _rows(weight * values[:, None], columns, len(graph)), -weight * offsets.ravel()
+
+
+def _twist_rows(graph: DeformationGraph, weight: float) -> sparse.csr_matrix:
+    """E_twist: nine rows an edge (l, n): R_l - R_n."""
+    edges = UNKNOWNS * graph.edges()[:, None] + np.arange(9)[:, None]  # (E, 9, 2)
+    values = np.broadcast_to([weight, -weight], edges.shape)
+    starts = 2 * np.arange(edges.size // 2 + 1)
+    shape = (edges.size // 2, UNKNOWNS * len(graph))
+    return sparse.csr_matrix((values.ravel(), edges.ravel(), starts), shape=shape)
 
 
 def _constraint_rows(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,9 +18,34 @@ from ms_slam_env.slam.surfel.splat_renderer import SplatRenderer
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.tracking import Alignment, Tracker, model_stride
 from ms_slam_env.slam.surfel.types import LiveFrame
-from ms_slam_env.slam.surfel.verdict import OK, make_limits
+from ms_slam_env.slam.surfel.verdict import OK, STAT_SIGMA, make_limits
 
 SETTLED_M, SETTLED_DEG = 0.02, 2.0  # largest motion of a repeated registration
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where frames lie in the inactive part.
+
+    Attributes:
+        found: (B,) whether the registration succeeded.
+        T_world_live: (B, 4, 4) pose.
+        sigma: (B,) standard deviation of its worst direction, metres and radians.
+    """
+
+    found: Bool
+    T_world_live: Float64
+    sigma: Float64
+
+
+def _placement(found: Bool, alignment: Alignment) -> Placement:
+    return Placement(found, alignment.T_world_live, alignment.stats[:, STAT_SIGMA])
+
+
+def _nowhere(batch: int) -> Placement:
+    return Placement(
+        np.zeros(batch, dtype=bool), np.tile(np.eye(4), (batch, 1, 1)), np.zeros(batch)
+    )
 
 
 class InactiveRegistration:
@@ -57,16 +83,12 @@ class InactiveRegistration:
         shares = (view.vertices.numpy()[..., 2] > 0).mean(axis=(1, 2))
         return due & (shares >= self.config.coverage)
 
-    def near(self, poses: Float64) -> tuple[Bool, Float64]:
-        """Register with the view that ``covered`` rendered from ``poses``.
-
-        Returns:
-            Which envs (B,) succeeded, and their poses (B, 4, 4) in the inactive part.
-        """
+    def near(self, poses: Float64) -> Placement:
+        """Register with the view that ``covered`` rendered from ``poses``."""
         found = self._align(poses, tracking_seeds(np.eye(4)), self._limits(self.config.largest_m))
-        return found.verdict == OK, found.T_world_live
+        return _placement(found.verdict == OK, found)
 
-    def from_keyframes(self, starts: Float64) -> tuple[Bool, Float64]:
+    def from_keyframes(self, starts: Float64) -> Placement:
         """Register from poses (B, 4, 4) that are rough and may be wrong, NaN for an env without.
 
         What is found must be found again from there.
@@ -76,18 +98,18 @@ class InactiveRegistration:
         limits = self._limits(0.6)
         given &= self.covered(origins, given)
         if not given.any():
-            return given, origins
+            return _nowhere(self.batch)
         first = self._align(origins, relocalisation_seeds(0), limits)
         good = given & (first.verdict == OK)
         origins = np.where(good[:, None, None], first.T_world_live, np.eye(4))
         good &= self.covered(origins, good)
         if not good.any():
-            return good, origins
+            return _nowhere(self.batch)
         again = self._align(origins, tracking_seeds(np.eye(4)), self._limits(0.1))
         good &= again.verdict == OK
         for env in np.flatnonzero(good):
             good[env] = _is_settled(origins[env], again.T_world_live[env])
-        return good, again.T_world_live
+        return _placement(good, again)
 
     def _align(self, origins: Float64, seeds: Float64, limits: NDArray[Any]) -> Alignment:
         stack = np.tile(seeds, (self.batch, 1, 1, 1))

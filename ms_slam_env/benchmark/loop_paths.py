@@ -1,0 +1,91 @@
+"""Camera paths that leave a place, see no more of it for long, and come back to it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import look_at, relative_angle
+from ms_slam_env.scenes.base import Scene
+
+Float64 = NDArray[np.float64]
+
+HEIGHT_M = 1.3
+CLEARANCE_M = 0.35  # free space kept around the camera
+STARTS = 64  # places tried for the middle of a room
+OVERLAP_TURNS = 0.3  # how far a path goes on over ground that it has seen
+
+
+def around_room(scene: Scene, seed: int, step_m: float = 0.02, step_deg: float = 1.5) -> Float64:
+    """Poses (N, 4, 4) of a camera that walks a circle in the freest place and looks outwards.
+
+    It turns once and OVERLAP_TURNS more, so the first view comes back after a whole turn.
+
+    Args:
+        scene: where.
+        seed: of the direction to start in, and how the gaze goes up and down.
+        step_m: largest translation from frame to frame.
+        step_deg: largest rotation from frame to frame.
+
+    Raises:
+        InputError: there is no such place.
+    """
+    rng = np.random.default_rng([seed, 5])
+    starts = np.stack([scene.sample_start(rng)[:3, 3] for _ in range(STARTS)])
+    starts[:, 2] = HEIGHT_M
+    clearance = scene.clearance(starts)
+    centre, room = starts[clearance.argmax()], float(clearance.max())
+    radius = min(0.6, room - CLEARANCE_M)
+    if radius < 0.05:
+        raise InputError(f"scene {scene.name!r}, seed {scene.seed}, has no room to walk around")
+    angle = rng.uniform(0, 2 * np.pi) + 2 * np.pi * np.linspace(0, 1 + OVERLAP_TURNS, 1000)
+    outward = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    waves = int(rng.integers(2, 5))
+    gaze = outward + np.array([0, 0, -0.25])
+    gaze[:, 2] += 0.2 * np.sin(waves * (angle - angle[0]))
+    return _at_speed(centre + radius * outward, gaze, step_m, step_deg)
+
+
+def along_corridor(scene: Scene, seed: int, step_m: float = 0.02, step_deg: float = 1.5) -> Float64:
+    """Poses (N, 4, 4) that follow one wall of a corridor (x), turn, and come back along the other.
+
+    At the end the camera turns to the first wall again and follows it for two metres.
+    """
+    rng = np.random.default_rng([seed, 6])
+    low, high = (extreme(scene.surface_points(0.1)[0], axis=0) for extreme in (np.min, np.max))
+    middle = float(low[1] + high[1]) / 2
+    begin, end = float(low[0]) + 1.2, float(high[0]) - 1.2
+    right, left = -np.radians(rng.uniform(50, 65)), np.radians(rng.uniform(50, 65))
+    pitch = rng.uniform(-0.25, -0.1)
+    # Place along the corridor, side, and yaw of the gaze (0 = along +x) at every corner.
+    corners = np.array(
+        [
+            (begin, right),
+            (end, right),
+            (end, 0.0),
+            (end, np.pi - left),
+            (begin, np.pi - left),
+            (begin, np.pi),
+            (begin, 2 * np.pi + right),
+            (begin + 2.0, 2 * np.pi + right),
+        ]
+    )
+    s = np.linspace(0, len(corners) - 1, 200 * (len(corners) - 1) + 1)
+    x, yaw = (np.interp(s, np.arange(len(corners)), column) for column in corners.T)
+    sway = 0.1 * np.sin(1.3 * x + rng.uniform(0, 6))
+    eyes = np.stack([x, middle + sway, HEIGHT_M + 0 * x], axis=1)
+    gaze = np.stack([np.cos(yaw), np.sin(yaw), pitch + 0.1 * np.sin(2 * x)], axis=1)
+    return _at_speed(eyes, gaze, step_m, step_deg)
+
+
+def _at_speed(eyes: Float64, gaze: Float64, step_m: float, step_deg: float) -> Float64:
+    """Poses along densely sampled eyes and directions (M, 3), as fast as the limits permit."""
+    dense = np.stack([look_at(eye, eye + aim) for eye, aim in zip(eyes, gaze, strict=True)])
+    steps = np.linalg.norm(np.diff(eyes, axis=0), axis=1) / step_m
+    pairs = zip(dense[:-1, :3, :3], dense[1:, :3, :3], strict=True)
+    turns = np.array([relative_angle(a, b) for a, b in pairs]) / np.radians(step_deg)
+    frames = np.concatenate([[0.0], np.cumsum(np.maximum(steps, turns))])
+    at = np.arange(0.0, frames[-1])
+    columns = [np.interp(at, frames, column) for column in np.hstack([eyes, gaze]).T]
+    return np.stack([look_at(row[:3], row[:3] + row[3:]) for row in np.stack(columns, axis=1)])

@@ -1,0 +1,118 @@
+"""The frames of one env, their poses, and the points of the map that each was seen to show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.slam.surfel.loops.base import Float64, Int32
+from ms_slam_env.slam.surfel.loops.deformation_graph import Deformation
+from ms_slam_env.slam.surfel.loops.energy import Constraints, join, no_constraints
+from ms_slam_env.slam.surfel.surfel_map import SurfelMap
+
+ANCHORS = 12  # points of the map that hold a frame's pose
+KEPT_CONSTRAINTS = 1000  # relative ones, of the newest loops
+_CONSTRAINT_ARRAYS = ("sources", "source_times", "targets", "target_times")
+
+
+@dataclass
+class Past:
+    """What is remembered of one env.
+
+    Attributes:
+        frames: the frames fused.
+        poses: (4, 4) of each, moved by every closure since.
+        anchors: (ANCHORS, 3) points of the map in view of each, moved likewise: a pose keeps its
+            place relative to what it saw, which is metres away and may be far older.
+        anchor_times: (ANCHORS,) when those were created.
+        joined: relative constraints of the loops closed.
+    """
+
+    frames: list[int] = field(default_factory=list)
+    poses: list[Float64] = field(default_factory=list)
+    anchors: list[Float64] = field(default_factory=list)
+    anchor_times: list[Float64] = field(default_factory=list)
+    joined: Constraints = field(default_factory=no_constraints)
+
+    @property
+    def last(self) -> int:
+        """The frame fused last; -1 if there is none."""
+        return self.frames[-1] if self.frames else -1
+
+    def record(self, surfel_map: SurfelMap, env: int, frame: int, pose: Float64) -> None:
+        """Take note of a frame that was just fused."""
+        points, times = _seen_now(surfel_map, env, frame)
+        self.frames.append(frame)
+        self.poses.append(pose.copy())
+        self.anchors.append(points)
+        self.anchor_times.append(times)
+
+    def move(self, deformation: Deformation, joined: Constraints, pose: Float64) -> None:
+        """Follow the map; the last frame's pose is ``pose`` (4, 4)."""
+        points = np.stack(self.anchors)
+        times = np.stack(self.anchor_times)
+        moved = deformation.points(points.reshape(-1, 3), times.ravel()).reshape(points.shape)
+        self.poses = list(_rigid_motions(points, moved) @ np.stack(self.poses))
+        self.poses[-1] = pose.copy()
+        self.anchors = list(moved)
+        self.joined = join([self.joined.moved_by(deformation), joined]).last(KEPT_CONSTRAINTS)
+
+    def path_m(self, frame: int) -> float:
+        """Length of the way since a frame."""
+        first = int(np.searchsorted(self.frames, frame))
+        positions = np.array([pose[:3, 3] for pose in self.poses[first:]]).reshape(-1, 3)
+        return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+
+    def trajectory(self) -> tuple[Int32, Float64]:
+        """Frames (N,) and their poses (N, 4, 4)."""
+        return np.array(self.frames, dtype=np.int32), np.array(self.poses).reshape(-1, 4, 4)
+
+    def get_state(self) -> dict[str, Any]:
+        """Everything, as NumPy arrays."""
+        frames, poses = self.trajectory()
+        return {
+            "frames": frames,
+            "poses": poses,
+            "anchors": np.array(self.anchors).reshape(-1, ANCHORS, 3),
+            "anchor_times": np.array(self.anchor_times).reshape(-1, ANCHORS),
+            "joined": {name: getattr(self.joined, name).copy() for name in _CONSTRAINT_ARRAYS},
+        }
+
+
+def past_from_state(state: dict[str, Any]) -> Past:
+    """The past that gave this state."""
+    return Past(
+        [int(frame) for frame in state["frames"]],
+        list(state["poses"].copy()),
+        list(state["anchors"].copy()),
+        list(state["anchor_times"].copy()),
+        Constraints(**{name: state["joined"][name].copy() for name in _CONSTRAINT_ARRAYS}),
+    )
+
+
+def _seen_now(surfel_map: SurfelMap, env: int, frame: int) -> tuple[Float64, Float64]:
+    """Some of the surfels (ANCHORS, 3) that a frame updated or started, and their times."""
+    surfels = surfel_map.surfels
+    used = int(surfels.count.numpy()[env])
+    slots = np.flatnonzero(surfels.seen[env, :used].numpy() == frame) if used else np.zeros(0, int)
+    if not len(slots):
+        return np.zeros((ANCHORS, 3)), np.zeros(ANCHORS)
+    chosen = slots[np.linspace(0, len(slots) - 1, ANCHORS).astype(np.int64)]
+    points = surfels.position[env].numpy()[chosen].astype(np.float64)
+    return points, surfels.created[env].numpy()[chosen] + 0.5
+
+
+def _rigid_motions(before: Float64, after: Float64) -> Float64:
+    """Motions (N, 4, 4) that take points (N, K, 3) closest to others (Kabsch 1976)."""
+    centre_before, centre_after = before.mean(axis=1), after.mean(axis=1)
+    spread = np.swapaxes(after - centre_after[:, None], 1, 2) @ (before - centre_before[:, None])
+    U, _, Vt = np.linalg.svd(spread)
+    U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
+    motions = np.tile(np.eye(4), (len(before), 1, 1))
+    R: NDArray[np.float64] = U @ Vt
+    motions[:, :3, :3] = R
+    motions[:, :3, 3] = centre_after - np.einsum("nij,nj->ni", R, centre_before)
+    return motions
