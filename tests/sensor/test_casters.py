@@ -1,5 +1,7 @@
 """Ray casting: both casters against each other and against closed forms."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from box_scene import ROOM_HIGH, ROOM_LOW, BoxScene
@@ -7,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ms_slam_env.camera import Intrinsics, xtion
-from ms_slam_env.geometry import look_at
+from ms_slam_env.geometry import look_at, se3_exp
 from ms_slam_env.sensor import (
     EmbreeRayCaster,
     EmbreeSingleRayCaster,
@@ -62,6 +64,29 @@ def test_casters_agree(sensors, box_scene: BoxScene, seed: int) -> None:
     np.testing.assert_allclose(embree.depth[same], warp.depth[same], rtol=1e-4)
     difference = np.abs(embree.color[same].astype(int) - warp.color[same])
     assert np.percentile(difference, 99) <= 1
+
+
+@pytest.mark.parametrize("height", [60, 59])
+def test_casters_agree_on_a_rolling_image(box_scene: BoxScene, height: int) -> None:
+    """Every two rows have a pose of their own, whoever casts the rays."""
+    camera = dataclasses.replace(SMALL, height=height)
+    mesh = box_scene.mesh
+    kinds = (EmbreeRayCaster(mesh), EmbreeSingleRayCaster(mesh), WarpRayCaster(mesh, "cpu"))
+    T = box_scene.sample_start(np.random.default_rng(1))
+    twists = np.linspace(-0.02, 0.02, 30)
+    poses = np.stack([T @ se3_exp([s, 0, 0, 0, 2 * s, 0]) for s in twists])
+    rolling = [
+        RGBDSensor(box_scene, camera, noise="none", caster=caster).capture_rolling(poses, 0)
+        for caster in kinds
+    ]
+    plain = RGBDSensor(box_scene, camera, noise="none", caster=kinds[0])
+    for row in (0, 1, 28, height - 1):
+        expected = plain.capture(poses[row // 2], 0)
+        for frame in rolling:
+            near = np.abs(frame.depth[row] - expected.depth[row]) < 1e-3 * expected.depth[row]
+            assert near.mean() > 0.98  # a ray along an edge may take either side
+            difference = np.abs(frame.color[row].astype(int) - expected.color[row])
+            assert np.percentile(difference, 98) <= 1
 
 
 @pytest.mark.parametrize("size", [(80, 60), (37, 23), (3, 1)])
