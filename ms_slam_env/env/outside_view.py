@@ -13,6 +13,7 @@ from ms_slam_env.env.dots import draw_dots, project
 from ms_slam_env.geometry import look_at, transform_points
 from ms_slam_env.robot.arm.arm_base import ArmEmbodiment
 from ms_slam_env.robot.arm.shape import arm_parts, column_parts, surface_dots
+from ms_slam_env.robot.free_room import floor_height
 
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv
@@ -72,8 +73,7 @@ def _arm(env: ActiveSlamEnv) -> tuple[Float64, Image]:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     parts = arm_parts(arm.model, arm.q, arm.T_world_base)
     if arm.config.base is None:
-        floor = float(env.scene.mesh.vertices[:, 2].min())
-        parts = parts + column_parts(arm.T_world_base[:3, 3], floor)
+        parts += column_parts(arm.T_world_base[:3, 3], floor_height(env.scene))
     points, normals, rgb = surface_dots(parts, 0.7 * _ARM_DOT_M)
     light = _AMBIENT + (1 - _AMBIENT) * np.clip(normals @ _TO_LIGHT, 0, 1)
     return points, np.clip(255 * rgb * light[:, None], 0, 255).astype(np.uint8)

@@ -9,6 +9,7 @@ from ms_slam_env.scenes.base import Scene
 
 Float64 = NDArray[np.float64]
 
+_FLOOR = "floor"
 _MET_M = 0.02  # closer than this to a surface is on it
 
 
@@ -17,9 +18,19 @@ def words(position: Float64) -> str:
     return str(np.round(position, 3).tolist())
 
 
+def floor_height(scene: Scene) -> float:
+    """Height of the floor: of what has that label, of the lowest surface where nothing has."""
+    mesh = scene.mesh
+    if _FLOOR not in mesh.labels:
+        return float(mesh.vertices[:, 2].min())
+    floor = mesh.faces[mesh.face_label == mesh.labels.index(_FLOOR)]
+    return float(mesh.vertices[floor.ravel(), 2].min())
+
+
 def outside(scene: Scene, position: Float64) -> str:
     """How a position (3,) lies outside the box around a scene's surfaces; empty if inside."""
     low, high = scene.mesh.vertices.min(axis=0), scene.mesh.vertices.max(axis=0)
+    low[2] = floor_height(scene)  # leaves of plants may reach through it
     if ((position >= low - _MET_M) & (position <= high + _MET_M)).all():
         return ""
     low, high = (np.round(corner, 2) + 0.0 for corner in (low, high))  # no minus before a zero

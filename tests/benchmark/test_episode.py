@@ -10,20 +10,21 @@ import numpy as np
 import pytest
 
 from ms_slam_env.benchmark import planner_report
-from ms_slam_env.benchmark.episode import EpisodeSpec, run_episode
+from ms_slam_env.benchmark.episode import EpisodeSpec, make_env, run_episode
 from ms_slam_env.benchmark.frame_skipping import (
     Arguments,
     SkippingSpec,
     run_sequence,
     suggest_targets,
 )
-from ms_slam_env.benchmark.options import parse_named
+from ms_slam_env.benchmark.options import parse_named, parse_options
 from ms_slam_env.benchmark.planners import (
     make_planner,
     planner_class,
     planner_names,
 )
 from ms_slam_env.benchmark.statistics import Interval
+from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.errors import InputError
 
 SPEC = EpisodeSpec("random", "table", seed=2000, steps=4)
@@ -134,3 +135,21 @@ def test_an_episode_moves_as_the_environment_does_by_default() -> None:
     assert SPEC.step_m == EnvConfig().step_m
     assert np.radians(SPEC.step_deg) == pytest.approx(EnvConfig().step_rad, abs=1e-12)
     assert EpisodeSpec("random").scene == EnvConfig().scene
+
+
+def test_options_may_name_the_embodiment() -> None:
+    options = parse_options(["embodiment=arm-kinematic", "arm.noise=none"])
+    assert options == {"embodiment": "arm-kinematic", "arm": {"noise": "none"}}
+    env = make_env(EpisodeSpec("random", "table", 1000, "MSActiveSLAM-v0", options=options))
+    assert env.unwrapped._embodiment_type is EMBODIMENTS["arm-kinematic"]
+    for text, message in (
+        ("embodiment=boat", "unknown embodiment 'boat'; valid choices: arm, arm-kinematic, free"),
+        (
+            "boat=1",
+            "option of the environment 'boat'; valid choices: embodiment, num_scene_seeds",
+        ),
+        ("render_mode=human", "option 'render_mode' is not free: the benchmark sets it"),
+        ("max_episode_steps=3", "option 'max_episode_steps' is not free: the benchmark sets it"),
+    ):
+        with pytest.raises(InputError, match=message):
+            parse_options([text])
