@@ -1,0 +1,89 @@
+"""The benchmark of loop closure: paths that come back, exact judgement, complete tables."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ms_slam_env import scenes
+from ms_slam_env.benchmark.loop_closure import COLUMNS, Arguments, as_table, main, summarise
+from ms_slam_env.benchmark.loop_closure_run import LoopSpec, _judge, camera_path, run_loop
+from ms_slam_env.geometry import make_pose, relative_angle, so3_exp
+
+SPEC = LoopSpec("living_room", 1002, "around", 0.06, 5.0, "kinect", "160x120", "deformation")
+
+
+@pytest.mark.parametrize(("scene", "path"), [("living_room", "around"), ("corridor", "corridor")])
+def test_paths_keep_their_limits_and_come_back(scene: str, path: str) -> None:
+    world = scenes.make(scene, 1001)
+    spec = LoopSpec(scene, 1001, path, 0.05, 4.0, "kinect", "160x120", "none")
+    poses = camera_path(world, spec)
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    turns = [
+        relative_angle(a, b) for a, b in zip(poses[:-1, :3, :3], poses[1:, :3, :3], strict=True)
+    ]
+    assert steps.max() < 0.051
+    assert max(turns) < np.radians(4.2)
+    assert world.clearance(poses[:, :3, 3]).min() > 0.1
+    later = poses[len(poses) // 2 :]
+    back = [
+        np.linalg.norm(T[:3, 3] - poses[0, :3, 3]) + relative_angle(T[:3, :3], poses[0, :3, :3])
+        for T in later
+    ]
+    assert min(back) < 0.3
+    np.testing.assert_array_equal(poses, camera_path(world, spec))
+
+
+def test_a_closure_is_judged_by_the_old_map() -> None:
+    truth = np.stack([make_pose(so3_exp([0, 0.1 * k, 0]), [0.1 * k, 0, 0]) for k in range(64)])
+    old_error = make_pose(np.eye(3), [0.0, 0.02, 0.0])
+    ideal = old_error @ truth[63]
+    drifted = make_pose(np.eye(3), [0.03, 0.0, 0.04]) @ ideal
+    turned = ideal @ make_pose(so3_exp([0, np.radians(4.0), 0]), [0, 0, 0])
+    past = np.arange(63, dtype=np.int32), old_error @ truth[:63]
+    closure = _judge(63, past, truth, drifted, turned, 20)
+    assert closure.before_m == pytest.approx(0.05)
+    assert closure.before_deg == pytest.approx(0.0, abs=1e-6)
+    assert closure.after_deg == pytest.approx(4.0)
+    assert closure.is_wrong
+
+
+def test_a_run_closes_its_loop_and_draws_the_map(tmp_path: Path) -> None:
+    picture = tmp_path / "maps" / "loop.png"
+    result = run_loop(LoopSpec(**{**asdict(SPEC), "picture": str(picture)}))
+    assert result["closures"]
+    assert result["wrong"] == 0
+    assert result["lost"] == 0
+    assert result["final_ate_aligned_m"] < result["ate_aligned_m"]
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    row = {"spec": asdict(SPEC), "result": result, "error": None}
+    other = {"spec": {**asdict(SPEC), "closure": "none"}, "result": result, "error": None}
+    table = as_table([row, other])
+    assert table.count("living_room:1002") == 2
+    assert all(heading in table for _, heading, _ in COLUMNS)
+    summary = summarise([row, other])
+    assert summary["recordings"] == 1
+    assert summary["ate_m"]["median"]["none"] == result["ate_m"]
+
+
+def test_bad_recordings_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    from ms_slam_env.benchmark.command_line import exit_code
+
+    for text, message in (
+        ("living_room:2000", "scene:seed:path"),
+        ("living_room:2000:spiral:0.02:1:kinect", "spiral"),
+        ("living_room:2000:around:0.02:1:loud", "loud"),
+        ("living_room:x:around:0.02:1:kinect", "numbers"),
+    ):
+        assert exit_code(lambda text=text: main(["--recordings", text, "--out", "/tmp/none"])) == 2
+        assert message in capsys.readouterr().err
+
+
+def test_both_variants_of_every_recording_are_run() -> None:
+    specs = Arguments(recordings=("corridor:2000:corridor:0.04:3:kinect",)).specs()
+    assert [(spec.size, spec.closure) for spec in specs] == [
+        (size, closure) for size in ("160x120", "320x240") for closure in ("none", "deformation")
+    ]
