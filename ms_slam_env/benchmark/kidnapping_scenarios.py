@@ -15,7 +15,7 @@ from ms_slam_env.sequences import handheld_trajectory
 
 Float64 = NDArray[np.float64]
 
-DEPTH_LIMIT_M = 3.0  # readings beyond are no part of a map
+DEPTH_LIMIT_M = 3.0  # readings beyond count neither as mapped nor as not
 _CLEARANCE_M = 0.1
 _AWAY_M, _AWAY_DEG = 0.3, 30.0  # a kidnapping ends at least so far from where it began
 _DRAWS = 300
