@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from ms_slam_env.benchmark.records import write_json
 from ms_slam_env.geometry import invert
 from ms_slam_env.sequences import associate
 from ms_slam_env.sequences.recording import Recording
-from ms_slam_env.sequences.tum import TRAJECTORY_HEADER, trajectory_line
+from ms_slam_env.sequences.tum import TRAJECTORY_HEADER, trajectory_line, write_trajectory
 from ms_slam_env.slam.base import TrackResult
 
 Float64 = NDArray[np.float64]
@@ -30,6 +30,7 @@ TRAJECTORY, UNFINISHED, MAP, METRICS = (
     "map.ply",
     "metrics.json",
 )
+CORRECTED = "trajectory.corrected.txt"
 MAX_DIFFERENCE_S = 0.02
 
 
@@ -57,8 +58,9 @@ def run_sequence(
 
     SLAM starts at the true pose of the first frame where that is known, else at the identity.
     While it runs, the trajectory so far stands in ``trajectory.incomplete.txt``; at the end it is
-    renamed to ``trajectory.txt``, beside ``map.ply`` and ``metrics.json``. A run that fails or is
-    interrupted leaves the unfinished file and a ``metrics.json`` that says so.
+    renamed to ``trajectory.txt``, beside ``map.ply`` and ``metrics.json``. Where the backend closes
+    loops, ``trajectory.corrected.txt`` holds the poses as the finished map has them. A run that
+    fails or is interrupted leaves the unfinished file and a ``metrics.json`` that says so.
 
     Returns:
         the content of ``metrics.json``.
@@ -69,7 +71,7 @@ def run_sequence(
     system = slam.make(backend, recording.intrinsics, **params)
     system.reset(_start(recording))
     out.mkdir(parents=True, exist_ok=True)
-    for old in (TRAJECTORY, MAP, METRICS):
+    for old in (TRAJECTORY, CORRECTED, MAP, METRICS):
         (out / old).unlink(missing_ok=True)
     track = Track()
     result: dict[str, Any] = {"complete": False}
@@ -87,6 +89,15 @@ def run_sequence(
             file.write(TRAJECTORY_HEADER + "\n")
             _track_all(recording, system, track, file)
         write_ply(out / MAP, system.surface_points(), system.map_attributes())
+        corrected = _corrected(track, system)
+        if corrected is not None:
+            write_trajectory(out / CORRECTED, corrected.times, np.stack(corrected.poses))
+            corrections = measure(corrected, recording)
+            result.update(
+                (f"{name}_corrected", corrections[name])
+                for name in ("ate_m", "rpe_m")
+                if name in corrections
+            )
         os.replace(out / UNFINISHED, out / TRAJECTORY)
         result["complete"] = True
     except BaseException as error:
@@ -108,6 +119,17 @@ def _track_all(recording: Recording, system: slam.SlamBackend, track: Track, fil
             file.flush()
             bar.set_postfix_str("tracking" if result.tracking_ok else "LOST", refresh=False)
             bar.update()
+
+
+def _corrected(track: Track, system: slam.SlamBackend) -> Track | None:
+    """The run with the poses that the finished map has; None if the backend corrects none."""
+    frames, poses = system.corrected_trajectory()
+    if not len(frames):
+        return None
+    final = list(track.poses)
+    for frame, pose in zip(frames, poses, strict=True):
+        final[frame] = pose
+    return replace(track, poses=final)
 
 
 def _start(recording: Recording) -> Float64 | None:

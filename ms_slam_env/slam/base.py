@@ -131,6 +131,13 @@ class SlamBackend(ABC):
         """
         return {"color": self.surface_colors()}
 
+    def corrected_trajectory(self) -> tuple[NDArray[np.int32], Float64]:
+        """Frames (N,), counted since ``reset``, and their poses (N, 4, 4) as the map has them now.
+
+        Closed loops have moved them since ``track`` returned them. Empty where no loops are closed.
+        """
+        return np.zeros(0, dtype=np.int32), np.zeros((0, 4, 4))
+
     @abstractmethod
     def get_state(self) -> dict[str, Any]:
         """Everything needed to go on bit-exactly, as NumPy arrays and plain values."""

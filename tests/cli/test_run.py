@@ -69,6 +69,18 @@ def test_writes_trajectory_map_and_metrics(sequence, tmp_path, capsys):
     assert "ate_m" in capsys.readouterr().out
 
 
+def test_a_backend_that_closes_loops_writes_the_final_poses_too(sequence, tmp_path):
+    out = tmp_path / "out"
+    command = ["run", str(sequence), "--out", str(out), "--params", "loop_closure=deformation"]
+    assert main(command) == 0
+    times, final = read_trajectory(out / "trajectory.corrected.txt")
+    first_times, first = read_trajectory(out / "trajectory.txt")
+    np.testing.assert_array_equal(times, first_times)
+    np.testing.assert_allclose(final, first, atol=1e-6)  # no loop in eight frames
+    written = json.loads((out / "metrics.json").read_text())
+    assert written["ate_m_corrected"] == pytest.approx(written["ate_m"], abs=1e-9)
+
+
 def test_reduced_images_and_parameters(sequence, tmp_path):
     out = tmp_path / "out"
     command = ["run", str(sequence), "--out", str(out), "--params", "depth_cutoff_m=2.5"]

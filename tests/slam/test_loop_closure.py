@@ -215,7 +215,7 @@ def test_without_loop_closure_no_trajectory_is_kept() -> None:
     system = slam.make("surfel", CAMERA)
     frame = RGBDFrame(np.zeros((120, 160, 3), np.uint8), np.ones((120, 160), np.float32))
     assert not system.track(frame).loop_closed
-    assert len(system._slam.loops.trajectory(0)[1]) == 0
+    assert len(system.corrected_trajectory()[1]) == 0
 
 
 @pytest.mark.parametrize(

@@ -86,6 +86,10 @@ class SurfelSlam(SlamBackend):
         living = {name: self.map.attribute(name, stable=False) for name in names}
         return {"color": self.surface_colors(), **living}
 
+    def corrected_trajectory(self) -> tuple[NDArray[np.int32], Float64]:
+        """Fused frames (N,) and their poses (N, 4, 4) as the map has them now; see the base."""
+        return self._slam.loops.trajectory(0)
+
     def get_state(self) -> dict[str, Any]:
         """Everything needed to go on bit-exactly, as NumPy arrays."""
         return self._slam.get_state()
