@@ -28,9 +28,12 @@ alone. Errors of neighbouring depths are alike (filter, quantisation, map), thos
 are not: 50 depths count as one independent reading. The number was chosen so that the default
 w = 0.1 is about the best on noisy sequences.
 
-Gain and bias follow the camera's exposure: each step solves for them too, by regression of the
-residual on I_p, weighted by rho's weights over s_rgb^2, so that flat regions decide, which
-misalignment leaves alone. The photometric c is the maximum-likelihood scale of Cauchy's
+Gain and bias follow the camera's exposure: each step solves for them too, from points weighted by
+rho's weights over s_rgb^2, so that flat regions decide, which misalignment leaves alone. The gain
+moves only as far as the data ask: regression of the live on the model's values gives too small a
+gain, that of the model's on the live values too large a one, where either is noisy or misaligned.
+(A gain that follows the first would shrink from frame to frame, since the map is made of colours
+that are freed from it.) The photometric c is the maximum-likelihood scale of Cauchy's
 distribution, where the mean weight is 1/2, but at least ``cauchy_rgb``. The term is divided by
 (c / least c)^2: images that are blurred or badly registered count less. ``Photometry.trust`` is
 one more factor.
@@ -41,7 +44,7 @@ from __future__ import annotations
 from ms_slam_env._warp import wp
 from ms_slam_env.slam.surfel.point_sums import Photometry, Weights, sum_points
 
-NUM_SUMS = 70
+NUM_SUMS = 71
 """Sums of a pass: geometric term, statistics, exposure, photometric term.
 
 A term has 21 sums of H (upper triangle by rows) and 6 of g = J^T W r.
@@ -59,6 +62,7 @@ SUM_EXPOSURE = 36  # sums of w, w m, w m^2, w r, w m r over exposed points, m = 
 SUM_ROUGH = 41  # of the textured: 1 - robust weight; half their number at the right scale
 SUM_PHOTOMETRIC = 42  # the photometric term's
 SUM_TILTED = 69  # geometric weights times 1 - cosine of the angle between the normals
+SUM_EXPOSURE_SQUARED = 70  # of w r^2 over exposed points
 
 
 OFF = wp.constant(0)  # states of a hypothesis, in ``active``: takes no part

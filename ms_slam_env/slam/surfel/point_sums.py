@@ -65,7 +65,7 @@ const float alike_limit = weights.alike * wp::min(light.reference, 2.0f);
 // Six rows of eight: a row of H, the component of g, and a zero that makes it eight.
 float system[48] = {}, photometric[48] = {};
 float cost = 0, squared = 0, sum_w = 0, sum_wm = 0, sum_wmm = 0, sum_wr = 0, sum_wmr = 0, rough = 0;
-float tilted = 0;
+float tilted = 0, sum_wrr = 0;
 int points = 0, visible = 0, matched = 0, inliers = 0, textured = 0, alike = 0, apart = 0;
 
 for (int first = start; first < end; first += LANES * stride) {
@@ -218,6 +218,7 @@ for (int first = start; first < end; first += LANES * stride) {
         sum_wmm += exposed[m] * centred[m] * centred[m];
         sum_wr += exposed[m] * r2[m];
         sum_wmr += exposed[m] * centred[m] * r2[m];
+        sum_wrr += exposed[m] * r2[m] * r2[m];
 #if defined(__CUDA_ARCH__)
         const float J[8] = {nx[m], ny[m], nz[m], ax[m], ay[m], az[m], r[m], 0.0f};
         const float G[8] = {gx[m], gy[m], gz[m], bx[m], by[m], bz[m], r2[m], 0.0f};
@@ -255,6 +256,7 @@ const float statistics[15] = {
     (float)alike, (float)apart, sum_w, sum_wm, sum_wmm, sum_wr, sum_wmr, rough};
 for (int i = 0; i < 15; ++i) out[27 + i] = statistics[i];
 out[69] = tilted;
+out[70] = sum_wrr;
 """)
 def sum_points(
     model_vertices: wp.array(dtype=wp.vec3),

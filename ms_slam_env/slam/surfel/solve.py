@@ -190,7 +190,10 @@ def orthonormalise(T: wp.mat44d):
 def update_photometry(
     sums: wp.array3d(dtype=wp.float64), b: int, k: int, light: Photometry, least_scale: float
 ):
-    """Gain and bias by regression on the sums of a pass; scale by a step to its fixed point.
+    """Gain and bias from the sums of a pass; scale by a step to its fixed point.
+
+    The gain stays where it is between the slopes of the regressions of the live on the model's
+    grey values and the other way around.
 
     At the scale c of Cauchy's distribution the mean weight is 1/2; from far away, c^2 is off by
     about the ratio of (1 - weight) and weight.
@@ -201,9 +204,15 @@ def update_photometry(
         mean_residual = sums[b, k, 39] / weight
         variance = sums[b, k, 38] / weight - mean * mean
         covariance = sums[b, k, 40] / weight - mean * mean_residual
+        spread = sums[b, k, 70] / weight - mean_residual * mean_residual
+        gain64 = wp.float64(light.gain)
+        common = covariance + gain64 * variance  # of the live and the model's values
+        live_variance = spread + gain64 * (covariance + common)
         # Without contrast, well below 5 grey levels, the gain stays.
-        slope = wp.float32(covariance / (variance + wp.float64(25.0)))
-        gain = wp.clamp(light.gain + slope, 0.2, 5.0)
+        slack = wp.float64(625.0) / wp.max(variance, wp.float64(1.0))
+        low = common / (variance + slack)
+        high = (live_variance + slack) / wp.max(common, wp.float64(1.0e-3))
+        gain = wp.clamp(wp.float32(wp.clamp(gain64, low, wp.max(low, high))), 0.2, 5.0)
         light.bias += wp.float32(mean_residual) - (gain - light.gain) * (wp.float32(mean) + 128.0)
         light.gain = gain
     textured = sums[b, k, 33]
