@@ -15,7 +15,8 @@ Float64 = NDArray[np.float64]
 
 BAND_M = (0.9, 1.5)  # heights shown: walls and furniture, neither floor nor ceiling
 NEW_FRAMES = 40  # surfels younger than this are the present part
-ZOOM_M = 0.35  # half of what the lower row shows
+CELL_M = 0.2  # places compared for how much of both parts they show
+ZOOM_M = 0.1  # half of what the lower row shows
 _COLOURS = {"old": "#3366bb", "new": "#cc3311", "true": "#bbbbbb"}
 
 
@@ -71,8 +72,8 @@ def _joined_part(view: MapView, pose: Float64) -> Float64:
     camera = (view.points - pose[:3, 3]) @ pose[:3, :3]
     u, v = camera[:, 0] / camera[:, 2], camera[:, 1] / camera[:, 2]
     seen = (camera[:, 2] > 0.3) & (np.abs(u) < 0.5) & (np.abs(v) < 0.4) & _in_band(view.points)
-    cells = np.floor(view.points[seen, :2] / ZOOM_M).astype(np.int64)
-    names, index = np.unique(cells, axis=0, return_inverse=True)
+    places = view.points[seen, :2]
+    names, index = np.unique(np.floor(places / CELL_M), axis=0, return_inverse=True)
     is_new = view.age[seen] <= NEW_FRAMES
     counts = [np.bincount(index.ravel()[part], minlength=len(names)) for part in (is_new, ~is_new)]
-    return (names[np.minimum(*counts).argmax()] + 0.5) * ZOOM_M
+    return np.median(places[index.ravel() == np.minimum(*counts).argmax()], axis=0)

@@ -15,6 +15,7 @@ from ms_slam_env.sequences import render_sequence
 from ms_slam_env.slam.ferns import Candidate
 from ms_slam_env.slam.surfel import SurfelConfig
 from ms_slam_env.slam.surfel.loops import LoopConfig
+from ms_slam_env.slam.surfel.loops.constraints import creation_times
 from ms_slam_env.slam.surfel.loops.deformation_graph import Deformation, identity, sample_graph
 from ms_slam_env.slam.surfel.loops.energy import pack, unpack
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
@@ -209,6 +210,12 @@ def test_surfels_move_as_the_deformation_says(turn: tuple[list[RGBDFrame], np.nd
     normals = np.einsum("nk,nkij,nj->ni", weights, motion.R[nodes], surfels["normal"])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     np.testing.assert_allclose(moved["normal"], normals, atol=1e-4)
+
+
+def test_creation_times_spread_the_surfels_of_a_frame_over_it() -> None:
+    order, times = creation_times(np.array([3, 0, 0, 7, 3, 3, 0, 0], dtype=np.int32))
+    np.testing.assert_array_equal(order, [1, 2, 6, 7, 0, 4, 5, 3])
+    np.testing.assert_allclose(times, [0, 0.25, 0.5, 0.75, 3, 3 + 1 / 3, 3 + 2 / 3, 7])
 
 
 def test_without_loop_closure_no_trajectory_is_kept() -> None:

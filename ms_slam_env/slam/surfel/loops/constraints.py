@@ -44,9 +44,10 @@ def creation_times(created: NDArray[np.int32]) -> tuple[Int64, Float64]:
     """
     order = np.argsort(created, kind="stable")
     ordered = created[order]
-    starts = np.searchsorted(ordered, ordered, side="left")
-    ends = np.searchsorted(ordered, ordered, side="right")
-    times = ordered + (np.arange(len(ordered)) - starts) / (ends - starts)
+    starts = np.flatnonzero(np.diff(ordered, prepend=-1))  # of every frame's surfels
+    counts = np.diff(starts, append=len(ordered))
+    places = np.arange(len(ordered)) - np.repeat(starts, counts)
+    times = ordered + places / np.repeat(counts, counts)
     return order.astype(np.int64), times.astype(np.float64)
 
 
