@@ -94,8 +94,11 @@ def run_all(
 
 def failures(rows: Sequence[Row]) -> list[str]:
     """The errors among ``rows``, one line each."""
+    failed = [row for row in rows if row["error"] is not None]
+    if not failed:
+        return []
     name_of = names({row["key"]: row["spec"] for row in rows})
-    return [f"{name_of[row['key']]}: {row['error']}" for row in rows if row["error"] is not None]
+    return [f"{name_of[row['key']]}: {row['error']}" for row in failed]
 
 
 def names(specs: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:

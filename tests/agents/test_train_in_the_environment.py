@@ -48,7 +48,10 @@ def test_two_processes_train_a_policy_that_plans(tmp_path):
     ("option", "message"),
     [
         (("--scenes", "mars"), "unknown scene 'mars'; valid choices: living_room"),
-        (("--env-id", "Mars-v0"), "environment 'Mars-v0' cannot be made"),
+        (
+            ("--env-id", "Mars-v0"),
+            "unknown environment 'Mars-v0'; valid choices: MSA",
+        ),
         (("--step-m", "7"), "EnvConfig.step_m = 7.0 is outside"),
     ],
 )

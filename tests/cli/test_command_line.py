@@ -129,7 +129,7 @@ def test_failed_episodes_are_code_1_and_stay_in_the_results(
     finished = {"result": {**result, "ate_over_time": [0.1]}, "error": None}
     monkeypatch.setattr(planner_benchmark, "run_all", made_up_rows(failed(), finished))
     assert main([*TWO_EPISODES, "--out", str(tmp_path)]) == 1
-    assert "1 failed, the first: k0: boom" in capsys.readouterr().err
+    assert "1 failed, the first: planner random, scene table, seed 2000" in capsys.readouterr().err
     content = json.loads((tmp_path / "results.json").read_text())
     assert [row["error"] for row in content["episodes"]] == ["boom", None]
 
@@ -140,7 +140,7 @@ def test_where_every_episode_failed_the_old_report_stays(
     (tmp_path / "table.md").write_text("good")
     monkeypatch.setattr(planner_benchmark, "run_all", made_up_rows(failed(), failed()))
     assert main([*TWO_EPISODES, "--out", str(tmp_path)]) == 1
-    assert "all 2 failed, the first: k0: boom" in one_line(capsys.readouterr().err)
+    assert "all 2 failed, the first: planner random, scene tab" in one_line(capsys.readouterr().err)
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("table.md", "good")]
 
 
