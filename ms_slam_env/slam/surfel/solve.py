@@ -186,6 +186,10 @@ def orthonormalise(T: wp.mat44d):
     )  # fmt: skip
 
 
+SMALLEST_GAIN = wp.constant(wp.float64(0.2))
+LARGEST_GAIN = wp.constant(wp.float64(5.0))
+
+
 @wp.func
 def update_photometry(
     sums: wp.array3d(dtype=wp.float64), b: int, k: int, light: Photometry, least_scale: float
@@ -212,7 +216,9 @@ def update_photometry(
         slack = wp.float64(625.0) / wp.max(variance, wp.float64(1.0))
         low = common / (variance + slack)
         high = (live_variance + slack) / wp.max(common, wp.float64(1.0e-3))
-        gain = wp.clamp(wp.float32(wp.clamp(gain64, low, wp.max(low, high))), 0.2, 5.0)
+        high = wp.max(low, high)
+        moved = wp.min(wp.max(gain64, low), high)
+        gain = wp.float32(wp.min(wp.max(moved, SMALLEST_GAIN), LARGEST_GAIN))
         light.bias += wp.float32(mean_residual) - (gain - light.gain) * (wp.float32(mean) + 128.0)
         light.gain = gain
     textured = sums[b, k, 33]
