@@ -164,9 +164,7 @@ def test_an_embodiment_that_cannot_start_says_why(monkeypatch):
 
     monkeypatch.setitem(EMBODIMENTS, "stuck", EmbodimentType(49, build, lambda config: None))
     env = ActiveSlamEnv("stuck", **OPTIONS)
-    with pytest.raises(
-        InputError, match="can be used, the last: the arm is in its box"
-    ):
+    with pytest.raises(InputError, match="can be used, the last: the arm is in its box"):
         env.reset(seed=0)
     with pytest.raises(InputError, match="reset option T_world_camera: the arm is in its box"):
         env.reset(seed=0, options={"T_world_camera": np.eye(4)})
