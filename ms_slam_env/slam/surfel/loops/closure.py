@@ -26,7 +26,7 @@ from ms_slam_env.geometry import invert, relative_angle
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.loops.base import Bool, Float64, Int32, LoopClosure, SimilarViews
 from ms_slam_env.slam.surfel.loops.bending import MapBender
-from ms_slam_env.slam.surfel.loops.past import Past, past_from_state
+from ms_slam_env.slam.surfel.loops.past import Past, motion_size, past_from_state
 from ms_slam_env.slam.surfel.loops.registration import InactiveRegistration, Placement
 from ms_slam_env.slam.surfel.surfel_arrays import EARLIEST, any_time
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
@@ -114,11 +114,13 @@ class DeformationLoopClosure(LoopClosure):
     def _close(self, env: int, poses: Float64, there: Placement) -> bool:
         """Bend map, pose and past of one env; returns whether that was believed and done."""
         past, corrected = self._past[env], there.T_world_live[env]
-        drift = _size(invert(poses[env]) @ corrected)
+        drift = motion_size(invert(poses[env]) @ corrected)
         if drift < self.config.smallest_m:
             self._bender.join_parts(env, poses[env], past.last)
             return False
-        if drift < SIGNIFICANT * there.sigma[env]:
+        if drift < SIGNIFICANT * there.sigma[env] or not past.confirms(
+            poses[env], corrected, self.config.agreement_m, 2 * self.config.global_interval
+        ):
             return False
         bent = self._bender.bend(env, poses[env], corrected, past.joined)
         if bent is None:
@@ -140,11 +142,6 @@ class DeformationLoopClosure(LoopClosure):
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state that ``get_state`` returned."""
         self._past = [past_from_state(past) for past in state["past"]]
-
-
-def _size(T: Float64) -> float:
-    """How far a motion moves points about 1 m away, at most: metres."""
-    return float(np.linalg.norm(T[:3, 3]) + relative_angle(np.eye(3), T[:3, :3]))
 
 
 def _may_be_the_same(pose: Float64, keyframe: Float64, drift_m: float) -> bool:

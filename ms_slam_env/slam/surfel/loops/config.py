@@ -25,6 +25,7 @@ class LoopConfig:
         largest_deg: largest correction of its rotation.
         smallest_m: a correction that moves a point at 1 m less than this bends nothing: the
             inactive surfels are taken back as they are.
+        agreement_m: a loop is closed when two looks agree so far on the correction, at 1 m.
         global_interval: frames between two looks at keyframes; a multiple of ``interval``.
         dissimilarity: of a frame and a keyframe that may show the same place, share of the ferns.
         drift_share: a keyframe's place is believed if it is no further away than this share of the
@@ -48,6 +49,7 @@ class LoopConfig:
     largest_m: float = 0.3
     largest_deg: float = 20.0
     smallest_m: float = 0.008
+    agreement_m: float = 0.01
     global_interval: int = 20
     dissimilarity: float = 0.3
     drift_share: float = 0.15
@@ -67,6 +69,7 @@ class LoopConfig:
         check_range(self, "largest_m", 0.0, 100.0)
         check_range(self, "largest_deg", 0.0, 180.0)
         check_range(self, "smallest_m", 0.0, 1.0)
+        check_range(self, "agreement_m", 0.0, 1.0)
         check_range(self, "global_interval", 1, 10_000)
         check_range(self, "dissimilarity", 0.0, 1.0)
         check_range(self, "drift_share", 0.0, 10.0)

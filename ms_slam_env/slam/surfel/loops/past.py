@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env.geometry import invert, relative_angle
 from ms_slam_env.slam.surfel.loops.base import Float64, Int32
 from ms_slam_env.slam.surfel.loops.deformation_graph import Deformation
 from ms_slam_env.slam.surfel.loops.energy import Constraints, join, no_constraints
@@ -29,6 +30,8 @@ class Past:
             place relative to what it saw, which is metres away and may be far older.
         anchor_times: (ANCHORS,) when those were created.
         joined: relative constraints of the loops closed.
+        found: the frame at which a loop was found that waits to be confirmed, -1: there is none.
+        correction: (4, 4) of the world about the camera, which would have closed it.
     """
 
     frames: list[int] = field(default_factory=list)
@@ -36,6 +39,8 @@ class Past:
     anchors: list[Float64] = field(default_factory=list)
     anchor_times: list[Float64] = field(default_factory=list)
     joined: Constraints = field(default_factory=no_constraints)
+    found: int = -1
+    correction: Float64 = field(default_factory=lambda: np.eye(4))
 
     @property
     def last(self) -> int:
@@ -49,6 +54,20 @@ class Past:
         self.poses.append(pose.copy())
         self.anchors.append(points)
         self.anchor_times.append(times)
+
+    def confirms(self, pose: Float64, corrected: Float64, agreement_m: float, memory: int) -> bool:
+        """Whether the last loop found within ``memory`` frames asks for the same correction.
+
+        A registration that slides along a surface comes out differently from frame to frame. If
+        not, this one waits to be confirmed.
+        """
+        is_recent = self.found >= 0 and self.last - self.found <= memory
+        difference = motion_size(invert(self.correction @ pose) @ corrected)
+        if is_recent and difference <= agreement_m:
+            self.found = -1
+            return True
+        self.found, self.correction = self.last, corrected @ invert(pose)
+        return False
 
     def move(self, deformation: Deformation, joined: Constraints, pose: Float64) -> None:
         """Follow the map; the last frame's pose is ``pose`` (4, 4)."""
@@ -78,8 +97,15 @@ class Past:
             "poses": poses,
             "anchors": np.array(self.anchors).reshape(-1, ANCHORS, 3),
             "anchor_times": np.array(self.anchor_times).reshape(-1, ANCHORS),
+            "found": self.found,
+            "correction": self.correction.copy(),
             "joined": {name: getattr(self.joined, name).copy() for name in _CONSTRAINT_ARRAYS},
         }
+
+
+def motion_size(T: Float64) -> float:
+    """How far a motion (4, 4) moves points about 1 m away, at most: metres."""
+    return float(np.linalg.norm(T[:3, 3]) + relative_angle(np.eye(3), T[:3, :3]))
 
 
 def past_from_state(state: dict[str, Any]) -> Past:
@@ -90,6 +116,8 @@ def past_from_state(state: dict[str, Any]) -> Past:
         list(state["anchors"].copy()),
         list(state["anchor_times"].copy()),
         Constraints(**{name: state["joined"][name].copy() for name in _CONSTRAINT_ARRAYS}),
+        state["found"],
+        state["correction"].copy(),
     )
 
 
