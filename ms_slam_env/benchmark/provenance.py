@@ -38,7 +38,7 @@ def provenance() -> dict[str, Any]:
 
 def git_commit() -> str | None:
     """Commit of the checkout that the package lies in, ``-dirty`` if files differ from it."""
-    here = Path(__file__).resolve().parent
+    here = Path(__file__).resolve().parents[1]
     commands = (["rev-parse", "HEAD"], ["status", "--porcelain", "--untracked-files=no", "."])
     answers = []
     for command in commands:
