@@ -11,6 +11,7 @@ import pytest
 from ms_slam_env import scenes
 from ms_slam_env.benchmark.loop_closure import COLUMNS, Arguments, as_table, main, summarise
 from ms_slam_env.benchmark.loop_closure_run import LoopSpec, _judge, camera_path, run_loop
+from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import make_pose, relative_angle, so3_exp
 
 SPEC = LoopSpec("living_room", 1002, "around", 0.06, 5.0, "kinect", "160x120", "deformation")
@@ -80,6 +81,13 @@ def test_bad_recordings_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
     ):
         assert exit_code(lambda text=text: main(["--recordings", text, "--out", "/tmp/none"])) == 2
         assert message in capsys.readouterr().err
+
+
+def test_parameters_of_the_slam_reach_it_and_bad_ones_are_refused() -> None:
+    specs = Arguments(options=("loops.window=70", "max_surfels=5000")).specs()
+    assert specs[0].options == {"loops": {"window": 70}, "max_surfels": 5000}
+    with pytest.raises(InputError, match="window"):
+        Arguments(options=("loops.windows=70",)).specs()
 
 
 def test_both_variants_of_every_recording_are_run() -> None:
