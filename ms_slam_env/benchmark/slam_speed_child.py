@@ -96,7 +96,7 @@ def measure(
     with np.load(sequence) as data:
         color, depth, poses = data["color"], data["depth"], data["poses"]
     # Far from crowded: a crowded map is busy with making room.
-    capacity = max(SurfelConfig.max_surfels, max(stored) * 5 // 4 + 8 * depth[0].size)
+    capacity = max(400_000, max(stored) * 5 // 4 + 8 * depth[0].size)
     config = SurfelConfig(**{"max_surfels": capacity, **backend})
     slam = BatchedSurfelSlam(1, xtion(size), config)
     slam.reset(poses[0])

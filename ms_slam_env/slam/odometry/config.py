@@ -18,7 +18,7 @@ class OdometryConfig:
         least_overlap: share of a frame's readings that the image it is aligned with must show,
         least_inliers: share of those that must fit its depth,
         least_alike: share of those that must fit its intensity.
-        max_surfels: capacity of the map.
+        max_surfels: capacity of the map; None as in ``SurfelConfig``.
 
     Raises:
         InputError: a value outside its range.
@@ -30,7 +30,7 @@ class OdometryConfig:
     least_overlap: float = 0.3
     least_inliers: float = 0.75
     least_alike: float = 0.9
-    max_surfels: int = 400_000
+    max_surfels: int | None = None
 
     def __post_init__(self) -> None:
         """Refuse values outside the ranges."""
@@ -40,4 +40,5 @@ class OdometryConfig:
         check_range(self, "least_overlap", 0.0, 1.0)
         check_range(self, "least_inliers", 0.0, 1.0)
         check_range(self, "least_alike", 0.0, 1.0)
-        check_range(self, "max_surfels", 1000, 50_000_000)
+        if self.max_surfels is not None:
+            check_range(self, "max_surfels", 1000, 50_000_000)

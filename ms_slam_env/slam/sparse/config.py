@@ -35,7 +35,7 @@ class SparseConfig:
         loops: whether loops are closed.
         remap_m: the dense map is made anew when a keyframe has moved by this much,
         remap_deg: or turned by this much, since it was fused.
-        max_surfels: capacity of the dense map.
+        max_surfels: capacity of the dense map; None as in ``SurfelConfig``.
 
     Raises:
         InputError: a value outside its range.
@@ -61,7 +61,7 @@ class SparseConfig:
     loops: bool = True
     remap_m: float = 0.005
     remap_deg: float = 0.3
-    max_surfels: int = 400_000
+    max_surfels: int | None = None
 
     def __post_init__(self) -> None:
         """Refuse values outside the ranges."""
@@ -86,4 +86,5 @@ class SparseConfig:
             raise InputError(f"SparseConfig.loops = {self.loops!r} must be true or false")
         check_range(self, "remap_m", 0.0, 1.0)
         check_range(self, "remap_deg", 0.0, 90.0)
-        check_range(self, "max_surfels", 1000, 50_000_000)
+        if self.max_surfels is not None:
+            check_range(self, "max_surfels", 1000, 50_000_000)

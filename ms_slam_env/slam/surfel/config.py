@@ -22,7 +22,8 @@ class SurfelConfig:
             geometry alone, 1 photometry alone; ``normal_equations`` has the exact cost.
         confidence_threshold: observations after which a surfel is stable, [0, 12].
         iterations: Gauss-Newton iterations per pyramid level, finest first.
-        max_surfels: capacity of the map, per env.
+        max_surfels: capacity of the map, per env; None for 400,000 with images of up to 160 columns
+            and in proportion to the columns beyond.
         coverage_px: a reading starts a new surfel only where none of its surface projects this
             close to its pixel.
         surfel_radius_px: radius of a new surfel in pixels of the view that made it.
@@ -65,7 +66,7 @@ class SurfelConfig:
     icp_rgb_weight: float = 0.1
     confidence_threshold: float = 10.0
     iterations: tuple[int, ...] = (4, 5, 10)
-    max_surfels: int = 400_000
+    max_surfels: int | None = None
     coverage_px: float = 0.85
     surfel_radius_px: float = 0.9
     max_confidence: float = 50.0
@@ -104,7 +105,8 @@ class SurfelConfig:
                 f"SurfelConfig.iterations = {self.iterations!r} must be 1 to 5 integers in [0, 100]"
             )
         object.__setattr__(self, "iterations", tuple(self.iterations))  # lists come from YAML
-        check_range(self, "max_surfels", 1000, 50_000_000)
+        if self.max_surfels is not None:
+            check_range(self, "max_surfels", 1000, 50_000_000)
         check_range(self, "coverage_px", 0.5, 1.0)
         check_range(self, "surfel_radius_px", 0.5, 3.0)
         check_range(self, "max_confidence", 1.0, 10_000.0)
@@ -129,3 +131,9 @@ class SurfelConfig:
                 f"SurfelConfig.refuse_bad_fits = {self.refuse_bad_fits!r} must be true or false"
             )
         check_choice(self, "loop_closure", LOOP_CLOSURES)
+
+    def capacity(self, columns: int) -> int:
+        """Surfels that the map of a camera with images of so many columns has room for."""
+        if self.max_surfels is not None:
+            return self.max_surfels
+        return round(400_000 * max(1.0, columns / 160))

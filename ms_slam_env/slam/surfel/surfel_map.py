@@ -84,7 +84,7 @@ class SurfelMap:
         self.config = config
         self.device = device
         self._workers = default_workers(batch, device) if workers is None else workers
-        capacity = config.max_surfels
+        capacity = config.capacity(intrinsics.width)
         self.surfels = allocate_surfels(batch, capacity, device)
         self._spare = allocate_surfels(batch, capacity, device)
         self._blocks = allocate_blocks(batch, capacity, device)
@@ -208,7 +208,8 @@ class SurfelMap:
 
     def _record_launches(self) -> None:
         """Record the launches of ``fuse``; what changes with the frame is set there."""
-        capacity, workers, config = self.config.max_surfels, self._workers, self.config
+        config, workers = self.config, self._workers
+        capacity = config.capacity(self.intrinsics.width)
         dim = (self.batch, workers)
         poses = wp.zeros(self.batch, dtype=wp.mat44, device=self.device)
         integers = wp.zeros(self.batch, dtype=wp.int32, device=self.device)
