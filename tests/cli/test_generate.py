@@ -15,7 +15,7 @@ from ms_slam_env.cli import main
 from ms_slam_env.sequences import read_trajectory, write_trajectory
 from ms_slam_env.sequences.recording import open_recording
 
-SMALL = ["--scene", "carpet", "--seed", "4", "--image-size", "80x60"]
+SMALL = ["--scene", "table", "--seed", "4", "--image-size", "80x60"]
 
 
 def files(folder: Path) -> dict[str, bytes]:

@@ -69,7 +69,7 @@ def test_gain_and_bias_are_recovered(seed, gain, bias):
     light = same_exposure(1)
     for _ in range(4):
         light = _regress(model, live, rng.uniform(0.5, 1, 2000), light)
-    assert light["gain"][0] == pytest.approx(gain, rel=0.03)
+    assert light["gain"][0] == pytest.approx(gain, rel=0.05)
     middle = light["gain"][0] * 90 + light["bias"][0]
     assert middle == pytest.approx(gain * 90 + bias, abs=0.5)
 
