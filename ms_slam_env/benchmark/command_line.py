@@ -16,6 +16,7 @@ from ms_slam_env.errors import InputError
 T = TypeVar("T")
 
 _FRAME = re.compile(r"[╭╮╰╯│─]+|-{4,}")  # dashes where the terminal is not UTF-8
+_CLASS = re.compile(r"^Error parsing \w+: ")  # names our dataclass, which tells a user nothing
 _PROPOSAL = re.compile(r"^[│ ] +(--[a-z][\w-]*)", re.MULTILINE)
 
 
@@ -78,4 +79,4 @@ def _one_line(box: str) -> str:
             break
         message.append(_FRAME.sub("", line).strip())
     text = " ".join(filter(None, message)) or _FRAME.sub("", title).strip() or "bad arguments"
-    return text + hint
+    return _CLASS.sub("", text) + hint
