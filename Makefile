@@ -3,7 +3,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 WORKERS ?= 2
 BIN := .venv/bin
 STAMP := .venv/.installed
-EXTRAS := open3d,gtsam,train,statistics,dev
+EXTRAS := open3d,gtsam,train,statistics,explore,ray,report,energy,dev
 SYSTEM_LIBRARIES := libusb-1.0-0 libgl1
 # One thread per process: the tests and the benchmark run in parallel processes.
 export OMP_NUM_THREADS := 1
@@ -23,6 +23,11 @@ $(STAMP): pyproject.toml constraints.txt
 	    DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends \
 	    $(SYSTEM_LIBRARIES) >/dev/null; then :; \
 	else echo "Open3D (optional) needs: sudo apt-get install $(SYSTEM_LIBRARIES)"; fi
+	@if command -v chromium >/dev/null || command -v google-chrome >/dev/null; then :; \
+	elif [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get update -qq && \
+	    DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends \
+	    chromium >/dev/null; then :; \
+	else echo "Tests of reports in a browser need: sudo apt-get install chromium"; fi
 	@touch $@
 
 lint: $(STAMP)
