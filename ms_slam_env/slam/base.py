@@ -34,6 +34,8 @@ class TrackResult:
             the twist xi = (rho, phi) in metres and radians, in the camera's frame, with the true
             pose T_world_camera exp(xi). None where no pose was estimated, or by a backend that
             does not know it.
+        processed: False where frame management dropped the frame: SLAM has not seen it, the pose
+            is predicted and ``tracking_ok`` is what it was.
     """
 
     T_world_camera: Float64
@@ -51,6 +53,7 @@ class TrackResult:
         return self.degenerate_directions > 0
 
     loop_closed: bool = False
+    processed: bool = True
 
 
 @dataclass(frozen=True)
