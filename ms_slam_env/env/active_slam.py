@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import gymnasium
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
 from ms_slam_env import slam as slam_backends
-from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image, xtion
+from ms_slam_env.camera import Intrinsics, intensity_image, xtion
 from ms_slam_env.divergence import Histograms, make_divergence
 from ms_slam_env.env.config import make_config
 from ms_slam_env.env.coverage import CoverageGrid
 from ms_slam_env.env.embodiments import EMBODIMENTS
+from ms_slam_env.env.episode_record import EpisodeRecord
 from ms_slam_env.env.lookahead import Lookahead
 from ms_slam_env.env.observations import RobotKnowledge, make_observation
 from ms_slam_env.env.pose_sources import POSE_SOURCES, Sighting, relative_motion
@@ -24,21 +24,19 @@ from ms_slam_env.env.reward import Outcome, reward_terms
 from ms_slam_env.env.state import EpisodeState
 from ms_slam_env.env.worlds import get_scene, get_sensor
 from ms_slam_env.errors import InputError, UnreachableError, unknown
-from ms_slam_env.geometry import check_pose, invert, transform_points
+from ms_slam_env.geometry import check_pose, invert
 from ms_slam_env.robot import Movement
-from ms_slam_env.scenes import SEED_SPLITS
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sensor import RGBDSensor
-from ms_slam_env.slam.base import SlamBackend, TrackResult, Views
+from ms_slam_env.slam.base import SlamBackend, Views
 from ms_slam_env.timings import Timings
 
 Float64 = NDArray[np.float64]
 
 _START_TRIES = 10  # a drawn start sees surface in most of its view: one try is nearly always enough
-_COVERAGE_STRIDE = 2  # every second pixel in each direction marks coverage
 
 
-class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
+class ActiveSlamEnv(EpisodeRecord):
     """A camera chooses its next motion while a dense RGB-D SLAM estimates where it is.
 
     Each step the camera makes one of 49 small motions (Saeedi et al., ICRA 2017, section V-D), a
@@ -124,7 +122,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
         self._observation = make_observation(self.config.observation, self.intrinsics, num_actions)
         self.observation_space = self._observation.space
         self._renderer = Renderer()
-        self._rays = self.intrinsics.rays()[::_COVERAGE_STRIDE, ::_COVERAGE_STRIDE].reshape(-1, 3)
+        self._rays = self.intrinsics.rays()
         self._episode: EpisodeState | None = None
 
     # -- Gymnasium ---------------------------------------------------------------------------
@@ -149,7 +147,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
             raise InputError(
                 f"unknown reset option {sorted(unknown_options)}; valid choices: T_world_camera"
             )
-        name, scene_seed = self._draw_scene()
+        name, scene_seed = self.config.draw_scene(self.np_random)
         self._enter_scene(name, scene_seed)
         given = options["T_world_camera"] if options else None
         if given is not None:
@@ -232,62 +230,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
                 )
         return episode.predicted_divergences.copy()
 
-    # -- What evaluation uses ----------------------------------------------------------------
-
-    @property
-    def trajectory_truth(self) -> Float64:
-        """(N, 4, 4) true poses of the episode so far."""
-        return np.stack(self._current().truth)
-
-    @property
-    def trajectory_estimate(self) -> Float64:
-        """(N, 4, 4) poses estimated when they were current."""
-        return np.stack(self._current().estimates)
-
-    @property
-    def trajectory_kinematics(self) -> Float64:
-        """(N, 4, 4) poses by forward kinematics, tied to the truth at the first."""
-        return np.stack(self._current().kinematics)
-
-    @property
-    def tracked(self) -> NDArray[np.bool_]:
-        """(N,) whether each frame was tracked, and so is part of the map."""
-        return np.array(self._current().tracked)
-
-    @property
-    def timestamps(self) -> Float64:
-        """(N,) simulated seconds since the start of the episode, of each frame."""
-        return np.array(self._current().times)
-
-    @property
-    def divergences(self) -> Float64:
-        """(N, 2) divergence of each frame from the one before; zero for the first."""
-        return np.stack(self._current().frame_divergences)
-
-    @property
-    def step_divergences(self) -> Float64:
-        """(S + 1, 2) ``info["divergence"]`` of the start and of each step."""
-        return np.stack(self._current().step_divergences)
-
-    @property
-    def pose_errors(self) -> Float64:
-        """(N,) distance between true and estimated position at each frame, metres."""
-        return np.array(self._current().errors)
-
-    @property
-    def tracking_ok(self) -> bool:
-        """Whether the last frame was tracked."""
-        return self._current().tracking_ok
-
-    @property
-    def last_frame(self) -> RGBDFrame:
-        """The last live frame."""
-        return self._current().last_frame
-
-    @property
-    def last_motion(self) -> int:
-        """The last action; 0 before the first."""
-        return self._current().action
+    # -- State -------------------------------------------------------------------------------
 
     def save_state(self) -> dict[str, Any]:
         """Everything needed to go on bit-exactly (the time limit's counter excepted)."""
@@ -312,14 +255,6 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
         self.np_random.bit_generator.state = state["random"]
 
     # -- The world ---------------------------------------------------------------------------
-
-    def _draw_scene(self) -> tuple[str, int]:
-        names = self.config.scenes
-        name = names[int(self.np_random.integers(len(names)))]
-        if self.config.scene_seed is not None:
-            return name, self.config.scene_seed
-        split = SEED_SPLITS[self.config.split]
-        return name, split[int(self.np_random.integers(self.config.num_scene_seeds))]
 
     def _enter_scene(self, name: str, scene_seed: int) -> None:
         self.scene: Scene = get_scene(name, scene_seed)
@@ -398,7 +333,10 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
             episode.histograms = self._measure.histograms(grey, frame.depth[None])
             divergence = self._divergence_from(before)
         with self.timings.stage("coverage"):
-            area = self._cover(frame, T_true, result)
+            area = 0.0
+            if result.tracking_ok:
+                seen = frame.depth, self.sensor.last_true_depth()
+                area = self.coverage.see(*seen, self._rays, T_true, result.T_world_camera)
         episode.record(sighting, result, divergence)
         return area
 
@@ -408,17 +346,6 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
         if before is None or histograms is None:
             return np.zeros(2)
         return self._measure.divergence(histograms, before)[0]
-
-    def _cover(self, frame: RGBDFrame, T_world_camera: Float64, result: TrackResult) -> float:
-        if not result.tracking_ok:
-            return 0.0
-        # true depth where the sensor had a reading: noise in depth would spread one surface over
-        # ever more voxels, and a camera at rest would be paid for it
-        depth = np.where(frame.depth > 0, self.sensor.last_true_depth(), 0)
-        depth = depth[::_COVERAGE_STRIDE, ::_COVERAGE_STRIDE].reshape(-1, 1)
-        points = (depth * self._rays)[depth[:, 0] > 0]
-        true = transform_points(T_world_camera, points)
-        return self.coverage.add(true, transform_points(result.T_world_camera, points))
 
     def __getstate__(self) -> dict[str, Any]:
         """Options and, once reset, the episode: device arrays are made anew."""
@@ -465,19 +392,8 @@ class ActiveSlamEnv(gymnasium.Env[Any, np.int64]):
             )
 
     def _info(self) -> dict[str, Any]:
-        episode = self._current()
         return {
-            "T_world_camera": episode.truth[-1].copy(),
-            "T_world_camera_estimate": episode.T_world_camera_estimate.copy(),
-            "pose_error": episode.pose_error,
-            "ate": episode.ate,
-            "divergence": episode.divergence.copy(),
-            "tracking_ok": episode.tracking_ok,
-            "reward_terms": dict(episode.reward_terms),
+            **self._current().info(),
             "action_mask": self.action_masks(),
             "mapped_area": self.coverage.mapped_area,
-            "time": episode.time_s,
-            "energy": episode.energy_j,
-            "scene": episode.scene,
-            "scene_seed": episode.scene_seed,
         }

@@ -189,6 +189,13 @@ class EnvConfig:
         """The scenes to draw from."""
         return (self.scene,) if isinstance(self.scene, str) else tuple(self.scene)
 
+    def draw_scene(self, rng: np.random.Generator) -> tuple[str, int]:
+        """Name and seed of an episode's scene."""
+        name = self.scenes[int(rng.integers(len(self.scenes)))]
+        if self.scene_seed is not None:
+            return name, self.scene_seed
+        return name, SEED_SPLITS[self.split][int(rng.integers(self.num_scene_seeds))]
+
 
 def make_config(
     options: Mapping[str, Any], others: Sequence[str] = OTHER_OPTIONS, taken: Sequence[str] = ()

@@ -7,9 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env.geometry import transform_points
 from ms_slam_env.scenes.base import Scene
 
 Float64 = NDArray[np.float64]
+
+_STRIDE = 2  # every second pixel in each direction marks coverage
 
 
 class CoverageGrid:
@@ -41,6 +44,35 @@ class CoverageGrid:
         new = np.unique(correct[~self._mapped[correct]])
         self._mapped[new] = True
         return len(new) * self.voxel_m**2
+
+    def see(
+        self,
+        depth: NDArray[np.float32],
+        true_depth: NDArray[np.float32],
+        rays: Float64,
+        T_world_camera: Float64,
+        T_world_camera_estimate: Float64,
+    ) -> float:
+        """Mark what a frame shows; return the area newly mapped in its true place, square metres.
+
+        Where the sensor has a reading the true depth counts: noise in depth would spread one
+        surface over ever more voxels, and a camera at rest would be paid for it.
+
+        Args:
+            depth: (H, W) readings, 0 = none.
+            true_depth: (H, W) metres.
+            rays: (H, W, 3) points at depth 1 m.
+            T_world_camera: (4, 4).
+            T_world_camera_estimate: (4, 4).
+        """
+        every = slice(None, None, _STRIDE)
+        valid = np.where(depth > 0, true_depth, 0)[every, every]
+        seen = valid > 0
+        points = rays[every, every][seen] * valid[seen][:, None]
+        return self.add(
+            transform_points(T_world_camera, points),
+            transform_points(T_world_camera_estimate, points),
+        )
 
     @property
     def mapped_area(self) -> float:

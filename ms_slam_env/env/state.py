@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,6 +100,22 @@ class EpisodeState:
     def ate(self) -> float:
         """RMSE of the position over the episode so far, metres, no alignment."""
         return float(np.sqrt(self.squared_error_sum / max(1, len(self.errors))))
+
+    def info(self) -> dict[str, Any]:
+        """What ``info`` says of the episode itself; the arrays are copies."""
+        return {
+            "T_world_camera": self.truth[-1].copy(),
+            "T_world_camera_estimate": self.T_world_camera_estimate.copy(),
+            "pose_error": self.pose_error,
+            "ate": self.ate,
+            "divergence": self.divergence.copy(),
+            "tracking_ok": self.tracking_ok,
+            "reward_terms": dict(self.reward_terms),
+            "time": self.time_s,
+            "energy": self.energy_j,
+            "scene": self.scene,
+            "scene_seed": self.scene_seed,
+        }
 
     def copy(self) -> EpisodeState:
         """An independent copy."""
