@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import numbers
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -22,20 +23,33 @@ class Named(ABC):
         """The values by name."""
 
 
+class Family(ABC):
+    """An abstract dataclass whose variants are chosen by key ``name``."""
+
+    @classmethod
+    @abstractmethod
+    def variants(cls) -> Mapping[str, type]:
+        """The dataclasses by name."""
+
+
 def from_dict(cls: type[T], values: Mapping[str, Any], path: str = "") -> T:
     """Build dataclass ``cls`` from a nested mapping.
 
     Args:
-        cls: a dataclass; fields that are themselves dataclasses take nested mappings.
-        values: field name to value; missing fields keep their default, and a :class:`Named`
-            field may be given by name.
+        cls: a dataclass; fields that are themselves dataclasses take nested mappings. Of a
+            :class:`Family` the variant that ``name`` names.
+        values: field name to value; missing fields keep their default, and a :class:`Named` or
+            :class:`Family` field may be given by name.
         path: dotted prefix used in error messages.
 
     Raises:
         InputError: an unknown key at any depth (the message lists the valid ones), or a value
             that the dataclass itself refuses or that is not a mapping where one belongs.
     """
+    if issubclass(cls, Family) and inspect.isabstract(cls):
+        cls, values = _variant(cls, values, path)
     fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    fields = {name: field for name, field in fields.items() if field.init}
     hints = get_type_hints(cls)
     arguments: dict[str, Any] = {}
     for key, value in values.items():
@@ -44,7 +58,9 @@ def from_dict(cls: type[T], values: Mapping[str, Any], path: str = "") -> T:
             raise unknown(f"option of {cls.__name__}", where, fields)
         hint = hints[key]
         nested = isinstance(hint, type) and dataclasses.is_dataclass(hint)
-        names = hint.named() if nested and issubclass(hint, Named) else {}
+        names = _names(hint) if nested else {}
+        if nested and issubclass(hint, Family) and isinstance(value, str):
+            value = {"name": value}
         if nested and isinstance(value, Mapping):
             value = from_dict(hint, value, where)
         elif isinstance(value, str) and value in names:
@@ -57,10 +73,28 @@ def from_dict(cls: type[T], values: Mapping[str, Any], path: str = "") -> T:
     return cls(**arguments)
 
 
+def _names(hint: type) -> Mapping[str, Any]:
+    """What may stand for a value of dataclass ``hint``, by name."""
+    if issubclass(hint, Named):
+        return hint.named()
+    return hint.variants() if issubclass(hint, Family) else {}
+
+
+def _variant(
+    family: type[Any], values: Mapping[str, Any], path: str
+) -> tuple[type[Any], dict[str, Any]]:
+    """The variant that ``values`` name, and the values for it."""
+    variants = family.variants()
+    name = values.get("name")
+    if not isinstance(name, str) or name not in variants:
+        raise unknown(f"{path}.name" if path else "name", name, variants)
+    return variants[name], {key: value for key, value in values.items() if key != "name"}
+
+
 def _no_mapping(where: str, value: Any, hint: Any, names: Mapping[str, Any]) -> InputError:
     choices = " or ".join([*map(repr, names), "a mapping of options"])
     known = ""
-    if dataclasses.is_dataclass(hint):
+    if dataclasses.is_dataclass(hint) and dataclasses.fields(hint):
         known = ": " + ", ".join(field.name for field in dataclasses.fields(hint))
     return InputError(f"{where} = {value!r} must be {choices}{known}")
 
