@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -52,7 +53,11 @@ class Track:
 
 
 def run_sequence(
-    recording: Recording, backend: str, params: dict[str, Any], out: Path
+    recording: Recording,
+    backend: str,
+    params: dict[str, Any],
+    out: Path,
+    fed: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Track every frame of ``recording`` and write what came of it to ``out``.
 
@@ -60,7 +65,8 @@ def run_sequence(
     While it runs, the trajectory so far stands in ``trajectory.incomplete.txt``; at the end it is
     renamed to ``trajectory.txt``, beside ``map.ply`` and ``metrics.json``. Where the backend closes
     loops, ``trajectory.corrected.txt`` holds the poses as the finished map has them. A run that
-    fails or is interrupted leaves the unfinished file and a ``metrics.json`` that says so.
+    fails or is interrupted leaves the unfinished file and a ``metrics.json`` that says so, and says
+    how the frames were ``fed`` to the backend.
 
     Returns:
         the content of ``metrics.json``.
@@ -80,6 +86,7 @@ def run_sequence(
         "layout": recording.layout,
         "backend": backend,
         "params": params,
+        **(fed or {}),
         "registration": None if recording.registration is None else str(recording.registration),
         "image_size": f"{recording.intrinsics.width}x{recording.intrinsics.height}",
         **provenance(),

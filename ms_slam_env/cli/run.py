@@ -10,6 +10,7 @@ from pathlib import Path
 import tyro
 
 from ms_slam_env.benchmark.command_line import parse
+from ms_slam_env.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -22,10 +23,13 @@ class Arguments:
 
     sequence: tyro.conf.Positional[Path]
     """Folder of the sequence."""
-    backend: str = "surfel"
-    """SLAM backend."""
-    image_size: str = "native"
-    """Reduce the images to this size, such as 160x120."""
+    config: Path | None = None
+    """Configuration file (YAML): backend, parameters, image size, which frames and threads."""
+    backend: str | None = None
+    """SLAM backend; without a configuration file surfel."""
+    image_size: str | None = None
+    """Reduce the images to this size, such as 160x120; by default that of the configuration file,
+    else "native"."""
     layout: str = "auto"
     """auto, tum, icl-nuim, 7-scenes or folder."""
     intrinsics: str | None = None
@@ -35,7 +39,7 @@ class Arguments:
     """Bring colour into the depth camera, as an uncalibrated Kinect needs it; by default only for
     7-scenes."""
     params: tuple[str, ...] = ()
-    """Parameters of the backend, as in icp_rgb_weight=0.2."""
+    """Parameters of the backend, as in icp_rgb_weight=0.2; before those of the file."""
     out: Path = Path("results/run")
     """Folder of the results."""
 
@@ -43,18 +47,31 @@ class Arguments:
 def main(arguments: Sequence[str]) -> int:
     """Run, write, and print what was measured."""
     args = parse(Arguments, arguments, "ms-slam run")
+    from ms_slam_env.benchmark.compare_run import limit_threads
     from ms_slam_env.benchmark.options import nested_options
     from ms_slam_env.benchmark.sequence_run import run_sequence
     from ms_slam_env.sequences.recording import open_recording, parse_calibration
+    from ms_slam_env.sequences.recording.recording import NATIVE
+    from ms_slam_env.slam.configuration import SlamConfiguration, merged, read_configuration
 
+    slam = SlamConfiguration(slam=args.backend or "surfel")
+    if args.config is not None:
+        slam = read_configuration(args.config)
+        if args.backend not in (None, slam.slam):
+            raise InputError(f"--backend {args.backend} but {args.config} configures {slam.slam}")
     given = None
     if args.intrinsics is not None:
         given = parse_calibration(args.intrinsics.replace(",", " ").split(), "--intrinsics")
     recording = open_recording(args.sequence, args.layout, given, args.register)
-    recording = recording.at_size(args.image_size)
+    recording = recording.at_size(args.image_size or slam.image_size or NATIVE)
+    recording = recording.every(slam.keep_every)
     if recording.registration is not None:
         print(recording.registration, file=sys.stderr)
-    result = run_sequence(recording, args.backend, nested_options(args.params), args.out)
+    if slam.threads is not None:
+        limit_threads(slam.threads)
+    params = merged(slam.slam_config, nested_options(args.params))
+    fed = {"keep_every": slam.keep_every, "threads": slam.threads}
+    result = run_sequence(recording, slam.slam, params, args.out, fed)
     for name in ("frames", "lost_frames", "ms_median", "path_m", "ate_m", "rpe_m"):
         if name in result:
             print(f"{name:12} {result[name]:.4g}")

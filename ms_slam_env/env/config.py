@@ -20,9 +20,12 @@ from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.robot.arm import ArmConfig
 from ms_slam_env.scenes import SEED_SPLITS
 from ms_slam_env.scenes.registry import check_name
+from ms_slam_env.slam.configuration import is_file_name, read_configuration
 
 OTHER_OPTIONS = ("embodiment", "render_mode", "max_episode_steps")
 """Options of ``gym.make`` beside the fields of ``EnvConfig``; the last is Gymnasium's own."""
+
+_OF_STATE = ("image_size", "noise", "arm", "pose", "slam", "slam_config", "divergence")
 
 
 @dataclass(frozen=True)
@@ -131,7 +134,8 @@ class EnvConfig:
             its search from the arm's forward kinematics), ``kinematics`` (noisy forward kinematics
             alone; SLAM only maps) or ``ground_truth``. Kinematics need an arm.
         slam: SLAM backend.
-        slam_config: options of the backend.
+        slam_config: options of the backend, or a configuration file (YAML), which also says what
+            ``slam`` is and what ``image_size`` is where that is not given.
         observation: ``rgbd``, ``features`` or ``lookahead``.
         step_m: translation of a motion, metres.
         step_rad: rotation of a motion, radians.
@@ -196,6 +200,10 @@ class EnvConfig:
             return name, self.scene_seed
         return name, SEED_SPLITS[self.split][int(rng.integers(self.num_scene_seeds))]
 
+    def of_state(self, embodiment: str) -> dict[str, Any]:
+        """What two environments must have in common to go on from one state."""
+        return {"embodiment": embodiment, **{name: getattr(self, name) for name in _OF_STATE}}
+
 
 def make_config(
     options: Mapping[str, Any], others: Sequence[str] = OTHER_OPTIONS, taken: Sequence[str] = ()
@@ -208,11 +216,24 @@ def make_config(
         taken: fields that are not to be named there.
 
     Raises:
-        InputError: an unknown option (the message lists the valid ones), or a bad value.
+        InputError: an unknown option (the message lists the valid ones), a bad value, or a bad
+            configuration file as ``slam_config``.
     """
     fields = [field.name for field in dataclasses.fields(EnvConfig)]
     for name in options:
         if name not in fields:
             valid = [*others, *(field for field in fields if field not in taken)]
             raise unknown("option of the environment", name, valid)
-    return from_dict(EnvConfig, options)
+    return from_dict(EnvConfig, _read_slam_config(options))
+
+
+def _read_slam_config(options: Mapping[str, Any]) -> Mapping[str, Any]:
+    """``options`` with what a file given as ``slam_config`` holds in its place."""
+    given = options.get("slam_config")
+    if given is None or not is_file_name(given):
+        return options
+    file = read_configuration(given)
+    if options.get("slam", file.slam) != file.slam:
+        raise InputError(f"slam = {options['slam']!r} but {given} configures {file.slam!r}")
+    size = {} if file.image_size is None else {"image_size": file.image_size}
+    return {**size, **options, "slam": file.slam, "slam_config": file.slam_config}

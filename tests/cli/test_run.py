@@ -81,6 +81,20 @@ def test_a_backend_that_closes_loops_writes_the_final_poses_too(sequence, tmp_pa
     assert written["ate_m_corrected"] == pytest.approx(written["ate_m"], abs=1e-9)
 
 
+def test_a_configuration_file_says_how_to_run(sequence, tmp_path):
+    out = tmp_path / "out"
+    file = tmp_path / "slam.yaml"
+    file.write_text("slam_config: {depth_cutoff_m: 2.5, icp_rgb_weight: 0.2}\nkeep_every: 3\n")
+    command = ["run", str(sequence), "--config", str(file), "--params", "icp_rgb_weight=0.3"]
+    assert main([*command, "--out", str(out)]) == 0
+    written = json.loads((out / "metrics.json").read_text())
+    assert written["params"] == {"depth_cutoff_m": 2.5, "icp_rgb_weight": 0.3}
+    assert (written["backend"], written["keep_every"]) == ("surfel", 3)
+    times, _ = read_trajectory(out / "trajectory.txt")
+    true_times, _ = read_trajectory(sequence / "groundtruth.txt")
+    np.testing.assert_allclose(times, true_times[::3])
+
+
 def test_reduced_images_and_parameters(sequence, tmp_path):
     out = tmp_path / "out"
     command = ["run", str(sequence), "--out", str(out), "--params", "depth_cutoff_m=2.5"]
@@ -166,6 +180,7 @@ def test_says_what_registration_it_assumes(sequence, tmp_path, capsys):
         (["run", "SEQUENCE", "--intrinsics", "1 2 3 4 5 x"], "--intrinsics: 'x' is not a number"),
         (["run", "SEQUENCE", "--intrinsics", "9 9 4 3 9 7"], "is 80x60 but the intrinsics say 9x7"),
         (["run", "SEQUENCE", "--image-size", "3x2"], "unknown image size '3x2'"),
+        (["run", "SEQUENCE", "--config", "no.yaml"], "no.yaml: cannot be read: No such file"),
     ],
 )
 def test_bad_input_is_one_line(arguments, message, sequence, tmp_path, capsys):

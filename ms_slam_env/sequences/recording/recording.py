@@ -130,6 +130,10 @@ class Recording:
             )
         return dataclasses.replace(self, intrinsics=self.source.scaled(factor))
 
+    def every(self, n: int) -> Recording:
+        """Return the same recording with every ``n``-th frame, the first among them."""
+        return dataclasses.replace(self, entries=self.entries[::n])
+
     def frame(self, index: int) -> RGBDFrame:
         """Decode frame ``index``: depth in metres, 0 = no reading; colour black if there is none.
 

@@ -1,0 +1,134 @@
+"""A SLAM configuration as a YAML file: backend, its parameters, and how frames are fed to it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ms_slam_env.camera import XTION_SIZES
+from ms_slam_env.config import check_range, from_dict
+from ms_slam_env.errors import InputError, unknown
+
+SUFFIXES = (".yaml", ".yml")
+
+
+@dataclass(frozen=True)
+class SlamConfiguration:
+    """A backend with its parameters, and how it is run.
+
+    Attributes:
+        slam: name of the backend.
+        slam_config: its parameters, such as the fields of ``SurfelConfig``.
+        image_size: the frames are reduced to this size, such as 160x120; None leaves it to whoever
+            runs the configuration.
+        keep_every: of a recorded or rendered sequence, every n-th frame is processed. An
+            environment has no frames to leave out and takes no notice.
+        threads: cores that the backend may use; None for no limit. Where other work shares the
+            process, as in an environment, no notice is taken.
+        about: where the configuration comes from, such as the trial and what it measured.
+
+    Raises:
+        InputError: an unknown backend, parameter or size, or a value out of range.
+    """
+
+    slam: str = "surfel"
+    slam_config: dict[str, Any] = field(default_factory=dict)
+    image_size: str | None = None
+    keep_every: int = 1
+    threads: int | None = None
+    about: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse what no backend could use."""
+        from ms_slam_env.slam import check_parameters
+
+        check_parameters(self.slam, self.slam_config)
+        if self.image_size is not None and self.image_size not in tuple(XTION_SIZES):
+            raise unknown("image_size", self.image_size, XTION_SIZES)
+        check_range(self, "keep_every", 1, 1000)
+        if self.threads is not None:
+            check_range(self, "threads", 1, 1024)
+
+
+def is_file_name(name: object) -> bool:
+    """Whether ``name`` is meant as a configuration file: a path, or text that ends as YAML does."""
+    return isinstance(name, Path) or (isinstance(name, str) and name.lower().endswith(SUFFIXES))
+
+
+def read_configuration(path: str | Path) -> SlamConfiguration:
+    """Read a configuration file.
+
+    Raises:
+        InputError: no such file, no YAML, an unknown or repeated key, or a bad value; one line that
+            names the file and the key.
+    """
+    try:
+        with Path(path).open(encoding="utf-8") as file:
+            content = yaml.load(file, _Loader)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file in UTF-8") from None
+    except yaml.YAMLError as error:
+        raise InputError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(content, Mapping):
+        fields = ", ".join(field.name for field in dataclasses.fields(SlamConfiguration))
+        raise InputError(f"{path}: holds no mapping of {fields}")
+    try:
+        return from_dict(SlamConfiguration, content)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def write_configuration(path: str | Path, configuration: SlamConfiguration) -> None:
+    """Write a file that ``read_configuration`` reads back; defaults that are None are left out."""
+    content = {
+        name: value
+        for name, value in dataclasses.asdict(configuration).items()
+        if value is not None
+    }
+    with Path(path).open("w", encoding="utf-8") as file:
+        yaml.safe_dump(_plain(content), file, sort_keys=False)
+
+
+def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Options ``base`` with those of ``over`` in their place, at any depth."""
+    result = dict(base)
+    for key, value in over.items():
+        old = result.get(key)
+        if isinstance(old, Mapping) and isinstance(value, Mapping):
+            value = merged(old, value)
+        result[key] = value
+    return result
+
+
+def _plain(value: Any) -> Any:
+    """``value`` with mappings, lists, text and Python's own numbers only."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(inner) for key, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(inner) for inner in value]
+    if hasattr(value, "tolist"):  # a number or an array of NumPy
+        return value.tolist()
+    return value
+
+
+class _Loader(yaml.SafeLoader):
+    """Refuses a key that is given twice, of which YAML's own loader silently keeps the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Construct the mapping of ``node``."""
+        seen = set()
+        for key_node, _ in node.value:
+            key = key_node.value if isinstance(key_node, yaml.ScalarNode) else None
+            if key is not None and key in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"key {key!r} is given twice", key_node.start_mark
+                )
+            seen.add(key)
+        return super().construct_mapping(node, deep)
