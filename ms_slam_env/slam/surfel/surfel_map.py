@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,29 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.base import Views
-from ms_slam_env.slam.surfel.blocks import allocate_blocks, bound_blocks, set_bounded
+from ms_slam_env.slam.surfel.blocks import allocate_blocks
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.discs import allocate_discs
-from ms_slam_env.slam.surfel.fusion import (
-    add_surfels,
-    radial_weights,
-)
-from ms_slam_env.slam.surfel.fusion_update import FusionParameters, update_surfels
+from ms_slam_env.slam.surfel.map_passes import MapArrays, MapPasses
 from ms_slam_env.slam.surfel.prediction import DeviceViews, ViewPredictor
-from ms_slam_env.slam.surfel.removal import (
-    Removal,
-    expire,
-    gather,
-    list_survivors,
-    put_back,
-)
-from ms_slam_env.slam.surfel.splat_renderer import (
-    Culler,
-    SplatParameters,
-    SplatRenderer,
-    every_nth,
-    splat_camera,
-)
+from ms_slam_env.slam.surfel.splat_renderer import SplatRenderer
 from ms_slam_env.slam.surfel.surfel_arrays import (
     ATTRIBUTES,
     COUNTERS,
@@ -49,7 +30,6 @@ Float64 = NDArray[np.float64]
 
 GPU_THREADS = 1 << 20  # of a launch, about
 GPU_WORKERS = (256, 8192)  # fewest and most that share one env's surfels
-_CHANGING = ("poses", "mask", "time", "weight", "live_depth", "live_normals", "live_color")
 
 
 class SurfelMap:
@@ -81,71 +61,64 @@ class SurfelMap:
     ) -> None:
         self.batch = batch
         self.intrinsics = intrinsics
-        self.config = config
         self.device = device
         self._workers = default_workers(batch, device) if workers is None else workers
         capacity = config.capacity(intrinsics.width)
         self.surfels = allocate_surfels(batch, capacity, device)
-        self._spare = allocate_surfels(batch, capacity, device)
         self._blocks = allocate_blocks(batch, capacity, device)
-        self._visible = allocate_visible(batch, capacity, device)
         self._discs = allocate_discs(batch, capacity, device)
         self.active = any_time(batch, device)
-        self._survivors = wp.zeros((batch, capacity), dtype=wp.int32, device=device)
-        self._kept = wp.zeros(batch, dtype=wp.int32, device=device)
-        self._expired = wp.zeros(batch, dtype=wp.int32, device=device)
-        pixels = batch * intrinsics.width * intrinsics.height
-        self._covered = wp.zeros(pixels, dtype=wp.int32, device=device)
-        self._fusion = FusionParameters()
-        self._fusion.distance_m = config.fusion_distance_m
-        self._fusion.min_cosine = math.cos(math.radians(config.fusion_angle_deg))
-        self._fusion.coverage_px = config.coverage_px
-        self._fusion.radius_px = config.surfel_radius_px
-        self._fusion.max_confidence = config.max_confidence
-        self._parameters = SplatParameters(tolerance_m=config.fusion_distance_m)
-        self._camera = splat_camera(intrinsics, self._parameters)
-        self._cull = Culler(
-            self.surfels,
-            self._blocks,
-            self._visible,
-            batch,
-            self._camera,
-            self._workers,
-            device,
-            self.active,
+        self._arrays = MapArrays(
+            batch=batch,
+            capacity=capacity,
+            workers=self._workers,
+            device=device,
+            surfels=self.surfels,
+            spare=allocate_surfels(batch, capacity, device),
+            blocks=self._blocks,
+            visible=allocate_visible(batch, capacity, device),
+            discs=self._discs,
+            survivors=wp.zeros((batch, capacity), dtype=wp.int32, device=device),
+            kept=wp.zeros(batch, dtype=wp.int32, device=device),
+            expired=wp.zeros(batch, dtype=wp.int32, device=device),
+            active=self.active,
         )
-        self._model_renderer = self.model_renderer(model_stride, self.active)
+        self._passes = self.make_passes(intrinsics, config, model_stride)
         self._predictor = ViewPredictor(
             self.surfels,
             self._blocks,
-            self._visible,
+            self._arrays.visible,
             self._discs,
             intrinsics,
-            self._parameters,
+            self._passes.splat_parameters,
             self._workers,
             device,
         )
-        self._arguments: tuple[Any, ...] = (None,) * 5
-        self._record_launches()
+
+    @property
+    def config(self) -> SurfelConfig:
+        """The parameters in force."""
+        return self._passes.config
+
+    def make_passes(
+        self, intrinsics: Intrinsics, config: SurfelConfig, model_stride: int
+    ) -> MapPasses:
+        """Passes for frames of another size or with other parameters; ``use`` puts them in force.
+
+        The capacity of the map stays what it is.
+        """
+        return MapPasses(self._arrays, intrinsics, config, model_stride)
+
+    def use(self, passes: MapPasses) -> None:
+        """Go on with other passes; views are predicted at the sizes of before."""
+        before, after = self.config, passes.config
+        self._passes = passes
+        if before.confidence_threshold != after.confidence_threshold:
+            self.surfels_moved()  # which surfels may expire is a matter of the threshold
 
     def model_renderer(self, stride: int, window: SeenWindow) -> SplatRenderer:
         """Renders every ``stride``-th row and column of what was last seen within ``window``."""
-        return SplatRenderer(
-            self.surfels,
-            self._blocks,
-            self._visible,
-            self._discs,
-            self.batch,
-            every_nth(self.intrinsics, stride),
-            replace(
-                self._parameters,
-                min_px=self._parameters.min_px / stride,
-                max_px=self._parameters.max_px / stride,
-            ),
-            self._workers,
-            self.device,
-            window,
-        )
+        return self._passes.model_renderer(stride, window)
 
     def clear(self, env: int | None = None) -> None:
         """Forget the map of one env, or of all."""
@@ -173,84 +146,13 @@ class SurfelMap:
             weight: (B,) float32 in (0, 1], lower for a fast camera (Whelan et al., section 3).
             mask: (B,) int32, 0 leaves an env's map as it is.
         """
-        self._cull(poses)
-        self._covered.zero_()
-        self._kept.zero_()
-        self._expired.zero_()
-        self._bind(live, poses, time, weight, mask)
-        self._update.launch()
-        self._add.launch()
-        for launch in (*self._removal, *self._bound):
-            launch.launch()
+        self._passes.fuse(live, poses, time, weight, mask)
 
     def surfels_moved(self) -> None:
         """Look at all surfels anew: something else than ``fuse`` has changed them."""
         self._blocks.bounded.zero_()
         self._blocks.num_listed.zero_()
-        for launch in self._bound:
-            launch.launch()
-
-    def _bind(
-        self, live: LiveFrame, poses: wp.array, time: wp.array, weight: wp.array, mask: wp.array
-    ) -> None:
-        """Make these the arguments of the recorded launches, if they are not already."""
-        arguments = (live, poses, time, weight, mask)
-        if all(new is old for new, old in zip(arguments, self._arguments, strict=True)):
-            return
-        self._arguments = arguments
-        images = (live.depth.flatten(), live.normals.flatten(), live.color.flatten())
-        for command in (self._update, self._add):
-            for name, value in zip(_CHANGING, (poses, mask, time, weight, *images), strict=True):
-                command.set_param_by_name(name, value)
-        for command in self._removal[:2]:
-            command.set_param_by_name("mask", mask)
-            command.set_param_by_name("time", time)
-
-    def _record_launches(self) -> None:
-        """Record the launches of ``fuse``; what changes with the frame is set there."""
-        config, workers = self.config, self._workers
-        capacity = config.capacity(self.intrinsics.width)
-        dim = (self.batch, workers)
-        poses = wp.zeros(self.batch, dtype=wp.mat44, device=self.device)
-        integers = wp.zeros(self.batch, dtype=wp.int32, device=self.device)
-        floats = wp.zeros(self.batch, dtype=wp.float32, device=self.device)
-        pixels = math.prod((self.batch, *self.intrinsics.shape))
-        depth = wp.zeros(pixels, dtype=wp.float32, device=self.device)
-        image = wp.zeros(pixels, dtype=wp.vec3, device=self.device)
-        radial = radial_weights(*self.intrinsics.shape).ravel()
-        frame = [poses, self._camera, integers, integers, floats, self._fusion, workers]
-        frame += [depth, image, image, wp.array(radial, device=self.device), self._covered]
-
-        def record(kernel: Any, inputs: list[Any]) -> Any:
-            return wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, record_cmd=True)
-
-        self._update = record(update_surfels, [self.surfels, self._visible, *frame])
-        self._add = record(add_surfels, [self.surfels, capacity, *frame])
-        removal = Removal()
-        removal.capacity = capacity
-        removal.interval = config.compaction_interval
-        removal.window = config.unstable_window
-        removal.confidence_threshold = config.confidence_threshold
-        surfels, spare, blocks = self.surfels, self._spare, self._blocks
-        survivors, kept, expired = self._survivors, self._kept, self._expired
-        due = [removal, integers, integers, workers, expired]
-        self._removal = [
-            record(expire, [surfels, blocks, *due]),
-            record(list_survivors, [surfels, *due, survivors, kept]),
-            record(gather, [surfels, spare, survivors, kept, workers]),
-            record(put_back, [spare, surfels, blocks, survivors, expired, kept, capacity, workers]),
-        ]
-        threshold = config.confidence_threshold
-        self._bound = [
-            record(bound_blocks, [surfels, blocks, capacity, threshold, workers]),
-            wp.launch(
-                set_bounded,
-                self.batch,
-                [surfels, blocks, capacity],
-                device=self.device,
-                record_cmd=True,
-            ),
-        ]
+        self._passes.bound_blocks()
 
     def render_model(self, poses: wp.array) -> ModelView:
         """Render every env's map from its pose (B,) mat44 T_world_camera.
@@ -258,8 +160,7 @@ class SurfelMap:
         With every ``model_stride``-th row and column, from the first on. The images are
         overwritten by the next call.
         """
-        self._model_renderer.cull(poses)
-        return self._model_renderer.splat()
+        return self._passes.render_model(poses)
 
     def predict_device(
         self, poses: ArrayLike, scale: float = 1.0, first_env: int = 0
