@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from ms_slam_env.camera import Intrinsics, intensity_image, xtion
+from ms_slam_env.camera.reduction import reduce_color, reduce_depth
 from ms_slam_env.errors import InputError
 from ms_slam_env.sensor import NoNoise
 from ms_slam_env.sequences import Misregistration, handheld_trajectory, render_sequence
 from ms_slam_env.sequences.recording import Registration, open_recording
-from ms_slam_env.sequences.recording.reduction import reduce_color, reduce_depth
 
 K = xtion("320x240")
 

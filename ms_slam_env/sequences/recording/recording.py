@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from ms_slam_env.camera import XTION_SIZES, Intrinsics, RGBDFrame
+from ms_slam_env.camera.reduction import reduce_color, reduce_depth
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.sequences.recording.reduction import reduce_color, reduce_depth
 from ms_slam_env.sequences.recording.registration import Registration
 
 Float64 = NDArray[np.float64]

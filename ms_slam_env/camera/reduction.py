@@ -1,4 +1,4 @@
-"""Smaller images of a recording."""
+"""Smaller images of a camera."""
 
 from __future__ import annotations
 
