@@ -21,7 +21,7 @@ from ms_slam_env.env.observations import RobotKnowledge, make_observation
 from ms_slam_env.env.pose_sources import POSE_SOURCES, Sighting, relative_motion
 from ms_slam_env.env.rendering import Renderer
 from ms_slam_env.env.reward import Outcome, reward_terms
-from ms_slam_env.env.state import EpisodeState
+from ms_slam_env.env.state import EpisodeState, check_same_settings
 from ms_slam_env.env.worlds import get_scene, get_sensor
 from ms_slam_env.errors import InputError, UnreachableError, unknown
 from ms_slam_env.geometry import check_pose, invert
@@ -235,6 +235,7 @@ class ActiveSlamEnv(EpisodeRecord):
     def save_state(self) -> dict[str, Any]:
         """Everything needed to go on bit-exactly (the time limit's counter excepted)."""
         return {
+            "settings": self.config.of_state(self._options["embodiment"]),
             "episode": self._current().copy(),
             "slam": self.slam.get_state(),
             "embodiment": self.embodiment.get_state(),
@@ -244,7 +245,12 @@ class ActiveSlamEnv(EpisodeRecord):
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Go on from a state that ``save_state`` of an env with the same options returned."""
+        """Go on from a state that ``save_state`` of an env with the same world and robot returned.
+
+        Raises:
+            InputError: options that shape the state differ; the environment is as it was.
+        """
+        check_same_settings(state["settings"], self.config.of_state(self._options["embodiment"]))
         episode: EpisodeState = state["episode"]
         self._enter_scene(episode.scene, episode.scene_seed)
         self._episode = episode.copy()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.divergence import Histograms
 from ms_slam_env.env.pose_sources import Sighting
+from ms_slam_env.errors import InputError
 from ms_slam_env.slam.base import TrackResult
 
 Float64 = NDArray[np.float64]
@@ -120,3 +122,17 @@ class EpisodeState:
     def copy(self) -> EpisodeState:
         """An independent copy."""
         return copy.deepcopy(self)
+
+
+def check_same_settings(saved: Mapping[str, Any], own: Mapping[str, Any]) -> None:
+    """Refuse a state that an environment with other options saved.
+
+    Raises:
+        InputError: naming the first option that differs and both values.
+    """
+    for name, value in own.items():
+        if name not in saved or saved[name] != value:
+            raise InputError(
+                f"the state was saved with {name} = {saved.get(name)!r}, "
+                f"this environment has {value!r}"
+            )

@@ -119,6 +119,16 @@ def test_saved_state_goes_on_to_the_bit_in_a_fresh_env(env_id):
     np.testing.assert_array_equal(fresh.unwrapped.lookahead(), expected_lookahead)
 
 
+def test_a_state_of_another_camera_is_refused_and_changes_nothing(env):
+    env.reset(seed=5)
+    before = env.unwrapped.trajectory_truth
+    other = gym.make("MSActiveSLAM-FreeCamera-v0", **{**OPTIONS, "noise": "none"})
+    other.reset(seed=6)
+    with pytest.raises(InputError, match=r"saved with noise = 'none'.*has 'kinect'"):
+        env.unwrapped.load_state(other.unwrapped.save_state())
+    np.testing.assert_array_equal(env.unwrapped.trajectory_truth, before)
+
+
 def test_pickled_env_goes_on_to_the_bit(env):
     env.reset(seed=6)
     env.step(5)
