@@ -29,6 +29,7 @@ _COLUMNS = (
     ("ms", "clock [ms]", 1, 3),
     ("memory_mb", "memory [MB]", 1, 3),
 )
+_ENERGY = ("ene_frame_j", "energy [J]", 1, 3)  # a column only where a machine counts it
 
 
 def backend_label(spec: dict[str, Any]) -> str:
@@ -55,8 +56,11 @@ def summarise(rows: Sequence[Row]) -> list[Cell]:
         cell: Cell = {"image_size": size, "sequence": sequence, "backend": backend}
         cell["error"] = None if results else errors[0]
         for name in results[0] if results else ():
-            values = [result[name] for result in results if result[name] is not None]
-            cell[name] = float(np.median(values)) if values else None
+            values = [result[name] for result in results if result.get(name) is not None]
+            if values and isinstance(values[0], str):
+                cell[name] = values[0]
+            else:
+                cell[name] = float(np.median(values)) if values else None
         cells.append(cell)
     return cells
 
@@ -70,8 +74,9 @@ def tables(summary: Sequence[Cell]) -> str:
     for size in dict.fromkeys(cell["image_size"] for cell in summary):
         cells = [cell for cell in summary if cell["image_size"] == size]
         parts.append(f"### {size}\n")
-        body = [_line(cell) for cell in (*cells, *medians(cells))]
-        header = ["sequence", "backend", *(heading for _, heading, _, _ in _COLUMNS)]
+        columns = _columns(cells)
+        body = [_line(cell, columns) for cell in (*cells, *medians(cells))]
+        header = ["sequence", "backend", *(heading for _, heading, _, _ in columns)]
         parts.append(markdown_table(header, body))
         failed = [cell for cell in cells if cell["error"] is not None]
         parts += [f"- {c['backend']} on {c['sequence']} failed: {c['error']}" for c in failed]
@@ -88,8 +93,8 @@ def medians(cells: Sequence[Cell]) -> list[Cell]:
         if not own:
             continue
         median: Cell = {"sequence": MEDIAN, "backend": backend, "error": None}
-        for name, *_ in _COLUMNS:
-            values = [cell[name] for cell in own if cell[name] is not None]
+        for name, *_ in _columns(cells):
+            values = [cell[name] for cell in own if cell.get(name) is not None]
             median[name] = float(np.median(values)) if values else None
         found.append(median)
     return found
@@ -121,11 +126,16 @@ def save_figure(summary: Sequence[Cell], path: Path) -> Path:
     return figures.save(figure, path)
 
 
-def _line(cell: Cell) -> list[str]:
+def _columns(cells: Sequence[Cell]) -> tuple[tuple[str, str, float, int], ...]:
+    counted = any(cell.get(_ENERGY[0]) is not None for cell in cells)
+    return (*_COLUMNS, _ENERGY) if counted else _COLUMNS
+
+
+def _line(cell: Cell, columns: Sequence[tuple[str, str, float, int]]) -> list[str]:
     if cell["error"] is not None:
-        return [cell["sequence"], cell["backend"], *["failed"] * len(_COLUMNS)]
+        return [cell["sequence"], cell["backend"], *["failed"] * len(columns)]
     values = [
-        "-" if cell[name] is None else format_number(cell[name] * scale, digits)
-        for name, _, scale, digits in _COLUMNS
+        "-" if cell.get(name) is None else format_number(cell[name] * scale, digits)
+        for name, _, scale, digits in columns
     ]
     return [cell["sequence"], cell["backend"], *values]

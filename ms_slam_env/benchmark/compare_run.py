@@ -7,15 +7,11 @@ one number for the life of a process.
 
 from __future__ import annotations
 
-import ctypes
-import gc
 import json
 import os
 import subprocess
 import sys
-import time
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,6 +20,7 @@ from ms_slam_env.errors import InputError
 
 if TYPE_CHECKING:
     from ms_slam_env.benchmark.compare_inputs import Input
+    from ms_slam_env.metrics import CostMeter
     from ms_slam_env.slam import SlamBackend
 
 WARM_UP = 5  # frames left out of the timing: buffers grow, kernels are loaded
@@ -87,9 +84,10 @@ def run_here(spec: CompareSpec) -> dict[str, Any]:
 
     Returns:
         ``ate_m`` and ``ate_max_m`` (SE(3)-aligned), ``ate_unaligned_m``, ``rpe_m`` and ``rpe_rad``
-        (frame to frame), ``lost`` (share of the frames), ``cpu_ms`` and ``cpu_ms_p95`` (processor
-        time of all threads a frame), ``ms`` (by the clock), ``memory_mb`` (peak, what the backend
-        alone needs of libraries included, frames not; None where the system does not tell),
+        (frame to frame), ``lost`` (share of the frames), medians ``cpu_ms`` (processor time of all
+        threads a frame) and ``ms`` (by the clock), ``memory_mb`` (peak, what the backend alone
+        needs of libraries included, frames not; None where the system does not tell), all of
+        ``CostMeter.summary`` without the first frames,
         ``precision_2cm`` and so on of the map against the surface that the true trajectory saw,
         ``map_error_mm`` (median distance of a map point to it), ``points``, ``path_m``, ``frames``.
     """
@@ -99,10 +97,10 @@ def run_here(spec: CompareSpec) -> dict[str, Any]:
 
     path = HandheldPath(spec.frames, speed_m_s=spec.speed_m_s, turn_deg_s=spec.turn_deg_s)
     given = compare_inputs.load(spec.sequence, spec.image_size, path)
-    before = forget_peak_memory()
+    costs = metrics.CostMeter(str(spec.params.get("device", "cpu")))
     system = slam.make(spec.backend, given.intrinsics, **spec.params)
-    estimates, tracked, processor_s, clock_s = _track(system, given)
-    peak = memory_mb("VmHWM")
+    estimates, tracked = _track(system, given, costs)
+    cost = costs.summary(skip=WARM_UP)
     ate = metrics.ate_statistics(estimates, given.poses)
     return {
         "frames": len(estimates),
@@ -113,28 +111,24 @@ def run_here(spec: CompareSpec) -> dict[str, Any]:
         "rpe_m": metrics.rpe_rmse(estimates, given.poses),
         "rpe_rad": metrics.rpe_rmse(estimates, given.poses, kind="rotation"),
         "lost": 1.0 - float(np.mean(tracked)),
-        "cpu_ms": 1e3 * float(np.median(processor_s[WARM_UP:])),
-        "cpu_ms_p95": 1e3 * float(np.percentile(processor_s[WARM_UP:], 95)),
-        "ms": 1e3 * float(np.median(clock_s[WARM_UP:])),
-        "memory_mb": None if peak is None or before is None else max(0.0, peak - before),
+        **cost,
+        "cpu_ms": cost["cpu_ms_median"],
+        "ms": cost["ext_ms_median"],
+        "memory_mb": cost["mem_peak_mb"],
         **_map_quality(system.surface_points(), given.surface),
     }
 
 
-def _track(
-    system: SlamBackend, given: Input
-) -> tuple[np.ndarray, list[bool], list[float], list[float]]:
-    """Poses (N, 4, 4), whether tracked, processor time and clock time (s) a frame."""
+def _track(system: SlamBackend, given: Input, costs: CostMeter) -> tuple[np.ndarray, list[bool]]:
+    """Poses (N, 4, 4), and whether tracked; ``costs`` measures the frames."""
     system.reset(given.poses[0])
-    estimates, tracked, processor_s, clock_s = [], [], [], []
+    estimates, tracked = [], []
     for frame in given.frames:
-        start, processor_start = time.perf_counter(), time.process_time()
-        result = system.track(frame)
-        processor_s.append(time.process_time() - processor_start)
-        clock_s.append(time.perf_counter() - start)
+        with costs.frame():
+            result = system.track(frame)
         estimates.append(result.T_world_camera)
         tracked.append(result.tracking_ok)
-    return np.stack(estimates), tracked, processor_s, clock_s
+    return np.stack(estimates), tracked
 
 
 def _map_quality(points: np.ndarray, surface: np.ndarray) -> dict[str, Any]:
@@ -152,32 +146,6 @@ def _map_quality(points: np.ndarray, surface: np.ndarray) -> dict[str, Any]:
         "map_error_mm": 1e3 * float(np.median(distances)),
         **dict(zip(names, values, strict=True)),
     }
-
-
-def memory_mb(name: str) -> float | None:
-    """Figure ``name`` of this process from Linux's status file, megabytes; None elsewhere."""
-    try:
-        lines = Path("/proc/self/status").read_text().splitlines()
-    except OSError:
-        return None
-    for line in lines:
-        if line.startswith(f"{name}:"):
-            return int(line.split()[1]) / 1024
-    return None
-
-
-def forget_peak_memory() -> float | None:
-    """Let the peak begin anew at what is in use now; return that, megabytes (proc(5)).
-
-    Memory that was freed is handed back first: what is taken from it again would not be counted.
-    """
-    gc.collect()
-    try:
-        ctypes.CDLL(None).malloc_trim(0)
-        Path("/proc/self/clear_refs").write_text("5")
-    except (OSError, AttributeError):  # no Linux, or no glibc
-        return None
-    return memory_mb("VmRSS")
 
 
 def limit_threads(threads: int) -> None:

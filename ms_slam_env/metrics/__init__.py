@@ -1,4 +1,4 @@
-"""Errors of trajectories and maps."""
+"""Errors of trajectories and maps; costs of SLAM."""
 
 from ms_slam_env.metrics.alignment import umeyama
 from ms_slam_env.metrics.cloud import (
@@ -15,6 +15,7 @@ from ms_slam_env.metrics.consistency import (
     ObjectConsistency,
     judge_consistency,
 )
+from ms_slam_env.metrics.cost import CostMeter, EnergyCounter, FrameCost, energy_counters
 from ms_slam_env.metrics.initialisation import Initialisation, initialisation, local_scales
 from ms_slam_env.metrics.multi_robot import mean_path_length, task_time, team_ate, team_rpe
 from ms_slam_env.metrics.reconstruction import (
@@ -55,7 +56,10 @@ from ms_slam_env.metrics.trajectory import (
 __all__ = [
     "CloudDistance",
     "ConsistencyRule",
+    "CostMeter",
+    "EnergyCounter",
     "ErrorStatistics",
+    "FrameCost",
     "Initialisation",
     "LabelledView",
     "MapConsistency",
@@ -69,6 +73,7 @@ __all__ = [
     "cloud_distance",
     "count_votes",
     "distinct_placements",
+    "energy_counters",
     "f_score",
     "hausdorff_distance",
     "icp",

@@ -1,0 +1,129 @@
+"""One meter for what SLAM costs, frame by frame.
+
+Measures and their names: EXT, MEM and ENE of Saeedi et al., ICRA 2017, section II-A; USME (Qu,
+Zhang, Yang, Dong, Navigation Positioning and Timing 2021), section 1.4 (2), asks for memory by the
+frame and for energy.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ms_slam_env.errors import InputError
+from ms_slam_env.metrics.cost.energy import EnergyCounter, energy_counters
+from ms_slam_env.metrics.cost.memory import forget_peak_memory, memory_mb, resident_mb
+
+
+@dataclass(frozen=True)
+class FrameCost:
+    """Cost of one frame.
+
+    Attributes:
+        ext_s: execution time by the clock, seconds.
+        cpu_s: processor time of all threads, seconds.
+        mem_mb: memory in use after the frame, above what was when the meter was made; NaN where
+            the system does not tell.
+        ene_j: energy of each counter, joules; NaN where there is none.
+    """
+
+    ext_s: float
+    cpu_s: float
+    mem_mb: float
+    ene_j: dict[str, float]
+
+
+class CostMeter:
+    """Measures the frames that run inside ``with meter.frame():``.
+
+    Make it before the SLAM, so that what the SLAM allocates at the start counts: the process's
+    peak of memory begins anew here, so that of two meters in one process only the later one's
+    peak holds.
+
+    Args:
+        device: that the work runs on, ``cpu`` or ``cuda``.
+        counters: of energy, by name; those of the machine if None.
+    """
+
+    def __init__(
+        self, device: str = "cpu", counters: Mapping[str, EnergyCounter] | None = None
+    ) -> None:
+        self.frames: list[FrameCost] = []
+        self._counters = dict(energy_counters(device) if counters is None else counters)
+        self._start_mb = forget_peak_memory()
+
+    @contextmanager
+    def frame(self) -> Iterator[None]:
+        """Measure the enclosed work as one frame; work that raises is not counted."""
+        energy = {name: counter.joules() for name, counter in self._counters.items()}
+        clock, processor = time.perf_counter(), time.process_time()
+        yield
+        cpu_s, ext_s = time.process_time() - processor, time.perf_counter() - clock
+        taken = {name: self._counters[name].joules() - before for name, before in energy.items()}
+        now = resident_mb()
+        known = now is not None and self._start_mb is not None
+        mem = now - self._start_mb if known else math.nan  # type: ignore[operator]
+        self.frames.append(FrameCost(ext_s, cpu_s, mem, taken))
+
+    def summary(self, skip: int = 0) -> dict[str, Any]:
+        """Costs by flat names; None where a figure cannot be had.
+
+        ``ext_ms`` (mean a frame, by the clock), ``ext_ms_median``, ``_p95``, ``_p99``, ``_max``;
+        ``cpu_ms_mean`` (processor time of all threads), ``cpu_ms_median``, ``cpu_ms_p95``;
+        ``mem_peak_mb`` and ``mem_mb`` (peak, and mean over the frames, above what was in use when
+        the meter was made: the SLAM's own), ``mem_process_mb`` (peak of the whole process);
+        ``ene_j`` (of the frames together), ``ene_frame_j`` (mean), ``ene_cpu_j``, ``ene_gpu_j``
+        and so on for every counter, and ``ene_source``, which says what was read or why not.
+        Energy between the frames does not count.
+
+        Args:
+            skip: leave so many first frames out of times and energy: buffers grow, kernels load.
+
+        Raises:
+            InputError: no frame is left.
+        """
+        counted = self.frames[skip:]
+        if not counted:
+            raise InputError(f"{len(self.frames)} frames were measured and {skip} left out")
+        ext = 1e3 * np.array([cost.ext_s for cost in counted])
+        cpu = 1e3 * np.array([cost.cpu_s for cost in counted])
+        memory = float(np.mean([cost.mem_mb for cost in self.frames]))
+        peak = memory_mb("VmHWM")
+        above = None if peak is None or self._start_mb is None else max(0.0, peak - self._start_mb)
+        return {
+            "ext_ms": float(ext.mean()),
+            "ext_ms_median": float(np.median(ext)),
+            "ext_ms_p95": float(np.percentile(ext, 95)),
+            "ext_ms_p99": float(np.percentile(ext, 99)),
+            "ext_ms_max": float(ext.max()),
+            "cpu_ms_mean": float(cpu.mean()),
+            "cpu_ms_median": float(np.median(cpu)),
+            "cpu_ms_p95": float(np.percentile(cpu, 95)),
+            "mem_peak_mb": above,
+            "mem_mb": memory if math.isfinite(memory) else None,
+            "mem_process_mb": peak,
+            **self._energy(counted),
+        }
+
+    def _energy(self, counted: list[FrameCost]) -> dict[str, Any]:
+        by_counter = {
+            name: float(np.sum([cost.ene_j[name] for cost in counted])) for name in self._counters
+        }
+        known = [joules for joules in by_counter.values() if math.isfinite(joules)]
+        total = sum(known) if known else None
+        said = [
+            f"{name}: {f'not available: {counter.reason}' if counter.reason else counter.source}"
+            for name, counter in self._counters.items()
+        ]
+        return {
+            "ene_j": total,
+            "ene_frame_j": None if total is None else total / len(counted),
+            **{f"ene_{k}_j": v if math.isfinite(v) else None for k, v in by_counter.items()},
+            "ene_source": "; ".join(said),
+        }
