@@ -6,7 +6,7 @@ divergence, such as mean and variance, to the sequence"; "evaluated per unit of 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from ms_slam_env.benchmark import figures
 from ms_slam_env.benchmark.table import format_number, markdown_table
-from ms_slam_env.camera import intensity_image
+from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.divergence import DivergenceConfig, make_divergence
 from ms_slam_env.errors import InputError
 from ms_slam_env.sequences.recording import Recording
@@ -44,23 +44,51 @@ class SequenceDivergence:
     gaps_s: Float64
 
     def statistics(self) -> dict[str, dict[str, float | None]]:
-        """``max``, ``mean``, ``variance`` by kind, and ``mean_per_s``, ``max_per_s`` of the rates.
+        """Of each kind: per frame ``max, mean, variance, std``; ``..._per_s`` those of the rates.
 
-        The mean rate is the sum of all divergences over the whole time. None without colour.
+        A rate is a divergence over the time between its two frames, nats/s; mean and variance of
+        the rates weigh each by that time, so that the mean is the sum of all divergences over the
+        whole time. None without colour.
         """
-        found = {}
-        for column, kind in enumerate(KINDS):
-            values = self.divergences[:, column]
-            rates = values / self.gaps_s
-            numbers = {
-                "max": values.max(),
-                "mean": values.mean(),
-                "variance": values.var(),
-                "max_per_s": rates.max(),
-                "mean_per_s": values.sum() / self.gaps_s.sum(),
-            }
-            found[kind] = {k: None if np.isnan(v) else float(v) for k, v in numbers.items()}
-        return found
+        return {
+            kind: statistics_of(self.divergences[:, column], self.gaps_s)
+            for column, kind in enumerate(KINDS)
+        }
+
+
+def statistics_of(values: Float64, gaps_s: Float64) -> dict[str, float | None]:
+    """Statistics of divergences (T,) between frames ``gaps_s`` (T,) apart, as described above."""
+    rates = values / gaps_s
+    mean_rate = values.sum() / gaps_s.sum()
+    rate_variance = np.average((rates - mean_rate) ** 2, weights=gaps_s)
+    numbers = {
+        "max": values.max(),
+        "mean": values.mean(),
+        "variance": values.var(),
+        "std": values.std(),
+        "max_per_s": rates.max(),
+        "mean_per_s": mean_rate,
+        "variance_per_s": rate_variance,
+        "std_per_s": np.sqrt(rate_variance),
+    }
+    return {name: None if np.isnan(v) else float(v) for name, v in numbers.items()}
+
+
+def consecutive_divergences(
+    frames: Iterable[RGBDFrame], intrinsics: Intrinsics, configs: Sequence[DivergenceConfig]
+) -> Float64:
+    """Divergences (T, C, 2) of each of T + 1 frames from the one before, with C configurations."""
+    measures = [make_divergence(config, intrinsics) for config in configs]
+    previous = None
+    rows = []
+    for frame in frames:
+        grey = intensity_image(frame.color).astype(np.float32)
+        histograms = [m.histograms(grey[None], frame.depth[None]) for m in measures]
+        if previous is not None:
+            triples = zip(measures, histograms, previous, strict=True)
+            rows.append([m.divergence(now, before)[0] for m, now, before in triples])
+        previous = histograms
+    return np.array(rows).reshape(-1, len(measures), len(KINDS))
 
 
 def sequence_divergence(
@@ -79,30 +107,35 @@ def sequence_divergence(
             f"sequence {recording.name}: {len(recording)} frames, every {every}th: "
             "a divergence needs two"
         )
-    divergence = make_divergence(config or DivergenceConfig(), recording.intrinsics)
-    previous = None
-    rows = []
-    for index in tqdm(picked, desc=recording.name, unit="frame"):
-        frame = recording.frame(index)
-        grey = intensity_image(frame.color).astype(np.float32)
-        histograms = divergence.histograms(grey[None], frame.depth[None])
-        if previous is not None:
-            rows.append(divergence.divergence(histograms, previous)[0])
-        previous = histograms
-    values = np.array(rows)
+    frames = (recording.frame(k) for k in tqdm(picked, desc=recording.name, unit="frame"))
+    config = config or DivergenceConfig()
+    values = consecutive_divergences(frames, recording.intrinsics, [config])[:, 0]
     if not recording.has_color:
         values[:, 0] = np.nan
     times = recording.timestamps[list(picked)]
     return SequenceDivergence(recording.name, times[1:] - times[0], values, np.diff(times))
 
 
+_SHOWN = {
+    "max": "max",
+    "mean": "mean",
+    "variance": "variance",
+    "std": "std",
+    "max_per_s": "max / s",
+    "mean_per_s": "mean / s",
+    "variance_per_s": "variance / s²",
+    "std_per_s": "std / s",
+}
+
+
 def table(measured: Sequence[SequenceDivergence]) -> str:
     """Markdown: one line a sequence and kind, Table I's statistics and those per second."""
-    header = ["sequence", "divergence", "max", "mean", "variance", "max / s", "mean / s", "frames"]
+    header = ["sequence", "divergence", *_SHOWN.values(), "frames"]
     body = []
     for sequence in measured:
         for kind, numbers in sequence.statistics().items():
-            shown = ["-" if v is None else format_number(v, 3) for v in numbers.values()]
+            cells = (numbers[name] for name in _SHOWN)
+            shown = ["-" if v is None else format_number(v, 3) for v in cells]
             body.append([sequence.name, kind, *shown, str(len(sequence.times) + 1)])
     return markdown_table(header, body)
 
