@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,7 @@ TRAJECTORY, UNFINISHED, MAP, METRICS = (
     "map.ply",
     "metrics.json",
 )
+FRAMES = "frames.csv"
 CORRECTED = "trajectory.corrected.txt"
 MAX_DIFFERENCE_S = 0.02
 
@@ -39,17 +40,16 @@ MAX_DIFFERENCE_S = 0.02
 class Track:
     """What SLAM said, frame by frame."""
 
+    costs: metrics.CostMeter
     times: list[float] = field(default_factory=list)
     poses: list[Float64] = field(default_factory=list)
     tracking_ok: list[bool] = field(default_factory=list)
-    seconds: list[float] = field(default_factory=list)
 
-    def append(self, timestamp: float, result: TrackResult, seconds: float) -> None:
+    def append(self, timestamp: float, result: TrackResult) -> None:
         """Add a frame."""
         self.times.append(timestamp)
         self.poses.append(result.T_world_camera)
         self.tracking_ok.append(result.tracking_ok)
-        self.seconds.append(seconds)
 
 
 def run_sequence(
@@ -64,7 +64,8 @@ def run_sequence(
     SLAM starts at the true pose of the first frame where that is known, else at the identity.
     While it runs, the trajectory so far stands in ``trajectory.incomplete.txt``; at the end it is
     renamed to ``trajectory.txt``, beside ``map.ply`` and ``metrics.json``. Where the backend closes
-    loops, ``trajectory.corrected.txt`` holds the poses as the finished map has them. A run that
+    loops, ``trajectory.corrected.txt`` holds the poses as the finished map has them; what every
+    frame cost stands in ``frames.csv``. A run that
     fails or is interrupted leaves the unfinished file and a ``metrics.json`` that says so, and says
     how the frames were ``fed`` to the backend.
 
@@ -74,12 +75,13 @@ def run_sequence(
     Raises:
         InputError: a bad option, or an image that cannot be read.
     """
+    costs = metrics.CostMeter(str(params.get("device", "cpu")))
     system = slam.make(backend, recording.intrinsics, **params)
     system.reset(_start(recording))
     out.mkdir(parents=True, exist_ok=True)
-    for old in (TRAJECTORY, CORRECTED, MAP, METRICS):
+    for old in (TRAJECTORY, CORRECTED, MAP, METRICS, FRAMES):
         (out / old).unlink(missing_ok=True)
-    track = Track()
+    track = Track(costs)
     result: dict[str, Any] = {"complete": False}
     about = {
         "sequence": recording.name,
@@ -112,20 +114,32 @@ def run_sequence(
         raise
     finally:
         result.update(measure(track, recording))
+        _write_frames(out / FRAMES, track)
         write_json(out / METRICS, {**result, **about})
     return result
 
 
-def _track_all(recording: Recording, system: slam.SlamBackend, track: Track, file: Any) -> None:
+def _track_all(recording: Recording, system: slam.SlamBackend, track: Track, file: TextIO) -> None:
     with tqdm(total=len(recording), desc=recording.name, unit="frame") as bar:
         for frame in recording:
-            start = time.process_time()
-            result = system.track(frame)
-            track.append(frame.timestamp, result, time.process_time() - start)
+            with track.costs.frame():
+                result = system.track(frame)
+            track.append(frame.timestamp, result)
             file.write(trajectory_line(frame.timestamp, result.T_world_camera) + "\n")
             file.flush()
             bar.set_postfix_str("tracking" if result.tracking_ok else "LOST", refresh=False)
             bar.update()
+
+
+def _write_frames(path: Path, track: Track) -> None:
+    """Write what every frame cost, as CSV; a figure that cannot be had stays empty."""
+    lines = ["timestamp,tracking_ok,ext_ms,cpu_ms,mem_mb,ene_j"]
+    pairs = zip(track.times, track.tracking_ok, track.costs.frames, strict=False)
+    for timestamp, ok, cost in pairs:
+        values = (1e3 * cost.ext_s, 1e3 * cost.cpu_s, cost.mem_mb, cost.joules)
+        words = ["" if math.isnan(value) else f"{value:.3f}" for value in values]
+        lines.append(",".join([f"{timestamp:.6f}", str(int(ok)), *words]))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _corrected(track: Track, system: slam.SlamBackend) -> Track | None:
@@ -153,18 +167,20 @@ def measure(track: Track, recording: Recording) -> dict[str, Any]:
     """Metrics of a run, finished or not; those against the truth only where there is one.
 
     ``frames``, ``lost_frames``, processor time a frame (``ms_median``, ``ms_p95``), ``path_m`` of
-    the estimate; ``ate_m`` (RMSE after SE(3) alignment), ``ate_max_m``, ``rpe_m``, ``rpe_rad``.
+    the estimate; ``ate_m`` (RMSE after SE(3) alignment), ``ate_max_m``, ``rpe_m``, ``rpe_rad``;
+    the costs by the names of ``CostMeter.summary``.
     """
     if not track.times:
         return {"frames": 0}
     poses = np.stack(track.poses)
-    ms = 1e3 * np.array(track.seconds)
+    cost = track.costs.summary()
     result: dict[str, Any] = {
         "frames": len(poses),
         "lost_frames": int(len(poses) - sum(track.tracking_ok)),
-        "ms_median": float(np.median(ms)),
-        "ms_p95": float(np.percentile(ms, 95)),
+        "ms_median": cost["cpu_ms_median"],
+        "ms_p95": cost["cpu_ms_p95"],
         "path_m": metrics.path_length(poses),
+        **cost,
     }
     if recording.truth is None or recording.truth_times is None:
         return result

@@ -153,7 +153,7 @@ def test_energy_has_a_column_where_a_machine_counts_it() -> None:
     rows[1]["result"] |= {"ene_frame_j": None, "ene_source": "cpu: not available"}
     text = tables(summarise(rows))
     assert "energy [J] |" in text
-    assert "| 1 | 0.25 |" in text
+    assert "| 1.00 | 0.250 |" in text
     assert "energy" not in tables(summarise([row("a:1", "one", 1.0), rows[1]]))
 
 

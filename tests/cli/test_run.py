@@ -50,6 +50,7 @@ def test_writes_trajectory_map_and_metrics(sequence, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["run", str(sequence), "--out", str(out)]) == 0
     assert sorted(path.name for path in out.iterdir()) == [
+        "frames.csv",
         "map.ply",
         "metrics.json",
         "trajectory.txt",
@@ -62,6 +63,14 @@ def test_writes_trajectory_map_and_metrics(sequence, tmp_path, capsys):
     assert written["ate_m"] == pytest.approx(ate_rmse(poses, truth), abs=1e-6)
     assert written["ate_m"] < 0.01
     np.testing.assert_allclose(poses[0], truth[0], atol=1e-6)
+    assert 0 < written["ext_ms_median"] <= written["ext_ms_p95"] <= written["ext_ms_max"]
+    assert written["ene_source"].startswith("cpu: ")
+    header, *rows = (out / "frames.csv").read_text().splitlines()
+    assert header == "timestamp,tracking_ok,ext_ms,cpu_ms,mem_mb,ene_j"
+    assert [float(row.split(",")[0]) for row in rows] == pytest.approx(times)
+    assert np.mean([float(row.split(",")[2]) for row in rows]) == pytest.approx(
+        written["ext_ms"], abs=1e-3
+    )
     cloud = trimesh.load(out / "map.ply")
     assert len(cloud.vertices) > 1000
     raw = cloud.metadata["_ply_raw"]["vertex"]["properties"]
@@ -141,6 +150,7 @@ def test_an_interrupted_run_keeps_the_trajectory_so_far(sequence, tmp_path, caps
     assert capsys.readouterr().err.strip().splitlines()[-1].startswith("ms-slam: interrupted")
     # Nothing of the earlier, finished run is left to be taken for this one's.
     assert sorted(path.name for path in out.iterdir()) == [
+        "frames.csv",
         "metrics.json",
         "trajectory.incomplete.txt",
     ]

@@ -38,6 +38,12 @@ class FrameCost:
     mem_mb: float
     ene_j: dict[str, float]
 
+    @property
+    def joules(self) -> float:
+        """Energy of all counters that there are; NaN without any."""
+        known = [joules for joules in self.ene_j.values() if math.isfinite(joules)]
+        return sum(known) if known else math.nan
+
 
 class CostMeter:
     """Measures the frames that run inside ``with meter.frame():``.
