@@ -47,6 +47,7 @@ class FernDatabase:
     ) -> None:
         """Start empty."""
         self.config = config or FernConfig()
+        self._seed = seed
         self._encoder = FernEncoder(intrinsics, self.config, seed)
         self.clear()
 
@@ -72,6 +73,20 @@ class FernDatabase:
         self._known: UInt8 = np.zeros((_FIRST_ROWS, ferns), dtype=np.uint8)
         self._poses: Float64 = np.zeros((_FIRST_ROWS, 4, 4))
         self._times = np.zeros(_FIRST_ROWS, dtype=np.int64)
+
+    def expect_size(self, intrinsics: Intrinsics) -> None:
+        """Take frames of another size of the same camera from now on; the keyframes stay.
+
+        Raises:
+            InputError: frames of another shape, or smaller than those that ferns test.
+        """
+        encoder = FernEncoder(intrinsics, self.config, self._seed)
+        if encoder.tested_size != self._encoder.tested_size:
+            raise InputError(
+                f"frames of {intrinsics.width}x{intrinsics.height} have other ferns: they test "
+                f"{encoder.tested_size} in place of {self._encoder.tested_size} pixels"
+            )
+        self._encoder = encoder
 
     def encode(self, color: UInt8, depth: NDArray[np.float32]) -> FernCode:
         """Code of a frame, for the methods that take one: colour (H, W, 3), depth (H, W) metres."""

@@ -61,6 +61,11 @@ class FernEncoder:
         u = ((column + 0.5) * width / columns).astype(np.int64)
         self._depth_place = v * width + u
 
+    @property
+    def tested_size(self) -> tuple[int, int]:
+        """Width and height of the reduced image that is tested."""
+        return self._size
+
     def encode(self, color: UInt8, depth: NDArray[np.float32]) -> FernCode:
         """Code of a frame: colour (H, W, 3) uint8, depth (H, W) metres, 0 = no reading.
 

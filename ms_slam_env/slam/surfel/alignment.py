@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ms_slam_env.slam.surfel.blank import BLANK
+from ms_slam_env.slam.surfel.verdict import FEW_POINTS, OK
 
 Float64 = NDArray[np.float64]
 
@@ -42,3 +45,11 @@ class Alignment:
             photometry=np.where(where, other.photometry, self.photometry),
             covariance=np.where(where[:, None, None], other.covariance, self.covariance),
         )
+
+
+def accept_any_fit(alignment: Alignment) -> Alignment:
+    """The same with a good verdict wherever there was something to align at all."""
+    usable = (alignment.verdict != FEW_POINTS) & (alignment.verdict != BLANK)
+    usable &= np.isfinite(alignment.T_world_live).all(axis=(1, 2))
+    unusable = np.where(alignment.verdict == BLANK, BLANK, FEW_POINTS)
+    return replace(alignment, verdict=np.where(usable, OK, unusable).astype(np.int32))

@@ -21,28 +21,26 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import check_pose, invert
 from ms_slam_env.slam.base import Float64, TrackResult
 from ms_slam_env.slam.ferns import Candidate
-from ms_slam_env.slam.surfel.alignment import Alignment
+from ms_slam_env.slam.surfel.alignment import Alignment, accept_any_fit
 from ms_slam_env.slam.surfel.blank import BLANK, REASON, BlankFrames
 from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.front_end import FrontEnd, FrontEnds, check_change
 from ms_slam_env.slam.surfel.inputs import check_guesses, check_images, check_poses
 from ms_slam_env.slam.surfel.loops.make import make_loop_closure
 from ms_slam_env.slam.surfel.mirror import Mirror
 from ms_slam_env.slam.surfel.motions import damped, motion_weight
 from ms_slam_env.slam.surfel.photometry import (
-    ExposureCorrection,
     follow,
     geometry_only,
     same_exposure,
 )
-from ms_slam_env.slam.surfel.preprocess import Preprocessor
 from ms_slam_env.slam.surfel.relocalisation import Images, make_relocalisation
 from ms_slam_env.slam.surfel.seeds import NUM_SEEDS, relocalisation_seeds, tracking_seeds
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
-from ms_slam_env.slam.surfel.tracking import NUM_FIRST, Tracker, model_stride
+from ms_slam_env.slam.surfel.tracking import NUM_FIRST, model_stride
 from ms_slam_env.slam.surfel.types import LiveFrame, ModelView
 from ms_slam_env.slam.surfel.verdict import (
     APPEARANCE,
-    FEW_POINTS,
     OK,
     REASONS,
     STAT_CONFLICT,
@@ -65,12 +63,8 @@ class BatchedSurfelSlam:
     ) -> None:
         """Allocate maps and buffers for ``batch`` envs with one camera model."""
         self.batch = batch
-        self.intrinsics = intrinsics
-        self.config = config
-        self.preprocess = Preprocessor(batch, intrinsics, config, device)
-        stride = model_stride(intrinsics, config)
-        self.tracker = Tracker(batch, NUM_SEEDS, intrinsics, config, device, stride)
-        self.map = SurfelMap(batch, intrinsics, config, device, stride)
+        self.map = SurfelMap(batch, intrinsics, config, device, model_stride(intrinsics, config))
+        self._front_ends = FrontEnds(self.map)
         self.loops = make_loop_closure(self.map, config, device)
         self.relocalisation = make_relocalisation(batch, intrinsics, config)
         self._blank_frames = BlankFrames(batch)
@@ -81,12 +75,28 @@ class BatchedSurfelSlam:
         self.poses: Float64 = np.tile(np.eye(4), (batch, 1, 1))
         self._motions: Float64 = np.tile(np.eye(4), (batch, 1, 1))
         self._photometry = same_exposure(batch)
-        self._correct_exposure = ExposureCorrection(batch, intrinsics, device)
         self._started = np.zeros(batch, dtype=bool)
         self._lost = np.zeros(batch, dtype=np.int32)  # frames since tracking was lost
         self._time = np.zeros(batch, dtype=np.int32)
         self._view: ModelView
         self._view_poses: Float64 | None = None  # of ``_view``; None: the maps have changed since
+        self._use(self._front_ends.get(intrinsics, config))
+
+    def reconfigure(self, config: SurfelConfig, intrinsics: Intrinsics) -> None:
+        """Go on with other parameters and frame size; see ``SurfelSlam.reconfigure``."""
+        if (config, intrinsics) == (self.config, self.intrinsics):
+            return
+        check_change(self.config, config, intrinsics != self.intrinsics)
+        self.relocalisation.adapt(intrinsics, config.depth_cutoff_m)
+        self._use(self._front_ends.get(intrinsics, config))
+
+    def _use(self, front_end: FrontEnd) -> None:
+        """Look at frames, and at the maps, in this way from now on."""
+        self.intrinsics, self.config = front_end.intrinsics, front_end.config
+        self.preprocess, self.tracker = front_end.preprocess, front_end.tracker
+        self._correct_exposure = front_end.correct_exposure
+        self.map.use(front_end.passes)
+        self._view_poses = None
 
     def reset(self, T_world_camera: ArrayLike | None = None, env: int = 0) -> None:
         """Forget one env; its next frame is taken at ``T_world_camera`` (identity if None)."""
@@ -386,11 +396,3 @@ class BatchedSurfelSlam:
         self.relocalisation.set_state(state["relocalisation"])
         self.loops.set_state(state["loops"])
         self._view_poses = None
-
-
-def accept_any_fit(alignment: Alignment) -> Alignment:
-    """The same with a good verdict wherever there was something to align at all."""
-    usable = (alignment.verdict != FEW_POINTS) & (alignment.verdict != BLANK)
-    usable &= np.isfinite(alignment.T_world_live).all(axis=(1, 2))
-    unusable = np.where(alignment.verdict == BLANK, BLANK, FEW_POINTS)
-    return replace(alignment, verdict=np.where(usable, OK, unusable).astype(np.int32))

@@ -48,6 +48,7 @@ class SurfelMap:
         surfels: the maps on the device.
         active: ``fuse`` and ``render_model`` work on the surfels last seen within this window; all
             unless its times are set.
+        passes: how ``fuse`` and ``render_model`` do that.
     """
 
     def __init__(
@@ -83,14 +84,14 @@ class SurfelMap:
             expired=wp.zeros(batch, dtype=wp.int32, device=device),
             active=self.active,
         )
-        self._passes = self.make_passes(intrinsics, config, model_stride)
+        self.passes = self.make_passes(intrinsics, config, model_stride)
         self._predictor = ViewPredictor(
             self.surfels,
             self._blocks,
             self._arrays.visible,
             self._discs,
             intrinsics,
-            self._passes.splat_parameters,
+            self.passes.splat_parameters,
             self._workers,
             device,
         )
@@ -98,7 +99,7 @@ class SurfelMap:
     @property
     def config(self) -> SurfelConfig:
         """The parameters in force."""
-        return self._passes.config
+        return self.passes.config
 
     def make_passes(
         self, intrinsics: Intrinsics, config: SurfelConfig, model_stride: int
@@ -112,13 +113,13 @@ class SurfelMap:
     def use(self, passes: MapPasses) -> None:
         """Go on with other passes; views are predicted at the sizes of before."""
         before, after = self.config, passes.config
-        self._passes = passes
+        self.passes = passes
         if before.confidence_threshold != after.confidence_threshold:
             self.surfels_moved()  # which surfels may expire is a matter of the threshold
 
     def model_renderer(self, stride: int, window: SeenWindow) -> SplatRenderer:
         """Renders every ``stride``-th row and column of what was last seen within ``window``."""
-        return self._passes.model_renderer(stride, window)
+        return self.passes.model_renderer(stride, window)
 
     def clear(self, env: int | None = None) -> None:
         """Forget the map of one env, or of all."""
@@ -146,13 +147,13 @@ class SurfelMap:
             weight: (B,) float32 in (0, 1], lower for a fast camera (Whelan et al., section 3).
             mask: (B,) int32, 0 leaves an env's map as it is.
         """
-        self._passes.fuse(live, poses, time, weight, mask)
+        self.passes.fuse(live, poses, time, weight, mask)
 
     def surfels_moved(self) -> None:
         """Look at all surfels anew: something else than ``fuse`` has changed them."""
         self._blocks.bounded.zero_()
         self._blocks.num_listed.zero_()
-        self._passes.bound_blocks()
+        self.passes.bound_blocks()
 
     def render_model(self, poses: wp.array) -> ModelView:
         """Render every env's map from its pose (B,) mat44 T_world_camera.
@@ -160,7 +161,7 @@ class SurfelMap:
         With every ``model_stride``-th row and column, from the first on. The images are
         overwritten by the next call.
         """
-        return self._passes.render_model(poses)
+        return self.passes.render_model(poses)
 
     def predict_device(
         self, poses: ArrayLike, scale: float = 1.0, first_env: int = 0

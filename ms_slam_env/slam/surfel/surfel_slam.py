@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame
+from ms_slam_env.camera.reduction import reduce_color, reduce_depth
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose
 from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult, Views
@@ -24,8 +25,43 @@ class SurfelSlam(SlamBackend):
     ) -> None:
         """Start empty at the identity pose."""
         self.intrinsics = intrinsics
-        self.config = config or SurfelConfig()
-        self._slam = BatchedSurfelSlam(1, intrinsics, self.config, device)
+        self._slam = BatchedSurfelSlam(1, intrinsics, config or SurfelConfig(), device)
+
+    @property
+    def config(self) -> SurfelConfig:
+        """The parameters in force."""
+        return self._slam.config
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(width, height) that frames are reduced to: the camera's own unless reconfigured."""
+        return self._slam.intrinsics.width, self._slam.intrinsics.height
+
+    def reconfigure(self, config: SurfelConfig, image_size: tuple[int, int] | None = None) -> None:
+        """Go on with other parameters: map, pose, motion and keyframes stay as they are.
+
+        With those in force already nothing changes, bit for bit. The state of ``get_state`` does
+        not hold them: it is set where they are in force.
+
+        Args:
+            config: differs in nothing that ``front_end.FIXED`` names. Loop closure keeps the
+                parameters that it was made with, and ferns the depths that they ask for.
+            image_size: (width, height) that frames are reduced to before anything else; None for
+                the size they have. ``track`` takes frames of the camera's own size all the same,
+                and ``predict`` renders views of it.
+
+        Raises:
+            InputError: a change of what must stay, or a size that the camera's frames cannot be
+                reduced to.
+        """
+        own = self.intrinsics
+        width, height = image_size or (own.width, own.height)
+        if width > own.width or width * own.height != own.width * height or width < 1:
+            raise InputError(
+                f"frames of {own.width}x{own.height} cannot be reduced to {width}x{height}"
+            )
+        reduced = own if width == own.width else own.scaled(width / own.width)
+        self._slam.reconfigure(config, reduced)
 
     @property
     def map(self) -> SurfelMap:
@@ -42,8 +78,8 @@ class SurfelSlam(SlamBackend):
         Raises:
             InputError: the frame's size is not that of the intrinsics, or the guess is no pose.
         """
-        self.intrinsics.check_image(frame.depth, "frame")
-        return self._slam.track(frame.color[None], frame.depth[None], [T_world_camera_guess])[0]
+        color, depth = self._images(frame)
+        return self._slam.track(color, depth, [T_world_camera_guess])[0]
 
     def fuse(self, frame: RGBDFrame, T_world_camera: ArrayLike) -> TrackResult:
         """Fuse ``frame`` into the map at a known pose (4, 4), without tracking.
@@ -51,9 +87,17 @@ class SurfelSlam(SlamBackend):
         Raises:
             InputError: the frame's size is not that of the intrinsics, or the pose is none.
         """
-        self.intrinsics.check_image(frame.depth, "frame")
+        color, depth = self._images(frame)
         pose = check_pose(T_world_camera, "T_world_camera")
-        return self._slam.fuse(frame.color[None], frame.depth[None], pose[None])[0]
+        return self._slam.fuse(color, depth, pose[None])[0]
+
+    def _images(self, frame: RGBDFrame) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """Colour (1, h, w, 3) and depth (1, h, w) at the size in force."""
+        self.intrinsics.check_image(frame.depth, "frame")
+        if self._slam.intrinsics == self.intrinsics:
+            return frame.color[None], frame.depth[None]
+        size = self.image_size
+        return reduce_color(frame.color, size)[None], reduce_depth(frame.depth, size)[None]
 
     def predict(self, poses: ArrayLike, scale: float = 1.0) -> Views:
         """Render the map from ``poses`` (N, 4, 4) T_world_camera at ``scale`` times the size.

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.ferns import Candidate
 from ms_slam_env.slam.surfel.tracking import Alignment
@@ -72,6 +73,10 @@ class Relocalisation(ABC):
     @abstractmethod
     def move(self, env: int, time: Int32, poses: Float64) -> None:
         """Follow a map that was bent: frames ``time`` (N,) were taken at ``poses`` (N, 4, 4)."""
+
+    @abstractmethod
+    def adapt(self, intrinsics: Intrinsics, depth_cutoff_m: float) -> None:
+        """Expect frames of another size, and a map of readings up to another distance."""
 
     @abstractmethod
     def clear(self, env: int) -> None:

@@ -182,6 +182,12 @@ class FernRelocalisation(Relocalisation):
         moved[known] = poses[index[known]]
         database.move(moved)
 
+    def adapt(self, intrinsics: Intrinsics, depth_cutoff_m: float) -> None:
+        """Keyframes are compared as small images of one size, so that those at hand stay."""
+        self._cutoff_m = depth_cutoff_m
+        for database in self.databases:
+            database.expect_size(intrinsics)
+
     def clear(self, env: int) -> None:
         """Forget the keyframes of one env."""
         self.databases[env].clear()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.ferns import Candidate
 from ms_slam_env.slam.surfel.relocalisation.base import (
@@ -38,6 +39,9 @@ class LocalSearch(Relocalisation):
 
     def move(self, env: int, time: Int32, poses: Float64) -> None:
         """Nothing to move."""
+
+    def adapt(self, intrinsics: Intrinsics, depth_cutoff_m: float) -> None:
+        """It asks for neither."""
 
     def clear(self, env: int) -> None:
         """Nothing to forget."""

@@ -1,0 +1,99 @@
+"""What of a surfel SLAM depends on its configuration and the size of its frames, but not the map.
+
+A running SLAM may change to another front end: it goes on with the same surfels, poses and
+keyframes.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.errors import InputError
+from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.map_passes import MapPasses
+from ms_slam_env.slam.surfel.photometry import ExposureCorrection
+from ms_slam_env.slam.surfel.preprocess import Preprocessor
+from ms_slam_env.slam.surfel.seeds import NUM_SEEDS
+from ms_slam_env.slam.surfel.surfel_map import SurfelMap
+from ms_slam_env.slam.surfel.tracking import Tracker, model_stride
+
+FIXED = ("max_surfels", "relocalisation", "loop_closure", "loops")
+"""Fields of ``SurfelConfig`` that a running SLAM keeps: they shape what it has stored."""
+
+_KEPT = 8  # front ends: each has the buffers of its images
+
+
+@dataclass(frozen=True)
+class FrontEnd:
+    """Buffers and launches for frames of one size under one configuration.
+
+    Attributes:
+        intrinsics: of the frames.
+        config: in force.
+        preprocess: of the frames.
+        tracker: of the frames against the map's views.
+        correct_exposure: of the frames before they are fused.
+        passes: over the map.
+    """
+
+    intrinsics: Intrinsics
+    config: SurfelConfig
+    preprocess: Preprocessor
+    tracker: Tracker
+    correct_exposure: ExposureCorrection
+    passes: MapPasses
+
+
+class FrontEnds:
+    """Front ends of one map, made when they are first asked for and kept for the next time."""
+
+    def __init__(self, surfel_map: SurfelMap) -> None:
+        """For the SLAM with this map."""
+        self._map = surfel_map
+        self._made: OrderedDict[tuple[Intrinsics, SurfelConfig], FrontEnd] = OrderedDict()
+
+    def get(self, intrinsics: Intrinsics, config: SurfelConfig) -> FrontEnd:
+        """The front end for frames of ``intrinsics`` under ``config``."""
+        key = (intrinsics, config)
+        if key not in self._made:
+            self._made[key] = self._make(intrinsics, config)
+        self._made.move_to_end(key)
+        if len(self._made) > _KEPT:
+            self._made.popitem(last=False)
+        return self._made[key]
+
+    def _make(self, intrinsics: Intrinsics, config: SurfelConfig) -> FrontEnd:
+        batch, device = self._map.batch, self._map.device
+        stride = model_stride(intrinsics, config)
+        is_first = not self._made  # the map was made with these passes
+        return FrontEnd(
+            intrinsics=intrinsics,
+            config=config,
+            preprocess=Preprocessor(batch, intrinsics, config, device),
+            tracker=Tracker(batch, NUM_SEEDS, intrinsics, config, device, stride),
+            correct_exposure=ExposureCorrection(batch, intrinsics, device),
+            passes=self._map.passes
+            if is_first
+            else self._map.make_passes(intrinsics, config, stride),
+        )
+
+
+def check_change(before: SurfelConfig, after: SurfelConfig, is_resized: bool) -> None:
+    """Refuse a change of what a running SLAM must keep.
+
+    Raises:
+        InputError: naming it.
+    """
+    for name in FIXED:
+        old, new = getattr(before, name), getattr(after, name)
+        if old != new:
+            raise InputError(
+                f"SurfelConfig.{name} = {new!r} differs from the running SLAM's {old!r}: these "
+                f"stay as they are: {', '.join(FIXED)}"
+            )
+    if is_resized and before.loop_closure != "none":
+        raise InputError(
+            f"a running SLAM with loop_closure = {before.loop_closure!r} keeps its image size"
+        )
