@@ -12,6 +12,7 @@ COMMANDS = {
     "divergence": "measure how hard recorded sequences are, from frame to frame",
     "evaluate": "compare an estimated trajectory with the truth (TUM files)",
     "generate": "render an RGB-D sequence with true poses into a folder",
+    "report": "turn a folder of results into one HTML page",
     "run": "run a SLAM backend over a recorded RGB-D sequence",
     "train": "train an agent with one of the installed training scripts",
 }

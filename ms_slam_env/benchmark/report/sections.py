@@ -1,0 +1,57 @@
+"""A result becomes a section: figures of its kind, the tables of its folder, pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ms_slam_env.benchmark.report.blocks import Block, Picture, Pictures, Section, Table
+from ms_slam_env.benchmark.report.discovery import PICTURES, Result
+from ms_slam_env.benchmark.report.kinds import kind_of
+from ms_slam_env.benchmark.report.kinds.generic import Generic, facts, row_tables, settings
+from ms_slam_env.benchmark.report.markdown import blocks_of
+
+_MAX_PICTURE_BYTES = 4_000_000
+_FIELDS = ("command", "time", "commit", "python", "versions", "platform", "cpu", "gpu")
+
+
+def section_of(result: Result) -> Section:
+    """The section of a result.
+
+    Raises:
+        OSError: a file of the folder cannot be read.
+    """
+    kind = kind_of(result.content)
+    written = [b for path in result.texts for b in blocks_of(path.read_text(encoding="utf-8"))]
+    own = kind.tables(result)
+    has_table = any(isinstance(block, Table) for block in (*written, *own))
+    values = facts(result.content)
+    blocks: list[Block] = [*kind.figures(result), *own, *written]
+    if values is not None:
+        blocks.append(values)
+    blocks += row_tables(result.content, folded=has_table)
+    given = settings(result.content)
+    if given is not None:
+        blocks.append(given)
+    drawn = tuple(
+        Picture(path.name, PICTURES[path.suffix.lower()], path.read_bytes())
+        for path in result.pictures
+        if path.stat().st_size <= _MAX_PICTURE_BYTES
+    )
+    if drawn:
+        blocks.append(Pictures(drawn, folded=not isinstance(kind, Generic)))
+    return Section(
+        result.title, kind.name, kind.about, tuple(blocks), provenance_lines(result.provenance)
+    )
+
+
+def provenance_lines(provenance: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
+    """Label and text of what made a result."""
+    lines = []
+    for key in (*_FIELDS, *(key for key in provenance if key not in _FIELDS)):
+        value = provenance.get(key)
+        if isinstance(value, Mapping):
+            value = ", ".join(f"{name} {version}" for name, version in value.items())
+        if value not in (None, ""):
+            lines.append((key.replace("_", " "), str(value)))
+    return tuple(lines)

@@ -1,0 +1,36 @@
+"""``ms-slam report``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from ms_slam_env.benchmark.command_line import parse
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Turn a folder of results into one HTML page with interactive figures and sortable tables.
+
+    Takes what benchmark, compare, divergence, evaluate, explore, run, usme and the benchmarks of
+    this package write; a folder of such folders gives one page with a table of contents. The page
+    needs no network and no other file.
+    """
+
+    folder: tyro.conf.Positional[Path]
+    """Folder of results."""
+    out: Path | None = None
+    """The page; by default report.html in the folder."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Write the page and print where it is."""
+    args = parse(Arguments, arguments, "ms-slam report")
+    from ms_slam_env.benchmark.report import write_report
+
+    path = write_report(args.folder, args.out)
+    print(f"{path} ({path.stat().st_size / 1e6:.1f} MB)")
+    return 0
