@@ -33,6 +33,7 @@ TRAJECTORY, UNFINISHED, MAP, METRICS = (
 )
 FRAMES = "frames.csv"
 CORRECTED = "trajectory.corrected.txt"
+TRUTH = "groundtruth.txt"
 MAX_DIFFERENCE_S = 0.02
 
 
@@ -64,10 +65,10 @@ def run_sequence(
     SLAM starts at the true pose of the first frame where that is known, else at the identity.
     While it runs, the trajectory so far stands in ``trajectory.incomplete.txt``; at the end it is
     renamed to ``trajectory.txt``, beside ``map.ply`` and ``metrics.json``. Where the backend closes
-    loops, ``trajectory.corrected.txt`` holds the poses as the finished map has them; what every
-    frame cost stands in ``frames.csv``. A run that
-    fails or is interrupted leaves the unfinished file and a ``metrics.json`` that says so, and says
-    how the frames were ``fed`` to the backend.
+    loops, ``trajectory.corrected.txt`` holds the poses as the finished map has them; where the true
+    poses are known, ``groundtruth.txt`` holds those; what every frame cost stands in
+    ``frames.csv``. A run that fails or is interrupted leaves the unfinished file and a
+    ``metrics.json`` that says so, and says how the frames were ``fed`` to the backend.
 
     Returns:
         the content of ``metrics.json``.
@@ -79,7 +80,7 @@ def run_sequence(
     system = slam.make(backend, recording.intrinsics, **params)
     system.reset(_start(recording))
     out.mkdir(parents=True, exist_ok=True)
-    for old in (TRAJECTORY, CORRECTED, MAP, METRICS, FRAMES):
+    for old in (TRAJECTORY, CORRECTED, TRUTH, MAP, METRICS, FRAMES):
         (out / old).unlink(missing_ok=True)
     track = Track(costs)
     result: dict[str, Any] = {"complete": False}
@@ -107,6 +108,8 @@ def run_sequence(
                 for name in ("ate_m", "rpe_m")
                 if name in corrections
             )
+        if recording.truth is not None and recording.truth_times is not None:
+            write_trajectory(out / TRUTH, recording.truth_times, recording.truth)
         os.replace(out / UNFINISHED, out / TRAJECTORY)
         result["complete"] = True
     except BaseException as error:

@@ -51,6 +51,7 @@ def test_writes_trajectory_map_and_metrics(sequence, tmp_path, capsys):
     assert main(["run", str(sequence), "--out", str(out)]) == 0
     assert sorted(path.name for path in out.iterdir()) == [
         "frames.csv",
+        "groundtruth.txt",
         "map.ply",
         "metrics.json",
         "trajectory.txt",
