@@ -1,0 +1,182 @@
+"""A threshold of divergence that is steered so that a budget is kept: section V-A of the paper."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from ms_slam_env.camera import Intrinsics, RGBDFrame
+from ms_slam_env.config import check_range
+from ms_slam_env.errors import InputError
+from ms_slam_env.slam.frame_management.base import FrameFilter
+from ms_slam_env.slam.frame_management.change import Change, ChangeConfig
+from ms_slam_env.slam.frame_management.config import DroppingConfig
+from ms_slam_env.slam.frame_management.controller import ThresholdController
+
+
+@dataclass(frozen=True)
+class BudgetConfig(DroppingConfig):
+    """Frames are dropped below a threshold of divergence that keeps a budget.
+
+    "The threshold can be dynamic and could be a function of the available resources such as battery
+    or the processing resources" (Saeedi et al., ICRA 2017, section V-A). Quiet stretches save up
+    for violent ones.
+
+    Attributes:
+        share: of the frames that may be processed, where there is no ``budget_per_s``.
+        budget_per_s: what may be spent in a second of the frames' time stamps, in the unit of the
+            costs: joules, processor seconds, frames.
+        cost_per_frame: of processing a frame.
+        cost_per_look: of judging a frame, processed or not.
+        measured: costs are processor seconds as measured instead; no two runs need then be alike.
+        gain: how fast the threshold follows: it changes by this share for each processed frame
+            too many or too few. Slower lets quiet stretches pay for violent ones, faster keeps the
+            budget over shorter times.
+        threshold: to begin with, nats.
+        lowest_threshold: a frame that changes less is dropped though it could be afforded.
+        highest_threshold: a frame that changes more is processed though it cannot be afforded.
+        change: how it is measured.
+
+    Raises:
+        InputError: a value out of range, a share that ``max_skip`` does not permit, or a cost
+            where only a share is given.
+    """
+
+    name: str = field(default="budget", init=False)
+    share: float = 0.5
+    budget_per_s: float | None = None
+    cost_per_frame: float = 1.0
+    cost_per_look: float = 0.0
+    measured: bool = False
+    gain: float = 0.05
+    threshold: float = 0.01
+    lowest_threshold: float = 1e-4
+    highest_threshold: float = 10.0
+    change: ChangeConfig = field(default_factory=ChangeConfig)
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range and those that contradict each other."""
+        super().__post_init__()
+        check_range(self, "share", 1e-4, 1)
+        check_range(self, "cost_per_frame", 1e-12, 1e12)
+        check_range(self, "cost_per_look", 0, 1e12)
+        check_range(self, "gain", 1e-6, 10)
+        check_range(self, "lowest_threshold", 1e-9, 1e6)
+        check_range(self, "threshold", self.lowest_threshold, 1e6)
+        check_range(self, "highest_threshold", self.threshold, 1e6)
+        if not isinstance(self.measured, bool):
+            raise InputError(f"BudgetConfig.measured = {self.measured!r} must be true or false")
+        if self.budget_per_s is not None:
+            check_range(self, "budget_per_s", 1e-12, 1e12)
+        elif self.measured or self.cost_per_frame != 1 or self.cost_per_look != 0:
+            raise InputError(
+                "BudgetConfig: costs are of use with budget_per_s only, not with share"
+            )
+        elif self.share * (self.max_skip + 1) < 1:
+            raise InputError(
+                f"BudgetConfig.share = {self.share:g} cannot be kept: max_skip = {self.max_skip} "
+                f"has 1 of {self.max_skip + 1} frames processed"
+            )
+
+    @property
+    def uses_clock(self) -> bool:
+        """Whether decisions depend on measured time."""
+        return self.measured
+
+    def make_filter(self, intrinsics: Intrinsics) -> FrameFilter:
+        """The filter for frames of ``intrinsics``."""
+        return BudgetFilter(self, Change(self.change, intrinsics))
+
+
+class BudgetFilter(FrameFilter):
+    """Admits a frame that differs enough from the last processed one for what can be afforded."""
+
+    def __init__(self, config: BudgetConfig, change: Change) -> None:
+        self._config = config
+        self._change = change
+        self._controller = ThresholdController(
+            config.threshold, config.gain, config.lowest_threshold, config.highest_threshold
+        )
+        self.reset()
+
+    @property
+    def threshold(self) -> float:
+        """What the change of the next frame must reach, nats."""
+        return self._controller.threshold
+
+    def reset(self) -> None:
+        """Forget every frame, owe nothing."""
+        self._change.reset()
+        self._controller.reset()
+        self._time: float | None = None
+        self._processed = False  # the last frame
+        self._allowed = 0.0  # for the last frame
+        self._spent_s, self._count = 0.0, 0  # on processed frames, as measured
+
+    def admits(self, frame: RGBDFrame, dropped: int, forced: bool = False) -> bool:
+        """Whether its change reaches the threshold of now.
+
+        Raises:
+            InputError: a budget a second, and a time stamp that is not later than the last.
+        """
+        config = self._config
+        self._allowed = self._allowance(frame.timestamp)
+        admitted = self._change.measure(frame) >= self.threshold
+        self._processed = admitted or forced
+        if self._processed:
+            self._change.keep()
+        if not config.measured:
+            spent = config.cost_per_look + config.cost_per_frame * self._processed
+            self._book(spent, config.cost_per_frame)
+        return admitted
+
+    def charge(self, seconds: float) -> None:
+        """Book the processor time of the last frame where costs are measured."""
+        if not self._config.measured:
+            return
+        if self._processed:
+            self._spent_s += seconds
+            self._count += 1
+        if self._count:
+            self._book(seconds, self._spent_s / self._count)
+
+    def _allowance(self, timestamp: float) -> float:
+        """What may be spent since the last frame, in the unit of the costs."""
+        config = self._config
+        if config.budget_per_s is None:
+            return config.share * config.cost_per_frame
+        before, self._time = self._time, timestamp
+        if before is None:
+            return 0.0
+        if not timestamp > before:
+            raise InputError(
+                f"a budget a second needs time stamps that increase; {timestamp:g} s follows "
+                f"{before:g} s"
+            )
+        return config.budget_per_s * (timestamp - before)
+
+    def _book(self, spent: float, unit: float) -> None:
+        """Book costs, ``unit`` being that of a processed frame."""
+        self._controller.update(spent / unit, self._allowed / unit)
+
+    def get_state(self) -> dict[str, Any]:
+        """The last processed frame's histograms, and the accounts."""
+        return {
+            "change": self._change.get_state(),
+            "debt": self._controller.debt,
+            "time": self._time,
+            "processed": self._processed,
+            "allowed": self._allowed,
+            "spent_s": self._spent_s,
+            "count": self._count,
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on with the accounts of a state."""
+        self._change.set_state(state["change"])
+        self._controller.debt = state["debt"]
+        self._time = state["time"]
+        self._processed = state["processed"]
+        self._allowed = state["allowed"]
+        self._spent_s = state["spent_s"]
+        self._count = state["count"]

@@ -1,0 +1,204 @@
+"""A SLAM backend that is shown only some of the frames."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ms_slam_env.camera import RGBDFrame
+from ms_slam_env.geometry import check_pose, invert
+from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult, Views
+from ms_slam_env.slam.frame_management.base import FrameFilter
+from ms_slam_env.slam.frame_management.prediction import Prediction
+
+
+class ManagedSlam(SlamBackend):
+    """A backend behind a filter: active frame management (Saeedi et al., ICRA 2017, section V-A).
+
+    A dropped frame is not shown to the backend; its result has ``processed`` False and a predicted
+    pose, and repeats of the last processed frame's what a prediction cannot know. Every frame is
+    processed until the backend has started and while its tracking is lost.
+
+    Args:
+        backend: any; whoever holds it as well must not feed it frames.
+        frame_filter: says which frames are worth processing.
+        max_skip: most frames dropped in a row.
+        pose: of a dropped frame without a known or guessed pose, ``constant-velocity`` or ``last``.
+    """
+
+    def __init__(
+        self,
+        backend: SlamBackend,
+        frame_filter: FrameFilter,
+        max_skip: int = 10,
+        pose: str = "constant-velocity",
+    ) -> None:
+        self.backend = backend
+        self.intrinsics = backend.intrinsics
+        self._filter = frame_filter
+        self._max_skip = max_skip
+        self._prediction = Prediction(pose == "constant-velocity")
+        self._forget()
+
+    def _forget(self) -> None:
+        """Be as before the first frame."""
+        self._filter.reset()
+        self._prediction.reset()
+        self._frames = 0  # since reset
+        self._last: TrackResult | None = None  # of a processed frame
+        self._processed: list[int] = []  # the frames that the backend has counted
+        self._offsets: dict[int, Float64] = {}  # of dropped frames from the processed one before
+
+    def reset(self, T_world_camera: ArrayLike | None = None) -> None:
+        """Forget everything; the next frame is taken at ``T_world_camera`` (identity if None)."""
+        self.backend.reset(T_world_camera)
+        self._forget()
+
+    def track(self, frame: RGBDFrame, T_world_camera_guess: ArrayLike | None = None) -> TrackResult:
+        """Estimate the pose of ``frame`` and fuse it into the map, or drop it. See ``SlamBackend``.
+
+        Raises:
+            InputError: the frame's size is not that of the intrinsics, or the guess is no pose.
+        """
+        self.intrinsics.check_image(frame.depth, "frame")
+        if T_world_camera_guess is not None:
+            check_pose(T_world_camera_guess, "T_world_camera_guess")
+        begin = time.process_time()
+        if self._is_worth(frame):
+            result = self._note(self.backend.track(frame, T_world_camera_guess))
+        else:
+            result = self._drop(T_world_camera_guess)
+        self._filter.charge(time.process_time() - begin)
+        return result
+
+    def fuse(self, frame: RGBDFrame, T_world_camera: ArrayLike) -> TrackResult:
+        """Fuse ``frame`` into the map at a known pose (4, 4), or drop it; nothing is tracked.
+
+        Raises:
+            InputError: the frame's size is not that of the intrinsics, or the pose is none.
+        """
+        self.intrinsics.check_image(frame.depth, "frame")
+        check_pose(T_world_camera, "T_world_camera")
+        begin = time.process_time()
+        if self._is_worth(frame):
+            result = self._note(self.backend.fuse(frame, T_world_camera))
+        else:
+            result = self._drop(T_world_camera)
+        self._filter.charge(time.process_time() - begin)
+        return result
+
+    @property
+    def _dropped(self) -> int:
+        """Frames dropped since the last processed one."""
+        return self._frames - 1 - self._processed[-1] if self._processed else 0
+
+    def _is_worth(self, frame: RGBDFrame) -> bool:
+        is_lost = self._last is None or not self._last.tracking_ok
+        forced = is_lost or self._dropped >= self._max_skip
+        admitted = self._filter.admits(frame, self._dropped, forced)
+        return admitted or forced
+
+    def _note(self, result: TrackResult) -> TrackResult:
+        """Count a frame that the backend has processed."""
+        before, dropped = self._last, self._dropped
+        self._processed.append(self._frames)
+        self._frames += 1
+        self._last = result
+        continues = before is not None and before.tracking_ok and result.tracking_ok
+        moved = continues and not (result.relocalised or result.loop_closed)
+        self._prediction.observe(result.T_world_camera, dropped + 1, moved)
+        return result
+
+    def _drop(self, known_pose: ArrayLike | None) -> TrackResult:
+        """Say what can be said of a frame that is not processed."""
+        assert self._last is not None  # the first frame is processed
+        pose = self._prediction.pose(self._dropped + 1)
+        if known_pose is not None:
+            pose = np.array(known_pose, dtype=np.float64)
+        self._offsets[self._frames] = invert(self._last.T_world_camera) @ pose
+        self._frames += 1
+        return replace(
+            self._last,
+            T_world_camera=pose,
+            relocalised=False,
+            covariance=None,
+            loop_closed=False,
+            processed=False,
+        )
+
+    def predict(self, poses: ArrayLike, scale: float = 1.0) -> Views:
+        """Render the backend's map; see ``SlamBackend``."""
+        return self.backend.predict(poses, scale)
+
+    def surface_points(self) -> Float64:
+        """Points (M, 3) of the backend's surface in the world frame, metres."""
+        return self.backend.surface_points()
+
+    def surface_colors(self) -> NDArray[np.uint8]:
+        """Colours (M, 3) RGB of ``surface_points``."""
+        return self.backend.surface_colors()
+
+    def map_points(self) -> Float64:
+        """Every point (M, 3) of the backend's map, metres."""
+        return self.backend.map_points()
+
+    def map_attributes(self) -> dict[str, NDArray[Any]]:
+        """What the backend knows of each of ``surface_points``."""
+        return self.backend.map_attributes()
+
+    def corrected_trajectory(self) -> tuple[NDArray[np.int32], Float64]:
+        """Frames (N,), counted since ``reset`` with the dropped ones, and their poses (N, 4, 4).
+
+        A dropped frame moves with the processed one before it; where the backend corrects that one,
+        the dropped one is among the frames too.
+        """
+        own, poses = self.backend.corrected_trajectory()
+        corrected = {self._processed[k]: pose for k, pose in zip(own, poses, strict=True)}
+        for frame, offset in self._offsets.items():
+            anchor = self._anchor(frame)
+            if anchor in corrected:
+                corrected[frame] = corrected[anchor] @ offset
+        frames = sorted(corrected)
+        stack = [corrected[frame] for frame in frames]
+        return np.array(frames, dtype=np.int32), np.stack(stack) if stack else np.zeros((0, 4, 4))
+
+    def _anchor(self, frame: int) -> int:
+        """The processed frame before a dropped one."""
+        return self._processed[int(np.searchsorted(self._processed, frame)) - 1]
+
+    def get_state(self) -> dict[str, Any]:
+        """Everything needed to go on bit-exactly, as NumPy arrays and plain values."""
+        last = self._last
+        return {
+            "backend": self.backend.get_state(),
+            "filter": self._filter.get_state(),
+            "prediction": self._prediction.get_state(),
+            "frames": self._frames,
+            "last": None if last is None else _plain(last),
+            "processed": np.array(self._processed, dtype=np.int64),
+            "dropped": np.array(list(self._offsets), dtype=np.int64),
+            "offsets": np.array(list(self._offsets.values())).reshape(-1, 4, 4),
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state of the same backend behind the same filter."""
+        self.backend.set_state(state["backend"])
+        self._filter.set_state(state["filter"])
+        self._prediction.set_state(state["prediction"])
+        self._frames = state["frames"]
+        self._last = None if state["last"] is None else TrackResult(**_copied(state["last"]))
+        self._processed = state["processed"].tolist()
+        self._offsets = dict(zip(state["dropped"].tolist(), state["offsets"].copy(), strict=True))
+
+
+def _plain(result: TrackResult) -> dict[str, Any]:
+    """The fields of a result, arrays copied."""
+    return _copied(vars(result))
+
+
+def _copied(values: dict[str, Any]) -> dict[str, Any]:
+    return {k: v.copy() if isinstance(v, np.ndarray) else v for k, v in values.items()}

@@ -1,0 +1,51 @@
+"""Where the camera is on a frame that SLAM does not process."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ms_slam_env.geometry import invert, se3_exp, se3_log
+from ms_slam_env.slam.base import Float64
+
+
+class Prediction:
+    """Carries the last processed pose on.
+
+    Args:
+        is_moving: on with the velocity between the last two processed frames; else at rest.
+    """
+
+    def __init__(self, is_moving: bool) -> None:
+        self._is_moving = is_moving
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget every pose."""
+        self._pose: Float64 = np.eye(4)
+        self._twist: Float64 = np.zeros(6)  # a frame
+
+    def observe(self, T_world_camera: Float64, frames: int, continues: bool) -> None:
+        """Note the pose of a processed frame, ``frames`` after the one before.
+
+        ``continues`` tells whether the motion between them was the camera's: not at the start, and
+        not across lost tracking or a closed loop.
+        """
+        if self._is_moving and continues:
+            self._twist = se3_log(invert(self._pose) @ T_world_camera) / frames
+        else:
+            self._twist = np.zeros(6)
+        self._pose = T_world_camera.copy()
+
+    def pose(self, frames: int) -> Float64:
+        """T_world_camera (4, 4) ``frames`` after the last processed frame."""
+        return self._pose @ se3_exp(frames * self._twist) if self._is_moving else self._pose.copy()
+
+    def get_state(self) -> dict[str, Any]:
+        """Pose and velocity."""
+        return {"pose": self._pose.copy(), "twist": self._twist.copy()}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state."""
+        self._pose, self._twist = state["pose"].copy(), state["twist"].copy()
