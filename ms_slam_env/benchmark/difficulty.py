@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env import scenes
 from ms_slam_env.benchmark import difficulty_report as report
 from ms_slam_env.benchmark.command_line import exit_code, parse, report_failures
 from ms_slam_env.benchmark.image_motion import MOTIONS, contrast, frame_motion
@@ -146,7 +145,7 @@ def specs_of(args: Arguments) -> list[DifficultySpec]:
     """
     motions = _concatenated(str(args.data), args.motions)[1]
     scale = min(
-        place_trajectory(scenes.make(scene, 0), motions, seed).scale
+        place_trajectory(get_scene(scene, 0), motions, seed).scale
         for scene in args.scenes
         for seed in range(args.placements)
     )

@@ -8,8 +8,27 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import tyro
+
 from ms_slam_env.benchmark.command_line import parse
+from ms_slam_env.errors import InputError
 from ms_slam_env.sequences.handheld_path import HandheldPath
+
+
+@dataclass(frozen=True)
+class EpisodeOptions:
+    """Episode of a planner; only with --planner."""
+
+    steps: int = 100
+    """Length of the episode."""
+    step_m: float = 0.12
+    """Translation of a motion."""
+    step_deg: float = 12.0
+    """Rotation of a motion."""
+    env_id: str = "MSActiveSLAM-FreeCamera-v0"
+    """Environment that the planner moves in."""
+    options: tuple[str, ...] = ()
+    """Options of the environment, as in targets.M_I=0.05."""
 
 
 @dataclass(frozen=True)
@@ -25,11 +44,16 @@ class Arguments:
     seed: int = 0
     """Of the scene, the path, the noise and the perturbations."""
     path: HandheldPath = field(default_factory=HandheldPath)
-    """Seeded hand-held path; not used with --trajectory."""
+    """Seeded hand-held path; not used with --trajectory or --planner."""
     trajectory: Path | None = None
     """Camera motion to place into the scene instead (TUM file)."""
     scale: float | None = None
     """Factor on that motion; by default the largest up to 1 that fits."""
+    planner: str | None = None
+    """Render the motion of this planner's episode instead: NAME or module:Class, options appended
+    as in greedy,rho_I=0.3."""
+    episode: tyro.conf.OmitArgPrefixes[EpisodeOptions] = field(default_factory=EpisodeOptions)
+    """Episode of the planner."""
     image_size: str = "320x240"
     """Size of the images."""
     noise: str = "kinect"
@@ -45,6 +69,10 @@ class Arguments:
 def main(arguments: Sequence[str]) -> int:
     """Render and write."""
     args = parse(Arguments, arguments, "ms-slam generate")
+    if args.planner is not None and args.trajectory is not None:
+        raise InputError("--planner and --trajectory exclude each other")
+    if args.planner is None and args.episode != EpisodeOptions():
+        raise InputError("the options of an episode need --planner")
     from ms_slam_env import __version__, scenes
     from ms_slam_env.benchmark.options import parse_named
     from ms_slam_env.camera import xtion
@@ -85,12 +113,35 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _motion(args: Arguments, recorded: Any, scene: Any) -> tuple[Any, Any, dict[str, Any]]:
-    """Times (N,), poses (N, 4, 4), and what to tell of a placed trajectory."""
-    from ms_slam_env.sequences import place_trajectory
-
+    """Times (N,), poses (N, 4, 4), and what to tell of a placed trajectory or an episode."""
+    if args.planner is not None:
+        return _planned(args, args.planner)
     if recorded is None:
         return args.path.timestamps, args.path.poses(scene, args.seed), {}
+    from ms_slam_env.sequences import place_trajectory
+
     times, poses = recorded
     placement = place_trajectory(scene, poses, args.seed, args.scale)
     print(f"{args.trajectory}: placed at scale {placement.scale:g}", file=sys.stderr)
     return times, placement.poses, {"placed_at_scale": placement.scale}
+
+
+def _planned(args: Arguments, planner: str) -> tuple[Any, Any, dict[str, Any]]:
+    """The same of a planner's episode."""
+    from ms_slam_env.benchmark.episode import EpisodeSpec
+    from ms_slam_env.benchmark.options import parse_options
+    from ms_slam_env.benchmark.planned_motion import planned_motion
+
+    motion = planned_motion(
+        EpisodeSpec(
+            planner,
+            args.scene,
+            args.seed,
+            args.episode.env_id,
+            args.episode.steps,
+            args.episode.step_m,
+            args.episode.step_deg,
+            parse_options(args.episode.options),
+        )
+    )
+    return motion.times_s, motion.poses, motion.about()

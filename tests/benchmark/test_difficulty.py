@@ -106,18 +106,19 @@ def data(tmp_path):
     return tmp_path / "data"
 
 
-def test_the_command_makes_tables_and_figures(data, tmp_path, capsys, monkeypatch):
+def test_the_command_makes_tables_and_figures(data, box_scene, tmp_path, capsys, monkeypatch):
     def here(specs, run, *_):
         return [{"spec": asdict(spec), "result": run(spec), "error": None} for spec in specs]
 
     monkeypatch.setattr(difficulty, "run_all", here)
+    monkeypatch.setattr(difficulty, "get_scene", lambda *_: box_scene)
     out = tmp_path / "out"
-    options = ["--data", str(data), "--scenes", "table", "--placements", "1"]
+    options = ["--data", str(data), "--scenes", "box", "--placements", "1"]
     options += ["--image-size", "80x60", "--workers", "1", "--out", str(out)]
     assert main(options) == 0
     assert "Spearman" in capsys.readouterr().out
     found = json.loads((out / "difficulty.json").read_text())
-    assert {row["scene"] for row in found["statistics"]} == {RECORDING, "table"}
+    assert {row["scene"] for row in found["statistics"]} == {RECORDING, "box"}
     assert [r["divergence"] for r in found["statistics"] if r["scene"] == RECORDING] == [
         "depth"
     ] * 2
@@ -125,7 +126,7 @@ def test_the_command_makes_tables_and_figures(data, tmp_path, capsys, monkeypatc
     still = [r["max"] for r in found["statistics"] if r["motion"] == "lr_kt0"]
     assert still == [0.0] * 4
     assert len(found["order"]) == 4
-    assert (out / "table_none_paper.png").stat().st_size > 1000
+    assert (out / "box_none_paper.png").stat().st_size > 1000
     assert (out / "recorded_depth_none_paper.png").stat().st_size > 1000
 
 

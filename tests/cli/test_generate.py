@@ -8,8 +8,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
+from ms_slam_baselines import GreedyDivergence
 
 from ms_slam_env.cli import main
 from ms_slam_env.sequences import read_trajectory, write_trajectory
@@ -52,6 +54,35 @@ def test_a_given_trajectory_is_placed(tmp_path, capsys) -> None:
     np.testing.assert_allclose(np.linalg.norm(np.diff(placed[:, :3, 3], axis=0), axis=1), 0.02)
     assert (out / "depth_true/3.000000.png").is_file()
     assert len(open_recording(out)) == 5
+
+
+def test_the_motion_of_a_planner_is_rendered(tmp_path) -> None:
+    out = tmp_path / "sequence"
+    given = ["--planner", "greedy", "--steps", "4", "--step-m", "0.05", "--step-deg", "5"]
+    given += ["--options", "image_size=80x60", "--perturbations", "frame-skipping,keep_every=2"]
+    command = ["generate", *SMALL, *given, "--out", str(out)]
+    assert main(command) == 0
+    env = gymnasium.make(
+        "MSActiveSLAM-FreeCamera-v0",
+        **{"scene": "table", "scene_seed": 4, "image_size": "80x60"},
+        **{"step_m": 0.05, "step_rad": np.radians(5), "observation": GreedyDivergence.observation},
+    )
+    observation, info = env.reset(seed=4)
+    planner = GreedyDivergence(env.unwrapped, seed=4)
+    poses, times = [info["T_world_camera"]], [info["time"]]
+    for _ in range(4):
+        observation, *_, info = env.step(planner.act(observation, info))
+        poses.append(info["T_world_camera"])
+        times.append(info["time"])
+    about = json.loads((out / "sequence.json").read_text())
+    assert (about["planner"], about["episode_steps"]) == ("greedy", 4)
+    assert about["episode_lost_frames"] == 0
+    found_times, found = read_trajectory(out / "groundtruth.txt")
+    index = [int(np.abs(np.array(times) - time).argmin()) for time in found_times]
+    assert index == [0, 2, 4]
+    np.testing.assert_allclose(found_times, np.array(times)[index], atol=1e-6)
+    np.testing.assert_allclose(found, np.stack(poses)[index], atol=1e-6)
+    assert main(command) == 0  # the episode is the same again, and so is the sequence
 
 
 INTERRUPTED = """
@@ -101,6 +132,13 @@ def test_an_interrupted_command_goes_on_to_the_same_files(tmp_path) -> None:
         (["--perturbations", "motion-blur,samples=x"], "MotionBlur.samples = 'x' is outside"),
         (["--path.frames", "1"], "HandheldPath.frames = 1 is outside"),
         (["--trajectory", "none.txt"], "cannot read trajectory none.txt"),
+        (["--planner", "dreamer"], "unknown planner 'dreamer'; valid choices: "),
+        (["--planner", "greedy,depth=3"], "unknown option of planner greedy 'depth'"),
+        (["--planner", "greedy", "--trajectory", "t.txt"], "exclude each other"),
+        (["--steps", "5"], "the options of an episode need --planner"),
+        (["--planner", "greedy", "--steps", "0"], "steps = 0 is outside"),
+        (["--planner", "greedy", "--options", "speed=3"], "speed"),
+        (["--planner", "greedy", "--env-id", "Mars-v0"], "Mars-v0"),
         (["--seed", "-1"], "scene seed -1 must be an integer"),
     ],
 )
