@@ -25,6 +25,7 @@ class SurfelSlam(SlamBackend):
     ) -> None:
         """Start empty at the identity pose."""
         self.intrinsics = intrinsics
+        self.device = device
         self._slam = BatchedSurfelSlam(1, intrinsics, config or SurfelConfig(), device)
 
     @property

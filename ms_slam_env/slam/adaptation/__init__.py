@@ -1,0 +1,52 @@
+"""Run-time adaptation: a running SLAM among configurations (Saeedi et al., ICRA 2017, section V-B).
+
+::
+
+    config = make_config("divergence", configurations=["fast.yaml", "robust.yaml"])
+    backend = config.adapt(slam.make("surfel", intrinsics))   # a SlamBackend again
+    backend.track(frame)
+    backend.level                                             # index of the one in force
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ms_slam_env.config import from_dict
+from ms_slam_env.slam.adaptation.adaptive_slam import AdaptiveSlam
+from ms_slam_env.slam.adaptation.agent import AgentConfig
+from ms_slam_env.slam.adaptation.config import AdaptationConfig, SwitchingConfig
+from ms_slam_env.slam.adaptation.divergence import DivergenceAdaptationConfig
+from ms_slam_env.slam.adaptation.levels import Level, default_configurations
+from ms_slam_env.slam.adaptation.none import NoAdaptationConfig
+
+ADAPTATIONS: Mapping[str, type[AdaptationConfig]] = {
+    "none": NoAdaptationConfig,
+    "divergence": DivergenceAdaptationConfig,
+    "agent": AgentConfig,
+}
+"""Name to configuration."""
+
+
+def make_config(name: str, **options: Any) -> AdaptationConfig:
+    """The configuration ``name`` with its options, nested ones as mappings.
+
+    Raises:
+        InputError: an unknown name or option (the message lists the valid ones), or a bad value.
+    """
+    return from_dict(AdaptationConfig, {"name": name, **options}, "adaptation")  # type: ignore[type-abstract]
+
+
+__all__ = [
+    "ADAPTATIONS",
+    "AdaptationConfig",
+    "AdaptiveSlam",
+    "AgentConfig",
+    "DivergenceAdaptationConfig",
+    "Level",
+    "NoAdaptationConfig",
+    "SwitchingConfig",
+    "default_configurations",
+    "make_config",
+]

@@ -1,0 +1,97 @@
+"""What the configurations of run-time adaptation have in common."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.config import Family, check_range
+from ms_slam_env.errors import InputError
+from ms_slam_env.slam.adaptation.base import Controller
+from ms_slam_env.slam.base import SlamBackend
+from ms_slam_env.slam.configuration import SlamConfiguration
+
+
+@dataclass(frozen=True)
+class AdaptationConfig(Family):
+    """How a running SLAM changes its configuration: Saeedi et al., ICRA 2017, section V-B.
+
+    Made from a mapping: ``from_dict(AdaptationConfig, {"name": "divergence", ...})``.
+    """
+
+    @classmethod
+    def variants(cls) -> Mapping[str, type]:
+        """The configurations by name."""
+        from ms_slam_env.slam.adaptation import ADAPTATIONS
+
+        return ADAPTATIONS
+
+    @abstractmethod
+    def adapt(self, backend: SlamBackend, drops_frames: bool = True) -> SlamBackend:
+        """``backend`` with this adaptation; ``keep_every`` counts only if it ``drops_frames``.
+
+        Raises:
+            InputError: a backend or a configuration that cannot change while SLAM runs.
+        """
+
+
+@dataclass(frozen=True)
+class SwitchingConfig(AdaptationConfig):
+    """Of what switches among configurations.
+
+    Attributes:
+        configurations: from fast to robust, at least two: YAML files of ``SlamConfiguration``,
+            mappings of its fields, or such objects. What one does not name stays as the backend
+            was made. None: three that suit the camera (``default_configurations``).
+        start: index of the first in force; None: the last, the most robust.
+
+    Raises:
+        InputError: a bad configuration, or an index that none has.
+    """
+
+    configurations: Any = None
+    start: int | None = None
+
+    def __post_init__(self) -> None:
+        """Read the configurations."""
+        from ms_slam_env.slam.adaptation.levels import as_configurations
+
+        if self.configurations is not None:
+            object.__setattr__(self, "configurations", as_configurations(self.configurations))
+            if len(self.configurations) < 2:
+                raise InputError("configurations must be at least two, from fast to robust")
+        if self.start is not None:
+            check_range(self, "start", 0, self.num_configurations - 1)
+
+    @property
+    def num_configurations(self) -> int:
+        """K, how many take turns."""
+        return 3 if self.configurations is None else len(self.configurations)
+
+    @property
+    def first(self) -> int:
+        """Index of the first configuration in force."""
+        return self.num_configurations - 1 if self.start is None else self.start
+
+    def resolved(self, intrinsics: Intrinsics) -> tuple[SlamConfiguration, ...]:
+        """The configurations for frames of ``intrinsics``."""
+        from ms_slam_env.slam.adaptation.levels import default_configurations
+
+        if self.configurations is None:
+            return default_configurations(intrinsics)
+        return tuple(self.configurations)
+
+    @abstractmethod
+    def make_controller(self, intrinsics: Intrinsics) -> Controller:
+        """What chooses among them."""
+
+    def adapt(self, backend: SlamBackend, drops_frames: bool = True) -> SlamBackend:
+        """``backend`` that switches; see ``AdaptiveSlam``."""
+        from ms_slam_env.slam.adaptation.adaptive_slam import AdaptiveSlam
+        from ms_slam_env.slam.adaptation.levels import make_levels
+
+        levels = make_levels(self.resolved(backend.intrinsics), backend)
+        return AdaptiveSlam(backend, levels, self.make_controller(backend.intrinsics), drops_frames)

@@ -1,0 +1,150 @@
+"""The configuration follows the observed divergence: section V-B of the paper.
+
+A set of parameters is good up to a maximum information divergence; where more is observed, another
+set is taken up, which costs more and copes with it.
+"""
+
+from __future__ import annotations
+
+import itertools
+from bisect import bisect_right
+from dataclasses import dataclass, field
+from typing import Any
+
+from ms_slam_env.camera import Intrinsics, RGBDFrame
+from ms_slam_env.config import check_choice, check_range
+from ms_slam_env.errors import InputError
+from ms_slam_env.slam.adaptation.base import Controller
+from ms_slam_env.slam.adaptation.config import SwitchingConfig
+from ms_slam_env.slam.frame_management import ChangeConfig
+from ms_slam_env.slam.frame_management.change import Change
+
+
+@dataclass(frozen=True)
+class DivergenceAdaptationConfig(SwitchingConfig):
+    """More divergence between frames, more robust a configuration; with hysteresis.
+
+    Attributes:
+        thresholds: K - 1 rising values; where the change between consecutive frames exceeds the
+            i-th, configuration i is not good enough. Up at once, as far as needed.
+        release_share: of the thresholds, below which the way down is open, (0, 1].
+        dwell_frames: down only after so many frames in a row below.
+        robust_when_lost: the most robust configuration while tracking is lost.
+        per: the change per ``frame`` or, by the time stamps, per ``second``.
+        change: how the change between frames is measured.
+
+    Raises:
+        InputError: another number of thresholds than of configurations less one, thresholds that
+            do not rise, or a value out of range.
+    """
+
+    name: str = field(default="divergence", init=False)
+    thresholds: tuple[float, ...] = (0.01, 0.02)
+    release_share: float = 0.7
+    dwell_frames: int = 10
+    robust_when_lost: bool = True
+    per: str = "frame"
+    change: ChangeConfig = field(default_factory=ChangeConfig)
+
+    def __post_init__(self) -> None:
+        """Refuse what is no ladder."""
+        super().__post_init__()
+        check_range(self, "release_share", 0.001, 1)
+        check_range(self, "dwell_frames", 1, 1_000_000)
+        check_choice(self, "per", ("frame", "second"))
+        if not isinstance(self.robust_when_lost, bool):
+            raise InputError(f"robust_when_lost = {self.robust_when_lost!r} must be true or false")
+        is_list = isinstance(self.thresholds, (tuple, list))
+        numbers = [x for x in self.thresholds if isinstance(x, (int, float))] if is_list else []
+        rising = all(0 < a < b for a, b in itertools.pairwise(numbers))
+        wanted = self.num_configurations - 1
+        if not rising or not len(numbers) == len(self.thresholds) == wanted or numbers[0] <= 0:
+            raise InputError(
+                f"thresholds = {self.thresholds!r} must be {wanted} rising positive numbers, one "
+                f"between any two of the {self.num_configurations} configurations"
+            )
+        object.__setattr__(self, "thresholds", tuple(numbers))  # lists come from YAML
+
+    def make_controller(self, intrinsics: Intrinsics) -> Controller:
+        """The controller for frames of ``intrinsics``."""
+        return DivergenceController(self, intrinsics)
+
+
+class DivergenceController(Controller):
+    """Up at once, down after a while below.
+
+    Attributes:
+        change: between the last two frames, nats or nats per second; 0 before the second frame.
+    """
+
+    def __init__(self, config: DivergenceAdaptationConfig, intrinsics: Intrinsics) -> None:
+        """Look at frames of ``intrinsics``."""
+        self._config = config
+        self._measure = Change(config.change, intrinsics)
+        self._release = [config.release_share * x for x in config.thresholds]
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget every frame."""
+        self._measure.reset()
+        self.change = 0.0
+        self._time_s: float | None = None  # of the last frame
+        self._index = self._config.first
+        self._below = 0  # frames in a row below the way down
+        self._peak = 0.0  # of the change since
+
+    def choose(self, frame: RGBDFrame, is_lost: bool) -> int:
+        """Index by the change from the frame before."""
+        is_first = self._time_s is None
+        self._observe(frame)
+        if is_first:
+            return self._index
+        thresholds = self._config.thresholds
+        needed = bisect_right(thresholds, self.change)
+        if is_lost and self._config.robust_when_lost:
+            needed = len(thresholds)
+        may_fall = self._index > 0 and self.change < self._release[self._index - 1]
+        if needed >= self._index or not may_fall:
+            self._index = max(needed, self._index)
+            self._below, self._peak = 0, 0.0
+            return self._index
+        self._below += 1
+        self._peak = max(self._peak, self.change)
+        if self._below >= self._config.dwell_frames:
+            self._index = bisect_right(self._release, self._peak)
+            self._below, self._peak = 0, 0.0
+        return self._index
+
+    def _observe(self, frame: RGBDFrame) -> None:
+        """Measure the change from the frame before; it is the reference from now on."""
+        nats = self._measure.measure(frame)
+        self._measure.keep()
+        before, self._time_s = self._time_s, frame.timestamp
+        if before is None:
+            return
+        if self._config.per == "second":
+            if not frame.timestamp > before:
+                raise InputError(
+                    f"a change per second needs time stamps that increase, got {before} s, then "
+                    f"{frame.timestamp} s"
+                )
+            nats /= frame.timestamp - before
+        self.change = nats
+
+    def get_state(self) -> dict[str, Any]:
+        """The last frame's histograms, and what is known since the last switch."""
+        return {
+            "measure": self._measure.get_state(),
+            "change": self.change,
+            "time_s": self._time_s,
+            "index": self._index,
+            "below": self._below,
+            "peak": self._peak,
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state."""
+        self._measure.set_state(state["measure"])
+        self.change, self._time_s = state["change"], state["time_s"]
+        self._index, self._below = state["index"], state["below"]
+        self._peak = state["peak"]
