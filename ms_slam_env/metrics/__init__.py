@@ -1,5 +1,12 @@
 """Errors of trajectories and maps; costs of SLAM."""
 
+from ms_slam_env.metrics.absolute import (
+    Alignment,
+    absolute_errors,
+    ate_rmse,
+    ate_statistics,
+    find_alignment,
+)
 from ms_slam_env.metrics.alignment import umeyama
 from ms_slam_env.metrics.cloud import (
     CloudDistance,
@@ -30,33 +37,33 @@ from ms_slam_env.metrics.reconstruction import (
     rer,
     voxel_thin,
 )
+from ms_slam_env.metrics.relative import (
+    pose_pairs,
+    relative_errors,
+    rpe_rmse,
+    rpe_statistics,
+)
 from ms_slam_env.metrics.relocalisation import mean_relocalisation_time, relocalisation_times
 from ms_slam_env.metrics.robustness import (
     TrackingRobustness,
     tracked_segments,
     tracking_robustness,
 )
+from ms_slam_env.metrics.segments import Drift, drifts, equal_pieces
 from ms_slam_env.metrics.sightings import (
     LabelledView,
     SightingRule,
     count_votes,
     distinct_placements,
 )
-from ms_slam_env.metrics.trajectory import (
-    ErrorStatistics,
-    absolute_errors,
-    ate_rmse,
-    ate_statistics,
-    path_length,
-    relative_errors,
-    rpe_rmse,
-    rpe_statistics,
-)
+from ms_slam_env.metrics.trajectory import ErrorStatistics, path_length
 
 __all__ = [
+    "Alignment",
     "CloudDistance",
     "ConsistencyRule",
     "CostMeter",
+    "Drift",
     "EnergyCounter",
     "ErrorStatistics",
     "FrameCost",
@@ -73,8 +80,11 @@ __all__ = [
     "cloud_distance",
     "count_votes",
     "distinct_placements",
+    "drifts",
     "energy_counters",
+    "equal_pieces",
     "f_score",
+    "find_alignment",
     "hausdorff_distance",
     "icp",
     "initialisation",
@@ -87,6 +97,7 @@ __all__ = [
     "noise_ratio",
     "path_length",
     "point_spacing",
+    "pose_pairs",
     "precision",
     "rcm",
     "recall",

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.errors import InputError
+from ms_slam_env.metrics.absolute import absolute_errors
+from ms_slam_env.metrics.relative import relative_errors
 from ms_slam_env.metrics.trajectory import (
     ErrorStatistics,
-    absolute_errors,
     check_lengths,
     check_positions,
     path_length,
-    relative_errors,
     statistics_of,
 )
 

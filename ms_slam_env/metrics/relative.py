@@ -1,0 +1,196 @@
+"""Relative errors of estimated trajectories (RPE): of the motions between pairs of poses.
+
+Sources: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012; Qu, Zhang,
+Yang, Dong, "USME", Navigation Positioning and Timing 2021, equations (3) to (5).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.geometry import invert
+from ms_slam_env.metrics.trajectory import (
+    ErrorStatistics,
+    check_kind,
+    check_lengths,
+    check_poses,
+    check_times,
+    path_distances,
+    rotation_angles,
+    statistics_of,
+)
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+DELTA_UNITS = ("frames", "m", "s")
+PAIRINGS = ("all", "consecutive")
+TOLERANCE = 0.1  # of a delta in metres or seconds, as a share of it
+
+
+def pose_pairs(
+    truth: ArrayLike,
+    delta: float = 1,
+    unit: str = "frames",
+    times: ArrayLike | None = None,
+    pairs: str = "all",
+    tolerance: float = TOLERANCE,
+) -> Int64:
+    """Pairs (K, 2) of poses that are ``delta`` apart, USME equation (3).
+
+    Args:
+        truth: T_world_camera (N, 4, 4); metres are those of the true path.
+        delta: how far apart.
+        unit: of ``delta``: ``frames``, ``m`` along the true path, or ``s``.
+        times: (N,) seconds, increasing; needed for ``s`` only.
+        pairs: ``all``: every pose that has one is paired with the later pose nearest to ``delta``
+            away, if the distance is right to ``tolerance`` times ``delta``. ``consecutive``: each
+            pair begins where the one before ends, at the first pose at least ``delta`` away.
+        tolerance: of ``all`` in metres or seconds. Frames are counted exactly.
+
+    Raises:
+        InputError: bad poses, times or options, or no pair at all.
+    """
+    poses = check_poses(truth, "truth")
+    if unit not in DELTA_UNITS:
+        raise unknown("unit of delta", unit, DELTA_UNITS)
+    if pairs not in PAIRINGS:
+        raise unknown("choice of pairs", pairs, PAIRINGS)
+    if not (np.isfinite(tolerance) and tolerance >= 0):
+        raise InputError(f"tolerance must be finite and >= 0, got {tolerance}")
+    if unit == "frames":
+        _check_frames(delta, len(poses))
+        along, reach = np.arange(len(poses), dtype=np.float64), 0.0
+    else:
+        is_number = isinstance(delta, (int, float, np.number)) and not isinstance(delta, bool)
+        if not (is_number and np.isfinite(delta) and delta > 0):
+            raise InputError(f"delta must be finite and > 0 {unit}, got {delta!r}")
+        along, reach = _distances(poses, unit, times), tolerance * delta
+    found = _all(along, delta, reach) if pairs == "all" else _consecutive(along, delta)
+    if len(found) == 0:
+        raise InputError(
+            f"no two poses are {delta:g} {unit} apart: the trajectory spans {along[-1]:.6g} {unit}"
+        )
+    return found
+
+
+def relative_errors(
+    estimate: ArrayLike,
+    truth: ArrayLike,
+    delta: float = 1,
+    kind: str = "translation",
+    unit: str = "frames",
+    times: ArrayLike | None = None,
+    pairs: str = "all",
+    tolerance: float = TOLERANCE,
+) -> Float64:
+    """Errors (K,) of the motions between poses ``delta`` apart, USME equation (4).
+
+    With Q the true and P the estimated poses and (i, j) a pair,
+    E_ij = (Q_i^-1 Q_j)^-1 (P_i^-1 P_j); the error is the length of its translation, metres, or the
+    angle of its rotation, radians. No alignment enters; an estimate without scale must be scaled
+    first.
+
+    Args:
+        estimate: T_world_camera (N, 4, 4).
+        truth: likewise, corresponding by row.
+        delta: as all that follows, see `pose_pairs`.
+        kind: ``translation`` or ``rotation``.
+        unit: of ``delta``.
+        times: of the poses.
+        pairs: which.
+        tolerance: of ``delta``.
+
+    Raises:
+        InputError: wrong shapes, lengths that differ, NaN, unknown kind, or as `pose_pairs`.
+    """
+    check_kind(kind)
+    poses, true_poses = check_poses(estimate, "estimate"), check_poses(truth, "truth")
+    check_lengths(poses, true_poses)
+    first, second = pose_pairs(true_poses, delta, unit, times, pairs, tolerance).T
+    return motion_errors(poses, true_poses, first, second, kind)
+
+
+def motion_errors(
+    poses: Float64, true_poses: Float64, first: Int64, second: Int64, kind: str
+) -> Float64:
+    """Errors (K,), m or rad, of the motions from poses ``first`` (K,) to ``second`` (K,)."""
+    motion = invert(poses[first]) @ poses[second]
+    true_motion = invert(true_poses[first]) @ true_poses[second]
+    error = invert(true_motion) @ motion
+    if kind == "translation":
+        return np.linalg.norm(error[:, :3, 3], axis=1)
+    return rotation_angles(error[:, :3, :3])
+
+
+def rpe_statistics(
+    estimate: ArrayLike,
+    truth: ArrayLike,
+    delta: float = 1,
+    kind: str = "translation",
+    unit: str = "frames",
+    times: ArrayLike | None = None,
+    pairs: str = "all",
+    tolerance: float = TOLERANCE,
+) -> ErrorStatistics:
+    """Statistics of the relative pose error (m or rad); arguments of `relative_errors`."""
+    return statistics_of(
+        relative_errors(estimate, truth, delta, kind, unit, times, pairs, tolerance)
+    )
+
+
+def rpe_rmse(
+    estimate: ArrayLike,
+    truth: ArrayLike,
+    delta: float = 1,
+    kind: str = "translation",
+    unit: str = "frames",
+    times: ArrayLike | None = None,
+    pairs: str = "all",
+    tolerance: float = TOLERANCE,
+) -> float:
+    """Relative pose error (m or rad), USME equation (5): the root mean square.
+
+    Arguments of `relative_errors`.
+    """
+    return rpe_statistics(estimate, truth, delta, kind, unit, times, pairs, tolerance).rmse
+
+
+def _check_frames(delta: float, count: int) -> None:
+    if isinstance(delta, bool) or not isinstance(delta, (int, np.integer)) or delta < 1:
+        raise InputError(f"delta must be an integer >= 1, got {delta!r}")
+    if count <= delta:
+        raise InputError(f"delta = {delta} needs at least {delta + 1} poses, got {count}")
+
+
+def _distances(poses: Float64, unit: str, times: ArrayLike | None) -> Float64:
+    """Metres or seconds (N,) from the first pose to each."""
+    if unit == "m":
+        return path_distances(poses[:, :3, 3])
+    if times is None:
+        raise InputError("a delta in seconds needs the times of the poses")
+    seconds = check_times(times, len(poses))
+    return seconds - seconds[0]
+
+
+def _all(along: Float64, delta: float, reach: float) -> Int64:
+    first = np.arange(len(along) - 1)
+    goal = along[first] + delta
+    # The nearest later pose is one of the two that enclose the goal.
+    after = np.clip(np.searchsorted(along, goal), first + 1, len(along) - 1)
+    before = np.maximum(after - 1, first + 1)
+    nearer = np.abs(along[before] - goal) <= np.abs(along[after] - goal)
+    second = np.where(nearer, before, after)
+    close = np.abs(along[second] - along[first] - delta) <= reach
+    return np.stack([first[close], second[close]], axis=1)
+
+
+def _consecutive(along: Float64, delta: float) -> Int64:
+    found = []
+    first = 0
+    while (second := int(np.searchsorted(along, along[first] + delta))) < len(along):
+        found.append((first, second))
+        first = second
+    return np.array(found, dtype=np.int64).reshape(-1, 2)
