@@ -7,7 +7,7 @@ from typing import Any
 
 from ms_slam_env.benchmark.report import plots
 from ms_slam_env.benchmark.report.blocks import Figure, Plot
-from ms_slam_env.benchmark.report.flatten import Record, number
+from ms_slam_env.benchmark.report.flatten import Record, Value, number
 from ms_slam_env.benchmark.report.glossary import heading, unit
 from ms_slam_env.benchmark.statistics import Interval
 
@@ -15,6 +15,7 @@ _MAX_SERIES = 10
 _MAX_LABELS = 60
 _MAX_MEASURES = 24
 _NO_MEASURES = ("seed", "repeat", "elapsed_s")
+_FIRST = ("ate_m", "f_score_5cm", "success", "found", "divergence", "step_ms", "steps_per_s")
 
 
 def text_columns(rows: Sequence[Record]) -> list[str]:
@@ -38,6 +39,8 @@ def measures(rows: Sequence[Record]) -> list[str]:
         known = {value for value in values if value is not None}
         if len(known) > 1 and key.rpartition(".")[2] not in _NO_MEASURES:
             found.append(key)
+    order = {key: place for place, key in enumerate(_FIRST)}
+    found.sort(key=lambda key: order.get(key, len(order)))
     return found[:_MAX_MEASURES]
 
 
@@ -72,7 +75,9 @@ def bar_figure(
     pairs = list(zip(labels, series, strict=True))
     if len(set(pairs)) < len(pairs) or len(set(labels)) > _MAX_LABELS:
         return None
-    found = [_plot(rows, pairs, key) for key in keys]
+    found = [_plot(rows, pairs, key) for key in keys if _tells_apart(rows, pairs, key)]
+    if not found:
+        return None
     height = 110 + (14 if len(set(series)) > 1 else 20) * len(rows) + 8 * len(set(labels))
     caption = "One row each" if series_key is None else f"Colour: {heading(series_key)}"
     if any(isinstance(row.get(key), Interval) for row in rows for key in keys):
@@ -86,6 +91,16 @@ def _series(rows: Sequence[Record], names: Sequence[str]) -> str | None:
         return None
     few = [n for n in names if len({str(row.get(n)) for row in rows}) <= _MAX_SERIES]
     return few[-1] if few else None
+
+
+def _tells_apart(rows: Sequence[Record], pairs: list[tuple[str, str]], key: str) -> bool:
+    """Whether measure ``key`` differs between the series of a label, where there are several."""
+    if len({series for _, series in pairs}) < 2:
+        return True
+    values: dict[str, set[float | None]] = {}
+    for row, (label, _) in zip(rows, pairs, strict=True):
+        values.setdefault(label, set()).add(number(row.get(key)))
+    return any(len(found) > 1 for found in values.values())
 
 
 def _plot(rows: Sequence[Record], pairs: list[tuple[str, str]], key: str) -> Plot:
@@ -152,3 +167,14 @@ def _trace(
             "offsetgroup": str(index),
         }
     return {**trace, "type": "bar"}
+
+
+def spans(values: Sequence[Value], scale: float = 1.0) -> tuple[list[float], list[float]]:
+    """Lower and upper ends of the intervals in ``values``; of plain numbers the numbers."""
+    lows, highs = [], []
+    for value in values:
+        middle = number(value) or 0.0
+        given = value if isinstance(value, Interval) else Interval(middle, middle, middle)
+        lows.append(scale * given.low)
+        highs.append(scale * given.high)
+    return lows, highs

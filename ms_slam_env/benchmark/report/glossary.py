@@ -102,17 +102,22 @@ _CAPITALS = re.compile(r"\b(ate|rpe|rer|rcm|ext|mem|ene|icp|rgb|cpu|gpu|fps)\b")
 
 def meaning(name: str) -> str:
     """What the column of a key or heading means; empty where that is not known."""
-    plain = name.rpartition(".")[2].rpartition(": ")[2].lower().replace("_", " ")
-    plain = re.sub(r"\[.*?\]|%", " ", plain)
-    plain = " ".join(plain.split())
-    return next((text for pattern, text in MEANINGS if re.search(pattern, plain)), "")
+    plain = re.sub(r"\[.*?\]|%", " ", name.lower().replace("_", " "))
+    for part in reversed(re.split(r"\.|: ", plain)):
+        words = " ".join(part.split())
+        for pattern, text in MEANINGS:
+            if re.search(pattern, words):
+                return text
+    return ""
 
 
 def unit(key: str) -> tuple[str, float]:
-    """Unit that a key's values are shown in, and the factor to it."""
-    last = key.rpartition(".")[2]
-    found = (entry[1:] for entry in _UNITS if re.search(entry[0], last))
-    return next(found, ("", 1.0))
+    """Unit that a key's values are shown in, and the factor to it: ``ate_m.median`` has one too."""
+    for part in reversed(key.split(".")):
+        for pattern, name, scale in _UNITS:
+            if re.search(pattern, part):
+                return name, scale
+    return "", 1.0
 
 
 def heading(key: str) -> str:
@@ -133,6 +138,6 @@ def _words(key: str) -> str:
     key = re.sub(r"^(ate|rpe|rer|map_error)_m$", r"\1", key)
     key = re.sub(r"^f(_score)?_(\d+)cm", r"F-score \2 cm", key)
     key = re.sub(r"(\d)cm\b", r"\1 cm", key).replace("_", " ")
-    if key in ("M I", "M D"):
+    if re.fullmatch(r"(M|mean) [ID]", key):
         return key.replace(" ", "_")
     return _CAPITALS.sub(lambda match: match[1].upper(), key)

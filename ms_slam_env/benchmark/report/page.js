@@ -76,7 +76,15 @@
   function draw(item) {
     const plot = item.plots[item.select ? Number(item.select.value) : 0];
     item.drawn = true;
-    return Plotly.react(item.canvas, plot.data, themed(plot.layout), {
+    const data = plot.data.map((trace) => {
+      const bars = { color: css("--text"), thickness: 1.2, width: 3 };
+      const found = { ...trace };
+      for (const name of ["error_x", "error_y"]) {
+        if (trace[name]) found[name] = { ...bars, ...trace[name] };
+      }
+      return found;
+    });
+    return Plotly.react(item.canvas, data, themed(plot.layout), {
       responsive: true,
       displaylogo: false,
       displayModeBar: touch.matches ? false : "hover",

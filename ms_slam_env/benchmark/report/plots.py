@@ -104,7 +104,6 @@ def error_bar(
         "symmetric": False,
         "array": finite(high - value for high, value in zip(highs, values, strict=True)),
         "arrayminus": finite(value - low for low, value in zip(lows, values, strict=True)),
-        "thickness": 1.5,
     }
 
 

@@ -5,9 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ms_slam_env.benchmark.report.blocks import Block, Picture, Pictures, Section, Table
+from ms_slam_env.benchmark.report.blocks import (
+    Block,
+    Picture,
+    Pictures,
+    Prose,
+    Section,
+    Table,
+)
 from ms_slam_env.benchmark.report.discovery import PICTURES, Result
 from ms_slam_env.benchmark.report.kinds import kind_of
+from ms_slam_env.benchmark.report.kinds.base import Kind
 from ms_slam_env.benchmark.report.kinds.generic import Generic, facts, row_tables, settings
 from ms_slam_env.benchmark.report.markdown import blocks_of
 
@@ -21,25 +29,30 @@ def section_of(result: Result) -> Section:
     Raises:
         OSError: a file of the folder cannot be read.
     """
-    kind = kind_of(result.content)
+    kind: Kind = kind_of(result.content)
     written = [b for path in result.texts for b in blocks_of(path.read_text(encoding="utf-8"))]
-    own = kind.tables(result)
+    written = [b for b in written if not (isinstance(b, Prose) and b.text.startswith("Made by "))]
+    try:
+        drawn, own = kind.figures(result), kind.tables(result)
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError):
+        kind = Generic()  # the file looks like a known kind but is not of its form
+        drawn, own = kind.figures(result), []
     has_table = any(isinstance(block, Table) for block in (*written, *own))
     values = facts(result.content)
-    blocks: list[Block] = [*kind.figures(result), *own, *written]
+    blocks: list[Block] = [*drawn, *own, *written]
     if values is not None:
         blocks.append(values)
     blocks += row_tables(result.content, folded=has_table)
     given = settings(result.content)
     if given is not None:
         blocks.append(given)
-    drawn = tuple(
+    pictures = tuple(
         Picture(path.name, PICTURES[path.suffix.lower()], path.read_bytes())
         for path in result.pictures
         if path.stat().st_size <= _MAX_PICTURE_BYTES
     )
-    if drawn:
-        blocks.append(Pictures(drawn, folded=not isinstance(kind, Generic)))
+    if pictures:
+        blocks.append(Pictures(pictures, folded=not isinstance(kind, Generic)))
     return Section(
         result.title, kind.name, kind.about, tuple(blocks), provenance_lines(result.provenance)
     )

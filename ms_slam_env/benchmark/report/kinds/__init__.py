@@ -1,13 +1,30 @@
-"""The kinds of results that a report knows, one file each; the first that fits is taken."""
+"""The kinds of results that a report knows; the first that fits is taken."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from ms_slam_env.benchmark.report.kinds.base import Kind
+from ms_slam_env.benchmark.report.kinds.compare import Comparison
+from ms_slam_env.benchmark.report.kinds.divergence import Divergence
 from ms_slam_env.benchmark.report.kinds.generic import Generic
+from ms_slam_env.benchmark.report.kinds.planners import Planners
+from ms_slam_env.benchmark.report.kinds.stages import Stages
+from ms_slam_env.benchmark.report.kinds.sweeps import FrameSkipping, StepSize, Training
+from ms_slam_env.benchmark.report.kinds.trajectory import Evaluation, Run
 
-KINDS: tuple[Kind, ...] = (Generic(),)
+KINDS: tuple[Kind, ...] = (
+    Planners(),
+    Comparison(),
+    Divergence(),
+    Run(),
+    Evaluation(),
+    StepSize(),
+    FrameSkipping(),
+    Training(),
+    Stages(),
+    Generic(),
+)
 
 
 def kind_of(content: dict[str, Any]) -> Kind:
