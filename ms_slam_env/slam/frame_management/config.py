@@ -51,8 +51,8 @@ class DroppingConfig(FrameManagementConfig):
     Attributes:
         max_skip: most frames dropped in a row; it protects tracking.
         pose: of a dropped frame: ``constant-velocity``, the last pose moved on as between the
-            last two processed frames, or ``last``, the last processed frame's. A pose that the
-            caller knows or guesses takes precedence.
+            last two processed frames, at most as far, or ``last``, the last processed frame's. A
+            pose that the caller knows or guesses takes precedence.
     """
 
     max_skip: int = field(default=10, kw_only=True)

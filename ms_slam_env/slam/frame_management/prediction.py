@@ -14,7 +14,9 @@ class Prediction:
     """Carries the last processed pose on.
 
     Args:
-        is_moving: on with the velocity between the last two processed frames; else at rest.
+        is_moving: on with the velocity between the last two processed frames, but no further than
+            the camera moved between them; else at rest. A frame dropped for its likeness cannot be
+            far away: without the limit a camera that stops is carried on.
     """
 
     def __init__(self, is_moving: bool) -> None:
@@ -24,7 +26,8 @@ class Prediction:
     def reset(self) -> None:
         """Forget every pose."""
         self._pose: Float64 = np.eye(4)
-        self._twist: Float64 = np.zeros(6)  # a frame
+        self._twist: Float64 = np.zeros(6)  # of the last motion, which took so many frames:
+        self._frames = 1
 
     def observe(self, T_world_camera: Float64, frames: int, continues: bool) -> None:
         """Note the pose of a processed frame, ``frames`` after the one before.
@@ -33,19 +36,23 @@ class Prediction:
         not across lost tracking or a closed loop.
         """
         if self._is_moving and continues:
-            self._twist = se3_log(invert(self._pose) @ T_world_camera) / frames
+            self._twist = se3_log(invert(self._pose) @ T_world_camera)
         else:
             self._twist = np.zeros(6)
         self._pose = T_world_camera.copy()
+        self._frames = frames
 
     def pose(self, frames: int) -> Float64:
         """T_world_camera (4, 4) ``frames`` after the last processed frame."""
-        return self._pose @ se3_exp(frames * self._twist) if self._is_moving else self._pose.copy()
+        if not self._is_moving:
+            return self._pose.copy()
+        return self._pose @ se3_exp(min(1.0, frames / self._frames) * self._twist)
 
     def get_state(self) -> dict[str, Any]:
-        """Pose and velocity."""
-        return {"pose": self._pose.copy(), "twist": self._twist.copy()}
+        """Pose and last motion."""
+        return {"pose": self._pose.copy(), "twist": self._twist.copy(), "frames": self._frames}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state."""
         self._pose, self._twist = state["pose"].copy(), state["twist"].copy()
+        self._frames = state["frames"]

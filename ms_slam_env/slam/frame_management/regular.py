@@ -1,7 +1,8 @@
-"""Every n-th frame is processed: the frame drop rate of the paper's section IV."""
+"""Frames are processed at regular intervals: the frame drop rate of the paper's section IV."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,23 +18,24 @@ class RegularConfig(DroppingConfig):
     """Every n-th frame is processed.
 
     Attributes:
-        every: n.
+        every: n; 2.5 takes turns between every second and every third.
 
     Raises:
         InputError: a value out of range, or more frames to drop in a row than ``max_skip``.
     """
 
     name: str = field(default="regular", init=False)
-    every: int = 2
+    every: float = 2.0
 
     def __post_init__(self) -> None:
         """Refuse values that contradict each other."""
         super().__post_init__()
         check_range(self, "every", 1, 10_001)
-        if self.every - 1 > self.max_skip:
+        longest = math.ceil(self.every) - 1
+        if longest > self.max_skip:
             raise InputError(
-                f"RegularConfig.every = {self.every} drops {self.every - 1} frames in a row, more "
-                f"than max_skip = {self.max_skip}"
+                f"RegularConfig.every = {self.every:g} drops {longest} frames in a row, more than "
+                f"max_skip = {self.max_skip}"
             )
 
     def make_filter(self, intrinsics: Intrinsics) -> FrameFilter:
@@ -42,21 +44,25 @@ class RegularConfig(DroppingConfig):
 
 
 class RegularSkipping(FrameFilter):
-    """Admits a frame when ``every - 1`` have been dropped."""
+    """Admits frames 0, n, 2n, ..., rounded up, counted since ``reset``."""
 
-    def __init__(self, every: int) -> None:
+    def __init__(self, every: float) -> None:
         self._every = every
+        self.reset()
 
     def reset(self) -> None:
-        """Nothing to forget."""
+        """Count from 0 again."""
+        self._count = 0
 
     def admits(self, frame: RGBDFrame, dropped: int, forced: bool = False) -> bool:
-        """Whether it is this one's turn."""
-        return dropped >= self._every - 1
+        """Whether it is this frame's turn."""
+        number, self._count = self._count, self._count + 1
+        return number == 0 or number // self._every > (number - 1) // self._every
 
     def get_state(self) -> dict[str, Any]:
-        """Nothing: the count of dropped frames is the caller's."""
-        return {}
+        """The count."""
+        return {"count": self._count}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Nothing to restore."""
+        """Go on counting."""
+        self._count = state["count"]
