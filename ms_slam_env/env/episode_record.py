@@ -43,8 +43,13 @@ class EpisodeRecord(gymnasium.Env[Any, Any]):
 
     @property
     def tracked(self) -> NDArray[np.bool_]:
-        """(N,) whether each frame was tracked, and so is part of the map."""
+        """(N,) whether tracking held at each frame; one that was processed is part of the map."""
         return np.array(self._current().tracked)
+
+    @property
+    def processed(self) -> NDArray[np.bool_]:
+        """(N,) whether SLAM has seen each frame; frame management drops the others."""
+        return np.array(self._current().processed)
 
     @property
     def timestamps(self) -> Float64:

@@ -24,7 +24,7 @@ class EpisodeState:
     """Trajectories, last frame and running measures of one episode.
 
     One step brings one frame or several. ``truth``, ``kinematics``, ``estimates``, ``tracked``,
-    ``times``, ``errors`` and ``frame_divergences`` (from the frame before) have an entry a frame;
+    ``processed``, ``times``, ``errors`` and ``frame_divergences`` (from the frame before) have an entry a frame;
     the step's ``divergence`` compares its last frame with the last one of the step before, and
     ``step_divergences`` has one for the start, zero, and for each step.
     """
@@ -44,6 +44,7 @@ class EpisodeState:
     kinematics: list[Float64] = field(default_factory=list)
     estimates: list[Float64] = field(default_factory=list)
     tracked: list[bool] = field(default_factory=list)
+    processed: list[bool] = field(default_factory=list)
     times: list[float] = field(default_factory=list)
     frame_divergences: list[Float64] = field(default_factory=list)
     divergence: Float64 = field(default_factory=lambda: np.zeros(2))
@@ -67,6 +68,7 @@ class EpisodeState:
         self.kinematics.append(sighting.T_world_camera_kinematic.copy())
         self.estimates.append(result.T_world_camera.copy())
         self.tracked.append(result.tracking_ok)
+        self.processed.append(result.processed)
         self.times.append(frame.timestamp)
         self.frame_divergences.append(divergence)
         error = float(np.linalg.norm(result.T_world_camera[:3, 3] - sighting.T_world_camera[:3, 3]))
