@@ -24,9 +24,9 @@ class EpisodeState:
     """Trajectories, last frame and running measures of one episode.
 
     One step brings one frame or several. ``truth``, ``kinematics``, ``estimates``, ``tracked``,
-    ``processed``, ``times``, ``errors`` and ``frame_divergences`` (from the frame before) have an entry a frame;
-    the step's ``divergence`` compares its last frame with the last one of the step before, and
-    ``step_divergences`` has one for the start, zero, and for each step.
+    ``processed``, ``times``, ``errors`` and ``frame_divergences`` (from the frame before) have an
+    entry a frame; the step's ``divergence`` compares its last frame with the last one of the step
+    before, and ``step_divergences`` has one for the start, zero, and for each step.
     """
 
     scene: str
