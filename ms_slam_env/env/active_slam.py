@@ -109,9 +109,9 @@ class ActiveSlamEnv(EpisodeRecord):
         self.render_mode = render_mode
         self.intrinsics: Intrinsics = xtion(self.config.image_size)
         self.timings = Timings()
-        self.slam: SlamBackend = slam_backends.make(
-            self.config.slam, self.intrinsics, **self.config.slam_config
-        )
+        backend = slam_backends.make(self.config.slam, self.intrinsics, **self.config.slam_config)
+        # A step's only frame is not to be dropped.
+        self.slam: SlamBackend = self.config.adaptation.adapt(backend, drops_frames=False)
         self._embodiment_type = EMBODIMENTS[embodiment]
         self._embodiment_type.check(self.config)
         self._pose_source = POSE_SOURCES[self.config.pose]()
@@ -191,7 +191,7 @@ class ActiveSlamEnv(EpisodeRecord):
             lost_for_good=lost_for_good,
             blocked=not movement.made,
         )
-        episode.reward_terms = reward_terms(outcome, self.config.reward, self.config.targets)
+        episode.reward_terms = self._reward_terms(outcome)
         reward = float(sum(episode.reward_terms.values()))
         return self._build_observation(), reward, lost_for_good, False, self._info()
 
@@ -364,6 +364,10 @@ class ActiveSlamEnv(EpisodeRecord):
         if pickled["state"] is not None:
             self.load_state(pickled["state"])
 
+    def _reward_terms(self, outcome: Outcome) -> dict[str, float]:
+        """Weighted terms of one step, name to value."""
+        return reward_terms(outcome, self.config.reward, self.config.targets)
+
     # -- Checks and views --------------------------------------------------------------------
 
     def _current(self) -> EpisodeState:
@@ -392,7 +396,7 @@ class ActiveSlamEnv(EpisodeRecord):
                     inlier_fraction=episode.inlier_fraction,
                     lost_share=min(1.0, episode.steps_lost / self.config.lost_patience),
                     motion=episode.action,
-                    action_mask=self.action_masks(),
+                    action_mask=self.embodiment.action_masks(),
                     lookahead=lambda: self.lookahead() / self.config.targets.maxima,
                 )
             )

@@ -20,12 +20,22 @@ from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.robot.arm import ArmConfig
 from ms_slam_env.scenes import SEED_SPLITS
 from ms_slam_env.scenes.registry import check_name
+from ms_slam_env.slam.adaptation import AdaptationConfig, NoAdaptationConfig
 from ms_slam_env.slam.configuration import is_file_name, read_configuration
 
 OTHER_OPTIONS = ("embodiment", "render_mode", "max_episode_steps")
 """Options of ``gym.make`` beside the fields of ``EnvConfig``; the last is Gymnasium's own."""
 
-_OF_STATE = ("image_size", "noise", "arm", "pose", "slam", "slam_config", "divergence")
+_OF_STATE = (
+    "image_size",
+    "noise",
+    "arm",
+    "pose",
+    "slam",
+    "slam_config",
+    "adaptation",
+    "divergence",
+)
 
 
 @dataclass(frozen=True)
@@ -82,6 +92,8 @@ class RewardConfig:
         lost: per step with tracking lost.
         lost_for_good: once, when the episode ends because tracking was lost beyond recovery.
         blocked: per masked action chosen.
+        compute: per unit of the SLAM configuration's cost, where the agent chooses it
+            (``MSActiveSLAM-Adaptive-v0``).
     """
 
     intensity_divergence: float = 0.1
@@ -91,6 +103,7 @@ class RewardConfig:
     lost: float = 0.5
     lost_for_good: float = 10.0
     blocked: float = 0.1
+    compute: float = 0.1
 
     def __post_init__(self) -> None:
         """Refuse negative weights."""
@@ -134,6 +147,9 @@ class EnvConfig:
             its search from the arm's forward kinematics), ``kinematics`` (noisy forward kinematics
             alone; SLAM only maps) or ``ground_truth``. Kinematics need an arm.
         slam: SLAM backend.
+        adaptation: how the running SLAM changes its configuration: ``none``, ``divergence`` or, as
+            ``MSActiveSLAM-Adaptive-v0`` has it, ``agent``; a mapping with the ``name`` of one for
+            options. Every frame is processed, whatever ``keep_every`` of a configuration says.
         slam_config: options of the backend, or a configuration file (YAML), which also says what
             ``slam`` is and what ``image_size`` is where that is not given.
         observation: ``rgbd``, ``features`` or ``lookahead``.
@@ -156,6 +172,7 @@ class EnvConfig:
     pose: str = "slam"
     slam: str = "surfel"
     slam_config: dict[str, object] = field(default_factory=dict)
+    adaptation: AdaptationConfig = field(default_factory=NoAdaptationConfig)
     observation: str = "features"
     step_m: float = 0.12
     step_rad: float = math.radians(12)
