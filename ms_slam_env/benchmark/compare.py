@@ -17,11 +17,11 @@ from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
 from ms_slam_env.camera import XTION_SIZES
 from ms_slam_env.config import check_range
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.scenes import SCENES
+from ms_slam_env.scenes import ROOMS, SCENES
 
 DEFAULT_SEQUENCES = (
     "living_room:2000:none",
-    *(f"{scene}:2000" for scene in SCENES),
+    *(f"{scene}:2000" for scene in ROOMS),
     *(
         f"living_room:2000:kinect+{name}"
         for name in (

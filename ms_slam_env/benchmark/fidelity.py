@@ -34,7 +34,7 @@ from ms_slam_env.env.worlds import get_scene
 from ms_slam_env.errors import InputError
 from ms_slam_env.robot import CAMERA_RADIUS_M
 from ms_slam_env.robot.motions import decompose
-from ms_slam_env.scenes import SCENES
+from ms_slam_env.scenes import ROOMS
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sequences import handheld_trajectory
@@ -123,7 +123,7 @@ class FidelitySpec:
 class Arguments:
     """Rank correlation of predicted and met divergence over the 49 motions, by setting."""
 
-    scenes: tuple[str, ...] = SCENES
+    scenes: tuple[str, ...] = ROOMS
     """Names of scenes, or mesh files."""
     seeds: str = "validation"
     """Split that the seeds come from; the defaults read from the result may not use test seeds."""

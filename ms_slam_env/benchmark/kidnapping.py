@@ -38,7 +38,7 @@ from ms_slam_env.config import check_range
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.geometry import invert, relative_angle
 from ms_slam_env.metrics import ate_rmse, relocalisation_times
-from ms_slam_env.scenes import SCENES, Scene
+from ms_slam_env.scenes import ROOMS, SCENES, Scene
 from ms_slam_env.sensor import FRAME_RATE_HZ, RGBDSensor
 from ms_slam_env.slam import SlamBackend
 from ms_slam_env.slam.surfel.config import RELOCALISATIONS
@@ -80,7 +80,7 @@ class KidnappingSpec:
 class Arguments:
     """Kidnap the SLAM's camera: how often, how soon and how truly it finds its pose again."""
 
-    scenes: tuple[str, ...] = SCENES
+    scenes: tuple[str, ...] = ROOMS
     """Names of scenes; the maps take them in turns."""
     sizes: tuple[str, ...] = ("160x120", "320x240")
     """Image sizes."""

@@ -29,8 +29,9 @@ class CoverageGrid:
     def __init__(self, scene: Scene, voxel_m: float = 0.05) -> None:
         margin = 2 * voxel_m
         self.voxel_m = voxel_m
-        self._origin = scene.mesh.vertices.min(axis=0).astype(np.float64) - margin
-        extent = scene.mesh.vertices.max(axis=0) + margin - self._origin
+        low, high = scene.bounds()
+        self._origin = low - margin
+        extent = high + margin - self._origin
         self._shape = np.ceil(extent / voxel_m).astype(np.int64) + 1
         self._mapped = np.zeros(int(np.prod(self._shape)), dtype=bool)
 

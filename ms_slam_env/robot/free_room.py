@@ -22,14 +22,14 @@ def floor_height(scene: Scene) -> float:
     """Height of the floor: of what has that label, of the lowest surface where nothing has."""
     mesh = scene.mesh
     if _FLOOR not in mesh.labels:
-        return float(mesh.vertices[:, 2].min())
+        return float(scene.bounds()[0][2])
     floor = mesh.faces[mesh.face_label == mesh.labels.index(_FLOOR)]
     return float(mesh.vertices[floor.ravel(), 2].min())
 
 
 def outside(scene: Scene, position: Float64) -> str:
     """How a position (3,) lies outside the box around a scene's surfaces; empty if inside."""
-    low, high = scene.mesh.vertices.min(axis=0), scene.mesh.vertices.max(axis=0)
+    low, high = scene.bounds()
     low[2] = floor_height(scene)  # leaves of plants may reach through it
     if ((position >= low - _MET_M) & (position <= high + _MET_M)).all():
         return ""

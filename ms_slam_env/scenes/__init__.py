@@ -1,6 +1,22 @@
-"""Textured, lit scenes: procedural rooms by name and seed, and mesh files by path."""
+"""Textured, lit scenes by name and seed (rooms, a hall, streets), and mesh files by path."""
 
 from ms_slam_env.scenes.base import Scene, TexturedMesh
-from ms_slam_env.scenes.registry import SCENES, SEED_SPLITS, make, split_of
+from ms_slam_env.scenes.registry import (
+    LARGE_SCENES,
+    ROOMS,
+    SCENES,
+    SEED_SPLITS,
+    make,
+    split_of,
+)
 
-__all__ = ["SCENES", "SEED_SPLITS", "Scene", "TexturedMesh", "make", "split_of"]
+__all__ = [
+    "LARGE_SCENES",
+    "ROOMS",
+    "SCENES",
+    "SEED_SPLITS",
+    "Scene",
+    "TexturedMesh",
+    "make",
+    "split_of",
+]

@@ -49,6 +49,13 @@ class Scene(ABC):
     seed: int
     mesh: TexturedMesh
     exposure: float  # factor from linear radiance to sensor value before the sRGB curve
+    lanes: tuple[tuple[Float64, Float64], ...] = ()
+    """Straight ways of cars: points (3,) on the ground where each begins and ends."""
+
+    def bounds(self) -> tuple[Float64, Float64]:
+        """Least and greatest corner (3,) of the box around all surfaces, metres."""
+        vertices = self.mesh.vertices
+        return vertices.min(axis=0).astype(np.float64), vertices.max(axis=0).astype(np.float64)
 
     @abstractmethod
     def clearance(self, points: Float64) -> Float64:

@@ -113,6 +113,33 @@ class Sun(Light):
 
 
 @dataclass(frozen=True)
+class SkyLight(Light):
+    """The light of an open sky, the same from everywhere above the horizon.
+
+    Attributes:
+        radiance: (3,) linear RGB.
+        rays: directions in which each point looks for the sky.
+    """
+
+    radiance: tuple[float, float, float]
+    rays: int = 24
+
+    def irradiance(self, points: Float64, normals: Float64, rays: RayCaster) -> Float32:
+        """See the base class: 1/pi times the integral of L cos over the open part of the sky."""
+        total = np.zeros(len(points), np.float32)
+        k = np.arange(self.rays) + 0.5
+        up, angle = k / self.rays, np.pi * (1 + 5**0.5) * k  # even over the upper half sphere
+        side = np.sqrt(1 - up * up)
+        for direction in np.stack([side * np.cos(angle), side * np.sin(angle), up], -1):
+            cosine = normals @ direction
+            facing = np.flatnonzero(cosine > 0)
+            towards = np.broadcast_to(direction * _FAR_M, (len(facing), 3))
+            distance, _ = rays.first_hit(points[facing], towards)
+            total[facing] += cosine[facing] * (distance > 1.0)
+        return _tint((total * (2.0 / self.rays)).astype(np.float32), self.radiance)
+
+
+@dataclass(frozen=True)
 class Lighting:
     """All light of a scene.
 
@@ -182,7 +209,7 @@ def _bounce(g: Geometry, direct: Float32, lighting: Lighting) -> Float32:
     bitangent = np.cross(g.normals, tangent)
     gathered = np.zeros((len(g.vertices), 3), np.float32)
     openness = np.zeros(len(g.vertices), np.float32)
-    for x, y, z in _cosine_directions(lighting.bounce_rays):
+    for x, y, z in cosine_directions(lighting.bounce_rays):
         distance, face = rays.first_hit(g.light_points, x * tangent + y * bitangent + z * g.normals)
         gathered += leaving[face]
         openness += np.minimum(distance, 0.8) / 0.8
@@ -266,7 +293,7 @@ def _ball(n: int) -> Float64:
     return np.stack([r * np.cos(angle), r * np.sin(angle), z], -1)
 
 
-def _cosine_directions(n: int) -> Float64:
+def cosine_directions(n: int) -> Float64:
     """Directions (n, 3) of the upper half sphere, density proportional to the cosine."""
     u = qmc.Halton(2, scramble=False).random(n + 1)[1:]
     r, angle = np.sqrt(u[:, 0]), 2 * np.pi * u[:, 1]

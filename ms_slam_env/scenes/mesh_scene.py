@@ -26,6 +26,9 @@ _ASIDE_M = 0.04
 class MeshScene(Scene):
     """Everything a scene must answer, from its mesh."""
 
+    start_depth_m = START_DEPTH_M
+    min_start_share = MIN_START_SHARE
+
     def __init__(
         self,
         name: str,
@@ -75,7 +78,7 @@ class MeshScene(Scene):
             T = look_at(eye, target)
             T[:3, :3] = T[:3, :3] @ so3_exp(np.array([0.0, 0.0, rng.normal(0.0, 0.02)]))
             share, objects = self._view_quality(T)
-            if share >= MIN_START_SHARE and objects >= self._start_objects:
+            if share >= self.min_start_share and objects >= self._start_objects:
                 return T
             if share + 0.1 * min(objects, self._start_objects) > best_score:
                 best, best_score = T, share + 0.1 * min(objects, self._start_objects)
@@ -87,7 +90,8 @@ class MeshScene(Scene):
         rays = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], -1)
         origins = np.broadcast_to(T_world_camera[:3, 3], rays.shape)
         depth, face = self._rays.first_hit(origins, rays @ T_world_camera[:3, :3].T)
-        good = (depth >= START_DEPTH_M[0]) & (depth <= START_DEPTH_M[1])
+        nearest, farthest = self.start_depth_m
+        good = (depth >= nearest) & (depth <= farthest)
         return float(good.mean()), len(np.unique(self.mesh.face_label[face[face >= 0]]))
 
     def surface_points(self, spacing_m: float = 0.01) -> tuple[Float64, Int32]:
@@ -99,8 +103,8 @@ class MeshScene(Scene):
         points, face = sample_surface(self.mesh.vertices, self.mesh.faces, spacing_m)
         corners = self.mesh.vertices[self.mesh.faces].astype(np.float64)
         tangent = corners[:, 1] - corners[:, 0]
-        normal = _unit(np.cross(tangent, corners[:, 2] - corners[:, 0]))
-        tangent = _unit(tangent)
+        normal = unit_rows(np.cross(tangent, corners[:, 2] - corners[:, 0]))
+        tangent = unit_rows(tangent)
         bitangent = np.cross(normal, tangent)
         before = points + _FACING_M * normal[face]
         visible = self.clearance(before) > 0.0
@@ -123,5 +127,6 @@ def free_space_around(mesh: TexturedMesh, inside: Float64) -> FreeSpace:
     return FreeSpace(points, Holding(np.asarray(inside, dtype=np.float64)))
 
 
-def _unit(vectors: Float64) -> Float64:
+def unit_rows(vectors: Float64) -> Float64:
+    """Directions (N, 3) of vectors (N, 3)."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)

@@ -8,15 +8,18 @@ import numpy as np
 
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.scenes.base import Scene
+from ms_slam_env.scenes.city_street import city_street
 from ms_slam_env.scenes.corridor import corridor
+from ms_slam_env.scenes.factory_hall import factory_hall
 from ms_slam_env.scenes.living_room import living_room
 from ms_slam_env.scenes.mesh_file import from_file
+from ms_slam_env.scenes.residential_street import residential_street
 from ms_slam_env.scenes.tabletop_carpet import carpet
 from ms_slam_env.scenes.tabletop_table import table
 from ms_slam_env.scenes.tabletop_wall import wall
 from ms_slam_env.scenes.tabletop_window import window
 
-_MAKERS = {
+_ROOMS = {
     "living_room": living_room,
     "corridor": corridor,
     "window": window,
@@ -24,6 +27,19 @@ _MAKERS = {
     "wall": wall,
     "carpet": carpet,
 }
+
+_LARGE = {
+    "residential_street": residential_street,
+    "city_street": city_street,
+    "factory_hall": factory_hall,
+}
+_MAKERS = {**_ROOMS, **_LARGE}
+
+ROOMS: tuple[str, ...] = tuple(_ROOMS)
+"""Names of the scenes the size of a room, which benchmarks and tests take by default."""
+
+LARGE_SCENES: tuple[str, ...] = tuple(_LARGE)
+"""Names of the streets and the hall: farther than a Kinect sees, slow to build (5 to 12 s)."""
 
 SCENES: tuple[str, ...] = tuple(_MAKERS)
 """Names of the procedural scenes; the first is the default."""

@@ -41,7 +41,7 @@ class _Roadmap:
 
 def _roadmap(scene: Scene, start: Float64, radius_m: float, rng: np.random.Generator) -> _Roadmap:
     """Random free places around the height of ``start`` (3,), which is the first of them."""
-    low, high = scene.mesh.vertices.min(0), scene.mesh.vertices.max(0)
+    low, high = scene.bounds()
     low[2], high[2] = start[2] - _HEIGHT_M, start[2] + _HEIGHT_M
     drawn = rng.uniform(low, high, (_SAMPLES, 3))
     places = [start]

@@ -96,7 +96,7 @@ def place_trajectory(
 
 def _place(scene: Scene, heights: list[float], rng: np.random.Generator) -> Float64:
     """A point (3,) within the scene's bounds at about one of the heights."""
-    low, high = scene.mesh.vertices.min(0), scene.mesh.vertices.max(0)
+    low, high = scene.bounds()
     point = rng.uniform(low, high)
     point[2] = rng.choice(heights) + rng.uniform(-0.2, 0.2)
     return point

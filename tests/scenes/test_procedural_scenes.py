@@ -11,7 +11,7 @@ from ms_slam_env.scenes.mesh_scene import MIN_START_CLEARANCE_M, START_DEPTH_M
 from ms_slam_env.scenes.rays import RayCaster
 
 
-@pytest.fixture(scope="module", params=scenes.SCENES)
+@pytest.fixture(scope="module", params=scenes.ROOMS)
 def scene(request: pytest.FixtureRequest) -> base.Scene:
     return _cached(request.param)
 

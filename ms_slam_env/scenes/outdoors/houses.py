@@ -1,0 +1,165 @@
+"""Detached houses with gables, windows, doors and chimneys."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ms_slam_env.scenes.base import Float64
+from ms_slam_env.scenes.builder import Material, MeshBuilder
+from ms_slam_env.scenes.textures import masonry, street
+from ms_slam_env.scenes.textures.noise import hsv
+
+STOREY_M = 2.7
+
+
+@dataclass(frozen=True)
+class Finishes:
+    """What the houses of a quarter are made of; each house draws from these."""
+
+    walls: tuple[Material, ...]
+    roofs: tuple[Material, ...]
+    panes: tuple[Material, ...]
+    doors: tuple[Material, ...]
+    trims: tuple[Material, ...]
+    chimney: Material
+    plinth: Material
+    step: Material
+
+
+def finishes(build: MeshBuilder, rng: np.random.Generator) -> Finishes:
+    """Draw the finishes of a quarter."""
+    tones = [
+        hsv(rng.choice([0.02, 0.04, 0.6]), rng.uniform(0.1, 0.6), rng.uniform(0.34, 0.6))
+        for _ in range(4)
+    ]
+    frames = (232, 230, 224)
+    paints = [hsv(rng.random(), rng.uniform(0.4, 0.8), rng.uniform(0.25, 0.6)) for _ in range(5)]
+    return Finishes(
+        walls=tuple(wall_finish(build, rng) for _ in range(8)),
+        roofs=tuple(build.material(street.roof_tiles(rng, tone), (3.0, 3.0)) for tone in tones),
+        panes=tuple(
+            build.material(street.pane(rng, frames, int(rng.integers(1, 3)))) for _ in range(10)
+        ),
+        doors=tuple(build.material(street.panelled_door(rng, paint)) for paint in paints),
+        trims=tuple(build.plain(hsv(0.1, 0.05, value)) for value in (0.78, 0.88, 0.95)),
+        chimney=build.material(masonry.brick(rng, hsv(0.03, 0.5, 0.5)), (0.8, 0.64)),
+        plinth=build.material(masonry.plaster(rng, (120, 116, 110), 4.0), (1.5, 1.5)),
+        step=build.material(street.paving(rng, 2, 256), (1.0, 1.0)),
+    )
+
+
+def wall_finish(build: MeshBuilder, rng: np.random.Generator) -> Material:
+    """Render, brick or painted boards."""
+    kind = rng.random()
+    if kind < 0.4:
+        hue, value = rng.choice([0.02, 0.04, 0.08]), rng.uniform(0.5, 0.72)
+        return build.material(masonry.brick(rng, hsv(hue, 0.5, value)), (0.8, 0.64))
+    colour = hsv(
+        rng.choice([0.08, 0.12, 0.15, 0.35, 0.57]), rng.uniform(0.06, 0.34), rng.uniform(0.68, 0.92)
+    )
+    if kind < 0.7:
+        return build.material(street.siding(rng, colour), (2.4, 1.4))
+    return build.material(masonry.plaster(rng, colour, 3.0), (2.0, 2.0))
+
+
+def window(
+    build: MeshBuilder,
+    image: Material,
+    frame: Material,
+    at: tuple[float, float],
+    size: tuple[float, float],
+    has_sill: bool = True,
+) -> None:
+    """Window on the wall at y = 0, front at -y; ``at`` is its middle (x, z)."""
+    (x, z), (w, h) = at, (size[0] / 2, size[1] / 2)
+    build.box((x - w, -0.06, z - h), (x + w, 0, z + h), frame, "Y", front=image)
+    if has_sill:
+        low = z - h
+        build.box((x - w - 0.1, -0.16, low - 0.08), (x + w + 0.1, 0, low), frame, "Y")
+
+
+def house(
+    build: MeshBuilder,
+    rng: np.random.Generator,
+    of: Finishes,
+    width_m: float,
+    depth_m: float,
+    name: str,
+    storeys: int = 2,
+) -> None:
+    """House with its front on y = 0 facing -y, from x = 0 to ``width_m``, and a gable roof."""
+    wall, tiles = _pick(rng, of.walls), _pick(rng, of.roofs)
+    trim, door = _pick(rng, of.trims), _pick(rng, of.doors)
+    panes = [_pick(rng, of.panes) for _ in range(3)]
+    eaves = STOREY_M * storeys
+    along_x = bool(rng.random() < 0.6)
+    with build.object(name):
+        build.box((0, 0, 0.4), (width_m, depth_m, eaves), wall, "zZ")
+        build.box((-0.05, -0.05, 0), (width_m + 0.05, depth_m + 0.05, 0.4), of.plinth, "z")
+        if along_x:
+            _gable_roof(build, width_m, depth_m, eaves, tiles, wall)
+        else:
+            with build.frame((0, depth_m, 0), -np.pi / 2):
+                _gable_roof(build, depth_m, width_m, eaves, tiles, wall)
+        x = width_m * rng.uniform(0.25, 0.75)
+        build.box(
+            (x, 0.4 * depth_m, eaves), (x + 0.6, 0.4 * depth_m + 0.5, eaves + 2.6), of.chimney, "z"
+        )
+    door_at = width_m * rng.choice([0.25, 0.5, 0.75])
+    with build.object(f"{name} windows"):
+        for k, (origin, yaw, length) in enumerate(_sides(width_m, depth_m)):
+            count = max(1, int(length / 2.1))
+            for storey in range(storeys):
+                for n in range(count):
+                    x = (n + 0.5) * length / count
+                    if k == 0 and storey == 0 and abs(x - door_at) < 1.1:
+                        continue
+                    at = (x, STOREY_M * storey + 1.55)
+                    size = (rng.uniform(0.95, 1.25), rng.uniform(1.15, 1.4))
+                    with build.frame(origin, yaw):
+                        window(build, panes[int(rng.integers(3))], trim, at, size)
+    with build.object(f"{name} door"):
+        build.box((door_at - 0.5, -0.08, 0.3), (door_at + 0.5, 0, 2.4), trim, "Yz", front=door)
+        build.box((door_at - 0.8, -0.9, 0), (door_at + 0.8, 0, 0.16), of.step, "zY")
+        build.box((door_at - 0.7, -0.5, 0.16), (door_at + 0.7, 0, 0.3), of.step, "zY")
+        build.box((door_at - 0.9, -0.9, 2.55), (door_at + 0.9, 0, 2.68), tiles, "Y")
+
+
+def _sides(
+    width: float, depth: float
+) -> tuple[tuple[tuple[float, float, float], float, float], ...]:
+    """Origin, yaw and length of each wall's frame, seen from outside from left to right."""
+    return (
+        ((0, 0, 0), 0.0, width),
+        ((width, 0, 0), np.pi / 2, depth),
+        ((width, depth, 0), np.pi, width),
+        ((0, depth, 0), -np.pi / 2, depth),
+    )
+
+
+def _pick(rng: np.random.Generator, materials: tuple[Material, ...]) -> Material:
+    return materials[int(rng.integers(len(materials)))]
+
+
+def _gable_roof(
+    build: MeshBuilder, width: float, depth: float, eaves: float, tiles: Material, wall: Material
+) -> None:
+    """Ridge along x over the middle, 0.35 m of overhang."""
+    over, rise = 0.35, 0.42 * depth
+    slope: Float64 = np.array([0.0, depth / 2 + over, rise * (1 + 2 * over / depth)])
+    low = eaves - rise * 2 * over / depth
+    span = (width + 2 * over, 0, 0)
+    build.quad((-over, -over, low), span, slope, tiles)
+    back = slope * [1, -1, 1]
+    build.quad((width + over, depth + over, low), (-span[0], 0, 0), back, tiles)
+    # The undersides, so that the overhang is no hole seen from below.
+    ridge = eaves + rise - 0.05
+    build.quad((-over, depth / 2, ridge), span, -slope, wall)
+    build.quad((width + over, depth / 2, ridge), (-span[0], 0, 0), -back, wall)
+    t = np.linspace(0, 1, 7)
+    for x, order in ((0.0, -1), (width, 1)):
+        y = np.stack([depth / 2 * t, depth - depth / 2 * t], 1)[:, ::order]  # (7, 2)
+        z = eaves + rise * t[:, None] * np.ones((1, 2))
+        build.patch(np.stack([np.full_like(y, x), y, z], -1), wall)

@@ -1,0 +1,83 @@
+"""Daylight: sun with cast shadows, open sky, one bounce; and the finished outdoor scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ms_slam_env.scenes.base import Float64
+from ms_slam_env.scenes.builder import MeshBuilder
+from ms_slam_env.scenes.large_scene import SKY, LargeScene
+from ms_slam_env.scenes.lighting import Lighting, SkyLight, Sun, auto_exposure, light_mesh
+from ms_slam_env.scenes.outdoors.plan import StreetPlan
+from ms_slam_env.scenes.outdoors.sky import sky_dome
+
+_KEY = 0.16
+_MOST_EXPOSED = 0.85
+_EYE_M = (1.4, 1.8)
+_STRAY_M = 0.5  # across the street
+_DEPTH_OF_VIEW_M = (3.0, 8.0)
+
+
+def daylight_scene(
+    name: str,
+    seed: int,
+    build: MeshBuilder,
+    rng: np.random.Generator,
+    plan: StreetPlan,
+    places: Mapping[str, Float64],
+    ways: tuple[tuple[str, str], ...],
+) -> LargeScene:
+    """Light what was built, from a sun 35 to 55 degrees high, and make the scene.
+
+    Args:
+        name: of the scene.
+        seed: of the scene.
+        build: everything but the sky.
+        rng: draws the sun's place.
+        plan: of the streets.
+        places: points (3,) on the ground where routes turn, by name.
+        ways: pairs of places between which a start pose may lie.
+    """
+    x0, y0, x1, y1 = plan.bounds
+    sky_dome(build, rng, ((x0 + x1) / 2, (y0 + y1) / 2))
+    azimuth, height = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(35.0, 55.0))
+    sun = (np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height))
+    bright = rng.uniform(0.85, 1.15)
+    lighting = Lighting(
+        lights=(
+            Sun(sun, tuple(np.array([2.9, 2.7, 2.35]) * bright)),
+            SkyLight((0.62, 0.72, 0.9)),
+        ),
+        glow={SKY: (1.25, 1.25, 1.25)},
+        clear=frozenset({SKY}),
+        ambient=(0.05, 0.05, 0.05),
+        bounce_rays=12,
+        bounce_gain=1.5,
+    )
+    mesh = light_mesh(build.build(), lighting)
+    middles = np.array([0.5 * (places[a] + places[b]) for a, b in ways])
+    eyes = middles + np.array([0.0, 0.0, 1.6])
+    # Between tall houses most is shade; exposed for it alone, what lies in the sun would be white.
+    exposure = min(auto_exposure(mesh, eyes, _KEY, frozenset({SKY})), _MOST_EXPOSED)
+
+    def start(draw: np.random.Generator) -> tuple[Float64, Float64]:
+        a, b = ways[int(draw.integers(len(ways)))]
+        if draw.random() < 0.5:
+            a, b = b, a
+        way = places[b] - places[a]
+        length = np.linalg.norm(way)
+        along = way / length
+        across = np.array([-along[1], along[0], 0.0])
+        eye = (
+            places[a] + draw.uniform(0.15, 0.85) * way + draw.uniform(-_STRAY_M, _STRAY_M) * across
+        )
+        eye[2] = draw.uniform(*_EYE_M)
+        angle = draw.uniform(-0.7, 0.7)
+        ahead = np.cos(angle) * along + np.sin(angle) * across
+        target = eye + draw.uniform(*_DEPTH_OF_VIEW_M) * ahead
+        target[2] = draw.uniform(0.6, 1.6)
+        return eye, target
+
+    return LargeScene(name, seed, mesh, start, exposure, places, eyes, lanes=plan.lanes())

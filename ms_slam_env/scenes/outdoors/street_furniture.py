@@ -1,0 +1,135 @@
+"""Lamp posts, cars, signs, bins, benches, pedestrian crossings."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ms_slam_env.scenes.base import Float64
+from ms_slam_env.scenes.builder import Material, MeshBuilder
+from ms_slam_env.scenes.textures import masonry, street
+from ms_slam_env.scenes.textures.noise import hsv, noise, shade
+
+
+def lamp_post(build: MeshBuilder, height_m: float, name: str) -> None:
+    """Post on the origin with an arm and a head towards -y."""
+    metal = build.plain((72, 78, 76))
+    glass = build.plain((236, 236, 226))
+    with build.object(name):
+        build.lathe([(0.11, 0), (0.11, 0.7), (0.07, 0.75), (0.05, height_m)], metal, 10)
+        build.box((-0.04, -0.9, height_m - 0.06), (0.04, 0.05, height_m + 0.02), metal)
+        build.box((-0.13, -1.3, height_m - 0.1), (0.13, -0.8, height_m + 0.04), metal, "z")
+        build.box((-0.11, -1.28, height_m - 0.14), (0.11, -0.82, height_m - 0.1), glass, "Z")
+
+
+def car(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
+    """Parked car on the origin, 4.1 m long, front at +x."""
+    hue, strength = rng.choice([0.0, 0.03, 0.12, 0.38, 0.58, 0.62]), rng.choice([0.04, 0.1, 0.65])
+    colour = hsv(hue, strength, rng.uniform(0.3, 0.9))
+    paint = build.material(
+        shade(colour, (0.03, noise(rng, (128, 128), 1.2)), (0.02, noise(rng, (128, 128), 0.3))),
+        (1.5, 1.5),
+    )
+    glass = build.plain((38, 46, 54))
+    dark, light, red = (
+        build.plain((24, 24, 26)),
+        build.plain((240, 240, 230)),
+        build.plain((180, 24, 20)),
+    )
+    plate = build.material(street.road_sign(rng, f"MS {rng.integers(100, 999)}", (240, 238, 230)))
+    upper: Float64 = np.array(
+        [(-2.05, 0.72), (-1.9, 0.92), (0.75, 0.94), (1.5, 0.86), (1.95, 0.72), (2.05, 0.55)]
+    )
+    lower = np.column_stack([np.linspace(-2.05, 2.05, 6), np.full(6, 0.27)])
+    roof: Float64 = np.array([(-1.75, 0.92), (-1.15, 1.42), (0.05, 1.45), (0.8, 0.94)])
+    base = np.column_stack([np.linspace(-1.75, 0.8, 4), np.full(4, 0.92)])
+    with build.object(name):
+        _prism(build, lower, upper, 0.86, paint, paint)
+        _prism(build, base, roof, 0.74, glass, glass)
+        build.box((-1.12, -0.72, 1.41), (0.05, 0.72, 1.47), paint, "z")
+        for x in (-0.6, -1.2, 0.15):  # pillars
+            build.box((x - 0.04, -0.755, 0.92), (x + 0.04, 0.755, 1.38), paint, "zZ")
+        for y in (-0.66, 0.42):
+            build.box((1.98, y, 0.52), (2.08, y + 0.26, 0.66), light)
+            build.box((-2.09, y, 0.6), (-2.03, y + 0.26, 0.75), red)
+        build.box((-2.08, -0.25, 0.38), (2.09, 0.25, 0.52), dark, "zZ")
+        with build.frame((2.1, 0.0, 0.38), np.pi / 2):
+            build.quad((-0.25, 0, 0), (0.5, 0, 0), (0, 0, 0.12), plate)
+        for x in (-1.25, 1.3):
+            for y, pitch in ((-0.87, np.pi / 2), (0.87, -np.pi / 2)):
+                _wheel(build, (x, y, 0.31), pitch, dark)
+
+
+def _prism(
+    build: MeshBuilder, lower: Float64, upper: Float64, half: float, side: Material, top: Material
+) -> None:
+    """Body between two chains (n, 2) of (x, z), from y = -half to half."""
+    for y, order in ((-half, 1), (half, -1)):
+        chain = np.stack([lower, upper])[:, ::order]  # (2, n, 2)
+        build.patch(np.insert(chain, 1, y, axis=2), side)
+    strip = np.stack([np.insert(upper, 1, -half, axis=1), np.insert(upper, 1, half, axis=1)])
+    build.patch(strip, top)
+    for k, order in ((0, -1), (-1, 1)):
+        ends = [np.insert(chain[k], 1, y) for chain in (lower, upper) for y in (-half, half)]
+        build.patch(np.array(ends).reshape(2, 2, 3)[:, ::order], side)
+
+
+def _wheel(build: MeshBuilder, centre: ArrayLike, pitch: float, tyre: Material) -> None:
+    hub = build.plain((150, 152, 156))
+    with build.frame(centre, 0.0, pitch):
+        build.lathe([(0.31, -0.16), (0.31, 0.0), (0.3, 0.02), (0.2, 0.02)], tyre, 14)
+        build.lathe([(0.2, 0.02), (0.0, 0.03)], hub, 14)
+
+
+def sign(build: MeshBuilder, rng: np.random.Generator, text: str, name: str) -> None:
+    """Street sign on a pole, readable from -y and from +y."""
+    metal = build.plain((120, 122, 124))
+    colour = hsv(rng.choice([0.0, 0.33, 0.62]), 0.75, rng.uniform(0.35, 0.6))
+    board = build.material(street.road_sign(rng, text, colour))
+    with build.object(name):
+        build.lathe([(0.035, 0), (0.035, 2.5)], metal, 8)
+        build.box((-0.45, -0.05, 2.0), (0.45, -0.03, 2.45), metal, front=board)
+        with build.frame((0, 0, 0), np.pi):
+            build.quad((-0.45, 0.02, 2.0), (0.9, 0, 0), (0, 0, 0.45), board)
+
+
+def bin_(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
+    """Wheeled refuse bin on the origin."""
+    colour = hsv(rng.choice([0.1, 0.33, 0.6]), rng.uniform(0.2, 0.7), rng.uniform(0.2, 0.5))
+    plastic = build.material(masonry.plaster(rng, colour, 3.0, 64), (0.6, 0.6))
+    with build.object(name):
+        build.box((-0.28, -0.3, 0.06), (0.28, 0.3, 1.0), plastic, "z")
+        build.box((-0.31, -0.34, 1.0), (0.31, 0.33, 1.08), plastic)
+        build.box((-0.14, -0.305, 0.4), (0.14, -0.3, 0.7), build.plain((225, 222, 214)), "Y")
+
+
+def bench(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
+    """Slatted bench, seat towards -y."""
+    wood = build.material(street.boards(rng, (150, 104, 66), 6), (0.5, 0.5))
+    metal = build.plain((48, 50, 52))
+    with build.object(name):
+        for k in range(4):
+            build.box((-0.8, -0.45 + 0.11 * k, 0.42), (0.8, -0.36 + 0.11 * k, 0.46), wood)
+        for k in range(3):
+            build.box((-0.8, 0.0, 0.55 + 0.12 * k), (0.8, 0.03, 0.64 + 0.12 * k), wood)
+        for x in (-0.7, 0.66):
+            build.box((x, -0.45, 0), (x + 0.04, 0.03, 0.42), metal, "z")
+            build.box((x, 0.03, 0), (x + 0.04, 0.06, 0.9), metal, "z")
+
+
+def stripes(
+    build: MeshBuilder,
+    low: tuple[float, float],
+    high: tuple[float, float],
+    along_x: bool,
+    name: str,
+) -> None:
+    """Zebra crossing on the carriageway; bars lie along x, or along y."""
+    paint = build.plain((214, 212, 204))
+    axis = 1 if along_x else 0
+    with build.object(name):
+        for start in np.arange(low[axis] + 0.2, high[axis] - 0.4, 0.9):
+            a = [*low, 0.005]
+            size = [high[0] - low[0], high[1] - low[1]]
+            a[axis], size[axis] = start, 0.45
+            build.quad(a, (size[0], 0, 0), (0, size[1], 0), paint)
