@@ -7,6 +7,7 @@ from ms_slam_env.metrics.absolute import (
     ate_statistics,
     find_alignment,
 )
+from ms_slam_env.metrics.accuracy import Completion, completion
 from ms_slam_env.metrics.alignment import umeyama
 from ms_slam_env.metrics.cloud import (
     CloudDistance,
@@ -16,6 +17,7 @@ from ms_slam_env.metrics.cloud import (
     point_spacing,
     statistical_inliers,
 )
+from ms_slam_env.metrics.cloud_registration import CloudRegistration, register_clouds
 from ms_slam_env.metrics.consistency import (
     ConsistencyRule,
     MapConsistency,
@@ -61,6 +63,8 @@ from ms_slam_env.metrics.trajectory import ErrorStatistics, path_length
 __all__ = [
     "Alignment",
     "CloudDistance",
+    "CloudRegistration",
+    "Completion",
     "ConsistencyRule",
     "CostMeter",
     "Drift",
@@ -78,6 +82,7 @@ __all__ = [
     "ate_rmse",
     "ate_statistics",
     "cloud_distance",
+    "completion",
     "count_votes",
     "distinct_placements",
     "drifts",
@@ -101,6 +106,7 @@ __all__ = [
     "precision",
     "rcm",
     "recall",
+    "register_clouds",
     "relative_errors",
     "relocalisation_times",
     "rer",

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import make_pose
 
 Float64 = NDArray[np.float64]
 
@@ -38,9 +37,3 @@ def umeyama(
             raise InputError("an alignment with scale needs an estimate that moves")
         scale = float((singular * np.diag(S)).sum() / variance)  # (42)
     return R, target_mean - scale * R @ source_mean, scale  # (41)
-
-
-def rigid_alignment(source: Float64, target: Float64) -> Float64:
-    """Rigid motion T_target_source (4, 4) that best maps points (N, 3) onto points (N, 3)."""
-    R, t, _ = umeyama(source, target)
-    return make_pose(R, t)

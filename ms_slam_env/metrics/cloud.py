@@ -2,7 +2,7 @@
 
 Source: Qu, Zhang, Yang, Dong, "USME: unified SLAM measurement and evaluation", Navigation
 Positioning and Timing 2021, section 1.2. Clouds are compared where they lie; register them first
-(`icp`) if that is wanted.
+(`register_clouds`) if that is wanted.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from ms_slam_env.errors import InputError
-from ms_slam_env.metrics.reconstruction import check_points, nearest_distances
+from ms_slam_env.metrics.points import check_points
+from ms_slam_env.metrics.reconstruction import nearest_distances
 
 Float64 = NDArray[np.float64]
 

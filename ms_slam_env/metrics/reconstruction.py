@@ -9,16 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import transform_points
-from ms_slam_env.metrics.alignment import rigid_alignment
+from ms_slam_env.metrics.cloud_registration import CUTOFF_M, register_clouds
+from ms_slam_env.metrics.points import check_points
 
 Float64 = NDArray[np.float64]
 
-REGISTRATIONS = ("none", "icp")
-ICP_ITERATIONS = 30
-ICP_POINTS = 5000
-ICP_CUTOFF_M = 0.5
+ICP_POINTS = 5000  # of a map, evenly picked, are enough to place it
 
 
 @dataclass(frozen=True)
@@ -38,22 +36,6 @@ class MapMetrics:
     f_score: dict[float, float]
     rer_m: float
     rcm: float
-
-
-def check_points(points: ArrayLike, name: str) -> Float64:
-    """Return points (N, 3) as float64.
-
-    Raises:
-        InputError: wrong shape, no points, values that are not finite.
-    """
-    values = np.asarray(points, dtype=np.float64)
-    if values.ndim != 2 or values.shape[1] != 3:
-        raise InputError(f"{name} must be (N, 3), got {values.shape}")
-    if len(values) == 0:
-        raise InputError(f"{name} is empty")
-    if not np.isfinite(values).all():
-        raise InputError(f"{name} holds values that are not finite")
-    return values
 
 
 def voxel_thin(points: ArrayLike, voxel_m: float) -> Float64:
@@ -119,7 +101,8 @@ def rer(points: ArrayLike, truth: ArrayLike, registration: str = "icp") -> float
 
     Saeedi et al., ICRA 2017, section II-A: "determined by running iterative closest point on the
     point cloud models of the world and the map. The error of the point cloud matching is used as
-    RER". With ``registration="none"`` the map stays where its estimated poses placed it.
+    RER". With ``registration="none"`` the map stays where its estimated poses placed it; the other
+    methods are those of `register_clouds`.
 
     Raises:
         InputError: bad points or an unknown registration.
@@ -167,43 +150,18 @@ def map_metrics(
     )
 
 
-def icp(source: ArrayLike, target: ArrayLike, cutoff_m: float = ICP_CUTOFF_M) -> Float64:
+def icp(source: ArrayLike, target: ArrayLike, cutoff_m: float = CUTOFF_M) -> Float64:
     """Rigid motion T_target_source (4, 4) by point-to-point iterative closest point.
 
-    Besl and McKay, PAMI 1992. Starts from the identity, so the clouds must nearly lie on each
-    other, as an estimated and a true map do; at most ICP_POINTS points, evenly picked, are
-    matched, and pairs farther apart than ``cutoff_m`` are left out.
-
-    Raises:
-        InputError: bad points.
+    `register_clouds` tells more, and knows other methods.
     """
-    return _icp(check_points(source, "source"), cKDTree(check_points(target, "target")), cutoff_m)
-
-
-def _icp(source: Float64, target_tree: cKDTree, cutoff_m: float) -> Float64:
-    target = np.asarray(target_tree.data)
-    subset = source[np.unique(np.linspace(0, len(source) - 1, ICP_POINTS).astype(int))]
-    T = np.eye(4)
-    for _ in range(ICP_ITERATIONS):
-        moved = transform_points(T, subset)
-        distance, index = target_tree.query(moved, distance_upper_bound=cutoff_m)
-        matched = np.isfinite(distance)
-        if matched.sum() < 3:
-            break
-        update = rigid_alignment(moved[matched], target[index[matched]])
-        T = update @ T
-        if np.abs(update - np.eye(4)).max() < 1e-6:
-            break
-    return T
+    return register_clouds(source, target, "icp", cutoff_m, ICP_POINTS).T_target_source
 
 
 def _registered_distances(cloud: Float64, true_tree: cKDTree, registration: str) -> Float64:
     """Distances (N,) of the cloud to the truth, after registration to it."""
-    if registration not in REGISTRATIONS:
-        raise unknown("registration", registration, REGISTRATIONS)
-    if registration == "icp":
-        cloud = transform_points(_icp(cloud, true_tree, ICP_CUTOFF_M), cloud)
-    return true_tree.query(cloud)[0]
+    found = register_clouds(cloud, np.asarray(true_tree.data), registration, max_points=ICP_POINTS)
+    return true_tree.query(transform_points(found.T_target_source, cloud))[0]
 
 
 def _rms(distances: Float64) -> float:

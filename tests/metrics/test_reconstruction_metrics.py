@@ -133,8 +133,8 @@ def test_bad_points_are_refused(bad, match):
 
 
 def test_bad_options_are_refused():
-    with pytest.raises(InputError, match="icp"):
-        rer(GOOD, GOOD, "gicp")
+    with pytest.raises(InputError, match="valid choices: none, icp, plane-icp, gicp"):
+        rer(GOOD, GOOD, "sift")
     for threshold in (0.0, -1.0, np.nan):
         with pytest.raises(InputError, match="threshold"):
             f_score(GOOD, GOOD, threshold)

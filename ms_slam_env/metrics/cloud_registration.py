@@ -1,0 +1,147 @@
+"""One point cloud brought onto another: iterative closest points, mostly by small_gicp.
+
+Source of the use: Qu, Zhang, Yang, Dong, "USME", Navigation Positioning and Timing 2021, section
+1.2: clouds are registered, equation (6), before their distance is taken.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.geometry import se3_exp, transform_points
+from ms_slam_env.metrics.points import check_points
+
+Float64 = NDArray[np.float64]
+
+REGISTRATIONS = ("none", "icp", "plane-icp", "gicp")
+CUTOFF_M = 0.5
+NEIGHBOURS = 20  # that the normal of a point is taken from
+_ITERATIONS = 100
+_STEP = 1e-6  # metres and radians: below it the search has ended
+
+
+@dataclass(frozen=True)
+class CloudRegistration:
+    """Where a cloud belongs.
+
+    Attributes:
+        T_target_source: (4, 4) rigid motion onto the target; the identity where nothing is near.
+        converged: whether the search ended by itself.
+        iterations: of it.
+        pairs: points that had a partner within the cut-off at the end.
+        share: of them in the points that were matched.
+    """
+
+    T_target_source: Float64
+    converged: bool
+    iterations: int
+    pairs: int
+    share: float
+
+
+def register_clouds(
+    source: ArrayLike,
+    target: ArrayLike,
+    method: str = "icp",
+    cutoff_m: float = CUTOFF_M,
+    max_points: int = 20_000,
+    neighbours: int = NEIGHBOURS,
+) -> CloudRegistration:
+    """Rigid motion that brings ``source`` (N, 3) onto ``target`` (M, 3), metres.
+
+    It starts from the identity, so the clouds must nearly lie on each other, as an estimated and a
+    true map do.
+
+    Args:
+        source: the cloud to move.
+        target: the cloud that stays.
+        method: ``icp`` is the sum of |T a - b|^2 over nearest points (Besl and McKay, PAMI 1992),
+            ``plane-icp`` of (n_b . (T a - b))^2 (Chen and Medioni, IVC 1992), ``gicp`` weighs
+            T a - b by the shape of the surface at both (Segal et al., "Generalized-ICP", RSS 2009);
+            ``none`` leaves the source where it is.
+        cutoff_m: pairs farther apart are left out.
+        max_points: at most so many points of the source, evenly picked, are matched.
+        neighbours: that the normal of a point is taken from.
+
+    Raises:
+        InputError: bad points, an unknown method, a cut-off that is not positive, too few points
+            for ``neighbours``.
+    """
+    cloud, fixed = check_points(source, "source"), check_points(target, "target")
+    if method not in REGISTRATIONS:
+        raise unknown("registration", method, REGISTRATIONS)
+    if not (np.isfinite(cutoff_m) and cutoff_m > 0):
+        raise InputError(f"cutoff_m must be finite and > 0, got {cutoff_m}")
+    if method == "none":
+        return CloudRegistration(np.eye(4), True, 0, len(cloud), 1.0)
+    picked = cloud[np.unique(np.linspace(0, len(cloud) - 1, max_points).astype(int))]
+    if method != "icp" and min(len(picked), len(fixed)) < neighbours:
+        raise InputError(f"{method} needs at least {neighbours} points in either cloud")
+    if method == "plane-icp":
+        return _plane_icp(picked, fixed, cutoff_m, neighbours)
+    return _small_gicp(picked, fixed, method, cutoff_m, neighbours)
+
+
+def _small_gicp(
+    source: Float64, target: Float64, method: str, cutoff_m: float, neighbours: int
+) -> CloudRegistration:
+    import small_gicp
+
+    clouds = [small_gicp.PointCloud(points) for points in (source, target)]
+    trees = [small_gicp.KdTree(points) for points in clouds]
+    if method == "gicp":
+        for points, tree in zip(clouds, trees, strict=True):
+            small_gicp.estimate_covariances(points, tree, neighbours, 1)
+    found = small_gicp.align(
+        target=clouds[1],
+        source=clouds[0],
+        target_tree=trees[1],
+        registration_type=method.upper(),
+        max_correspondence_distance=cutoff_m,
+        num_threads=1,  # more would not add up in a fixed order
+        max_iterations=_ITERATIONS,
+        rotation_epsilon=_STEP,
+        translation_epsilon=_STEP,
+    )
+    T, pairs = np.array(found.T_target_source), int(found.num_inliers)
+    if pairs < 3 or not np.isfinite(T).all():
+        return CloudRegistration(np.eye(4), False, int(found.iterations), 0, 0.0)
+    return CloudRegistration(
+        T, bool(found.converged), int(found.iterations), pairs, pairs / len(source)
+    )
+
+
+def _plane_icp(
+    source: Float64, target: Float64, cutoff_m: float, neighbours: int
+) -> CloudRegistration:
+    """Gauss-Newton on the distances along the normals.
+
+    Not small_gicp's own PLANE_ICP: on slanted surfaces that ends millimetres from the least sum of
+    (n_b . (T a - b))^2, where this and Open3D's end.
+    """
+    import small_gicp
+
+    cloud = small_gicp.PointCloud(target)
+    small_gicp.estimate_normals(cloud, small_gicp.KdTree(cloud), neighbours, 1)
+    normals = cloud.normals()[:, :3]
+    tree = cKDTree(target)
+    T, count = np.eye(4), 0
+    for iteration in range(1, _ITERATIONS + 1):
+        moved = transform_points(T, source)
+        distance, index = tree.query(moved, distance_upper_bound=cutoff_m)
+        near = np.isfinite(distance)
+        count = int(near.sum())
+        if count < 6:
+            return CloudRegistration(np.eye(4), False, iteration, 0, 0.0)
+        a, b, n = moved[near], target[index[near]], normals[index[near]]
+        J = np.concatenate([n, np.cross(a, n)], axis=1)  # of n . (a + rho + phi x a - b)
+        step = np.linalg.lstsq(J, -np.einsum("ij,ij->i", n, a - b), rcond=None)[0]
+        T = se3_exp(step) @ T
+        if np.abs(step).max() < _STEP:
+            return CloudRegistration(T, True, iteration, count, count / len(source))
+    return CloudRegistration(T, False, _ITERATIONS, count, count / len(source))
