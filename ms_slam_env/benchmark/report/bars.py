@@ -15,7 +15,16 @@ _MAX_SERIES = 10
 _MAX_LABELS = 60
 _MAX_MEASURES = 24
 _NO_MEASURES = ("seed", "repeat", "elapsed_s")
-_FIRST = ("ate_m", "f_score_5cm", "success", "found", "divergence", "step_ms", "steps_per_s")
+_FIRST = (
+    "ate_m",
+    "f_score_5cm",
+    "success",
+    "found",
+    "divergence",
+    "step_ms",
+    "median_ms",
+    "steps_per_s",
+)
 
 
 def text_columns(rows: Sequence[Record]) -> list[str]:
@@ -49,6 +58,7 @@ def bar_figure(
     title: str = "Measures",
     names: Sequence[str] | None = None,
     keys: Sequence[str] | None = None,
+    coloured: bool = False,
 ) -> Figure | None:
     """Bars (dots on a logarithmic axis where values spread far), intervals where there are any.
 
@@ -58,6 +68,7 @@ def bar_figure(
         names: columns that name the rows, the last of them being the series where there are
             several; by default those of text that differ.
         keys: measures to choose from; by default all that differ.
+        coloured: give each row the colour that the series of its place has in other figures.
 
     Returns:
         the figure; None where nothing can be compared.
@@ -78,6 +89,9 @@ def bar_figure(
     found = [_plot(rows, pairs, key) for key in keys if _tells_apart(rows, pairs, key)]
     if not found:
         return None
+    if coloured:
+        for plot in found:
+            plot.data[0]["marker"] = {"color": [plots.colour(k) for k in range(len(rows))]}
     height = 110 + (14 if len(set(series)) > 1 else 20) * len(rows) + 8 * len(set(labels))
     caption = "One row each" if series_key is None else f"Colour: {heading(series_key)}"
     if any(isinstance(row.get(key), Interval) for row in rows for key in keys):

@@ -21,7 +21,8 @@ def flatten(row: Mapping[str, Any], prefix: str = "") -> Record:
     """One level from nested objects, keys joined by dots.
 
     ``{value, low, high}`` becomes an :class:`Interval`; the parts ``spec`` and ``result`` of a run
-    leave no trace in the keys; long lists are left out.
+    leave no trace in the keys; up to four numbers of a list have columns of their own, longer
+    lists of numbers are left out.
     """
     found: Record = {}
     for key, value in row.items():
@@ -33,8 +34,11 @@ def flatten(row: Mapping[str, Any], prefix: str = "") -> Record:
             found.update(flatten(value, inner))
         elif isinstance(value, (str, int, float, bool)) or value is None:
             found[name] = value
-        elif isinstance(value, list) and len(value) <= 6 and not any(map(_nested, value)):
-            found[name] = ", ".join(cell_of(v).text for v in value)
+        elif isinstance(value, list) and 0 < len(value) <= 4 and all(map(_is_measure, value)):
+            for place, part in enumerate(value, start=1):
+                found.update(flatten({f"{name}.{place}": part}))
+        elif isinstance(value, list) and len(value) <= 8 and not any(map(_nested, value)):
+            found[name] = ", ".join(cell_of(part).text for part in value)
     return found
 
 
@@ -63,7 +67,7 @@ def records(value: Any, names: Sequence[str] = ()) -> list[Record] | None:
     for key, inner in value.items():
         deeper = records(inner, rest) if _has_rows(inner) else None
         for row in deeper if deeper is not None else [flatten(inner)]:
-            found.append({_free(name, row): _number_or_text(key), **row})
+            found.append({_free(name, row): _placeor_text(key), **row})
     return found
 
 
@@ -129,6 +133,11 @@ def _has_rows(value: Any) -> bool:
     return 2 * len(common) >= max(len(row) for row in inner)
 
 
+def _is_measure(value: Any) -> bool:
+    """Whether JSON ``value`` is a number or an estimate."""
+    return is_interval(value) or (isinstance(value, (int, float)) and not isinstance(value, bool))
+
+
 def _nested(value: Any) -> bool:
     return isinstance(value, (list, Mapping))
 
@@ -139,7 +148,7 @@ def _free(name: str, row: Record) -> str:
     return name
 
 
-def _number_or_text(key: str) -> Value:
+def _placeor_text(key: str) -> Value:
     try:
         return float(key) if "." in key else int(key)
     except ValueError:

@@ -130,7 +130,7 @@ def heading(key: str) -> str:
 
 def _words(key: str) -> str:
     for pattern, *_ in _UNITS:
-        if pattern.startswith("_"):
+        if pattern.startswith(("_", "(^|_)")):
             shorter = re.sub(pattern, "", key)
             if shorter != key and shorter:
                 key = shorter if pattern != "_share$" else key

@@ -38,7 +38,7 @@ def section_of(result: Result) -> Section:
         kind = Generic()  # the file looks like a known kind but is not of its form
         drawn, own = kind.figures(result), []
     has_table = any(isinstance(block, Table) for block in (*written, *own))
-    values = facts(result.content)
+    values = facts(result.content, folded=has_table)
     blocks: list[Block] = [*drawn, *own, *written]
     if values is not None:
         blocks.append(values)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from ms_slam_env.benchmark.report.bars import bar_figure
@@ -13,12 +13,13 @@ from ms_slam_env.benchmark.report.glossary import heading, meaning
 from ms_slam_env.benchmark.report.kinds.base import Kind
 
 SETTINGS = ("config", "options", "settings", "rule", "params", "divergence")
+_DEPTH = 2
 
 
 class Generic(Kind):
     """Anything: the measures of its rows, one at a time."""
 
-    name = "result"
+    name = "benchmark"
     about = "All values of the result file, as figures and tables."
 
     def fits(self, content: dict[str, Any]) -> bool:
@@ -40,18 +41,27 @@ class Generic(Kind):
 
 def row_groups(content: Mapping[str, Any]) -> list[tuple[str, list[Record]]]:
     """Groups of rows in ``content`` with a title each, results before single runs."""
-    names = list(key_names(content))
-    found = []
+    found = list(_groups(content, list(key_names(content)), _DEPTH))
+    return sorted(found, key=lambda group: is_raw(group[1]))
+
+
+def _groups(
+    content: Mapping[str, Any], names: list[tuple[set[str], str]], depth: int
+) -> Iterator[tuple[str, list[Record]]]:
     for key, value in content.items():
         if key in SETTINGS:
             continue
         rows = records(value, outer_names(value, names))
-        if rows is None and isinstance(value, Mapping):
+        if rows:
+            yield heading(key), rows
+        elif isinstance(value, Mapping) and depth:
             inner = {k: v for k, v in value.items() if isinstance(v, Mapping)}
             rows = records(inner, outer_names(inner, names)) if len(inner) > 1 else None
-        if rows:
-            found.append((heading(key), rows))
-    return sorted(found, key=lambda group: is_raw(group[1]))
+            if rows:
+                yield heading(key), rows
+            else:
+                for title, deeper in _groups(value, names, depth - 1):
+                    yield f"{heading(key)}: {title}", deeper
 
 
 def is_raw(rows: list[Record]) -> bool:
@@ -59,13 +69,13 @@ def is_raw(rows: list[Record]) -> bool:
     return any("key" in row and "elapsed_s" in row for row in rows[:1]) or len(rows) > 200
 
 
-def facts(content: Mapping[str, Any]) -> Table | None:
-    """Single values at the top of ``content``, as a table of two columns."""
+def facts(content: Mapping[str, Any], folded: bool) -> Table | None:
+    """Values of ``content`` that are in no group of rows, as a table of two columns."""
     single: Record = {}
     for key, value in content.items():
-        if key not in SETTINGS and records(value) is None:
+        if key not in SETTINGS and not any(_groups({key: value}, [], _DEPTH)):
             single.update(flatten({key: value}))
-    return _two_columns("Values", single, False)
+    return _two_columns("Values", single, folded)
 
 
 def settings(content: Mapping[str, Any]) -> Table | None:

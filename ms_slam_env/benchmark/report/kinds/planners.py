@@ -53,7 +53,7 @@ class Planners(Kind):
         found = [
             scatter(rows, planners, result.content["summary"], label_of),
             over_time(rows, planners, label_of),
-            bar_figure(measures, "Every measure", ["planner"], keys),
+            bar_figure(measures, "Every measure", ["planner"], keys, coloured=True),
             bar_figure(by_scene(rows, planners, label_of), "By scene", ["scene", "planner"]),
         ]
         return [figure for figure in found if figure is not None]

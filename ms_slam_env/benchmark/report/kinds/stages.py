@@ -67,9 +67,12 @@ def stage_figure(stages: dict[str, dict[str, float]]) -> Figure | None:
         for index, name in enumerate(names)
     ]
     y = {"automargin": True, "type": "category", "autorange": "reversed"}
-    layout = plots.layout(plots.axis("time [ms]"), y, barmode="stack", showlegend=True)
+    order = {"traceorder": "normal"}
+    layout = plots.layout(
+        plots.axis("time [ms]"), y, barmode="stack", showlegend=True, legend=order
+    )
     height = min(220 + 34 * len(stages) + 12 * len(names), 900)
-    caption = "Parts that are below one per cent are hard to see: hide the others by a click."
+    caption = "Click a stage to hide it, twice to see it alone."
     return Figure("Time by stage", caption, (plots.plot(data, layout),), height) if data else None
 
 
