@@ -15,7 +15,10 @@ _EMBODIMENT_OF_ID = {
     "MSActiveSLAM-FixedTranslation-v0": "fixed-translation",
 }
 
-ENV_IDS = tuple(_EMBODIMENT_OF_ID)
+ADAPTIVE_ID = "MSActiveSLAM-Adaptive-v0"
+"""The agent chooses motion and SLAM configuration, by an arm unless ``embodiment`` is given."""
+
+ENV_IDS = (*_EMBODIMENT_OF_ID, ADAPTIVE_ID)
 """Every registered environment id."""
 
 
@@ -26,11 +29,19 @@ class InProcessVectorEnv(SyncVectorEnv):
         self, num_envs: int, max_episode_steps: int = MAX_EPISODE_STEPS, **options: Any
     ) -> None:
         def make() -> gymnasium.Env[Any, Any]:
-            from ms_slam_env.env.active_slam import ActiveSlamEnv
-
-            return gymnasium.wrappers.TimeLimit(ActiveSlamEnv(**options), max_episode_steps)
+            return gymnasium.wrappers.TimeLimit(self._make_one(**options), max_episode_steps)
 
         super().__init__([make] * num_envs)
+
+    def _make_one(self, **options: Any) -> gymnasium.Env[Any, Any]:
+        return make_env(**options)
+
+
+class AdaptiveInProcessVectorEnv(InProcessVectorEnv):
+    """The same for environments whose agent chooses the SLAM configuration too."""
+
+    def _make_one(self, **options: Any) -> gymnasium.Env[Any, Any]:
+        return make_adaptive_env(**options)
 
 
 def make_env(**options: Any) -> gymnasium.Env[Any, Any]:
@@ -40,9 +51,17 @@ def make_env(**options: Any) -> gymnasium.Env[Any, Any]:
     return ActiveSlamEnv(**options)
 
 
+def make_adaptive_env(**options: Any) -> gymnasium.Env[Any, Any]:
+    """Entry point: one environment whose agent chooses the SLAM configuration too."""
+    from ms_slam_env.env.adaptive_env import AdaptiveSlamEnv
+
+    return AdaptiveSlamEnv(**options)
+
+
 # Without "human" Gymnasium would warn, wrap the environment and fail at the first reset for want of
 # pygame; with it the environment itself is asked, and refuses in one line.
 make_env.metadata = {"render_modes": ["rgb_array", "human"]}  # type: ignore[attr-defined]
+make_adaptive_env.metadata = make_env.metadata  # type: ignore[attr-defined]
 
 
 def register_all() -> None:
@@ -56,4 +75,12 @@ def register_all() -> None:
             vector_entry_point="ms_slam_env.registration:InProcessVectorEnv",
             max_episode_steps=MAX_EPISODE_STEPS,
             kwargs={"embodiment": embodiment},
+        )
+    if ADAPTIVE_ID not in gymnasium.registry:
+        gymnasium.register(
+            ADAPTIVE_ID,
+            entry_point="ms_slam_env.registration:make_adaptive_env",
+            vector_entry_point="ms_slam_env.registration:AdaptiveInProcessVectorEnv",
+            max_episode_steps=MAX_EPISODE_STEPS,
+            kwargs={"embodiment": "arm"},
         )

@@ -379,7 +379,7 @@ class ActiveSlamEnv(EpisodeRecord):
         self._current()
         array = np.asarray(action)
         is_integer = array.shape == () and np.issubdtype(array.dtype, np.integer)
-        last = int(self.action_space.n) - 1  # type: ignore[attr-defined]
+        last = self._embodiment_type.num_actions - 1
         if not is_integer or not 0 <= int(array) <= last:
             raise InputError(f"action {action!r} is not an integer in [0, {last}]")
         return int(array)

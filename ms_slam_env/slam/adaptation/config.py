@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,6 +14,20 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.slam.adaptation.base import Controller
 from ms_slam_env.slam.base import SlamBackend
 from ms_slam_env.slam.configuration import SlamConfiguration
+
+
+def rising(values: Any, name: str, count: int) -> tuple[float, ...]:
+    """``count`` positive numbers, each larger than the one before, as a tuple.
+
+    Raises:
+        InputError: they are something else.
+    """
+    is_list = isinstance(values, (tuple, list))
+    numbers = [x for x in values if isinstance(x, (int, float))] if is_list else []
+    is_rising = all(a < b for a, b in itertools.pairwise([0, *numbers]))
+    if not is_rising or not is_list or not len(numbers) == len(values) == count:
+        raise InputError(f"{name} = {values!r} must be {count} positive numbers that rise")
+    return tuple(float(x) for x in numbers)
 
 
 @dataclass(frozen=True)
@@ -47,13 +62,16 @@ class SwitchingConfig(AdaptationConfig):
             mappings of its fields, or such objects. What one does not name stays as the backend
             was made. None: three that suit the camera (``default_configurations``).
         start: index of the first in force; None: the last, the most robust.
+        costs: of each configuration, rising and positive: a stand-in for processor time that is
+            the same in every run. None: ``about.cost`` of each configuration.
 
     Raises:
-        InputError: a bad configuration, or an index that none has.
+        InputError: a bad configuration, an index that none has, or bad costs.
     """
 
     configurations: Any = None
     start: int | None = None
+    costs: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         """Read the configurations."""
@@ -65,6 +83,9 @@ class SwitchingConfig(AdaptationConfig):
                 raise InputError("configurations must be at least two, from fast to robust")
         if self.start is not None:
             check_range(self, "start", 0, self.num_configurations - 1)
+        if self.costs is not None:
+            count = self.num_configurations
+            object.__setattr__(self, "costs", rising(self.costs, "costs", count))
 
     @property
     def num_configurations(self) -> int:
@@ -83,6 +104,21 @@ class SwitchingConfig(AdaptationConfig):
         if self.configurations is None:
             return default_configurations(intrinsics)
         return tuple(self.configurations)
+
+    def costs_of(self, intrinsics: Intrinsics) -> tuple[float, ...]:
+        """(K,) the cost of each configuration for frames of ``intrinsics``.
+
+        Raises:
+            InputError: neither ``costs`` nor the configurations say it.
+        """
+        if self.costs is not None:
+            return self.costs
+        named = [one.about.get("cost") for one in self.resolved(intrinsics)]
+        if None in named:
+            raise InputError(
+                f"configurations[{named.index(None)}] has no about.cost, and no costs are given"
+            )
+        return rising(named, "about.cost of the configurations", len(named))
 
     @abstractmethod
     def make_controller(self, intrinsics: Intrinsics) -> Controller:

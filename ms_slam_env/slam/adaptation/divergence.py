@@ -6,7 +6,6 @@ set is taken up, which costs more and copes with it.
 
 from __future__ import annotations
 
-import itertools
 from bisect import bisect_right
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,7 +14,7 @@ from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.config import check_choice, check_range
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.adaptation.base import Controller
-from ms_slam_env.slam.adaptation.config import SwitchingConfig
+from ms_slam_env.slam.adaptation.config import SwitchingConfig, rising
 from ms_slam_env.slam.frame_management import ChangeConfig
 from ms_slam_env.slam.frame_management.change import Change
 
@@ -54,16 +53,8 @@ class DivergenceAdaptationConfig(SwitchingConfig):
         check_choice(self, "per", ("frame", "second"))
         if not isinstance(self.robust_when_lost, bool):
             raise InputError(f"robust_when_lost = {self.robust_when_lost!r} must be true or false")
-        is_list = isinstance(self.thresholds, (tuple, list))
-        numbers = [x for x in self.thresholds if isinstance(x, (int, float))] if is_list else []
-        rising = all(0 < a < b for a, b in itertools.pairwise(numbers))
         wanted = self.num_configurations - 1
-        if not rising or not len(numbers) == len(self.thresholds) == wanted or numbers[0] <= 0:
-            raise InputError(
-                f"thresholds = {self.thresholds!r} must be {wanted} rising positive numbers, one "
-                f"between any two of the {self.num_configurations} configurations"
-            )
-        object.__setattr__(self, "thresholds", tuple(numbers))  # lists come from YAML
+        object.__setattr__(self, "thresholds", rising(self.thresholds, "thresholds", wanted))
 
     def make_controller(self, intrinsics: Intrinsics) -> Controller:
         """The controller for frames of ``intrinsics``."""

@@ -108,7 +108,7 @@ def default_configurations(intrinsics: Intrinsics) -> tuple[SlamConfiguration, .
     fast: dict[str, Any] = {"iterations": [1, 1, 2], "points_per_level": 2000}
     robust: dict[str, Any] = {"iterations": [8, 10, 20], "points_per_level": 20_000}
     return (
-        SlamConfiguration(slam_config=fast, image_size=size, keep_every=3),
-        SlamConfiguration(image_size=size),
-        SlamConfiguration(slam_config=robust),
+        SlamConfiguration(slam_config=fast, image_size=size, keep_every=4, about={"cost": 0.35}),
+        SlamConfiguration(image_size=size, keep_every=2, about={"cost": 0.5}),
+        SlamConfiguration(slam_config=robust, image_size=size, about={"cost": 1.0}),
     )
