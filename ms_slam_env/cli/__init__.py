@@ -11,6 +11,7 @@ COMMANDS = {
     "compare": "run SLAM backends over the same sequences and compare them",
     "divergence": "measure how hard recorded sequences are, from frame to frame",
     "evaluate": "compare an estimated trajectory with the truth (TUM files)",
+    "explore": "search the parameters of a SLAM backend for the best compromises",
     "generate": "render an RGB-D sequence with true poses into a folder",
     "report": "turn a folder of results into one HTML page",
     "run": "run a SLAM backend over a recorded RGB-D sequence",

@@ -111,8 +111,11 @@ def make(name: str | Path, intrinsics: Intrinsics, **params: Any) -> SlamBackend
     return BACKENDS[name](intrinsics, **params)
 
 
-def check_parameters(name: object, params: object) -> None:
+def check_parameters(name: object, params: object) -> Any:
     """Refuse what ``make`` would refuse, without making a backend.
+
+    Returns:
+        the backend's parameters as its dataclass.
 
     Raises:
         InputError: unknown backend, unknown parameter or value out of range.
@@ -121,7 +124,7 @@ def check_parameters(name: object, params: object) -> None:
         raise unknown("SLAM backend", name, BACKENDS)
     if not isinstance(params, Mapping) or not all(isinstance(key, str) for key in params):
         raise InputError(f"slam_config = {params!r} must be a mapping of options")
-    _CONFIGS[name](**params)
+    return _CONFIGS[name](**params)
 
 
 __all__ = [

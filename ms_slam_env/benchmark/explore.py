@@ -1,0 +1,159 @@
+"""An exploration from its settings to its results on disk."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from ms_slam_env.benchmark.explore_evaluation import SlamEvaluator
+from ms_slam_env.benchmark.explore_figures import save_figures
+from ms_slam_env.benchmark.explore_judge import judge
+from ms_slam_env.benchmark.explore_report import table
+from ms_slam_env.benchmark.provenance import provenance
+from ms_slam_env.benchmark.records import write_json
+from ms_slam_env.errors import InputError
+from ms_slam_env.exploration import ExplorationSettings, explore, make_space
+from ms_slam_env.exploration.front import (
+    Point,
+    choose,
+    hypervolume_history,
+    importances,
+    points_of,
+)
+from ms_slam_env.exploration.ledger import Ledger
+from ms_slam_env.metrics.cost import energy_counters
+from ms_slam_env.slam.configuration import SlamConfiguration, write_configuration
+
+
+@dataclass(frozen=True)
+class Exploration:
+    """What is explored, on what, and how.
+
+    Attributes:
+        evaluator: measures a configuration.
+        settings: objectives, constraints and sampler.
+        parameters: ``NAME``, ``NAME=low:high[:log]``, ``NAME=a,b,c``, or a group of them.
+        base: configuration that the exploration starts from, its first trial.
+        held_out: sequences that the chosen configurations are judged on.
+
+    Raises:
+        InputError: an unknown name, a value out of range, or an objective that this machine or
+            evaluation cannot measure.
+    """
+
+    evaluator: SlamEvaluator
+    settings: ExplorationSettings = field(default_factory=ExplorationSettings)
+    parameters: tuple[str, ...] = ("algorithm",)
+    base: SlamConfiguration = field(default_factory=SlamConfiguration)
+    held_out: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be measured."""
+        asked = {*self.settings.objectives}
+        asked |= {constraint.metric for constraint in self.settings.parsed_constraints()}
+        if "map_error_mm" in asked and not self.evaluator.map_error:
+            raise InputError("map_error_mm is not measured: the evaluator has map_error off")
+        if "energy_j" in asked:
+            reasons = [counter.reason for counter in energy_counters("cpu").values()]
+            if all(reasons):
+                raise InputError(f"energy_j is not available: {'; '.join(reasons)}")
+        both = set(self.held_out) & set(self.evaluator.sequences)
+        if both:
+            raise InputError(f"sequence {sorted(both)[0]} is explored and held out")
+
+
+def run_exploration(
+    exploration: Exploration,
+    out: Path,
+    trials: int,
+    workers: int = 1,
+    ray_address: str | None = None,
+) -> str:
+    """Explore until ``trials`` trials have finished, and write what came of it to ``out``.
+
+    ``study.db`` (Optuna's, to go on from), ``explore.json``, ``table.md``, ``pareto.png``,
+    ``hypervolume.png``, ``importance.png``, and the chosen configurations as YAML.
+
+    Returns:
+        the table.
+
+    Raises:
+        InputError: bad input, or ``out`` holds another exploration.
+        RuntimeError: worker processes die again and again.
+    """
+    space = make_space(exploration.parameters, exploration.base)
+    with tqdm(total=trials, desc=exploration.settings.sampler, unit="trial") as bar:
+        ledger = explore(
+            out,
+            space,
+            exploration.settings,
+            exploration.evaluator,
+            trials,
+            workers,
+            ray_address,
+            lambda finished: _show(bar, finished),
+        )
+    return write_results(exploration, ledger, out)
+
+
+def _show(bar: tqdm, finished: int) -> None:
+    bar.update(finished - bar.n)
+
+
+def write_results(exploration: Exploration, ledger: Ledger, out: Path) -> str:
+    """Write everything but the study; return the table."""
+    objectives = exploration.settings.objectives
+    points = points_of(ledger)
+    reference = ledger.reference() or {}
+    chosen = choose(points, objectives)
+    files = {name: f"{name.replace('_', '-')}.yaml" for name in chosen}
+    for name, point in chosen.items():
+        write_configuration(out / files[name], _configuration(ledger, point, name))
+    held_out = judge(
+        exploration.evaluator,
+        {
+            "default": ledger.space.base,
+            **{name: ledger.space.configuration(point.params) for name, point in chosen.items()},
+        },
+        exploration.held_out,
+        out,
+    )
+    history = hypervolume_history(points, reference, objectives)
+    content: dict[str, Any] = {
+        "provenance": provenance(),
+        "config": {
+            **asdict(exploration.evaluator),
+            **asdict(exploration.settings),
+            "parameters": {name: str(kind) for name, kind in ledger.space.parameters.items()},
+            "base": asdict(exploration.base),
+            "held_out": exploration.held_out,
+        },
+        "objectives": objectives,
+        "reference": reference,
+        "chosen": {name: {"file": files[name], **point.row()} for name, point in chosen.items()},
+        "hypervolume": [float(value) for value in history],
+        "importance": importances(ledger),
+        "held_out": held_out,
+        "trials": [point.row() for point in points],
+    }
+    write_json(out / "explore.json", content)
+    text = table(content)
+    (out / "table.md").write_text(text, encoding="utf-8")
+    save_figures(content, out)
+    return text
+
+
+def _configuration(ledger: Ledger, point: Point, purpose: str) -> SlamConfiguration:
+    """The configuration of ``point`` with where it comes from."""
+    made = ledger.space.configuration(point.params)
+    about = {
+        "purpose": purpose,
+        "trial": point.number,
+        "measured": {k: v for k, v in point.measured.items() if v is not None},
+    }
+    return SlamConfiguration(
+        made.slam, made.slam_config, made.image_size, made.keep_every, made.threads, about
+    )

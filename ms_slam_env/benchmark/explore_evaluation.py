@@ -1,0 +1,215 @@
+"""What an exploration measures of a SLAM configuration: a run over each of several sequences."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from ms_slam_env import metrics, slam
+from ms_slam_env.benchmark import compare_inputs
+from ms_slam_env.benchmark.compare_inputs import Input
+from ms_slam_env.benchmark.sequence_divergence import consecutive_divergences
+from ms_slam_env.camera import XTION_SIZES
+from ms_slam_env.config import check_choice, check_range
+from ms_slam_env.divergence import DivergenceConfig
+from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.exploration.objectives import FAILURE
+from ms_slam_env.metrics.cost import CostMeter
+from ms_slam_env.sequences import HandheldPath
+from ms_slam_env.slam.configuration import SlamConfiguration
+
+CLOCKS = {"processor": "cpu_ms_median", "wall": "ext_ms_median"}
+"""What execution time is measured by, and the meter's name of it."""
+
+Row = dict[str, Any]
+
+_WARM_UP = 5  # frames left out of the timing: buffers grow, kernels are loaded
+_WARM_UP_FRAMES = 15
+_ALL_CORES = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
+
+
+@dataclass(frozen=True)
+class SlamEvaluator:
+    """Runs configurations over sequences, which stay in memory; it can be sent to other processes.
+
+    Attributes:
+        sequences: folders, or ``scene:seed[:noise[+perturbation ...]]``.
+        frames: of a rendered sequence.
+        speed_m_s: mean speed of the camera of a rendered sequence, where it does not turn.
+        turn_deg_s: mean speed of rotation, where it turns.
+        image_size: where a configuration does not say.
+        max_lost: share of the frames that tracking may lose; beyond, the run has failed.
+        clock: of the execution time: ``processor`` counts the time of all threads and not that of
+            other programs; ``wall`` is what a GPU needs.
+        map_error: whether maps are compared with the true surface, which takes a while.
+
+    Raises:
+        InputError: an unknown name, or a value out of range.
+    """
+
+    sequences: tuple[str, ...]
+    frames: int = 90
+    speed_m_s: float = 0.5
+    turn_deg_s: float = 30.0
+    image_size: str = "160x120"
+    max_lost: float = 0.02
+    clock: str = "processor"
+    map_error: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse what no run could use."""
+        if not self.sequences:
+            raise InputError("no sequence to explore on")
+        for text in self.sequences:
+            compare_inputs.parse_sequence(text)
+        check_range(self, "frames", 10, 100_000)
+        check_range(self, "speed_m_s", 0.0, 10.0)
+        check_range(self, "turn_deg_s", 0.0, 1000.0)
+        check_range(self, "max_lost", 0.0, 1.0)
+        check_choice(self, "clock", tuple(CLOCKS))
+        if self.image_size not in XTION_SIZES:
+            raise unknown("image size", self.image_size, XTION_SIZES)
+
+    def __call__(self, configuration: SlamConfiguration) -> Row:
+        """Measure ``configuration`` on every sequence together; see ``summarise``."""
+        return summarise([self.measure(configuration, text) for text in self.sequences])
+
+    def context(self) -> Row:
+        """What decides the figures, to be kept with a study."""
+        return asdict(self)
+
+    def measure(self, configuration: SlamConfiguration, text: str) -> Row:
+        """Measure ``configuration`` on one sequence.
+
+        Returns:
+            ``ate_m`` (RMSE, SE(3)-aligned), ``ate_max_m``, ``ext_ms`` (median time of a processed
+            frame), ``load_ms`` (mean time by all frames, those left out included), ``mem_mb`` (peak
+            of the SLAM's own), ``energy_j`` (a processed frame), ``map_error_mm``, ``lost`` (share
+            of the processed frames), ``M_I``, ``M_D`` (largest divergences between processed
+            neighbours, nats), ``frames``; None or missing where it cannot be had. ``failure`` in
+            words if tracking was lost too often, or SLAM broke down.
+
+        Raises:
+            InputError: a sequence that cannot be read, or parameters that the backend refuses.
+        """
+        size = configuration.image_size or self.image_size
+        path = HandheldPath(self.frames, speed_m_s=self.speed_m_s, turn_deg_s=self.turn_deg_s)
+        given = _load(text, size, path)
+        every = configuration.keep_every
+        M_I, M_D = _divergences(text, size, path, every)
+        row: Row = {"sequence": text, "M_I": M_I, "M_D": M_D}
+        _warm_up(
+            configuration.slam, size, str(configuration.slam_config.get("device", "cpu")), given
+        )
+        _limit_threads(configuration.threads)
+        try:
+            return {**row, **self._run(configuration, given)}
+        except InputError:
+            raise
+        except (RuntimeError, ArithmeticError, ValueError, MemoryError) as error:
+            return {**row, "lost": 1.0, FAILURE: f"{text}: {error or type(error).__name__}"}
+        finally:
+            _limit_threads(None)
+
+    def _run(self, configuration: SlamConfiguration, given: Input) -> Row:
+        device = str(configuration.slam_config.get("device", "cpu"))
+        meter = CostMeter(device)
+        system = slam.make(configuration.slam, given.intrinsics, **configuration.slam_config)
+        system.reset(given.poses[0])
+        truth = given.poses[:: configuration.keep_every]
+        estimates, tracked = [], []
+        for frame in given.frames[:: configuration.keep_every]:
+            with meter.frame():
+                result = system.track(frame)
+            estimates.append(result.T_world_camera)
+            tracked.append(result.tracking_ok)
+        ate = metrics.ate_statistics(np.stack(estimates), truth)
+        costs = meter.summary(min(_WARM_UP, len(estimates) - 1))
+        ext_ms = costs[CLOCKS[self.clock]]
+        lost = 1.0 - float(np.mean(tracked))
+        row: Row = {
+            "frames": len(estimates),
+            "ate_m": ate.rmse,
+            "ate_max_m": ate.max,
+            "ext_ms": ext_ms,
+            "load_ms": ext_ms * len(estimates) / len(given.frames),
+            "mem_mb": costs["mem_peak_mb"],
+            "energy_j": costs["ene_frame_j"],
+            "lost": lost,
+        }
+        if self.map_error:
+            row["map_error_mm"] = _map_error_mm(system.surface_points(), given.surface)
+        if not math.isfinite(ate.rmse):
+            row[FAILURE] = "the trajectory is not finite"
+        elif lost > self.max_lost:
+            row[FAILURE] = f"tracking lost in {100 * lost:.0f} % of the frames"
+        return row
+
+
+def summarise(rows: Sequence[Row]) -> Row:
+    """One row for all sequences: means, but the largest of maxima and memory; any failure."""
+    largest = ("ate_max_m", "mem_mb", "lost", "M_I", "M_D")
+    means = ("ate_m", "ext_ms", "load_ms", "energy_j", "map_error_mm")
+    result: Row = {}
+    for name in (*means, *largest):
+        values = [row.get(name) for row in rows]
+        known = [value for value in values if value is not None]
+        if len(known) == len(rows):
+            result[name] = float(np.max(known) if name in largest else np.mean(known))
+    failures = [f"{row['sequence']}: {row[FAILURE]}" for row in rows if row.get(FAILURE)]
+    if failures:
+        result[FAILURE] = "; ".join(failures)
+    return result
+
+
+@lru_cache(maxsize=64)
+def _load(text: str, size: str, path: HandheldPath) -> Input:
+    return compare_inputs.load(text, size, path)
+
+
+@lru_cache(maxsize=1024)
+def _divergences(text: str, size: str, path: HandheldPath, every: int) -> tuple[float, float]:
+    """Largest intensity and depth divergence between processed neighbours, equations (11), (12)."""
+    given = _load(text, size, path)
+    frames = given.frames[::every]
+    if len(frames) < 2:
+        raise InputError(f"sequence {text}: every {every}th of {len(given.frames)} frames is one")
+    values = consecutive_divergences(frames, given.intrinsics, [DivergenceConfig()])[:, 0]
+    return float(values[:, 0].max()), float(values[:, 1].max())
+
+
+_WARM: set[tuple[str, str, str]] = set()
+
+
+def _warm_up(backend: str, size: str, device: str, given: Input) -> None:
+    """Run the backend once in this process before any run is timed: kernels are loaded."""
+    if (backend, size, device) not in _WARM:
+        _WARM.add((backend, size, device))
+        system = slam.make(
+            backend, given.intrinsics, **({} if device == "cpu" else {"device": device})
+        )
+        system.reset(given.poses[0])
+        for frame in given.frames[:_WARM_UP_FRAMES]:
+            system.track(frame)
+
+
+def _map_error_mm(points: np.ndarray, surface: np.ndarray) -> float | None:
+    """Median distance of a map point to the true surface, millimetres; None for an empty map."""
+    from ms_slam_env.metrics import reconstruction
+
+    if len(points) == 0:
+        return None
+    distances = reconstruction.nearest_distances(reconstruction.voxel_thin(points, 0.01), surface)
+    return 1e3 * float(np.median(distances))
+
+
+def _limit_threads(threads: int | None) -> None:
+    """Keep this process on so many cores; on all that it began with if None."""
+    if _ALL_CORES is not None:
+        os.sched_setaffinity(0, sorted(_ALL_CORES)[:threads])

@@ -1,0 +1,97 @@
+"""``ms-slam explore``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ms_slam_env.benchmark.command_line import parse
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Search the design space of a SLAM backend for the best compromises of error and cost.
+
+    The default configuration is the first trial. May be killed and called again with the same
+    arguments at any time: finished trials are kept. Writes explore.json, table.md, figures and the
+    chosen configurations as YAML.
+    """
+
+    sequences: tuple[str, ...] = (
+        "living_room:1000",
+        "corridor:1001",
+        "table:1002",
+        "carpet:1003",
+    )
+    """Sequences to explore on: folders, or scene:seed[:noise[+perturbation ...]]."""
+    held_out: tuple[str, ...] = ()
+    """Sequences to judge the chosen configurations on."""
+    objectives: tuple[str, ...] = ("ate_m", "ext_ms")
+    """What to minimise: ate_m, ate_max_m, ext_ms, load_ms, mem_mb, energy_j, map_error_mm, lost."""
+    constraints: tuple[str, ...] = ()
+    """What to demand, as in "ate_m<0.01"."""
+    parameters: tuple[str, ...] = ("algorithm",)
+    """Parameters of the backend: NAME, NAME=low:high[:log], NAME=a,b,c; keep_every, image_size,
+    threads; or a group: paper, algorithm, machine."""
+    config: Path | None = None
+    """Configuration file (YAML) to start from; by default the surfel backend's own."""
+    sampler: str = "tpe"
+    """random, nsga2, tpe or gp."""
+    trials: int = 100
+    """Finished trials, those of earlier calls included."""
+    seed: int = 0
+    """Of the sampler."""
+    workers: int = 1
+    """Processes that share the trials."""
+    ray: str | None = None
+    """Address of a Ray cluster to use, such as "auto"; "local" for one on this machine."""
+    image_size: str = "160x120"
+    """Of the camera, where the configuration does not say."""
+    frames: int = 90
+    """Length of a rendered sequence."""
+    speed_m_s: float = 0.5
+    """Mean speed of the camera of a rendered sequence, where it does not turn."""
+    turn_deg_s: float = 30.0
+    """Mean speed of rotation, where it turns."""
+    max_lost: float = 0.02
+    """Share of the frames that tracking may lose; a trial that loses more has failed."""
+    clock: str = "processor"
+    """Execution time is processor time of all threads, or "wall" time, which a GPU needs."""
+    reference_factor: float = 3.0
+    """Results worse than so many times the default's count as that."""
+    out: Path = Path("results/explore")
+    """Folder of the study and the results."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Explore, write, and print the table."""
+    args = parse(Arguments, arguments, "ms-slam explore")
+    from ms_slam_env.benchmark.explore import Exploration, run_exploration
+    from ms_slam_env.benchmark.explore_evaluation import SlamEvaluator
+    from ms_slam_env.exploration import ExplorationSettings
+    from ms_slam_env.slam.configuration import SlamConfiguration, read_configuration
+
+    names = " ".join((*args.objectives, *args.constraints))
+    evaluator = SlamEvaluator(
+        args.sequences,
+        args.frames,
+        args.speed_m_s,
+        args.turn_deg_s,
+        args.image_size,
+        args.max_lost,
+        args.clock,
+        map_error="map_error_mm" in names,
+    )
+    settings = ExplorationSettings(
+        args.objectives,
+        args.constraints,
+        args.sampler,
+        args.seed,
+        reference_factor=args.reference_factor,
+        context=evaluator.context(),
+    )
+    base = SlamConfiguration() if args.config is None else read_configuration(args.config)
+    exploration = Exploration(evaluator, settings, args.parameters, base, args.held_out)
+    print(run_exploration(exploration, args.out, args.trials, args.workers, args.ray))
+    return 0

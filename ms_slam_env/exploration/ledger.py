@@ -1,0 +1,242 @@
+"""A study on disk: trials are handed out, told, and taken back from processes that died.
+
+One SQLite file, because a killed process leaves nothing behind there: the system drops its locks
+and SQLite undoes what it had half written. Optuna's journal keeps half a line and a lock file.
+"""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ms_slam_env.errors import InputError
+from ms_slam_env.exploration.objectives import FAILURE, METRICS, Measured, objective_values
+from ms_slam_env.exploration.ownership import is_alive, process_name
+from ms_slam_env.exploration.samplers import make_sampler
+from ms_slam_env.exploration.settings import ExplorationSettings
+from ms_slam_env.exploration.space import SearchSpace
+from ms_slam_env.slam.configuration import SlamConfiguration
+
+if TYPE_CHECKING:
+    from optuna import Study, Trial
+    from optuna.trial import FrozenTrial
+
+STUDY_FILE, LOCK_FILE = "study.db", "study.lock"
+_NAME = "exploration"
+_MOST_RETRIES = 2  # of a trial whose process died; then its values may be what kills processes
+_LOCK_TIMEOUT_S = 600.0
+_DEFAULT, _OWNER, _RETRY_OF, _RETRIES = "default", "owner", "retry_of", "retries"
+MEASURED = "measured"
+"""User attribute of a finished trial: everything that its evaluation returned."""
+
+
+class Ledger:
+    """The trials of one study; any number of processes may hold a ledger of one folder.
+
+    Args:
+        folder: of the study; made if it is not there.
+        space: the parameters.
+        settings: of the exploration.
+
+    Raises:
+        InputError: the folder holds a study with other settings, or no study file at all.
+    """
+
+    def __init__(self, folder: Path, space: SearchSpace, settings: ExplorationSettings) -> None:
+        self.folder, self.space, self.settings = folder, space, settings
+        self.owner = process_name()
+        folder.mkdir(parents=True, exist_ok=True)
+        with self._alone():
+            self.study = self._open()
+
+    # -- Handing out and taking in -----------------------------------------------------------
+
+    def ask(self, budget: int) -> Trial | None:
+        """Hand out the next trial; None while ``budget`` trials are finished or in living hands.
+
+        The default configuration is the first; while it has not finished there is no other,
+        because results are measured by it.
+        """
+        from optuna.trial import TrialState
+
+        with self._alone():
+            self._take_back()
+            trials = self.study.get_trials(deepcopy=False)
+            states = [trial.state for trial in trials]
+            running = states.count(TrialState.RUNNING)
+            if states.count(TrialState.COMPLETE) + running >= budget:
+                return None
+            if self.reference() is None and running:
+                return None
+            # A sampler for each trial, seeded by the trial's number: a study that goes on after an
+            # interruption draws what it would have drawn without.
+            seed = np.random.SeedSequence([self.settings.seed, len(trials)]).generate_state(1)[0]
+            self.study.sampler = make_sampler(
+                self.settings.sampler, int(seed), self.settings.population
+            )
+            trial = self.study.ask(self.space.distributions())
+            trial.set_user_attr(_OWNER, self.owner)
+            return trial
+
+    def tell(self, trial: Trial, measured: Measured) -> None:
+        """Finish ``trial`` with what its evaluation returned."""
+        content = {name: _plain(value) for name, value in measured.items()}
+        if self.reference() is None:
+            self.study.set_user_attr("reference", self._reference_from(content))
+        trial.set_user_attr(MEASURED, content)
+        for name in ("M_I", "M_D"):
+            trial.set_user_attr(name, content.get(name))
+        trial.set_constraint("failed", 1.0 if content.get(FAILURE) else 0.0)
+        for constraint in self.settings.parsed_constraints():
+            trial.set_constraint(str(constraint), constraint.violation(content))
+        reference = self.reference()
+        assert reference is not None
+        values = objective_values(content, self.settings.objectives, reference)
+        self.study.tell(trial, values, skip_if_finished=True)
+
+    def give_up(self, trial: Trial, why: str) -> None:
+        """Mark ``trial`` as failed: its process died or could not work; it will be redone."""
+        from optuna.trial import TrialState
+
+        trial.set_user_attr("given_up", why)
+        self.study.tell(trial, state=TrialState.FAIL, skip_if_finished=True)
+
+    def configuration(self, trial: Trial | FrozenTrial) -> SlamConfiguration:
+        """What is to be evaluated."""
+        return self.space.configuration(trial.params)
+
+    # -- Looking -----------------------------------------------------------------------------
+
+    def finished(self) -> list[FrozenTrial]:
+        """Finished trials, in the order of their numbers."""
+        from optuna.trial import TrialState
+
+        return self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+
+    def reference(self) -> dict[str, float] | None:
+        """Where objectives stop to count, by name; None until the default has finished."""
+        return self.study.user_attrs.get("reference")
+
+    # -- Inside ------------------------------------------------------------------------------
+
+    def _open(self) -> Study:
+        import optuna
+        from optuna.storages import RDBStorage
+
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        try:
+            storage = RDBStorage(
+                f"sqlite:///{self.folder / STUDY_FILE}", engine_kwargs={"creator": self._connect}
+            )
+            study = optuna.create_study(
+                storage=storage,
+                study_name=_NAME,
+                directions=["minimize"] * len(self.settings.objectives),
+                load_if_exists=True,
+                sampler=optuna.samplers.RandomSampler(),
+            )
+        except Exception as error:
+            if isinstance(error, (OSError, MemoryError)):
+                raise
+            line = " ".join(str(error).split("\n")[0].split())
+            raise InputError(f"{self.folder / STUDY_FILE}: not a study: {line}") from None
+        self._check_settings(study)
+        if not any(trial.user_attrs.get(_DEFAULT) for trial in study.get_trials(deepcopy=False)):
+            study.enqueue_trial(self.space.defaults(), user_attrs={_DEFAULT: True})
+        return study
+
+    def _check_settings(self, study: Study) -> None:
+        mine = self.settings.fingerprint(self.space)
+        theirs: dict[str, Any] = study.user_attrs.get("settings", {})
+        if not theirs:
+            study.set_user_attr("settings", mine)
+            study.set_user_attr("objectives", list(self.settings.objectives))
+            return
+        for name in {**theirs, **mine}:
+            if theirs.get(name) != mine.get(name):
+                raise InputError(
+                    f"{self.folder} holds an exploration with other settings: {name} was "
+                    f"{theirs.get(name)} and is {mine.get(name)}; choose another folder"
+                )
+
+    def _take_back(self) -> None:
+        """Mark trials of dead processes as failed, and queue what was given up once more."""
+        from optuna.trial import TrialState
+
+        trials = self.study.get_trials(deepcopy=False)
+        for trial in trials:
+            owner = trial.user_attrs.get(_OWNER)
+            # Without an owner: its process died between asking and signing, which happen under the
+            # lock that is held here.
+            if trial.state == TrialState.RUNNING and (owner is None or not is_alive(owner)):
+                self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
+        trials = self.study.get_trials(deepcopy=False)
+        redone = {trial.user_attrs.get(_RETRY_OF) for trial in trials}
+        for trial in trials:
+            retries = trial.user_attrs.get(_RETRIES, 0)
+            is_default = bool(trial.user_attrs.get(_DEFAULT))
+            given_up = trial.state == TrialState.FAIL and trial.number not in redone
+            if given_up and (retries < _MOST_RETRIES or is_default):
+                values = self.space.defaults() if is_default else trial.params
+                if set(values) == set(self.space.parameters):
+                    attributes = {_RETRY_OF: trial.number, _RETRIES: retries + 1}
+                    if is_default:
+                        attributes[_DEFAULT] = True
+                    self.study.enqueue_trial(values, user_attrs=attributes)
+
+    def _reference_from(self, measured: Mapping[str, Any]) -> dict[str, float]:
+        factor = self.settings.reference_factor
+        reference = {}
+        for name in self.settings.objectives:
+            value, worst = measured.get(name, math.nan), METRICS[name].worst
+            failed = METRICS[name].is_error and bool(measured.get(FAILURE))
+            unusable = value is None or not math.isfinite(value) or failed
+            reference[name] = worst if unusable else (factor * float(value) or worst)
+        return reference
+
+    def _connect(self) -> sqlite3.Connection:
+        """A connection that is safe against the death of processes, at a fraction of the syncs.
+
+        A loss of power may cost the last trials, never the file.
+        """
+        connection = sqlite3.connect(
+            self.folder / STUDY_FILE, timeout=_LOCK_TIMEOUT_S, check_same_thread=False
+        )
+        connection.execute("PRAGMA journal_mode=WAL")
+        connection.execute("PRAGMA synchronous=NORMAL")
+        return connection
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """Hold the folder's lock; the system drops it when the process dies, however it dies."""
+        lock = sqlite3.connect(
+            self.folder / LOCK_FILE, timeout=_LOCK_TIMEOUT_S, isolation_level=None
+        )
+        try:
+            lock.execute("BEGIN EXCLUSIVE")
+            yield
+        finally:
+            lock.close()
+
+
+def _plain(value: Any) -> Any:
+    """``value`` as JSON has it: NaN and infinity become None."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): _plain(inner) for key, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def wait_a_moment() -> None:
+    """Let others finish."""
+    time.sleep(0.05)

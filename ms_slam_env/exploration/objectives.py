@@ -1,0 +1,104 @@
+"""What is minimised, what is demanded, and what a failed evaluation counts as."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from ms_slam_env.errors import InputError, unknown
+
+Measured = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A figure of an evaluation; smaller is better.
+
+    Attributes:
+        label: for figures and tables.
+        worst: what counts where nothing better is known, in the metric's unit.
+        is_error: whether it says nothing of a run that lost track.
+    """
+
+    label: str
+    worst: float
+    is_error: bool
+
+
+METRICS: dict[str, Metric] = {
+    "ate_m": Metric("ATE [m]", 1.0, True),
+    "ate_max_m": Metric("maximum ATE [m]", 1.0, True),
+    "ext_ms": Metric("EXT [ms/frame]", 1e3, False),
+    "load_ms": Metric("EXT [ms/frame of the sequence]", 1e3, False),
+    "mem_mb": Metric("MEM [MB]", 1e5, False),
+    "energy_j": Metric("ENE [J/frame]", 1e3, False),
+    "map_error_mm": Metric("map error [mm]", 1e3, True),
+    "lost": Metric("share of frames lost", 1.0, False),
+}
+"""What an evaluation can measure; all are minimised."""
+
+FAILURE = "failure"
+"""Key of an evaluation under which it says, in words, why it measured less than it should."""
+
+
+@dataclass(frozen=True)
+class Constraint:
+    """``metric`` may not exceed ``limit``."""
+
+    metric: str
+    limit: float
+
+    def __str__(self) -> str:
+        return f"{self.metric}<{self.limit:g}"
+
+    def violation(self, measured: Measured) -> float:
+        """By how much of the limit it is exceeded; 0 or less if it is kept.
+
+        What was not measured exceeds it by as much as the worst value does.
+        """
+        value = measured.get(self.metric)
+        if value is None or not math.isfinite(value):
+            value = METRICS[self.metric].worst
+        return float((value - self.limit) / (abs(self.limit) or 1.0))
+
+
+def parse_constraint(text: str) -> Constraint:
+    """Read ``metric<limit``.
+
+    Raises:
+        InputError: no such form, or an unknown metric.
+    """
+    name, sign, limit = text.replace("<=", "<").partition("<")
+    name = name.strip()
+    if not sign:
+        raise InputError(f"constraint {text!r} is not metric<limit, as in ate_m<0.01")
+    if name not in METRICS:
+        raise unknown("metric of a constraint", name, METRICS)
+    try:
+        number = float(limit)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise InputError(f"constraint {text!r}: {limit.strip()!r} is not a number")
+    return Constraint(name, number)
+
+
+def objective_values(
+    measured: Measured, objectives: Sequence[str], reference: Mapping[str, float]
+) -> list[float]:
+    """What the sampler is told of each objective: finite, and never above ``reference``.
+
+    A run that failed counts as the reference in everything that speaks of errors: the trajectory of
+    a camera that got lost may lie near the true one by chance. What it took still counts, where it
+    was measured: a sampler learns from that.
+    """
+    failed = bool(measured.get(FAILURE))
+    values = []
+    for name in objectives:
+        value = measured.get(name)
+        if value is None or not math.isfinite(value) or (failed and METRICS[name].is_error):
+            value = reference[name]
+        values.append(min(float(value), reference[name]))
+    return values

@@ -1,0 +1,196 @@
+"""The design space: named parameters of a SLAM configuration, and configurations from values."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.exploration.parameters import Choice, Float, Integer, Parameter
+from ms_slam_env.slam import check_parameters
+from ms_slam_env.slam.configuration import SlamConfiguration, merged
+
+if TYPE_CHECKING:
+    from optuna.distributions import BaseDistribution
+
+# Algorithmic parameters of the paper, section IV-A, with its ranges.
+_PAPER: dict[str, Parameter] = {
+    "depth_cutoff_m": Float(0.5, 10.0),  # nothing is nearer than the sensor's 0.5 m
+    "icp_rgb_weight": Float(0.0, 1.0),
+    "confidence_threshold": Float(0.0, 12.0),
+}
+_ALGORITHM: dict[str, Parameter] = {
+    **_PAPER,
+    "iterations.0": Integer(0, 12),
+    "iterations.1": Integer(0, 12),
+    "iterations.2": Integer(0, 15),
+    "points_per_level": Integer(500, 20_000, log=True),
+    "surfel_radius_px": Float(0.5, 2.0),
+    "coverage_px": Float(0.5, 1.0),
+    "bilateral_radius_px": Integer(0, 3),
+    "icp_distance_m": Float(0.02, 0.3, log=True),
+    "fusion_distance_m": Float(0.005, 0.1, log=True),
+    "unstable_window": Integer(10, 400, log=True),
+}
+_MOTION: dict[str, Parameter] = {"keep_every": Integer(1, 6)}
+_OTHERS: dict[str, Parameter] = {
+    "max_confidence": Float(5.0, 500.0, log=True),
+    "compaction_interval": Integer(2, 50, log=True),
+    "cauchy_icp": Float(0.5, 10.0, log=True),
+    "cauchy_rgb": Float(0.3, 10.0, log=True),
+    "intensity_noise": Float(0.2, 10.0, log=True),
+    "depth_noise_m": Float(0.001, 0.01, log=True),
+    "icp_angle_deg": Float(10.0, 80.0),
+    "fusion_angle_deg": Float(10.0, 80.0),
+    "normal_edge_per_m": Float(0.01, 0.1, log=True),
+    "image_size": Choice(("80x60", "160x120", "320x240")),
+    "threads": Choice((1, 2)),
+    "device": Choice(("cpu", "cuda")),
+}
+KNOWN: dict[str, Parameter] = {**_ALGORITHM, **_MOTION, **_OTHERS}
+"""Parameters of the surfel backend that have a range of their own."""
+
+GROUPS: dict[str, tuple[str, ...]] = {
+    "paper": tuple(_PAPER),
+    "algorithm": tuple(_ALGORITHM),
+    "machine": ("threads", "device"),
+}
+"""Names that stand for several parameters."""
+
+_OF_CONFIGURATION = ("image_size", "keep_every", "threads")
+
+
+@dataclass(frozen=True)
+class SearchSpace:
+    """Parameters by name, and the configuration that they start from.
+
+    Names are those of the backend, with dots for nested ones and for places of a list
+    (``iterations.0``), or ``image_size``, ``keep_every`` and ``threads`` of the configuration.
+
+    Raises:
+        InputError: no parameter, one that the backend does not have, or one whose range does not
+            hold the value that it starts from.
+    """
+
+    parameters: Mapping[str, Parameter]
+    base: SlamConfiguration = dataclasses.field(default_factory=SlamConfiguration)
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be explored."""
+        if not self.parameters:
+            raise InputError("no parameter to explore")
+        for name, value in self.defaults().items():
+            if not self.parameters[name].contains(value):
+                raise InputError(
+                    f"parameter {name!r} starts at {value!r}, which is not one of "
+                    f"{self.parameters[name]}"
+                )
+
+    def defaults(self) -> dict[str, Any]:
+        """The value of each parameter that the exploration starts from."""
+        return {name: default_of(name, self.base) for name in self.parameters}
+
+    def distributions(self) -> dict[str, BaseDistribution]:
+        """What Optuna draws from, by name."""
+        return {name: parameter.distribution() for name, parameter in self.parameters.items()}
+
+    def configuration(self, values: Mapping[str, Any]) -> SlamConfiguration:
+        """The base with ``values`` in the place of its own.
+
+        Raises:
+            InputError: values that the backend refuses.
+        """
+        direct = {name: values[name] for name in _OF_CONFIGURATION if name in values}
+        params = dict(self.base.slam_config)
+        for name, value in values.items():
+            if name not in _OF_CONFIGURATION:
+                params = merged(params, self._nested(name, value, params))
+        return dataclasses.replace(self.base, slam_config=params, **direct)
+
+    def _nested(self, name: str, value: Any, params: dict[str, Any]) -> Any:
+        """Options that set ``name``, the other places of its list as in ``params``."""
+        *path, last = name.split(".")
+        if last.isdigit():
+            listed = ".".join(path)
+            whole = list(default_of(listed, dataclasses.replace(self.base, slam_config=params)))
+            whole[int(last)] = value
+            return self._nested(listed, whole, params)
+        for part in [last, *reversed(path)]:
+            value = {part: value}
+        return value
+
+
+def default_of(name: str, base: SlamConfiguration) -> Any:
+    """Value of parameter ``name`` in ``base``: given there, or the backend's own default.
+
+    Raises:
+        InputError: no such parameter.
+    """
+    if name == "device":
+        return base.slam_config.get("device", "cpu")
+    if name in _OF_CONFIGURATION:
+        value = getattr(base, name)
+        return {"image_size": "160x120", "threads": 1}[name] if value is None else value
+    found: Any = check_parameters(base.slam, base.slam_config)
+    for part in name.split("."):
+        if part.isdigit() and isinstance(found, tuple) and int(part) < len(found):
+            found = found[int(part)]
+        elif dataclasses.is_dataclass(found) and part in found.__dataclass_fields__:
+            found = getattr(found, part)
+        else:
+            valid = [*KNOWN, *_OF_CONFIGURATION]
+            if dataclasses.is_dataclass(found):
+                valid = [*found.__dataclass_fields__, *_OF_CONFIGURATION, *GROUPS]
+            raise unknown("parameter", name, dict.fromkeys(valid))
+    return found
+
+
+def make_space(texts: Sequence[str], base: SlamConfiguration | None = None) -> SearchSpace:
+    """The space that texts name: ``NAME``, ``NAME=low:high``, ``NAME=a,b,c``, or a group.
+
+    A range of integers stays one where the parameter's value is an integer; ``low:high:log`` makes
+    equal ratios equally likely.
+
+    Raises:
+        InputError: an unknown parameter, one without a known range, or a range that is none.
+    """
+    base = base or SlamConfiguration()
+    parameters: dict[str, Parameter] = {}
+    for text in texts:
+        name, equals, values = text.partition("=")
+        if equals:
+            parameters[name] = _parse_values(name, values, default_of(name, base))
+            continue
+        for member in GROUPS.get(name, (name,)):
+            default_of(member, base)
+            if member not in KNOWN:
+                raise InputError(f"parameter {member!r} needs a range, as in {member}=1:10")
+            parameters[member] = KNOWN[member]
+    return SearchSpace(parameters, base)
+
+
+def _parse_values(name: str, text: str, default: Any) -> Parameter:
+    low, *rest = text.split(":")
+    if not rest:
+        return Choice(tuple(_scalar(name, part) for part in text.split(",")))
+    is_log = rest[1:] == ["log"]
+    numbers = [_scalar(name, part) for part in (low, rest[0])]
+    if (len(rest) > 1 and not is_log) or not all(isinstance(n, (int, float)) for n in numbers):
+        raise InputError(f"parameter {name!r}: {text!r} is not low:high or low:high:log")
+    if all(isinstance(n, int) for n in numbers) and isinstance(default, int):
+        return Integer(numbers[0], numbers[1], is_log)
+    return Float(float(numbers[0]), float(numbers[1]), is_log)
+
+
+def _scalar(name: str, text: str) -> Any:
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError:
+        value = []
+    if value is not None and not isinstance(value, (str, int, float, bool)):
+        raise InputError(f"parameter {name!r}: {text!r} is not one value")
+    return value
