@@ -128,13 +128,7 @@ def _plot(rows: Sequence[Record], pairs: list[tuple[str, str]], key: str) -> Plo
         own = [i for i in own if values[i] is not None]
         data.append(_trace(rows, pairs, key, own, scale, log, index, name, label_of))
     order = [label_of[label] for label in dict.fromkeys(label for label, _ in pairs)]
-    y = {
-        "automargin": True,
-        "type": "category",
-        "categoryorder": "array",
-        "categoryarray": order,
-        "autorange": "reversed",
-    }
+    y = plots.category_axis(order)
     shape: dict[str, Any] = {"scattermode": "group"} if log else {"barmode": "group"}
     if len(data) == 1:
         shape["showlegend"] = False

@@ -45,6 +45,10 @@
     return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   }
 
+  function shorter(name) {
+    return name.length > 17 ? `${name.slice(0, 8)}…${name.slice(-8)}` : name;
+  }
+
   function themed(layout) {
     const text = css("--text"), grid = css("--grid"), line = css("--line");
     const small = narrow.matches;
@@ -68,6 +72,10 @@
           gridcolor: grid, zerolinecolor: line, linecolor: line, tickcolor: line,
           fixedrange: touch.matches, ...found[name],
         };
+        const names = found[name].categoryarray;
+        if (small && names) {
+          Object.assign(found[name], { tickmode: "array", tickvals: names, ticktext: names.map(shorter) });
+        }
       }
     }
     return found;

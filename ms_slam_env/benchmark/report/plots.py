@@ -76,6 +76,17 @@ def axis(title: str, log: bool = False, **more: Any) -> dict[str, Any]:
     return {"title": {"text": text(title)}, "automargin": True, **kind, **more}
 
 
+def category_axis(names: Sequence[str]) -> dict[str, Any]:
+    """An axis of names, the first one on top; the page shortens them on a narrow screen."""
+    return {
+        "automargin": True,
+        "type": "category",
+        "categoryorder": "array",
+        "categoryarray": list(names),
+        "autorange": "reversed",
+    }
+
+
 def layout(x: dict[str, Any], y: dict[str, Any], **more: Any) -> dict[str, Any]:
     """A layout with the legend above the drawing."""
     return {"xaxis": x, "yaxis": y, **more}

@@ -66,7 +66,7 @@ def stage_figure(stages: dict[str, dict[str, float]]) -> Figure | None:
         }
         for index, name in enumerate(names)
     ]
-    y = {"automargin": True, "type": "category", "autorange": "reversed"}
+    y = plots.category_axis(list(label_of.values()))
     order = {"traceorder": "normal"}
     layout = plots.layout(
         plots.axis("time [ms]"), y, barmode="stack", showlegend=True, legend=order
