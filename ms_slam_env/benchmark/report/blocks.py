@@ -100,7 +100,15 @@ class Pictures:
     folded: bool
 
 
-Block = Prose | Table | Figure | Pictures
+@dataclass(frozen=True)
+class Code:
+    """A text file, shown on demand."""
+
+    name: str
+    text: str
+
+
+Block = Prose | Table | Figure | Pictures | Code
 
 
 @dataclass(frozen=True)

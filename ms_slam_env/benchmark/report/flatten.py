@@ -39,6 +39,17 @@ def flatten(row: Mapping[str, Any], prefix: str = "") -> Record:
                 found.update(flatten({f"{name}.{place}": part}))
         elif isinstance(value, list) and len(value) <= 8 and not any(map(_nested, value)):
             found[name] = ", ".join(cell_of(part).text for part in value)
+    return found if prefix else _with_ends(found)
+
+
+def _with_ends(row: Record) -> Record:
+    """``row`` with one interval in place of ``x``, ``x_low`` and ``x_high``."""
+    found = dict(row)
+    for key, value in row.items():
+        ends = [row.get(f"{key}_{end}") for end in ("low", "high")]
+        if all(isinstance(v, (int, float)) for v in (value, *ends)):
+            low, high = (found.pop(f"{key}_{end}") for end in ("low", "high"))
+            found[key] = Interval(*(float(v) for v in (value, low, high)))  # type: ignore[arg-type]
     return found
 
 

@@ -12,6 +12,7 @@ from importlib import resources
 from ms_slam_env import __version__
 from ms_slam_env.benchmark.report.blocks import (
     Block,
+    Code,
     Figure,
     Pictures,
     Prose,
@@ -127,6 +128,11 @@ def _block(block: Block, anchor: str) -> str:
         return _table(block, anchor)
     if isinstance(block, Figure):
         return _figure(block, anchor)
+    if isinstance(block, Code):
+        return (
+            f"<details><summary><code>{escape(block.name)}</code></summary>"
+            f'<pre tabindex="0">{escape(block.text)}</pre></details>'
+        )
     return _pictures(block)
 
 

@@ -7,6 +7,7 @@ from typing import Any
 from ms_slam_env.benchmark.report.kinds.base import Kind
 from ms_slam_env.benchmark.report.kinds.compare import Comparison
 from ms_slam_env.benchmark.report.kinds.divergence import Divergence
+from ms_slam_env.benchmark.report.kinds.exploration import Exploration
 from ms_slam_env.benchmark.report.kinds.generic import Generic
 from ms_slam_env.benchmark.report.kinds.planners import Planners
 from ms_slam_env.benchmark.report.kinds.stages import Stages
@@ -17,6 +18,7 @@ KINDS: tuple[Kind, ...] = (
     Planners(),
     Comparison(),
     Divergence(),
+    Exploration(),
     Run(),
     Evaluation(),
     StepSize(),
