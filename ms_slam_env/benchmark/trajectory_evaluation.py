@@ -1,50 +1,258 @@
-"""Two trajectory files compared: ATE and RPE of the poses that correspond in time."""
+"""Two trajectory files compared: every measure of the poses that correspond in time."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ms_slam_env import metrics
+from ms_slam_env.config import check_choice, check_range
 from ms_slam_env.errors import InputError
+from ms_slam_env.metrics.absolute import ALIGNMENTS
+from ms_slam_env.metrics.relative import DELTA_UNITS, PAIRINGS, TOLERANCE
 from ms_slam_env.sequences import associate, read_trajectory
 
+Float64 = NDArray[np.float64]
 
-def evaluate_files(
-    estimate: Path, truth: Path, align: str = "se3", delta: int = 1, max_difference_s: float = 0.02
-) -> dict[str, Any]:
-    """Compare TUM file ``estimate`` with TUM file ``truth``.
+_GAP_INTERVALS = 3.0
 
-    Args:
-        estimate: estimated T_world_camera.
-        truth: true T_world_camera.
-        align: ``se3``, ``sim3`` or ``none``, for ATE.
-        delta: frames between the poses of a relative error.
+
+@dataclass(frozen=True)
+class TrajectoryOptions:
+    """How two trajectories are compared.
+
+    Attributes:
+        align: ``se3``, ``sim3`` or ``none``. With ``sim3`` relative errors are those of the
+            estimate after scaling, too.
+        delta: how far apart the poses of a relative error are.
+        delta_unit: ``frames``, ``m`` along the true path, or ``s``.
+        pairs: ``all`` or ``consecutive``, see ``metrics.pose_pairs``.
+        tolerance: of a delta in metres or seconds, as a share of it.
+        segments: equal pieces of the trajectory that errors are also given for.
+        segment_lengths_m: of sub-trajectories for drift; None for a tenth to a half of the path.
         max_difference_s: largest difference between timestamps that correspond.
+        gap_s: an estimate without poses for longer was lost in between; None for three times the
+            median interval.
+    """
 
-    Returns:
-        number of ``poses`` that correspond, and statistics ``ate_m``, ``rpe_m``, ``rpe_rad``.
+    align: str = "se3"
+    delta: float = 1
+    delta_unit: str = "frames"
+    pairs: str = "all"
+    tolerance: float = TOLERANCE
+    segments: int = 1
+    segment_lengths_m: Sequence[float] | None = None
+    max_difference_s: float = 0.02
+    gap_s: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be."""
+        check_choice(self, "align", ALIGNMENTS)
+        check_choice(self, "delta_unit", DELTA_UNITS)
+        check_choice(self, "pairs", PAIRINGS)
+        check_range(self, "tolerance", 0.0, 1.0)
+        check_range(self, "segments", 1, 1_000_000)
+        check_range(self, "max_difference_s", 0.0, 1e9)
+        if self.gap_s is not None:
+            check_range(self, "gap_s", 0.0, 1e9)
+        if self.delta_unit == "frames" and float(self.delta).is_integer():
+            object.__setattr__(self, "delta", int(self.delta))
+
+    @property
+    def relative(self) -> dict[str, Any]:
+        """The options of a relative error."""
+        return {
+            "delta": self.delta,
+            "unit": self.delta_unit,
+            "pairs": self.pairs,
+            "tolerance": self.tolerance,
+        }
+
+
+@dataclass(frozen=True)
+class Matched:
+    """The poses of two trajectories that correspond.
+
+    Attributes:
+        times: (N,) of the estimate, seconds.
+        estimate: (N, 4, 4) T_world_camera, aligned with the truth.
+        raw: (N, 4, 4) the same as read.
+        truth: (N, 4, 4).
+        piece: (N,) number of the piece, between gaps, that the pose belongs to.
+        gaps: (K, 2) last time before and first after each gap.
+        alignment: that was found.
+    """
+
+    times: Float64
+    estimate: Float64
+    raw: Float64
+    truth: Float64
+    piece: NDArray[np.int64]
+    gaps: Float64
+    alignment: metrics.Alignment
+
+
+def match_files(estimate: Path, truth: Path, options: TrajectoryOptions) -> Matched:
+    """Read two TUM files, find the poses that correspond, and align them.
 
     Raises:
-        InputError: a file that cannot be read, fewer than two poses in common, a bad option.
+        InputError: a file that cannot be read, fewer than two poses in common, no alignment.
     """
     times, poses = read_trajectory(estimate)
     true_times, true_poses = read_trajectory(truth)
-    first, second = associate(times, true_times, max_difference_s)
+    first, second = associate(times, true_times, options.max_difference_s)
     if len(first) < 2:
         raise InputError(
             f"{estimate} and {truth} have {len(first)} timestamps in common "
-            f"(at most {max_difference_s} s apart); at least 2 are needed"
+            f"(at most {options.max_difference_s} s apart); at least 2 are needed"
         )
-    P, Q = poses[first], true_poses[second]
-    return {
+    raw, true = poses[first], true_poses[second]
+    alignment = metrics.find_alignment(raw, true, options.align)
+    gap_s = options.gap_s
+    if gap_s is None:
+        gap_s = _GAP_INTERVALS * float(np.median(np.diff(times)))
+    jumps = np.flatnonzero(np.diff(times) > gap_s)
+    return Matched(
+        times=times[first],
+        estimate=alignment.poses(raw),
+        raw=raw,
+        truth=true,
+        piece=np.searchsorted(jumps, first),
+        gaps=np.stack([times[jumps], times[jumps + 1]], axis=1),
+        alignment=alignment,
+    )
+
+
+def evaluate_files(
+    estimate: Path, truth: Path, options: TrajectoryOptions | None = None
+) -> dict[str, Any]:
+    """Compare TUM file ``estimate`` with TUM file ``truth``, both T_world_camera.
+
+    Returns:
+        the options, the number of ``poses`` that correspond, and as statistics (rmse, mean, median,
+        std, min, max) ``ate_m``, ``ate_rad`` (None where the path is a line), ``rpe_m`` and
+        ``rpe_rad``; ``scale`` of the alignment, ``path_m``, ``duration_s``, ``segments`` (the same
+        statistics by piece), ``drift`` (by length of path), ``robustness`` (USME equations 9 and
+        10 over gaps in time) and ``initialisation`` (12 and 13).
+
+    Raises:
+        InputError: as `match_files`; no two poses ``delta`` apart; more segments than poses.
+    """
+    options = options or TrajectoryOptions()
+    return measure_matched(estimate, truth, match_files(estimate, truth, options), options)
+
+
+def measure_matched(
+    estimate: Path, truth: Path, matched: Matched, options: TrajectoryOptions
+) -> dict[str, Any]:
+    """`evaluate_files` of poses that are already matched."""
+    ate_m, ate_rad = absolute(matched)
+    count = len(matched.times)
+    result = {
         "estimate": str(estimate),
         "truth": str(truth),
-        "align": align,
-        "delta": delta,
-        "poses": len(first),
-        "ate_m": asdict(metrics.ate_statistics(P, Q, align)),
-        "rpe_m": asdict(metrics.rpe_statistics(P, Q, delta)),
-        "rpe_rad": asdict(metrics.rpe_statistics(P, Q, delta, kind="rotation")),
+        **asdict(options),
+        "poses": count,
+        "scale": matched.alignment.scale,
+        "path_m": metrics.path_length(matched.truth),
+        "estimate_path_m": metrics.path_length(matched.raw),
+        "duration_s": float(matched.times[-1] - matched.times[0]),
+        "ate_m": _statistics(ate_m),
+        "ate_rad": None if ate_rad is None else _statistics(ate_rad),
+        **_relative(matched, slice(None), options),
     }
+    result["segments"] = [
+        {
+            "start_s": float(matched.times[first] - matched.times[0]),
+            "end_s": float(matched.times[end - 1] - matched.times[0]),
+            "poses": int(end - first),
+            "ate_m": _statistics(ate_m[first:end]),
+            "ate_rad": None if ate_rad is None else _statistics(ate_rad[first:end]),
+            **_relative_or_none(matched, slice(first, end), options),
+        }
+        for first, end in metrics.equal_pieces(count, options.segments)
+    ]
+    result["drift"] = [
+        {
+            "length_m": drift.length_m,
+            "segments": drift.segments,
+            "translation_percent": {k: 100 * v for k, v in asdict(drift.translation).items()},
+            "rotation_deg_m": {k: np.degrees(v) for k, v in asdict(drift.rotation_rad_m).items()},
+        }
+        for drift in metrics.drifts(matched.estimate, matched.truth, options.segment_lengths_m)
+    ]
+    result["robustness"] = _robustness(matched, options)
+    result["initialisation"] = _initialisation(matched, options)
+    return result
+
+
+def absolute(matched: Matched) -> tuple[Float64, Float64 | None]:
+    """Errors (N,) of the aligned poses: metres, and radians unless the path leaves them open."""
+    ate_m = metrics.absolute_errors(matched.estimate, matched.truth, "none")
+    if not matched.alignment.unique:
+        return ate_m, None
+    return ate_m, metrics.absolute_errors(matched.estimate, matched.truth, "none", "rotation")
+
+
+def _relative(matched: Matched, part: slice, options: TrajectoryOptions) -> dict[str, Any]:
+    P, Q, times = matched.estimate[part], matched.truth[part], matched.times[part]
+    return {
+        name: _statistics(metrics.relative_errors(P, Q, kind=kind, times=times, **options.relative))
+        for name, kind in (("rpe_m", "translation"), ("rpe_rad", "rotation"))
+    }
+
+
+def _relative_or_none(matched: Matched, part: slice, options: TrajectoryOptions) -> dict[str, Any]:
+    """None for a piece too short to hold a pair of poses."""
+    try:
+        return _relative(matched, part, options)
+    except InputError:
+        return {"rpe_m": None, "rpe_rad": None}
+
+
+def _robustness(matched: Matched, options: TrajectoryOptions) -> dict[str, Any]:
+    """How well the pieces between gaps in time fit together, USME equations (9) and (10)."""
+    lost_s = float(np.diff(matched.gaps, axis=1).sum())
+    duration = float(matched.times[-1] - matched.times[0])
+    breaks = np.flatnonzero(np.diff(matched.piece)) + 1
+    # A gap stands as one untracked frame between the pieces.
+    rows = np.insert(np.arange(len(matched.piece)), breaks, -1)
+    align = "sim3" if options.align == "sim3" else "se3"
+    try:
+        found = metrics.tracking_robustness(
+            matched.raw[rows], matched.truth[rows], rows >= 0, align
+        )
+        parts = {
+            "error": found.error,
+            "translation_m": found.translation_m,
+            "rotation_rad": found.rotation_rad,
+            "log_scale": found.log_scale,
+            "pieces": len(found.segments),
+            "reason": "",
+        }
+    except InputError as error:
+        names = ("error", "translation_m", "rotation_rad", "log_scale")
+        parts = {**dict.fromkeys(names), "pieces": 0, "reason": str(error)}
+    return {
+        **parts,
+        "gaps": len(matched.gaps),
+        "lost_s": lost_s,
+        "lost_share": lost_s / duration if duration > 0 else 0.0,
+    }
+
+
+def _initialisation(matched: Matched, options: TrajectoryOptions) -> dict[str, Any]:
+    """When the scale has settled, and how right it is, USME equations (12) and (13)."""
+    known = None if options.align == "sim3" else 1.0
+    return asdict(
+        metrics.initialisation(matched.times, matched.raw, matched.truth, global_scale=known)
+    )
+
+
+def _statistics(errors: Float64) -> dict[str, float]:
+    return asdict(metrics.statistics_of(errors))

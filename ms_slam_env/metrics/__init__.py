@@ -26,6 +26,7 @@ from ms_slam_env.metrics.consistency import (
 )
 from ms_slam_env.metrics.cost import CostMeter, EnergyCounter, FrameCost, energy_counters
 from ms_slam_env.metrics.initialisation import Initialisation, initialisation, local_scales
+from ms_slam_env.metrics.map_quality import MapQuality, map_quality
 from ms_slam_env.metrics.multi_robot import mean_path_length, task_time, team_ate, team_rpe
 from ms_slam_env.metrics.reconstruction import (
     MapMetrics,
@@ -58,7 +59,7 @@ from ms_slam_env.metrics.sightings import (
     count_votes,
     distinct_placements,
 )
-from ms_slam_env.metrics.trajectory import ErrorStatistics, path_length
+from ms_slam_env.metrics.trajectory import ErrorStatistics, path_length, statistics_of
 
 __all__ = [
     "Alignment",
@@ -75,6 +76,7 @@ __all__ = [
     "LabelledView",
     "MapConsistency",
     "MapMetrics",
+    "MapQuality",
     "ObjectConsistency",
     "SightingRule",
     "TrackingRobustness",
@@ -96,6 +98,7 @@ __all__ = [
     "judge_consistency",
     "local_scales",
     "map_metrics",
+    "map_quality",
     "mean_path_length",
     "mean_relocalisation_time",
     "nearest_distances",
@@ -113,6 +116,7 @@ __all__ = [
     "rpe_rmse",
     "rpe_statistics",
     "statistical_inliers",
+    "statistics_of",
     "task_time",
     "team_ate",
     "team_rpe",

@@ -9,10 +9,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.metrics.reconstruction import nearest_distances
+
+Float64 = NDArray[np.float64]
 
 SAMPLES = 200_000
 RATIO_THRESHOLD_M = 0.05
@@ -44,9 +47,15 @@ def completion(
     """
     if not threshold_m > 0:
         raise InputError(f"a threshold must be > 0 m, got {threshold_m}")
-    to_map = nearest_distances(truth, points)
+    return completion_of(
+        nearest_distances(points, truth), nearest_distances(truth, points), threshold_m
+    )
+
+
+def completion_of(to_truth: Float64, to_map: Float64, threshold_m: float) -> Completion:
+    """The same from distances (N,) of points to the truth and (M,) of the truth to points."""
     return Completion(
-        accuracy_cm=100 * float(nearest_distances(points, truth).mean()),
+        accuracy_cm=100 * float(to_truth.mean()),
         completion_cm=100 * float(to_map.mean()),
         completion_ratio=float((to_map < threshold_m).mean()),
     )

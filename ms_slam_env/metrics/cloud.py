@@ -87,7 +87,11 @@ def point_spacing(points: ArrayLike) -> float:
 
 def cloud_distance(points: ArrayLike, truth: ArrayLike) -> CloudDistance:
     """Cloud-to-cloud distance: of each of ``points`` (N, 3) to the nearest of ``truth`` (M, 3)."""
-    distances = nearest_distances(points, truth)
+    return distance_statistics(nearest_distances(points, truth))
+
+
+def distance_statistics(distances: Float64) -> CloudDistance:
+    """Statistics of distances (N,), N >= 1."""
     return CloudDistance(
         mean=float(distances.mean()),
         std=float(distances.std()),

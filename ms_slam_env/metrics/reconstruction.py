@@ -93,7 +93,7 @@ def rcm(points: ArrayLike, truth: ArrayLike, threshold_m: float = 0.05) -> float
 
 def f_score(points: ArrayLike, truth: ArrayLike, threshold_m: float) -> float:
     """Harmonic mean of `precision` and `recall` (Knapitsch et al., Tanks and Temples, 2017)."""
-    return _harmonic_mean(precision(points, truth, threshold_m), recall(points, truth, threshold_m))
+    return harmonic_mean(precision(points, truth, threshold_m), recall(points, truth, threshold_m))
 
 
 def rer(points: ArrayLike, truth: ArrayLike, registration: str = "icp") -> float:
@@ -144,7 +144,7 @@ def map_metrics(
     return MapMetrics(
         precision=precisions,
         recall=recalls,
-        f_score={t: _harmonic_mean(precisions[t], recalls[t]) for t in thresholds_m},
+        f_score={t: harmonic_mean(precisions[t], recalls[t]) for t in thresholds_m},
         rer_m=_rms(_registered_distances(cloud, true_tree, registration)),
         rcm=float((to_map < rcm_threshold_m).mean()),
     )
@@ -168,7 +168,8 @@ def _rms(distances: Float64) -> float:
     return float(np.sqrt(np.mean(distances**2)))
 
 
-def _harmonic_mean(a: float, b: float) -> float:
+def harmonic_mean(a: float, b: float) -> float:
+    """2 a b / (a + b), 0 where both are 0."""
     return 2 * a * b / (a + b) if a + b > 0 else 0.0
 
 

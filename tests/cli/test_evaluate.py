@@ -1,0 +1,301 @@
+"""``ms-slam evaluate``: trajectories against evo, gaps, pieces; maps as clouds and meshes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from evo.core import metrics as evo_metrics
+from evo.core import sync
+from evo.core.units import Unit
+from evo.tools import file_interface
+
+from ms_slam_env import metrics
+from ms_slam_env.benchmark.point_cloud import write_ply
+from ms_slam_env.benchmark.trajectory_evaluation import TrajectoryOptions, evaluate_files
+from ms_slam_env.cli import main
+from ms_slam_env.geometry import invert, make_pose, se3_exp, so3_exp, transform_points
+from ms_slam_env.sequences import write_trajectory
+
+STATISTICS = ("rmse", "mean", "median", "std", "min", "max")
+COUNT = 120
+
+
+def truth_path() -> tuple[np.ndarray, np.ndarray]:
+    t = 0.05 * np.arange(COUNT)
+    places = np.stack([np.sin(t), np.cos(1.3 * t), 0.2 * t], axis=1)
+    return t, np.stack(
+        [make_pose(so3_exp([0.1 * x, 0.2 * x, 0.3 * x]), p) for x, p in zip(t, places, strict=True)]
+    )
+
+
+def write_pair(
+    folder: Path, scale: float = 1.0, noise: float = 0.01, keep: np.ndarray | None = None
+) -> list[str]:
+    """Paths of an estimate in a world and scale of its own, some poses left out, and the truth."""
+    t, truth = truth_path()
+    rng = np.random.default_rng(0)
+    estimate = se3_exp([1, 2, 3, 0.3, -0.2, 0.1]) @ truth
+    estimate = np.stack([T @ se3_exp(rng.normal(0, noise, 6)) for T in estimate])
+    estimate[:, :3, 3] *= scale
+    kept = np.ones(COUNT, dtype=bool) if keep is None else keep
+    write_trajectory(folder / "estimate.txt", t[kept] + 0.003, estimate[kept])
+    write_trajectory(folder / "truth.txt", t, truth)
+    return [str(folder / "estimate.txt"), str(folder / "truth.txt")]
+
+
+def evaluate(arguments: list[str], out: Path) -> dict[str, Any]:
+    assert main(["evaluate", *arguments, "--out", str(out)]) == 0
+    return json.loads((out / "evaluation.json").read_text())
+
+
+def one_line(text: str) -> str:
+    lines = text.strip().splitlines()
+    assert len(lines) == 1, text
+    return lines[0]
+
+
+@pytest.mark.parametrize("align", ["se3", "sim3", "none"])
+@pytest.mark.parametrize(
+    ("options", "unit", "delta", "every"),
+    [
+        ({}, Unit.frames, 1, True),
+        ({"delta": 6, "pairs": "consecutive"}, Unit.frames, 6, False),
+        ({"delta": 0.5, "delta_unit": "m"}, Unit.meters, 0.5, True),
+    ],
+)
+def test_statistics_are_those_of_evo(
+    tmp_path: Path, align: str, options: dict, unit: Unit, delta: float, every: bool
+) -> None:
+    pair = write_pair(tmp_path, scale=1.5 if align == "sim3" else 1.0)
+    result = evaluate_files(*map(Path, pair), TrajectoryOptions(align, tolerance=0.2, **options))
+    truth, estimate = sync.associate_trajectories(
+        *(file_interface.read_tum_trajectory_file(pair[k]) for k in (1, 0)), max_diff=0.02
+    )
+    if align != "none":
+        estimate.align(truth, correct_scale=align == "sim3")
+    assert result["scale"] == pytest.approx(1 / 1.5 if align == "sim3" else 1.0, abs=0.01)
+    relations = {
+        "m": evo_metrics.PoseRelation.translation_part,
+        "rad": evo_metrics.PoseRelation.rotation_angle_rad,
+    }
+    for name, relation in relations.items():
+        ape = evo_metrics.APE(relation)
+        rpe = evo_metrics.RPE(relation, delta, unit, 0.2, every, pairs_from_reference=True)
+        for key, metric in ((f"ate_{name}", ape), (f"rpe_{name}", rpe)):
+            metric.process_data((truth, estimate))
+            for statistic, value in metric.get_all_statistics().items():
+                if statistic in STATISTICS:
+                    assert result[key][statistic] == pytest.approx(value, abs=1e-9)
+
+
+def test_files_and_options_are_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pair = write_pair(tmp_path)
+    out = tmp_path / "out"
+    options = ["--segments", "4", "--delta", "1.0", "--delta-unit", "s"]
+    result = evaluate([*pair, *options], out)
+    assert sorted(path.name for path in out.iterdir()) == [
+        "evaluation.json",
+        "table.md",
+        "trajectory.png",
+    ]
+    assert (out / "trajectory.png").stat().st_size > 10_000
+    assert (result["delta"], result["delta_unit"], result["max_difference_s"]) == (1, "s", 0.02)
+    assert result["provenance"]["versions"]["numpy"] == np.__version__
+    assert f"{result['rpe_m']['rmse']:.6f}" in capsys.readouterr().out
+    assert (
+        result["rpe_m"]
+        == evaluate_files(*map(Path, pair), TrajectoryOptions(delta=1.0, delta_unit="s"))["rpe_m"]
+    )
+    # Pieces cover the whole: their errors are those of the whole.
+    pieces = result["segments"]
+    assert [piece["poses"] for piece in pieces] == [30, 30, 30, 30]
+    squares = [piece["ate_m"]["rmse"] ** 2 for piece in pieces]
+    assert np.sqrt(np.mean(squares)) == pytest.approx(result["ate_m"]["rmse"])
+    assert max(piece["ate_rad"]["max"] for piece in pieces) == result["ate_rad"]["max"]
+    shares = [drift["length_m"] / result["path_m"] for drift in result["drift"]]
+    np.testing.assert_allclose(shares, [0.1, 0.2, 0.3, 0.4, 0.5])
+    table = (out / "table.md").read_text()
+    assert "RMSE of equal pieces" in table
+    assert "Drift over lengths of the true path" in table
+    assert "0 gaps" in table
+    assert result["initialisation"]["time_s"] is not None
+
+
+def test_lengths_of_segments_are_free(tmp_path: Path) -> None:
+    pair = write_pair(tmp_path)
+    options = TrajectoryOptions(segment_lengths_m=(0.5, 2.0, 500.0))
+    result = evaluate_files(*map(Path, pair), options)
+    assert [drift["length_m"] for drift in result["drift"]] == [0.5, 2.0]
+
+
+def test_gaps_are_lost_segments(tmp_path: Path) -> None:
+    keep = np.ones(COUNT, dtype=bool)
+    keep[40:60] = False  # 59 is the last one lost: 21 intervals of 0.05 s without a pose
+    keep[80] = False  # 2 intervals: not longer than three times the median
+    pair = write_pair(tmp_path, noise=0.0, keep=keep)
+    result = evaluate_files(*map(Path, pair))["robustness"]
+    assert (result["gaps"], result["pieces"]) == (1, 2)
+    assert result["lost_s"] == pytest.approx(21 * 0.05)
+    assert result["error"] == pytest.approx(0, abs=1e-6)
+    strict = evaluate_files(*map(Path, pair), TrajectoryOptions(gap_s=0.08))["robustness"]
+    assert (strict["gaps"], strict["pieces"]) == (2, 3)
+    # The second piece elsewhere: the error is by how much.
+    lines = Path(pair[0]).read_text().splitlines()
+    moved = []
+    for line in lines[41:]:
+        numbers = line.split()
+        numbers[1] = f"{float(numbers[1]) + 0.25:.9f}"
+        moved.append(" ".join(numbers))
+    Path(pair[0]).write_text("\n".join([*lines[:41], *moved]))
+    shifted = evaluate(pair, tmp_path / "out")["robustness"]
+    assert shifted["translation_m"] == pytest.approx(0.25, abs=1e-5)
+    assert shifted["rotation_rad"] == pytest.approx(0, abs=1e-5)
+
+
+def test_a_straight_path_has_no_orientation_error(tmp_path: Path) -> None:
+    line = np.repeat(np.eye(4)[None], 30, axis=0)
+    line[:, 0, 3] = 0.1 * np.arange(30)
+    for name in ("estimate.txt", "truth.txt"):
+        write_trajectory(tmp_path / name, 0.1 * np.arange(30), line)
+    pair = [str(tmp_path / "estimate.txt"), str(tmp_path / "truth.txt")]
+    result = evaluate(pair, tmp_path / "out")
+    assert result["ate_rad"] is None
+    assert result["ate_m"]["max"] == pytest.approx(0, abs=1e-9)
+    unaligned = evaluate_files(*map(Path, pair), TrajectoryOptions(align="none"))
+    assert unaligned["ate_rad"]["max"] == 0
+
+
+def test_two_poses_and_a_camera_that_stands_still(tmp_path: Path) -> None:
+    still = np.repeat(np.eye(4)[None], 2, axis=0)
+    write_trajectory(tmp_path / "still.txt", [0.0, 1.0], still)
+    result = evaluate([str(tmp_path / "still.txt")] * 2, tmp_path / "out")
+    assert (result["poses"], result["drift"], result["ate_rad"]) == (2, [], None)
+    assert result["robustness"]["error"] is None
+    assert result["initialisation"]["time_s"] is None
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--delta-unit", "km"], "valid choices: frames, m, s"),
+        (["--delta", "1.5"], "delta must be an integer"),
+        (["--delta", "1000", "--delta-unit", "m"], "no two poses are 1000 m apart"),
+        (["--pairs", "some"], "valid choices: all, consecutive"),
+        (["--segments", "0"], "segments = 0 is outside"),
+        (["--segments", "5000"], "cannot be cut into 5000 segments"),
+        (["--segment-lengths-m", "-1"], "> 0 m"),
+        (["--tolerance", "nan"], "tolerance = nan is outside"),
+        (["--gap-s", "-1"], "gap_s = -1.0 is outside"),
+        (["--map", "map.ply"], "maps are given as --map ESTIMATE --true-map GROUNDTRUTH"),
+    ],
+)
+def test_bad_options_are_one_line_and_code_2(
+    tmp_path: Path, options: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["evaluate", *write_pair(tmp_path), *options]) == 2
+    assert message in one_line(capsys.readouterr().err)
+
+
+def test_one_trajectory_is_too_few(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", write_pair(tmp_path)[0]]) == 2
+    assert "Missing GROUNDTRUTH" in one_line(capsys.readouterr().err)
+
+
+T_TRUE_MAP = se3_exp([0.02, -0.015, 0.01, 0.01, -0.01, 0.015])
+
+
+@pytest.fixture
+def maps(tmp_path: Path) -> list[str]:
+    """A cloud of a box, moved and with ten far points, and the box as a mesh."""
+    box = trimesh.creation.box(extents=[2.0, 1.5, 1.0])
+    box.export(tmp_path / "box.ply")
+    points, _ = trimesh.sample.sample_surface(box, 20_000, seed=1)
+    points = transform_points(invert(T_TRUE_MAP), np.asarray(points))
+    far = 3.0 + np.random.default_rng(0).uniform(0, 20, (10, 3))
+    write_ply(tmp_path / "map.ply", np.concatenate([points, far]), {})
+    return ["--map", str(tmp_path / "map.ply"), "--true-map", str(tmp_path / "box.ply")]
+
+
+def test_maps_by_their_measures(maps: list[str], tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    options = ["--samples", "30000", "--voxel-m", "0", "--thresholds-m", "0.01", "0.025"]
+    result = evaluate([*maps, *options], out)
+    assert sorted(path.name for path in out.iterdir()) == ["evaluation.json", "map.png", "table.md"]
+    assert (out / "map.png").stat().st_size > 10_000
+    assert (result["map_kind"], result["true_map_kind"]) == ("cloud", "mesh")
+    assert (result["map_points"], result["true_points"]) == (20_010, 30_000)
+    points = trimesh.load(tmp_path / "map.ply").vertices
+    box = trimesh.load(tmp_path / "box.ply")
+    surface, _ = trimesh.sample.sample_surface(box, 30_000, seed=0)
+    expected = {
+        "precision_1cm": metrics.precision(points, surface, 0.01),
+        "recall_2.5cm": metrics.recall(points, surface, 0.025),
+        "f_2.5cm": metrics.f_score(points, surface, 0.025),
+        "rer_m": metrics.rer(points, surface),
+        "rcm": metrics.rcm(points, surface),
+        "accuracy_cm": metrics.completion(points, surface).accuracy_cm,
+        "completion_cm": metrics.completion(points, surface).completion_cm,
+        "c2c_rms_m": metrics.cloud_distance(points, surface).rms,
+        "hausdorff_m": metrics.hausdorff_distance(points, surface),
+        "noise_ratio": metrics.noise_ratio(points),
+        "spacing_m": metrics.point_spacing(points),
+    }
+    for name, value in expected.items():
+        assert result[name] == pytest.approx(value, abs=1e-12), name
+    assert result["hausdorff_m"] > 3
+    np.testing.assert_array_equal(result["T_true_map"], np.eye(4))
+
+
+@pytest.mark.parametrize("method", ["icp", "plane-icp", "gicp"])
+def test_registered_maps_lie_where_they_belong(
+    maps: list[str], tmp_path: Path, method: str
+) -> None:
+    options = ["--register", method, "--remove-outliers", "--samples", "30000"]
+    result = evaluate([*maps, *options], tmp_path / "out")
+    np.testing.assert_allclose(result["T_true_map"], T_TRUE_MAP, atol=5e-3)
+    assert result["registration_share"] > 0.99
+    assert result["hausdorff_directed_m"] < 0.05
+    assert result["precision_2cm"] > 0.9  # points of either surface are 17 mm apart
+    assert result["noise_ratio"] == pytest.approx(10 / 20_010)
+
+
+def test_trajectory_and_map_together(maps: list[str], tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    result = evaluate([*write_pair(tmp_path), *maps, "--samples", "5000"], out)
+    assert {"ate_m", "accuracy_cm", "provenance"} <= set(result)
+    assert {"map.png", "trajectory.png"} <= {path.name for path in out.iterdir()}
+    table = (out / "table.md").read_text()
+    assert "ATE [m]" in table
+    assert "F-score, 2 cm [%]" in table
+
+
+def test_bad_maps_are_one_line_and_code_2(
+    maps: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refused(arguments: list[str]) -> str:
+        assert main(["evaluate", *arguments]) == 2
+        return one_line(capsys.readouterr().err)
+
+    junk = tmp_path / "junk.ply"
+    junk.write_text("ply?")
+    empty = tmp_path / "empty.ply"
+    write_ply(empty, np.zeros((0, 3)), {})
+    endless = tmp_path / "endless.ply"
+    write_ply(endless, np.array([[0.0, np.inf, 0.0]]), {})
+    few = tmp_path / "few.ply"
+    write_ply(few, np.zeros((3, 3)), {})
+    assert "Missing files" in refused([])
+    assert "maps are given as" in refused(maps[:2])
+    assert "valid choices: none, icp, plane-icp, gicp" in refused([*maps, "--register", "sift"])
+    assert "thresholds_m = 0.0 is outside" in refused([*maps, "--thresholds-m", "0"])
+    assert "voxel_m = -1.0 is outside" in refused([*maps, "--voxel-m", "-1"])
+    assert "does not exist" in refused(["--map", "none.ply", *maps[2:]])
+    assert "cannot be read" in refused(["--map", str(junk), *maps[2:]])
+    assert "holds no points" in refused([*maps[:2], "--true-map", str(empty)])
+    assert "not finite" in refused(["--map", str(endless), *maps[2:]])
+    assert "20 neighbours need as many points" in refused(["--map", str(few), *maps[2:]])
