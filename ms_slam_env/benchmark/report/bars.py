@@ -59,6 +59,7 @@ def bar_figure(
     names: Sequence[str] | None = None,
     keys: Sequence[str] | None = None,
     coloured: bool = False,
+    log: bool = True,
 ) -> Figure | None:
     """Bars (dots on a logarithmic axis where values spread far), intervals where there are any.
 
@@ -68,6 +69,7 @@ def bar_figure(
         names: columns that name the rows, the last of them being the series where there are
             several; by default those of text that differ.
         keys: measures to choose from; by default all that differ.
+        log: whether an axis may be logarithmic.
         coloured: give each row the colour that the series of its place has in other figures.
 
     Returns:
@@ -86,7 +88,7 @@ def bar_figure(
     pairs = list(zip(labels, series, strict=True))
     if len(set(pairs)) < len(pairs) or len(set(labels)) > _MAX_LABELS:
         return None
-    found = [_plot(rows, pairs, key) for key in keys if _tells_apart(rows, pairs, key)]
+    found = [_plot(rows, pairs, key, log) for key in keys if _tells_apart(rows, pairs, key)]
     if not found:
         return None
     if coloured:
@@ -117,11 +119,11 @@ def _tells_apart(rows: Sequence[Record], pairs: list[tuple[str, str]], key: str)
     return any(len(found) > 1 for found in values.values())
 
 
-def _plot(rows: Sequence[Record], pairs: list[tuple[str, str]], key: str) -> Plot:
+def _plot(rows: Sequence[Record], pairs: list[tuple[str, str]], key: str, may_log: bool) -> Plot:
     _, scale = unit(key)
     label_of = plots.shorts(dict.fromkeys(label for label, _ in pairs))
     values = [number(row.get(key)) for row in rows]
-    log = plots.wide_range(values)
+    log = may_log and plots.wide_range(values)
     data: list[dict[str, Any]] = []
     for index, name in enumerate(dict.fromkeys(series for _, series in pairs)):
         own = [i for i, (_, series) in enumerate(pairs) if series == name]

@@ -40,7 +40,8 @@ def page(name: str, sections: Sequence[Section]) -> str:
     now = datetime.now(timezone.utc)
     contents = _contents(sections) if len(sections) > 1 else ""
     body = "\n".join(
-        _section(section, f"s{number}") for number, section in enumerate(sections, start=1)
+        _section(section, f"s{number}", len(sections) == 1)
+        for number, section in enumerate(sections, start=1)
     )
     return f"""<!DOCTYPE html>
 <html lang="en">
@@ -96,13 +97,16 @@ def _contents(sections: Sequence[Section]) -> str:
     )
 
 
-def _section(section: Section, anchor: str) -> str:
+def _section(section: Section, anchor: str, alone: bool) -> str:
     blocks = "\n".join(
         _block(block, f"{anchor}-{number}") for number, block in enumerate(section.blocks, start=1)
     )
+    title, kind = section.title, f'<p class="kind">{escape(section.kind)}</p>'
+    if alone:  # the page has the folder's name above
+        title, kind = section.kind[:1].upper() + section.kind[1:], ""
     return f"""<section id="{anchor}" aria-labelledby="{anchor}-title">
-<h2 id="{anchor}-title">{escape(section.title)}</h2>
-<p class="kind">{escape(section.kind)}</p>
+<h2 id="{anchor}-title">{escape(title)}</h2>
+{kind}
 <p>{escape(section.about)}</p>
 {blocks}
 {_provenance(section)}

@@ -72,7 +72,7 @@ def shorts(values: Iterable[Any], length: int = _LABEL_LENGTH) -> dict[Any, str]
 
 def axis(title: str, log: bool = False, **more: Any) -> dict[str, Any]:
     """An axis with a title; logarithmic on demand."""
-    kind = {"type": "log", "exponentformat": "none"} if log else {}
+    kind = {"type": "log", "dtick": "D2", "exponentformat": "none"} if log else {}
     return {"title": {"text": text(title)}, "automargin": True, **kind, **more}
 
 

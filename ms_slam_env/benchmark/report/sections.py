@@ -7,6 +7,7 @@ from typing import Any
 
 from ms_slam_env.benchmark.report.blocks import (
     Block,
+    Code,
     Picture,
     Pictures,
     Prose,
@@ -39,7 +40,9 @@ def section_of(result: Result) -> Section:
         drawn, own = kind.figures(result), []
     has_table = any(isinstance(block, Table) for block in (*written, *own))
     values = facts(result.content, folded=has_table)
-    blocks: list[Block] = [*drawn, *own, *written]
+    files = [block for block in own if isinstance(block, Code)]
+    own = [block for block in own if not isinstance(block, Code)]
+    blocks: list[Block] = [*drawn, *own, *written, *files]
     if values is not None:
         blocks.append(values)
     blocks += row_tables(result.content, folded=has_table)

@@ -55,7 +55,9 @@ class Exploration(Kind):
         found = [
             pareto_figure(trials, objectives, chosen),
             hypervolume_figure(content.get("hypervolume") or []),
-            bar_figure(importance, "Importance of the parameters", ["parameter", "objective"]),
+            bar_figure(
+                importance, "Importance of the parameters", ["parameter", "objective"], log=False
+            ),
             parameter_figure(trials, objectives),
             bar_figure(held_out, "Held-out sequences", ["configuration"]),
         ]
@@ -154,11 +156,12 @@ def _marks(
 ) -> dict[str, Any]:
     x, y = ([unit(key)[1] * row[key] for row in rows] for key in (cost, error))
     colour = plots.colour(index)
+    outline = {"width": 2 if shape.endswith("open") else 0, "color": colour}
     return {
         **plots.line(name, x, y, index),
         "mode": mode,
         "text": [_description(row) for row in rows],
-        "marker": {"color": colour, "symbol": shape, "size": size, "line": {"width": 2}},
+        "marker": {"color": colour, "symbol": shape, "size": size, "line": outline},
         "hovertemplate": f"{plots.text(heading(cost))}: %{{x:.4g}}<br>"
         f"{plots.text(heading(error))}: %{{y:.4g}}<br>%{{text}}<extra>%{{fullData.name}}</extra>",
     }
