@@ -110,8 +110,9 @@ class ActiveSlamEnv(EpisodeRecord):
         self.intrinsics: Intrinsics = xtion(self.config.image_size)
         self.timings = Timings()
         backend = slam_backends.make(self.config.slam, self.intrinsics, **self.config.slam_config)
-        # A step's only frame is not to be dropped.
-        self.slam: SlamBackend = self.config.adaptation.adapt(backend, drops_frames=False)
+        # A step's only frame is not to be dropped unless frame management is asked for.
+        self.adaptive: SlamBackend = self.config.adaptation.adapt(backend, drops_frames=False)
+        self.slam: SlamBackend = self.config.frame_management.manage(self.adaptive)
         self._embodiment_type = EMBODIMENTS[embodiment]
         self._embodiment_type.check(self.config)
         self._pose_source = POSE_SOURCES[self.config.pose]()
@@ -340,7 +341,7 @@ class ActiveSlamEnv(EpisodeRecord):
             divergence = self._divergence_from(before)
         with self.timings.stage("coverage"):
             area = 0.0
-            if result.tracking_ok:
+            if result.tracking_ok and result.processed:
                 seen = frame.depth, self.sensor.last_true_depth()
                 area = self.coverage.see(*seen, self._rays, T_true, result.T_world_camera)
         episode.record(sighting, result, divergence)

@@ -51,7 +51,7 @@ class AdaptiveSlamEnv(ActiveSlamEnv):
         InputError: an unknown option or choice, a value out of range, or another adaptation.
     """
 
-    slam: AdaptiveSlam
+    adaptive: AdaptiveSlam
 
     def __init__(
         self, embodiment: str = "arm", render_mode: str | None = None, **options: Any
@@ -81,7 +81,7 @@ class AdaptiveSlamEnv(ActiveSlamEnv):
         if array.shape != (2,) or array not in self.action_space:
             sizes = " x ".join(f"[0, {n - 1}]" for n in self._sizes)
             raise InputError(f"action {action!r} is not two integers in {sizes}")
-        self.slam.use(int(array[1]))
+        self.adaptive.use(int(array[1]))
         return super().step(array[0])
 
     @property
@@ -89,19 +89,19 @@ class AdaptiveSlamEnv(ActiveSlamEnv):
         return [self._embodiment_type.num_actions, len(self.costs)]
 
     def _reward_terms(self, outcome: Outcome) -> dict[str, float]:
-        cost = self.costs[self.slam.level]
+        cost = self.costs[self.adaptive.level]
         terms = super()._reward_terms(outcome)
         return {**terms, "compute": -self.config.reward.compute * cost}
 
     def _build_observation(self) -> Any:
         observation = super()._build_observation()
-        level = np.eye(len(self.costs), dtype=np.float32)[self.slam.level]
+        level = np.eye(len(self.costs), dtype=np.float32)[self.adaptive.level]
         if isinstance(observation, dict):
             return {**observation, LEVEL: level}
         return np.concatenate([observation, level])
 
     def _info(self) -> dict[str, Any]:
-        return {**super()._info(), LEVEL: self.slam.level}
+        return {**super()._info(), LEVEL: self.adaptive.level}
 
 
 def _with_level(space: spaces.Space[Any], count: int) -> spaces.Space[Any]:

@@ -22,6 +22,7 @@ from ms_slam_env.scenes import SEED_SPLITS
 from ms_slam_env.scenes.registry import check_name
 from ms_slam_env.slam.adaptation import AdaptationConfig, NoAdaptationConfig
 from ms_slam_env.slam.configuration import is_file_name, read_configuration
+from ms_slam_env.slam.frame_management import EveryFrameConfig, FrameManagementConfig
 
 OTHER_OPTIONS = ("embodiment", "render_mode", "max_episode_steps")
 """Options of ``gym.make`` beside the fields of ``EnvConfig``; the last is Gymnasium's own."""
@@ -34,6 +35,7 @@ _OF_STATE = (
     "slam",
     "slam_config",
     "adaptation",
+    "frame_management",
     "divergence",
 )
 
@@ -150,6 +152,9 @@ class EnvConfig:
         adaptation: how the running SLAM changes its configuration: ``none``, ``divergence`` or, as
             ``MSActiveSLAM-Adaptive-v0`` has it, ``agent``; a mapping with the ``name`` of one for
             options. Every frame is processed, whatever ``keep_every`` of a configuration says.
+        frame_management: which frames SLAM processes: ``none`` (every frame), ``regular``,
+            ``divergence`` or ``budget``; a mapping with the ``name`` of one for options. The pose
+            of a dropped frame is predicted, its surface is not mapped.
         slam_config: options of the backend, or a configuration file (YAML), which also says what
             ``slam`` is and what ``image_size`` is where that is not given.
         observation: ``rgbd``, ``features`` or ``lookahead``.
@@ -173,6 +178,7 @@ class EnvConfig:
     slam: str = "surfel"
     slam_config: dict[str, object] = field(default_factory=dict)
     adaptation: AdaptationConfig = field(default_factory=NoAdaptationConfig)
+    frame_management: FrameManagementConfig = field(default_factory=EveryFrameConfig)
     observation: str = "features"
     step_m: float = 0.12
     step_rad: float = math.radians(12)
@@ -193,6 +199,11 @@ class EnvConfig:
         check_range(self, "step_m", 0, 1)
         check_range(self, "step_rad", 0, math.pi / 2)
         check_range(self, "lost_patience", 1, 1_000_000)
+        if self.frame_management.uses_clock:
+            raise InputError(
+                "frame_management.measured cannot be had in an environment, whose infos must be "
+                "reproducible; give cost_per_frame instead"
+            )
         if self.scene_seed is not None and (
             isinstance(self.scene_seed, bool) or not isinstance(self.scene_seed, (int, np.integer))
         ):

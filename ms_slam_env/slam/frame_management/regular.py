@@ -12,6 +12,8 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.slam.frame_management.base import FrameFilter
 from ms_slam_env.slam.frame_management.config import DroppingConfig
 
+_ROUNDING = 1e-9  # 13 / 1.3 is less than 10
+
 
 @dataclass(frozen=True)
 class RegularConfig(DroppingConfig):
@@ -56,8 +58,10 @@ class RegularSkipping(FrameFilter):
 
     def admits(self, frame: RGBDFrame, dropped: int, forced: bool = False) -> bool:
         """Whether it is this frame's turn."""
-        number, self._count = self._count, self._count + 1
-        return number == 0 or number // self._every > (number - 1) // self._every
+        turns = math.floor(self._count / self._every + _ROUNDING)
+        before = math.floor((self._count - 1) / self._every + _ROUNDING)
+        self._count += 1
+        return turns > before
 
     def get_state(self) -> dict[str, Any]:
         """The count."""
