@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from numpy.typing import NDArray
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import PPO
@@ -109,17 +110,29 @@ def load_metadata(path: str | Path) -> Metadata:
     return metadata
 
 
+def action_parts(space: Any) -> tuple[int, ...]:
+    """Choices of each number that an action of a discrete space consists of."""
+    if isinstance(space, spaces.MultiDiscrete):
+        return tuple(int(n) for n in space.nvec)
+    return (int(space.n),)
+
+
 class Policy:
     """A trained network with its normalisation: observations in, action probabilities out.
 
     Args:
         model: Stable-Baselines3's model.
         moments: normalise observations.
+
+    Attributes:
+        parts: choices of each number that an action consists of; one number in most environments.
+        num_actions: all of them together, the length of a mask.
     """
 
     def __init__(self, model: PPO | MaskablePPO, moments: Moments) -> None:
         self._network = model.policy
-        self.num_actions = int(model.action_space.n)  # type: ignore[attr-defined]
+        self.parts = action_parts(model.action_space)
+        self.num_actions = sum(self.parts)
         self._mean = np.asarray(moments.mean)
         self._std = np.sqrt(np.asarray(moments.var) + _EPSILON)
 
@@ -137,17 +150,30 @@ class Policy:
     def probabilities(self, observations: NDArray[Any], masks: NDArray[np.bool_]) -> NDArray[Any]:
         """Probabilities (B, n) of the actions, 0 where ``masks`` (B, n) is false.
 
+        Of an action of several numbers, those of each number side by side; each sums to 1.
+
         Args:
             observations: (B, k) as the environment returns them, not normalised.
-            masks: (B, n) true for permitted actions, at least one a row.
+            masks: (B, n) true for permitted actions, at least one a row and number.
         """
         scaled = np.clip((observations - self._mean) / self._std, -_CLIP, _CLIP)
         self._network.set_training_mode(False)
         with torch.no_grad():
             tensor = torch.as_tensor(scaled.astype(np.float32))
-            distribution = self._network.get_distribution(tensor).distribution
-            assert isinstance(distribution, torch.distributions.Categorical)
-            logits = distribution.logits.double().numpy()
+            logits = _logits(self._network.get_distribution(tensor))
         logits = np.where(masks, logits, -np.inf)
-        weights = np.exp(logits - logits.max(axis=1, keepdims=True))
-        return weights / weights.sum(axis=1, keepdims=True)
+        borders = np.cumsum(self.parts)[:-1]
+        return np.concatenate([_softmax(x) for x in np.split(logits, borders, axis=1)], axis=1)
+
+
+def _logits(distribution: Any) -> NDArray[Any]:
+    """Logits (B, n) of one categorical distribution, or of several side by side."""
+    # Stable-Baselines3 and sb3-contrib name them differently.
+    found = getattr(distribution, "distributions", None) or distribution.distribution
+    several = found if isinstance(found, list) else [found]
+    return np.concatenate([one.logits.double().numpy() for one in several], axis=1)
+
+
+def _softmax(logits: NDArray[Any]) -> NDArray[Any]:
+    weights = np.exp(logits - logits.max(axis=1, keepdims=True))
+    return weights / weights.sum(axis=1, keepdims=True)

@@ -7,6 +7,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from ms_slam_agents.artefact import action_parts
 from ms_slam_baselines.greedy import distance_to_targets
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
@@ -14,6 +15,7 @@ from tqdm import tqdm
 
 Actions = NDArray[np.int64]
 Choose = Callable[[NDArray[Any], NDArray[np.bool_]], Actions]  # observations, masks -> actions
+"""Actions are (B,), or (B, numbers) where each has several."""
 
 
 class FixedEpisodes(gym.Wrapper[Any, Any, Any, Any]):
@@ -89,26 +91,57 @@ def paired_gain(returns: Sequence[float], reference: Sequence[float]) -> dict[st
     return {"gain": float(np.mean(gain)), "gain_sem": error}
 
 
-def sample(probabilities: NDArray[Any], rng: np.random.Generator) -> Actions:
-    """Draw one action a row of ``probabilities`` (B, n)."""
-    return np.array([rng.choice(len(row), p=row) for row in probabilities])
+def sample(
+    probabilities: NDArray[Any], rng: np.random.Generator, parts: Sequence[int] = ()
+) -> Actions:
+    """Draw one action a row of ``probabilities`` (B, n).
+
+    With several ``parts``, choices of each number of an action, (B, numbers).
+    """
+    drawn = [[rng.choice(len(row), p=row) for row in part] for part in _split(probabilities, parts)]
+    return _joined(drawn)
+
+
+def most_probable(probabilities: NDArray[Any], parts: Sequence[int] = ()) -> Actions:
+    """The most probable action of each row of ``probabilities`` (B, n), as ``sample`` has them."""
+    return _joined([np.argmax(part, axis=1) for part in _split(probabilities, parts)])
+
+
+def _split(values: NDArray[Any], parts: Sequence[int]) -> list[NDArray[Any]]:
+    return np.split(values, np.cumsum(parts)[:-1], axis=1) if len(parts) > 1 else [values]
+
+
+def _joined(numbers: Sequence[Any]) -> Actions:
+    return np.stack(numbers, axis=1) if len(numbers) > 1 else np.array(numbers[0])
 
 
 def references(venv: VecEnv, num_episodes: int, seed: int) -> dict[str, dict[str, Any]]:
-    """What random walk, standing still and the greedy planner reach on the same episodes."""
+    """What random walk, standing still and the greedy planner reach on the same episodes.
+
+    Where an action has a second number, the SLAM configuration, random walk draws that too and the
+    other two keep to the last, the most robust.
+    """
     rng = np.random.default_rng(seed)
     targets = venv.get_attr("config")[0].targets
+    parts = action_parts(venv.action_space)
+
+    def whole(motions: Actions) -> Actions:
+        others = [np.full(len(motions), count - 1) for count in parts[1:]]
+        return _joined([motions, *others])
 
     def random_walk(_: NDArray[Any], masks: NDArray[np.bool_]) -> Actions:
-        return sample(masks / masks.sum(axis=1, keepdims=True), rng)
+        split = _split(masks, parts)
+        uniform = [part / part.sum(axis=1, keepdims=True) for part in split]
+        return sample(np.concatenate(uniform, axis=1), rng, parts)
 
     def stationary(_: NDArray[Any], masks: NDArray[np.bool_]) -> Actions:
-        return np.zeros(len(masks), dtype=np.int64)
+        return whole(np.zeros(len(masks), dtype=np.int64))
 
     def greedy(_: NDArray[Any], masks: NDArray[np.bool_]) -> Actions:
         delta_I, delta_D = np.moveaxis(np.stack(venv.env_method("lookahead")), -1, 0)
-        distance = np.where(masks, distance_to_targets(delta_I, delta_D, targets), np.inf)
-        return np.argmin(distance, axis=1)
+        possible = _split(masks, parts)[0]
+        distance = np.where(possible, distance_to_targets(delta_I, delta_D, targets), np.inf)
+        return whole(np.argmin(distance, axis=1))
 
     planners = {"random walk": random_walk, "stationary": stationary, "greedy": greedy}
     results = {}

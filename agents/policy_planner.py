@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from ms_slam_agents import artefact
+from ms_slam_agents.evaluation import most_probable, sample
 
 from ms_slam_env.env.planner import Planner
 from ms_slam_env.errors import InputError
@@ -59,26 +60,35 @@ class TrainedPolicy(Planner):
                 f"{_NAMES[self.observation]} runs policies trained on {self.observation!r}{right}"
             )
         self.policy = artefact.Policy.load(path)
-        num_actions = int(env.action_space.n)  # type: ignore[attr-defined]
-        if self.policy.num_actions != num_actions:
+        parts = artefact.action_parts(env.action_space)
+        if self.policy.parts != parts:
             raise InputError(
-                f"{path!r} chooses among {self.policy.num_actions} actions, "
-                f"the environment has {num_actions}"
+                f"{path!r} chooses among {_product(self.policy.parts)} actions, "
+                f"the environment has {_product(parts)}"
             )
 
-    def act(self, observation: Any, info: dict[str, Any]) -> int:
-        """Draw an unmasked action from the policy's probabilities, or take the most probable."""
+    def act(self, observation: Any, info: dict[str, Any]) -> Any:
+        """Draw an unmasked action from the policy's probabilities, or take the most probable.
+
+        An integer, or an array of them where an action has several.
+        """
         mask = self.env.action_masks()
-        (probabilities,) = self.policy.probabilities(observation[None], mask[None])
+        probabilities = self.policy.probabilities(observation[None], mask[None])
         if self.deterministic:
-            return int(np.argmax(probabilities))
-        return int(self.rng.choice(len(probabilities), p=probabilities))
+            (action,) = most_probable(probabilities, self.policy.parts)
+        else:
+            (action,) = sample(probabilities, self.rng, self.policy.parts)
+        return action if np.ndim(action) else int(action)
 
 
 class TrainedFeaturesPolicy(TrainedPolicy):
     """A policy trained by ``train_sb3`` on the observation variant ``features``."""
 
     observation = "features"
+
+
+def _product(parts: tuple[int, ...]) -> str:
+    return " x ".join(map(str, parts))
 
 
 def _truth(value: bool | str) -> bool:

@@ -31,6 +31,7 @@ from ms_slam_agents.evaluation import (
     Actions,
     FixedEpisodes,
     evaluate,
+    most_probable,
     paired_gain,
     references,
     sample,
@@ -69,6 +70,7 @@ class Args:
         resume: go on from ``out/latest.zip``, with the learning settings saved in it.
         algorithm: PPO over the actions that are not blocked, or over all of them.
         env_id: id of the environment.
+        embodiment: what carries the camera; None: what the id says.
         observation: ``lookahead`` shows the agent what the greedy planner sees, ``features`` is
             cheaper.
         scenes: trained and validated on, with training and validation seeds.
@@ -100,6 +102,7 @@ class Args:
     resume: bool = False
     algorithm: Literal["maskable_ppo", "ppo"] = "maskable_ppo"
     env_id: str = "MSActiveSLAM-FreeCamera-v0"
+    embodiment: str | None = None
     observation: Literal["features", "lookahead"] = "lookahead"
     scenes: tuple[str, ...] = ("living_room", "corridor", "table")
     scene_seeds: int = 4
@@ -149,6 +152,8 @@ def make_env(args: Args, split: str, seeds: Sequence[int]) -> gym.Env[Any, Any]:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         torch.set_num_threads(1)
     options: dict[str, Any] = {}
+    if args.embodiment is not None:
+        options["embodiment"] = args.embodiment
     if args.step_m is not None:
         options["step_m"] = args.step_m
     if args.step_deg is not None:
@@ -282,8 +287,8 @@ class Supervisor(BaseCallback):
         def choose(observations: NDArray[Any], masks: NDArray[np.bool_]) -> Actions:
             probabilities = policy.probabilities(observations, masks)
             if self.args.deterministic_eval:
-                return np.argmax(probabilities, axis=1)
-            return sample(probabilities, rng)
+                return most_probable(probabilities, policy.parts)
+            return sample(probabilities, rng, policy.parts)
 
         result = evaluate(self.validation, self.args.eval_episodes, choose)
         random_walk = self.curve["references"]["random walk"]

@@ -6,9 +6,10 @@ import pytest
 pytest.importorskip("sb3_contrib")
 
 from ms_slam_agents import artefact, train_sb3
-from ms_slam_agents.policy_planner import TrainedPolicy
+from ms_slam_agents.policy_planner import TrainedFeaturesPolicy, TrainedPolicy
 
 import ms_slam_env  # noqa: F401 -- registers the environments
+from ms_slam_env.errors import InputError
 
 
 @pytest.mark.slow
@@ -61,3 +62,47 @@ def test_bad_options_of_the_environment_give_one_line(tmp_path, capsys, option, 
     assert message in error
     assert len(error.strip().splitlines()) == 1
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algorithm", ["maskable_ppo", "ppo"])
+def test_motion_and_slam_configuration_are_learnt_together(tmp_path, algorithm):
+    options = {
+        "out": tmp_path / "run",
+        "algorithm": algorithm,
+        "env-id": "MSActiveSLAM-Adaptive-v0",
+        "embodiment": "free",
+        "observation": "features",
+        "scenes": "table",
+        "scene-seeds": 1,
+        "episode-steps": 4,
+        "total-timesteps": 8,
+        "num-envs": 1,
+        "n-steps": 8,
+        "batch-size": 8,
+        "n-epochs": 1,
+        "eval-episodes": 1,
+        "eval-every": 0,
+    }
+    words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
+    assert train_sb3.main(words) == 0
+    path = tmp_path / "run" / "latest.zip"
+    env = gym.make(
+        "MSActiveSLAM-Adaptive-v0",
+        embodiment="free",
+        scene="table",
+        scene_seed=1000,
+        observation="features",
+    )
+    planner = TrainedFeaturesPolicy(env.unwrapped, path=str(path))
+    observation, info = env.reset(seed=0)
+    for _ in range(3):
+        action = planner.act(observation, info)
+        assert env.action_space.contains(action)
+        assert info["action_mask"][[action[0], 49 + action[1]]].all()
+        observation, _, _, _, info = env.step(action)
+    with pytest.raises(InputError, match="chooses among 49 x 3 actions, the environment has 49"):
+        TrainedFeaturesPolicy(
+            gym.make("MSActiveSLAM-FreeCamera-v0", scene="table", scene_seed=1000).unwrapped,
+            path=str(path),
+        )
