@@ -111,7 +111,7 @@ def _rendered(named: SequenceName, intrinsics: Intrinsics, path: HandheldPath) -
         perturbations=[make_perturbation(name) for name in named.perturbations],
         timestamps=path.timestamps,
     )
-    picked = _some(len(sequence))
+    picked = evenly_picked(len(sequence))
     views = ((sequence.poses[k], sequence.frames.truth(int(k)).depth) for k in picked)
     surface = seen_surface(views, intrinsics)
     return Input(tuple(sequence.frames), sequence.poses, intrinsics, surface)
@@ -125,12 +125,12 @@ def _recorded(recording: Recording) -> Input:
         raise InputError(f"sequence {recording.name}: fewer than 2 frames have a true pose")
     poses = recording.truth[true]
     kept = tuple(recording.frame(int(index)) for index in own)
-    views = ((poses[k], kept[k].depth) for k in _some(len(kept)))
+    views = ((poses[k], kept[k].depth) for k in evenly_picked(len(kept)))
     return Input(kept, poses, recording.intrinsics, seen_surface(views, recording.intrinsics))
 
 
-def _some(count: int) -> NDArray[np.int64]:
-    """At most ``_MOST_VIEWS`` of the numbers below ``count``, evenly picked."""
+def evenly_picked(count: int) -> NDArray[np.int64]:
+    """Numbers below ``count``, evenly picked, ``_MOST_VIEWS`` at most: enough to see a surface."""
     return np.unique(np.linspace(0, count - 1, _MOST_VIEWS).astype(np.int64))
 
 

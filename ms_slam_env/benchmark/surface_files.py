@@ -1,14 +1,21 @@
-"""Points of a surface from a file: a point cloud as it is, a mesh sampled."""
+"""Points of a surface from a file or a sequence: clouds as they are, meshes sampled, depth back-
+projected from the true poses."""
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env.benchmark.compare_inputs import evenly_picked, seen_surface
 from ms_slam_env.errors import InputError
+from ms_slam_env.sequences import associate
+from ms_slam_env.sequences.recording import Recording, open_recording
+
+_MAX_DIFFERENCE_S = 0.02
 
 Float64 = NDArray[np.float64]
 
@@ -19,7 +26,7 @@ class SurfaceFile:
 
     Attributes:
         points: (N, 3) metres.
-        kind: ``cloud`` or ``mesh``.
+        kind: ``cloud``, ``mesh``, ``true depth`` or ``recorded depth``.
     """
 
     points: Float64
@@ -30,7 +37,9 @@ def read_surface(path: Path, samples: int, seed: int = 0) -> SurfaceFile:
     """Read a cloud or a mesh (PLY, or what else trimesh reads).
 
     Args:
-        path: of the file.
+        path: of the file; or of a sequence's folder, for the surface that its depth images show
+            from its true poses, up to 3 m away. Those of ``depth_true`` are taken if
+            ``ms-slam generate --truth`` wrote them, else the recorded ones with their noise.
         samples: points taken evenly from the surface of a mesh.
         seed: of that choice.
 
@@ -40,6 +49,8 @@ def read_surface(path: Path, samples: int, seed: int = 0) -> SurfaceFile:
     """
     import trimesh
 
+    if path.is_dir():
+        return _sequence_surface(open_recording(path), path / "depth_true")
     if not path.is_file():
         raise InputError(f"map file {str(path)!r} does not exist")
     try:
@@ -59,3 +70,24 @@ def read_surface(path: Path, samples: int, seed: int = 0) -> SurfaceFile:
         raise InputError(f"map file {str(path)!r} holds a mesh without area")
     points, _ = trimesh.sample.sample_surface(loaded, samples, seed=seed)
     return SurfaceFile(np.asarray(points, dtype=np.float64), "mesh")
+
+
+def _sequence_surface(recording: Recording, true_depth: Path) -> SurfaceFile:
+    """What the frames of a sequence with a true trajectory saw."""
+    truth, truth_times = recording.truth, recording.truth_times
+    if truth is None or truth_times is None:
+        raise InputError(f"sequence {recording.name} has no true trajectory to place its depth by")
+    kind = "recorded depth"
+    if true_depth.is_dir():
+        kind = "true depth"
+        entries = tuple(
+            dataclasses.replace(entry, depth=true_depth / entry.depth.name)
+            for entry in recording.entries
+        )
+        recording = dataclasses.replace(recording, entries=entries)
+    own, true = associate(recording.timestamps, truth_times, _MAX_DIFFERENCE_S)
+    if len(own) == 0:
+        raise InputError(f"sequence {recording.name}: no frame has a true pose")
+    picked = evenly_picked(len(own))
+    views = ((truth[true[k]], recording.frame(int(own[k])).depth) for k in picked)
+    return SurfaceFile(seen_surface(views, recording.intrinsics), kind)

@@ -83,6 +83,7 @@ class Matched:
         estimate: (N, 4, 4) T_world_camera, aligned with the truth.
         raw: (N, 4, 4) the same as read.
         truth: (N, 4, 4).
+        true_path: (M, 3) all true positions from the first of these poses to the last.
         piece: (N,) number of the piece, between gaps, that the pose belongs to.
         gaps: (K, 2) last time before and first after each gap.
         alignment: that was found.
@@ -92,6 +93,7 @@ class Matched:
     estimate: Float64
     raw: Float64
     truth: Float64
+    true_path: Float64
     piece: NDArray[np.int64]
     gaps: Float64
     alignment: metrics.Alignment
@@ -122,6 +124,7 @@ def match_files(estimate: Path, truth: Path, options: TrajectoryOptions) -> Matc
         estimate=alignment.poses(raw),
         raw=raw,
         truth=true,
+        true_path=true_poses[second[0] : second[-1] + 1, :3, 3],
         piece=np.searchsorted(jumps, first),
         gaps=np.stack([times[jumps], times[jumps + 1]], axis=1),
         alignment=alignment,

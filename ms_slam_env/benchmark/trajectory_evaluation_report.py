@@ -6,10 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ms_slam_env.benchmark import figures
 from ms_slam_env.benchmark.table import format_number, markdown_table
 from ms_slam_env.benchmark.trajectory_evaluation import Matched, absolute
+
+Float64 = NDArray[np.float64]
 
 _STATISTICS = ("rmse", "mean", "median", "std", "min", "max")
 _ERRORS = (
@@ -83,12 +86,9 @@ def save_figure(matched: Matched, path: Path) -> Path:
     figure = figures.new_figure(2, 4.4, 7.0)
     axes = figure.subplots(2, 2)
     for ax, (a, b) in zip(axes[0], ((0, 1), (0, 2)), strict=True):
-        for poses, label, style in (
-            (matched.truth, "truth", {"color": "black", "linewidth": 1.0, "linestyle": ":"}),
-            (matched.estimate, "estimate", {"color": figures.colour(0), "linewidth": 1.2}),
-        ):
-            line = _broken(poses[:, :3, 3], matched.piece if label == "estimate" else None)
-            ax.plot(line[:, a], line[:, b], label=label, **style)
+        estimate = _broken(matched.estimate[:, :3, 3], matched.piece)
+        ax.plot(*matched.true_path.T[[a, b]], ":", color="black", linewidth=1.0, label="truth")
+        ax.plot(*estimate.T[[a, b]], color=figures.colour(0), linewidth=1.2, label="estimate")
         ax.set(xlabel=f"{'xyz'[a]} [m]", ylabel=f"{'xyz'[b]} [m]")
         ax.set_aspect("equal", adjustable="datalim")
         ax.grid(alpha=0.3)
@@ -113,10 +113,8 @@ def save_figure(matched: Matched, path: Path) -> Path:
     return figures.save(figure, path)
 
 
-def _broken(line: np.ndarray, piece: np.ndarray | None) -> np.ndarray:
+def _broken(line: Float64, piece: NDArray[np.int64]) -> Float64:
     """The points (N, k) of a line with NaN between pieces, so that no stroke joins them."""
-    if piece is None:
-        return line
     return np.insert(line, np.flatnonzero(np.diff(piece)) + 1, np.nan, axis=0)
 
 
@@ -152,4 +150,6 @@ def _row(statistics: dict[str, float] | None) -> list[str]:
 
 
 def _number(value: float | None) -> str:
-    return "-" if value is None else format_number(value, 4)
+    if value is None:
+        return "-"
+    return "0" if abs(value) < 1e-12 else format_number(value, 4)

@@ -49,7 +49,7 @@ class Arguments:
     map: Path | None = None
     """Estimated map."""
     true_map: Path | None = None
-    """True surface."""
+    """True surface; or a sequence's folder, for what its depth shows from its true poses."""
     register: str = "none"
     """Bring the map onto the true one first: none, icp, plane-icp or gicp."""
     cutoff_m: float = 0.5

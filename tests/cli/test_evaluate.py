@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,15 @@ from evo.core import metrics as evo_metrics
 from evo.core import sync
 from evo.core.units import Unit
 from evo.tools import file_interface
+from PIL import Image
 
 from ms_slam_env import metrics
+from ms_slam_env.benchmark.map_evaluation import evaluate_maps
 from ms_slam_env.benchmark.point_cloud import write_ply
 from ms_slam_env.benchmark.trajectory_evaluation import TrajectoryOptions, evaluate_files
+from ms_slam_env.camera import xtion
 from ms_slam_env.cli import main
+from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, make_pose, se3_exp, so3_exp, transform_points
 from ms_slam_env.sequences import write_trajectory
 
@@ -262,6 +267,34 @@ def test_registered_maps_lie_where_they_belong(
     assert result["hausdorff_directed_m"] < 0.05
     assert result["precision_2cm"] > 0.9  # points of either surface are 17 mm apart
     assert result["noise_ratio"] == pytest.approx(10 / 20_010)
+
+
+def test_a_sequence_stands_for_the_surface_that_it_saw(tmp_path: Path) -> None:
+    """A wall 2 m ahead, seen by two frames; the recorded depth is 3 cm off, the true one is not."""
+    folder = tmp_path / "wall"
+    intrinsics = xtion("80x60")
+    for name, metres in (("depth", 2.03), ("depth_true", 2.0)):
+        (folder / name).mkdir(parents=True)
+        for k in range(2):
+            values = np.full(intrinsics.shape, round(5000 * metres), dtype=np.uint16)
+            Image.fromarray(values).save(folder / name / f"{k}.png")
+    (folder / "depth.txt").write_text("0.0 depth/0.png\n1.0 depth/1.png\n")
+    i = intrinsics
+    (folder / "intrinsics.txt").write_text(f"{i.fx} {i.fy} {i.cx} {i.cy} {i.width} {i.height} 5000")
+    poses = np.stack([np.eye(4), make_pose(np.eye(3), [0.1, 0, 0])])
+    write_trajectory(folder / "groundtruth.txt", [0.0, 1.0], poses)
+    wall = np.stack(np.meshgrid(*[np.linspace(-0.5, 0.5, 60)] * 2, [2.0]), -1).reshape(-1, 3)
+    write_ply(tmp_path / "wall.ply", wall, {})
+    result, _ = evaluate_maps(tmp_path / "wall.ply", folder)
+    assert result["true_map_kind"] == "true depth"
+    assert result["rer_m"] < 0.02
+    assert result["precision_2cm"] == 1
+    shutil.rmtree(folder / "depth_true")
+    result, _ = evaluate_maps(tmp_path / "wall.ply", folder)
+    assert (result["true_map_kind"], result["precision_2cm"]) == ("recorded depth", 0)
+    (folder / "groundtruth.txt").unlink()
+    with pytest.raises(InputError, match="no true trajectory"):
+        evaluate_maps(tmp_path / "wall.ply", folder)
 
 
 def test_trajectory_and_map_together(maps: list[str], tmp_path: Path) -> None:
