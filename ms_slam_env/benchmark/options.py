@@ -11,6 +11,8 @@ from ms_slam_env.env.config import make_config
 from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.slam import BACKENDS
+from ms_slam_env.slam.frame_management import FrameManagementConfig
+from ms_slam_env.slam.frame_management import make_config as make_frame_management
 
 OWN_OPTIONS = (
     *("scene", "scene_seed", "split", "observation", "step_m", "step_rad"),
@@ -49,6 +51,16 @@ def parse_named(text: str, kind: str) -> tuple[str, dict[str, Any]]:
             raise InputError(f"{kind} {text!r}: {part!r} is not option=value")
         options[option] = parse_value(value, option)
     return name, options
+
+
+def parse_frame_management(text: str) -> FrameManagementConfig:
+    """The frame management ``NAME,option=value,...``; nested options as in ``change.width=40``.
+
+    Raises:
+        InputError: an unknown name or option (the message lists the valid ones), or a bad value.
+    """
+    name, *parts = text.split(",")
+    return make_frame_management(name, **nested_options(parts))
 
 
 def nested_options(texts: Sequence[str]) -> dict[str, Any]:

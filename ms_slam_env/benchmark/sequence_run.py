@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -22,6 +22,7 @@ from ms_slam_env.sequences import associate
 from ms_slam_env.sequences.recording import Recording
 from ms_slam_env.sequences.tum import TRAJECTORY_HEADER, trajectory_line, write_trajectory
 from ms_slam_env.slam.base import TrackResult
+from ms_slam_env.slam.frame_management import EveryFrameConfig, FrameManagementConfig
 
 Float64 = NDArray[np.float64]
 
@@ -45,12 +46,14 @@ class Track:
     times: list[float] = field(default_factory=list)
     poses: list[Float64] = field(default_factory=list)
     tracking_ok: list[bool] = field(default_factory=list)
+    processed: list[bool] = field(default_factory=list)
 
     def append(self, timestamp: float, result: TrackResult) -> None:
         """Add a frame."""
         self.times.append(timestamp)
         self.poses.append(result.T_world_camera)
         self.tracking_ok.append(result.tracking_ok)
+        self.processed.append(result.processed)
 
 
 def run_sequence(
@@ -59,9 +62,11 @@ def run_sequence(
     params: dict[str, Any],
     out: Path,
     fed: Mapping[str, Any] | None = None,
+    management: FrameManagementConfig | None = None,
 ) -> dict[str, Any]:
     """Track every frame of ``recording`` and write what came of it to ``out``.
 
+    Those that ``management`` drops are not processed; their poses are predicted.
     SLAM starts at the true pose of the first frame where that is known, else at the identity.
     While it runs, the trajectory so far stands in ``trajectory.incomplete.txt``; at the end it is
     renamed to ``trajectory.txt``, beside ``map.ply`` and ``metrics.json``. Where the backend closes
@@ -77,7 +82,8 @@ def run_sequence(
         InputError: a bad option, or an image that cannot be read.
     """
     costs = metrics.CostMeter(str(params.get("device", "cpu")))
-    system = slam.make(backend, recording.intrinsics, **params)
+    management = management or EveryFrameConfig()
+    system = management.manage(slam.make(backend, recording.intrinsics, **params))
     system.reset(_start(recording))
     out.mkdir(parents=True, exist_ok=True)
     for old in (TRAJECTORY, CORRECTED, TRUTH, MAP, METRICS, FRAMES):
@@ -90,6 +96,7 @@ def run_sequence(
         "backend": backend,
         "params": params,
         **(fed or {}),
+        "frame_management": asdict(management),
         "registration": None if recording.registration is None else str(recording.registration),
         "image_size": f"{recording.intrinsics.width}x{recording.intrinsics.height}",
         **provenance(),
@@ -169,9 +176,9 @@ def _start(recording: Recording) -> Float64 | None:
 def measure(track: Track, recording: Recording) -> dict[str, Any]:
     """Metrics of a run, finished or not; those against the truth only where there is one.
 
-    ``frames``, ``lost_frames``, processor time a frame (``ms_median``, ``ms_p95``), ``path_m`` of
-    the estimate; ``ate_m`` (RMSE after SE(3) alignment), ``ate_max_m``, ``rpe_m``, ``rpe_rad``;
-    the costs by the names of ``CostMeter.summary``.
+    ``frames``, ``lost_frames``, ``processed_frames``, processor time a frame (``ms_median``,
+    ``ms_p95``), ``path_m`` of the estimate; ``ate_m`` (RMSE after SE(3) alignment), ``ate_max_m``,
+    ``rpe_m``, ``rpe_rad``; the costs by the names of ``CostMeter.summary``.
     """
     if not track.times:
         return {"frames": 0}
@@ -180,6 +187,7 @@ def measure(track: Track, recording: Recording) -> dict[str, Any]:
     result: dict[str, Any] = {
         "frames": len(poses),
         "lost_frames": int(len(poses) - sum(track.tracking_ok)),
+        "processed_frames": sum(track.processed),
         "ms_median": cost["cpu_ms_median"],
         "ms_p95": cost["cpu_ms_p95"],
         "path_m": metrics.path_length(poses),

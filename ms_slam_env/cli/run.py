@@ -12,6 +12,11 @@ import tyro
 from ms_slam_env.benchmark.command_line import parse
 from ms_slam_env.errors import InputError
 
+_PRINTED = (
+    *("frames", "processed_frames", "lost_frames"),
+    *("ms_median", "path_m", "ate_m", "rpe_m"),
+)
+
 
 @dataclass(frozen=True)
 class Arguments:
@@ -40,6 +45,9 @@ class Arguments:
     7-scenes."""
     params: tuple[str, ...] = ()
     """Parameters of the backend, as in icp_rgb_weight=0.2; before those of the file."""
+    frame_management: str = "none"
+    """Which frames SLAM processes: none (every frame), regular,every=2, divergence,threshold=0.01,
+    budget,share=0.5 and so on; the poses of the others are predicted."""
     out: Path = Path("results/run")
     """Folder of the results."""
 
@@ -48,12 +56,13 @@ def main(arguments: Sequence[str]) -> int:
     """Run, write, and print what was measured."""
     args = parse(Arguments, arguments, "ms-slam run")
     from ms_slam_env.benchmark.compare_run import limit_threads
-    from ms_slam_env.benchmark.options import nested_options
+    from ms_slam_env.benchmark.options import nested_options, parse_frame_management
     from ms_slam_env.benchmark.sequence_run import run_sequence
     from ms_slam_env.sequences.recording import open_recording, parse_calibration
     from ms_slam_env.sequences.recording.recording import NATIVE
     from ms_slam_env.slam.configuration import SlamConfiguration, merged, read_configuration
 
+    management = parse_frame_management(args.frame_management)
     slam = SlamConfiguration(slam=args.backend or "surfel")
     if args.config is not None:
         slam = read_configuration(args.config)
@@ -71,8 +80,8 @@ def main(arguments: Sequence[str]) -> int:
         limit_threads(slam.threads)
     params = merged(slam.slam_config, nested_options(args.params))
     fed = {"keep_every": slam.keep_every, "threads": slam.threads}
-    result = run_sequence(recording, slam.slam, params, args.out, fed)
-    for name in ("frames", "lost_frames", "ms_median", "path_m", "ate_m", "rpe_m"):
+    result = run_sequence(recording, slam.slam, params, args.out, fed, management)
+    for name in _PRINTED:
         if name in result:
-            print(f"{name:12} {result[name]:.4g}")
+            print(f"{name:16} {result[name]:.4g}")
     return 0

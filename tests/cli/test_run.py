@@ -180,6 +180,22 @@ def test_says_what_registration_it_assumes(sequence, tmp_path, capsys):
     assert json.loads((out / "metrics.json").read_text())["registration"] is None
 
 
+def test_manages_frames(sequence, tmp_path, capsys):
+    out = tmp_path / "out"
+    options = ["--frame-management", "regular,every=2"]
+    assert main(["run", str(sequence), *options, "--out", str(out)]) == 0
+    assert f"processed_frames {FRAMES // 2}" in capsys.readouterr().out
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["frame_management"] == {
+        "name": "regular",
+        "every": 2,
+        "max_skip": 10,
+        "pose": "constant-velocity",
+    }
+    times, _ = read_trajectory(out / "trajectory.txt")
+    assert len(times) == metrics["frames"] == FRAMES
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -191,6 +207,8 @@ def test_says_what_registration_it_assumes(sequence, tmp_path, capsys):
         (["run", "SEQUENCE", "--intrinsics", "1 2 3 4 5 x"], "--intrinsics: 'x' is not a number"),
         (["run", "SEQUENCE", "--intrinsics", "9 9 4 3 9 7"], "is 80x60 but the intrinsics say 9x7"),
         (["run", "SEQUENCE", "--image-size", "3x2"], "unknown image size '3x2'"),
+        (["run", "SEQUENCE", "--frame-management", "some"], "'some'; valid choices: none, regular"),
+        (["run", "SEQUENCE", "--frame-management", "divergence,x=1"], "frame_management.x"),
         (["run", "SEQUENCE", "--config", "no.yaml"], "no.yaml: cannot be read: No such file"),
     ],
 )
