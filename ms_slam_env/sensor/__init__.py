@@ -1,11 +1,13 @@
 """The RGB-D sensor: ray casting, shading and published Kinect noise."""
 
+from ms_slam_env.sensor.bodies import Body
 from ms_slam_env.sensor.casters import (
     EmbreeRayCaster,
     EmbreeSingleRayCaster,
     RayCaster,
     WarpRayCaster,
 )
+from ms_slam_env.sensor.changes import ChangingLight
 from ms_slam_env.sensor.noise import NOISE_MODELS, NoiseConfig, NoNoise
 from ms_slam_env.sensor.rgbd import FRAME_RATE_HZ, ROLLING_ROWS, RGBDSensor, TrueView
 
@@ -13,6 +15,8 @@ __all__ = [
     "FRAME_RATE_HZ",
     "NOISE_MODELS",
     "ROLLING_ROWS",
+    "Body",
+    "ChangingLight",
     "EmbreeRayCaster",
     "EmbreeSingleRayCaster",
     "NoNoise",

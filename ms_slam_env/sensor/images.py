@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,9 @@ from numpy.typing import NDArray
 
 from ms_slam_env._warp import wp
 from ms_slam_env.scenes.base import TexturedMesh
+from ms_slam_env.sensor.bodies import Body
 from ms_slam_env.sensor.casters import Hits, RayCaster
+from ms_slam_env.sensor.changes import ChangingLight, ChangingView
 from ms_slam_env.sensor.depth_noise import DepthNoise, measure_depth, projector_shadow
 from ms_slam_env.sensor.noise import NoiseConfig
 from ms_slam_env.sensor.random_numbers import normal_table
@@ -54,6 +57,16 @@ class Tables:
         self.encode: wp.array = wp.array(encode_table(), dtype=wp.float32, device=device)
 
 
+@dataclass(frozen=True)
+class Changes:
+    """What changes from frame to frame in a scene, and the mesh of all there is, joined."""
+
+    mesh: TexturedMesh
+    bodies: Sequence[Body]
+    casters: Sequence[RayCaster]
+    light: ChangingLight | None
+
+
 class Images:
     """Arrays for a number of images and the work on them, overwritten from call to call.
 
@@ -72,10 +85,12 @@ class Images:
         depth_noise: DepthNoise,
         exposure: float,
         device: str,
+        changes: Changes | None = None,
     ) -> None:
         """Allocate the arrays for images (B, H, W) and record the launches.
 
-        ``camera.rows`` says how many rows of an image have a pose of their own.
+        ``camera.rows`` says how many rows of an image have a pose of their own. With ``changes``
+        there is one image.
         """
         self._device = device
         self._shape = shape
@@ -93,6 +108,22 @@ class Images:
         self._color = wp.zeros((count, 3), dtype=wp.uint8, device=device)
         self._depth = wp.zeros(count, dtype=wp.float32, device=device)
         self._cast = caster.bind(self._poses, camera, hits)
+        self._exposure = exposure
+        self._view = None
+        posed = [hits.face, surfaces.normal, surfaces.plane]
+        if changes is not None:
+            self._view = view = ChangingView(
+                changes.mesh,
+                changes.bodies,
+                changes.light,
+                changes.casters,
+                surfaces,
+                camera,
+                hits,
+                device,
+            )
+            self._surfaces = surfaces = view.surfaces
+            posed = [view.posed_face, view.normal, view.plane]
 
         def shading(shot: float, read: float) -> Any:
             found = [self._poses, camera, span, hits.t, hits.u, hits.v, hits.face, surfaces]
@@ -109,7 +140,7 @@ class Images:
             self._measure.append(
                 self._record(projector_shadow, batch * height, inputs, [self._shadow])
             )
-        inputs = [self._poses, camera, span, hits.t, hits.face, surfaces.normal, surfaces.plane]
+        inputs = [self._poses, camera, span, hits.t, *posed]
         inputs += [self._shadow, depth_noise, self._keys, tables.normals]
         self._measure.append(self._record(measure_depth, parts, inputs, [self._depth]))
 
@@ -120,23 +151,41 @@ class Images:
             kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._device, record_cmd=True
         )
 
-    def capture(
-        self, poses: NDArray[np.float64], keys: NDArray[np.uint32]
-    ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Noisy colour (B, H, W, 3) and depth (B, H, W) from poses (B, 4, 4) with keys (B, 2)."""
+    def _look(self, poses: NDArray[np.float64], times_s: NDArray[np.float64] | None) -> None:
+        """Find what the images from poses (P, 4, 4) see."""
         self._poses.assign(poses.astype(np.float32))
+        if self._view is None:
+            self._cast()
+            return
+        times = np.zeros(len(poses)) if times_s is None else times_s
+        self._view.look(self._cast, poses, times)
+        exposure = self._exposure * self._view.exposure_factor
+        for command in (self._shade, self._shade_ideal):
+            command.set_param_by_name("exposure", exposure)
+
+    def capture(
+        self,
+        poses: NDArray[np.float64],
+        keys: NDArray[np.uint32],
+        times_s: NDArray[np.float64] | None = None,
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """Noisy colour (B, H, W, 3) and depth (B, H, W) from poses (P, 4, 4) with keys (B, 2).
+
+        ``times_s`` (P,), of the poses, matters only where something changes.
+        """
         self._keys.assign(keys)
-        self._cast()
+        self._look(poses, times_s)
         self._shade.launch()
         for command in self._measure:
             command.launch()
         colors = self._color.numpy().reshape(*self._shape, 3)
         return colors, self._depth.numpy().reshape(self._shape)
 
-    def ideal_colors(self, poses: NDArray[np.float64]) -> NDArray[np.uint8]:
-        """Noise-free colour (B, H, W, 3) from poses (B, 4, 4)."""
-        self._poses.assign(poses.astype(np.float32))
-        self._cast()
+    def ideal_colors(
+        self, poses: NDArray[np.float64], times_s: NDArray[np.float64] | None = None
+    ) -> NDArray[np.uint8]:
+        """Noise-free colour (B, H, W, 3) from poses (P, 4, 4) at times (P,)."""
+        self._look(poses, times_s)
         self._shade_ideal.launch()
         return self._color.numpy().reshape(*self._shape, 3)
 
@@ -145,10 +194,11 @@ class Images:
         depth = np.where(self._hits.face.numpy() >= 0, self._hits.t.numpy(), np.float32(0))
         return depth.reshape(self._shape)
 
-    def truth(self, poses: NDArray[np.float64]) -> list[NDArray[Any]]:
-        """Noise-free colour, depth, normals, labels and points from poses (B, 4, 4)."""
-        self._poses.assign(poses.astype(np.float32))
-        self._cast()
+    def truth(
+        self, poses: NDArray[np.float64], times_s: NDArray[np.float64] | None = None
+    ) -> list[NDArray[Any]]:
+        """Noise-free colour, depth, normals, labels and points from poses (P, 4, 4)."""
+        self._look(poses, times_s)
         self._shade_ideal.launch()
         count = self._depth.shape[0]
         outputs: list[wp.array] = [

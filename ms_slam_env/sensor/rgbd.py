@@ -14,9 +14,11 @@ from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose
 from ms_slam_env.scenes.base import Scene
+from ms_slam_env.sensor.bodies import Body, joined
 from ms_slam_env.sensor.casters import RayCaster, make_caster
+from ms_slam_env.sensor.changes import ChangingLight
 from ms_slam_env.sensor.depth_noise import make_depth_noise
-from ms_slam_env.sensor.images import Images, Tables, upload_surfaces
+from ms_slam_env.sensor.images import Changes, Images, Tables, upload_surfaces
 from ms_slam_env.sensor.noise import NoiseConfig, noise_config
 from ms_slam_env.sensor.random_numbers import frame_key
 from ms_slam_env.sensor.rays import make_pinhole
@@ -77,6 +79,8 @@ class RGBDSensor:
         seed: int = 0,
         device: str = "cpu",
         caster: RayCaster | None = None,
+        bodies: Sequence[Body] = (),
+        light: ChangingLight | None = None,
     ) -> None:
         """Prepare to render ``scene``.
 
@@ -87,6 +91,8 @@ class RGBDSensor:
             seed: of the noise.
             device: Warp device, such as "cpu" or "cuda:0".
             caster: what finds the ray hits; by default the fastest of the device.
+            bodies: things that move in it; each is where it is at the time of the frame.
+            light: how its light changes; None leaves it as it is.
 
         Raises:
             InputError: unknown noise model, or a seed that is not an integer >= 0.
@@ -103,7 +109,13 @@ class RGBDSensor:
             True: make_pinhole(intrinsics, ROLLING_ROWS),
         }
         self._depth_noise = make_depth_noise(self.noise, intrinsics)
-        self._surfaces = upload_surfaces(scene.mesh, device)
+        mesh = joined(scene.mesh, bodies) if bodies else scene.mesh
+        self.labels: tuple[str, ...] = mesh.labels
+        self._surfaces = upload_surfaces(mesh, device)
+        self._changes = None
+        if bodies or light is not None:
+            casters = [make_caster(body.mesh, device) for body in bodies]
+            self._changes = Changes(mesh, tuple(bodies), casters, light)
         self._tables = Tables(device)
         self._of_thread = _OfThread()
 
@@ -156,8 +168,13 @@ class RGBDSensor:
         noise_seed = self.seed if seed is None else seed
         keys = np.stack([frame_key(noise_seed, index) for index in indices])
         times = _frame_times(indices, timestamps)
+        if self._changes is not None and len(poses) > 1:
+            return [
+                self.capture(pose, index, time, noise_seed)
+                for pose, index, time in zip(poses, indices, times, strict=True)
+            ]
         images = self._images(len(poses))
-        colors, depths = images.capture(poses, keys)
+        colors, depths = images.capture(poses, keys, np.array(times))
         self._of_thread.last = images
         return [RGBDFrame(colors[b].copy(), depths[b].copy(), time) for b, time in enumerate(times)]
 
@@ -172,6 +189,7 @@ class RGBDSensor:
         index: int,
         timestamp: float | None = None,
         seed: int | None = None,
+        row_times_s: ArrayLike | None = None,
     ) -> RGBDFrame:
         """Take frame ``index`` with a rolling shutter: every two rows have a pose of their own.
 
@@ -182,30 +200,40 @@ class RGBDSensor:
             index: counter of the noise.
             timestamp: seconds; index / 30 Hz by default.
             seed: of the noise, in place of the sensor's own.
+            row_times_s: (rolling_poses,) when, for what moves or changes by itself; by default all
+                at the time stamp.
 
         Raises:
-            InputError: another number of poses, a pose that is not a finite rigid motion, or a bad
-                index, seed or time stamp.
+            InputError: another number of poses or times, a pose that is not a finite rigid motion,
+                or a bad index, seed or time stamp.
         """
         poses = self._check_rolling(np.asarray(T_world_camera, dtype=np.float64)[None])
         keys = frame_key(self.seed if seed is None else seed, index)[None]
         time = _frame_times([index], None if timestamp is None else [timestamp])[0]
         images = self._images(1, is_rolling=True)
-        colors, depths = images.capture(poses, keys)
+        colors, depths = images.capture(poses, keys, _times_of(row_times_s, len(poses), time))
         self._of_thread.last = images
         return RGBDFrame(colors[0].copy(), depths[0].copy(), time)
 
-    def ideal_colors(self, T_world_camera: ArrayLike) -> NDArray[np.uint8]:
+    def ideal_colors(
+        self, T_world_camera: ArrayLike, times_s: ArrayLike | None = None
+    ) -> NDArray[np.uint8]:
         """Noise-free colour (B, H, W, 3) from poses (B, rolling_poses, 4, 4).
 
-        One pose for every two rows, as in ``capture_rolling``.
+        One pose for every two rows, as in ``capture_rolling``; ``times_s`` (B, rolling_poses) says
+        when, for what moves or changes by itself.
 
         Raises:
             InputError: another shape, or a pose that is not a finite rigid motion.
         """
         poses = np.asarray(T_world_camera, dtype=np.float64)
         flat = self._check_rolling(poses)
-        return self._images(len(poses), is_rolling=True).ideal_colors(flat).copy()
+        times = _times_of(times_s, len(flat), 0.0)
+        if self._changes is None:
+            return self._images(len(poses), is_rolling=True).ideal_colors(flat).copy()
+        images = self._images(1, is_rolling=True)
+        each = zip(poses, times.reshape(len(poses), -1), strict=True)
+        return np.concatenate([images.ideal_colors(*one).copy() for one in each])
 
     def _check_rolling(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
         """Poses (B * rolling_poses, 4, 4) of poses (B, rolling_poses, 4, 4)."""
@@ -238,14 +266,16 @@ class RGBDSensor:
             raise InputError("the sensor has captured no frame yet")
         return self._of_thread.last.true_depth()[-1]
 
-    def ground_truth(self, T_world_camera: ArrayLike) -> TrueView:
-        """Noise-free view from pose ``T_world_camera`` (4, 4).
+    def ground_truth(self, T_world_camera: ArrayLike, time_s: float = 0.0) -> TrueView:
+        """Noise-free view from pose ``T_world_camera`` (4, 4) at ``time_s``.
 
         Raises:
             InputError: a pose that is not a finite rigid motion.
         """
         pose = check_pose(T_world_camera, "T_world_camera")
-        color, depth, normals, labels, points = self._images(1).truth(pose[None])
+        color, depth, normals, labels, points = self._images(1).truth(
+            pose[None], np.array([time_s])
+        )
         return TrueView(color[0], depth[0], normals[0], labels[0], points[0])
 
     def _images(self, batch: int, is_rolling: bool = False) -> Images:
@@ -263,12 +293,23 @@ class RGBDSensor:
                     self._depth_noise,
                     self.scene.exposure,
                     self.device,
+                    self._changes,
                 )
             kept = self._of_thread.images
             if len(kept) == _BATCH_SIZES_KEPT:
                 kept.pop(next(iter(kept)))
             kept[batch, is_rolling] = images
         return images
+
+
+def _times_of(times_s: ArrayLike | None, count: int, default: float) -> NDArray[np.float64]:
+    """Times (count,) of poses."""
+    if times_s is None:
+        return np.full(count, default)
+    times = np.asarray(times_s, dtype=np.float64).ravel()
+    if len(times) != count:
+        raise InputError(f"{len(times)} times for {count} poses")
+    return times
 
 
 def _frame_times(

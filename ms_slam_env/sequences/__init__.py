@@ -12,7 +12,8 @@ Rendered, streamed and reproducible bit for bit::
     sequence.frames.truth(k)                     # TrueView: depth, normals, labels, points
 
 A perturbation is one of ``RollingShutter, MotionBlur, Misregistration, ExposureRamp,
-ExposureJumps, AutoExposure, BlackFrames, DepthDropout, DepthQuantisation, FrameSkipping``, or
+ExposureJumps, AutoExposure, BlackFrames, DepthDropout, DepthQuantisation, FrameSkipping,
+MovingObjects``, or
 ``make_perturbation("rolling-shutter", {"readout_s": 0.02})``.
 """
 
@@ -29,6 +30,7 @@ from ms_slam_env.sequences.perturbations import (
     FrameSkipping,
     Misregistration,
     MotionBlur,
+    MovingObjects,
     Perturbation,
     RollingShutter,
     make_perturbation,
@@ -51,6 +53,7 @@ __all__ = [
     "HandheldPath",
     "Misregistration",
     "MotionBlur",
+    "MovingObjects",
     "Perturbation",
     "Placement",
     "PoseInterpolation",

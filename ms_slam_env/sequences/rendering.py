@@ -23,8 +23,10 @@ from ms_slam_env.sequences.perturbations.base import (
     OpticalPerturbation,
     Optics,
     Perturbation,
+    WorldPerturbation,
     random_numbers,
 )
+from ms_slam_env.sequences.perturbations.moving import Mover, bodies_of
 from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
 
 Float64 = NDArray[np.float64]
@@ -39,6 +41,7 @@ class RenderedFrames(collections.abc.Sequence[RGBDFrame]):
         kept: (N,) indices of the frames on the trajectory.
         timestamps: (N,) seconds.
         poses: (N, 4, 4) true T_world_camera, of the depth camera at the time stamp.
+        object_trajectories: name -> (N, 4, 4) T_world_object of each object that moves.
     """
 
     def __init__(
@@ -58,13 +61,15 @@ class RenderedFrames(collections.abc.Sequence[RGBDFrame]):
         self._seed = seed
         self._trajectory = trajectory
         self._caster = make_caster(scene.mesh, "cpu")
-        self._sensor = self._camera(scene, intrinsics, noise)
         optics = Optics(intrinsics)
+        movers: list[Mover] = []
         self._images: list[ImagePerturbation] = []
         self.kept = np.arange(len(trajectory.poses))
         for perturbation in perturbations:
             if isinstance(perturbation, FrameSelection):
                 self.kept = self.kept[perturbation.keep(len(self.kept), seed)]
+            elif isinstance(perturbation, WorldPerturbation):
+                movers += perturbation.populate(scene, trajectory, intrinsics, seed)
             elif isinstance(perturbation, OpticalPerturbation):
                 optics = perturbation.alter(optics)
             elif isinstance(perturbation, ImagePerturbation):
@@ -73,6 +78,9 @@ class RenderedFrames(collections.abc.Sequence[RGBDFrame]):
                 raise InputError(f"{perturbation!r} is not a perturbation")
         self.timestamps: Float64 = trajectory.times_s[self.kept]
         self.poses: Float64 = trajectory.poses[self.kept]
+        self.object_trajectories = _trajectories(movers, self.timestamps)
+        self._bodies = bodies_of(movers, scene)
+        self._sensor = self._camera(scene, intrinsics, noise)
         self._optics = optics
         self._has_own_color_camera = optics.color != intrinsics or bool(
             (optics.T_depth_color != np.eye(4)).any()
@@ -84,7 +92,9 @@ class RenderedFrames(collections.abc.Sequence[RGBDFrame]):
         self._brightness: Float64 | None = None
 
     def _camera(self, scene: Scene, K: Intrinsics, noise: str | NoiseConfig) -> RGBDSensor:
-        return RGBDSensor(scene, K, noise=noise, seed=self._seed, caster=self._caster)
+        return RGBDSensor(
+            scene, K, noise=noise, seed=self._seed, caster=self._caster, bodies=self._bodies
+        )
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -110,14 +120,15 @@ class RenderedFrames(collections.abc.Sequence[RGBDFrame]):
     @property
     def labels(self) -> tuple[str, ...]:
         """Names of the objects in the scene, by the labels of ``truth``."""
-        return self._sensor.scene.mesh.labels
+        return self._sensor.labels
 
     def truth(self, index: int) -> TrueView:
         """Noise-free view (colour, depth, normals, labels, points) from the true pose of a frame.
 
-        Nothing of it is perturbed: it is what a perfect camera sees at the time stamp.
+        Nothing of it is perturbed: it is what a perfect camera sees at the time stamp, what moves
+        through the scene included.
         """
-        return self._sensor.ground_truth(self.poses[index])
+        return self._sensor.ground_truth(self.poses[index], float(self.timestamps[index]))
 
     def _moment(self, number: int) -> Moment:
         return Moment(
@@ -146,8 +157,9 @@ class RenderedFrames(collections.abc.Sequence[RGBDFrame]):
         time = float(self._trajectory.times_s[number])
         if not self._optics.readout_s:
             return sensor.capture(self._trajectory.poses[number] @ offset, number, time)
-        poses = self._trajectory(time + self._row_times()) @ offset
-        return sensor.capture_rolling(poses, number, time)
+        times = time + self._row_times()
+        poses = self._trajectory(times) @ offset
+        return sensor.capture_rolling(poses, number, time, row_times_s=times)
 
     def _row_times(self) -> Float64:
         """Times (rolling_poses,) of the rows that share a pose, after the frame's time stamp."""
@@ -160,9 +172,10 @@ class RenderedFrames(collections.abc.Sequence[RGBDFrame]):
         """Colour integrated over the exposure, with the noise of one image."""
         optics = self._optics
         instants = (np.arange(optics.exposure_samples) + 0.5) / optics.exposure_samples - 0.5
-        times = self._trajectory.times_s[number] + optics.exposure_s * instants
-        poses = self._trajectory(times[:, None] + self._row_times()) @ optics.T_depth_color
-        colors = self._color_sensor.ideal_colors(poses)
+        middles = self._trajectory.times_s[number] + optics.exposure_s * instants
+        times = middles[:, None] + self._row_times()
+        poses = self._trajectory(times) @ optics.T_depth_color
+        colors = self._color_sensor.ideal_colors(poses, times)
         rng = random_numbers(self._seed, number, name="noise-of-blurred-colour")
         return self._light.mean(colors, rng)
 
@@ -173,6 +186,23 @@ class RenderedFrames(collections.abc.Sequence[RGBDFrame]):
             small = K.scaled(min(1.0, _METERING_WIDTH / K.width))
             sensor = self._camera(self._sensor.scene, small, "none")
             self._brightness = np.array(
-                [intensity_image(sensor.capture(T, 0).color).mean() for T in self._trajectory.poses]
+                [
+                    intensity_image(sensor.capture(T, 0, time).color).mean()
+                    for time, T in zip(
+                        self._trajectory.times_s, self._trajectory.poses, strict=True
+                    )
+                ]
             )
         return self._brightness
+
+
+def _trajectories(movers: Iterable[Mover], times_s: Float64) -> dict[str, Float64]:
+    """Trajectory (N, 4, 4) of each mover, by name."""
+    trajectories: dict[str, Float64] = {}
+    for mover in movers:
+        if mover.name in trajectories:
+            raise InputError(
+                f"two moving objects are called {mover.name!r}; use one moving-objects"
+            )
+        trajectories[mover.name] = mover.pose(times_s)
+    return trajectories

@@ -41,7 +41,8 @@ def write_sequence(
     """Write a rendered sequence in the TUM layout; show progress.
 
     ``rgb/TIME.png``, ``depth/TIME.png`` (16 bits, 5000 a metre, 0 = no reading or beyond 13.1 m),
-    ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``, ``intrinsics.txt`` and ``sequence.json``.
+    ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``, ``intrinsics.txt`` and ``sequence.json``; of
+    every moving object ``objects/NAME.txt``, its poses T_world_object at the times of the frames.
     Everything grows in ``FOLDER.partial``, image by image, each appearing when it is whole, and
     the folder gets its name at the end. A second call with the same description goes on where an
     interrupted one stopped, and ends with the same files.
@@ -77,6 +78,10 @@ def write_sequence(
         lines = "".join(f"{value} {label}\n" for value, label in objects)
         (partial / "objects.txt").write_text(f"# value object\n{lines}", encoding="utf-8")
     write_trajectory(partial / "groundtruth.txt", sequence.frames.timestamps, sequence.poses)
+    for name, poses in sequence.frames.object_trajectories.items():
+        (partial / "objects").mkdir(exist_ok=True)
+        file = partial / "objects" / f"{name.replace(' ', '_')}.txt"
+        write_trajectory(file, sequence.frames.timestamps, poses)
     (partial / "intrinsics.txt").write_text(_intrinsics(sequence.intrinsics), encoding="utf-8")
     os.replace(partial / UNFINISHED, partial / DESCRIPTION)
     os.replace(partial, target)

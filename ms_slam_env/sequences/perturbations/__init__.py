@@ -1,7 +1,6 @@
 """Imperfections of cameras and recordings, each with a strength; one file per variant.
 
-Stochastic ones have a ``seed`` of their own beside the sequence's. Moving objects are not among
-them.
+Stochastic ones have a ``seed`` of their own beside the sequence's.
 """
 
 from ms_slam_env.sequences.perturbations.auto_exposure import AutoExposure
@@ -12,6 +11,7 @@ from ms_slam_env.sequences.perturbations.base import (
     OpticalPerturbation,
     Optics,
     Perturbation,
+    WorldPerturbation,
 )
 from ms_slam_env.sequences.perturbations.black_frames import BlackFrames
 from ms_slam_env.sequences.perturbations.depth_dropout import DepthDropout
@@ -21,6 +21,7 @@ from ms_slam_env.sequences.perturbations.exposure_ramp import ExposureRamp
 from ms_slam_env.sequences.perturbations.frame_skipping import FrameSkipping
 from ms_slam_env.sequences.perturbations.misregistration import Misregistration
 from ms_slam_env.sequences.perturbations.motion_blur import MotionBlur
+from ms_slam_env.sequences.perturbations.moving_objects import MovingObjects
 from ms_slam_env.sequences.perturbations.registry import PERTURBATIONS, make_perturbation
 from ms_slam_env.sequences.perturbations.rolling_shutter import RollingShutter
 
@@ -38,9 +39,11 @@ __all__ = [
     "Misregistration",
     "Moment",
     "MotionBlur",
+    "MovingObjects",
     "OpticalPerturbation",
     "Optics",
     "Perturbation",
     "RollingShutter",
+    "WorldPerturbation",
     "make_perturbation",
 ]

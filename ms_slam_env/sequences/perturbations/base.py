@@ -1,6 +1,7 @@
 """What a perturbation of a rendered sequence may change, and what it may ask.
 
-Three kinds, applied in this order: which frames there are, how they are taken, what is in them.
+Kinds, applied in this order: how the camera moves, which frames there are, what there is to see,
+how the frames are taken, what is in them.
 """
 
 from __future__ import annotations
@@ -15,6 +16,9 @@ from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.errors import InputError
+from ms_slam_env.scenes.base import Scene
+from ms_slam_env.sequences.perturbations.moving.mover import Mover
+from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -73,7 +77,7 @@ class Moment:
     brightness: Callable[[], Float64]
 
 
-class Perturbation(ABC):  # noqa: B024 - its three kinds share a name and no method
+class Perturbation(ABC):  # noqa: B024 - its kinds share a name and no method
     """One imperfection of a camera or of a recording. Leave it out of the list to switch it off."""
 
 
@@ -83,6 +87,16 @@ class FrameSelection(Perturbation):
     @abstractmethod
     def keep(self, count: int, seed: int) -> Int64:
         """Indices kept of ``count`` frames, increasing; ``seed`` is that of the sequence."""
+
+
+class WorldPerturbation(Perturbation):
+    """Changes what there is to see."""
+
+    @abstractmethod
+    def populate(
+        self, scene: Scene, camera: PoseInterpolation, intrinsics: Intrinsics, seed: int
+    ) -> tuple[Mover, ...]:
+        """Return the things that move through ``scene`` while ``camera`` is on its way."""
 
 
 class OpticalPerturbation(Perturbation):

@@ -17,6 +17,7 @@ from ms_slam_env.sequences.perturbations.exposure_ramp import ExposureRamp
 from ms_slam_env.sequences.perturbations.frame_skipping import FrameSkipping
 from ms_slam_env.sequences.perturbations.misregistration import Misregistration
 from ms_slam_env.sequences.perturbations.motion_blur import MotionBlur
+from ms_slam_env.sequences.perturbations.moving_objects import MovingObjects
 from ms_slam_env.sequences.perturbations.rolling_shutter import RollingShutter
 
 PERTURBATIONS: dict[str, type[Perturbation]] = {
@@ -30,6 +31,7 @@ PERTURBATIONS: dict[str, type[Perturbation]] = {
     "depth-dropout": DepthDropout,
     "depth-quantisation": DepthQuantisation,
     "frame-skipping": FrameSkipping,
+    "moving-objects": MovingObjects,
 }
 """Name to class."""
 

@@ -1,0 +1,142 @@
+"""What a thing that moves is made of: rigid parts, some of which swing or roll as it goes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ms_slam_env.scenes.base import Float32, Float64, TexturedMesh
+from ms_slam_env.scenes.builder import Geometry, MeshBuilder
+from ms_slam_env.scenes.lighting import cosine_directions
+from ms_slam_env.scenes.rays import RayCaster
+
+_OPENNESS_RAYS = 24
+_DARKEST = 0.25  # of the light around, where nothing of it arrives directly
+
+
+@dataclass(frozen=True)
+class Joint:
+    """How a part moves in the frame of the whole while that goes ``s`` metres.
+
+    Its angle is swing_rad * sin(2 pi s / stride_m + phase_rad) + s * roll_rad_m.
+
+    Attributes:
+        pivot: (3,) a point of the axis, in the frame of the whole.
+        axis: (3,) unit vector.
+        swing_rad: amplitude to and fro.
+        stride_m: distance of one swing to and fro.
+        phase_rad: of the swing at s = 0.
+        roll_rad_m: angle a metre.
+    """
+
+    pivot: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    axis: tuple[float, float, float] = (0.0, 1.0, 0.0)
+    swing_rad: float = 0.0
+    stride_m: float = 1.0
+    phase_rad: float = 0.0
+    roll_rad_m: float = 0.0
+
+    def pose(self, s: Float64) -> Float64:
+        """T_whole_part (..., 4, 4) after ways (...) in metres."""
+        angle = self.swing_rad * np.sin(2 * np.pi * s / self.stride_m + self.phase_rad)
+        angle = np.asarray(angle + s * self.roll_rad_m)
+        turns = np.asarray(self.axis) * angle.reshape(-1, 1)
+        T = np.zeros((*angle.shape, 4, 4))
+        T[..., :3, :3] = Rotation.from_rotvec(turns).as_matrix().reshape(*angle.shape, 3, 3)
+        T[..., :3, 3] = self.pivot - T[..., :3, :3] @ np.asarray(self.pivot)
+        T[..., 3, 3] = 1.0
+        return T
+
+
+@dataclass(frozen=True)
+class Part:
+    """A rigid piece.
+
+    Attributes:
+        mesh: in the frame of the whole, at angle 0; ``irradiance`` is the share of the light
+            around that reaches a corner.
+        joint: how it moves in that frame.
+    """
+
+    mesh: TexturedMesh
+    joint: Joint
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A thing that moves: x points ahead, z up.
+
+    Attributes:
+        kind: of what it is.
+        parts: its pieces.
+        radius_m: of the circle about the z axis that it fits in.
+        length_m: along the direction of travel, its middle at the origin.
+        width_m: across it, likewise.
+        height_m: above the origin.
+        depth_m: below the origin; 0 for what stands on the ground.
+    """
+
+    kind: str
+    parts: tuple[Part, ...]
+    radius_m: float
+    length_m: float
+    width_m: float
+    height_m: float
+    depth_m: float = 0.0
+
+
+Piece = tuple[Callable[[MeshBuilder], None], Joint]
+"""What adds the patches of a part to a builder, and the part's joint."""
+
+
+def assemble(pieces: list[Piece], cell_m: float, ground_z: float | None = 0.0) -> tuple[Part, ...]:
+    """Build the parts, with the light that each corner loses to the others and to the ground."""
+    geometries = []
+    for add, _ in pieces:
+        builder = MeshBuilder(cell_m)
+        with builder.object("part"):
+            add(builder)
+        geometries.append(builder.build())
+    counts = np.cumsum([0, *(len(g.vertices) for g in geometries)])
+    rays = RayCaster(
+        np.concatenate([g.vertices for g in geometries]),
+        np.concatenate([g.faces + n for g, n in zip(geometries, counts[:-1], strict=True)]),
+    )
+    return tuple(
+        Part(_mesh(g, _openness(g, rays, ground_z)), joint)
+        for g, (_, joint) in zip(geometries, pieces, strict=True)
+    )
+
+
+def _openness(g: Geometry, rays: RayCaster, ground_z: float | None) -> Float32:
+    """Share (V,) of the cosine-weighted directions from which light arrives."""
+    helper = np.where(np.abs(g.normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+    tangent = np.cross(helper, g.normals)
+    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
+    bitangent = np.cross(g.normals, tangent)
+    total = np.zeros(len(g.vertices), np.float32)
+    for x, y, z in cosine_directions(_OPENNESS_RAYS):
+        direction = x * tangent + y * bitangent + z * g.normals
+        distance, _ = rays.first_hit(g.light_points, direction)
+        arrives = np.minimum(distance, 1.0)
+        if ground_z is not None:  # near the ground less light comes from below
+            height = g.light_points[:, 2] - ground_z
+            arrives = np.where(direction[:, 2] < 0, arrives * np.clip(height, 0.2, 1.0), arrives)
+        total += arrives
+    return (_DARKEST + (1 - _DARKEST) * total / _OPENNESS_RAYS).astype(np.float32)
+
+
+def _mesh(g: Geometry, openness: Float32) -> TexturedMesh:
+    return TexturedMesh(
+        vertices=g.vertices.astype(np.float32),
+        faces=g.faces,
+        uv=g.uv,
+        face_texture=g.face_texture,
+        face_label=g.face_label,
+        irradiance=np.repeat(openness[g.faces][..., None], 3, axis=2).astype(np.float32),
+        textures=g.textures,
+        labels=g.labels,
+    )

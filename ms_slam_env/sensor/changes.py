@@ -1,0 +1,184 @@
+"""What changes from frame to frame in what one image sees: bodies that move, light."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env._warp import wp
+from ms_slam_env.scenes.base import TexturedMesh
+from ms_slam_env.sensor.bodies import Body
+from ms_slam_env.sensor.body_cast import BodyCast
+from ms_slam_env.sensor.casters import Hits, RayCaster
+from ms_slam_env.sensor.nearer import keep_nearer
+from ms_slam_env.sensor.rays import Pinhole
+from ms_slam_env.sensor.shading import Surfaces
+
+Float64 = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+
+_GATHER = 0.2  # of the way from a corner to the middle of its face: there light is gathered
+_LIFT_M = 0.006
+
+
+class ChangingLight(ABC):
+    """Light that changes over time."""
+
+    @abstractmethod
+    def level(self, time_s: float) -> float:
+        """Factor > 0 on all light that the scene has by itself."""
+
+    @abstractmethod
+    def added(self, points: Float64, normals: Float64, time_s: float) -> Float32 | None:
+        """Light (N, 3) beside it at points (N, 3) with unit normals (N, 3); None = nowhere."""
+
+
+class ChangingView:
+    """The changes in what a single image sees; owns what of the surfaces changes.
+
+    Attributes:
+        surfaces: of the joined mesh, with arrays of its own for what changes.
+        posed_face: (H * W,) index into ``normal`` and ``plane`` of the face that a pixel sees.
+        normal: unit normals, of a body's faces once for every pose of the image.
+        plane: offsets of the faces' planes, likewise.
+        exposure_factor: on the exposure of the next image.
+    """
+
+    def __init__(
+        self,
+        mesh: TexturedMesh,
+        bodies: Sequence[Body],
+        light: ChangingLight | None,
+        casters: Sequence[RayCaster],
+        surfaces: Surfaces,
+        camera: Pinhole,
+        hits: Hits,
+        device: str,
+    ) -> None:
+        """Prepare for one image; ``mesh`` is the scene's and the bodies', joined."""
+        self._mesh, self._light, self._camera, self._hits = mesh, light, camera, hits
+        self._shape, self._device = hits.shape, device
+        self._is_cpu = device == "cpu"
+        poses = -(-int(camera.height) // int(camera.rows))
+        first = len(mesh.faces) - sum(len(body.mesh.faces) for body in bodies)
+        self._first, self._moving_faces = first, len(mesh.faces) - first
+        self._bodies: list[BodyCast] = []
+        at = first
+        for body, caster in zip(bodies, casters, strict=True):
+            cast = BodyCast(body, caster, at, camera, hits.shape, poses, device)
+            self._bodies.append(cast)
+            at += len(body.mesh.faces)
+        self.surfaces = _copy(surfaces)
+        self.surfaces.irradiance = wp.clone(surfaces.irradiance)
+        self.posed_face, self.normal, self.plane = hits.face, surfaces.normal, surfaces.plane
+        if bodies:
+            self.surfaces.normal = wp.clone(surfaces.normal)
+            self.surfaces.plane = wp.clone(surfaces.plane)
+            self.normal, self.plane = self.surfaces.normal, self.surfaces.plane
+            if poses > 1:
+                more = poses * self._moving_faces
+                self.posed_face = wp.zeros_like(hits.face)
+                self.normal = wp.zeros(first + more, dtype=wp.vec3, device=device)
+                self.plane = wp.zeros(first + more, dtype=wp.float32, device=device)
+                wp.copy(self.normal, surfaces.normal, count=first)
+                wp.copy(self.plane, surfaces.plane, count=first)
+        self.exposure_factor = 1.0
+        self._lit: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
+
+    def look(self, cast_scene: Callable[[], None], T: Float64, times_s: Float64) -> None:
+        """Find what the image from poses T (P, 4, 4) at times (P,) sees, and how it is lit."""
+        cast_scene()
+        middle = float(times_s[len(times_s) // 2])
+        if self._bodies:
+            self._cast_bodies(T, times_s, middle)
+        if self._light is not None:
+            self.exposure_factor = float(self._light.level(middle))
+            self._add_light(self._light, middle)
+
+    def _cast_bodies(self, T: Float64, times_s: Float64, middle: float) -> None:
+        is_split = self.posed_face is not self._hits.face
+        if is_split:
+            wp.copy(self.posed_face, self._hits.face)
+        for cast in self._bodies:
+            T_world_body = cast.body.pose(times_s)
+            if not cast.cast(T, T_world_body):
+                continue
+            R = T_world_body[:, :3, :3]
+            normals = np.einsum("pij,fj->pfi", R, cast.normals)
+            planes = cast.planes + np.einsum("pfi,pi->pf", normals, T_world_body[:, :3, 3])
+            here = len(times_s) // 2
+            _put(self.surfaces.normal, cast.faces.start, normals[here])
+            _put(self.surfaces.plane, cast.faces.start, planes[here])
+            if is_split:
+                for p in range(len(times_s)):
+                    start = cast.faces.start + p * self._moving_faces
+                    _put(self.normal, start, normals[p])
+                    _put(self.plane, start, planes[p])
+            self._light_body(cast, R[here], middle)
+            found = cast.hits
+            wp.launch(
+                keep_nearer,
+                dim=self._shape,
+                inputs=[self._camera, found.t, found.u, found.v, found.face, cast.faces.start],
+                outputs=[
+                    self._moving_faces,
+                    self._hits.t,
+                    self._hits.u,
+                    self._hits.v,
+                    self._hits.face,
+                    self.posed_face,
+                ],
+                device=self._device,
+            )
+
+    def _light_body(self, cast: BodyCast, R: Float64, time_s: float) -> None:
+        """Light the faces of a body that is turned by R (3, 3)."""
+        around = cast.body.light(time_s)
+        arriving = around[0] + cast.corner_normals @ (R.T @ around[1:])
+        lit = np.maximum(arriving, 0.0) * cast.body.mesh.irradiance
+        _put(self.surfaces.irradiance, cast.faces.start, lit.astype(np.float32))
+
+    def _add_light(self, light: ChangingLight, time_s: float) -> None:
+        """Add light to the faces in sight; those of the last image lose theirs."""
+        static = self._lit[self._lit < self._first]
+        irradiance = self.surfaces.irradiance.numpy()
+        irradiance[static] = self._mesh.irradiance[static]
+        seen = np.unique(self._hits.face.numpy())
+        self._lit = seen[seen >= 0]
+        points, normals = self._gathering_points()
+        added = light.added(points, normals, time_s)
+        if added is not None:
+            irradiance[self._lit] += added.reshape(-1, 3, 3) / self.exposure_factor
+        if not self._is_cpu:  # there the array above is the real one
+            self.surfaces.irradiance.assign(irradiance)
+
+    def _gathering_points(self) -> tuple[Float64, Float64]:
+        """Places (3 N, 3) just in front of the corners of the lit faces, and normals (3 N, 3)."""
+        faces = self._lit
+        corners = self._mesh.vertices[self._mesh.faces[faces]].astype(np.float64)
+        normal = self.surfaces.normal.numpy()[faces].astype(np.float64)
+        for cast in self._bodies:
+            is_own = (faces >= cast.faces.start) & (faces < cast.faces.stop)
+            T = cast.T_world_body
+            corners[is_own] = corners[is_own] @ T[:3, :3].T + T[:3, 3]
+        places = (1 - _GATHER) * corners + _GATHER * corners.mean(1, keepdims=True)
+        places += _LIFT_M * normal[:, None]
+        return places.reshape(-1, 3), np.repeat(normal, 3, axis=0)
+
+
+def _put(array: wp.array, start: int, values: NDArray[np.floating]) -> None:
+    """Write rows of an array, on whatever device it lies."""
+    rows = np.ascontiguousarray(values, dtype=np.float32)
+    array[start : start + len(rows)].assign(rows)
+
+
+def _copy(surfaces: Surfaces) -> Surfaces:
+    copied = Surfaces()
+    for name in ("uv", "irradiance", "normal", "plane", "density", "texture", "label"):
+        setattr(copied, name, getattr(surfaces, name))
+    for name in ("texels", "offsets", "sizes"):
+        setattr(copied, name, getattr(surfaces, name))
+    return copied

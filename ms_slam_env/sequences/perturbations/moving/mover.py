@@ -1,0 +1,143 @@
+"""A thing on its way through the scene, with a clock that can be held back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ms_slam_env.scenes.base import Scene
+from ms_slam_env.scenes.light_probe import LightProbe
+from ms_slam_env.scenes.movers import Joint, Shape
+from ms_slam_env.sensor import Body
+from ms_slam_env.sequences.perturbations.moving.tracks import Track
+
+Float64 = NDArray[np.float64]
+
+_LIGHT_EVERY_M = 0.3
+_MOST_PROBES = 40
+
+
+class Mover:
+    """One moving object.
+
+    Where it is depends on its clock, which runs with the time of the frames from ``phase_s`` on;
+    ``wait`` makes it stand still for a while.
+
+    Attributes:
+        name: of the object.
+        shape: what it is.
+        track: its way.
+    """
+
+    def __init__(
+        self, name: str, shape: Shape, track: Track, phase_s: float, spin_rad_s: float = 0.0
+    ) -> None:
+        """Put it on its way; with ``spin_rad_s`` it turns on the spot instead of looking ahead."""
+        self.name, self.shape, self.track = name, shape, track
+        self._spin = spin_rad_s
+        self._phase = phase_s
+        self._waits: list[tuple[float, float]] = []  # (from, how long), in order
+
+    def clock(self, times_s: ArrayLike) -> Float64:
+        """Its clock (...) at times (...) in seconds."""
+        t = np.asarray(times_s, dtype=np.float64)
+        clock = t + self._phase
+        for start, duration in self._waits:
+            clock = clock - np.clip(t - start, 0.0, duration)
+        return clock
+
+    def wait(self, start_s: float, duration_s: float) -> None:
+        """Stand still from a time on, for so long; waits must come in order."""
+        self._waits.append((float(start_s), float(duration_s)))
+
+    def get_state(self) -> list[tuple[float, float]]:
+        """The waits so far."""
+        return list(self._waits)
+
+    def set_state(self, waits: list[tuple[float, float]]) -> None:
+        """Go on from what ``get_state`` returned."""
+        self._waits = list(waits)
+
+    def pose(self, times_s: ArrayLike) -> Float64:
+        """T_world_object (..., 4, 4) at times (...)."""
+        T, _ = self._pose_and_way(times_s)
+        return T
+
+    def _pose_and_way(self, times_s: ArrayLike) -> tuple[Float64, Float64]:
+        clock = self.clock(times_s)
+        points, yaws, ways = self.track.at(clock)
+        if self._spin:
+            yaws = self._spin * clock
+        T = np.zeros((*clock.shape, 4, 4))
+        c, s = np.cos(yaws), np.sin(yaws)
+        T[..., 0, 0], T[..., 0, 1], T[..., 1, 0], T[..., 1, 1] = c, -s, s, c
+        T[..., 2, 2] = T[..., 3, 3] = 1.0
+        T[..., :3, 3] = points
+        return T, ways
+
+    def middle(self, times_s: ArrayLike) -> Float64:
+        """Middle (..., 3) of the object at times (...)."""
+        points, _, _ = self.track.at(self.clock(times_s))
+        height = 0.5 * (self.shape.height_m - self.shape.depth_m)
+        return points + np.array([0.0, 0.0, height])
+
+    def distance(self, points: Float64, times_s: Float64) -> Float64:
+        """Distance (N,) of points (N, 3) from the box around the object at times (N,)."""
+        T = self.pose(times_s)
+        local = np.einsum("nji,nj->ni", T[:, :3, :3], points - T[:, :3, 3])
+        shape = self.shape
+        high = np.array([0.5 * shape.length_m, 0.5 * shape.width_m, shape.height_m])
+        low = np.array([-high[0], -high[1], -shape.depth_m])
+        return np.linalg.norm(local - np.clip(local, low, high), axis=1)
+
+    def outline(self, times_s: Float64) -> Float64:
+        """Nine points (9, N, 3) of the object at times (N,): its middle, corners and sides."""
+        T = self.pose(times_s)
+        shape = self.shape
+        z = 0.5 * (shape.height_m - shape.depth_m)
+        x, y = np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0])
+        local = np.stack(
+            [0.5 * shape.length_m * x.ravel(), 0.5 * shape.width_m * y.ravel(), np.full(9, z)], -1
+        )
+        return np.einsum("nij,kj->kni", T[:, :3, :3], local) + T[:, :3, 3]
+
+    def bodies(self, probe: LightProbe) -> list[Body]:
+        """What the sensor sees of it."""
+        light = self._light(probe)
+        return [
+            Body(self.name, part.mesh, partial(self._part_pose, part.joint), light)
+            for part in self.shape.parts
+        ]
+
+    def _part_pose(self, joint: Joint, times_s: Float64) -> Float64:
+        T, ways = self._pose_and_way(times_s)
+        return T @ joint.pose(ways)
+
+    def _light(self, probe: LightProbe) -> Callable[[float], Float64]:
+        """The light around the object at a time, between probes along its way."""
+        track = self.track
+        count = int(np.clip(track.way_m[-1] / _LIGHT_EVERY_M, 2, _MOST_PROBES))
+        instants = np.linspace(0.0, track.period_s, count)
+        height = 0.5 * (self.shape.height_m - self.shape.depth_m)
+        lights = np.stack(
+            [probe.around(point + np.array([0.0, 0.0, height])) for point in track.at(instants)[0]]
+        ).reshape(count, 12)
+
+        def light(time_s: float) -> Float64:
+            clock = float(self.clock(time_s)) % track.period_s
+            return np.array([np.interp(clock, instants, column) for column in lights.T]).reshape(
+                4, 3
+            )
+
+        return light
+
+
+def bodies_of(movers: Sequence[Mover], scene: Scene) -> list[Body]:
+    """What the sensor sees of moving objects, in the light of a scene."""
+    if not movers:
+        return []
+    probe = LightProbe(scene.mesh)
+    return [body for mover in movers for body in mover.bodies(probe)]
