@@ -23,6 +23,7 @@ NEVER = {"baselines", "agents", "ms_slam_baselines", "ms_slam_agents", "evo"}
 ONLY_INSIDE_FUNCTIONS = {
     "open3d",
     "optuna",
+    "pynvml",
     "plotly",
     "ray",
     "rerun",

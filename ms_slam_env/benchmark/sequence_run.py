@@ -178,7 +178,8 @@ def measure(track: Track, recording: Recording) -> dict[str, Any]:
 
     ``frames``, ``lost_frames``, ``processed_frames``, processor time a frame (``ms_median``,
     ``ms_p95``), ``path_m`` of the estimate; ``ate_m`` (RMSE after SE(3) alignment), ``ate_max_m``,
-    ``rpe_m``, ``rpe_rad``; the costs by the names of ``CostMeter.summary``.
+    ``ate_rad`` (RMSE of the orientation after it, None where the path is a line), ``rpe_m``,
+    ``rpe_rad``; the costs by the names of ``CostMeter.summary``.
     """
     if not track.times:
         return {"frames": 0}
@@ -206,7 +207,14 @@ def measure(track: Track, recording: Recording) -> dict[str, Any]:
         "compared": len(P),
         "ate_m": ate.rmse,
         "ate_max_m": ate.max,
+        "ate_rad": _orientation_error(P, Q),
         "ate_unaligned_m": metrics.ate_rmse(Q[0] @ invert(P[0]) @ P, Q, align="none"),
         "rpe_m": metrics.rpe_rmse(P, Q),
         "rpe_rad": metrics.rpe_rmse(P, Q, kind="rotation"),
     }
+
+
+def _orientation_error(P: Float64, Q: Float64) -> float | None:
+    """RMS angle in radians between aligned and true poses; None if positions leave it open."""
+    unique = metrics.find_alignment(P, Q).unique
+    return metrics.ate_rmse(P, Q, kind="rotation") if unique else None

@@ -14,7 +14,8 @@ from ms_slam_env.errors import InputError
 
 _PRINTED = (
     *("frames", "processed_frames", "lost_frames"),
-    *("ms_median", "path_m", "ate_m", "rpe_m"),
+    *("ms_median", "ext_ms", "ext_ms_p95", "mem_peak_mb", "ene_j"),
+    *("path_m", "ate_m", "ate_rad", "rpe_m"),
 )
 
 
@@ -23,7 +24,8 @@ class Arguments:
     """Run a SLAM backend over a recorded RGB-D sequence.
 
     Layouts: TUM RGB-D, ICL-NUIM, 7-Scenes, or folders depth and rgb with an intrinsics.txt of
-    "fx fy cx cy width height [depth_scale]". Writes trajectory.txt (TUM), map.ply, metrics.json.
+    "fx fy cx cy width height [depth_scale]". Writes trajectory.txt (TUM), map.ply, metrics.json
+    and frames.csv (what each frame cost).
     """
 
     sequence: tyro.conf.Positional[Path]
@@ -82,6 +84,8 @@ def main(arguments: Sequence[str]) -> int:
     fed = {"keep_every": slam.keep_every, "threads": slam.threads}
     result = run_sequence(recording, slam.slam, params, args.out, fed, management)
     for name in _PRINTED:
-        if name in result:
+        if result.get(name) is not None:
             print(f"{name:16} {result[name]:.4g}")
+    if result.get("ene_j") is None and "ene_source" in result:
+        print(f"{'ene_j':16} {result['ene_source']}")
     return 0

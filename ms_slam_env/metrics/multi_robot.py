@@ -16,7 +16,9 @@ from ms_slam_env.metrics.absolute import absolute_errors
 from ms_slam_env.metrics.relative import relative_errors
 from ms_slam_env.metrics.trajectory import (
     ErrorStatistics,
+    check_kind,
     check_lengths,
+    check_poses,
     check_positions,
     path_length,
     statistics_of,
@@ -26,50 +28,64 @@ Float64 = NDArray[np.float64]
 
 
 def team_ate(
-    estimates: Sequence[ArrayLike], truths: Sequence[ArrayLike], align: str = "se3"
+    estimates: Sequence[ArrayLike],
+    truths: Sequence[ArrayLike],
+    align: str = "se3",
+    kind: str = "translation",
 ) -> ErrorStatistics:
-    """Absolute trajectory error in metres of M robots, USME equations (14) and (15).
+    """Absolute trajectory error (m or rad) of M robots, USME equations (14) and (15).
 
     One alignment for all: what counts is one common world. Its RMSE is (15).
 
     Args:
-        estimates: M trajectories T_world_camera (N_i, 4, 4) or positions (N_i, 3), one world.
+        estimates: M trajectories T_world_camera (N_i, 4, 4), one world; positions (N_i, 3) do for
+            ``translation``.
         truths: likewise.
         align: ``se3``, ``sim3`` or ``none``.
+        kind: ``translation``, metres, or ``rotation``, radians.
 
     Raises:
         InputError: no robot, numbers or lengths that differ, bad poses, unknown alignment.
     """
     _check_team(estimates, truths)
+    check_kind(kind)
+    check = check_poses if kind == "rotation" else check_positions
     pairs = []
     for k, (estimate, truth) in enumerate(zip(estimates, truths, strict=True)):
         own, true = (
-            check_positions(estimate, f"estimate of robot {k}"),
-            check_positions(truth, f"truth of robot {k}"),
+            check(estimate, f"estimate of robot {k}"),
+            check(truth, f"truth of robot {k}"),
         )
         check_lengths(own, true)
         pairs.append((own, true))
     own, true = (np.concatenate(side) for side in zip(*pairs, strict=True))
-    return statistics_of(absolute_errors(own, true, align))
+    return statistics_of(absolute_errors(own, true, align, kind))
 
 
 def team_rpe(
     estimates: Sequence[ArrayLike],
     truths: Sequence[ArrayLike],
-    delta: int = 1,
+    delta: float = 1,
     kind: str = "translation",
+    unit: str = "frames",
+    times: Sequence[ArrayLike] | None = None,
 ) -> ErrorStatistics:
     """Relative pose error (m or rad) of M robots, USME equations (16) and (17).
 
-    Every robot's motions over ``delta`` frames count alike; arguments of `relative_errors`.
+    Every robot's motions over ``delta`` count alike; arguments of `relative_errors`, ``times`` of
+    each robot.
 
     Raises:
         InputError: no robot, numbers that differ, or as `relative_errors`.
     """
     _check_team(estimates, truths)
+    if times is not None and len(times) != len(truths):
+        raise InputError(f"{len(truths)} true trajectories but times of {len(times)} robots")
     errors = [
-        relative_errors(estimate, truth, delta, kind)
-        for estimate, truth in zip(estimates, truths, strict=True)
+        relative_errors(
+            estimates[k], truths[k], delta, kind, unit, None if times is None else times[k]
+        )
+        for k in range(len(truths))
     ]
     return statistics_of(np.concatenate(errors))
 

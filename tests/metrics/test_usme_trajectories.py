@@ -126,8 +126,16 @@ def test_one_robot_is_judged_as_before_and_two_in_one_world() -> None:
     assert team_rpe(noisy[:1], [a]).rmse == pytest.approx(rpe_rmse(noisy[0], a))
     joined = np.concatenate(noisy)[:, :3, 3], np.concatenate([a, b])[:, :3, 3]
     assert team_ate(noisy, [a, b]).rmse == pytest.approx(ate_rmse(*joined))
+    poses = np.concatenate(noisy), np.concatenate([a, b])
+    assert team_ate(noisy, [a, b], kind="rotation").rmse == pytest.approx(
+        ate_rmse(*poses, kind="rotation")
+    )
     squares = 59 * rpe_rmse(noisy[0], a) ** 2 + 39 * rpe_rmse(noisy[1], b) ** 2
     assert team_rpe(noisy, [a, b]).rmse == pytest.approx(np.sqrt(squares / 98))
+    seconds = [TIMES[: len(a)], TIMES[: len(b)] + 3.0]
+    assert team_rpe(noisy, [a, b], 0.1, unit="s", times=seconds).rmse == pytest.approx(
+        team_rpe(noisy, [a, b]).rmse
+    )
     # Each alone fits its truth, but they disagree about the world.
     apart = [a, se3_exp([1, 0, 0, 0, 0, 0]) @ b]
     assert ate_rmse(apart[1], b) == pytest.approx(0, abs=1e-9)
@@ -152,6 +160,11 @@ def test_time_and_way_of_a_team() -> None:
         (lambda: local_scales(TIMES, winding(), winding(), 0), "window_s"),
         (lambda: team_ate([], []), "no robot"),
         (lambda: team_rpe([winding()], []), "1 estimates but 0"),
+        (
+            lambda: team_rpe([winding()], [winding()], 1.0, unit="s", times=[]),
+            "1 true trajectories but times of 0",
+        ),
+        (lambda: team_ate([winding()], [winding()], kind="both"), "valid choices: translation"),
         (lambda: team_ate([winding()], [winding(9)]), "must correspond"),
         (lambda: task_time([[1.0, 1.0]]), "robot 0"),
         (lambda: mean_path_length([]), "no robot"),
