@@ -12,6 +12,7 @@ from ms_slam_env.benchmark.compare_inputs import Input, load, seen_surface
 from ms_slam_env.camera import xtion
 from ms_slam_env.config import check_range
 from ms_slam_env.env.worlds import get_scene
+from ms_slam_env.errors import InputError
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sequences import HandheldPath, render_sequence
 from ms_slam_env.sequences.path_shape import hand_tremor, resample
@@ -75,18 +76,41 @@ class UnevenPath:
         return resample(path, times, progress, tremor)
 
 
+def parse_uneven(sequence: str) -> tuple[str, int, bool]:
+    """Scene, seed and whether the pace is steady, of ``scene:seed`` or ``scene:seed:steady``.
+
+    Raises:
+        InputError: something else. The scene is checked where it is made.
+    """
+    name, _, rest = sequence.partition(":")
+    seed, _, pace = rest.partition(":")
+    if not name or not seed.isdigit() or pace not in ("", "steady"):
+        raise InputError(
+            f"sequence {sequence!r} is neither a folder nor scene:seed or scene:seed:steady, such "
+            "as living_room:2000"
+        )
+    return name, int(seed), pace == "steady"
+
+
 def load_uneven(sequence: str, image_size: str, frames: int) -> Input:
-    """The sequence ``scene:seed`` on an :class:`UnevenPath`, or the recording in a folder.
+    """The sequence of a name, with its truth.
+
+    Args:
+        sequence: ``scene:seed`` on an :class:`UnevenPath`, ``scene:seed:steady`` on a
+            :class:`HandheldPath`, or the folder of a recording.
+        image_size: such as 160x120.
+        frames: of a rendered sequence.
 
     Raises:
         InputError: a sequence that cannot be made or read.
     """
     if Path(sequence).is_dir():
         return load(sequence, image_size, HandheldPath())
-    name, _, seed = sequence.partition(":")
-    scene, intrinsics = get_scene(name, int(seed)), xtion(image_size)
-    poses = UnevenPath(frames).poses(scene, int(seed))
-    rendered = render_sequence(scene, poses, intrinsics, "kinect", int(seed))
+    name, seed, is_steady = parse_uneven(sequence)
+    scene, intrinsics = get_scene(name, seed), xtion(image_size)
+    path = HandheldPath(frames) if is_steady else UnevenPath(frames)
+    poses = path.poses(scene, seed)
+    rendered = render_sequence(scene, poses, intrinsics, "kinect", seed)
     picked = np.unique(np.linspace(0, frames - 1, _VIEWS).astype(np.int64))
     views = ((poses[k], rendered.frames.truth(int(k)).depth) for k in picked)
     surface = seen_surface(views, intrinsics)

@@ -387,6 +387,20 @@ def test_known_and_guessed_poses_are_those_of_dropped_frames():
     np.testing.assert_array_equal(backend.guesses[0], START)
 
 
+def test_the_frame_after_a_gap_is_also_tracked_from_its_predicted_pose():
+    backend = Recorder()
+    managed = make_config("divergence", threshold=1e6, max_skip=2).manage(backend)
+    for _ in range(6):
+        managed.track(_black())  # 0 and 3 are processed; nothing was known of a motion before 3
+    assert backend.guesses == [None, None]
+    managed.track(_black())
+    np.testing.assert_allclose(backend.guesses[2], STEP @ STEP @ STEP, atol=1e-12)
+    always = make_config("divergence", threshold=0.0).manage(Recorder())
+    for _ in range(4):
+        always.track(_black())  # no gap, no guess
+    assert always.backend.guesses == [None] * 4
+
+
 def test_the_last_pose_can_be_held():
     backend = Recorder()
     managed = make_config("regular", every=3, pose="last").manage(backend)

@@ -19,7 +19,12 @@ class FrameManagementConfig(Family):
     """Which frames SLAM processes: Saeedi et al., ICRA 2017, section V-A.
 
     Made from a mapping: ``from_dict(FrameManagementConfig, {"name": "divergence", ...})``.
+
+    Attributes:
+        name: of the variant.
     """
+
+    name: str = field(default="", init=False)
 
     @classmethod
     def variants(cls) -> Mapping[str, type]:

@@ -23,6 +23,9 @@ class ManagedSlam(SlamBackend):
     pose, and repeats of the last processed frame's what a prediction cannot know. Every frame is
     processed until the backend has started and while its tracking is lost.
 
+    The frame after a gap is tracked from the predicted pose too, where the caller has no guess: the
+    backend's own idea of the motion spans the gap before, which may have been longer or shorter.
+
     Args:
         backend: any; whoever holds it as well must not feed it frames.
         frame_filter: says which frames are worth processing.
@@ -69,7 +72,10 @@ class ManagedSlam(SlamBackend):
             check_pose(T_world_camera_guess, "T_world_camera_guess")
         begin = time.process_time()
         if self._is_worth(frame):
-            result = self._note(self.backend.track(frame, T_world_camera_guess))
+            guess = T_world_camera_guess
+            if guess is None and self._dropped:
+                guess = self._prediction.guess(self._dropped + 1)
+            result = self._note(self.backend.track(frame, guess))
         else:
             result = self._drop(T_world_camera_guess)
         self._filter.charge(time.process_time() - begin)

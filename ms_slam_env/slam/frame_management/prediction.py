@@ -48,6 +48,10 @@ class Prediction:
             return self._pose.copy()
         return self._pose @ se3_exp(min(1.0, frames / self._frames) * self._twist)
 
+    def guess(self, frames: int) -> Float64 | None:
+        """The same as a guess for tracking; None where no motion is known."""
+        return self.pose(frames) if self._twist.any() else None
+
     def get_state(self) -> dict[str, Any]:
         """Pose and last motion."""
         return {"pose": self._pose.copy(), "twist": self._twist.copy(), "frames": self._frames}

@@ -1,0 +1,115 @@
+"""Filters in front of SLAM on one sequence, each beside regular skipping of as many frames."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ms_slam_env import metrics, slam
+from ms_slam_env.benchmark.compare_inputs import Input
+from ms_slam_env.benchmark.compare_run import limit_threads
+from ms_slam_env.benchmark.episode import LOST_ERROR_M
+from ms_slam_env.benchmark.frame_management_inputs import load_uneven
+from ms_slam_env.benchmark.options import parse_frame_management
+from ms_slam_env.metrics import reconstruction
+from ms_slam_env.slam.frame_management import FrameManagementConfig, RegularConfig
+
+THRESHOLDS_M = (0.02, 0.05)
+
+
+@dataclass(frozen=True)
+class FilterSpec:
+    """Several filters on one sequence.
+
+    Attributes:
+        sequence: ``scene:seed``, ``scene:seed:steady`` or a folder.
+        managements: ``NAME,option=value,...``.
+        backend: name of the SLAM.
+        image_size: such as 160x120.
+        frames: of a rendered sequence.
+    """
+
+    sequence: str
+    managements: tuple[str, ...]
+    backend: str = "surfel"
+    image_size: str = "160x120"
+    frames: int = 300
+
+
+def run_filters(spec: FilterSpec) -> dict[str, Any]:
+    """Run every filter, and for each that is not regular, regular skipping at the same share.
+
+    Returns:
+        ``runs``: for each of the managements what :func:`run_one` measured, with ``management``,
+        its text, and ``regular``, the same of regular skipping at the share that the filter had;
+        None where the filter is regular itself.
+    """
+    limit_threads(1)
+    given = load_uneven(spec.sequence, spec.image_size, spec.frames)
+    runs = []
+    for text in spec.managements:
+        config = parse_frame_management(text)
+        run: dict[str, Any] = {"management": text, **run_one(config, spec.backend, given)}
+        run["regular"] = None
+        if config.name not in ("none", "regular"):
+            share = run["processed"]
+            regular = RegularConfig(every=1 / share, max_skip=len(given.frames))
+            run["regular"] = run_one(regular, spec.backend, given)
+        runs.append(run)
+    return {"runs": runs}
+
+
+def run_one(config: FrameManagementConfig, backend: str, given: Input) -> dict[str, Any]:
+    """Track the sequence from its true first pose behind a filter and measure.
+
+    Returns:
+        ``processed`` and ``lost``, shares of the frames; ``ate_m`` of all frames and
+        ``ate_processed_m`` (SE(3)-aligned); ``largest_error_m`` of a processed frame, no alignment,
+        and ``failed``, whether it says that tracking went astray; ``f_2cm``, ``f_5cm`` of the map
+        where its estimated poses placed it; ``cpu_ms``, processor time a frame, the filter's
+        included, and ``filter_ms``, the filter's own.
+    """
+    system = config.manage(slam.make(backend, given.intrinsics))
+    system.reset(given.poses[0])
+    begin = time.process_time()
+    results = [system.track(frame) for frame in given.frames]
+    cpu_ms = 1e3 * (time.process_time() - begin) / len(results)
+    estimate = np.stack([result.T_world_camera for result in results])
+    kept = np.array([result.processed for result in results])
+    errors = metrics.absolute_errors(estimate[kept], given.poses[kept], align="none")
+    lost = 1.0 - float(np.mean([result.tracking_ok for result in results]))
+    return {
+        "frames": len(results),
+        "processed": float(kept.mean()),
+        "lost": lost,
+        "ate_m": metrics.ate_rmse(estimate, given.poses),
+        "ate_processed_m": metrics.ate_rmse(estimate[kept], given.poses[kept]),
+        "largest_error_m": float(errors.max()),
+        "failed": bool(errors.max() > LOST_ERROR_M),
+        **_map_quality(system.surface_points(), given.surface),
+        "cpu_ms": cpu_ms,
+        "filter_ms": _filter_ms(config, given),
+    }
+
+
+def _map_quality(points: np.ndarray, surface: np.ndarray) -> Mapping[str, float]:
+    """F-scores of the map; 0 of an empty one."""
+    names = [f"f_{round(100 * t)}cm" for t in THRESHOLDS_M]
+    if len(points) == 0:
+        return dict.fromkeys(names, 0.0)
+    found = reconstruction.map_metrics(points, surface, THRESHOLDS_M, registration="none")
+    return dict(zip(names, (found.f_score[t] for t in THRESHOLDS_M), strict=True))
+
+
+def _filter_ms(config: FrameManagementConfig, given: Input) -> float:
+    """Processor time in which the filter judges a frame."""
+    judge = config.make_filter(given.intrinsics)
+    judge.admits(given.frames[0], 0, True)  # buffers grow
+    begin = time.process_time()
+    for frame in given.frames:
+        judge.admits(frame, 0)
+    return 1e3 * (time.process_time() - begin) / len(given.frames)
