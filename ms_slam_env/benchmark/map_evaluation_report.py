@@ -86,7 +86,7 @@ def save_figure(compared: ComparedMaps, path: Path) -> Path:
     curve.set_ylim(0, 101)
     curve.grid(alpha=0.3)
     curve.legend(fontsize="small")
-    figures.caption(figure, "Map from above, where it was judged; shares within a distance.")
+    figures.caption(figure, "Map where it was judged, along z; share of points within a distance.")
     path.parent.mkdir(parents=True, exist_ok=True)
     return figures.save(figure, path)
 

@@ -87,6 +87,7 @@ class Matched:
         piece: (N,) number of the piece, between gaps, that the pose belongs to.
         gaps: (K, 2) last time before and first after each gap.
         alignment: that was found.
+        unmatched: poses of the estimate without a true one near enough in time.
     """
 
     times: Float64
@@ -97,6 +98,7 @@ class Matched:
     piece: NDArray[np.int64]
     gaps: Float64
     alignment: metrics.Alignment
+    unmatched: int
 
 
 def match_files(estimate: Path, truth: Path, options: TrajectoryOptions) -> Matched:
@@ -128,6 +130,7 @@ def match_files(estimate: Path, truth: Path, options: TrajectoryOptions) -> Matc
         piece=np.searchsorted(jumps, first),
         gaps=np.stack([times[jumps], times[jumps + 1]], axis=1),
         alignment=alignment,
+        unmatched=len(times) - len(first),
     )
 
 
@@ -137,11 +140,12 @@ def evaluate_files(
     """Compare TUM file ``estimate`` with TUM file ``truth``, both T_world_camera.
 
     Returns:
-        the options, the number of ``poses`` that correspond, and as statistics (rmse, mean, median,
-        std, min, max) ``ate_m``, ``ate_rad`` (None where the path is a line), ``rpe_m`` and
-        ``rpe_rad``; ``scale`` of the alignment, ``path_m``, ``duration_s``, ``segments`` (the same
-        statistics by piece), ``drift`` (by length of path), ``robustness`` (USME equations 9 and
-        10 over gaps in time) and ``initialisation`` (12 and 13).
+        the options, the number of ``poses`` that correspond and of ``unmatched_poses`` of the
+        estimate, and as statistics (rmse, mean, median, std, min, max) ``ate_m``, ``ate_rad`` (None
+        where the path is a line), ``rpe_m`` and ``rpe_rad``; ``scale`` of the alignment,
+        ``path_m``, ``duration_s``, ``segments`` (the same statistics by piece), ``drift`` (by
+        length of path), ``robustness`` (USME equations 9 and 10 over gaps in time) and
+        ``initialisation`` (12 and 13).
 
     Raises:
         InputError: as `match_files`; no two poses ``delta`` apart; more segments than poses.
@@ -161,6 +165,7 @@ def measure_matched(
         "truth": str(truth),
         **asdict(options),
         "poses": count,
+        "unmatched_poses": matched.unmatched,
         "scale": matched.alignment.scale,
         "path_m": metrics.path_length(matched.truth),
         "estimate_path_m": metrics.path_length(matched.raw),

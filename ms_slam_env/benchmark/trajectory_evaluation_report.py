@@ -47,7 +47,9 @@ def tables(result: dict[str, Any]) -> str:
     """Everything that was measured, in Markdown."""
     unit = result["delta_unit"]
     parts = [
-        f"{result['poses']} poses over {result['duration_s']:.3f} s and {result['path_m']:.3f} m; "
+        f"{result['poses']} poses over {result['duration_s']:.3f} s and {result['path_m']:.3f} m, "
+        f"timestamps at most {result['max_difference_s']:g} s apart ({result['unmatched_poses']} "
+        "poses of the estimate have no true one); "
         f"alignment {result['align']} (scale {result['scale']:.6f}); relative errors over "
         f"{result['delta']} {unit} ({result['pairs']} pairs)."
     ]
@@ -108,7 +110,7 @@ def save_figure(matched: Matched, path: Path) -> Path:
         ax.grid(alpha=0.3)
     if ate_rad is None:
         axes[1, 1].set_axis_off()
-    figures.caption(figure, "Top view (left), side view (right); errors after alignment.")
+    figures.caption(figure, "After alignment; x and y are the view from above.")
     path.parent.mkdir(parents=True, exist_ok=True)
     return figures.save(figure, path)
 

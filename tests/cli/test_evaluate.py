@@ -131,6 +131,16 @@ def test_files_and_options_are_written(tmp_path: Path, capsys: pytest.CaptureFix
     assert result["initialisation"]["time_s"] is not None
 
 
+def test_poses_without_a_true_one_are_counted(tmp_path: Path) -> None:
+    pair = write_pair(tmp_path)
+    t, truth = truth_path()
+    write_trajectory(tmp_path / "truth.txt", t[::3], truth[::3])
+    result = evaluate_files(*map(Path, pair))
+    assert (result["poses"], result["unmatched_poses"]) == (COUNT // 3, COUNT - COUNT // 3)
+    loose = evaluate_files(*map(Path, pair), TrajectoryOptions(max_difference_s=1.0))
+    assert loose["poses"] == COUNT // 3  # one true pose belongs to one of the estimate
+
+
 def test_lengths_of_segments_are_free(tmp_path: Path) -> None:
     pair = write_pair(tmp_path)
     options = TrajectoryOptions(segment_lengths_m=(0.5, 2.0, 500.0))
