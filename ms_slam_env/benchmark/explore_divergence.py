@@ -104,7 +104,7 @@ def table(summaries: Sequence[Mapping[str, Any]]) -> str:
 
 
 def figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Left Fig. 5, maximum ATE against EXT, coloured by divergence; right Fig. 3, ATE against it."""
+    """Left Fig. 5, maximum ATE against EXT, coloured by divergence; right Fig. 3."""
     drawn = new_figure(columns=2, width=4.2)
     left, right = drawn.subplots(1, 2)
     rows = [row for row in rows if row.get("ate_m") is not None]

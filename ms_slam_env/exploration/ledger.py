@@ -193,6 +193,8 @@ class Ledger:
 
     def _reference_from(self, measured: Mapping[str, Any]) -> dict[str, float]:
         factor = self.settings.reference_factor
+        if self.settings.reference:
+            return dict(self.settings.reference)
         reference = {}
         for name in self.settings.objectives:
             value, worst = measured.get(name, math.nan), METRICS[name].worst

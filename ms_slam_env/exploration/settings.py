@@ -31,6 +31,7 @@ class ExplorationSettings:
         population: of NSGA-II.
         reference_factor: results worse than so many times the default's count as that; the volume
             that the front dominates is measured from there.
+        reference: where each objective stops to count, instead of that multiple.
         context: whatever else decides what the evaluation measures, such as the sequences.
 
     Raises:
@@ -43,6 +44,7 @@ class ExplorationSettings:
     seed: int = 0
     population: int = 16
     reference_factor: float = 3.0
+    reference: dict[str, float] = field(default_factory=dict)
     context: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -56,7 +58,9 @@ class ExplorationSettings:
         check_range(self, "seed", 0, 2**31)
         check_range(self, "population", 2, 10_000)
         check_range(self, "reference_factor", 1.0, 1000.0)
-        _ = self.parsed_constraints()
+        if self.reference and set(self.reference) != set(self.objectives):
+            raise InputError(f"reference {self.reference} must name every objective")
+        self.parsed_constraints()
 
     def parsed_constraints(self) -> list[Constraint]:
         """The constraints."""

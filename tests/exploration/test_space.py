@@ -1,0 +1,94 @@
+"""Design spaces from texts, and configurations from values."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ms_slam_env.errors import InputError
+from ms_slam_env.exploration import Choice, Float, Integer, make_space
+from ms_slam_env.exploration.space import KNOWN
+from ms_slam_env.slam.configuration import SlamConfiguration
+
+
+def test_the_paper_has_three_parameters():
+    space = make_space(["paper"])
+    assert space.defaults() == {
+        "depth_cutoff_m": 4.0,
+        "icp_rgb_weight": 0.1,
+        "confidence_threshold": 10.0,
+    }
+
+
+def test_every_known_parameter_holds_its_default():
+    space = make_space([name for name in KNOWN if name != "keep_every"])
+    for name, value in space.defaults().items():
+        assert space.parameters[name].contains(value), name
+        assert (
+            space.parameters[name]
+            .distribution()
+            ._contains(space.parameters[name].distribution().to_internal_repr(value))
+        )
+    assert space.configuration(space.defaults()).slam_config["iterations"] == [4, 5, 10]
+
+
+def test_values_go_where_they_belong():
+    base = SlamConfiguration(slam_config={"max_confidence": 20.0}, image_size="80x60")
+    space = make_space(["iterations.0", "iterations.2", "loops.window=1:500", "keep_every"], base)
+    values = {"iterations.0": 1, "iterations.2": 7, "loops.window": 33, "keep_every": 2}
+    made = space.configuration(values)
+    assert made.slam_config == {
+        "max_confidence": 20.0,
+        "iterations": [1, 5, 7],
+        "loops": {"window": 33},
+    }
+    assert (made.keep_every, made.image_size, base.keep_every) == (2, "80x60", 1)
+
+
+def test_ranges_as_text():
+    space = make_space(
+        [
+            "depth_cutoff_m=1:5",
+            "points_per_level=100:9000:log",
+            "loop_closure=none,deformation",
+            "icp_angle_deg=10:80",
+            "image_size=80x60,160x120",
+        ]
+    )
+    assert space.parameters == {
+        "depth_cutoff_m": Float(1, 5),
+        "points_per_level": Integer(100, 9000, log=True),
+        "loop_closure": Choice(("none", "deformation")),
+        "icp_angle_deg": Float(10, 80),
+        "image_size": Choice(("80x60", "160x120")),
+    }
+
+
+@given(low=st.integers(-50, 50), size=st.integers(1, 50), value=st.integers(-120, 120))
+def test_a_range_holds_what_lies_in_it(low, size, value):
+    for kind in (Integer, Float):
+        assert kind(low, low + size).contains(value) == (low <= value <= low + size)
+    assert not Integer(low, low + size).contains(low + 0.5)
+
+
+@pytest.mark.parametrize(
+    ("texts", "message"),
+    [
+        ([], "no parameter to explore"),
+        (["speed"], "unknown parameter 'speed'; valid choices: depth_cutoff_m"),
+        (["iterations.7"], "unknown parameter 'iterations.7'"),
+        (["loops.speed=1:2"], "unknown parameter 'loops.speed'"),
+        (["lateral_noise_px"], "parameter 'lateral_noise_px' needs a range, as in lateral_noise_p"),
+        (["depth_cutoff_m=5:9"], "'depth_cutoff_m' starts at 4.0, which is not one of 5 to 9"),
+        (["depth_cutoff_m=5:1"], "range 5.0:1.0 holds no values"),
+        (["depth_cutoff_m=0:5:log"], "holds no values"),
+        (["depth_cutoff_m=1:5:exp"], "'1:5:exp' is not low:high or low:high:log"),
+        (["depth_cutoff_m=near:far"], "'near:far' is not low:high"),
+        (["loop_closure=none"], "values none must be two or more"),
+        (["loop_closure=[,none"], "is not one value"),
+    ],
+)
+def test_bad_parameters_are_one_line(texts, message):
+    with pytest.raises(InputError) as caught:
+        make_space(texts)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
