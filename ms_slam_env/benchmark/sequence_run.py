@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from ms_slam_env import metrics, slam
+from ms_slam_env.benchmark.frame_records import FRAMES, write_frames
 from ms_slam_env.benchmark.point_cloud import write_ply
 from ms_slam_env.benchmark.provenance import provenance
 from ms_slam_env.benchmark.records import write_json
@@ -32,7 +32,6 @@ TRAJECTORY, UNFINISHED, MAP, METRICS = (
     "map.ply",
     "metrics.json",
 )
-FRAMES = "frames.csv"
 CORRECTED = "trajectory.corrected.txt"
 TRUTH = "groundtruth.txt"
 MAX_DIFFERENCE_S = 0.02
@@ -124,7 +123,7 @@ def run_sequence(
         raise
     finally:
         result.update(measure(track, recording))
-        _write_frames(out / FRAMES, track)
+        write_frames(out / FRAMES, track.times, track.tracking_ok, track.costs.frames)
         write_json(out / METRICS, {**result, **about})
     return result
 
@@ -139,17 +138,6 @@ def _track_all(recording: Recording, system: slam.SlamBackend, track: Track, fil
             file.flush()
             bar.set_postfix_str("tracking" if result.tracking_ok else "LOST", refresh=False)
             bar.update()
-
-
-def _write_frames(path: Path, track: Track) -> None:
-    """Write what every frame cost, as CSV; a figure that cannot be had stays empty."""
-    lines = ["timestamp,tracking_ok,ext_ms,cpu_ms,mem_mb,ene_j"]
-    pairs = zip(track.times, track.tracking_ok, track.costs.frames, strict=False)
-    for timestamp, ok, cost in pairs:
-        values = (1e3 * cost.ext_s, 1e3 * cost.cpu_s, cost.mem_mb, cost.joules)
-        words = ["" if math.isnan(value) else f"{value:.3f}" for value in values]
-        lines.append(",".join([f"{timestamp:.6f}", str(int(ok)), *words]))
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _corrected(track: Track, system: slam.SlamBackend) -> Track | None:

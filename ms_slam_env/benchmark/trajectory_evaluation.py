@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import metrics
+from ms_slam_env.benchmark.frame_records import lost_times
 from ms_slam_env.config import check_choice, check_range
 from ms_slam_env.errors import InputError
 from ms_slam_env.metrics.absolute import ALIGNMENTS
@@ -38,6 +39,8 @@ class TrajectoryOptions:
         max_difference_s: largest difference between timestamps that correspond.
         gap_s: an estimate without poses for longer was lost in between; None for three times the
             median interval.
+        frames: ``frames.csv`` of ``ms-slam run``: the poses of frames that were not tracked, which
+            it writes too, are left out, and there is a gap wherever one was.
     """
 
     align: str = "se3"
@@ -49,6 +52,7 @@ class TrajectoryOptions:
     segment_lengths_m: Sequence[float] | None = None
     max_difference_s: float = 0.02
     gap_s: float | None = None
+    frames: str | None = None
 
     def __post_init__(self) -> None:
         """Refuse what cannot be."""
@@ -107,7 +111,7 @@ def match_files(estimate: Path, truth: Path, options: TrajectoryOptions) -> Matc
     Raises:
         InputError: a file that cannot be read, fewer than two poses in common, no alignment.
     """
-    times, poses = read_trajectory(estimate)
+    times, poses, was_lost = _tracked(*read_trajectory(estimate), options.frames)
     true_times, true_poses = read_trajectory(truth)
     first, second = associate(times, true_times, options.max_difference_s)
     if len(first) < 2:
@@ -120,7 +124,7 @@ def match_files(estimate: Path, truth: Path, options: TrajectoryOptions) -> Matc
     gap_s = options.gap_s
     if gap_s is None:
         gap_s = _GAP_INTERVALS * float(np.median(np.diff(times)))
-    jumps = np.flatnonzero(np.diff(times) > gap_s)
+    jumps = np.flatnonzero((np.diff(times) > gap_s) | was_lost[1:])
     return Matched(
         times=times[first],
         estimate=alignment.poses(raw),
@@ -132,6 +136,20 @@ def match_files(estimate: Path, truth: Path, options: TrajectoryOptions) -> Matc
         alignment=alignment,
         unmatched=len(times) - len(first),
     )
+
+
+def _tracked(
+    times: Float64, poses: Float64, frames: str | None
+) -> tuple[Float64, Float64, NDArray[np.bool_]]:
+    """Times and poses of the frames that were tracked, and whether one before each was not."""
+    if frames is None:
+        return times, poses, np.zeros(len(times), dtype=bool)
+    lost = lost_times(Path(frames))
+    kept = ~np.isin(np.rint(1e6 * times), np.rint(1e6 * lost))  # both are written to microseconds
+    if kept.sum() < 2:
+        raise InputError(f"{frames} leaves {kept.sum()} tracked poses; at least 2 are needed")
+    index = np.flatnonzero(kept)
+    return times[kept], poses[kept], np.diff(index, prepend=index[0] - 1) > 1
 
 
 def evaluate_files(

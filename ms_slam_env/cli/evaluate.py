@@ -46,6 +46,8 @@ class Arguments:
     gap_s: float | None = None
     """An estimate without poses for longer was lost in between; by default three times the median
     interval."""
+    frames: Path | None = None
+    """frames.csv of ms-slam run: leave out the poses of frames that were not tracked."""
     map: Path | None = None
     """Estimated map."""
     true_map: Path | None = None
@@ -116,6 +118,7 @@ def _trajectories(args: Arguments, result: dict[str, Any], parts: list[str]) -> 
         segment_lengths_m=args.segment_lengths_m or None,
         max_difference_s=args.max_difference_s,
         gap_s=args.gap_s,
+        frames=None if args.frames is None else str(args.frames),
     )
     matched = match_files(args.estimate, args.groundtruth, options)
     result.update(measure_matched(args.estimate, args.groundtruth, matched, options))

@@ -17,6 +17,7 @@ from evo.tools import file_interface
 from PIL import Image
 
 from ms_slam_env import metrics
+from ms_slam_env.benchmark.frame_records import write_frames
 from ms_slam_env.benchmark.map_evaluation import evaluate_maps
 from ms_slam_env.benchmark.point_cloud import write_ply
 from ms_slam_env.benchmark.trajectory_evaluation import TrajectoryOptions, evaluate_files
@@ -24,7 +25,8 @@ from ms_slam_env.camera import xtion
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, make_pose, se3_exp, so3_exp, transform_points
-from ms_slam_env.sequences import write_trajectory
+from ms_slam_env.metrics import FrameCost
+from ms_slam_env.sequences import read_trajectory, write_trajectory
 
 STATISTICS = ("rmse", "mean", "median", "std", "min", "max")
 COUNT = 120
@@ -170,6 +172,45 @@ def test_gaps_are_lost_segments(tmp_path: Path) -> None:
     shifted = evaluate(pair, tmp_path / "out")["robustness"]
     assert shifted["translation_m"] == pytest.approx(0.25, abs=1e-5)
     assert shifted["rotation_rad"] == pytest.approx(0, abs=1e-5)
+
+
+def test_frames_that_a_run_lost_are_gaps(tmp_path: Path) -> None:
+    pair = write_pair(tmp_path, noise=0.0)
+    times, poses = read_trajectory(pair[0])
+    poses[50:53, :3, 3] += 5.0  # where it was while it was lost does not count
+    write_trajectory(pair[0], times, poses)
+    tracked = np.ones(COUNT, dtype=bool)
+    tracked[50:53] = False
+    tracked[80] = False
+    frames = tmp_path / "frames.csv"
+    write_frames(frames, times.tolist(), tracked.tolist(), [FrameCost(0, 0, 0, {})] * COUNT)
+    assert evaluate_files(*map(Path, pair))["ate_m"]["max"] > 1
+    result = evaluate([*pair, "--frames", str(frames)], tmp_path / "out")
+    assert result["poses"] == COUNT - 4
+    assert result["ate_m"]["max"] < 1e-6
+    robustness = result["robustness"]
+    assert (robustness["gaps"], robustness["pieces"]) == (2, 3)
+    assert robustness["lost_s"] == pytest.approx(4 * 0.05 + 2 * 0.05)
+    assert robustness["error"] == pytest.approx(0, abs=1e-6)
+
+
+def test_bad_frames_are_one_line_and_code_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pair, frames = write_pair(tmp_path), tmp_path / "frames.csv"
+    head = "timestamp,tracking_ok"
+    lost = [f"{t + 0.003:.6f},0" for t in truth_path()[0]]
+    for lines, message in (
+        (None, "cannot read frames"),
+        (["time,ok"], "line 1: expected columns timestamp, tracking_ok"),
+        ([head, "0.1,1", "0.2,yes"], "line 3: expected a timestamp"),
+        ([head, "0.1"], "line 2: expected a timestamp"),
+        ([head, *lost], "leaves 0 tracked poses"),
+    ):
+        if lines is not None:
+            frames.write_text("\n".join(lines))
+        assert main(["evaluate", *pair, "--frames", str(frames)]) == 2
+        assert message in one_line(capsys.readouterr().err)
 
 
 def test_a_straight_path_has_no_orientation_error(tmp_path: Path) -> None:
