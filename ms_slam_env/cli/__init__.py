@@ -10,12 +10,13 @@ COMMANDS = {
     "benchmark": "run planners on scenes with SLAM in the loop and compare them",
     "compare": "run SLAM backends over the same sequences and compare them",
     "divergence": "measure how hard recorded sequences are, from frame to frame",
-    "evaluate": "compare an estimated trajectory with the truth (TUM files)",
+    "evaluate": "compare an estimated trajectory (TUM file) or map (PLY) with the truth",
     "explore": "search the parameters of a SLAM backend for the best compromises",
     "generate": "render an RGB-D sequence with true poses into a folder",
     "report": "turn a folder of results into one HTML page",
     "run": "run a SLAM backend over a recorded RGB-D sequence",
     "train": "train an agent with one of the installed training scripts",
+    "usme": "make the eight USME sequences, and run SLAM backends over them",
 }
 
 
