@@ -24,7 +24,7 @@ from ms_slam_env.benchmark.planner_report import finished
 from ms_slam_env.benchmark.provenance import provenance
 from ms_slam_env.benchmark.records import write_json
 from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
-from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
+from ms_slam_env.camera import XTION_SIZES, Intrinsics, RGBDFrame, xtion
 from ms_slam_env.config import check_range
 from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
 from ms_slam_env.slam.adaptation import (
@@ -38,7 +38,13 @@ from ms_slam_env.slam.configuration import SlamConfiguration, write_configuratio
 
 PROGRAM = "python -m ms_slam_env.benchmark.adaptation"
 ADAPTIVE = "adaptive"
-FULL_SIZE = "full size, every frame"
+_ROBUST = {"iterations": [8, 10, 20], "points_per_level": 20_000}
+ALSO = (
+    SlamConfiguration(image_size="160x120"),
+    SlamConfiguration(slam_config=_ROBUST, image_size="160x120"),
+    SlamConfiguration(),
+)
+"""Fixed configurations that run too: what others may pick as the best one."""
 
 Float64 = NDArray[np.float64]
 
@@ -165,10 +171,10 @@ def run_sequence(spec: AdaptationSpec) -> dict[str, Any]:
 def competitors(
     adaptation: DivergenceAdaptationConfig, intrinsics: Intrinsics
 ) -> dict[str, SlamBackend]:
-    """Each configuration alone, every frame at the camera's size, and the adaptation, last."""
+    """Each configuration alone, the default ones with every frame, and the adaptation, last."""
     given = adaptation.resolved(intrinsics)
-    fixed = {describe(one): one for one in given}
-    fixed.setdefault(FULL_SIZE, SlamConfiguration())
+    also = [one for one in ALSO if _width(one) <= intrinsics.width]
+    fixed = {describe(one): one for one in (*given, *also)}
     alone = {
         name: AgentConfig(configurations=(one, one), start=0).adapt(slam.make("surfel", intrinsics))
         for name, one in fixed.items()
@@ -178,12 +184,21 @@ def competitors(
     return {**alone, ADAPTIVE: adaptive}
 
 
+def _width(configuration: SlamConfiguration) -> int:
+    """Columns that frames are reduced to; 0 for as they come."""
+    size = configuration.image_size
+    return 0 if size is None else XTION_SIZES[size][0]
+
+
 def describe(configuration: SlamConfiguration) -> str:
-    """A configuration in a few words."""
+    """A configuration in a few words: image size, iterations and the like, share of frames."""
+    parts = [configuration.image_size or "full size"]
+    for key, value in configuration.slam_config.items():
+        is_list = isinstance(value, (tuple, list))
+        text = "-".join(map(str, value)) if is_list else str(value)
+        parts.append(f"{text} {key.replace('_', ' ').replace(' per level', '')}")
     every = configuration.keep_every
-    size = configuration.image_size or "full size"
-    parts = [f"{key} {value}" for key, value in configuration.slam_config.items()]
-    return ", ".join([size, *parts, "every frame" if every == 1 else f"one frame in {every}"])
+    return ", ".join([*parts, "every frame" if every == 1 else f"one frame in {every}"])
 
 
 def judge(

@@ -42,7 +42,7 @@ class Stretches:
     turn_deg_s: float = 7.5
     quiet: int = 75
     violent: int = 30
-    factor: float = 16.0
+    factor: float = 20.0
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""

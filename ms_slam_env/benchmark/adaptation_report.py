@@ -114,7 +114,7 @@ def save_figures(rows: Sequence[Row], out: Path) -> list[Path]:
 
 def _save_scatter(rows: Sequence[Row], path: Path) -> Path:
     """ATE against processor time: a dot a sequence, a large mark the median."""
-    figure = new_figure(1, width=7.0, height=3.6)
+    figure = new_figure(1, width=9.0, height=3.8)
     ax = figure.subplots()
     for index, name in enumerate(competitors(rows)):
         ms, ate = values(rows, name, "ext_ms"), 1000 * np.array(values(rows, name, "ate_m"))
@@ -130,7 +130,7 @@ def _save_scatter(rows: Sequence[Row], path: Path) -> Path:
     ax.set_ylabel("ATE [mm]")
     ax.grid(alpha=0.3)
     legend_beside(figure, ax)
-    caption(figure, "One dot a sequence; large marks are medians.")
+    caption(figure, "One dot a sequence;\nlarge marks are medians.")
     return save(figure, path)
 
 

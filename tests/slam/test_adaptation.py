@@ -165,9 +165,12 @@ def test_the_default_configurations_suit_the_camera(size):
     backend = make_config("agent").adapt(slam.make("surfel", camera, **PARAMS))
     assert isinstance(backend, AdaptiveSlam)
     assert len(backend.levels) == 3
-    costs = [one.about["cost"] for one in default_configurations(camera)]
-    assert costs == sorted(costs)
-    assert make_config("agent").costs_of(camera) == tuple(costs)
+    for drops_frames in (True, False):
+        given = default_configurations(camera, drops_frames)
+        costs = [one.about["cost"] for one in given]
+        assert costs == sorted(costs)
+        assert make_config("agent").costs_of(camera, drops_frames) == tuple(costs)
+    assert {one.keep_every for one in given} == {1}
 
 
 class _Changes(DivergenceController):
@@ -188,26 +191,22 @@ class _Changes(DivergenceController):
     share=st.sampled_from([0.5, 1.0]),
 )
 def test_the_ladder_against_a_slow_obvious_one(changes, dwell, share):
-    """Every step down needs a whole window of calm; every step up is at once."""
+    """Up at once; down to what the largest change of a whole window permits."""
     config = DivergenceAdaptationConfig(
         configurations=({}, {}, {}), thresholds=(1, 2), dwell_frames=dwell, release_share=share
     )
     controller = _Changes(config, changes)
     frame = RGBDFrame(np.zeros((1, 1, 3), np.uint8), np.zeros((1, 1), np.float32))
-    index, since = 2, 0
+    index = 2
     for place, change in enumerate(changes):
         got = controller.choose(frame, False)
-        if place == 0:
-            assert got == 2
-            since = 1
-            continue
-        window = changes[since : place + 1]
-        if change >= 2 or (change >= 1 and index < 1):
-            index, since = (2 if change >= 2 else 1), place + 1
-        elif index and len(window) >= dwell and max(window) < share * index:
-            index, since = sum(max(window) >= share * x for x in (1, 2)), place + 1
-        elif (index and change >= share * index) or not index:
-            since = place + 1
+        if place > 0:  # the first frame has none before it
+            for level in (1, 2):
+                if change >= level and index < level:
+                    index = level
+            window = changes[max(1, place + 1 - dwell) : place + 1]
+            while len(window) == dwell and index and max(window) < share * index:
+                index -= 1
         assert got == index
 
 

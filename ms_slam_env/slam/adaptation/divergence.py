@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from dataclasses import dataclass, field
+from math import inf
 from typing import Any
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame
@@ -27,8 +28,8 @@ class DivergenceAdaptationConfig(SwitchingConfig):
         thresholds: K - 1 rising values; where the change between consecutive frames exceeds the
             i-th, configuration i is not good enough. Up at once, as far as needed.
         release_share: of the thresholds, below which the way down is open, (0, 1].
-        dwell_frames: down only after so many frames in a row below.
-        robust_when_lost: the most robust configuration while tracking is lost.
+        dwell_frames: down only as far as the largest change of so many frames permits.
+        robust_when_lost: the most robust configuration while tracking is lost, and so long after.
         per: the change per ``frame`` or, by the time stamps, per ``second``.
         change: how the change between frames is measured.
 
@@ -38,9 +39,9 @@ class DivergenceAdaptationConfig(SwitchingConfig):
     """
 
     name: str = field(default="divergence", init=False)
-    thresholds: tuple[float, ...] = (0.01, 0.02)
+    thresholds: tuple[float, ...] = (0.004, 0.01)
     release_share: float = 0.7
-    dwell_frames: int = 10
+    dwell_frames: int = 6
     robust_when_lost: bool = True
     per: str = "frame"
     change: ChangeConfig = field(default_factory=ChangeConfig)
@@ -81,8 +82,7 @@ class DivergenceController(Controller):
         self.change = 0.0
         self._time_s: float | None = None  # of the last frame
         self._index = self._config.first
-        self._below = 0  # frames in a row below the way down
-        self._peak = 0.0  # of the change since
+        self._recent: list[float] = []  # changes of the last frames, as many as the dwell
 
     def choose(self, frame: RGBDFrame, is_lost: bool) -> int:
         """Index by the change from the frame before."""
@@ -90,20 +90,12 @@ class DivergenceController(Controller):
         self._observe(frame)
         if is_first:
             return self._index
-        thresholds = self._config.thresholds
-        needed = bisect_right(thresholds, self.change)
-        if is_lost and self._config.robust_when_lost:
-            needed = len(thresholds)
-        may_fall = self._index > 0 and self.change < self._release[self._index - 1]
-        if needed >= self._index or not may_fall:
-            self._index = max(needed, self._index)
-            self._below, self._peak = 0, 0.0
-            return self._index
-        self._below += 1
-        self._peak = max(self._peak, self.change)
-        if self._below >= self._config.dwell_frames:
-            self._index = bisect_right(self._release, self._peak)
-            self._below, self._peak = 0, 0.0
+        config = self._config
+        change = inf if is_lost and config.robust_when_lost else self.change
+        self._recent = [*self._recent, change][-config.dwell_frames :]
+        self._index = max(self._index, bisect_right(config.thresholds, change))
+        if len(self._recent) == config.dwell_frames:
+            self._index = min(self._index, bisect_right(self._release, max(self._recent)))
         return self._index
 
     def _observe(self, frame: RGBDFrame) -> None:
@@ -129,13 +121,11 @@ class DivergenceController(Controller):
             "change": self.change,
             "time_s": self._time_s,
             "index": self._index,
-            "below": self._below,
-            "peak": self._peak,
+            "recent": list(self._recent),
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state."""
         self._measure.set_state(state["measure"])
         self.change, self._time_s = state["change"], state["time_s"]
-        self._index, self._below = state["index"], state["below"]
-        self._peak = state["peak"]
+        self._index, self._recent = state["index"], list(state["recent"])
