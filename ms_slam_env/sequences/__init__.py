@@ -13,7 +13,7 @@ Rendered, streamed and reproducible bit for bit::
 
 A perturbation is one of ``RollingShutter, MotionBlur, Misregistration, ExposureRamp,
 ExposureJumps, AutoExposure, BlackFrames, DepthDropout, DepthQuantisation, FrameSkipping,
-MovingObjects``, or
+MovingObjects, FastMotion, Illumination``, or
 ``make_perturbation("rolling-shutter", {"readout_s": 0.02})``.
 """
 
@@ -27,7 +27,9 @@ from ms_slam_env.sequences.perturbations import (
     DepthQuantisation,
     ExposureJumps,
     ExposureRamp,
+    FastMotion,
     FrameSkipping,
+    Illumination,
     Misregistration,
     MotionBlur,
     MovingObjects,
@@ -37,6 +39,7 @@ from ms_slam_env.sequences.perturbations import (
 )
 from ms_slam_env.sequences.placement import Placement, place_trajectory
 from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
+from ms_slam_env.sequences.route_path import RoutePath
 from ms_slam_env.sequences.sequence import RenderedSequence, Sequence, render_sequence
 from ms_slam_env.sequences.trajectories import handheld_trajectory, repeated_trajectory
 from ms_slam_env.sequences.tum import read_trajectory, write_trajectory
@@ -49,8 +52,10 @@ __all__ = [
     "DepthQuantisation",
     "ExposureJumps",
     "ExposureRamp",
+    "FastMotion",
     "FrameSkipping",
     "HandheldPath",
+    "Illumination",
     "Misregistration",
     "MotionBlur",
     "MovingObjects",
@@ -59,6 +64,7 @@ __all__ = [
     "PoseInterpolation",
     "RenderedSequence",
     "RollingShutter",
+    "RoutePath",
     "Sequence",
     "associate",
     "handheld_trajectory",

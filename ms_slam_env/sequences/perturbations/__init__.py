@@ -7,7 +7,9 @@ from ms_slam_env.sequences.perturbations.auto_exposure import AutoExposure
 from ms_slam_env.sequences.perturbations.base import (
     FrameSelection,
     ImagePerturbation,
+    LightPerturbation,
     Moment,
+    MotionPerturbation,
     OpticalPerturbation,
     Optics,
     Perturbation,
@@ -18,7 +20,9 @@ from ms_slam_env.sequences.perturbations.depth_dropout import DepthDropout
 from ms_slam_env.sequences.perturbations.depth_quantisation import DepthQuantisation
 from ms_slam_env.sequences.perturbations.exposure_jumps import ExposureJumps
 from ms_slam_env.sequences.perturbations.exposure_ramp import ExposureRamp
+from ms_slam_env.sequences.perturbations.fast_motion import FastMotion
 from ms_slam_env.sequences.perturbations.frame_skipping import FrameSkipping
+from ms_slam_env.sequences.perturbations.illumination import Illumination
 from ms_slam_env.sequences.perturbations.misregistration import Misregistration
 from ms_slam_env.sequences.perturbations.motion_blur import MotionBlur
 from ms_slam_env.sequences.perturbations.moving_objects import MovingObjects
@@ -33,12 +37,16 @@ __all__ = [
     "DepthQuantisation",
     "ExposureJumps",
     "ExposureRamp",
+    "FastMotion",
     "FrameSelection",
     "FrameSkipping",
+    "Illumination",
     "ImagePerturbation",
+    "LightPerturbation",
     "Misregistration",
     "Moment",
     "MotionBlur",
+    "MotionPerturbation",
     "MovingObjects",
     "OpticalPerturbation",
     "Optics",

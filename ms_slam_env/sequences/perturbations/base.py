@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.errors import InputError
 from ms_slam_env.scenes.base import Scene
+from ms_slam_env.sensor import ChangingLight
 from ms_slam_env.sequences.perturbations.moving.mover import Mover
 from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
 
@@ -81,6 +82,14 @@ class Perturbation(ABC):  # noqa: B024 - its kinds share a name and no method
     """One imperfection of a camera or of a recording. Leave it out of the list to switch it off."""
 
 
+class MotionPerturbation(Perturbation):
+    """Changes how the camera moves."""
+
+    @abstractmethod
+    def retime(self, path: PoseInterpolation, seed: int) -> PoseInterpolation:
+        """Return the changed path; ``seed`` is that of the sequence."""
+
+
 class FrameSelection(Perturbation):
     """Decides which frames of the trajectory there are."""
 
@@ -97,6 +106,16 @@ class WorldPerturbation(Perturbation):
         self, scene: Scene, camera: PoseInterpolation, intrinsics: Intrinsics, seed: int
     ) -> tuple[Mover, ...]:
         """Return the things that move through ``scene`` while ``camera`` is on its way."""
+
+
+class LightPerturbation(Perturbation):
+    """Changes the light of the scene over time."""
+
+    @abstractmethod
+    def light(
+        self, scene: Scene, camera: PoseInterpolation, intrinsics: Intrinsics, seed: int
+    ) -> ChangingLight | None:
+        """Return the light of ``scene`` while ``camera`` is on its way; None as it is."""
 
 
 class OpticalPerturbation(Perturbation):

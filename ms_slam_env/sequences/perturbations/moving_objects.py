@@ -20,9 +20,9 @@ from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
 Float64 = NDArray[np.float64]
 
 _TRIES = 4000
-_CANDIDATES = 12  # free ways among which the one that is seen most is taken
-_PHASES = 4  # starts on each
-_INSTANTS = 60  # of the camera's path at which is checked who sees what and who is near whom
+_CANDIDATES = 8  # free ways among which the one that is seen most is taken
+_PHASES = 3  # starts on each
+_INSTANTS = 40  # of the camera's path at which is checked who sees what and who is near whom
 _NEAREST_CAMERA_M = 0.35  # between the camera and the object's outline
 _NEAREST_OTHER_M = 0.15
 _SPIN_RAD_S = 0.5
@@ -120,13 +120,19 @@ def _keeps_clear(mover: Mover, times: Float64, poses: Float64, others: list[Move
         return False
     # A minute beyond the path: where time goes on, objects go on.
     more = np.concatenate([times, times[-1] + np.arange(0.2, 60.0, 0.2)])
-    return not any(
-        (one.distance(points, more) < _NEAREST_OTHER_M).any()
-        for other in others
-        for one, points in (
-            *((other, points) for points in mover.outline(more)),
-            *((mover, points) for points in other.outline(more)),
-        )
+    return all(_are_apart(mover, other, more) for other in others)
+
+
+def _are_apart(a: Mover, b: Mover, times: Float64) -> bool:
+    """Whether two objects never come too near to each other."""
+    gap = np.linalg.norm(a.middle(times) - b.middle(times), axis=1)
+    if gap.min() < 0.5 * (a.shape.width_m + b.shape.width_m):
+        return False
+    near = times[gap < a.reach_m + b.reach_m + _NEAREST_OTHER_M]
+    return not len(near) or not any(
+        (one.distance(points, near) < _NEAREST_OTHER_M).any()
+        for one, other in ((a, b), (b, a))
+        for points in other.outline(near)
     )
 
 

@@ -14,7 +14,9 @@ from ms_slam_env.sequences.perturbations.depth_dropout import DepthDropout
 from ms_slam_env.sequences.perturbations.depth_quantisation import DepthQuantisation
 from ms_slam_env.sequences.perturbations.exposure_jumps import ExposureJumps
 from ms_slam_env.sequences.perturbations.exposure_ramp import ExposureRamp
+from ms_slam_env.sequences.perturbations.fast_motion import FastMotion
 from ms_slam_env.sequences.perturbations.frame_skipping import FrameSkipping
+from ms_slam_env.sequences.perturbations.illumination import Illumination
 from ms_slam_env.sequences.perturbations.misregistration import Misregistration
 from ms_slam_env.sequences.perturbations.motion_blur import MotionBlur
 from ms_slam_env.sequences.perturbations.moving_objects import MovingObjects
@@ -32,6 +34,8 @@ PERTURBATIONS: dict[str, type[Perturbation]] = {
     "depth-quantisation": DepthQuantisation,
     "frame-skipping": FrameSkipping,
     "moving-objects": MovingObjects,
+    "fast-motion": FastMotion,
+    "illumination": Illumination,
 }
 """Name to class."""
 

@@ -84,6 +84,12 @@ class Mover:
         height = 0.5 * (self.shape.height_m - self.shape.depth_m)
         return points + np.array([0.0, 0.0, height])
 
+    @property
+    def reach_m(self) -> float:
+        """Radius of a ball about the middle that holds it."""
+        half = 0.5 * (self.shape.height_m + self.shape.depth_m)
+        return float(np.hypot(self.shape.radius_m, half))
+
     def distance(self, points: Float64, times_s: Float64) -> Float64:
         """Distance (N,) of points (N, 3) from the box around the object at times (N,)."""
         T = self.pose(times_s)
@@ -102,7 +108,7 @@ class Mover:
         local = np.stack(
             [0.5 * shape.length_m * x.ravel(), 0.5 * shape.width_m * y.ravel(), np.full(9, z)], -1
         )
-        return np.einsum("nij,kj->kni", T[:, :3, :3], local) + T[:, :3, 3]
+        return np.swapaxes(local @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3], 0, 1)
 
     def bodies(self, probe: LightProbe) -> list[Body]:
         """What the sensor sees of it."""

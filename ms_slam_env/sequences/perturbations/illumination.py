@@ -1,0 +1,147 @@
+"""Light that changes over time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.config import check_range
+from ms_slam_env.errors import InputError
+from ms_slam_env.scenes.base import Scene
+from ms_slam_env.scenes.movers import Shape
+from ms_slam_env.scenes.rays import RayCaster
+from ms_slam_env.sensor import ChangingLight
+from ms_slam_env.sequences.perturbations.base import LightPerturbation, random_numbers
+from ms_slam_env.sequences.perturbations.moving.places import Places
+from ms_slam_env.sequences.perturbations.moving.tracks import Track
+from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
+
+Float64 = NDArray[np.float64]
+
+_BULB = Shape("box", (), radius_m=0.15, length_m=0.1, width_m=0.1, height_m=0.05, depth_m=0.05)
+_NEAREST_M = 0.2  # closer the light of the lamp grows no more
+_DIMMEST = 1e-3  # of the typical light: less is not followed
+_SHADOW_END = 0.999
+_TRIES = 2000
+_SHORTEST_M = 0.3  # between the camera and the lamp
+
+
+@dataclass(frozen=True)
+class Illumination(LightPerturbation):
+    """The scene's lights go down and up again, and a small lamp wanders about and casts shadows.
+
+    Both change linear light before noise and the sRGB curve; depth does not change. The lamp goes
+    there and back in free space, as a box of ``moving-objects`` does. Its shadows are those of the
+    scene on the scene, sampled at the corners of the triangles; it is too small to be seen.
+
+    Attributes:
+        dim: share of the scene's own light that is gone when it is darkest; 0 = off.
+        period_s: from full light to full light.
+        lamp: what the lamp adds to a surface that faces it from 1 m, in units of the median light
+            in the scene; 0 = off.
+        speed_m_s: of the lamp.
+        seed: of the lamp's way, beside the sequence's.
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    dim: float = 0.6
+    period_s: float = 4.0
+    lamp: float = 1.0
+    speed_m_s: float = 0.8
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        check_range(self, "dim", 0.0, 0.98)
+        check_range(self, "period_s", 0.01, 1e6)
+        check_range(self, "lamp", 0.0, 1e3)
+        check_range(self, "speed_m_s", 1e-3, 100.0)
+        check_range(self, "seed", 0, 2**32)
+
+    def light(
+        self, scene: Scene, camera: PoseInterpolation, intrinsics: Intrinsics, seed: int
+    ) -> ChangingLight | None:
+        """See the base class.
+
+        Raises:
+            InputError: no free way for the lamp.
+        """
+        if self.dim == 0 and self.lamp == 0:
+            return None
+        lamp = None
+        if self.lamp:
+            lamp = WanderingLamp(scene, self._way(scene, camera, intrinsics, seed), self.lamp)
+        return LampsAndDimmer(self.dim, self.period_s, float(camera.times_s[0]), lamp)
+
+    def _way(
+        self, scene: Scene, camera: PoseInterpolation, intrinsics: Intrinsics, seed: int
+    ) -> Track:
+        """The first free way that does not come too near to the camera."""
+        rng = random_numbers(seed, self.seed, name="illumination")
+        poses = camera.poses
+        eyes = poses[:, :3, 3]
+        for track in Places(scene, poses, intrinsics, rng).tracks(_BULB, self.speed_m_s, _TRIES):
+            at, _, _ = track.at(camera.times_s)
+            if np.linalg.norm(at - eyes, axis=1).min() > _SHORTEST_M:
+                return track
+        raise InputError(
+            f"illumination: found no free way for a lamp in scene {scene.name!r}, seed "
+            f"{scene.seed}; try lamp=0 or another seed"
+        )
+
+
+class WanderingLamp:
+    """A point light on its way."""
+
+    def __init__(self, scene: Scene, track: Track, strength: float) -> None:
+        """Let a lamp as strong as ``strength`` times the median light of the scene go."""
+        mesh = scene.mesh
+        self._track = track
+        self._rays = RayCaster(mesh.vertices, mesh.faces)
+        brightness = mesh.irradiance.mean(axis=(1, 2))
+        lit = brightness[brightness > 0]
+        self._typical = float(np.median(lit)) if len(lit) else 1.0
+        self._intensity = strength * self._typical
+
+    def position(self, time_s: float) -> Float64:
+        """Where (3,) it is."""
+        return self._track.at(time_s)[0]
+
+    def light(self, points: Float64, normals: Float64, time_s: float) -> Float64:
+        """Light (N,) at points (N, 3) with unit normals (N, 3): I cos / r^2, 0 in shadow."""
+        towards = self.position(time_s) - points
+        square = np.einsum("ni,ni->n", towards, towards)
+        cosine = np.einsum("ni,ni->n", towards, normals) / np.sqrt(np.maximum(square, 1e-12))
+        value = self._intensity * np.maximum(cosine, 0.0) / np.maximum(square, _NEAREST_M**2)
+        lit = np.flatnonzero(value > _DIMMEST * self._typical)
+        distance, _ = self._rays.first_hit(points[lit], towards[lit])
+        result = np.zeros(len(points))
+        result[lit] = value[lit] * (distance > _SHADOW_END)
+        return result
+
+
+class LampsAndDimmer(ChangingLight):
+    """The scene's light times a level that goes down and up, and a lamp's beside it."""
+
+    def __init__(
+        self, dim: float, period_s: float, start_s: float, lamp: WanderingLamp | None
+    ) -> None:
+        """Begin at ``start_s`` in full light."""
+        self._dim, self._period, self._start, self._lamp = dim, period_s, start_s, lamp
+
+    def level(self, time_s: float) -> float:
+        """See the base class."""
+        turn = 2 * np.pi * (time_s - self._start) / self._period
+        return float(1.0 - self._dim * 0.5 * (1.0 - np.cos(turn)))
+
+    def added(self, points: Float64, normals: Float64, time_s: float) -> NDArray[np.float32] | None:
+        """See the base class."""
+        if self._lamp is None:
+            return None
+        light = self._lamp.light(points, normals, time_s)
+        return np.repeat(light[:, None], 3, axis=1).astype(np.float32)

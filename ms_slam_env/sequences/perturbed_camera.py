@@ -1,0 +1,236 @@
+"""A camera with imperfections, on any path: what a rendered sequence and an environment share."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
+from ms_slam_env.errors import InputError
+from ms_slam_env.scenes.base import Scene
+from ms_slam_env.sensor import ROLLING_ROWS, ChangingLight, NoiseConfig, RGBDSensor
+from ms_slam_env.sensor.casters import RayCaster, make_caster
+from ms_slam_env.sequences.exposure import LinearLight
+from ms_slam_env.sequences.perturbations.base import (
+    FrameSelection,
+    ImagePerturbation,
+    LightPerturbation,
+    Moment,
+    MotionPerturbation,
+    OpticalPerturbation,
+    Optics,
+    Perturbation,
+    WorldPerturbation,
+    random_numbers,
+)
+from ms_slam_env.sequences.perturbations.moving import Mover, bodies_of
+from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
+
+Float64 = NDArray[np.float64]
+
+_METERING_WIDTH = 40  # images whose brightness is what an exposure control goes by
+
+
+@dataclasses.dataclass(frozen=True)
+class Imperfections:
+    """Perturbations by what they change, each kind in the order in which it was given."""
+
+    motion: tuple[MotionPerturbation, ...]
+    selection: tuple[FrameSelection, ...]
+    world: tuple[WorldPerturbation, ...]
+    light: tuple[LightPerturbation, ...]
+    optics: tuple[OpticalPerturbation, ...]
+    images: tuple[ImagePerturbation, ...]
+
+    @staticmethod
+    def of(perturbations: Iterable[Perturbation]) -> Imperfections:
+        """Sort them.
+
+        Raises:
+            InputError: something that is no perturbation, or two of the light.
+        """
+        given = tuple(perturbations)
+        kinds = (
+            MotionPerturbation,
+            FrameSelection,
+            WorldPerturbation,
+            LightPerturbation,
+            OpticalPerturbation,
+            ImagePerturbation,
+        )
+        for perturbation in given:
+            if not isinstance(perturbation, kinds):
+                raise InputError(f"{perturbation!r} is not a perturbation")
+        sorted_out = [tuple(p for p in given if isinstance(p, kind)) for kind in kinds]
+        if len(sorted_out[3]) > 1:
+            raise InputError("only one perturbation can change the light: give illumination once")
+        return Imperfections(*sorted_out)  # type: ignore[arg-type]
+
+    def movers(
+        self, scene: Scene, path: PoseInterpolation, intrinsics: Intrinsics, seed: int
+    ) -> list[Mover]:
+        """What moves through the scene while the camera is on its path.
+
+        Raises:
+            InputError: no free way, or two objects of one name.
+        """
+        movers: list[Mover] = []
+        for perturbation in self.world:
+            movers += perturbation.populate(scene, path, intrinsics, seed)
+        names = [mover.name for mover in movers]
+        if len(set(names)) < len(names):
+            raise InputError("two moving-objects of one kind: give it once, with a larger count")
+        return movers
+
+    def changing_light(
+        self, scene: Scene, path: PoseInterpolation, intrinsics: Intrinsics, seed: int
+    ) -> ChangingLight | None:
+        """How the light changes; None as it is."""
+        return next((p.light(scene, path, intrinsics, seed) for p in self.light), None)
+
+
+class PerturbedCamera:
+    """Takes frames with imperfect optics of a scene in which things move and the light changes.
+
+    Attributes:
+        sensor: of the depth image, and of colour unless colour has a camera of its own.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        intrinsics: Intrinsics,
+        noise: str | NoiseConfig,
+        imperfections: Imperfections,
+        movers: Iterable[Mover] = (),
+        light: ChangingLight | None = None,
+        sensor: RGBDSensor | None = None,
+        caster: RayCaster | None = None,
+    ) -> None:
+        """Prepare to render.
+
+        Args:
+            scene: where.
+            intrinsics: of the frames.
+            noise: of the sensor.
+            imperfections: those of the optics and of the images are used.
+            movers: what moves through the scene.
+            light: how its light changes.
+            sensor: one that looks at the scene already; used if nothing moves or changes there.
+            caster: of the rays in the scene.
+
+        Raises:
+            InputError: unknown noise model.
+        """
+        self._scene, self._light = scene, light
+        self._bodies = bodies_of(list(movers), scene)
+        self._caster = caster
+        is_still = not self._bodies and light is None
+        self.sensor = sensor if sensor is not None and is_still else self._camera(intrinsics, noise)
+        self._images = imperfections.images
+        optics = Optics(intrinsics)
+        for perturbation in imperfections.optics:
+            optics = perturbation.alter(optics)
+        self._optics = optics
+        self._has_own_color_camera = optics.color != intrinsics or bool(
+            (optics.T_depth_color != np.eye(4)).any()
+        )
+        self._color_sensor = self.sensor
+        if self._has_own_color_camera:
+            self._color_sensor = self._camera(optics.color, noise)
+        self._linear_light = LinearLight(self.sensor.noise)
+        self._meter: RGBDSensor | None = None
+
+    def _camera(self, K: Intrinsics, noise: str | NoiseConfig) -> RGBDSensor:
+        if self._caster is None:
+            self._caster = make_caster(self._scene.mesh, "cpu")
+        return RGBDSensor(
+            self._scene,
+            K,
+            noise=noise,
+            caster=self._caster,
+            bodies=self._bodies,
+            light=self._light,
+        )
+
+    def take(
+        self,
+        path: PoseInterpolation,
+        time_s: float,
+        index: int,
+        count: int,
+        seed: int,
+        brightness: Callable[[], Float64],
+    ) -> RGBDFrame:
+        """Take a frame at a time on a path.
+
+        Args:
+            path: of the camera around that time.
+            time_s: time stamp.
+            index: of the frame, counter of its noise.
+            count: of the frames, for what runs from the first to the last.
+            seed: of noise and perturbations.
+            brightness: see ``Moment``.
+        """
+        frame = self._take(path, time_s, index, seed)
+        moment = Moment(index, count, time_s, self.sensor.intrinsics, seed, brightness)
+        for perturbation in self._images:
+            frame = perturbation.apply(frame, moment)
+        return frame
+
+    def brightness(self, T_world_camera: Float64, time_s: float) -> float:
+        """Mean intensity in [0, 255] of what is seen from a pose (4, 4) at a time."""
+        if self._meter is None:
+            K = self.sensor.intrinsics
+            small = K.scaled(min(1.0, _METERING_WIDTH / K.width))
+            self._meter = self._camera(small, "none")
+        color = self._meter.capture(T_world_camera, 0, time_s).color
+        return float(intensity_image(color).mean())
+
+    def _take(self, path: PoseInterpolation, time_s: float, index: int, seed: int) -> RGBDFrame:
+        """With the optics; the images are not perturbed."""
+        color = None
+        if self._optics.exposure_s:
+            color = self._blurred(path, time_s, index, seed)
+        elif self._has_own_color_camera:
+            offset = self._optics.T_depth_color
+            color = self._expose(self._color_sensor, path, time_s, index, seed, offset).color
+        frame = self._expose(self.sensor, path, time_s, index, seed, np.eye(4))
+        return frame if color is None else dataclasses.replace(frame, color=color)
+
+    def _expose(
+        self,
+        sensor: RGBDSensor,
+        path: PoseInterpolation,
+        time_s: float,
+        index: int,
+        seed: int,
+        offset: Float64,
+    ) -> RGBDFrame:
+        """Frame of one of the two cameras, which stands at ``offset`` in the depth camera."""
+        if not self._optics.readout_s:
+            return sensor.capture(path(time_s) @ offset, index, time_s, seed)
+        times = time_s + self._row_times()
+        return sensor.capture_rolling(path(times) @ offset, index, time_s, seed, times)
+
+    def _row_times(self) -> Float64:
+        """Times (rolling_poses,) of the rows that share a pose, after the frame's time stamp."""
+        height = self.sensor.intrinsics.height
+        first = ROLLING_ROWS * np.arange(self.sensor.rolling_poses)
+        last = np.minimum(first + ROLLING_ROWS, height) - 1
+        return self._optics.readout_s * ((0.5 * (first + last) + 0.5) / height - 0.5)
+
+    def _blurred(
+        self, path: PoseInterpolation, time_s: float, index: int, seed: int
+    ) -> NDArray[np.uint8]:
+        """Colour integrated over the exposure, with the noise of one image."""
+        optics = self._optics
+        instants = (np.arange(optics.exposure_samples) + 0.5) / optics.exposure_samples - 0.5
+        middles = time_s + optics.exposure_s * instants
+        times = middles[:, None] + self._row_times()
+        colors = self._color_sensor.ideal_colors(path(times) @ optics.T_depth_color, times)
+        rng = random_numbers(seed, index, name="noise-of-blurred-colour")
+        return self._linear_light.mean(colors, rng)
