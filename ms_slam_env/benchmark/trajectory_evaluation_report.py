@@ -37,7 +37,7 @@ def summary(result: dict[str, Any]) -> str:
     robustness = result["robustness"]
     if robustness["gaps"]:
         lines.append(
-            f"{robustness['gaps']} gaps of {robustness['lost_s']:.3f} s together; robustness error "
+            f"lost in {_gaps(robustness)}; robustness error "
             + (robustness["reason"] or f"{robustness['error']:.6f}")
         )
     return "\n".join(lines)
@@ -122,10 +122,7 @@ def _broken(line: Float64, piece: NDArray[np.int64]) -> Float64:
 
 def _robustness(result: dict[str, Any]) -> str:
     robustness, start = result["robustness"], result["initialisation"]
-    lines = [
-        f"- lost: {robustness['gaps']} gaps, {robustness['lost_s']:.3f} s "
-        f"({100 * robustness['lost_share']:.1f} % of the time)"
-    ]
+    lines = [f"- lost: {_gaps(robustness)}, {100 * robustness['lost_share']:.1f} % of the time"]
     if robustness["reason"]:
         lines.append(f"- robustness of tracking: not available: {robustness['reason']}")
     else:
@@ -143,6 +140,11 @@ def _robustness(result: dict[str, Any]) -> str:
             f"symmetric relative scale error {_number(start['scale_error'])}"
         )
     return "\n".join(lines)
+
+
+def _gaps(robustness: dict[str, Any]) -> str:
+    plural = "" if robustness["gaps"] == 1 else "s"
+    return f"{robustness['gaps']} gap{plural}, {robustness['lost_s']:.3f} s together"
 
 
 def _row(statistics: dict[str, float] | None) -> list[str]:

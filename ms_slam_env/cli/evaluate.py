@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
@@ -22,9 +22,11 @@ class Arguments:
     evaluation.json, table.md, trajectory.png and map.png.
     """
 
-    estimate: tyro.conf.Positional[Path | None] = None
+    estimate: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="ESTIMATE")] = None
     """Estimated trajectory."""
-    groundtruth: tyro.conf.Positional[Path | None] = None
+    groundtruth: Annotated[
+        tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="GROUNDTRUTH")
+    ] = None
     """True trajectory."""
     align: str = "se3"
     """Alignment for ATE: se3, sim3 (relative errors are then of the scaled estimate) or none."""
