@@ -38,10 +38,9 @@ from ms_slam_env.slam.configuration import SlamConfiguration, write_configuratio
 
 PROGRAM = "python -m ms_slam_env.benchmark.adaptation"
 ADAPTIVE = "adaptive"
-_ROBUST = {"iterations": [8, 10, 20], "points_per_level": 20_000}
 ALSO = (
+    SlamConfiguration(image_size="160x120", keep_every=3),
     SlamConfiguration(image_size="160x120"),
-    SlamConfiguration(slam_config=_ROBUST, image_size="160x120"),
     SlamConfiguration(),
 )
 """Fixed configurations that run too: what others may pick as the best one."""

@@ -61,7 +61,7 @@ class AdaptiveSlamEnv(ActiveSlamEnv):
         if not isinstance(self.config.adaptation, AgentConfig):
             raise InputError("adaptation must be 'agent': here the agent chooses the configuration")
         count = self.config.adaptation.num_configurations
-        self.costs = self.config.adaptation.costs_of(self.intrinsics, drops_frames=False)
+        self.costs = self.config.adaptation.costs_of(self.intrinsics)
         motions = self._embodiment_type.num_actions
         self.action_space = spaces.MultiDiscrete([motions, count])
         self.observation_space = _with_level(self.observation_space, count)

@@ -165,12 +165,9 @@ def test_the_default_configurations_suit_the_camera(size):
     backend = make_config("agent").adapt(slam.make("surfel", camera, **PARAMS))
     assert isinstance(backend, AdaptiveSlam)
     assert len(backend.levels) == 3
-    for drops_frames in (True, False):
-        given = default_configurations(camera, drops_frames)
-        costs = [one.about["cost"] for one in given]
-        assert costs == sorted(costs)
-        assert make_config("agent").costs_of(camera, drops_frames) == tuple(costs)
-    assert {one.keep_every for one in given} == {1}
+    costs = [one.about["cost"] for one in default_configurations(camera)]
+    assert costs == sorted(costs)
+    assert make_config("agent").costs_of(camera) == tuple(costs)
 
 
 class _Changes(DivergenceController):

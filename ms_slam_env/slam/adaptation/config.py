@@ -97,17 +97,15 @@ class SwitchingConfig(AdaptationConfig):
         """Index of the first configuration in force."""
         return self.num_configurations - 1 if self.start is None else self.start
 
-    def resolved(
-        self, intrinsics: Intrinsics, drops_frames: bool = True
-    ) -> tuple[SlamConfiguration, ...]:
+    def resolved(self, intrinsics: Intrinsics) -> tuple[SlamConfiguration, ...]:
         """The configurations for frames of ``intrinsics``."""
         from ms_slam_env.slam.adaptation.levels import default_configurations
 
         if self.configurations is None:
-            return default_configurations(intrinsics, drops_frames)
+            return default_configurations(intrinsics)
         return tuple(self.configurations)
 
-    def costs_of(self, intrinsics: Intrinsics, drops_frames: bool = True) -> tuple[float, ...]:
+    def costs_of(self, intrinsics: Intrinsics) -> tuple[float, ...]:
         """(K,) the cost of each configuration for frames of ``intrinsics``.
 
         Raises:
@@ -115,7 +113,7 @@ class SwitchingConfig(AdaptationConfig):
         """
         if self.costs is not None:
             return self.costs
-        named = [one.about.get("cost") for one in self.resolved(intrinsics, drops_frames)]
+        named = [one.about.get("cost") for one in self.resolved(intrinsics)]
         if None in named:
             raise InputError(
                 f"configurations[{named.index(None)}] has no about.cost, and no costs are given"
@@ -131,5 +129,5 @@ class SwitchingConfig(AdaptationConfig):
         from ms_slam_env.slam.adaptation.adaptive_slam import AdaptiveSlam
         from ms_slam_env.slam.adaptation.levels import make_levels
 
-        levels = make_levels(self.resolved(backend.intrinsics, drops_frames), backend)
+        levels = make_levels(self.resolved(backend.intrinsics), backend)
         return AdaptiveSlam(backend, levels, self.make_controller(backend.intrinsics), drops_frames)

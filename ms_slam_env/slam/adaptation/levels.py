@@ -97,28 +97,20 @@ def make_levels(
     return tuple(levels)
 
 
-def default_configurations(
-    intrinsics: Intrinsics, drops_frames: bool = True
-) -> tuple[SlamConfiguration, ...]:
+def default_configurations(intrinsics: Intrinsics) -> tuple[SlamConfiguration, ...]:
     """Three configurations for a camera's images, from fast to robust.
 
-    Where frames may be dropped, that is what saves time at the least loss; where not, it is
-    iterations and points. Images are halved where the camera's are large enough: that is faster
-    and, because every level of the pyramid is coarser, copes with larger motions. Chosen on
-    validation seeds (``python -m ms_slam_env.benchmark.adaptation``). ``about.cost`` is relative to
-    the last.
+    Images are halved where the camera's are large enough: that is faster and, because every level
+    of the pyramid is coarser, copes with larger motions. Chosen on validation seeds
+    (``python -m ms_slam_env.benchmark.adaptation``). ``about.cost`` is a processor time a processed
+    frame, relative to the last.
     """
     half = intrinsics.width // 2
     size = next((name for name, wh in XTION_SIZES.items() if wh[0] == half >= 160), None)
-    if drops_frames:
-        return tuple(
-            SlamConfiguration(image_size=size, keep_every=n, about={"cost": 1 / n})
-            for n in (4, 2, 1)
-        )
     fast: dict[str, Any] = {"iterations": [1, 1, 2], "points_per_level": 2000}
     robust: dict[str, Any] = {"iterations": [8, 10, 20], "points_per_level": 20_000}
     return (
-        SlamConfiguration(slam_config=fast, image_size=size, about={"cost": 0.35}),
-        SlamConfiguration(image_size=size, about={"cost": 0.5}),
+        SlamConfiguration(slam_config=fast, image_size=size, keep_every=4, about={"cost": 0.35}),
+        SlamConfiguration(image_size=size, keep_every=2, about={"cost": 0.5}),
         SlamConfiguration(slam_config=robust, image_size=size, about={"cost": 1.0}),
     )
