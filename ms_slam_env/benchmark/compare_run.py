@@ -63,10 +63,20 @@ def run_apart(spec: CompareSpec) -> dict[str, Any]:
         InputError: bad input, as the process said.
         RuntimeError: it failed otherwise; the last line of its complaint.
     """
-    environment = os.environ | dict.fromkeys(_THREAD_VARIABLES, str(spec.threads))
+    return run_module(_NAME, asdict(spec), spec.threads)
+
+
+def run_module(name: str, spec: dict[str, Any], threads: int) -> dict[str, Any]:
+    """What benchmark module ``name`` answers, as JSON, to ``spec`` as JSON, in a new process.
+
+    Raises:
+        InputError: bad input, as the process said.
+        RuntimeError: it failed otherwise; the last line of its complaint.
+    """
+    environment = os.environ | dict.fromkeys(_THREAD_VARIABLES, str(threads))
     done = subprocess.run(
-        [sys.executable, "-m", "ms_slam_env.benchmark.compare_run"],
-        input=json.dumps(asdict(spec)),
+        [sys.executable, "-m", f"ms_slam_env.benchmark.{name}"],
+        input=json.dumps(spec),
         capture_output=True,
         text=True,
         env=environment,
@@ -75,7 +85,7 @@ def run_apart(spec: CompareSpec) -> dict[str, Any]:
     if done.returncode == 0:
         return json.loads(done.stdout.splitlines()[-1])
     complaint = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
-    complaint = complaint.removeprefix(f"{_NAME}: error: ")
+    complaint = complaint.removeprefix(f"{name}: error: ")
     raise (InputError if done.returncode == 2 else RuntimeError)(complaint)
 
 

@@ -17,6 +17,8 @@ _KEY = 0.16
 _CELL_M = 0.5
 _AISLE_M = 3.0
 _LANE_M = 3.4  # along the walls
+_OFF_RACKS_M = 1.1
+_LINES_M = 0.9  # from the middle of a lane
 _WAYS = (("A", "B"), ("B", "C"), ("C", "D"), ("D", "A"), ("E", "F"))
 
 
@@ -77,7 +79,7 @@ def _places(room: Room, x0: float, y0: float, length: float, width: float) -> di
     """Turning points on the lane around the racks and in the aisle between rows 0 and 1."""
     half = 0.5 * _LANE_M
     low_x, high_x = x0 - half, x0 + length + half
-    low_y, high_y = y0 - half + 0.2, y0 + width + half - 0.2
+    low_y, high_y = y0 - _OFF_RACKS_M, y0 + width + _OFF_RACKS_M  # machines narrow these two
     aisle = y0 + industrial.RACK_DEPTH_M + 0.5 * _AISLE_M
     other = y0 + 3 * industrial.RACK_DEPTH_M + 1.5 * _AISLE_M
     corners = {
@@ -136,13 +138,12 @@ def _around(build: MeshBuilder, rng: np.random.Generator, of: industrial.Stock, 
 def _markings(build: MeshBuilder, places: dict[str, Float64]) -> None:
     """Yellow lines on both sides of the lanes, arrows in the middle."""
     yellow, white = build.plain((218, 178, 38)), build.plain((214, 214, 208))
-    half = 0.5 * _LANE_M - 0.35
     with build.object("floor markings"):
         for a, b in (("A", "B"), ("B", "C"), ("C", "D"), ("D", "A"), ("E", "F"), ("G", "H")):
             way = places[b] - places[a]
             length = float(np.linalg.norm(way))
             yaw = float(np.arctan2(way[1], way[0]))
-            side = half if a in "ABCD" else 0.5 * _AISLE_M - 0.3
+            side = _LINES_M if a in "ABCD" else 0.5 * _AISLE_M - 0.3
             with build.frame(places[a] + np.array([0.0, 0.0, 0.004]), yaw):
                 for y in (-side, side):
                     build.quad((side, y - 0.05, 0), (length - 2 * side, 0, 0), (0, 0.1, 0), yellow)

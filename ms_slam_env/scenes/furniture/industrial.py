@@ -159,7 +159,7 @@ def drum(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
     """Steel drum on the origin."""
     paint = hsv(rng.choice([0.0, 0.12, 0.36, 0.6]), 0.7, rng.uniform(0.35, 0.7))
     metal = build.material(industrial.corrugated(rng, paint, 3, 64), (0.9, 0.9))
-    profile = [(0.29, 0)]
+    profile = [(0.29, 0.0)]
     for z in (0.3, 0.6):
         profile += [(0.29, z - 0.02), (0.31, z), (0.29, z + 0.02)]
     with build.object(name):

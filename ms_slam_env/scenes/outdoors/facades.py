@@ -121,10 +121,10 @@ def _shop(
     if rng.random() < 0.5:
         cloth = _pick(rng, of.cloths)
         with build.object(f"{name} awning"):
-            x = np.linspace(low, high, max(2, int((high - low) / 0.4)))
+            xs = np.linspace(low, high, max(2, int((high - low) / 0.4)))
             out = np.array([1.1, 0.0])
             z = np.array([2.35, 2.72])
-            grid = np.stack(np.broadcast_arrays(x[None, :], -0.02 - out[:, None], z[:, None]), -1)
+            grid = np.stack(np.broadcast_arrays(xs[None, :], -0.02 - out[:, None], z[:, None]), -1)
             build.sheet(grid, cloth, 0.02)
 
 

@@ -1,0 +1,159 @@
+"""A camera carried along streets and aisles, from one named place of a scene to the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+
+from ms_slam_env.config import check_range
+from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.geometry import look_at
+from ms_slam_env.scenes.base import Scene
+from ms_slam_env.sequences.path_shape import frame_times, hand_tremor, resample, unit
+from ms_slam_env.sequences.trajectories import RADIUS_M
+
+Float64 = NDArray[np.float64]
+
+_SAMPLE_M = 0.1
+_CORNER_M = 0.9  # width of the filter that rounds corners
+_AHEAD_M = 2.5  # the camera looks at where it will be
+_WAVES_M = (5.3, 11.9, 27.1)  # lengths of the sway along the way
+_PACE_PERIODS = (23.0, 51.0, 117.0)  # in frames
+_ATTEMPTS = 20
+
+
+@dataclass(frozen=True)
+class RoutePath:
+    """A way along named places of a scene.
+
+    At every instant the camera moves at the pace that whichever of the two speeds permits that is
+    reached first: along streets the first, around corners the second. It looks where it goes, a
+    little down, swaying to the sides, and keeps no perfectly straight line: where the way leads
+    along a street for the second time it runs a little beside the first.
+
+    Attributes:
+        via: names of places (``Scene.places``), or ``A-B`` for the middle between two.
+        rate_hz: of the frames.
+        speed_m_s: mean speed of the camera where it does not turn.
+        turn_deg_s: mean speed of rotation where it turns.
+        variation: the pace varies by this share, up and down.
+        height_m: of the camera above the ground.
+        down_deg: mean angle of the view below the horizon.
+        sway_deg: how far the view swings to the sides.
+        stray_m: how far the way strays to the sides.
+
+    Raises:
+        InputError: a value out of range, or fewer than two places.
+    """
+
+    via: tuple[str, ...]
+    rate_hz: float = 10.0
+    speed_m_s: float = 1.4
+    turn_deg_s: float = 25.0
+    variation: float = 0.2
+    height_m: float = 1.6
+    down_deg: float = 6.0
+    sway_deg: float = 8.0
+    stray_m: float = 0.25
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        if len(self.via) < 2:
+            raise InputError(f"RoutePath.via = {self.via!r} must name at least two places")
+        check_range(self, "rate_hz", 0.1, 10_000.0)
+        check_range(self, "speed_m_s", 1e-3, 100.0)
+        check_range(self, "turn_deg_s", 1e-2, 1e5)
+        check_range(self, "variation", 0.0, 0.9)
+        check_range(self, "height_m", 0.3, 3.0)
+        check_range(self, "down_deg", -60.0, 60.0)
+        check_range(self, "sway_deg", 0.0, 60.0)
+        check_range(self, "stray_m", 0.0, 2.0)
+
+    def with_frames_scaled(self, scale: float) -> RoutePath:
+        """The same way in ``scale`` times as many frames, so that much slower."""
+        return replace(self, speed_m_s=self.speed_m_s / scale, turn_deg_s=self.turn_deg_s / scale)
+
+    def motion(self, scene: Scene, seed: int) -> tuple[Float64, Float64]:
+        """Times (N,) in seconds and poses T_world_camera (N, 4, 4).
+
+        Raises:
+            InputError: a scene without such places, or a way that is not free.
+        """
+        corners = _corners(scene, self.via)
+        rng = np.random.default_rng([seed, 80])
+        for _ in range(_ATTEMPTS):
+            path = self._dense(corners, rng)
+            if scene.clearance(path[:, :3, 3]).min() > RADIUS_M:
+                return self._timed(path, rng)
+        raise InputError(
+            f"found no free way via {', '.join(self.via)} in scene {scene.name!r}, "
+            f"seed {scene.seed}"
+        )
+
+    def _dense(self, corners: Float64, rng: np.random.Generator) -> Float64:
+        """Poses (M, 4, 4) every ``_SAMPLE_M``, speeds left aside."""
+        line = _rounded(corners)
+        arc: Float64 = _SAMPLE_M * np.arange(len(line), dtype=np.float64)
+        ahead = np.minimum(np.arange(len(line)) + round(_AHEAD_M / _SAMPLE_M), len(line) - 1)
+        forward = line[ahead] - line
+        last = int(np.argmax(ahead == len(line) - 1))
+        forward[last:] = forward[last]
+        forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+        side = np.stack([-forward[:, 1], forward[:, 0], np.zeros(len(line))], -1)
+        eyes = line + self.stray_m * _wave(arc, rng)[:, None] * side
+        eyes[:, 2] += self.height_m + 0.05 * _wave(arc, rng)
+        yaw = np.radians(self.sway_deg) * _wave(arc, rng)
+        pitch = np.radians(-self.down_deg + 2.0 * _wave(arc, rng))
+        aims = np.cos(yaw)[:, None] * forward + np.sin(yaw)[:, None] * side
+        aims = np.cos(pitch)[:, None] * aims + np.sin(pitch)[:, None] * np.array([0.0, 0.0, 1.0])
+        return np.stack([look_at(eye, eye + aim) for eye, aim in zip(eyes, aims, strict=True)])
+
+    def _timed(self, path: Float64, rng: np.random.Generator) -> tuple[Float64, Float64]:
+        turn_rad = np.radians(self.turn_deg_s) / self.rate_hz
+        times = frame_times(path, self.speed_m_s / self.rate_hz, turn_rad)
+        count = max(2, round(times[-1]) + 1)
+        k = np.arange(count)[:, None]
+        phase = rng.uniform(0, 2 * np.pi, len(_PACE_PERIODS))
+        waves = np.sin(2 * np.pi * k / np.array(_PACE_PERIODS) + phase).mean(axis=1)
+        progress = np.concatenate([[0.0], np.cumsum(1.0 + self.variation * waves[1:])])
+        instants = progress / progress[-1] * times[-1]
+        return k[:, 0] / self.rate_hz, resample(path, times, instants, hand_tremor(count, rng))
+
+
+def _corners(scene: Scene, via: tuple[str, ...]) -> Float64:
+    """Points (K, 3) of the named places."""
+    places: dict[str, Float64] = getattr(scene, "places", {})
+    if not places:
+        raise InputError(f"scene {scene.name!r} has no named places for a route")
+    points = []
+    for name in via:
+        ends = name.split("-")
+        for end in ends:
+            if end not in places:
+                raise unknown(f"place of a route in scene {scene.name!r}", end, places)
+        points.append(np.mean([places[end] for end in ends], axis=0))
+    return np.stack(points)
+
+
+def _rounded(corners: Float64) -> Float64:
+    """Points (M, 3) every ``_SAMPLE_M`` or so along the corners (K, 3), which are rounded."""
+    lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+    at = np.concatenate([[0.0], np.cumsum(lengths)])
+    arc = np.arange(0.0, at[-1], _SAMPLE_M)
+    line = np.stack([np.interp(arc, at, corners[:, k]) for k in range(3)], -1)
+    # Run straight on beyond both ends, which the filter would pull inwards.
+    margin = round(4 * _CORNER_M / _SAMPLE_M)
+    steps = _SAMPLE_M * np.arange(1, margin + 1)[:, None]
+    before = line[0] - steps[::-1] * unit(corners[1] - corners[0])
+    after = line[-1] + steps * unit(corners[-1] - corners[-2])
+    long = np.concatenate([before, line, after])
+    return gaussian_filter1d(long, _CORNER_M / _SAMPLE_M, axis=0)[margin:-margin]
+
+
+def _wave(arc: Float64, rng: np.random.Generator) -> Float64:
+    """A smooth function (M,) of the way, within [-1, 1]."""
+    phase = rng.uniform(0, 2 * np.pi, len(_WAVES_M))
+    return np.sin(2 * np.pi * arc[:, None] / np.array(_WAVES_M) + phase).mean(axis=1)
