@@ -19,7 +19,8 @@ class Arguments:
 
     Trajectories are TUM files: timestamp tx ty tz qx qy qz qw, camera to world. Maps are PLY files
     (or what else trimesh reads): clouds as they are, meshes sampled. With --out, writes
-    evaluation.json, table.md, trajectory.png and map.png.
+    evaluation.json, table.md, trajectory.png and map.png, and the poses that correspond, aligned,
+    as estimate.txt and groundtruth.txt.
     """
 
     estimate: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="ESTIMATE")] = None
@@ -107,6 +108,7 @@ def _trajectories(args: Arguments, result: dict[str, Any], parts: list[str]) -> 
         match_files,
         measure_matched,
     )
+    from ms_slam_env.sequences import write_trajectory
 
     assert args.estimate is not None
     assert args.groundtruth is not None
@@ -128,6 +130,8 @@ def _trajectories(args: Arguments, result: dict[str, Any], parts: list[str]) -> 
     print(report.summary(result))
     if args.out is not None:
         report.save_figure(matched, args.out / "trajectory.png")
+        for name, poses in (("estimate", matched.estimate), ("groundtruth", matched.truth)):
+            write_trajectory(args.out / f"{name}.txt", matched.times, poses)
 
 
 def _maps(args: Arguments, result: dict[str, Any], parts: list[str]) -> None:

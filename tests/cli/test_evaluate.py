@@ -106,7 +106,9 @@ def test_files_and_options_are_written(tmp_path: Path, capsys: pytest.CaptureFix
     options = ["--segments", "4", "--delta", "1.0", "--delta-unit", "s"]
     result = evaluate([*pair, *options], out)
     assert sorted(path.name for path in out.iterdir()) == [
+        "estimate.txt",
         "evaluation.json",
+        "groundtruth.txt",
         "table.md",
         "trajectory.png",
     ]

@@ -55,7 +55,7 @@ def section_of(result: Result) -> Section:
         if path.stat().st_size <= _MAX_PICTURE_BYTES
     )
     if pictures:
-        blocks.append(Pictures(pictures, folded=not isinstance(kind, Generic)))
+        blocks.append(Pictures(pictures, folded=bool(drawn) and not isinstance(kind, Generic)))
     return Section(
         result.title, kind.name, kind.about, tuple(blocks), provenance_lines(result.provenance)
     )

@@ -10,8 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.benchmark.report import plots
+from ms_slam_env.benchmark.report.bars import measures
 from ms_slam_env.benchmark.report.blocks import Figure, Plot
+from ms_slam_env.benchmark.report.curves import curve_figure
 from ms_slam_env.benchmark.report.discovery import Result
+from ms_slam_env.benchmark.report.flatten import flatten
 from ms_slam_env.benchmark.report.kinds.base import Kind
 from ms_slam_env.errors import InputError
 from ms_slam_env.metrics import umeyama
@@ -21,6 +24,9 @@ Float64 = NDArray[np.float64]
 
 _MAX_POINTS = 3000
 _MAX_DIFFERENCE_S = 0.02
+ESTIMATE, TRUTH = "estimate.txt", "groundtruth.txt"
+"""What ``ms-slam evaluate`` leaves: the poses that correspond, aligned."""
+
 _COSTS = {"cpu_ms": "processor time [ms]", "ext_ms": "EXT [ms]", "mem_mb": "memory [MB]"}
 
 
@@ -56,27 +62,40 @@ class Evaluation(Kind):
     )
 
     def fits(self, content: dict[str, Any]) -> bool:
-        """Statistics of one estimate, with the names of both files."""
-        return {"estimate", "truth", "ate_m"} <= set(content)
+        """Statistics of a trajectory or of a map, with the names of both files."""
+        names = set(content)
+        return {"estimate", "truth", "ate_m"} <= names or {"map", "true_map", "register"} <= names
 
     def figures(self, result: Result) -> list[Figure]:
-        """Path from above and error over time, where the files are still there."""
-        content = result.content
-        scale = content.get("align") == "sim3"
-        return trajectory_figures(
-            Path(str(content["truth"])), {"estimate": Path(str(content["estimate"]))}, scale
-        )
+        """Path from above, error over time, error by piece, drift by length."""
+        content, folder = result.content, result.folder
+        found = trajectory_figures(folder / TRUTH, {"estimate": folder / ESTIMATE}, "none")
+        if not found and "estimate" in content:  # of another program: the files as they were
+            files = Path(str(content["truth"])), Path(str(content["estimate"]))
+            found = trajectory_figures(files[0], {"estimate": files[1]}, str(content.get("align")))
+        pieces = [flatten(row) for row in content.get("segments") or ()]
+        keys = [f"{error}.rmse" for error in ("ate_m", "rpe_m", "ate_rad", "rpe_rad")]
+        drift = [flatten(row) for row in content.get("drift") or ()]
+        more = [
+            curve_figure(pieces, "start_s", None, keys, "Error by piece", "RMSE of each piece.")
+            if len(pieces) > 1
+            else None,
+            curve_figure(
+                drift, "length_m", None, measures(drift), "Drift over lengths of the true path"
+            )
+            if len(drift) > 1
+            else None,
+        ]
+        return [*found, *(figure for figure in more if figure is not None)]
 
 
-def trajectory_figures(
-    truth: Path, estimates: dict[str, Path], with_scale: bool = False
-) -> list[Figure]:
+def trajectory_figures(truth: Path, estimates: dict[str, Path], align: str = "se3") -> list[Figure]:
     """Path from above and error over time; empty without an estimate.
 
     Args:
         truth: TUM file; without it estimates are drawn as they are.
         estimates: TUM files by name; those that do not exist are left out.
-        with_scale: align with a scale too.
+        align: se3, sim3 or none.
     """
     true = _read(truth)
     read = {name: _read(path) for name, path in estimates.items()}
@@ -89,7 +108,8 @@ def trajectory_figures(
         if true is not None:
             first, second = associate(times, true[0], _MAX_DIFFERENCE_S)
             if len(first) >= 2:
-                points = _aligned(points, points[first], true[1][second], with_scale)
+                if align != "none":
+                    points = _aligned(points, points[first], true[1][second], align)
                 distance = 1e3 * np.linalg.norm(points[first] - true[1][second], axis=1)
                 picked = _thin(len(first))
                 seconds = (times[first] - times[0])[picked]
@@ -99,7 +119,7 @@ def trajectory_figures(
     if errors:
         axes = plots.axis("time [s]"), plots.axis("position error [mm]", rangemode="tozero")
         layout = plots.layout(*axes, showlegend=len(errors) > 1)
-        caption = "Distance from the true position, after alignment."
+        caption = f"Distance from the true position, alignment {align}."
         found.append(Figure("Error over time", caption, (plots.plot(errors, layout),)))
     return found
 
@@ -156,8 +176,8 @@ def _read(path: Path) -> tuple[Float64, Float64] | None:
     return (times, poses[:, :3, 3]) if len(times) else None
 
 
-def _aligned(points: Float64, first: Float64, second: Float64, with_scale: bool) -> Float64:
-    R, t, scale = umeyama(first, second, with_scale)
+def _aligned(points: Float64, first: Float64, second: Float64, align: str) -> Float64:
+    R, t, scale = umeyama(first, second, with_scale=align == "sim3")
     moved: Float64 = scale * points @ R.T + t
     return moved
 
