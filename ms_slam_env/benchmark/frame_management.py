@@ -51,9 +51,9 @@ class Arguments:
     """scene:seed (quiet, walking and fast stretches), scene:seed:steady, or folders."""
     managements: tuple[str, ...] = (
         "none",
-        *(f"regular,every={n}" for n in (2, 3, 4, 5)),
-        *(f"divergence,threshold={t}" for t in (0.005, 0.01, 0.02, 0.04, 0.08)),
-        *(f"budget,share={s}" for s in (0.5, 0.33, 0.25, 0.2)),
+        *(f"regular,every={n}" for n in (2, 3, 4)),
+        *(f"divergence,threshold={t}" for t in (0.005, 0.01, 0.02, 0.04)),
+        *(f"budget,share={s}" for s in (0.5, 0.33, 0.25)),
     )
     """NAME,option=value,... as the option frame_management of an environment has them."""
     backend: str = "surfel"

@@ -48,7 +48,7 @@ class BudgetConfig(DroppingConfig):
     cost_per_frame: float = 1.0
     cost_per_look: float = 0.0
     measured: bool = False
-    gain: float = 0.05
+    gain: float = 0.1
     threshold: float = 0.01
     lowest_threshold: float = 1e-4
     highest_threshold: float = 10.0
