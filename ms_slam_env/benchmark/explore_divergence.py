@@ -112,6 +112,8 @@ def figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
     norm = LogNorm(divergence.min(), divergence.max())
     for failed, mark in ((False, "o"), (True, "x")):
         own = [k for k, row in enumerate(rows) if bool(row.get(FAILURE)) == failed]
+        if not own:
+            continue
         shown = left.scatter(
             [rows[k]["ext_ms"] for k in own],
             [rows[k]["ate_max_m"] for k in own],

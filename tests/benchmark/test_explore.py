@@ -1,0 +1,246 @@
+"""Explorations of a real backend: what is measured, written, chosen, and refused."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from ms_slam_env import slam
+from ms_slam_env.benchmark import compare_inputs, explore_evaluation, explore_samplers
+from ms_slam_env.benchmark.explore import Exploration, run_exploration
+from ms_slam_env.benchmark.explore_divergence import main as divergence_main
+from ms_slam_env.benchmark.explore_evaluation import SlamEvaluator, summarise
+from ms_slam_env.benchmark.explore_judge import judge
+from ms_slam_env.benchmark.sequence_divergence import sequence_divergence
+from ms_slam_env.camera import xtion
+from ms_slam_env.cli import main
+from ms_slam_env.errors import InputError
+from ms_slam_env.exploration import ExplorationSettings
+from ms_slam_env.geometry import look_at
+from ms_slam_env.metrics import ate_rmse
+from ms_slam_env.metrics.cost import energy_counters
+from ms_slam_env.metrics.reconstruction import voxel_thin
+from ms_slam_env.sequences import HandheldPath, render_sequence
+from ms_slam_env.sequences.recording import open_recording
+from ms_slam_env.sequences.writing import write_sequence
+from ms_slam_env.slam.configuration import SlamConfiguration, read_configuration
+
+FRAMES = 12
+
+
+def recorded(box_scene, folder, shift) -> str:
+    """A short sequence of the box scene in the TUM layout, 80x60."""
+    eye = box_scene.sample_start(np.random.default_rng(0))[:3, 3]
+    low, high = box_scene.mesh.vertices.min(0), box_scene.mesh.vertices.max(0)
+    poses = [look_at(eye + k * np.array(shift), (low + high) / 2) for k in range(FRAMES)]
+    rendered = render_sequence(box_scene, np.stack(poses), xtion("80x60"))
+    write_sequence(rendered, folder, {"shift": shift})
+    return str(folder)
+
+
+@pytest.fixture(scope="module")
+def sequences(box_scene, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sequences")
+    return (
+        recorded(box_scene, folder / "right", [0.01, 0.0, 0.0]),
+        recorded(box_scene, folder / "up", [0.0, 0.0, 0.01]),
+    )
+
+
+@pytest.fixture(scope="module")
+def evaluator(sequences):
+    return SlamEvaluator(sequences[:1], image_size="80x60", map_error=True)
+
+
+def test_measures_what_a_run_by_hand_gives(evaluator, sequences):
+    configuration = SlamConfiguration(slam_config={"icp_rgb_weight": 0.2}, keep_every=2)
+    row = evaluator(configuration)
+    recording = open_recording(sequences[0])
+    frames = list(recording)[::2]
+    system = slam.make("surfel", recording.intrinsics, icp_rgb_weight=0.2)
+    system.reset(recording.truth[0])
+    poses = np.stack([system.track(frame).T_world_camera for frame in frames])
+    assert row["ate_m"] == pytest.approx(ate_rmse(poses, recording.truth[::2]), rel=1e-9)
+    divergences = sequence_divergence(recording, every=2).divergences
+    assert (row["M_I"], row["M_D"]) == tuple(pytest.approx(m) for m in divergences.max(axis=0))
+    assert row["load_ms"] == pytest.approx(row["ext_ms"] / 2)
+    surface = compare_inputs.load(sequences[0], "80x60", HandheldPath(90)).surface
+    distances, _ = cKDTree(surface).query(voxel_thin(system.surface_points(), 0.01))
+    assert row["map_error_mm"] == pytest.approx(1e3 * np.median(distances))
+    assert row["mem_mb"] is None or row["mem_mb"] > 0
+    assert "failure" not in row
+
+
+def test_lost_tracking_is_a_result(evaluator):
+    blind = evaluator(SlamConfiguration(slam_config={"depth_cutoff_m": 0.01}))
+    assert "tracking lost in" in blind["failure"]
+    assert blind["lost"] > 0.5
+    assert np.isfinite(blind["ext_ms"])
+
+
+def test_a_backend_that_breaks_down_is_a_result(evaluator, monkeypatch):
+    def broken(*_, **__):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr(explore_evaluation.slam, "make", broken)
+    monkeypatch.setattr(explore_evaluation, "_warm_up", lambda *_: None)
+    row = evaluator(SlamConfiguration())
+    assert "Singular matrix" in row["failure"]
+    assert (row["lost"], row.get("ate_m")) == (1.0, None)
+
+
+def test_several_sequences_make_one_row():
+    rows = [
+        {"sequence": "a", "ate_m": 0.1, "ate_max_m": 0.2, "mem_mb": None, "lost": 0.0},
+        {"sequence": "b", "ate_m": 0.3, "ate_max_m": 0.1, "mem_mb": 3.0, "failure": "lost"},
+    ]
+    assert summarise(rows) == {
+        "ate_m": pytest.approx(0.2),
+        "ate_max_m": 0.2,
+        "failure": "b: lost",
+    }
+
+
+@pytest.fixture(scope="module")
+def explored(evaluator, sequences, tmp_path_factory):
+    out = tmp_path_factory.mktemp("explore") / "out"
+    exploration = Exploration(
+        evaluator,
+        ExplorationSettings(("ate_m", "ext_ms", "map_error_mm"), sampler="random"),
+        ("points_per_level", "depth_cutoff_m", "iterations.0"),
+        held_out=sequences[1:],
+    )
+    return exploration, out, run_exploration(exploration, out, 4)
+
+
+def test_results_on_disk(explored):
+    _, out, table = explored
+    content = json.loads((out / "explore.json").read_text())
+    assert len(content["trials"]) == len(content["hypervolume"]) == 4
+    assert content["trials"][0]["default"]
+    assert content["trials"][0]["params"]["points_per_level"] == 5000
+    assert content["provenance"]["command"]
+    assert all(trial["M_I"] > 0 for trial in content["trials"])
+    assert {row["configuration"] for row in content["held_out"]} >= {"default", "knee"}
+    assert content["held_out"][0]["ate_ratio"] == 1.0
+    for name in ("pareto.png", "hypervolume.png", "table.md", "study.db"):
+        assert (out / name).stat().st_size > 0
+    assert "4 finished trials" in table
+    assert (out / "table.md").read_text() == table
+
+
+def test_going_on_keeps_what_is_there(explored, monkeypatch):
+    exploration, out, _ = explored
+    before = json.loads((out / "explore.json").read_text())
+    monkeypatch.setattr(SlamEvaluator, "measure", None)  # nothing is left to measure
+    run_exploration(exploration, out, 4)
+    after = json.loads((out / "explore.json").read_text())
+    assert after["trials"] == before["trials"]
+    assert after["held_out"] == before["held_out"]
+
+
+def test_chosen_configurations_are_taken_everywhere(explored, sequences, tmp_path):
+    _, out, _ = explored
+    content = json.loads((out / "explore.json").read_text())
+    for name, row in content["chosen"].items():
+        path = out / row["file"]
+        configuration = read_configuration(path)
+        assert configuration.about["purpose"] == name
+        assert configuration.slam_config["points_per_level"] == row["params"]["points_per_level"]
+        assert slam.make(path, xtion("80x60")).config.iterations[0] == row["params"]["iterations.0"]
+    command = ["run", sequences[0], "--config", str(path), "--out", str(tmp_path / "run")]
+    assert main(command) == 0
+
+
+def test_held_out_ratios(tmp_path, monkeypatch):
+    figures = {4.0: (0.02, 8.0), 2.0: (0.01, 2.0), 1.0: (0.5, 1.0)}
+
+    def measure(self, configuration, sequence):
+        ate, ext = figures[configuration.slam_config["depth_cutoff_m"]]
+        failure = {"failure": "lost"} if ate == 0.5 else {}
+        return {"ate_m": ate * (2 if sequence.endswith("1") else 1), "ext_ms": ext, **failure}
+
+    monkeypatch.setattr(SlamEvaluator, "measure", measure)
+    configurations = {
+        name: SlamConfiguration(slam_config={"depth_cutoff_m": cutoff})
+        for name, cutoff in (("default", 4.0), ("fastest", 2.0), ("knee", 1.0))
+    }
+    evaluator = SlamEvaluator(("table:0",))
+    rows = judge(evaluator, configurations, ("table:1", "table:2"), tmp_path)
+    default, fastest, knee = rows
+    assert (default["ate_ratio"], default["ext_ratio"]) == (1.0, 1.0)
+    assert (fastest["ate_m"], fastest["ext_ms"]) == (pytest.approx(0.015), 2.0)
+    assert fastest["ate_ratio"] == pytest.approx(0.5)
+    assert fastest["ext_ratio_low"] == fastest["ext_ratio_high"] == pytest.approx(0.25)
+    assert (knee["failed"], knee["ate_m"]) == (2, None)
+    assert judge(evaluator, configurations, (), tmp_path) == []
+
+
+def test_samplers_are_compared_seed_by_seed():
+    histories = {"random": [[0.1, 0.2], [0.2, 0.4]], "tpe": [[0.1, 0.3], [0.3, 0.5]]}
+    random, tpe = explore_samplers.summarise(histories)
+    assert random["gain_end"] == 0
+    assert (tpe["hypervolume_half"], tpe["hypervolume_end"]) == (
+        pytest.approx(0.2),
+        pytest.approx(0.4),
+    )
+    assert (tpe["gain_end"], tpe["gain_end_low"]) == (pytest.approx(0.1), pytest.approx(0.1))
+    assert tpe["wins"] == 2
+    assert "2 of 2" in explore_samplers.table([random, tpe])
+
+
+def test_samplers_share_one_reference(sequences, tmp_path):
+    arguments = explore_samplers.Arguments(
+        ("random", "tpe"), 1, 2, sequences[:1], ("points_per_level",), out=tmp_path
+    )
+    explore_samplers.run(arguments)
+    first = json.loads((tmp_path / "samplers.json").read_text())
+    assert {name: len(runs[0]) for name, runs in first["hypervolume"].items()} == {
+        "random": 2,
+        "tpe": 2,
+    }
+    explore_samplers.run(arguments)  # nothing is done again
+    second = json.loads((tmp_path / "samplers.json").read_text())
+    assert second["hypervolume"] == first["hypervolume"]
+    assert (tmp_path / "hypervolume.png").stat().st_size > 0
+
+
+def test_divergence_grows_when_frames_are_left_out(sequences, tmp_path):
+    command = ["--sequences", sequences[0], "--keep-every", "1", "4", "--image-size", "80x60"]
+    assert divergence_main([*command, "--out", str(tmp_path)]) == 0
+    summary = json.loads((tmp_path / "divergence.json").read_text())["summary"]
+    assert summary[1]["M_I"] > summary[0]["M_I"]
+    assert summary[1]["load_ms"] < summary[0]["load_ms"]
+    assert (tmp_path / "divergence.png").stat().st_size > 0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--sampler", "grid"], "valid choices: random, nsga2, tpe, gp"),
+        (["--objectives", "ate", "ext_ms"], "unknown objective 'ate'"),
+        (["--constraints", "ate_m=1"], "is not metric<limit"),
+        (["--parameters", "speed"], "unknown parameter 'speed'"),
+        (["--sequences", "nowhere"], "sequence 'nowhere' is neither a folder nor"),
+        (["--held-out", "table:1002"], "sequence table:1002 is explored and held out"),
+        (["--trials", "0"], "trials 0 and workers 1 must be 1 or more"),
+        (["--config", "no.yaml"], "no.yaml: cannot be read"),
+        (["--clock", "sundial"], "valid choices: processor, wall"),
+        (["--frames", "3"], "frames = 3 is outside"),
+        (["--image-size", "3x3"], "unknown image size '3x3'"),
+    ],
+)
+def test_bad_input_is_one_line(options, message, tmp_path, capsys):
+    assert main(["explore", *options, "--out", str(tmp_path / "out")]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert message in lines[-1]
+
+
+def test_energy_is_refused_where_there_is_none(sequences):
+    if not all(counter.reason for counter in energy_counters("cpu").values()):
+        pytest.skip("this machine counts energy")
+    with pytest.raises(InputError, match="energy_j is not available: "):
+        Exploration(SlamEvaluator(sequences), ExplorationSettings(("ate_m", "energy_j")))
+    with pytest.raises(InputError, match="map_error_mm is not measured"):
+        Exploration(SlamEvaluator(sequences), ExplorationSettings(("ate_m", "map_error_mm")))
