@@ -20,7 +20,7 @@ class Arguments:
     Trajectories are TUM files: timestamp tx ty tz qx qy qz qw, camera to world. Maps are PLY files
     (or what else trimesh reads): clouds as they are, meshes sampled. With --out, writes
     evaluation.json, table.md, trajectory.png and map.png, and the poses that correspond, aligned,
-    as estimate.txt and groundtruth.txt.
+    as evaluation.estimate.txt and evaluation.truth.txt.
     """
 
     estimate: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="ESTIMATE")] = None
@@ -130,8 +130,9 @@ def _trajectories(args: Arguments, result: dict[str, Any], parts: list[str]) -> 
     print(report.summary(result))
     if args.out is not None:
         report.save_figure(matched, args.out / "trajectory.png")
-        for name, poses in (("estimate", matched.estimate), ("groundtruth", matched.truth)):
-            write_trajectory(args.out / f"{name}.txt", matched.times, poses)
+        for name, poses in (("estimate", matched.estimate), ("truth", matched.truth)):
+            # A name of its own: the folder may be that of the files that are compared.
+            write_trajectory(args.out / f"evaluation.{name}.txt", matched.times, poses)
 
 
 def _maps(args: Arguments, result: dict[str, Any], parts: list[str]) -> None:

@@ -57,7 +57,7 @@ def test_names_of_sequences(tmp_path: Path) -> None:
     [
         ("sequences", ("table",), "neither a folder nor scene:seed"),
         ("sequences", ("table:x",), "neither a folder nor scene:seed"),
-        ("sequences", ("table:1:fog",), "'fog'; valid choices: kinect, none"),
+        ("sequences", ("table:1:fog",), "'fog'; valid choices: kinect"),
         ("sequences", ("table:1:none+fog",), "'fog'; valid choices: rolling-shutter"),
         ("sequences", ("attic:1",), "valid choices: living_room"),
         ("sequences", (), "Comparison.sequences is empty"),

@@ -104,11 +104,14 @@ def test_files_and_options_are_written(tmp_path: Path, capsys: pytest.CaptureFix
     pair = write_pair(tmp_path)
     out = tmp_path / "out"
     options = ["--segments", "4", "--delta", "1.0", "--delta-unit", "s"]
+    before = [Path(path).read_bytes() for path in pair]
     result = evaluate([*pair, *options], out)
+    evaluate(pair, tmp_path)  # the results may lie beside the files
+    assert [Path(path).read_bytes() for path in pair] == before
     assert sorted(path.name for path in out.iterdir()) == [
-        "estimate.txt",
+        "evaluation.estimate.txt",
         "evaluation.json",
-        "groundtruth.txt",
+        "evaluation.truth.txt",
         "table.md",
         "trajectory.png",
     ]
@@ -116,6 +119,10 @@ def test_files_and_options_are_written(tmp_path: Path, capsys: pytest.CaptureFix
     assert (result["delta"], result["delta_unit"], result["max_difference_s"]) == (1, "s", 0.02)
     assert result["provenance"]["versions"]["numpy"] == np.__version__
     assert f"{result['rpe_m']['rmse']:.6f}" in capsys.readouterr().out
+    _, aligned = read_trajectory(out / "evaluation.estimate.txt")
+    _, true = read_trajectory(out / "evaluation.truth.txt")
+    ate = metrics.ate_rmse(aligned, true, "none")
+    assert ate == pytest.approx(result["ate_m"]["rmse"], abs=1e-8)
     assert (
         result["rpe_m"]
         == evaluate_files(*map(Path, pair), TrajectoryOptions(delta=1.0, delta_unit="s"))["rpe_m"]

@@ -24,7 +24,7 @@ Float64 = NDArray[np.float64]
 
 _MAX_POINTS = 3000
 _MAX_DIFFERENCE_S = 0.02
-ESTIMATE, TRUTH = "estimate.txt", "groundtruth.txt"
+ESTIMATE, TRUTH = "evaluation.estimate.txt", "evaluation.truth.txt"
 """What ``ms-slam evaluate`` leaves: the poses that correspond, aligned."""
 
 _COSTS = {"cpu_ms": "processor time [ms]", "ext_ms": "EXT [ms]", "mem_mb": "memory [MB]"}
