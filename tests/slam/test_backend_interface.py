@@ -15,16 +15,27 @@ from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at, make_pose, relative_angle, so3_exp
 from ms_slam_env.sensor import RGBDSensor
+from ms_slam_env.slam.frame_management import make_config
 
 CAMERA = xtion("160x120")
 START = look_at([-0.8, -0.8, 1.2], [1.2, 0.1, 0.5])
 COUNT = 12
-OPTIONS = {
+MANAGED = "surfel behind a filter"
+"""A decorator is a backend, too; of the path it processes some of the frames."""
+FILTER = {"name": "divergence", "threshold": 0.003}
+OPTIONS: dict[str, dict[str, float]] = {
     "surfel": {"max_surfels": 60_000, "depth_cutoff_m": 4.0},
     "odometry": {"max_surfels": 60_000},
     "sparse": {"max_surfels": 60_000},
 }
-ACCURACY_M = {"surfel": 0.008, "odometry": 0.02, "volumetric": 0.015, "sparse": 0.01}
+OPTIONS[MANAGED] = OPTIONS["surfel"]
+ACCURACY_M = {
+    "surfel": 0.008,
+    "odometry": 0.02,
+    "volumetric": 0.015,
+    "sparse": 0.01,
+    MANAGED: 0.022,  # two frames are dropped before any motion is known
+}
 """Largest error of position on the noisy path of 0.11 m."""
 
 
@@ -39,8 +50,13 @@ def _path() -> np.ndarray:
 PATH = _path()
 
 
+def _make(name: str, **options: object) -> slam.SlamBackend:
+    backend = slam.make("surfel" if name == MANAGED else name, CAMERA, **options)
+    return make_config(**FILTER).manage(backend) if name == MANAGED else backend
+
+
 def _new(name: str) -> slam.SlamBackend:
-    backend = slam.make(name, CAMERA, **OPTIONS.get(name, {}))
+    backend = _make(name, **OPTIONS.get(name, {}))
     backend.reset(START)
     return backend
 
@@ -61,7 +77,7 @@ def frames(box_scene: BoxScene) -> list[RGBDFrame]:
     return [sensor.capture(pose, index) for index, pose in enumerate(PATH)]
 
 
-@pytest.fixture(scope="module", params=sorted(slam.BACKENDS))
+@pytest.fixture(scope="module", params=[*sorted(slam.BACKENDS), MANAGED])
 def name(request: pytest.FixtureRequest) -> str:
     if request.param == "volumetric":
         pytest.importorskip("open3d", reason="Open3D is not installed", exc_type=ImportError)
@@ -95,6 +111,7 @@ def test_a_noisy_path_is_tracked(name, tracked):
         )
         assert 0.8 < result.inlier_fraction <= 1
     assert 0 < results[-1].residual_m < 0.03
+    assert all(result.processed for result in results) == (name != MANAGED)
     assert _errors_m(results).max() < ACCURACY_M[name]
 
 
@@ -272,9 +289,9 @@ def test_bad_input_is_refused(name):
         with pytest.raises(InputError, match="scale"):
             backend.predict(START[None], scale=scale)
     with pytest.raises(InputError, match=r"valid choices: .*depth_cutoff_m"):
-        slam.make(name, CAMERA, depth_cutof_m=3.0)
+        _make(name, depth_cutof_m=3.0)
     with pytest.raises(InputError, match="depth_cutoff_m"):
-        slam.make(name, CAMERA, depth_cutoff_m=-1.0)
+        _make(name, depth_cutoff_m=-1.0)
 
 
 def _first_allowed(env: ActiveSlamEnv) -> int:
@@ -286,7 +303,8 @@ def test_works_in_the_environment(name):
         "free",
         scene="wall",
         scene_seed=0,
-        slam=name,
+        slam="surfel" if name == MANAGED else name,
+        frame_management=FILTER if name == MANAGED else "none",
         step_m=0.04,
         step_rad=0.04,
         image_size="80x60",
