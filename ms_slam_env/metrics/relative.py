@@ -27,6 +27,7 @@ Int64 = NDArray[np.int64]
 
 DELTA_UNITS = ("frames", "m", "s")
 PAIRINGS = ("all", "consecutive")
+_ROUNDING = 1e-9
 TOLERANCE = 0.1  # of a delta in metres or seconds, as a share of it
 
 
@@ -190,7 +191,11 @@ def _all(along: Float64, delta: float, reach: float) -> Int64:
 def _consecutive(along: Float64, delta: float) -> Int64:
     found = []
     first = 0
-    while (second := int(np.searchsorted(along, along[first] + delta))) < len(along):
+    while True:
+        # Times of 0.1 s add up to a hair more or less than 1 s.
+        second = int(np.searchsorted(along, along[first] + delta - _ROUNDING))
+        if second == len(along):
+            break
         found.append((first, second))
         first = second
     return np.array(found, dtype=np.int64).reshape(-1, 2)

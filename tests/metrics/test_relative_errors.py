@@ -105,7 +105,14 @@ def test_a_second_of_a_drift_in_time() -> None:
     estimate[:, 1, 3] = 0.02 * times
     errors = relative_errors(estimate, truth, 1.0, unit="s", times=times)
     np.testing.assert_allclose(errors, np.full(20, 0.02), atol=1e-12)
-    assert len(relative_errors(estimate, truth, 1.0, unit="s", times=times, pairs="consecutive"))
+    consecutive = pose_pairs(truth, 1.0, "s", times, "consecutive")
+    np.testing.assert_array_equal(consecutive, [[0, 10], [10, 20]])
+    for step in (0.1, 0.3, 1 / 3, 0.7):
+        times = np.arange(301) * step + 1.3e3
+        found = pose_pairs(
+            np.repeat(np.eye(4)[None], 301, axis=0), 10 * step, "s", times, "consecutive"
+        )
+        np.testing.assert_array_equal(found[:, 1], np.arange(10, 301, 10))
 
 
 def slow_drift(
