@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 Float64 = NDArray[np.float64]
 
 _NAME = "usme_run"
-_VIEW_EVERY_M = 1.0  # along the true path, for the true surface
+_VIEW_EVERY_M = 1.5  # along the true path, for the true surface
 _VIEW_SIZE = "320x240"
-_MOST_VIEWS = 250
+_MOST_VIEWS = 150
 _MOST_POINTS = 1_000_000
 
 
@@ -195,7 +195,7 @@ def voxel_m(scene: str) -> float:
     """Edge of the voxels in which clouds keep one point: by them a surface counts by its area."""
     from ms_slam_env.scenes import LARGE_SCENES
 
-    return 0.04 if scene in LARGE_SCENES else 0.01
+    return 0.05 if scene in LARGE_SCENES else 0.01
 
 
 def map_measures(points: Float64, surface: Float64, scene: str) -> dict[str, Any]:

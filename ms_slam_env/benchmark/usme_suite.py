@@ -34,12 +34,12 @@ from ms_slam_env.sequences import (
 
 Float64 = NDArray[np.float64]
 
-_OUTDOORS = {"rate_hz": 20.0, "speed_m_s": 1.4, "turn_deg_s": 25.0}
+_OUTDOORS = {"rate_hz": 15.0, "speed_m_s": 1.4, "turn_deg_s": 25.0}
 _AROUND = ("SW-S", "S", "SE", "E", "NE", "N", "NW", "W")
 
-_FAST = HandheldPath(
-    frames=500, rate_hz=30.0, speed_m_s=1.5, turn_deg_s=90.0, max_step_m=0.06, max_turn_deg=4.5
-)
+_HAND = HandheldPath(frames=900)
+_FAST = "fast-motion,factor=4,share=0.5,length_s=1.5"
+_LIGHT = "illumination,dim=0.4,period_s=8"
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ SUITE: tuple[UsmeSequence, ...] = (
         ),
         "range",
         "the same three loops with motion blur",
-        ("motion-blur,exposure_s=0.04,samples=6",),
+        ("motion-blur,exposure_s=0.04,samples=4",),
         loops=3,
     ),
     UsmeSequence(
@@ -159,18 +159,19 @@ SUITE: tuple[UsmeSequence, ...] = (
     UsmeSequence(
         "room-fast",
         "living_room",
-        _FAST,
+        _HAND,
         "kinect",
-        "fast motion and rotation in a room",
+        "a room with stretches of fast motion and rotation, and changing light",
+        (_FAST, _LIGHT),
         loops=None,
     ),
     UsmeSequence(
         "room-fast-black",
         "living_room",
-        _FAST,
+        _HAND,
         "kinect",
         "the same with a run of black frames",
-        ("black-frames,start=250,length=20",),
+        (_FAST, _LIGHT, "black-frames,start=250,length=20"),
         loops=None,
     ),
 )
