@@ -1,0 +1,156 @@
+"""Relative poses of two robots' maps from points that look alike in their frames.
+
+Relocalisation finds a frame in a map that was seen from about the same place. Two robots rather see
+the same things from different places, so points are matched by their looks (SIFT, Lowe, IJCV
+2004), and three matches give a relative pose (RANSAC, Fischler and Bolles, 1981), since depth puts
+every point into space.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
+from ms_slam_env.geometry import make_pose, transform_points
+from ms_slam_env.metrics import umeyama
+from ms_slam_env.slam.sparse.features import InverseDepth
+
+Float64 = NDArray[np.float64]
+
+_MAGNIFY_TO = 640  # columns of the image in which corners are sought
+_MOST_FEATURES = 400
+_RATIO = 0.8  # the best match must be this much better than the second best
+_TRIALS = 300  # of three matches
+_REFITS = 3
+
+
+@dataclass(frozen=True)
+class Landmarks:
+    """Points of one frame.
+
+    Attributes:
+        points: (N, 3) in the frame of the robot's map.
+        descriptors: (N, 128) float32, RootSIFT.
+        depth_m: (N,) distance along the optical axis, by which their error grows.
+    """
+
+    points: Float64
+    descriptors: NDArray[np.float32]
+    depth_m: Float64
+
+
+def landmarks(frame: RGBDFrame, T_map_camera: Float64, K: Intrinsics) -> Landmarks:
+    """Points with known depth that can be recognised; none in an image without texture."""
+    grey = intensity_image(frame.color).round().astype(np.uint8)
+    n = max(1, round(_MAGNIFY_TO / K.width))
+    image = cv2.resize(grey, (n * K.width, n * K.height), interpolation=cv2.INTER_CUBIC)
+    corners, described = cv2.SIFT.create(nfeatures=_MOST_FEATURES).detectAndCompute(image, None)
+    if described is None:
+        return Landmarks(np.zeros((0, 3)), np.zeros((0, 128), np.float32), np.zeros(0))
+    # A pixel of the image covers n x n of the magnified one; centres lie at integers.
+    pixels = (np.asarray(cv2.KeyPoint.convert(corners), dtype=np.float64) + 0.5) / n - 0.5
+    inverse = InverseDepth(frame.depth).at(pixels)
+    known = inverse > 0
+    depth = 1.0 / inverse[known]
+    u, v = pixels[known].T
+    rays = np.stack([(u - K.cx) / K.fx, (v - K.cy) / K.fy, np.ones_like(u)], axis=1)
+    kept = described[known]
+    root = np.sqrt(kept / np.maximum(kept.sum(axis=1, keepdims=True), 1e-9))
+    points = transform_points(T_map_camera, rays * depth[:, None])
+    return Landmarks(points, root.astype(np.float32), depth)
+
+
+def match_landmarks(
+    a: Sequence[Landmarks],
+    b: Landmarks,
+    least_inliers: int,
+    tolerance_m: float,
+    rng: np.random.Generator,
+) -> tuple[Float64, int] | None:
+    """Find where the frame of robot b lies in map a: T_a_b (4, 4) and the matches behind it.
+
+    Of the frames of robot a the one with most inliers counts.
+
+    Args:
+        a: landmarks of robot a's frames.
+        b: landmarks of a frame of robot b.
+        least_inliers: matches that must fit one rigid motion.
+        tolerance_m: to this at 1 m of depth; grows with depth squared, as the sensor's noise does.
+        rng: draws the trials.
+    """
+    best: tuple[Float64, int] | None = None
+    for one in a:
+        rows_a, rows_b = _matches(one.descriptors, b.descriptors)
+        if len(rows_a) < least_inliers:
+            continue
+        depth = np.maximum(one.depth_m[rows_a], b.depth_m[rows_b])
+        tolerances = tolerance_m * np.maximum(1.0, depth) ** 2
+        found = _rigid_motion(one.points[rows_a], b.points[rows_b], tolerances, rng)
+        if found is not None and found[1] >= least_inliers and (best is None or found[1] > best[1]):
+            best = found
+    return best
+
+
+def _matches(
+    a: NDArray[np.float32], b: NDArray[np.float32]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Indices (M,) of descriptors that are each other's best and clearly better than the second."""
+    none = np.zeros(0, dtype=np.int64)
+    if len(a) < 2 or len(b) < 2:
+        return none, none
+    likeness = a @ b.T  # of unit vectors
+    there, back = likeness.argmax(axis=1), likeness.argmax(axis=0)
+    rows = np.flatnonzero(back[there] == np.arange(len(a)))
+    columns = there[rows]
+    first = likeness[rows, columns]
+    rest = likeness[rows].copy()
+    rest[np.arange(len(rows)), columns] = -1.0
+    distance, second = (np.sqrt(np.maximum(2 - 2 * x, 0)) for x in (first, rest.max(axis=1)))
+    clear = distance < _RATIO * second
+    return rows[clear], columns[clear]
+
+
+def _rigid_motion(
+    a: Float64, b: Float64, tolerances: Float64, rng: np.random.Generator
+) -> tuple[Float64, int] | None:
+    """T_a_b (4, 4) that most of the pairs (N, 3), (N, 3) fit, and their number; None without."""
+    best, most = None, 2
+    for _ in range(_TRIALS):
+        chosen = rng.choice(len(a), 3, replace=False)
+        if not _are_rigid(a[chosen], b[chosen], tolerances[chosen]):
+            continue
+        inliers = _fitting(_alignment(b[chosen], a[chosen]), a, b, tolerances)
+        if inliers.sum() > most:
+            best, most = inliers, int(inliers.sum())
+    if best is None:
+        return None
+    for _ in range(_REFITS):
+        T = _alignment(b[best], a[best])
+        best = _fitting(T, a, b, tolerances)
+        if best.sum() < 3:
+            return None
+    return T, int(best.sum())
+
+
+def _are_rigid(a: Float64, b: Float64, tolerances: Float64) -> bool:
+    """Whether two triangles have the same sides, none of them tiny."""
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        in_a, in_b = np.linalg.norm(a[i] - a[j]), np.linalg.norm(b[i] - b[j])
+        slack = tolerances[i] + tolerances[j]
+        if min(in_a, in_b) < slack or abs(in_a - in_b) > slack:
+            return False
+    return True
+
+
+def _fitting(T_a_b: Float64, a: Float64, b: Float64, tolerances: Float64) -> NDArray[np.bool_]:
+    return np.linalg.norm(transform_points(T_a_b, b) - a, axis=1) <= tolerances
+
+
+def _alignment(source: Float64, target: Float64) -> Float64:
+    R, t, _ = umeyama(source, target)
+    return make_pose(R, t)

@@ -1,0 +1,225 @@
+"""Where two robots' maps lie relative to each other, found from what both saw, or refused.
+
+Every robot's SLAM has a frame of its own. Frames of one robot give guesses of where its map lies in
+the map of the other (:mod:`.map_hypotheses`): by points that look alike, and by relocalising them
+there. A pose that enough of them agree on is refined by registration of the maps, and believed if
+the images of either robot look like the view that the other's map predicts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.benchmark.map_hypotheses import (
+    SOURCES,
+    Hypothesis,
+    RobotRun,
+    consensus,
+    mean_pose,
+    pose_difference,
+    query_frames,
+    recognised,
+    relocalised,
+)
+from ms_slam_env.config import check_range
+from ms_slam_env.errors import unknown
+from ms_slam_env.geometry import invert, transform_points
+from ms_slam_env.metrics import voxel_thin
+from ms_slam_env.metrics.cloud_registration import register_clouds
+from ms_slam_env.slam.surfel.relocalisation.likeness import measure_likeness
+
+Float64 = NDArray[np.float64]
+
+_SLACK = 0.01  # by which registration may worsen a share of pixels
+_LOOKS_AT = 0.2  # share of a frame that the other map must show for the frame to be compared
+_FAR_M = 10.0
+
+
+@dataclass(frozen=True)
+class MergeConfig:
+    """When two maps are taken to show the same place.
+
+    Attributes:
+        sources: of the guesses.
+        queries: frames of each robot that are compared by their features, and judged by.
+        lost_queries: places on each robot's path from where it is relocalised in the other's map.
+        patience: consecutive frames tried at each.
+        agree_m: guesses that put robot b's cameras less than this apart agree,
+        agree_deg: and whose rotations differ by less than this.
+        least_agreeing: so many guesses must agree,
+        least_share: and be this share of all.
+        tolerance_m: depth differs from the other map where it differs by more than this.
+        least_overlap: share of the pixels with a reading that must fit the other map.
+        least_consistent: share of those that fit among those that fit or contradict.
+        least_alike: correlation of the images' fine structure with the other map's view, the
+            median over the frames that look at it.
+        voxel_m: thinning of the maps before they are registered.
+        cutoff_m: farthest pair of points in the registration.
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    sources: tuple[str, ...] = SOURCES
+    queries: int = 24
+    lost_queries: int = 8
+    patience: int = 4
+    agree_m: float = 0.10
+    agree_deg: float = 5.0
+    least_agreeing: int = 3
+    least_share: float = 0.6
+    tolerance_m: float = 0.05
+    least_overlap: float = 0.05
+    least_consistent: float = 0.85
+    least_alike: float = 0.5
+    voxel_m: float = 0.02
+    cutoff_m: float = 0.10
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        for source in self.sources:
+            if source not in SOURCES:
+                raise unknown("source of guesses", source, SOURCES)
+        check_range(self, "queries", 1, 10_000)
+        check_range(self, "lost_queries", 1, 10_000)
+        check_range(self, "patience", 2, 1000)
+        check_range(self, "agree_m", 1e-4, 10.0)
+        check_range(self, "agree_deg", 1e-2, 180.0)
+        check_range(self, "least_agreeing", 1, 10_000)
+        check_range(self, "least_share", 0.0, 1.0)
+        check_range(self, "tolerance_m", 1e-4, 1.0)
+        check_range(self, "least_overlap", 0.0, 1.0)
+        check_range(self, "least_consistent", 0.0, 1.0)
+        check_range(self, "least_alike", -1.0, 1.0)
+        check_range(self, "voxel_m", 1e-3, 1.0)
+        check_range(self, "cutoff_m", 1e-3, 10.0)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How what either robot saw fits the map of the other.
+
+    Attributes:
+        overlap: share of the pixels with a reading that fit.
+        consistent: share of those among the pixels that fit or contradict.
+        alike: correlation with the other map's view, median over the frames that look at it.
+    """
+
+    overlap: float = float("nan")
+    consistent: float = float("nan")
+    alike: float = float("nan")
+
+
+@dataclass(frozen=True)
+class Merge:
+    """What came of an attempt.
+
+    Attributes:
+        T_a_b: (4, 4) maps points of map b into map a; None if the maps were not merged.
+        reason: why not; empty if they were.
+        found: number of guesses.
+        agreeing: largest number of them that agree.
+        fit: of the maps; NaN if no pose was judged.
+        refined_m: by how much registration moved b's cameras, metres; 0 if it was not accepted.
+    """
+
+    T_a_b: Float64 | None
+    reason: str
+    found: int = 0
+    agreeing: int = 0
+    fit: Fit = Fit()
+    refined_m: float = 0.0
+
+
+def merge_maps(a: RobotRun, b: RobotRun, config: MergeConfig | None = None) -> Merge:
+    """Find T_a_b from what the robots saw, or say why there is none to be believed."""
+    config = config or MergeConfig()
+    return decide(a, b, find_hypotheses(a, b, config), config)
+
+
+def find_hypotheses(a: RobotRun, b: RobotRun, config: MergeConfig) -> list[Hypothesis]:
+    """Guesses of T_a_b, from the frames of both robots."""
+    found: list[Hypothesis] = []
+    if SOURCES[0] in config.sources:
+        found += recognised(a, b, config.queries)
+    if SOURCES[1] in config.sources:
+        found += relocalised(a, b, config.lost_queries, config.patience)
+        found += [
+            Hypothesis(invert(back.T_a_b), back.weight, back.source)
+            for back in relocalised(b, a, config.lost_queries, config.patience)
+        ]
+    return found
+
+
+def decide(
+    a: RobotRun, b: RobotRun, hypotheses: Sequence[Hypothesis], config: MergeConfig
+) -> Merge:
+    """The pose that the guesses agree on, refined, if the maps bear it out."""
+    if not (a.tracked.any() and b.tracked.any()):
+        return Merge(None, "a robot has tracked no frame")
+    centre = b.estimates[b.tracked, :3, 3].mean(axis=0)
+    agreeing = consensus(hypotheses, centre, config.agree_m, config.agree_deg)
+    counts = len(hypotheses), len(agreeing)
+    if len(agreeing) < config.least_agreeing:
+        return Merge(None, "too few frames show the other map", *counts)
+    if len(agreeing) < config.least_share * len(hypotheses):
+        return Merge(None, "the frames contradict each other", *counts)
+    T_a_b, refined_m = mean_pose(agreeing, centre), 0.0
+    fit = judge(a, b, T_a_b, config)
+    refined = refine(a, b, T_a_b, config)
+    moved_m, moved_deg = pose_difference(refined, T_a_b, centre)
+    if moved_m < config.agree_m and moved_deg < config.agree_deg:
+        again = judge(a, b, refined, config)
+        if again.overlap >= fit.overlap - _SLACK and again.consistent >= fit.consistent - _SLACK:
+            T_a_b, fit, refined_m = refined, again, moved_m
+    if fit.overlap < config.least_overlap:
+        return Merge(None, "the maps hardly overlap there", *counts, fit)
+    if fit.consistent < config.least_consistent:
+        return Merge(None, "the surfaces contradict each other there", *counts, fit)
+    if not fit.alike >= config.least_alike:
+        return Merge(None, "the images do not look alike there", *counts, fit)
+    return Merge(T_a_b, "", *counts, fit, refined_m)
+
+
+def judge(a: RobotRun, b: RobotRun, T_a_b: Float64, config: MergeConfig) -> Fit:
+    """Lay both robots' frames upon the view that the other's map predicts there.
+
+    A surface of the map behind the reading may be one that only the map's robot saw, and says
+    nothing. One in front of the reading contradicts it: the ray went through it. Frames that do not
+    look at the other map at all say nothing either.
+    """
+    fits, contradictions, readings = 0, 0, 0
+    alike: list[float] = []
+    for here, there, T_here_there in ((a, b, T_a_b), (b, a, invert(T_a_b))):
+        indices = query_frames(there, config.queries)
+        views = here.backend.predict(T_here_there @ there.estimates[indices])
+        for grey, depth, index in zip(views.intensity, views.depth, indices, strict=True):
+            frame = there.frames[index]
+            valid = frame.depth > 0
+            both = valid & (depth > 0)
+            difference = depth - frame.depth
+            here_fits = both & (np.abs(difference) <= config.tolerance_m)
+            fits += int(here_fits.sum())
+            contradictions += int((both & (difference < -config.tolerance_m)).sum())
+            readings += int(valid.sum())
+            if here_fits.sum() >= _LOOKS_AT * max(1, valid.sum()):
+                same = np.where(here_fits, depth, np.float32(0))
+                likeness = measure_likeness(frame.color, frame.depth, grey, same, _FAR_M)
+                alike.append(likeness.correlation)
+    return Fit(
+        overlap=fits / readings if readings else 0.0,
+        consistent=fits / (fits + contradictions) if fits else 0.0,
+        alike=float(np.median(alike)) if alike else float("nan"),
+    )
+
+
+def refine(a: RobotRun, b: RobotRun, T_a_b: Float64, config: MergeConfig) -> Float64:
+    """T_a_b (4, 4) after registration of the maps from that start."""
+    target = voxel_thin(a.backend.surface_points(), config.voxel_m)
+    source = voxel_thin(b.backend.surface_points(), config.voxel_m)
+    moved = transform_points(T_a_b, source)
+    return register_clouds(moved, target, "gicp", config.cutoff_m).T_target_source @ T_a_b
