@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,10 @@ from ms_slam_env.env.config import make_config
 from ms_slam_env.env.coverage import CoverageGrid
 from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.env.episode_record import EpisodeRecord
+from ms_slam_env.env.frame_source import FrameSource
 from ms_slam_env.env.lookahead import Lookahead
 from ms_slam_env.env.observations import RobotKnowledge, make_observation
+from ms_slam_env.env.perturbed_frames import frames_with
 from ms_slam_env.env.pose_sources import POSE_SOURCES, Sighting, relative_motion
 from ms_slam_env.env.rendering import Renderer
 from ms_slam_env.env.reward import Outcome, reward_terms
@@ -122,6 +125,7 @@ class ActiveSlamEnv(EpisodeRecord):
         self.action_space = spaces.Discrete(num_actions)
         self._observation = make_observation(self.config.observation, self.intrinsics, num_actions)
         self.observation_space = self._observation.space
+        self.frames: FrameSource = frames_with(())
         self._renderer = Renderer()
         self._rays = self.intrinsics.rays()
         self._episode: EpisodeState | None = None
@@ -236,11 +240,12 @@ class ActiveSlamEnv(EpisodeRecord):
     def save_state(self) -> dict[str, Any]:
         """Everything needed to go on bit-exactly (the time limit's counter excepted)."""
         return {
-            "settings": self.config.of_state(self._options["embodiment"]),
+            "settings": self._settings(),
             "episode": self._current().copy(),
             "slam": self.slam.get_state(),
             "embodiment": self.embodiment.get_state(),
             "coverage": self.coverage.get_state(),
+            "frames": self.frames.get_state(),
             "T_world_kinematic": self._T_world_kinematic.copy(),
             "random": self.np_random.bit_generator.state,
         }
@@ -251,15 +256,21 @@ class ActiveSlamEnv(EpisodeRecord):
         Raises:
             InputError: options that shape the state differ; the environment is as it was.
         """
-        check_same_settings(state["settings"], self.config.of_state(self._options["embodiment"]))
+        check_same_settings(state["settings"], self._settings())
         episode: EpisodeState = state["episode"]
         self._enter_scene(episode.scene, episode.scene_seed)
         self._episode = episode.copy()
         self.slam.set_state(state["slam"])
         self.embodiment.set_state(state["embodiment"])
         self.coverage.set_state(state["coverage"])
+        self.frames.set_state(state["frames"], self.scene, self.sensor, episode.truth[0])
         self._T_world_kinematic = state["T_world_kinematic"].copy()
         self.np_random.bit_generator.state = state["random"]
+
+    def _settings(self) -> dict[str, Any]:
+        """What two environments must have in common to go on from one state."""
+        settings = self.config.of_state(self._options["embodiment"])
+        return {**settings, "perturbations": self.frames.perturbations}
 
     # -- The world ---------------------------------------------------------------------------
 
@@ -284,6 +295,10 @@ class ActiveSlamEnv(EpisodeRecord):
         )
         self.coverage = CoverageGrid(self.scene)
         here = self.embodiment.T_world_camera
+        try:
+            self.frames.begin(self.scene, self.sensor, here, self._episode.noise_seed)
+        except InputError as error:
+            return str(error)
         self.slam.reset(here)
         self._observe(here, here, timestamp=0.0)
         self._current().end_step(np.zeros(2), 0.0)
@@ -296,6 +311,10 @@ class ActiveSlamEnv(EpisodeRecord):
         """Take and track the frames of a motion; return the newly mapped area, m2."""
         episode = self._current()
         begin = episode.time_s
+        self.frames.set_out(
+            np.concatenate([[begin], begin + movement.times_s]),
+            np.concatenate([episode.truth[-1][None], movement.T_world_camera]),
+        )
         area = 0.0
         for T_true, T_kinematic, after in zip(
             movement.T_world_camera,
@@ -316,12 +335,10 @@ class ActiveSlamEnv(EpisodeRecord):
         """Render, track, measure and judge one frame; return the newly mapped area, m2."""
         episode = self._current()
         with self.timings.stage("render"):
-            frame = self.sensor.capture(
-                T_true, index=episode.frame_index, timestamp=timestamp, seed=episode.noise_seed
-            )
+            frame = self.frames.take(T_true, episode.frame_index, timestamp)
         first = not episode.truth
         sighting = Sighting(
-            frame=frame,
+            frame=frame or replace(episode.last_frame, timestamp=timestamp),
             T_world_camera=T_true,
             T_world_camera_kinematic=T_kinematic,
             T_previous_camera_kinematic=relative_motion(
@@ -329,6 +346,12 @@ class ActiveSlamEnv(EpisodeRecord):
             ),
             T_world_previous_estimate=T_true if first else episode.estimates[-1],
         )
+        if frame is None:
+            unseen = self._pose_source.pass_by(
+                sighting, episode.tracking_ok, episode.inlier_fraction
+            )
+            episode.record(sighting, unseen, np.zeros(2))
+            return 0.0
         with self.timings.stage("slam"):
             if first:
                 result = self.slam.track(frame)
@@ -342,7 +365,7 @@ class ActiveSlamEnv(EpisodeRecord):
         with self.timings.stage("coverage"):
             area = 0.0
             if result.tracking_ok and result.processed:
-                seen = frame.depth, self.sensor.last_true_depth()
+                seen = frame.depth, self.frames.true_depth()
                 area = self.coverage.see(*seen, self._rays, T_true, result.T_world_camera)
         episode.record(sighting, result, divergence)
         return area
@@ -357,11 +380,16 @@ class ActiveSlamEnv(EpisodeRecord):
     def __getstate__(self) -> dict[str, Any]:
         """Options and, once reset, the episode: device arrays are made anew."""
         state = None if self._episode is None else self.save_state()
-        return {"options": self._options, "state": state}
+        return {
+            "options": self._options,
+            "perturbations": self.frames.perturbations,
+            "state": state,
+        }
 
     def __setstate__(self, pickled: dict[str, Any]) -> None:
         """Build the environment anew and go on from where the pickled one was."""
         self.__init__(**pickled["options"])  # type: ignore[misc]
+        self.frames = frames_with(pickled["perturbations"])
         if pickled["state"] is not None:
             self.load_state(pickled["state"])
 

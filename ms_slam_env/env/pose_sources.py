@@ -41,6 +41,15 @@ class PoseSource(ABC):
     def locate(self, slam: SlamBackend, sighting: Sighting) -> TrackResult:
         """Estimate the pose of a frame that is not the first."""
 
+    def pass_by(self, sighting: Sighting, tracking_ok: bool, inlier_fraction: float) -> TrackResult:
+        """What is known at a moment whose frame was not delivered; nothing is tracked or fused."""
+        pose = self.without_frame(sighting)
+        return TrackResult(pose, tracking_ok, inlier_fraction=inlier_fraction, processed=False)
+
+    def without_frame(self, sighting: Sighting) -> Float64:
+        """T_world_camera (4, 4) at a moment whose frame was not delivered: where it last was."""
+        return sighting.T_world_previous_estimate
+
 
 class SlamPose(PoseSource):
     """SLAM tracks the frame; it knows nothing of joints."""
@@ -55,8 +64,11 @@ class GuessedSlamPose(PoseSource):
 
     def locate(self, slam: SlamBackend, sighting: Sighting) -> TrackResult:
         """Track from the last estimate, moved as the joints moved."""
-        guess = sighting.T_world_previous_estimate @ sighting.T_previous_camera_kinematic
-        return slam.track(sighting.frame, guess)
+        return slam.track(sighting.frame, self.without_frame(sighting))
+
+    def without_frame(self, sighting: Sighting) -> Float64:
+        """The last estimate, moved as the joints moved."""
+        return sighting.T_world_previous_estimate @ sighting.T_previous_camera_kinematic
 
 
 class KinematicPose(PoseSource):
@@ -66,6 +78,10 @@ class KinematicPose(PoseSource):
         """Fuse at the kinematic pose."""
         return slam.fuse(sighting.frame, sighting.T_world_camera_kinematic)
 
+    def without_frame(self, sighting: Sighting) -> Float64:
+        """The kinematic pose."""
+        return sighting.T_world_camera_kinematic
+
 
 class TruePose(PoseSource):
     """The true pose: what a perfect tracker would leave to mapping."""
@@ -73,6 +89,10 @@ class TruePose(PoseSource):
     def locate(self, slam: SlamBackend, sighting: Sighting) -> TrackResult:
         """Fuse at the true pose."""
         return slam.fuse(sighting.frame, sighting.T_world_camera)
+
+    def without_frame(self, sighting: Sighting) -> Float64:
+        """The true pose."""
+        return sighting.T_world_camera
 
 
 def relative_motion(T_world_a: Float64, T_world_b: Float64) -> Float64:

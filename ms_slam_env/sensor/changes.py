@@ -45,6 +45,7 @@ class ChangingView:
         normal: unit normals, of a body's faces once for every pose of the image.
         plane: offsets of the faces' planes, likewise.
         exposure_factor: on the exposure of the next image.
+        first_face: of the bodies' in the joined mesh.
     """
 
     def __init__(
@@ -64,7 +65,7 @@ class ChangingView:
         self._is_cpu = device == "cpu"
         poses = -(-int(camera.height) // int(camera.rows))
         first = len(mesh.faces) - sum(len(body.mesh.faces) for body in bodies)
-        self._first, self._moving_faces = first, len(mesh.faces) - first
+        self.first_face, self._moving_faces = first, len(mesh.faces) - first
         self._bodies: list[BodyCast] = []
         at = first
         for body, caster in zip(bodies, casters, strict=True):
@@ -143,7 +144,7 @@ class ChangingView:
 
     def _add_light(self, light: ChangingLight, time_s: float) -> None:
         """Add light to the faces in sight; those of the last image lose theirs."""
-        static = self._lit[self._lit < self._first]
+        static = self._lit[self._lit < self.first_face]
         irradiance = self.surfaces.irradiance.numpy()
         irradiance[static] = self._mesh.irradiance[static]
         seen = np.unique(self._hits.face.numpy())

@@ -189,9 +189,13 @@ class Images:
         self._shade_ideal.launch()
         return self._color.numpy().reshape(*self._shape, 3)
 
-    def true_depth(self) -> NDArray[np.float32]:
-        """True depth (B, H, W) of the last capture, metres; 0 = no surface."""
-        depth = np.where(self._hits.face.numpy() >= 0, self._hits.t.numpy(), np.float32(0))
+    def true_depth(self, moving: bool = True) -> NDArray[np.float32]:
+        """True depth (B, H, W) of the last capture, metres; 0 = no surface, or a moving one."""
+        faces = self._hits.face.numpy()
+        is_surface = faces >= 0
+        if not moving and self._view is not None:
+            is_surface &= faces < self._view.first_face
+        depth = np.where(is_surface, self._hits.t.numpy(), np.float32(0))
         return depth.reshape(self._shape)
 
     def truth(

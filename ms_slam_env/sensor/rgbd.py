@@ -254,9 +254,15 @@ class RGBDSensor:
             check_pose(pose, "T_world_camera")
         return flat
 
-    def last_true_depth(self) -> NDArray[np.float32]:
+    @property
+    def caster(self) -> RayCaster:
+        """What finds the ray hits in the scene."""
+        return self._caster
+
+    def last_true_depth(self, moving: bool = True) -> NDArray[np.float32]:
         """True depth (H, W) of the frame that this thread captured last, metres; 0 = no surface.
 
+        Without ``moving`` bodies that move count as no surface.
         Costs no second ray cast. Other users of the same sensor in the same thread overwrite it.
 
         Raises:
@@ -264,7 +270,7 @@ class RGBDSensor:
         """
         if self._of_thread.last is None:
             raise InputError("the sensor has captured no frame yet")
-        return self._of_thread.last.true_depth()[-1]
+        return self._of_thread.last.true_depth(moving)[-1]
 
     def ground_truth(self, T_world_camera: ArrayLike, time_s: float = 0.0) -> TrueView:
         """Noise-free view from pose ``T_world_camera`` (4, 4) at ``time_s``.

@@ -1,0 +1,155 @@
+"""Frames with the imperfections of rendered sequences, taken while an agent moves the camera."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.camera import RGBDFrame
+from ms_slam_env.env.frame_source import FrameSource, SensorFrames
+from ms_slam_env.errors import InputError
+from ms_slam_env.scenes.base import Scene
+from ms_slam_env.sensor import RGBDSensor
+from ms_slam_env.sequences.perturbations.base import Perturbation
+from ms_slam_env.sequences.perturbations.moving import Mover
+from ms_slam_env.sequences.perturbed_camera import Imperfections, PerturbedCamera
+from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
+
+Float64 = NDArray[np.float64]
+
+_FRAMES_OF_AN_EPISODE = (
+    151  # one step each and the first: what runs over a whole sequence ends here
+)
+_NEAREST_M = 0.35  # nearer than this to the camera nothing comes by itself
+
+
+class PerturbedFrames(FrameSource):
+    """Applies perturbations to each frame, by the same rules as in a rendered sequence.
+
+    Between frames the camera moves as ``PoseInterpolation`` says from the frame before to the next
+    one of the same motion; after the last one the motion goes on. What moves through the scene
+    begins where the camera of the start can see it, and waits rather than bump into the camera.
+    """
+
+    def __init__(self, perturbations: tuple[Perturbation, ...]) -> None:
+        """Take the perturbations.
+
+        Raises:
+            InputError: one that changes how the camera moves, which is the agent's business.
+        """
+        self.perturbations = perturbations
+        self._imperfections = Imperfections.of(perturbations)
+        if self._imperfections.motion:
+            raise InputError(
+                "fast-motion changes a path that is known; in an environment the agent moves the "
+                "camera: make an id with FastMotion in its name, or give larger step_m and step_rad"
+            )
+        self._began: tuple[Any, ...] = ()
+        self._brightness: list[float] = []
+        self._movers: list[Mover] = []
+
+    def begin(
+        self, scene: Scene, sensor: RGBDSensor, T_world_camera: Float64, noise_seed: int
+    ) -> None:
+        """See the base class."""
+        self._enter(scene, sensor, T_world_camera, noise_seed)
+        self._brightness = []
+        for mover in self._movers:
+            mover.set_state([])
+
+    def _enter(self, scene: Scene, sensor: RGBDSensor, start: Float64, noise_seed: int) -> None:
+        """Put camera and moving things into the scene, unless they are there already."""
+        self._path = path = PoseInterpolation([0.0], start[None])
+        began = (scene.name, scene.seed, noise_seed, start.tobytes())
+        if began == self._began:
+            return
+        self._began = ()
+        self._seed = noise_seed
+        given = (scene, path, sensor.intrinsics, noise_seed)
+        self._movers = self._imperfections.movers(*given)
+        light = self._imperfections.changing_light(*given)
+        self._camera = PerturbedCamera(
+            scene,
+            sensor.intrinsics,
+            sensor.noise,
+            self._imperfections,
+            self._movers,
+            light,
+            sensor,
+            sensor.caster,
+        )
+        self._began = began
+
+    def set_out(self, times_s: Float64, poses: Float64) -> None:
+        """See the base class; what would come too near to the camera waits."""
+        self._path = PoseInterpolation(times_s, poses)
+        for k in range(1, len(times_s)):
+            here, before, now = poses[k : k + 1, :3, 3], times_s[k - 1], times_s[k]
+            for mover in self._movers:
+                if mover.distance(here, times_s[k : k + 1])[0] < _NEAREST_M:
+                    mover.wait(float(before), float(now - before))
+
+    def take(self, T_world_camera: Float64, index: int, time_s: float) -> RGBDFrame | None:
+        """See the base class."""
+        if not self._is_delivered(index):
+            return None
+        count = max(_FRAMES_OF_AN_EPISODE, index + 1)
+        return self._camera.take(
+            self._path,
+            time_s,
+            index,
+            count,
+            self._seed,
+            lambda: self._meter(T_world_camera, index, time_s),
+        )
+
+    def _is_delivered(self, index: int) -> bool:
+        """Whether a sequence of this frame and those before would keep it."""
+        kept = np.arange(index + 1)
+        for selection in self._imperfections.selection:
+            kept = kept[selection.keep(len(kept), self._seed)]
+            if kept[-1] != index:
+                return index == 0
+        return True
+
+    def _meter(self, T_world_camera: Float64, index: int, time_s: float) -> Float64:
+        """Mean intensity (index + 1,) of the frames so far; one not taken has that before it."""
+        if len(self._brightness) <= index:
+            now = self._camera.brightness(T_world_camera, time_s)
+            gap = index - len(self._brightness)
+            self._brightness += [self._brightness[-1] if self._brightness else now] * gap
+            self._brightness.append(now)
+        return np.array(self._brightness)
+
+    def true_depth(self) -> NDArray[np.float32]:
+        """See the base class."""
+        return self._camera.sensor.last_true_depth(moving=False)
+
+    @property
+    def movers(self) -> tuple[Mover, ...]:
+        """What moves through the scene, with its poses by time."""
+        return tuple(self._movers)
+
+    def get_state(self) -> dict[str, Any]:
+        """See the base class."""
+        return {
+            "noise_seed": self._seed,
+            "brightness": list(self._brightness),
+            "waits": [mover.get_state() for mover in self._movers],
+        }
+
+    def set_state(
+        self, state: dict[str, Any], scene: Scene, sensor: RGBDSensor, start: Float64
+    ) -> None:
+        """See the base class."""
+        self._enter(scene, sensor, start, state["noise_seed"])
+        self._brightness = list(state["brightness"])
+        for mover, waits in zip(self._movers, state["waits"], strict=True):
+            mover.set_state(waits)
+
+
+def frames_with(perturbations: tuple[Perturbation, ...]) -> FrameSource:
+    """Frames as the sensor takes them, with perturbations if there are any."""
+    return PerturbedFrames(perturbations) if perturbations else SensorFrames()
