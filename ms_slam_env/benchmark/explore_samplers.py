@@ -1,13 +1,14 @@
 """Do samplers that learn beat random ones? Hypervolume at equal numbers of trials.
 
-Every sampler explores the same space on the same sequences with several seeds, in turn, so that
-none has a quieter machine. Run as ``python -m ms_slam_env.benchmark.explore_samplers --help``;
-interrupted and called again, it goes on.
+Many studies of every sampler need many evaluations. So each proposal is moved to the nearest point
+of a grid, ten thousand points and more for seven parameters, and what has been measured at a point
+is not measured again: every study of every sampler then explores one and the same function. Run as
+``python -m ms_slam_env.benchmark.explore_samplers --help``; measurements are kept, and what is
+interrupted goes on from there.
 """
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -20,19 +21,30 @@ from tqdm import tqdm
 from ms_slam_env.benchmark.command_line import exit_code, parse
 from ms_slam_env.benchmark.explore_evaluation import SlamEvaluator
 from ms_slam_env.benchmark.explore_figures import hypervolume_figure
+from ms_slam_env.benchmark.explore_grid import Grid
 from ms_slam_env.benchmark.figures import save
 from ms_slam_env.benchmark.provenance import provenance
 from ms_slam_env.benchmark.records import write_json
 from ms_slam_env.benchmark.statistics import bootstrap_interval
 from ms_slam_env.benchmark.table import markdown_table
 from ms_slam_env.errors import InputError
-from ms_slam_env.exploration import ExplorationSettings, SearchSpace, explore, make_space
-from ms_slam_env.exploration.front import hypervolume_history, points_of
-from ms_slam_env.exploration.samplers import SAMPLERS
+from ms_slam_env.exploration import make_space
+from ms_slam_env.exploration.front import hypervolume
+from ms_slam_env.exploration.objectives import FAILURE, objective_values
+from ms_slam_env.exploration.samplers import SAMPLERS, make_sampler
 
 PROGRAM = "python -m ms_slam_env.benchmark.explore_samplers"
-BASELINE = "random"
-_AT_A_TIME = 20  # trials of one study before the next has its turn
+OBJECTIVES = ("ate_m", "load_ms")
+PARAMETERS = (
+    "depth_cutoff_m=1:10:log",
+    "icp_rgb_weight=0:1",
+    "iterations.0=0:10",
+    "points_per_level=500:16000:log",
+    "surfel_radius_px=0.5:2",
+    "unstable_window=10:400:log",
+    "keep_every=1:6",
+)
+_POPULATION = 10  # of NSGA-II: several generations within a budget of tens
 
 
 @dataclass(frozen=True)
@@ -41,60 +53,79 @@ class Arguments:
 
     samplers: tuple[str, ...] = tuple(SAMPLERS)
     """random, nsga2, tpe, gp; the first is what the others are compared with."""
-    seeds: int = 5
+    seeds: int = 6
     """Studies of each sampler."""
     trials: int = 40
     """Finished trials of each study."""
     sequences: tuple[str, ...] = ("living_room:1000",)
     """Folders, or scene:seed[:noise[+perturbation ...]]."""
-    parameters: tuple[str, ...] = ("algorithm",)
-    """As of ms-slam explore."""
-    image_size: str = "80x60"
+    parameters: tuple[str, ...] = PARAMETERS
+    """As of ms-slam explore, with ranges."""
+    levels: int = 4
+    """Points of the grid along each parameter; a range of integers may hold fewer."""
+    image_size: str = "160x120"
     """Of the camera."""
-    frames: int = 40
+    frames: int = 48
     """Length of a rendered sequence."""
     reference_factor: float = 2.0
     """The hypervolume counts from so many times the default's figures."""
     out: Path = Path("results/explore_samplers")
-    """Folder of the studies and the results."""
+    """Folder of the measurements and the results."""
+
+
+def run_study(
+    grid: Grid, sampler: str, seed: int, trials: int, reference: Mapping[str, float]
+) -> list[float]:
+    """Explore in memory; return the hypervolume after every trial, as a share of the box."""
+    import optuna
+
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    study = optuna.create_study(
+        directions=["minimize"] * len(OBJECTIVES), sampler=make_sampler(sampler, seed, _POPULATION)
+    )
+    study.enqueue_trial(grid.space.defaults())
+    kept: list[list[float]] = []
+    history = []
+    for _ in range(trials):
+        trial = study.ask(grid.space.distributions())
+        measured = grid(trial.params)
+        values = objective_values(measured, OBJECTIVES, reference)
+        trial.set_constraint("failed", 1.0 if measured.get(FAILURE) else 0.0)
+        study.tell(trial, values)
+        if not measured.get(FAILURE):
+            kept.append([v / reference[n] for v, n in zip(values, OBJECTIVES, strict=True)])
+        history.append(hypervolume(kept, [1.0] * len(OBJECTIVES)))
+    return history
 
 
 def run(arguments: Arguments) -> str:
     """Explore, write ``samplers.json``, ``table.md``, ``hypervolume.png``; return the table."""
-    if arguments.seeds < 1 or arguments.trials < 1 or not arguments.samplers:
-        raise InputError("samplers, seeds and trials must be 1 or more")
+    if min(arguments.seeds, arguments.trials, len(arguments.samplers)) < 1 or arguments.levels < 2:
+        raise InputError("samplers, seeds and trials must be 1 or more, levels 2 or more")
     evaluator = SlamEvaluator(
         arguments.sequences, arguments.frames, image_size=arguments.image_size
     )
     space = make_space(arguments.parameters)
-    reference = _reference(evaluator, space, arguments)
+    grid = Grid(space, evaluator, arguments.levels, arguments.out / "evaluations.jsonl")
+    default = grid(space.defaults())
+    if default.get(FAILURE):
+        raise InputError(f"the default configuration failed: {default[FAILURE]}")
+    reference = {name: arguments.reference_factor * default[name] for name in OBJECTIVES}
     histories: dict[str, list[list[float]]] = {name: [] for name in arguments.samplers}
-    done = {}
-    total = len(arguments.samplers) * arguments.seeds * arguments.trials
-    with tqdm(total=total, unit="trial") as bar:
-        for seed in range(arguments.seeds):
-            budgets = [*range(_AT_A_TIME, arguments.trials, _AT_A_TIME), arguments.trials]
-            for budget in budgets:
-                for name in arguments.samplers:
-                    settings = ExplorationSettings(
-                        sampler=name,
-                        seed=seed,
-                        reference=reference,
-                        context=evaluator.context(),
-                    )
-                    folder = arguments.out / "studies" / f"{name}-{seed}"
-                    ledger = explore(folder, space, settings, evaluator, budget)
-                    done[name, seed] = budget
-                    bar.update(sum(done.values()) - bar.n)
-                    if budget == arguments.trials:
-                        points = points_of(ledger)
-                        history = hypervolume_history(points, reference, settings.objectives)
-                        histories[name].append([float(value) for value in history])
+    pairs = [(seed, name) for seed in range(arguments.seeds) for name in arguments.samplers]
+    for seed, name in tqdm(pairs, unit="study"):
+        histories[name].append(run_study(grid, name, seed, arguments.trials, reference))
     content = {
         "provenance": provenance(),
-        "config": {name: getattr(arguments, name) for name in Arguments.__dataclass_fields__}
-        | {"out": str(arguments.out), **asdict(evaluator)},
+        "config": {
+            **asdict(evaluator),
+            **asdict(arguments),
+            "out": str(arguments.out),
+            "grid": grid.levels,
+        },
         "reference": reference,
+        "points_measured": grid.measured,
+        "points_of_the_grid": grid.size,
         "summary": summarise(histories),
         "hypervolume": histories,
     }
@@ -105,26 +136,10 @@ def run(arguments: Arguments) -> str:
     return text
 
 
-def _reference(
-    evaluator: SlamEvaluator, space: SearchSpace, arguments: Arguments
-) -> dict[str, float]:
-    """One reference for every study: multiples of the default's figures, kept in a file."""
-    path = arguments.out / "reference.json"
-    if path.exists():
-        return dict(json.loads(path.read_text()))
-    runs = [evaluator(space.base) for _ in range(3)]
-    reference = {
-        name: arguments.reference_factor * float(np.median([row[name] for row in runs]))
-        for name in ExplorationSettings().objectives
-    }
-    write_json(path, reference)
-    return reference
-
-
 def summarise(histories: Mapping[str, Sequence[Sequence[float]]]) -> list[dict[str, Any]]:
     """A row a sampler: final and half-way hypervolume, and by how much it exceeds the first's.
 
-    Seeds are paired: studies of one seed have had the same machine at the same time.
+    Intervals are of the mean over the seeds, 95 %, bootstrapped; differences are of equal seeds.
     """
     baseline = np.array(next(iter(histories.values())))
     rows = []

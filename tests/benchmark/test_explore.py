@@ -11,12 +11,13 @@ from ms_slam_env.benchmark import compare_inputs, explore_evaluation, explore_sa
 from ms_slam_env.benchmark.explore import Exploration, run_exploration
 from ms_slam_env.benchmark.explore_divergence import main as divergence_main
 from ms_slam_env.benchmark.explore_evaluation import SlamEvaluator, summarise
+from ms_slam_env.benchmark.explore_grid import Grid
 from ms_slam_env.benchmark.explore_judge import judge
 from ms_slam_env.benchmark.sequence_divergence import sequence_divergence
 from ms_slam_env.camera import xtion
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
-from ms_slam_env.exploration import ExplorationSettings
+from ms_slam_env.exploration import ExplorationSettings, make_space
 from ms_slam_env.geometry import look_at
 from ms_slam_env.metrics import ate_rmse
 from ms_slam_env.metrics.cost import energy_counters
@@ -190,19 +191,43 @@ def test_samplers_are_compared_seed_by_seed():
     assert "2 of 2" in explore_samplers.table([random, tpe])
 
 
-def test_samplers_share_one_reference(sequences, tmp_path):
+def test_a_grid_measures_each_point_once(sequences, tmp_path):
+    space = make_space(["points_per_level=500:16000:log", "keep_every=1:4"])
+    evaluator = SlamEvaluator(sequences[:1], image_size="80x60")
+    grid = Grid(space, evaluator, 3, tmp_path / "evaluations.jsonl")
+    assert grid.levels == {"points_per_level": [500, 5000, 16000], "keep_every": [1, 2, 4]}
+    assert grid.size == 9
+    assert grid.nearest({"points_per_level": 1700, "keep_every": 3}) == {
+        "points_per_level": 5000,  # nearer in ratio, though not in difference
+        "keep_every": 2,
+    }
+    first = grid({"points_per_level": 4800, "keep_every": 4})
+    assert grid({"points_per_level": 5100, "keep_every": 4}) == first
+    assert grid.measured == 1
+    again = Grid(space, evaluator, 3, tmp_path / "evaluations.jsonl")
+    assert again({"points_per_level": 5000, "keep_every": 4}) == first
+    assert again.measured == 1
+    with pytest.raises(InputError, match="'image_size' has no order"):
+        Grid(make_space(["image_size"]), evaluator, 3, tmp_path / "other.jsonl")
+
+
+def test_samplers_explore_one_function(sequences, tmp_path):
     arguments = explore_samplers.Arguments(
-        ("random", "tpe"), 1, 2, sequences[:1], ("points_per_level",), out=tmp_path
+        ("random", "nsga2", "tpe"),
+        2,
+        4,
+        sequences[:1],
+        ("keep_every=1:3",),
+        image_size="80x60",
+        out=tmp_path,
     )
     explore_samplers.run(arguments)
-    first = json.loads((tmp_path / "samplers.json").read_text())
-    assert {name: len(runs[0]) for name, runs in first["hypervolume"].items()} == {
-        "random": 2,
-        "tpe": 2,
-    }
-    explore_samplers.run(arguments)  # nothing is done again
-    second = json.loads((tmp_path / "samplers.json").read_text())
-    assert second["hypervolume"] == first["hypervolume"]
+    content = json.loads((tmp_path / "samplers.json").read_text())
+    assert content["points_measured"] == content["points_of_the_grid"] == 3
+    for runs in content["hypervolume"].values():
+        assert np.shape(runs) == (2, 4)
+        assert np.all(np.diff(runs) >= 0)
+        assert runs[0][0] == runs[1][0] == pytest.approx(0.25)  # the default: half the reference
     assert (tmp_path / "hypervolume.png").stat().st_size > 0
 
 
