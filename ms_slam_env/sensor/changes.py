@@ -25,7 +25,13 @@ _LIFT_M = 0.006
 
 
 class ChangingLight(ABC):
-    """Light that changes over time."""
+    """Light that changes over time.
+
+    Attributes:
+        is_added: whether there is any beside the scene's own.
+    """
+
+    is_added: bool = True
 
     @abstractmethod
     def level(self, time_s: float) -> float:
@@ -97,7 +103,8 @@ class ChangingView:
             self._cast_bodies(T, times_s, middle)
         if self._light is not None:
             self.exposure_factor = float(self._light.level(middle))
-            self._add_light(self._light, middle)
+            if self._light.is_added:
+                self._add_light(self._light, middle)
 
     def _cast_bodies(self, T: Float64, times_s: Float64, middle: float) -> None:
         is_split = self.posed_face is not self._hits.face

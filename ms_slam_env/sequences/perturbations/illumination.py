@@ -133,6 +133,7 @@ class LampsAndDimmer(ChangingLight):
     ) -> None:
         """Begin at ``start_s`` in full light."""
         self._dim, self._period, self._start, self._lamp = dim, period_s, start_s, lamp
+        self.is_added = lamp is not None
 
     def level(self, time_s: float) -> float:
         """See the base class."""

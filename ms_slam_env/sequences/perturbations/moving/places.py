@@ -24,7 +24,7 @@ _FLAT_M = 0.06  # the ground may rise or fall by so much along a way, rugs and k
 _TURN_RAD_S = np.radians(120.0)
 _HALF_WIDTH_M = (0.08, 0.25)
 _WAYS_A_PLACE = (4, 40)  # fewest and most; the more, the fewer places are free
-_AROUND_M = 6.0  # of the camera: there the floor is looked for
+_AROUND_M = 6.0  # of the camera: there floor and room are looked for
 _SOUNDINGS = 400
 _LANE_STEP_M = 0.25
 _LONGEST_M = {"box": 1.5, "person": 3.0, "car": 40.0}  # from the middle of the way to its end
@@ -62,15 +62,20 @@ class Places:
 
     def _ground(self) -> float:
         """Height of the floor: nearly the lowest of what lies beneath free places."""
-        low, high = self._scene.mesh.vertices.min(0), self._scene.mesh.vertices.max(0)
         near = self._camera[:, :3, 3]
-        low[:2] = np.maximum(low[:2], near[:, :2].min(0) - _AROUND_M)
-        high[:2] = np.minimum(high[:2], near[:, :2].max(0) + _AROUND_M)
-        places = np.concatenate([near, self._rng.uniform(low, high, (_SOUNDINGS, 3))])
+        places = np.concatenate([near, self._rng.uniform(*self._around(), (_SOUNDINGS, 3))])
         free = places[self._scene.clearance(places) > 0.1]
         reach, _ = self._rays.first_hit(free, np.broadcast_to([0.0, 0.0, -1.0], free.shape))
         heights = (free[:, 2] - reach)[np.isfinite(reach)]
         return float(np.percentile(heights, 5)) if len(heights) else 0.0
+
+    def _around(self) -> tuple[Float64, Float64]:
+        """Least and greatest corner (3,) of the scene, as far as it is near the camera's path."""
+        low, high = self._scene.bounds()
+        near = self._camera[:, :2, 3]
+        low[:2] = np.maximum(low[:2], near.min(0) - _AROUND_M)
+        high[:2] = np.minimum(high[:2], near.max(0) + _AROUND_M)
+        return low, high
 
     def _points_in_view(self, kind: str, count: int) -> Float64:
         """Points (count, 3) in front of the camera's poses; of walkers and cars on the ground."""
@@ -81,7 +86,9 @@ class Places:
         y = (rng.uniform(0.2, 0.8, count) * K.height - K.cy) / K.fy
         local = np.stack([x * z, y * z, z], -1)
         points = np.einsum("kij,kj->ki", T[:, :3, :3], local) + T[:, :3, 3]
-        if kind != "box":
+        if kind != "box":  # where there is little room it may also begin out of sight
+            anywhere = count // 3
+            points[:anywhere] = rng.uniform(*self._around(), (anywhere, 3))
             points[:, 2] = self._ground_z
         return points
 
