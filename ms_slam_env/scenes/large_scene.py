@@ -14,9 +14,9 @@ from ms_slam_env.scenes.sampling import sample_surface
 SKY = "sky"
 """Label of the dome that stands for the sky: beyond any range, no surface, no obstacle."""
 
-_VOXEL_M = 0.18
+_VOXEL_M = 0.2
 _MOST_POINTS = 3_000_000
-_FINENESS = 0.4  # distance between samples of the surface, in voxels
+_FINENESS = 0.45  # distance between samples of the surface, in voxels
 
 
 class LargeScene(MeshScene):
@@ -94,7 +94,9 @@ def solid_faces(mesh: TexturedMesh) -> Int32:
 
 def _free_space(mesh: TexturedMesh, solid: Int32, inside: Float64, lid_m: float) -> FreeSpace:
     """Free space below a lid at height ``lid_m``, which keeps the insides of houses apart."""
-    points, _ = sample_surface(mesh.vertices, mesh.faces[solid], _FINENESS * _VOXEL_M)
+    faces = mesh.faces[solid]
+    below = mesh.vertices[faces, 2].min(axis=1) < lid_m
+    points, _ = sample_surface(mesh.vertices, faces[below], _FINENESS * _VOXEL_M)
     points = points[points[:, 2] < lid_m]
     low, high = points.min(0), points.max(0)
     step = _FINENESS * _VOXEL_M
