@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.benchmark import difficulty_report as report
 from ms_slam_env.benchmark.command_line import exit_code, parse, report_failures
+from ms_slam_env.benchmark.difficulty_report import RECORDING
 from ms_slam_env.benchmark.image_motion import MOTIONS, contrast, frame_motion
 from ms_slam_env.benchmark.provenance import provenance
 from ms_slam_env.benchmark.records import write_json
@@ -41,9 +42,6 @@ Float64 = NDArray[np.float64]
 PROGRAM = "python -m ms_slam_env.benchmark.difficulty"
 SETTINGS = {"paper": DivergenceConfig.paper(), "default": DivergenceConfig()}
 ICL_NUIM = Intrinsics(fx=481.2, fy=480.0, cx=319.5, cy=239.5, width=640, height=480)
-RECORDING = "recorded depth"
-"""Scene of a row that was recorded, not rendered."""
-
 _TRAJECTORY = "icl_nuim/trajectories/{}.tum.txt"
 _DEPTH = "icl_nuim/lr_kt3_depth"
 

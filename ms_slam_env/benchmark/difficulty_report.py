@@ -31,6 +31,9 @@ PAPER = {
 }
 """Table I of the paper: max, mean and "variance" of the intensity divergence."""
 
+RECORDING = "recorded depth"
+"""Scene of a row that was recorded, not rendered."""
+
 _STATISTICS = ("max", "mean", "variance", "std", "max_per_s", "mean_per_s", "std_per_s")
 _SMOOTH_S = 1.0  # window of the lines in the figure
 
@@ -39,10 +42,11 @@ def statistics(rows: Sequence[Row]) -> Found:
     """Of every motion in a scene, setting and kind: the statistics, averaged over its places.
 
     ``places`` tells over how many; the quantities in ``MOTIONS``, ``contrast`` and ``depth_m``
-    are averaged likewise.
+    are averaged likewise. Of a motion that was also recorded there is a second entry, over as many
+    frames as the recording has.
     """
     found = []
-    for (scene, noise, motion), group in _by_sequence(rows).items():
+    for (scene, noise, motion), group in _by_sequence([*rows, *_as_recorded(rows)]).items():
         results = [row["result"] for row in group]
         moving = {name: _mean([np.mean(r["motion"][name]) for r in results]) for name in MOTIONS}
         seen = {name: _mean([r[name] for r in results]) for name in ("contrast", "depth_m")}
@@ -127,16 +131,16 @@ def correlations(rows: Sequence[Row]) -> Found:
                     for _, r in results
                 ]
                 entry[f"frames_{name}"] = float(np.median(single))
+                of_motions = [[r for motion, r in results if motion == wanted] for wanted in names]
                 means = np.array(
                     [
                         [
-                            [np.mean(_values(r, setting, column)), np.mean(r["motion"][name])]
-                            for m, r in results
-                            if m == motion
+                            np.mean([np.mean(_values(r, setting, column)) for r in group]),
+                            np.mean([np.mean(r["motion"][name]) for r in group]),
                         ]
-                        for motion in names
+                        for group in of_motions
                     ]
-                ).mean(axis=1)
+                )
                 enough = len(names) > 2
                 entry[f"motions_{name}"] = _rank_correlation(*means.T) if enough else None
             found.append(entry)
@@ -208,6 +212,30 @@ def _by_sequence(rows: Sequence[Row]) -> dict[tuple[str, str, str], list[Row]]:
         spec = row["spec"]
         grouped.setdefault((spec["scene"], spec["noise"], spec["motion"]), []).append(row)
     return grouped
+
+
+def _as_recorded(rows: Sequence[Row]) -> list[Row]:
+    """Rows of the motions that were recorded too, cut to the recording's length."""
+    recorded = {
+        row["spec"]["motion"]: len(row["result"]["gaps_s"])
+        for row in rows
+        if row["spec"]["scene"] == RECORDING
+    }
+    cut_rows = []
+    for row in rows:
+        spec, result = row["spec"], row["result"]
+        count = recorded.get(spec["motion"], len(result["gaps_s"]))
+        if spec["scene"] == RECORDING or count >= len(result["gaps_s"]):
+            continue
+        cut = {
+            **result,
+            **{name: result[name][:count] for name in ("times_s", "gaps_s")},
+            "divergences": {k: v[:count] for k, v in result["divergences"].items()},
+            "motion": {k: v[:count] for k, v in result["motion"].items()},
+        }
+        motion = f"{spec['motion']}, first {count + 1} frames"
+        cut_rows.append({"spec": {**spec, "motion": motion}, "result": cut})
+    return cut_rows
 
 
 def _values(result: dict[str, Any], setting: str, column: int) -> Float64:

@@ -12,7 +12,7 @@ from ms_slam_env.geometry import invert, relative_angle, transform_points
 
 Float64 = NDArray[np.float64]
 
-MOTIONS = ("turn_deg_s", "speed_m_s", "image_motion_deg_s", "left_view_share_per_s")
+MOTIONS = ("turn_deg_s", "speed_m_s", "image_motion_deg_s")
 """Columns of `frame_motion`."""
 
 _PIXELS_ACROSS = 40  # of the grid of points that are followed
@@ -21,12 +21,11 @@ _PIXELS_ACROSS = 40  # of the grid of points that are followed
 def frame_motion(
     frame: RGBDFrame, T_world_camera: Float64, T_world_next: Float64, K: Intrinsics, gap_s: float
 ) -> Float64:
-    """How fast the camera and its image move from a frame to the next, (4,) as in ``MOTIONS``.
+    """How fast the camera and its image move from a frame to the next, (3,) as in ``MOTIONS``.
 
     ``turn_deg_s`` and ``speed_m_s`` are the camera's; ``image_motion_deg_s`` is the mean angle by
-    which the surface points of the frame move in the camera's view, and ``left_view_share_per_s``
-    the share of them that leave it, both per second. The latter two depend on the distance of
-    what is seen, the former do not; without a depth reading they are NaN.
+    which the surface points of the frame move in the camera's view, which depends on how far away
+    they are; without a depth reading it is NaN.
 
     Args:
         frame: with depth.
@@ -38,15 +37,14 @@ def frame_motion(
     T_next_camera = invert(T_world_next) @ T_world_camera
     turn_deg = np.degrees(relative_angle(np.eye(3), T_next_camera[:3, :3]))
     distance_m = np.linalg.norm(T_world_next[:3, 3] - T_world_camera[:3, 3])
-    moved_deg, left = np.nan, np.nan
+    moved_deg = np.nan
     step = max(1, K.width // _PIXELS_ACROSS)
     depth = frame.depth[::step, ::step]
     rays = _rays(K, step)[depth > 0]
     if len(rays):
         points = transform_points(T_next_camera, rays * depth[depth > 0][:, None])
         moved_deg = np.degrees(_angles(rays, points).mean())
-        left = 1.0 - _is_in_view(points, K).mean()
-    return np.array([turn_deg, distance_m, moved_deg, left]) / gap_s
+    return np.array([turn_deg, distance_m, moved_deg]) / gap_s
 
 
 def contrast(frame: RGBDFrame) -> float:
@@ -62,11 +60,3 @@ def _rays(K: Intrinsics, step: int) -> Float64:
 def _angles(a: Float64, b: Float64) -> Float64:
     """Angles (N,) in radians between directions (N, 3)."""
     return np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(axis=1))
-
-
-def _is_in_view(points: Float64, K: Intrinsics) -> NDArray[np.bool_]:
-    """Which points (N, 3) of the camera frame the image shows."""
-    ahead = points[:, 2] > 1e-6
-    u, v = K.project(np.where(ahead[:, None], points, 1.0)).T
-    inside = (u >= -0.5) & (u < K.width - 0.5) & (v >= -0.5) & (v < K.height - 0.5)
-    return ahead & inside
