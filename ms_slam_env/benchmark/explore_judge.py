@@ -16,7 +16,7 @@ from ms_slam_env.exploration.objectives import FAILURE
 from ms_slam_env.slam.configuration import SlamConfiguration
 
 DEFAULT = "default"
-_FIGURES = ("ate_m", "ext_ms")
+FIGURES = ("ate_m", "ext_ms", "load_ms")
 
 
 @dataclass(frozen=True)
@@ -39,10 +39,10 @@ def judge(
     Runs that are on disk already are not repeated.
 
     Returns:
-        a row for each configuration: ``ate_m``, ``ext_ms`` (means over the sequences),
-        ``ate_ratio`` and ``ext_ratio`` of these to the default's with ``_low`` and ``_high`` of the
-        95 % bootstrap interval over the sequences, ``failed`` (number of sequences), ``sequences``.
-        Sequences on which either failed have no part in a ratio.
+        a row for each configuration: ``ate_m``, ``ext_ms``, ``load_ms`` (means over the sequences),
+        ``ate_m_ratio`` and so on of these to the default's with ``_low`` and ``_high`` of the 95 %
+        bootstrap interval over the sequences, ``failed`` (number of sequences), ``sequences``.
+        Sequences on which either failed have no part in means and ratios.
     """
     records = RecordFile(out / "held_out.jsonl")
     done = records.load()
@@ -67,16 +67,15 @@ def _summary(name: str, own: Sequence[Row], default: Sequence[Row]) -> dict[str,
         "sequences": len(own),
         "failed": sum(not _usable(row) for row in own),
     }
-    for figure in _FIGURES:
+    for figure in FIGURES:
         mine = np.array([row[figure] for row, _ in pairs])
         theirs = np.array([row[figure] for _, row in pairs])
         ratio = bootstrap_interval((mine, theirs), _ratio_of_means)
-        short = figure.split("_")[0]
         result |= {
             figure: float(mine.mean()) if len(mine) else None,
-            f"{short}_ratio": ratio.value,
-            f"{short}_ratio_low": ratio.low,
-            f"{short}_ratio_high": ratio.high,
+            f"{figure}_ratio": ratio.value,
+            f"{figure}_ratio_low": ratio.low,
+            f"{figure}_ratio_high": ratio.high,
         }
     return result
 
@@ -86,4 +85,4 @@ def _ratio_of_means(x: Any, y: Any, axis: int) -> Any:
 
 
 def _usable(row: Row) -> bool:
-    return not row.get(FAILURE) and all(row.get(figure) is not None for figure in _FIGURES)
+    return not row.get(FAILURE) and all(row.get(figure) is not None for figure in FIGURES)

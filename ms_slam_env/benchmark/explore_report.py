@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from ms_slam_env.benchmark.explore_judge import FIGURES
 from ms_slam_env.benchmark.table import format_number, markdown_table
 from ms_slam_env.exploration.objectives import METRICS
 
@@ -65,28 +66,16 @@ def _configurations(content: Mapping[str, Any]) -> str:
 def _held_out(rows: Sequence[Mapping[str, Any]]) -> str:
     if not rows:
         return ""
-    header = [
-        "held-out sequences",
-        "ATE [mm]",
-        "of default's",
-        "EXT [ms]",
-        "of default's",
-        "failed",
-    ]
-    return markdown_table(
-        header,
-        [
-            [
-                row["configuration"].replace("_", " "),
-                "-" if row["ate_m"] is None else format_number(1e3 * row["ate_m"], 3),
-                _ratio(row, "ate"),
-                _number(row["ext_ms"]),
-                _ratio(row, "ext"),
-                f"{row['failed']} of {row['sequences']}",
-            ]
-            for row in rows
-        ],
-    )
+    header = ["held-out sequences"]
+    for name in FIGURES:
+        header += [METRICS[name].label, "of default's"]
+    body = []
+    for row in rows:
+        cells = [row["configuration"].replace("_", " ")]
+        for name in FIGURES:
+            cells += [_number(row[name]), _ratio(row, name)]
+        body.append([*cells, f"{row['failed']} of {row['sequences']}"])
+    return markdown_table([*header, "failed"], body)
 
 
 def _importance(importance: Mapping[str, Mapping[str, float]]) -> str:

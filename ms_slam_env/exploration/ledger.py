@@ -127,9 +127,13 @@ class Ledger:
     # -- Inside ------------------------------------------------------------------------------
 
     def _open(self) -> Study:
-        import optuna
-        from optuna.storages import RDBStorage
-
+        try:
+            import optuna
+            from optuna.storages import RDBStorage
+        except ImportError:
+            raise InputError(
+                "exploration needs Optuna: pip install 'ms-slam-env[explore]'"
+            ) from None
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         try:
             storage = RDBStorage(

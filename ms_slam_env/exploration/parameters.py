@@ -25,6 +25,10 @@ class Parameter(ABC):
         """Whether ``value`` is one of them."""
 
     @abstractmethod
+    def ends(self) -> tuple[Any, ...]:
+        """The extreme values, or all where there is no order."""
+
+    @abstractmethod
     def __str__(self) -> str:
         """The values in words."""
 
@@ -45,6 +49,10 @@ class _Range(Parameter):
         """Refuse what holds no values."""
         if not self.low < self.high or (self.log and not self.low > 0):
             raise InputError(f"range {self.low}:{self.high} holds no values")
+
+    def ends(self) -> tuple[Any, ...]:
+        """The extreme values."""
+        return self.low, self.high
 
     def __str__(self) -> str:
         return f"{self.low:g} to {self.high:g}" + (", logarithmic" if self.log else "")
@@ -104,6 +112,10 @@ class Choice(Parameter):
     def contains(self, value: Any) -> bool:
         """Whether ``value`` is one of them."""
         return value in self.values
+
+    def ends(self) -> tuple[Any, ...]:
+        """All values."""
+        return self.values
 
     def __str__(self) -> str:
         return ", ".join(map(str, self.values))

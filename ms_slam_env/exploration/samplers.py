@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.util
 import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING
+
+from ms_slam_env.errors import InputError
 
 if TYPE_CHECKING:
     from optuna.samplers import BaseSampler
@@ -47,9 +50,15 @@ SAMPLERS: dict[str, Callable[[int, int], BaseSampler]] = {
 
 
 def make_sampler(name: str, seed: int, population: int) -> BaseSampler:
-    """Make the sampler ``name``."""
+    """Make the sampler ``name``.
+
+    Raises:
+        InputError: its library is not installed.
+    """
     from optuna.exceptions import ExperimentalWarning
 
+    if name == "gp" and importlib.util.find_spec("torch") is None:
+        raise InputError("sampler gp needs PyTorch: pip install 'ms-slam-env[explore]'")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ExperimentalWarning)
         return SAMPLERS[name](seed, population)

@@ -72,8 +72,8 @@ class SearchSpace:
     (``iterations.0``), or ``image_size``, ``keep_every`` and ``threads`` of the configuration.
 
     Raises:
-        InputError: no parameter, one that the backend does not have, or one whose range does not
-            hold the value that it starts from.
+        InputError: no parameter, one that the backend does not have, one whose range does not hold
+            the value that it starts from, or a value that the backend refuses.
     """
 
     parameters: Mapping[str, Parameter]
@@ -89,6 +89,9 @@ class SearchSpace:
                     f"parameter {name!r} starts at {value!r}, which is not one of "
                     f"{self.parameters[name]}"
                 )
+        for name, parameter in self.parameters.items():
+            for value in parameter.ends():
+                self.configuration({name: value})
 
     def defaults(self) -> dict[str, Any]:
         """The value of each parameter that the exploration starts from."""

@@ -124,7 +124,7 @@ def test_results_on_disk(explored):
     assert content["provenance"]["command"]
     assert all(trial["M_I"] > 0 for trial in content["trials"])
     assert {row["configuration"] for row in content["held_out"]} >= {"default", "knee"}
-    assert content["held_out"][0]["ate_ratio"] == 1.0
+    assert content["held_out"][0]["ate_m_ratio"] == 1.0
     for name in ("pareto.png", "hypervolume.png", "table.md", "study.db"):
         assert (out / name).stat().st_size > 0
     assert "4 finished trials" in table
@@ -160,7 +160,8 @@ def test_held_out_ratios(tmp_path, monkeypatch):
     def measure(self, configuration, sequence):
         ate, ext = figures[configuration.slam_config["depth_cutoff_m"]]
         failure = {"failure": "lost"} if ate == 0.5 else {}
-        return {"ate_m": ate * (2 if sequence.endswith("1") else 1), "ext_ms": ext, **failure}
+        ate *= 2 if sequence.endswith("1") else 1
+        return {"ate_m": ate, "ext_ms": ext, "load_ms": ext / 2, **failure}
 
     monkeypatch.setattr(SlamEvaluator, "measure", measure)
     configurations = {
@@ -170,10 +171,10 @@ def test_held_out_ratios(tmp_path, monkeypatch):
     evaluator = SlamEvaluator(("table:0",))
     rows = judge(evaluator, configurations, ("table:1", "table:2"), tmp_path)
     default, fastest, knee = rows
-    assert (default["ate_ratio"], default["ext_ratio"]) == (1.0, 1.0)
+    assert (default["ate_m_ratio"], default["ext_ms_ratio"]) == (1.0, 1.0)
     assert (fastest["ate_m"], fastest["ext_ms"]) == (pytest.approx(0.015), 2.0)
-    assert fastest["ate_ratio"] == pytest.approx(0.5)
-    assert fastest["ext_ratio_low"] == fastest["ext_ratio_high"] == pytest.approx(0.25)
+    assert fastest["ate_m_ratio"] == pytest.approx(0.5)
+    assert fastest["ext_ms_ratio_low"] == fastest["ext_ms_ratio_high"] == pytest.approx(0.25)
     assert (knee["failed"], knee["ate_m"]) == (2, None)
     assert judge(evaluator, configurations, (), tmp_path) == []
 
