@@ -79,7 +79,7 @@ class Imperfections:
         """
         movers: list[Mover] = []
         for perturbation in self.world:
-            movers += perturbation.populate(scene, path, intrinsics, seed)
+            movers += perturbation.populate(scene, path, intrinsics, seed, tuple(movers))
         names = [mover.name for mover in movers]
         if len(set(names)) < len(names):
             raise InputError("two moving-objects of one kind: give it once, with a larger count")

@@ -24,7 +24,9 @@ from ms_slam_env.sequences import (
     render_sequence,
 )
 from ms_slam_env.sequences.perturbations.illumination import WanderingLamp
+from ms_slam_env.sequences.perturbations.moving import bodies_of
 from ms_slam_env.sequences.perturbations.moving.tracks import round_track, straight_track
+from ms_slam_env.sequences.perturbed_camera import Imperfections
 from ms_slam_env.sequences.writing import write_sequence
 
 K = xtion("80x60")
@@ -98,11 +100,14 @@ def test_ways_keep_clear(box_scene: BoxScene, path, kind, count) -> None:
     movers = moving.populate(box_scene, camera, K, seed=4)
     times = np.arange(0.0, 20.0, 0.05)
     for mover in movers:
-        points = np.concatenate([mover.outline(times).reshape(-1, 3), mover.middle(times)])
-        assert (points > ROOM_LOW).all()
-        assert (points < ROOM_HIGH).all()
-        for low, high in BOXES:
-            assert not ((points > low) & (points < high)).all(axis=1).any()
+        for body in bodies_of([mover], box_scene):
+            T = body.pose(times[::8])
+            points = body.mesh.vertices[::9] @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
+            points = points.reshape(-1, 3)
+            assert (points > ROOM_LOW - 0.02).all()  # soles, which swing
+            assert (points < ROOM_HIGH).all()
+            for low, high in BOXES:
+                assert not ((points > low) & (points < high)).all(axis=1).any()
         steps = np.linalg.norm(np.diff(mover.middle(times), axis=0), axis=1)
         assert 0.5 * 0.05 < steps.max() < 1.02 * 0.05
         assert mover.distance(path[:, :3, 3], camera.times_s).min() > 0.3
@@ -110,6 +115,16 @@ def test_ways_keep_clear(box_scene: BoxScene, path, kind, count) -> None:
         for b in movers:
             if a is not b:
                 assert all((a.distance(p, times) > 0.1).all() for p in b.outline(times))
+
+
+def test_kinds_keep_clear_of_each_other(box_scene, path) -> None:
+    both = Imperfections.of([MovingObjects("person", 1), MovingObjects("box", 2)])
+    camera = PoseInterpolation(np.arange(FRAMES) / 30, path)
+    movers = both.movers(box_scene, camera, K, seed=4)
+    assert [mover.name for mover in movers] == ["person 0", "box 0", "box 1"]
+    times = np.arange(0.0, 20.0, 0.05)
+    for mover in movers[1:]:
+        assert (movers[0].distance(mover.middle(times), times) > 0.1).all()
 
 
 def test_a_person_walks_on_the_ground_and_looks_ahead(box_scene, path) -> None:
@@ -122,14 +137,8 @@ def test_a_person_walks_on_the_ground_and_looks_ahead(box_scene, path) -> None:
     is_going = np.linalg.norm(steps, axis=1) > 0.01
     ahead = steps[is_going] / np.linalg.norm(steps[is_going], axis=1, keepdims=True)
     assert np.median(np.einsum("ni,ni->n", ahead, poses[:-1][is_going, :3, 0])) > 0.98
-    legs = [body.pose(times) for body in mover_bodies(mover, box_scene)[1:3]]
+    legs = [body.pose(times) for body in bodies_of([mover], box_scene)[1:3]]
     assert not np.allclose(legs[0], legs[1])
-
-
-def mover_bodies(mover, scene):
-    from ms_slam_env.sequences.perturbations.moving import bodies_of
-
-    return bodies_of([mover], scene)
 
 
 def test_a_mover_can_wait(box_scene, path) -> None:

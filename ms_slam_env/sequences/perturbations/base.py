@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -103,9 +103,17 @@ class WorldPerturbation(Perturbation):
 
     @abstractmethod
     def populate(
-        self, scene: Scene, camera: PoseInterpolation, intrinsics: Intrinsics, seed: int
+        self,
+        scene: Scene,
+        camera: PoseInterpolation,
+        intrinsics: Intrinsics,
+        seed: int,
+        others: Sequence[Mover] = (),
     ) -> tuple[Mover, ...]:
-        """Return the things that move through ``scene`` while ``camera`` is on its way."""
+        """Return the things that move through ``scene`` while ``camera`` is on its way.
+
+        ``others`` are on the move there already.
+        """
 
 
 class LightPerturbation(Perturbation):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,7 +61,12 @@ class MovingObjects(WorldPerturbation):
         check_range(self, "seed", 0, 2**32)
 
     def populate(
-        self, scene: Scene, camera: PoseInterpolation, intrinsics: Intrinsics, seed: int
+        self,
+        scene: Scene,
+        camera: PoseInterpolation,
+        intrinsics: Intrinsics,
+        seed: int,
+        others: Sequence[Mover] = (),
     ) -> tuple[Mover, ...]:
         """See the base class.
 
@@ -72,7 +78,7 @@ class MovingObjects(WorldPerturbation):
         movers: list[Mover] = []
         for k in range(self.count):
             rng = random_numbers(seed, self.seed, k, name=f"moving-{self.kind}")
-            movers.append(self._mover(k, scene, times, poses, intrinsics, rng, movers))
+            movers.append(self._mover(k, scene, times, poses, intrinsics, rng, [*others, *movers]))
         return tuple(movers)
 
     def _mover(

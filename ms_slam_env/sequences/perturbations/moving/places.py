@@ -109,7 +109,11 @@ class Places:
         turning = np.inf if kind == "box" else _TURN_RAD_S
         half_width = rng.uniform(*_HALF_WIDTH_M)
         track = round_track(middle - along, middle + along, half_width, speed_m_s, turning)
-        return track if self._are_free(shape, track.points[::4]).all() else None
+        # Legs reach out ahead and behind, farther than the shape is wide.
+        ahead = np.stack([np.cos(track.yaws), np.sin(track.yaws), np.zeros_like(track.yaws)], -1)
+        reach = max(0.0, 0.5 * shape.length_m - shape.radius_m) * ahead
+        points = np.concatenate([track.points + reach, track.points - reach])
+        return track if self._are_free(shape, points[::4]).all() else None
 
     def _straight(self, shape: Shape, middle: Float64, speed_m_s: float) -> Track | None:
         """As far as the ground is free and level to both sides of a point."""
