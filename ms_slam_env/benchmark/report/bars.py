@@ -93,7 +93,8 @@ def bar_figure(
         return None
     if coloured:
         for plot in found:
-            plot.data[0]["marker"] = {"color": [plots.colour(k) for k in range(len(rows))]}
+            shown = [plots.colour(k) for k in range(len(rows))]
+            plot.data[0]["marker"] = {**plot.data[0]["marker"], "color": shown}
     height = 110 + (14 if len(set(series)) > 1 else 20) * len(rows) + 8 * len(set(labels))
     caption = "One row each" if series_key is None else f"Colour: {heading(series_key)}"
     if any(isinstance(row.get(key), Interval) for row in rows for key in keys):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -15,6 +16,7 @@ Record = dict[str, Value]
 
 _MAX_COLUMNS = 60
 _MAX_ROWS = 2000
+_MAX_INT = 2**63
 
 
 def flatten(row: Mapping[str, Any], prefix: str = "") -> Record:
@@ -32,6 +34,8 @@ def flatten(row: Mapping[str, Any], prefix: str = "") -> Record:
         elif isinstance(value, Mapping):
             inner = prefix if key in ("spec", "result") else f"{name}."
             found.update(flatten(value, inner))
+        elif isinstance(value, int) and abs(value) > _MAX_INT:
+            found[name] = f"{str(value)[:12]}…"
         elif isinstance(value, (str, int, float, bool)) or value is None:
             found[name] = value
         elif isinstance(value, list) and 0 < len(value) <= 4 and all(map(_is_measure, value)):
@@ -59,6 +63,7 @@ def is_interval(value: Any) -> bool:
         isinstance(value, Mapping)
         and set(value) == {"value", "low", "high"}
         and all(isinstance(part, (int, float)) for part in value.values())
+        and all(abs(part) <= _MAX_INT for part in value.values())
     )
 
 
@@ -127,10 +132,10 @@ def cell_of(value: Value, key: str = "") -> Cell:
 
 
 def number(value: Value) -> float | None:
-    """The number in a value, None where there is none."""
+    """The number in a value, None where there is none that is finite."""
     if isinstance(value, Interval):
-        return value.value
-    return float(value) if isinstance(value, (int, float)) else None
+        value = value.value
+    return float(value) if isinstance(value, (int, float)) and math.isfinite(value) else None
 
 
 def _has_rows(value: Any) -> bool:
@@ -146,7 +151,9 @@ def _has_rows(value: Any) -> bool:
 
 def _is_measure(value: Any) -> bool:
     """Whether JSON ``value`` is a number or an estimate."""
-    return is_interval(value) or (isinstance(value, (int, float)) and not isinstance(value, bool))
+    if isinstance(value, int):
+        return not isinstance(value, bool) and abs(value) <= _MAX_INT
+    return is_interval(value) or isinstance(value, float)
 
 
 def _nested(value: Any) -> bool:

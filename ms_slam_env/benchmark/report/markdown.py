@@ -46,7 +46,7 @@ def blocks_of(text: str) -> list[Block]:
             end_paragraph()
         elif line.startswith(("- ", "* ")):
             end_paragraph()
-            paragraph.append(line)
+            paragraph.append(f"• {line[2:]}")
         else:
             paragraph.append(line)
         index += 1

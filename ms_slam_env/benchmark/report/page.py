@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 from collections.abc import Sequence
 from datetime import datetime, timezone
 from html import escape
@@ -12,6 +13,7 @@ from importlib import resources
 from ms_slam_env import __version__
 from ms_slam_env.benchmark.report.blocks import (
     Block,
+    Cell,
     Code,
     Figure,
     Pictures,
@@ -180,6 +182,12 @@ def _table(table: Table, anchor: str) -> str:
         return f'<details class="table">{summary}{parts}</details>'
     caption = f"<h3>{escape(table.title)}</h3>" if table.title else ""
     return caption + parts
+
+
+def _cell(cell: Cell) -> str:
+    number = cell.number
+    mark = "" if number is None or not math.isfinite(number) else f' class="n" data-n="{number!r}"'
+    return f"<td{mark}>{escape(cell.text)}</td>"
 
 
 def _meanings(table: Table) -> str:

@@ -116,11 +116,8 @@ def _pareto(trials: Sequence[Trial], cost: str, error: str, chosen: Mapping[str,
     front = sorted((row for row in rows if row.get("on_front")), key=lambda row: row[cost])
     failed = [row for row in rows if row.get(FAILURE)]
     refused = [row for row in rows if not row.get("feasible", True) and not row.get(FAILURE)]
-    plain = [
-        row
-        for row in rows
-        if row.get("feasible", True) and not row.get("on_front") and not row.get(FAILURE)
-    ]
+    special = {id(row) for row in (*front, *failed, *refused)}
+    plain = [row for row in rows if id(row) not in special and not row.get("default")]
     data = [
         _marks("trial", plain, cost, error, 0, "circle", 7),
         _marks("breaks a constraint", refused, cost, error, 8, "circle-open", 8),

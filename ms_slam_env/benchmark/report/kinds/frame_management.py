@@ -43,10 +43,13 @@ class FrameManagement(Kind):
             kind = name.partition(",")[0]
             curves.append(_row(kind, cell, ""))
             if f"{_REGULAR}ate_m" in cell:
-                curves.append(_row(f"regular, at the share of {kind}", cell, _REGULAR))
+                curves.append(_row(f"regular beside {kind}", cell, _REGULAR))
                 pairs.append({**_row("filter", cell, ""), "management": name})
                 pairs.append({**_row("regular skipping", cell, _REGULAR), "management": name})
-        caption = "Medians over the sequences. None is every frame."
+        caption = (
+            "Medians over the sequences; none: every frame; regular beside a filter: as many "
+            "frames as it took, at regular intervals."
+        )
         x, title = "processed_share", "Measures over the share of frames processed"
         found = [
             curve_figure(curves, x, "filter", _MEASURES, title, caption),

@@ -14,6 +14,7 @@ from ms_slam_env.benchmark.report.blocks import Figure
 from ms_slam_env.benchmark.report.curves import curve_figure
 from ms_slam_env.benchmark.report.discovery import Result
 from ms_slam_env.benchmark.report.flatten import Record, flatten
+from ms_slam_env.benchmark.report.glossary import heading
 from ms_slam_env.benchmark.report.kinds.base import Kind
 from ms_slam_env.benchmark.report.kinds.scatter import scatter_plot
 
@@ -81,14 +82,17 @@ class Rates(Kind):
                 },
                 x,
                 y,
-                f"{y} against {x}",
+                f"{heading(y)} against {heading(x)}",
                 medians=False,
             )
             for x, y in pairs
         ]
+        shown = [plot for plot in found if any(trace["x"] for trace in plot.data)]
         keys = ["ate_m", "ate_max_m", "M_I", "M_D", "ext_ms", "load_ms", "failed"]
         drawn = [
-            Figure("Every run", "One mark a sequence and rate.", tuple(found), 460, "Axes"),
+            Figure("Every run", "One mark a sequence and rate.", tuple(shown), 460, "Axes")
+            if shown
+            else None,
             curve_figure(rows, "keep_every", None, keys, "Medians over the rate"),
         ]
         return [figure for figure in drawn if figure is not None]

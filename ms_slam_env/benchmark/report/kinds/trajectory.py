@@ -14,7 +14,7 @@ from ms_slam_env.benchmark.report.bars import measures
 from ms_slam_env.benchmark.report.blocks import Figure, Plot
 from ms_slam_env.benchmark.report.curves import curve_figure
 from ms_slam_env.benchmark.report.discovery import Result
-from ms_slam_env.benchmark.report.flatten import flatten
+from ms_slam_env.benchmark.report.flatten import Record, flatten
 from ms_slam_env.benchmark.report.kinds.base import Kind
 from ms_slam_env.errors import InputError
 from ms_slam_env.metrics import umeyama
@@ -81,7 +81,7 @@ class Evaluation(Kind):
             if len(pieces) > 1
             else None,
             curve_figure(
-                drift, "length_m", None, measures(drift), "Drift over lengths of the true path"
+                drift, "length_m", None, _drifts(drift), "Drift over lengths of the true path"
             )
             if len(drift) > 1
             else None,
@@ -119,7 +119,9 @@ def trajectory_figures(truth: Path, estimates: dict[str, Path], align: str = "se
     if errors:
         axes = plots.axis("time [s]"), plots.axis("position error [mm]", rangemode="tozero")
         layout = plots.layout(*axes, showlegend=len(errors) > 1)
-        caption = f"Distance from the true position, alignment {align}."
+        caption = "Distance from the true position."
+        if align != "none":
+            caption = f"Distance from the true position after alignment ({align})."
         found.append(Figure("Error over time", caption, (plots.plot(errors, layout),)))
     return found
 
@@ -165,6 +167,11 @@ def _top_view(lines: dict[str, Float64]) -> Figure:
     layout = plots.layout(x, y, showlegend=True)
     caption = "The two directions in which the path extends furthest."
     return Figure("Path", caption, (plots.plot(data, layout),), 460)
+
+
+def _drifts(rows: list[Record]) -> list[str]:
+    """The drifts among the measures of segments."""
+    return [key for key in measures(rows) if "." in key]
 
 
 def _read(path: Path) -> tuple[Float64, Float64] | None:
