@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from ms_slam_env.env.frame_source import FrameSource
 from ms_slam_env.env.lookahead import Lookahead
 from ms_slam_env.env.observations import RobotKnowledge, make_observation
 from ms_slam_env.env.perturbed_frames import frames_with
-from ms_slam_env.env.pose_sources import POSE_SOURCES, Sighting, relative_motion
+from ms_slam_env.env.pose_sources import POSE_SOURCES
 from ms_slam_env.env.rendering import Renderer
 from ms_slam_env.env.reward import Outcome, reward_terms
 from ms_slam_env.env.state import EpisodeState, check_same_settings
@@ -337,15 +336,7 @@ class ActiveSlamEnv(EpisodeRecord):
         with self.timings.stage("render"):
             frame = self.frames.take(T_true, episode.frame_index, timestamp)
         first = not episode.truth
-        sighting = Sighting(
-            frame=frame or replace(episode.last_frame, timestamp=timestamp),
-            T_world_camera=T_true,
-            T_world_camera_kinematic=T_kinematic,
-            T_previous_camera_kinematic=relative_motion(
-                T_kinematic if first else episode.kinematics[-1], T_kinematic
-            ),
-            T_world_previous_estimate=T_true if first else episode.estimates[-1],
-        )
+        sighting = episode.sighting(frame, T_true, T_kinematic, timestamp)
         if frame is None:
             unseen = self._pose_source.pass_by(
                 sighting, episode.tracking_ok, episode.inlier_fraction

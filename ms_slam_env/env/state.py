@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.divergence import Histograms
-from ms_slam_env.env.pose_sources import Sighting
+from ms_slam_env.env.pose_sources import Sighting, relative_motion
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.base import TrackResult
 
@@ -55,6 +55,21 @@ class EpisodeState:
     step_histograms: Histograms | None = None
     frame: RGBDFrame | None = None
     predicted_divergences: Float64 | None = None
+
+    def sighting(
+        self, frame: RGBDFrame | None, T_true: Float64, T_kinematic: Float64, time_s: float
+    ) -> Sighting:
+        """What is known of a moment; where no frame was delivered the last one is still there."""
+        first = not self.truth
+        return Sighting(
+            frame=frame or replace(self.last_frame, timestamp=time_s),
+            T_world_camera=T_true,
+            T_world_camera_kinematic=T_kinematic,
+            T_previous_camera_kinematic=relative_motion(
+                T_kinematic if first else self.kinematics[-1], T_kinematic
+            ),
+            T_world_previous_estimate=T_true if first else self.estimates[-1],
+        )
 
     def record(self, sighting: Sighting, result: TrackResult, divergence: Float64) -> None:
         """Append what one frame brought; ``divergence`` (2,) is from the frame before."""

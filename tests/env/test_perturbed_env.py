@@ -32,7 +32,11 @@ OPTIONS = {
 }
 ACTIONS = (35, 6, 12, 0, 36)
 ONLINE = tuple(name for name in PERTURBATIONS if name != "fast-motion")
-STRONG = {"black-frames": {"start": 2, "length": 2}, "exposure-jumps": {"every": 2}}
+STRONG = {
+    "black-frames": {"start": 2, "length": 2},
+    "exposure-jumps": {"every": 2},
+    "moving-objects": {"count": 1},
+}
 
 
 def perturbed(*names, **options):
