@@ -13,7 +13,7 @@ from ms_slam_env.benchmark.options import parse_named
 from ms_slam_env.benchmark.provenance import provenance
 from ms_slam_env.benchmark.records import write_json
 from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
-from ms_slam_env.benchmark.usme_report import label, tables
+from ms_slam_env.benchmark.usme_report import label, save_figure, tables
 from ms_slam_env.benchmark.usme_run import UsmeSpec, run_apart
 from ms_slam_env.camera import XTION_SIZES
 from ms_slam_env.config import check_range
@@ -95,7 +95,7 @@ def run_suite(
     folder: Path | None = None,
     workers: int = 1,
 ) -> tuple[str, list[str]]:
-    """Run every backend over every sequence; write ``usme.json`` and ``table.md``.
+    """Run every backend over every sequence; write ``usme.json``, ``table.md`` and ``usme.png``.
 
     Runs that an earlier call left in ``out`` are not repeated.
 
@@ -153,6 +153,7 @@ def run_suite(
     write_json(out / "usme.json", content)
     text = tables(rows)
     (out / "table.md").write_text(text, encoding="utf-8")
+    save_figure(rows, out / "usme.png")
     return text, failures(rows)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import scenes
+from ms_slam_env.benchmark import figures
 from ms_slam_env.benchmark.records import Row
 from ms_slam_env.benchmark.table import format_number, markdown_table
 from ms_slam_env.benchmark.usme_suite import SUITE, render
@@ -66,8 +67,8 @@ def label(spec: Mapping[str, Any]) -> str:
 
 
 def tables(rows: Sequence[Row]) -> str:
-    """A Markdown table for each family of measures; "-" where one does not apply."""
-    parts = []
+    """The sequences that were run, then a table for each family; "-" where nothing applies."""
+    parts = [_sequences(rows)]
     for title, columns in _TABLES.items():
         body = []
         for row in rows:
@@ -78,6 +79,48 @@ def tables(rows: Sequence[Row]) -> str:
     failed = [row for row in rows if row["error"] is not None]
     parts += [f"- {label(r['spec'])} on {r['spec']['sequence']}: {r['error']}" for r in failed]
     return "\n".join(parts)
+
+
+def _sequences(rows: Sequence[Row]) -> str:
+    """What each sequence is: our Table 2, from the words of the paper."""
+    names = {row["spec"]["sequence"] for row in rows}
+    body = [
+        [
+            entry.name,
+            entry.scene,
+            "-" if entry.loops is None else str(entry.loops),
+            ", ".join(text.replace(",", " ") for text in entry.perturbations) or "-",
+            entry.about,
+        ]
+        for entry in SUITE
+        if entry.name in names
+    ]
+    header = ["sequence", "scene", "loops", "perturbations", "what it is"]
+    return f"### Sequences\n\n{markdown_table(header, body)}"
+
+
+def save_figure(rows: Sequence[Row], path: Path) -> Path:
+    """Error and share of lost frames of every backend on every sequence, side by side."""
+    names = list(dict.fromkeys(row["spec"]["sequence"] for row in rows))
+    backends = list(dict.fromkeys(label(row["spec"]) for row in rows))
+    figure = figures.new_figure(2, 4.6, 0.7 + 0.42 * len(names))
+    axes = figure.subplots(1, 2, sharey=True)
+    height = 0.8 / len(backends)
+    for index, backend in enumerate(backends):
+        own = [r for r in rows if label(r["spec"]) == backend and r["error"] is None]
+        at = [names.index(row["spec"]["sequence"]) + height * index for row in own]
+        for ax, name, scale in zip(axes, ("ate_m", "lost"), (1.0, 100.0), strict=True):
+            values = [scale * row["result"][name] for row in own]
+            ax.barh(at, values, height, color=figures.colour(index), label=backend)
+    axes[0].set(xscale="log", xlabel="ATE [m]")
+    axes[1].set(xlabel="frames lost [%]", xlim=(0, 100))
+    axes[0].set_yticks(np.arange(len(names)) + 0.4 - height / 2, names)
+    axes[0].invert_yaxis()
+    for ax in axes:
+        ax.grid(alpha=0.3, axis="x")
+    figures.plain_log_ticks(axes[0].xaxis)
+    figures.legend_beside(figure, axes[0])
+    return figures.save(figure, path)
 
 
 def _cell(row: Row, name: str, _: str, scale: float, digits: int) -> str:

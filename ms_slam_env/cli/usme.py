@@ -85,7 +85,7 @@ def main(arguments: Sequence[str]) -> int:
         command.options, command.backends, command.out, command.folder, command.workers
     )
     print(text)
-    print(f"written: {command.out}/usme.json, table.md", file=sys.stderr)
+    print(f"written: {command.out}/usme.json, table.md, usme.png", file=sys.stderr)
     return report_failures(failed)
 
 

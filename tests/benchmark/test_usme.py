@@ -140,6 +140,8 @@ def test_one_run_has_every_measure():
         assert heading in text
     failed = usme_report.tables([{**row, "result": None, "error": "InputError: no"}])
     assert "surfel on room-fast-black: InputError: no" in failed
+    assert "stretches" not in failed
+    assert "the same with a run of black frames" in failed
 
 
 def test_a_map_against_itself_is_without_error():
@@ -175,6 +177,7 @@ def test_make_writes_what_run_reads(tmp_path, capsys, monkeypatch):
     content = json.loads((tmp_path / "out/usme.json").read_text())
     assert content["summary"][0]["frames"] >= 5
     assert "provenance" in content
+    assert (tmp_path / "out/usme.png").stat().st_size > 1000
     other = [*ran, "--seed", "7", "--out", str(tmp_path / "other")]
     assert main(other) == 2
     assert "another seed" in capsys.readouterr().err
