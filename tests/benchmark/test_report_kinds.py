@@ -115,6 +115,16 @@ EXAMPLES = {
             {"spec": {"scene": "table", "seed": 2}, "error": "broke down", "result": None},
         ],
     },
+    "teams of robots": {
+        "summary": [{"setting": "shared", "robots": 2, "wrong": 0}],
+        "teams": [
+            {
+                "scene": "table", "seed": seed, "setting": "shared", "team_ate_m": 0.002 * seed,
+                "robots": [{"ate_m": 0.001}, {"ate_m": 0.003 * seed}],
+            }
+            for seed in (1, 2)
+        ],
+    },
     "trajectory against the truth": {
         "estimate": "none.txt", "truth": "none.txt", "align": "se3", "ate_m": {"rmse": 0.1},
         "segments": [{"start_s": t, "ate_m": {"rmse": 0.1 * t}} for t in (1.0, 2.0)],
@@ -184,3 +194,11 @@ def test_hypervolumes_are_averaged_over_seeds(tmp_path):
     ].plots
     lines = [trace["y"] for trace in plot.data if trace.get("hoverinfo") != "skip"]
     assert lines == [pytest.approx([0.2, 0.3]), pytest.approx([0.3, 0.5])]
+
+
+def test_a_team_stands_beside_its_robots(tmp_path):
+    figures = example_figures("teams of robots", tmp_path)
+    (plot,) = figures["Teams beside their robots alone"].plots
+    values = {trace["name"]: trace["x"] for trace in plot.data}
+    assert values["team, merged"] == [2.0, 4.0]
+    assert values["robot 2 alone"] == [3.0, 6.0]

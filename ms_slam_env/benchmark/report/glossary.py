@@ -92,10 +92,10 @@ _UNITS = (
     (r"_mrad$", "mrad", 1.0),
     (r"_deg$", "deg", 1.0),
     (r"_s$", "s", 1.0),
-    (rf"^(final_|mean_)?{_SMALL_DISTANCES}([a-z_]*)_m$", "mm", 1000.0),
+    (rf"^(final_|mean_|median_|team_|map_|regular_)?{_SMALL_DISTANCES}([a-z_]*)_m$", "mm", 1000.0),
     (r"_m$", "m", 1.0),
     (r"_share$", "%", 100.0),
-    (r"^(f|f_score|precision|recall)_\d+cm$|^rcm(_tracked)?$", "%", 100.0),
+    (r"^(map_|regular_)?((f|f_score|precision|recall)_\d+cm|rcm(_tracked)?)$", "%", 100.0),
 )  # pattern of a key; unit that its values are shown in; factor to it
 _CAPITALS = re.compile(r"\b(ate|rpe|rer|rcm|ext|mem|ene|icp|rgb|cpu|gpu|fps)\b")
 
@@ -136,7 +136,7 @@ def _words(key: str) -> str:
                 key = shorter if pattern != "_share$" else key
                 break
     key = re.sub(r"^(ate|rpe|rer|map_error)_m$", r"\1", key)
-    key = re.sub(r"^f(_score)?_(\d+)cm", r"F-score \2 cm", key)
+    key = re.sub(r"\bf(_score)?_(\d+)cm", r"F-score \2 cm", re.sub(r"^(map|team)_", r"\1 ", key))
     key = re.sub(r"(\d)cm\b", r"\1 cm", key).replace("_", " ")
     if re.fullmatch(r"(M|mean) [ID]", key):
         return key.replace(" ", "_")

@@ -15,6 +15,7 @@ from ms_slam_env.benchmark.report.kinds.planners import Planners
 from ms_slam_env.benchmark.report.kinds.stages import Stages
 from ms_slam_env.benchmark.report.kinds.studies import Difficulty, Rates, Samplers
 from ms_slam_env.benchmark.report.kinds.sweeps import FrameSkipping, StepSize, Training
+from ms_slam_env.benchmark.report.kinds.teams import Teams
 from ms_slam_env.benchmark.report.kinds.trajectory import Evaluation, Run
 from ms_slam_env.benchmark.report.kinds.usme import Usme
 
@@ -29,6 +30,7 @@ KINDS: tuple[Kind, ...] = (
     Usme(),
     FrameManagement(),
     Adaptation(),
+    Teams(),
     Run(),
     Evaluation(),
     StepSize(),
