@@ -45,6 +45,8 @@ class Arguments:
     """Of the scene, the path, the noise and the perturbations."""
     path: HandheldPath = field(default_factory=HandheldPath)
     """Seeded hand-held path; not used with --trajectory or --planner."""
+    route: tuple[str, ...] = ()
+    """Walk along these places of a street or hall instead, as in SW NW N; A-B is half-way."""
     trajectory: Path | None = None
     """Camera motion to place into the scene instead (TUM file)."""
     scale: float | None = None
@@ -57,7 +59,7 @@ class Arguments:
     image_size: str = "320x240"
     """Size of the images."""
     noise: str = "kinect"
-    """Noise of the sensor: kinect or none."""
+    """Noise of the sensor: kinect, range (up to 12 m, for streets and halls) or none."""
     perturbations: tuple[str, ...] = ()
     """NAME, options appended as in motion-blur,exposure_s=0.02,samples=8."""
     truth: bool = False
@@ -71,6 +73,8 @@ def main(arguments: Sequence[str]) -> int:
     args = parse(Arguments, arguments, "ms-slam generate")
     if args.planner is not None and args.trajectory is not None:
         raise InputError("--planner and --trajectory exclude each other")
+    if args.route and (args.planner is not None or args.trajectory is not None):
+        raise InputError("--route excludes --planner and --trajectory")
     if args.planner is None and args.episode != EpisodeOptions():
         raise InputError("the options of an episode need --planner")
     from ms_slam_env import __version__, scenes
@@ -116,6 +120,10 @@ def _motion(args: Arguments, recorded: Any, scene: Any) -> tuple[Any, Any, dict[
     """Times (N,), poses (N, 4, 4), and what to tell of a placed trajectory or an episode."""
     if args.planner is not None:
         return _planned(args, args.planner)
+    if args.route:
+        from ms_slam_env.sequences import RoutePath
+
+        return *RoutePath(args.route).motion(scene, args.seed), {}
     if recorded is None:
         return args.path.timestamps, args.path.poses(scene, args.seed), {}
     from ms_slam_env.sequences import place_trajectory

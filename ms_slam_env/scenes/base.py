@@ -49,6 +49,8 @@ class Scene(ABC):
     seed: int
     mesh: TexturedMesh
     exposure: float  # factor from linear radiance to sensor value before the sRGB curve
+    gaze_m: float = 2.4
+    """How far away the things are, at most, that a hand-held camera looks at."""
     lanes: tuple[tuple[Float64, Float64], ...] = ()
     """Straight ways of cars: points (3,) on the ground where each begins and ends."""
 

@@ -27,6 +27,7 @@ class LargeScene(MeshScene):
         lanes: see ``Scene``.
     """
 
+    gaze_m = 7.0
     start_depth_m = (0.8, 12.0)
     min_start_share = 0.6
 

@@ -30,7 +30,7 @@ class Gaze:
         eye: Float64,
         cones: Sequence[tuple[Float64, float]],
         rng: np.random.Generator,
-        farthest_m: float = 2.4,
+        farthest_m: float | None = None,
     ) -> Float64 | None:
         """A surface point (3,) that ``eye`` (3,) sees; None if there is none.
 
@@ -38,8 +38,9 @@ class Gaze:
             eye: position of the camera.
             cones: unit vectors (3,) and the angles in radians within which it must lie of each.
             rng: draws among the suitable points.
-            farthest_m: largest distance from the camera.
+            farthest_m: largest distance from the camera; by default that of the scene.
         """
+        farthest_m = self.scene.gaze_m if farthest_m is None else farthest_m
         offsets = self.surface - eye
         distance = np.linalg.norm(offsets, axis=1)
         slope = np.abs(offsets[:, 2]) / np.maximum(distance, 1e-9)

@@ -98,7 +98,7 @@ def _sweep(
         cones = [(turned, _SWEEP_RAD)]
         if targets:
             cones.append((unit(targets[-1] - eyes[k - 1]), _TURN_RAD))
-        target = gaze.choose(eye, cones, rng, _FARTHEST_M)
+        target = gaze.choose(eye, cones, rng, max(_FARTHEST_M, gaze.scene.gaze_m))
         if target is None:
             return None
         targets.append(target)

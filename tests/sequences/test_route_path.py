@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from large_scenes import large_scene
 
+from ms_slam_env import scenes
+from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose, relative_angle
-from ms_slam_env.sequences import RoutePath
+from ms_slam_env.sequences import HandheldPath, RoutePath, read_trajectory
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +47,22 @@ def test_fewer_frames_for_the_same_way(hall):
     assert len(short) == pytest.approx(0.5 * len(long), rel=0.02)
     length = [np.linalg.norm(np.diff(p[:, :3, 3], axis=0), axis=1).sum() for p in (long, short)]
     assert length[0] == pytest.approx(length[1], rel=0.05)
+
+
+def test_a_hand_held_camera_finds_its_way_too(hall):
+    poses = HandheldPath(frames=12).poses(hall, 3)
+    assert hall.clearance(poses[:, :3, 3]).min() > 0.1
+
+
+def test_generate_takes_a_route(hall, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(scenes, "make", lambda name, seed: hall)
+    few = ["--image-size", "80x60", "--noise", "range", "--out", str(tmp_path / "out")]
+    assert main(["generate", "--scene", "factory_hall", "--route", "A", "A-E", *few]) == 0
+    times, poses = read_trajectory(tmp_path / "out/groundtruth.txt")
+    assert len(times) > 10
+    assert np.linalg.norm(poses[-1, :2, 3] - poses[0, :2, 3]) > 1.0
+    assert main(["generate", "--scene", "factory_hall", "--route", "A", *few]) == 2
+    assert "two places" in capsys.readouterr().err
 
 
 def test_bad_routes_are_refused(hall):
