@@ -67,7 +67,7 @@ class Moment:
         intrinsics: of the frames.
         seed: of the sequence.
         brightness: gives the mean intensity (count,) in [0, 255] of what is seen from every pose
-            of the trajectory; computed at the first call.
+            of the trajectory, or of those so far; computed at the first call.
     """
 
     index: int
