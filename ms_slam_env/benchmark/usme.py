@@ -11,7 +11,7 @@ from ms_slam_env import __version__, scenes, slam
 from ms_slam_env.benchmark import usme_suite
 from ms_slam_env.benchmark.options import parse_named
 from ms_slam_env.benchmark.provenance import provenance
-from ms_slam_env.benchmark.records import write_json
+from ms_slam_env.benchmark.records import Row, write_json
 from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
 from ms_slam_env.benchmark.usme_report import label, save_figure, tables
 from ms_slam_env.benchmark.usme_run import UsmeSpec, run_apart
@@ -136,6 +136,14 @@ def run_suite(
     ]
     rows = run_all(specs, run_apart, out, workers, "runs")
     check_any_finished(rows)
+    return write_results(options, backends, rows, out), failures(rows)
+
+
+def write_results(
+    options: UsmeOptions, backends: tuple[str, ...], rows: list[Row], out: Path
+) -> str:
+    """Write ``usme.json``, ``table.md`` and ``usme.png``; return the tables as Markdown."""
+    out.mkdir(parents=True, exist_ok=True)
     content = {
         "provenance": provenance(),
         "config": {**asdict(options), "backends": backends},
@@ -154,7 +162,7 @@ def run_suite(
     text = tables(rows)
     (out / "table.md").write_text(text, encoding="utf-8")
     save_figure(rows, out / "usme.png")
-    return text, failures(rows)
+    return text
 
 
 def _check_folder(folder: Path, options: UsmeOptions) -> None:

@@ -76,6 +76,8 @@ def tables(rows: Sequence[Row]) -> str:
             body.append([row["spec"]["sequence"], label(row["spec"]), *cells])
         header = ["sequence", "backend", *(heading for _, heading, _, _ in columns)]
         parts.append(f"### {title}\n\n{markdown_table(header, body)}")
+    sources = {str(r["result"]["ene_source"]) for r in rows if r["error"] is None}
+    parts += [f"- ENE: {source}" for source in sorted(sources)]
     failed = [row for row in rows if row["error"] is not None]
     parts += [f"- {label(r['spec'])} on {r['spec']['sequence']}: {r['error']}" for r in failed]
     return "\n".join(parts)
