@@ -22,7 +22,7 @@ from ms_slam_env.benchmark.command_line import exit_code, parse, report_failures
 from ms_slam_env.benchmark.planner_benchmark import check_names, seed_list
 from ms_slam_env.benchmark.planner_report import finished
 from ms_slam_env.benchmark.provenance import provenance
-from ms_slam_env.benchmark.records import write_json
+from ms_slam_env.benchmark.records import Row, write_json
 from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
 from ms_slam_env.camera import XTION_SIZES, Intrinsics, RGBDFrame, xtion
 from ms_slam_env.config import check_range
@@ -135,7 +135,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             "seeds": seed_list(args.seeds, args.sequences),
             "summary": summary,
             "comparison": comparison(done),
-            "sequences": rows,
+            "sequences": [_brief(row) for row in rows],
         },
     )
     text = tables(done)
@@ -143,6 +143,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     save_figures(done, args.out)
     print(text)
     return report_failures(failures(rows), PROGRAM)
+
+
+def _brief(row: Row) -> Row:
+    """A row without the traceback of a failure, which names folders; the error says enough."""
+    return {key: value for key, value in row.items() if key != "traceback"}
 
 
 def run_sequence(spec: AdaptationSpec) -> dict[str, Any]:
