@@ -6,6 +6,7 @@ and SQLite undoes what it had half written. Optuna's journal keeps half a line a
 
 from __future__ import annotations
 
+import contextlib
 import math
 import sqlite3
 import time
@@ -86,7 +87,13 @@ class Ledger:
             return trial
 
     def tell(self, trial: Trial, measured: Measured) -> None:
-        """Finish ``trial`` with what its evaluation returned."""
+        """Finish ``trial`` with what its evaluation returned; no matter if it was taken back."""
+        from optuna.exceptions import UpdateFinishedTrialError
+
+        with contextlib.suppress(UpdateFinishedTrialError):
+            self._tell(trial, measured)
+
+    def _tell(self, trial: Trial, measured: Measured) -> None:
         content = {name: _plain(value) for name, value in measured.items()}
         if self.reference() is None:
             self.study.set_user_attr("reference", self._reference_from(content))

@@ -14,10 +14,14 @@ def process_name(pid: int | None = None) -> str:
 
 
 def is_alive(name: str) -> bool:
-    """Whether the process called ``name`` lives; of another host nothing is known, so it does."""
+    """Whether the process called ``name`` lives on this host.
+
+    A study's file lies on one machine: the process of another host is one from before a container
+    was started anew, under a new name.
+    """
     host, pid, start = name.rsplit("/", 2)
     if host != socket.gethostname():
-        return True
+        return False
     try:
         os.kill(int(pid), 0)
     except ProcessLookupError:

@@ -114,6 +114,20 @@ def test_a_trial_that_was_given_up_is_redone(tmp_path):
     assert ledger.ask(5).params != lost.params  # it may be what kills processes
 
 
+def test_trials_from_before_a_restart_are_taken_back(tmp_path):
+    old = Ledger(tmp_path, fake_space(), ExplorationSettings(sampler="random"))
+    old.tell(old.ask(2), values(fake_space().defaults()))
+    old.owner = "old-name-of-the-container/1/2"
+    forgotten = old.ask(2)
+    new = Ledger(tmp_path, fake_space(), ExplorationSettings(sampler="random"))
+    again = new.ask(2)
+    assert again.params == forgotten.params
+    old.tell(forgotten, {"ate_m": 9.9})  # too late: it counts as failed
+    new.tell(again, values(again.params))
+    assert [trial.number for trial in new.finished()] == [0, again.number]
+    assert new.finished()[1].user_attrs["measured"]["ate_m"] < 1
+
+
 def test_results_wait_for_the_default(tmp_path):
     ledger = Ledger(tmp_path, fake_space(), ExplorationSettings())
     first = ledger.ask(9)
@@ -160,4 +174,4 @@ def test_processes_have_names(processes):
     name = process_name(process.pid)
     process.join()
     assert not is_alive(name)
-    assert is_alive("another-host/1/2")  # of which nothing is known
+    assert not is_alive("another-host/1/2")
