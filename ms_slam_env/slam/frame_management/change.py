@@ -23,8 +23,8 @@ class ChangeConfig:
     Attributes:
         width: pixels are left out so that about so many columns remain; a frame must be cheap to
             judge.
-        depth_weight: lambda. On hand-held sequences the sum with 1 follows the size of the motion
-            better than either divergence alone (BENCHMARK.md).
+        depth_weight: lambda. On hand-held sequences of validation seeds the sum with 1 followed the
+            size of the motion at least as well as either divergence alone.
         divergence: of the two kinds.
 
     Raises:
