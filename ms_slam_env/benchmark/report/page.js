@@ -45,8 +45,15 @@
     return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   }
 
+  // A long name in two lines, broken where it is best to.
   function shorter(name) {
-    return name.length > 17 ? `${name.slice(0, 8)}…${name.slice(-8)}` : name;
+    if (name.length <= 17) return name;
+    const middle = name.length / 2;
+    const breaks = [...name.matchAll(/[ ,:+_…-]/g)].map((match) => match.index + 1);
+    breaks.sort((a, b) => Math.abs(a - middle) - Math.abs(b - middle));
+    const place = breaks.find((k) => k < name.length && Math.abs(k - middle) < 9) ?? Math.round(middle);
+    const cut = (part) => (part.length > 21 ? `${part.slice(0, 10)}…${part.slice(-10)}` : part);
+    return `${cut(name.slice(0, place).trim())}<br>${cut(name.slice(place).trim())}`;
   }
 
   function themed(layout) {
