@@ -51,6 +51,8 @@ class Scene(ABC):
     exposure: float  # factor from linear radiance to sensor value before the sRGB curve
     gaze_m: float = 2.4
     """How far away the things are, at most, that a hand-held camera looks at."""
+    gaze_gap_m: float = 0.05
+    """How much of the line of sight to them need not be free, before their surface."""
     lanes: tuple[tuple[Float64, Float64], ...] = ()
     """Straight ways of cars: points (3,) on the ground where each begins and ends."""
 

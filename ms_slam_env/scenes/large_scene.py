@@ -28,6 +28,7 @@ class LargeScene(MeshScene):
     """
 
     gaze_m = 7.0
+    gaze_gap_m = 0.35  # its grid of clearances is coarse
     start_depth_m = (0.8, 12.0)
     min_start_share = 0.6
 

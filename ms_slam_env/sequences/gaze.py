@@ -55,7 +55,7 @@ class Gaze:
         count = min(_LOOKS, len(suitable))
         drawn = rng.choice(suitable, count, replace=False, p=weights / weights.sum())
         for target in self.surface[drawn]:
-            short = target - 0.05 * unit(target - eye)
+            short = target - self.scene.gaze_gap_m * unit(target - eye)
             if self.scene.segment_is_free(eye, short, 0.01):
                 return target
         return None

@@ -49,9 +49,11 @@ def test_fewer_frames_for_the_same_way(hall):
     assert length[0] == pytest.approx(length[1], rel=0.05)
 
 
-def test_a_hand_held_camera_finds_its_way_too(hall):
-    poses = HandheldPath(frames=12).poses(hall, 3)
-    assert hall.clearance(poses[:, :3, 3]).min() > 0.1
+@pytest.mark.parametrize("name", ["factory_hall", "residential_street"])
+def test_a_hand_held_camera_finds_its_way_too(name):
+    scene = large_scene(name)
+    poses = HandheldPath(frames=12).poses(scene, 3)
+    assert scene.clearance(poses[:, :3, 3]).min() > 0.1
 
 
 def test_generate_takes_a_route(hall, tmp_path, monkeypatch, capsys):
