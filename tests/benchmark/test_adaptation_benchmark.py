@@ -32,7 +32,7 @@ def test_the_same_path_is_travelled_faster_in_haste():
 
 def test_a_sequence_moves_at_its_pace_and_is_the_same_twice():
     sequence = SHORT.render("table", 1000, "80x60")
-    again = SHORT.render("table", 1000, "80x60")
+    again = SHORT.render("table", 1000, "80x60")  # the scene is kept, the frames are not
     np.testing.assert_array_equal(sequence.poses, again.poses)
     np.testing.assert_array_equal(sequence.frames[5].depth, again.frames[5].depth)
     np.testing.assert_allclose(np.diff(sequence.frames.timestamps), 1 / 30)
@@ -82,8 +82,9 @@ def test_the_comparison_is_paired():
     assert "| adaptive | 5.0 [4.5, 5.5] |" in tables(rows)
 
 
+@pytest.mark.slow
 def test_one_command_writes_table_figures_and_configurations(tmp_path, capsys):
-    words = "--scenes table --sequences 1 --image-size 160x120 --stretches.frames 12"
+    words = "--scenes table --sequences 1 --image-size 80x60 --stretches.frames 12"
     words += f" --stretches.quiet 5 --stretches.violent 5 --out {tmp_path}"
     assert adaptation.main(words.split()) == 0
     names = {path.name for path in tmp_path.iterdir()}

@@ -181,7 +181,7 @@ class _Changes(DivergenceController):
         self._time_s, self.change = 0.0, next(self.told)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(
     changes=st.lists(st.floats(0, 4), min_size=1, max_size=60),
     dwell=st.integers(1, 5),
