@@ -13,6 +13,7 @@ from ms_slam_env import scenes
 from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.metrics.reconstruction import voxel_thin
+from ms_slam_env.scenes.registry import check_name
 from ms_slam_env.sensor import NOISE_MODELS
 from ms_slam_env.sequences import (
     PERTURBATIONS,
@@ -88,6 +89,19 @@ def parse_sequence(text: str) -> SequenceName | Path:
     return SequenceName(scene, int(rest[0]), noise, tuple(perturbations))
 
 
+def check_sequence(text: str) -> None:
+    """Refuse, before any work is done, what ``load`` would refuse.
+
+    Raises:
+        InputError: as `parse_sequence`; an unknown scene, no recording, or one without truth.
+    """
+    named = parse_sequence(text)
+    if isinstance(named, Path):
+        _check_truth(open_recording(named))
+    else:
+        check_name(named.scene)
+
+
 def load(text: str, image_size: str, path: HandheldPath) -> Input:
     """The sequence that ``text`` names, at ``image_size``; ``path`` is that of rendered ones.
 
@@ -117,13 +131,18 @@ def _rendered(named: SequenceName, intrinsics: Intrinsics, path: HandheldPath) -
     return Input(tuple(sequence.frames), sequence.poses, intrinsics, surface)
 
 
-def _recorded(recording: Recording) -> Input:
+def _check_truth(recording: Recording) -> tuple[NDArray[np.int64], Float64]:
+    """Frames (N,) that have a true pose, and these poses (N, 4, 4)."""
     if recording.truth is None or recording.truth_times is None:
         raise InputError(f"sequence {recording.name} has no true trajectory to compare with")
     own, true = associate(recording.timestamps, recording.truth_times, _MAX_DIFFERENCE_S)
     if len(own) < 2:
         raise InputError(f"sequence {recording.name}: fewer than 2 frames have a true pose")
-    poses = recording.truth[true]
+    return own, recording.truth[true]
+
+
+def _recorded(recording: Recording) -> Input:
+    own, poses = _check_truth(recording)
     kept = tuple(recording.frame(int(index)) for index in own)
     views = ((poses[k], kept[k].depth) for k in evenly_picked(len(kept)))
     return Input(kept, poses, recording.intrinsics, seen_surface(views, recording.intrinsics))

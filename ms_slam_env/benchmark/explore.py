@@ -8,6 +8,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from ms_slam_env.benchmark.compare_inputs import check_sequence
 from ms_slam_env.benchmark.explore_evaluation import SlamEvaluator
 from ms_slam_env.benchmark.explore_figures import save_figures
 from ms_slam_env.benchmark.explore_judge import judge
@@ -40,8 +41,8 @@ class Exploration:
         held_out: sequences that the chosen configurations are judged on.
 
     Raises:
-        InputError: an unknown name, a value out of range, or an objective that this machine or
-            evaluation cannot measure.
+        InputError: an unknown name, a value out of range, a sequence that cannot be had, or an
+            objective that this machine or evaluation cannot measure.
     """
 
     evaluator: SlamEvaluator
@@ -51,7 +52,9 @@ class Exploration:
     held_out: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be measured."""
+        """Refuse what cannot be measured before a study is begun that would keep it."""
+        for text in (*self.evaluator.sequences, *self.held_out):
+            check_sequence(text)
         asked = {*self.settings.objectives}
         asked |= {constraint.metric for constraint in self.settings.parsed_constraints()}
         if "map_error_mm" in asked and not self.evaluator.map_error:

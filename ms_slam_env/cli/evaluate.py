@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -91,17 +91,24 @@ def main(arguments: Sequence[str]) -> int:
 
     result: dict[str, Any] = {}
     parts: list[str] = []
+    # Nothing is written before everything has been measured: bad input leaves no half of a result.
+    writers = []
     if args.estimate is not None:
-        _trajectories(args, result, parts)
+        writers.append(_trajectories(args, result, parts))
     if args.map is not None:
-        _maps(args, result, parts)
+        writers.append(_maps(args, result, parts))
     if args.out is not None:
+        for write in writers:
+            write(args.out)
         write_json(args.out / "evaluation.json", {**result, "provenance": provenance()})
         (args.out / "table.md").write_text("\n".join(parts), encoding="utf-8")
     return 0
 
 
-def _trajectories(args: Arguments, result: dict[str, Any], parts: list[str]) -> None:
+def _trajectories(
+    args: Arguments, result: dict[str, Any], parts: list[str]
+) -> Callable[[Path], None]:
+    """Measure and print; return what writes figure and poses into a folder."""
     from ms_slam_env.benchmark import trajectory_evaluation_report as report
     from ms_slam_env.benchmark.trajectory_evaluation import (
         TrajectoryOptions,
@@ -128,14 +135,18 @@ def _trajectories(args: Arguments, result: dict[str, Any], parts: list[str]) -> 
     result.update(measure_matched(args.estimate, args.groundtruth, matched, options))
     parts.append(report.tables(result))
     print(report.summary(result))
-    if args.out is not None:
-        report.save_figure(matched, args.out / "trajectory.png")
+
+    def write(out: Path) -> None:
+        report.save_figure(matched, out / "trajectory.png")
         for name, poses in (("estimate", matched.estimate), ("truth", matched.truth)):
             # A name of its own: the folder may be that of the files that are compared.
-            write_trajectory(args.out / f"evaluation.{name}.txt", matched.times, poses)
+            write_trajectory(out / f"evaluation.{name}.txt", matched.times, poses)
+
+    return write
 
 
-def _maps(args: Arguments, result: dict[str, Any], parts: list[str]) -> None:
+def _maps(args: Arguments, result: dict[str, Any], parts: list[str]) -> Callable[[Path], None]:
+    """Measure and print; return what writes the figure into a folder."""
     from ms_slam_env.benchmark import map_evaluation_report as report
     from ms_slam_env.benchmark.map_evaluation import MapOptions, evaluate_maps
 
@@ -155,5 +166,4 @@ def _maps(args: Arguments, result: dict[str, Any], parts: list[str]) -> None:
     result.update(found)
     parts.append(report.tables(found))
     print(report.summary(found))
-    if args.out is not None:
-        report.save_figure(compared, args.out / "map.png")
+    return lambda out: report.save_figure(compared, out / "map.png")

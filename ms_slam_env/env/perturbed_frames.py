@@ -83,7 +83,12 @@ class PerturbedFrames(FrameSource):
         self._began = began
 
     def set_out(self, times_s: Float64, poses: Float64) -> None:
-        """See the base class; what would come too near to the camera waits."""
+        """See the base class; what would come too near to the camera waits.
+
+        Raises:
+            InputError: the episode began before the perturbations were put on.
+        """
+        self._check_begun()
         self._path = PoseInterpolation(times_s, poses)
         for k in range(1, len(times_s)):
             here, before, now = poses[k : k + 1, :3, 3], times_s[k - 1], times_s[k]
@@ -132,8 +137,19 @@ class PerturbedFrames(FrameSource):
         """What moves through the scene, with its poses by time."""
         return tuple(self._movers)
 
+    def _check_begun(self) -> None:
+        if not self._began:
+            raise InputError(
+                "a perturbation was put on after the episode began: call env.reset() first"
+            )
+
     def get_state(self) -> dict[str, Any]:
-        """See the base class."""
+        """See the base class.
+
+        Raises:
+            InputError: the episode began before the perturbations were put on.
+        """
+        self._check_begun()
         return {
             "noise_seed": self._seed,
             "brightness": list(self._brightness),

@@ -42,14 +42,14 @@ def statistical_inliers(
 ) -> NDArray[np.bool_]:
     """Which of ``points`` (N, 3) a statistical outlier removal keeps, (N,) bool.
 
-    USME equation (6), after Rusu et al., "Towards 3D point cloud based object maps", 2008: the
+    USME, section 1.2 (1), after Rusu et al., "Towards 3D point cloud based object maps", 2008: the
     mean distance d of a point to its ``neighbours`` nearest points, itself among them, must be
     below mean(d) + ``std_ratio`` std(d) over the cloud. A point that coincides with all its
     neighbours is dropped too, as Open3D does.
 
     Raises:
-        InputError: bad points, fewer than 2 neighbours or no more points than that, a ratio that
-            is not positive.
+        InputError: bad points, fewer than 2 neighbours or fewer points than neighbours, a ratio
+            that is not positive.
     """
     values = check_points(points, "points")
     if isinstance(neighbours, bool) or not isinstance(neighbours, int) or neighbours < 2:

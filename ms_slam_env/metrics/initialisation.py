@@ -40,8 +40,8 @@ def local_scales(
 ) -> Float64:
     """Scale s(t) (N,) of the estimate around every pose: metres of truth per unit of estimate.
 
-    Umeyama's scale of the poses less than ``window_s`` / 2 away; NaN where fewer than 3 are, or
-    where the estimate stands still.
+    Umeyama's scale of the poses at most ``window_s`` / 2 away; NaN where fewer than 3 are, or
+    where the estimate or the truth stands still.
 
     Raises:
         InputError: bad positions, times that do not increase, lengths that differ, a window that is
@@ -63,7 +63,7 @@ def local_scales(
     for k, (a, b) in enumerate(zip(first, end, strict=True)):
         if b - a >= 3 and np.ptp(positions[a:b], axis=0).max() > 1e-9:
             scales[k] = umeyama(positions[a:b], true_positions[a:b], with_scale=True)[2]
-    return scales
+    return np.where(scales > 0, scales, np.nan)
 
 
 def initialisation(

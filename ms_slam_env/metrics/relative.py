@@ -193,8 +193,9 @@ def _consecutive(along: Float64, delta: float) -> Int64:
     first = 0
     while True:
         # Times of 0.1 s add up to a hair more or less than 1 s.
-        second = int(np.searchsorted(along, along[first] + delta - _ROUNDING))
-        if second == len(along):
+        goal = along[first] + max(delta - _ROUNDING, 0.5 * delta)
+        second = max(first + 1, int(np.searchsorted(along, goal)))
+        if second >= len(along):
             break
         found.append((first, second))
         first = second

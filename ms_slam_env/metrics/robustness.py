@@ -83,7 +83,7 @@ def tracking_robustness(
 
     Raises:
         InputError: bad poses, lengths that differ, an unknown alignment, a negative lever, no
-            piece of at least 3 frames.
+            piece of at least 3 frames; ``sim3`` of a piece in which either stands still.
     """
     if align not in SEGMENT_ALIGNMENTS:
         raise unknown("alignment", align, SEGMENT_ALIGNMENTS)
@@ -103,6 +103,8 @@ def tracking_robustness(
     for first, end in segments:
         own, true = poses[first:end], true_poses[first:end]
         scale = umeyama(own[:, :3, 3], true[:, :3, 3], True)[2] if align == "sim3" else 1.0
+        if not scale > 0:
+            raise InputError(f"the truth stands still in frames {first} to {end - 1}: no scale")
         points = _levers(own, lever_m / scale)
         R, t, scale = umeyama(points, _levers(true, lever_m), align == "sim3")
         similarities.append(_similarity(R, t, scale))  # (9)

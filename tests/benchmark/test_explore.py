@@ -249,6 +249,9 @@ def test_divergence_grows_when_frames_are_left_out(sequences, tmp_path):
         (["--constraints", "ate_m=1"], "is not metric<limit"),
         (["--parameters", "speed"], "unknown parameter 'speed'"),
         (["--sequences", "nowhere"], "sequence 'nowhere' is neither a folder nor"),
+        (["--sequences", "nowhere:1000"], "unknown scene 'nowhere'"),
+        (["--held-out", "nowhere:1000"], "unknown scene 'nowhere'"),
+        (["--held-out", "."], "is no RGB-D sequence"),
         (["--held-out", "table:1002"], "sequence table:1002 is explored and held out"),
         (["--trials", "0"], "trials 0 and workers 1 must be 1 or more"),
         (["--config", "no.yaml"], "no.yaml: cannot be read"),
@@ -261,6 +264,7 @@ def test_bad_input_is_one_line(options, message, tmp_path, capsys):
     assert main(["explore", *options, "--out", str(tmp_path / "out")]) == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert message in lines[-1]
+    assert not (tmp_path / "out").exists()  # a study there would keep the bad input
 
 
 def test_energy_is_refused_where_there_is_none(sequences):

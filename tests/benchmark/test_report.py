@@ -264,6 +264,19 @@ def test_any_object_gives_a_section(tmp_path_factory, content):
     assert "NaN" not in page("any", [section]).rpartition("</main>")[0]  # JSON has no such number
 
 
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"summary": {}, "episodes": [None]},
+        {"summary": {}, "episodes": [{"spec": None}]},
+        {"sequences": [{"result": [1]}]},
+    ],
+)
+def test_rows_of_another_shape_are_shown_as_they_are(content, tmp_path):
+    write(tmp_path / "any.json", content)
+    assert len(sections_of(tmp_path)) == 1
+
+
 HOSTILE = "</script><script>owned=1</script><img src=x onerror=owned=1>\"'&"
 
 
@@ -277,6 +290,15 @@ def test_hostile_text_reaches_the_page_only_escaped(tmp_path):
     assert escape(HOSTILE) in written
     assert "<img src=x" not in written
     assert "<script>owned" not in written
+
+
+def test_a_cell_that_is_not_finite_has_no_place_in_the_order(tmp_path):
+    write(tmp_path / "r.json", {"a": 1})
+    (tmp_path / "table.md").write_text("| a |\n| --- |\n| 2 |\n| 1e999 |\n")
+    assert main(["report", str(tmp_path)]) == 0
+    written = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert '<td class="n" data-n="2.0">2</td>' in written
+    assert "<td>1e999</td>" in written
 
 
 def test_the_page_is_one_file_with_plotly_in_it_once(tmp_path, capsys):

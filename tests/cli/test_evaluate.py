@@ -367,6 +367,23 @@ def test_trajectory_and_map_together(maps: list[str], tmp_path: Path) -> None:
     assert "F-score, 2 cm [%]" in table
 
 
+def test_a_bad_map_leaves_no_half_of_a_result(maps: list[str], tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    bad = [*write_pair(tmp_path), "--map", "none.ply", *maps[2:], "--out", str(out)]
+    assert main(["evaluate", *bad]) == 2
+    assert not out.exists()
+
+
+def test_a_truth_that_stands_still_has_no_scale(tmp_path: Path) -> None:
+    pair = write_pair(tmp_path)
+    t, poses = truth_path()
+    poses[:, :3, 3] = 1.0
+    write_trajectory(tmp_path / "truth.txt", t, poses)
+    result = evaluate([*pair, "--align", "sim3"], tmp_path / "out")
+    assert "stands still" in result["robustness"]["reason"]
+    assert result["initialisation"]["time_s"] is None
+
+
 def test_bad_maps_are_one_line_and_code_2(
     maps: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

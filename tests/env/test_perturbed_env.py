@@ -210,6 +210,17 @@ def test_other_environments_are_refused() -> None:
 # ---------------------------------------------------------------- ids
 
 
+def test_it_takes_effect_at_the_next_reset() -> None:
+    env = ActiveSlamEnv("free", **OPTIONS)
+    env.reset(seed=1)
+    late = Perturbed(env, "black-frames")
+    for use in (lambda: late.step(0), env.save_state):
+        with pytest.raises(InputError, match=r"call env.reset\(\) first"):
+            use()
+    late.reset(seed=1)
+    late.step(0)
+
+
 def test_every_perturbation_has_an_id() -> None:
     ids = ms_slam_env.PERTURBED_ENV_IDS
     assert len(ids) == 2 * len(ONLINE) + 1

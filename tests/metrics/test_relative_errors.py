@@ -150,6 +150,13 @@ def test_drift_by_length_equals_a_plain_loop(seed: int, every: int) -> None:
         assert drift.rotation_rad_m.median == pytest.approx(np.median(rotation), abs=1e-7)
 
 
+def test_a_delta_below_the_rounding_of_times_ends() -> None:
+    poses = np.repeat(np.eye(4)[None], 5, axis=0)
+    poses[:, 0, 3] = np.arange(5)
+    pairs = pose_pairs(poses, 1e-12, "m", pairs="consecutive")
+    np.testing.assert_array_equal(pairs, [[0, 1], [1, 2], [2, 3], [3, 4]])
+
+
 def test_drift_of_a_wrong_scale_is_that_share() -> None:
     truth = np.repeat(np.eye(4)[None], 101, axis=0)
     truth[:, 0, 3] = 0.1 * np.arange(101)

@@ -109,6 +109,14 @@ def test_scale_that_settles_after_two_seconds() -> None:
     assert (at_once.time_s, at_once.scale_error) == pytest.approx((0, 0))
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_truth_that_stands_still_has_no_scale() -> None:
+    poses, still = winding(), np.repeat(winding()[:1], 60, axis=0)
+    assert initialisation(TIMES, poses, still, global_scale=1.0).time_s is None
+    with pytest.raises(InputError, match="the truth stands still in frames 0 to 19"):
+        tracking_robustness(poses, still, ~LOST, "sim3")
+
+
 def test_scale_that_never_settles() -> None:
     truth = straight(100)[:, :3, 3]
     estimate = truth * np.linspace(1, 30, 100)[:, None] ** 2

@@ -160,16 +160,7 @@ def _table(table: Table, anchor: str) -> str:
         f'<th scope="col" aria-sort="none"><button type="button">{escape(column)}</button></th>'
         for column in table.columns
     )
-    body = "\n".join(
-        "<tr>"
-        + "".join(
-            f"<td{'' if cell.number is None else f' class=n data-n={cell.number!r}'}>"
-            f"{escape(cell.text)}</td>"
-            for cell in row
-        )
-        + "</tr>"
-        for row in table.rows
-    )
+    body = "\n".join(f"<tr>{''.join(map(_cell, row))}</tr>" for row in table.rows)
     note = f'<p class="note">{escape(table.note)}</p>' if table.note else ""
     parts = (
         f'{note}<div class="scroll" tabindex="0" role="region" aria-label="{escape(title)}">'

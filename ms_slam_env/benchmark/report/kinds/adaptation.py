@@ -33,7 +33,7 @@ class Adaptation(Kind):
             isinstance(rows, list)
             and bool(rows)
             and all(
-                isinstance(row, dict) and isinstance((row.get("result") or {}).get("runs"), dict)
+                isinstance(row.get("result"), dict) and isinstance(row["result"].get("runs"), dict)
                 for row in rows
                 if isinstance(row, dict) and row.get("error") is None
             )

@@ -37,7 +37,8 @@ class Planners(Kind):
         if not isinstance(summary, dict) or not isinstance(episodes, list) or not episodes:
             return False
         return all(isinstance(m, dict) and "f_score_5cm" in m for m in summary.values()) and all(
-            "planner" in row.get("spec", {}) for row in episodes
+            isinstance(row, dict) and isinstance(row.get("spec"), dict) and "planner" in row["spec"]
+            for row in episodes
         )
 
     def figures(self, result: Result) -> list[Figure]:

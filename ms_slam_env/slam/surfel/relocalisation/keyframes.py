@@ -184,9 +184,9 @@ class FernRelocalisation(Relocalisation):
 
     def adapt(self, intrinsics: Intrinsics, depth_cutoff_m: float) -> None:
         """Keyframes are compared as small images of one size, so that those at hand stay."""
-        self._cutoff_m = depth_cutoff_m
         for database in self.databases:
             database.expect_size(intrinsics)
+        self._cutoff_m = depth_cutoff_m
 
     def clear(self, env: int) -> None:
         """Forget the keyframes of one env."""
