@@ -120,10 +120,8 @@ def _rigid_motion(
 ) -> tuple[Float64, int] | None:
     """T_a_b (4, 4) that most of the pairs (N, 3), (N, 3) fit, and their number; None without."""
     best, most = None, 2
-    for _ in range(_TRIALS):
-        chosen = rng.choice(len(a), 3, replace=False)
-        if not _are_rigid(a[chosen], b[chosen], tolerances[chosen]):
-            continue
+    trials = np.stack([rng.choice(len(a), 3, replace=False) for _ in range(_TRIALS)])
+    for chosen in trials[_are_rigid(a[trials], b[trials], tolerances[trials])]:
         inliers = _fitting(_alignment(b[chosen], a[chosen]), a, b, tolerances)
         if inliers.sum() > most:
             best, most = inliers, int(inliers.sum())
@@ -137,14 +135,14 @@ def _rigid_motion(
     return T, int(best.sum())
 
 
-def _are_rigid(a: Float64, b: Float64, tolerances: Float64) -> bool:
-    """Whether two triangles have the same sides, none of them tiny."""
+def _are_rigid(a: Float64, b: Float64, tolerances: Float64) -> NDArray[np.bool_]:
+    """Which triangles (T, 3, 3) have the same sides in both sets, none of them tiny."""
+    rigid = np.ones(len(a), dtype=bool)
     for i, j in ((0, 1), (1, 2), (2, 0)):
-        in_a, in_b = np.linalg.norm(a[i] - a[j]), np.linalg.norm(b[i] - b[j])
-        slack = tolerances[i] + tolerances[j]
-        if min(in_a, in_b) < slack or abs(in_a - in_b) > slack:
-            return False
-    return True
+        in_a, in_b = (np.linalg.norm(x[:, i] - x[:, j], axis=1) for x in (a, b))
+        slack = tolerances[:, i] + tolerances[:, j]
+        rigid &= (np.minimum(in_a, in_b) >= slack) & (np.abs(in_a - in_b) <= slack)
+    return rigid
 
 
 def _fitting(T_a_b: Float64, a: Float64, b: Float64, tolerances: Float64) -> NDArray[np.bool_]:

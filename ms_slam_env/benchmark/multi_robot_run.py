@@ -166,7 +166,8 @@ def merge_pairs(robots: list[RobotRun], config: MergeConfig) -> dict[tuple[int, 
         alone = {}
         for source in config.sources:
             some = [guess for guess in guesses if guess.source == source]
-            alone[source] = decide(robots[a], robots[b], some, config)
+            is_all = len(some) == len(guesses)
+            alone[source] = merge if is_all else decide(robots[a], robots[b], some, config)
         found[a, b] = PairMerge(merge, alone)
     return found
 

@@ -10,7 +10,12 @@ import pytest
 from box_scene import BoxScene
 
 from ms_slam_env import slam
-from ms_slam_env.benchmark import multi_robot, multi_robot_paths, multi_robot_run
+from ms_slam_env.benchmark import (
+    multi_robot,
+    multi_robot_paths,
+    multi_robot_report,
+    multi_robot_run,
+)
 from ms_slam_env.benchmark.map_hypotheses import (
     FEATURES,
     RELOCALISATION,
@@ -310,18 +315,23 @@ def test_a_team_maps_its_paths_in_frames_of_its_own(box_scene, monkeypatch) -> N
     assert box_scene.clearance(team.seen.astype(float)).max() < 1e-4
 
 
-def test_the_command_reports_teams(robots, box_scene, tmp_path, monkeypatch, capsys) -> None:
+def test_the_command_reports_teams(robots, tmp_path, monkeypatch, capsys) -> None:
     def here(specs, run, *_):
         rows = []
         for spec in specs:
             rows.append({"spec": dataclasses.asdict(spec), "result": run(spec), "error": None})
         return rows
 
-    surface = box_scene.surface_points(0.05)[0]
-    team = Team(robots, list(TRUTHS), [np.arange(10) / 30] * 2, surface, surface, [0.5])
+    def judged(points, *_):
+        return {"f_score_2cm": 0.5, "f_score_5cm": 1.0, "map_points": len(points)}
+
+    floor = np.zeros((1, 3))
+    team = Team(robots, list(TRUTHS), [np.arange(10) / 30] * 2, floor, floor, [0.5])
+    monkeypatch.setattr(multi_robot_run, "judge_map", judged)  # takes seconds, and is tested above
     monkeypatch.setattr(multi_robot, "run_all", here)
     monkeypatch.setattr(multi_robot, "make_team", lambda _: team)
     monkeypatch.setattr(multi_robot_run, "make_team", lambda _: team)
+    monkeypatch.setattr(multi_robot_report, "CAMERA", multi_robot_report.CAMERA.scaled(0.125))
     options = ["--scenes", "table", "--merge.sources", "features", "--out", str(tmp_path)]
     assert multi_robot.main(options) == 0
     assert "| table | 1000 | shared | 2 of 2 |" in capsys.readouterr().out
