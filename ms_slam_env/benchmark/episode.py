@@ -20,6 +20,7 @@ from ms_slam_env.benchmark.planners import make_planner, planner_class
 from ms_slam_env.config import check_choice, check_range
 from ms_slam_env.env import ActiveSlamEnv, Planner
 from ms_slam_env.errors import InputError
+from ms_slam_env.registration import ADAPTIVE_ID
 
 Float64 = NDArray[np.float64]
 
@@ -64,6 +65,12 @@ class EpisodeSpec:
         except InputError as error:
             # Users know the fields as options of a command, not this class.
             raise InputError(str(error).replace("EpisodeSpec.", "")) from None
+        name = self.planner.partition(",")[0]
+        if self.env_id == ADAPTIVE_ID and ":" not in name:
+            raise InputError(
+                f"planner {name!r} chooses motions only, {ADAPTIVE_ID} asks for a SLAM "
+                "configuration too; valid choices: module:Class"
+            )
 
 
 def run_episode(spec: EpisodeSpec) -> dict[str, Any]:

@@ -111,13 +111,13 @@ def run_suite(
         the tables as Markdown, and what failed, one line each.
 
     Raises:
-        InputError: an unknown backend, or a folder that lacks a sequence or holds another.
+        InputError: an unknown backend or parameter, or a folder that lacks a sequence or holds
+            another.
         RuntimeError: every run failed.
     """
     named = [parse_named(text, "backend") for text in backends]
-    for name, _ in named:
-        if name not in slam.BACKENDS:
-            raise unknown("SLAM backend", name, slam.BACKENDS)
+    for name, params in named:
+        slam.check_parameters(name, params)
     if folder is not None:
         for name in options.sequences:
             _check_folder(folder / name, options)

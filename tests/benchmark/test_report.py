@@ -301,6 +301,12 @@ def test_a_cell_that_is_not_finite_has_no_place_in_the_order(tmp_path):
     assert "<td>1e999</td>" in written
 
 
+def test_a_text_in_another_encoding_is_no_obstacle(tmp_path):
+    write(tmp_path / "r.json", {"a": 1})
+    (tmp_path / "table.md").write_bytes("Größe".encode("latin-1"))
+    assert main(["report", str(tmp_path)]) == 0
+
+
 def test_the_page_is_one_file_with_plotly_in_it_once(tmp_path, capsys):
     for name in ("a", "b"):
         rows = [{"planner": p, "ate_m": 0.1 * k} for k, p in enumerate("xyz")]

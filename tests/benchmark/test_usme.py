@@ -193,6 +193,7 @@ def _run(spec: usme_run.UsmeSpec) -> dict:
     [
         (["fly"], "make, run, picture"),
         (["run", "--backends", "magic"], "unknown SLAM backend 'magic'"),
+        (["run", "--backends", "odometry,magic=1"], "slam_config.magic"),
         (["make", "--sequences", "x"], "unknown USME sequence 'x'"),
         (["make", "--image-size", "1x1"], "unknown image size"),
         (["run", "/nowhere"], "holds no finished sequence"),

@@ -49,6 +49,10 @@ def one_line(text: str) -> str:
         (["benchmark", "--steps", "three"], "--steps"),
         (["benchmark", "--seeds", "exam"], "valid choices: train, validation, test"),
         (["benchmark", "--env-id", "CartPole-v1"], "unknown env_id 'CartPole-v1'; valid"),
+        (
+            ["benchmark", "--env-id", "MSActiveSLAM-Adaptive-v0"],
+            "chooses motions only, MSActiveSLAM-Adaptive-v0 asks for a SLAM configuration too",
+        ),
         (["benchmark", "--workers", "0", "--planners", "random"], "workers = 0"),
         (["evaluate"], "Missing"),
         (["evaluate", "missing.txt", "missing.txt"], "cannot read trajectory missing.txt"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from ms_slam_env.benchmark.report.blocks import (
@@ -31,7 +32,7 @@ def section_of(result: Result) -> Section:
         OSError: a file of the folder cannot be read.
     """
     kind: Kind = kind_of(result.content)
-    written = [b for path in result.texts for b in blocks_of(path.read_text(encoding="utf-8"))]
+    written = [b for path in result.texts for b in blocks_of(_text_of(path))]
     written = [b for b in written if not (isinstance(b, Prose) and b.text.startswith("Made by "))]
     try:
         drawn, own = kind.figures(result), kind.tables(result)
@@ -59,6 +60,11 @@ def section_of(result: Result) -> Section:
     return Section(
         result.title, kind.name, kind.about, tuple(blocks), provenance_lines(result.provenance)
     )
+
+
+def _text_of(path: Path) -> str:
+    """Text of a file that another program may have written in another encoding."""
+    return path.read_text(encoding="utf-8", errors="replace")
 
 
 def provenance_lines(provenance: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
