@@ -107,7 +107,7 @@ def main(arguments: Sequence[str]) -> int:
 
 def _trajectories(
     args: Arguments, result: dict[str, Any], parts: list[str]
-) -> Callable[[Path], None]:
+) -> Callable[[Path], object]:
     """Measure and print; return what writes figure and poses into a folder."""
     from ms_slam_env.benchmark import trajectory_evaluation_report as report
     from ms_slam_env.benchmark.trajectory_evaluation import (
@@ -145,7 +145,7 @@ def _trajectories(
     return write
 
 
-def _maps(args: Arguments, result: dict[str, Any], parts: list[str]) -> Callable[[Path], None]:
+def _maps(args: Arguments, result: dict[str, Any], parts: list[str]) -> Callable[[Path], object]:
     """Measure and print; return what writes the figure into a folder."""
     from ms_slam_env.benchmark import map_evaluation_report as report
     from ms_slam_env.benchmark.map_evaluation import MapOptions, evaluate_maps
