@@ -3,8 +3,8 @@
 Many studies of every sampler need many evaluations. So each proposal is moved to the nearest point
 of a grid, ten thousand points and more for seven parameters, and what has been measured at a point
 is not measured again: every study of every sampler then explores one and the same function. Run as
-``python -m ms_slam_env.benchmark.explore_samplers --help``; measurements are kept, and what is
-interrupted goes on from there.
+``python -m ms_slam_env.benchmark.explore_samplers --help``; measurements and finished studies are
+kept, and what is interrupted goes on from there, also with more seeds.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ms_slam_env.benchmark.explore_figures import hypervolume_figure
 from ms_slam_env.benchmark.explore_grid import Grid
 from ms_slam_env.benchmark.figures import save
 from ms_slam_env.benchmark.provenance import provenance
-from ms_slam_env.benchmark.records import write_json
+from ms_slam_env.benchmark.records import RecordFile, spec_key, write_json
 from ms_slam_env.benchmark.statistics import bootstrap_interval
 from ms_slam_env.benchmark.table import markdown_table
 from ms_slam_env.errors import InputError
@@ -73,6 +73,18 @@ class Arguments:
     """Folder of the measurements and the results."""
 
 
+@dataclass(frozen=True)
+class _Study:
+    """A study; what decides its history."""
+
+    evaluator: SlamEvaluator
+    grid: dict[str, list[Any]]
+    sampler: str
+    seed: int
+    trials: int
+    reference: dict[str, float]
+
+
 def run_study(
     grid: Grid, sampler: str, seed: int, trials: int, reference: Mapping[str, float]
 ) -> list[float]:
@@ -113,8 +125,15 @@ def run(arguments: Arguments) -> str:
     reference = {name: arguments.reference_factor * default[name] for name in OBJECTIVES}
     histories: dict[str, list[list[float]]] = {name: [] for name in arguments.samplers}
     pairs = [(seed, name) for seed in range(arguments.seeds) for name in arguments.samplers]
+    records = RecordFile(arguments.out / "studies.jsonl")
+    done = records.load()
     for seed, name in tqdm(pairs, unit="study"):
-        histories[name].append(run_study(grid, name, seed, arguments.trials, reference))
+        key = spec_key(_Study(evaluator, grid.levels, name, seed, arguments.trials, reference))
+        if key not in done:
+            history = run_study(grid, name, seed, arguments.trials, reference)
+            done[key] = {"key": key, "sampler": name, "seed": seed, "hypervolume": history}
+            records.append(done[key])
+        histories[name].append(done[key]["hypervolume"])
     content = {
         "provenance": provenance(),
         "config": {

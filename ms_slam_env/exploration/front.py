@@ -26,7 +26,8 @@ class Point:
         measured: everything that the evaluation returned.
         values: of the objectives, as the sampler was told.
         feasible: it did not fail and kept every constraint.
-        on_front: no feasible trial is as good in every objective and better in one.
+        on_front: no feasible trial is as good in every objective and better in one, and every
+            objective is better than the reference.
         is_default: it is the configuration that the exploration started from.
     """
 
@@ -51,7 +52,12 @@ class Point:
 
 def points_of(ledger: Ledger) -> list[Point]:
     """The finished trials, in the order of their numbers."""
-    best = {trial.number for trial in ledger.study.best_trials}
+    limits = [(ledger.reference() or {})[name] for name in ledger.settings.objectives]
+    best = {
+        trial.number
+        for trial in ledger.study.best_trials
+        if all(value < limit for value, limit in zip(trial.values, limits, strict=True))
+    }
     defaults = ledger.space.defaults()
     return [
         Point(
