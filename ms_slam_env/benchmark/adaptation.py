@@ -214,7 +214,7 @@ def judge(
     """Run a SLAM over the frames.
 
     Returns:
-        figures: ``ext_ms``, mean processor time a frame, dropped ones and the adaptation's own work
+        figures: ``cpu_ms``, mean processor time a frame, dropped ones and the adaptation's own work
         included; ``ate_m``, RMSE over all frames after SE(3) alignment, with the poses of dropped
         frames interpolated between processed ones; ``ate_online_m``, the same with the poses that
         were predicted for them; ``ate_max_m``; ``processed`` and ``lost``, shares of the frames;
@@ -238,7 +238,7 @@ def judge(
     ms = 1e3 * np.array(seconds)
     ate = metrics.ate_statistics(filled, truth)
     figures = {
-        "ext_ms": float(ms.mean()),
+        "cpu_ms": float(ms.mean()),
         "ext_quiet_ms": float(ms[~violent].mean()),
         "ext_violent_ms": float(ms[violent].mean()) if violent.any() else float("nan"),
         "ate_m": ate.rmse,

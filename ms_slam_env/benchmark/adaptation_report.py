@@ -24,7 +24,7 @@ from ms_slam_env.benchmark.records import Row
 from ms_slam_env.benchmark.table import format_interval, markdown_table
 
 COLUMNS = (
-    Column("ext_ms", "processor time a frame [ms]"),
+    Column("cpu_ms", "processor time a frame [ms]"),
     Column("ate_m", "ATE [mm]", 1000),
     Column("ate_online_m", "ATE as predicted [mm]", 1000),
     Column("processed", "frames processed [%]", 100),
@@ -66,7 +66,7 @@ def comparison(rows: Sequence[Row]) -> list[dict[str, Any]]:
         if name == _ADAPTIVE:
             continue
         cut: dict[str, Any] = {"against": name}
-        for metric in ("ext_ms", "ate_m"):
+        for metric in ("cpu_ms", "ate_m"):
             own, other = (values(rows, who, metric) for who in (_ADAPTIVE, name))
             cut[f"{metric}_cut"] = asdict(statistics.relative_cut(own, other))
             cut[f"{metric}_lower_share"] = float(np.mean(np.less(own, other)))
@@ -96,7 +96,7 @@ def tables(rows: Sequence[Row]) -> str:
         [
             [
                 cut["against"],
-                format_interval(statistics.Interval(**cut["ext_ms_cut"]), 100),
+                format_interval(statistics.Interval(**cut["cpu_ms_cut"]), 100),
                 format_interval(statistics.Interval(**cut["ate_m_cut"]), 100),
                 f"{100 * cut['ate_m_lower_share']:.0f}",
             ]
@@ -117,7 +117,7 @@ def _save_scatter(rows: Sequence[Row], path: Path) -> Path:
     figure = new_figure(1, width=9.0, height=3.8)
     ax = figure.subplots()
     for index, name in enumerate(competitors(rows)):
-        ms, ate = values(rows, name, "ext_ms"), 1000 * np.array(values(rows, name, "ate_m"))
+        ms, ate = values(rows, name, "cpu_ms"), 1000 * np.array(values(rows, name, "ate_m"))
         marker = "*" if name == _ADAPTIVE else "o"
         ax.scatter(ms, ate, s=10, alpha=0.4, color=colour(index))
         ax.scatter(

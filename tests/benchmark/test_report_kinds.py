@@ -105,8 +105,8 @@ EXAMPLES = {
                 "error": None,
                 "result": {
                     "runs": {
-                        "fast": {"ate_m": 0.01, "ext_ms": 3},
-                        "adaptive": {"ate_m": 0.02, "ext_ms": 4},
+                        "fast": {"ate_m": 0.01, "cpu_ms": 3},
+                        "adaptive": {"ate_m": 0.02, "cpu_ms": 4},
                     },
                     "change": [0.0, 0.1, 0.2, 0.1], "level": [0, 0, 1, 1],
                     "thresholds": [0.15], "violent": [False, True, True, False],

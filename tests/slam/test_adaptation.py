@@ -53,6 +53,19 @@ def adapted(name="divergence", configurations=(FAST, PLAIN), drops_frames=True, 
     return backend
 
 
+def test_before_any_frame_the_level_is_the_first(frames):
+    backend = adapted(thresholds=[0.02], dwell_frames=3)
+    assert backend.level == 1
+    state = backend.get_state()
+    for frame in frames[:5]:
+        backend.track(frame)
+    assert backend.level == 0
+    backend.reset(START)
+    assert backend.level == 1
+    backend.set_state(state)
+    assert backend.level == 1
+
+
 def test_violent_frames_are_processed_robustly_and_calm_ones_fast(frames):
     backend = adapted(thresholds=[0.02], dwell_frames=3)
     levels = []

@@ -43,7 +43,7 @@ class AdaptiveSlam(ManagedSlam):
 
     @property
     def level(self) -> int:
-        """Index of the configuration that the last frame was processed under."""
+        """Index of the configuration of the last processed frame; of the first before any."""
         return self._switch.index
 
     @property
@@ -74,11 +74,12 @@ class _Switch(FrameFilter):
         self.levels = tuple(levels)
         self._controller = controller
         self._drops_frames = drops_frames
-        self.index = 0
+        self.index = controller.index
 
     def reset(self) -> None:
         """Forget every frame."""
         self._controller.reset()
+        self.index = self._controller.index
 
     def admits(self, frame: RGBDFrame, dropped: int, forced: bool = False) -> bool:
         """Whether the level in force keeps this frame; ``forced`` means lost or not started."""

@@ -32,11 +32,11 @@ class AgentController(Controller):
 
     def reset(self) -> None:
         """Back to the first."""
-        self._index = self._first
+        self.index = self._first
 
     def choose(self, frame: RGBDFrame, is_lost: bool) -> int:
         """The index told."""
-        return self._index
+        return self.index
 
     def use(self, index: int) -> None:
         """Take configuration ``index`` from the next frame on.
@@ -46,12 +46,12 @@ class AgentController(Controller):
         """
         if not 0 <= index < self._count:
             raise InputError(f"configuration {index!r} is outside [0, {self._count - 1}]")
-        self._index = int(index)
+        self.index = int(index)
 
     def get_state(self) -> dict[str, Any]:
         """The index."""
-        return {"index": self._index}
+        return {"index": self.index}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on with the index of a state."""
-        self._index = state["index"]
+        self.index = state["index"]

@@ -10,7 +10,13 @@ from ms_slam_env.errors import InputError
 
 
 class Controller(ABC):
-    """Chooses before every frame one of the configurations, by index from fast to robust."""
+    """Chooses before every frame one of the configurations, by index from fast to robust.
+
+    Attributes:
+        index: of the configuration chosen last; of the first one before any frame.
+    """
+
+    index: int
 
     @abstractmethod
     def reset(self) -> None:

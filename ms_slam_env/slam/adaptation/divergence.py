@@ -81,7 +81,7 @@ class DivergenceController(Controller):
         self._measure.reset()
         self.change = 0.0
         self._time_s: float | None = None  # of the last frame
-        self._index = self._config.first
+        self.index = self._config.first
         self._recent: list[float] = []  # changes of the last frames, as many as the dwell
 
     def choose(self, frame: RGBDFrame, is_lost: bool) -> int:
@@ -89,14 +89,14 @@ class DivergenceController(Controller):
         is_first = self._time_s is None
         self._observe(frame)
         if is_first:
-            return self._index
+            return self.index
         config = self._config
         change = inf if is_lost and config.robust_when_lost else self.change
         self._recent = [*self._recent, change][-config.dwell_frames :]
-        self._index = max(self._index, bisect_right(config.thresholds, change))
+        self.index = max(self.index, bisect_right(config.thresholds, change))
         if len(self._recent) == config.dwell_frames:
-            self._index = min(self._index, bisect_right(self._release, max(self._recent)))
-        return self._index
+            self.index = min(self.index, bisect_right(self._release, max(self._recent)))
+        return self.index
 
     def _observe(self, frame: RGBDFrame) -> None:
         """Measure the change from the frame before; it is the reference from now on."""
@@ -120,7 +120,7 @@ class DivergenceController(Controller):
             "measure": self._measure.get_state(),
             "change": self.change,
             "time_s": self._time_s,
-            "index": self._index,
+            "index": self.index,
             "recent": list(self._recent),
         }
 
@@ -128,4 +128,4 @@ class DivergenceController(Controller):
         """Go on from a state."""
         self._measure.set_state(state["measure"])
         self.change, self._time_s = state["change"], state["time_s"]
-        self._index, self._recent = state["index"], list(state["recent"])
+        self.index, self._recent = state["index"], list(state["recent"])

@@ -46,14 +46,14 @@ class Adaptation(Kind):
         names = list(rows[0]["result"]["runs"])
         runs = {
             name: [
-                (run["ext_ms"], run["ate_m"], _label(row))
+                (run["cpu_ms"], run["ate_m"], _label(row))
                 for row in rows
                 if (run := row["result"]["runs"].get(name)) and run.get("ate_m") is not None
             ]
             for name in names
         }
         caption = "Small marks: one a sequence; large marks: medians. Down and left is good."
-        plot = scatter_plot(runs, "ext_ms", "ate_m")
+        plot = scatter_plot(runs, "cpu_ms", "ate_m")
         summary = [flatten(row) for row in result.content.get("summary") or ()]
         found = [
             Figure("Error against time", caption, (plot,), 480),
