@@ -11,7 +11,7 @@ from tqdm import tqdm
 from ms_slam_env.benchmark.compare_inputs import check_sequence
 from ms_slam_env.benchmark.explore_evaluation import SlamEvaluator
 from ms_slam_env.benchmark.explore_figures import save_figures
-from ms_slam_env.benchmark.explore_judge import judge
+from ms_slam_env.benchmark.explore_judge import DEFAULT, judge
 from ms_slam_env.benchmark.explore_report import table
 from ms_slam_env.benchmark.provenance import provenance
 from ms_slam_env.benchmark.records import write_json
@@ -38,7 +38,7 @@ class Exploration:
         settings: objectives, constraints and sampler.
         parameters: ``NAME``, ``NAME=low:high[:log]``, ``NAME=a,b,c``, or a group of them.
         base: configuration that the exploration starts from, its first trial.
-        held_out: sequences that the chosen configurations are judged on.
+        held_out: sequences that the front and the chosen configurations are judged on.
 
     Raises:
         InputError: an unknown name, a value out of range, a sequence that cannot be had, or an
@@ -115,15 +115,13 @@ def write_results(exploration: Exploration, ledger: Ledger, out: Path) -> str:
     files = {name: f"{name.replace('_', '-')}.yaml" for name in chosen}
     for name, point in chosen.items():
         write_configuration(out / files[name], _configuration(ledger, point, name))
-    held_out = judge(
-        exploration.evaluator,
-        {
-            "default": ledger.space.base,
-            **{name: ledger.space.configuration(point.params) for name, point in chosen.items()},
-        },
-        exploration.held_out,
-        out,
-    )
+    known = {point.number for point in chosen.values()}
+    others = {f"trial {p.number}": p for p in points if p.on_front and p.number not in known}
+    judged = {
+        name: ledger.space.configuration(point.params) for name, point in (chosen | others).items()
+    }
+    configurations = {DEFAULT: ledger.space.base, **judged}
+    held_out = judge(exploration.evaluator, configurations, exploration.held_out, out)
     history = hypervolume_history(points, reference, objectives)
     content: dict[str, Any] = {
         "provenance": provenance(),

@@ -26,7 +26,7 @@ class Arguments:
     )
     """Sequences to explore on: folders, or scene:seed[:noise[+perturbation ...]]."""
     held_out: tuple[str, ...] = ()
-    """Sequences to judge the chosen configurations on."""
+    """Sequences to judge the front and the chosen configurations on."""
     objectives: tuple[str, ...] = ("ate_m", "ext_ms")
     """What to minimise: ate_m, ate_max_m, ext_ms, load_ms, mem_mb, energy_j, map_error_mm, lost."""
     constraints: tuple[str, ...] = ()

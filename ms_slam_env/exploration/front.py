@@ -52,7 +52,8 @@ class Point:
 
 def points_of(ledger: Ledger) -> list[Point]:
     """The finished trials, in the order of their numbers."""
-    limits = [(ledger.reference() or {})[name] for name in ledger.settings.objectives]
+    reference = ledger.reference() or {}  # none before the first trial has finished
+    limits = [reference.get(name, math.inf) for name in ledger.settings.objectives]
     best = {
         trial.number
         for trial in ledger.study.best_trials

@@ -57,7 +57,7 @@ class ExplorationSettings:
         check_choice(self, "sampler", tuple(SAMPLERS))
         check_range(self, "seed", 0, 2**31)
         check_range(self, "population", 2, 10_000)
-        check_range(self, "reference_factor", 1.0, 1000.0)
+        check_range(self, "reference_factor", 1.01, 1000.0)  # the default itself lies inside
         if self.reference and set(self.reference) != set(self.objectives):
             raise InputError(f"reference {self.reference} must name every objective")
         self.parsed_constraints()
