@@ -229,11 +229,16 @@ class Ledger:
     @contextmanager
     def _alone(self) -> Iterator[None]:
         """Hold the folder's lock; the system drops it when the process dies, however it dies."""
-        lock = sqlite3.connect(
-            self.folder / LOCK_FILE, timeout=_LOCK_TIMEOUT_S, isolation_level=None
-        )
+        path = self.folder / LOCK_FILE
         try:
-            lock.execute("BEGIN EXCLUSIVE")
+            lock = sqlite3.connect(path, timeout=_LOCK_TIMEOUT_S, isolation_level=None)
+        except sqlite3.OperationalError as error:
+            raise InputError(f"{path}: {error}") from None
+        try:
+            try:
+                lock.execute("BEGIN EXCLUSIVE")
+            except sqlite3.DatabaseError as error:  # no right to write, or another kind of file
+                raise InputError(f"{path}: {error}") from None
             yield
         finally:
             lock.close()

@@ -36,11 +36,10 @@ def explore_here(
             wait_a_moment()
             continue
         try:
-            measured = evaluate(ledger.configuration(trial))
-        except BaseException as error:
+            ledger.tell(trial, evaluate(ledger.configuration(trial)))
+        except BaseException as error:  # also an interrupt between evaluating and telling
             ledger.give_up(trial, str(error) or type(error).__name__)
             raise
-        ledger.tell(trial, measured)
 
 
 def explore_in_processes(

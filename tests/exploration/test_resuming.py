@@ -167,6 +167,12 @@ def test_a_file_that_is_no_study_is_one_clear_line(tmp_path):
     assert "\n" not in str(caught.value)
 
 
+def test_a_lock_that_cannot_be_taken_is_one_clear_line(tmp_path):
+    (tmp_path / "study.lock").mkdir()
+    with pytest.raises(InputError, match=r"study\.lock: unable to open"):
+        Ledger(tmp_path, fake_space(), ExplorationSettings())
+
+
 def test_processes_have_names(processes):
     assert is_alive(process_name())
     process = processes.Process(target=int)
