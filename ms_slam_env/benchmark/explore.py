@@ -114,7 +114,8 @@ def write_results(exploration: Exploration, ledger: Ledger, out: Path) -> str:
     chosen = choose(points, objectives)
     files = {name: f"{name.replace('_', '-')}.yaml" for name in chosen}
     for name, point in chosen.items():
-        write_configuration(out / files[name], _configuration(ledger, point, name))
+        made = _configuration(ledger, point, name, exploration.evaluator.image_size)
+        write_configuration(out / files[name], made)
     known = {point.number for point in chosen.values()}
     others = {f"trial {p.number}": p for p in points if p.on_front and p.number not in known}
     judged = {
@@ -147,8 +148,10 @@ def write_results(exploration: Exploration, ledger: Ledger, out: Path) -> str:
     return text
 
 
-def _configuration(ledger: Ledger, point: Point, purpose: str) -> SlamConfiguration:
-    """The configuration of ``point`` with where it comes from."""
+def _configuration(
+    ledger: Ledger, point: Point, purpose: str, image_size: str
+) -> SlamConfiguration:
+    """The configuration of ``point`` with where it comes from and the image size it ran at."""
     made = ledger.space.configuration(point.params)
     about = {
         "purpose": purpose,
@@ -156,5 +159,10 @@ def _configuration(ledger: Ledger, point: Point, purpose: str) -> SlamConfigurat
         "measured": {k: v for k, v in point.measured.items() if v is not None},
     }
     return SlamConfiguration(
-        made.slam, made.slam_config, made.image_size, made.keep_every, made.threads, about
+        made.slam,
+        made.slam_config,
+        made.image_size or image_size,
+        made.keep_every,
+        made.threads,
+        about,
     )

@@ -23,7 +23,7 @@ class Make:
     An interrupted call goes on from where it was when the same command is given again.
     """
 
-    out: Path = Path("results/usme")
+    out: Path = Path("results/usme_sequences")
     """Folder that gets one folder a sequence."""
     truth: bool = False
     """Also write true depth and object labels."""

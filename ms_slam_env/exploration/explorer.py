@@ -46,7 +46,8 @@ def explore(
         RuntimeError: worker processes die again and again.
     """
     if isinstance(budget, bool) or budget < 1 or workers < 1:
-        raise InputError(f"trials {budget} and workers {workers} must be 1 or more")
+        name, value = ("trials", budget) if budget < 1 else ("workers", workers)
+        raise InputError(f"{name} = {value} must be at least 1")
     ledger = Ledger(folder, space, settings)
     report = progress or _silent
     if ray_address is not None:

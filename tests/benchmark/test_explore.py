@@ -146,12 +146,13 @@ def test_going_on_keeps_what_is_there(explored, monkeypatch):
 
 
 def test_chosen_configurations_are_taken_everywhere(explored, sequences, tmp_path):
-    _, out, _ = explored
+    exploration, out, _ = explored
     content = json.loads((out / "explore.json").read_text())
     for name, row in content["chosen"].items():
         path = out / row["file"]
         configuration = read_configuration(path)
         assert configuration.about["purpose"] == name
+        assert configuration.image_size == exploration.evaluator.image_size
         assert configuration.slam_config["points_per_level"] == row["params"]["points_per_level"]
         assert slam.make(path, xtion("80x60")).config.iterations[0] == row["params"]["iterations.0"]
     command = ["run", sequences[0], "--config", str(path), "--out", str(tmp_path / "run")]
@@ -257,7 +258,7 @@ def test_divergence_grows_when_frames_are_left_out(sequences, tmp_path):
         (["--held-out", "nowhere:1000"], "unknown scene 'nowhere'"),
         (["--held-out", "."], "is no RGB-D sequence"),
         (["--held-out", "table:1002"], "sequence table:1002 is explored and held out"),
-        (["--trials", "0"], "trials 0 and workers 1 must be 1 or more"),
+        (["--trials", "0"], "trials = 0 must be at least 1"),
         (["--config", "no.yaml"], "no.yaml: cannot be read"),
         (["--clock", "sundial"], "valid choices: processor, wall"),
         (["--frames", "3"], "frames = 3 is outside"),

@@ -62,5 +62,5 @@ def test_no_cluster_at_the_address(tmp_path):
 
 def test_bad_numbers(tmp_path):
     for budget, workers in ((0, 1), (1, 0), (True, 1)):
-        with pytest.raises(InputError, match="must be 1 or more"):
+        with pytest.raises(InputError, match="must be at least 1"):
             explore(tmp_path, fake_space(), SETTINGS, FakeEvaluation(), budget, workers)

@@ -338,7 +338,7 @@ def test_every_frame_is_a_function_of_its_index(box_scene: BoxScene, path) -> No
         box_scene, path, K, seed=seed, perturbations=everything
     )
     first = list(make(7))
-    assert len(first) == FRAMES // 2
+    assert 2 <= len(first) <= FRAMES // 2  # every second one, and a hurried path has fewer
     again = make(7)
     backwards = [again.frames[k] for k in reversed(range(len(again)))][::-1]
     for (frame, T), other, pose in zip(first, backwards, again.poses, strict=True):
@@ -358,7 +358,7 @@ def test_each_changes_something(name: str, box_scene: BoxScene, path) -> None:
 
 
 def test_truth_is_what_an_ideal_camera_sees(box_scene: BoxScene, path) -> None:
-    in_the_world = ("moving-objects",)  # which is what there is to see
+    in_the_world = ("moving-objects", "fast-motion")  # what there is to see, and from where
     everything = [make_perturbation(name) for name in PERTURBATIONS if name not in in_the_world]
     truth = render_sequence(box_scene, path, K, perturbations=everything).frames.truth(1)
     expected = RGBDSensor(box_scene, K, noise="none").ground_truth(path[2])
