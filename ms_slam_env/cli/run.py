@@ -14,7 +14,7 @@ from ms_slam_env.errors import InputError
 
 _PRINTED = (
     *("frames", "processed_frames", "lost_frames"),
-    *("ms_median", "ext_ms", "ext_ms_p95", "mem_peak_mb", "ene_j"),
+    *("cpu_ms_median", "ext_ms", "ext_ms_p95", "mem_peak_mb", "ene_j"),
     *("path_m", "ate_m", "ate_rad", "rpe_m"),
 )
 
