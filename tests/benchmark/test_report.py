@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from ms_slam_env.benchmark.report.blocks import Figure, Prose, Table
 from ms_slam_env.benchmark.report.discovery import find_results
 from ms_slam_env.benchmark.report.flatten import flatten, records, table_of
-from ms_slam_env.benchmark.report.glossary import heading, meaning, unit
+from ms_slam_env.benchmark.report.glossary import heading, meaning, unit, with_unit
 from ms_slam_env.benchmark.report.kinds.trajectory import trajectory_figures
 from ms_slam_env.benchmark.report.markdown import blocks_of
 from ms_slam_env.benchmark.report.page import page
@@ -175,6 +175,52 @@ def test_units_and_headings():
     assert "trajectory" in meaning("ATE [mm]")
     assert meaning("ate_max_m") != meaning("ate_m")
     assert meaning("zzz") == ""
+    assert heading("rotation_deg_per_m.mean") == "rotation: mean [deg/m]"
+
+
+@pytest.mark.parametrize(
+    ("label", "shown"),
+    [
+        ("turn deg s", "turn [deg/s]"),
+        ("motions speed m s", "motions speed [m/s]"),
+        ("image motion deg s", "image motion [deg/s]"),
+        ("max per s", "max [1/s]"),
+        ("depth m", "depth [m]"),
+        ("ate_m", "ate_m"),
+        ("path, m", "path, m"),
+        ("frames", "frames"),
+    ],
+)
+def test_units_at_the_end_of_a_written_heading_stand_in_brackets(label, shown):
+    assert with_unit(label) == shown
+    (table,) = blocks_of(f"| {label} |\n| ---: |\n| 1 |\n")
+    assert table.columns == (shown,)
+
+
+@pytest.mark.parametrize(
+    ("name", "part"),
+    [
+        ("EXT [ms]", "by the clock"),
+        ("ext_ms_p95", "by the clock"),
+        ("cpu_ms_mean", "Processor time"),
+        ("M_I", "chosen motions"),
+        ("importance of", "PED-ANOVA"),
+        ("noise ratio", "USME 8"),
+        ("processed frames", "Number"),
+        ("points_per_level", "Pixels"),
+        ("map points", "Surface points"),
+    ],
+)
+def test_a_column_means_what_its_whole_name_says(name, part):
+    assert part in meaning(name)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["points_of_the_grid", "intensity_noise", "depth_noise_m", "seeds", "wall 0", "path_overlaps"],
+)
+def test_a_part_of_a_name_explains_nothing(name):
+    assert meaning(name) == ""
 
 
 def test_numbers_keep_their_value_through_text_and_intervals():

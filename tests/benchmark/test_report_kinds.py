@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from ms_slam_env.benchmark.report.blocks import Figure
+from ms_slam_env.benchmark.report.blocks import Figure, Table
 from ms_slam_env.benchmark.report.discovery import find_results
 from ms_slam_env.benchmark.report.sections import section_of
 
@@ -202,3 +202,46 @@ def test_a_team_stands_beside_its_robots(tmp_path):
     values = {trace["name"]: trace["x"] for trace in plot.data}
     assert values["team, merged"] == [2.0, 4.0]
     assert values["robot 2 alone"] == [3.0, 6.0]
+
+
+def explained(section):
+    """What the section says of each column, by heading."""
+    tables = [block for block in section.blocks if isinstance(block, Table)]
+    return {name: text for table in tables for name, text in table.meanings.items()}
+
+
+@pytest.mark.parametrize(
+    ("clock", "time"), [("processor", "processor time"), ("wall", "time by the clock")]
+)
+def test_time_of_an_exploration_is_by_the_clock_of_its_settings(clock, time, tmp_path):
+    content = EXAMPLES["design-space exploration"] | {"config": {"clock": clock}}
+    write(tmp_path / "r.json", content)
+    header = "| ext_ms | load_ms | EXT [ms/frame] | EXT [ms/frame of the sequence] | M_I |"
+    (tmp_path / "table.md").write_text(f"{header}\n|{' ---: |' * 5}\n|{' 1 |' * 5}\n")
+    (section,) = [section_of(result) for result in find_results(tmp_path)]
+    said = explained(section)
+    assert said["ext_ms"] == said["EXT [ms/frame]"] == f"Median {time} of a processed frame."
+    assert said["load_ms"] == said["EXT [ms/frame of the sequence]"]
+    assert "of the sequence" in said["load_ms"]
+    assert time in said["load_ms"]
+    assert "consecutive processed frames" in said["M_I"]
+    assert "above the default's" in section.about
+
+
+def test_times_of_the_usme_suite_are_by_the_clock(tmp_path):
+    write(tmp_path / "r.json", EXAMPLES["USME suite"])
+    header = "| scene | noise [%] | EXT [ms] | processor [ms] |"
+    (tmp_path / "table.md").write_text(f"{header}\n|{' --- |' * 4}\n|{' 1 |' * 4}\n")
+    (section,) = [section_of(result) for result in find_results(tmp_path)]
+    said = explained(section)
+    assert "by the clock" in said["EXT [ms]"]
+    assert "Processor time" in said["processor [ms]"]
+    assert "USME 8" in said["noise [%]"]
+    assert "scene" in said["scene"]
+
+
+def test_the_error_column_of_an_evaluation_names_a_measure(tmp_path):
+    write(tmp_path / "r.json", EXAMPLES["trajectory against the truth"])
+    (tmp_path / "table.md").write_text("| error | rmse |\n| --- | ---: |\n| ATE | 1 |\n")
+    (section,) = [section_of(result) for result in find_results(tmp_path)]
+    assert "measure" in explained(section)["error"]

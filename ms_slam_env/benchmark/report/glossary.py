@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
-MEANINGS = (
+Meanings = Sequence[tuple[str, str]]
+"""Pairs of a pattern and a sentence; the first that matches holds."""
+
+MEANINGS: Meanings = (
     (
         r"^ate max|^largest|^max(imum)? ate",
         "Largest distance between an estimated and the true position.",
@@ -49,27 +53,41 @@ MEANINGS = (
     ),
     (r"^initialisation", "Time until the scale of the estimate is steady (USME 12)."),
     (r"^scale error", "Symmetric relative error of the scale (USME 13)."),
-    (r"^noise ratio", "Share of map points that statistical outlier removal takes away."),
+    (
+        r"^noise ratio",
+        "Noise ratio (USME 8): share of map points that statistical outlier removal takes away.",
+    ),
     (r"frames lost|^lost (frames|steps)", "Frames for which SLAM had no pose, or their share."),
     (r"^lost\b", "Whether, or in which share of episodes, tracking was lost."),
     (r"^success", "Share of episodes whose map shows nothing twice."),
     (r"^(cpu|processor|frame cpu)\b|^frame ms", "Processor time a frame, all threads together."),
-    (r"^ext\b", "Execution time: processor time of SLAM a frame."),
+    (r"^ext( ms)?$", "Execution time: mean time of SLAM a frame, by the clock."),
+    (
+        r"^ext ms (median|p95|p99|max)$",
+        "Execution time of a frame, by the clock: median, percentile or largest of the frames.",
+    ),
+    (r"^ext (quiet|violent)( ms)?$", "Mean processor time of a frame in such stretches."),
+    (r"^mem peak( mb)?$", "Memory that SLAM itself took, at its peak."),
+    (r"^mem process( mb)?$", "Memory of the whole process at its peak."),
     (r"^mem(ory)?\b|^peak mem", "Memory of the process at its peak, unless stated otherwise."),
     (r"^ene(rgy)?\b", "Energy, measured or by the stated model."),
-    (r"^(clock|wall)|^ms( median| p95)?$", "Time a frame."),
-    (r"^path( length)?( m)?\b", "Length of the path."),
+    (r"^(clock|wall)( ms( p\d+)?)?$|^ms( median| p95)?$", "Time a frame."),
+    (r"^path( length)?(,? m)?$", "Length of the path."),
     (r"^decision", "Time the planner took to choose a motion."),
     (r"^m i$", "Mean intensity divergence of the chosen motions, nats."),
     (r"^m d$", "Mean depth divergence of the chosen motions, nats."),
     (
-        r"^mean (i|d)$|^intensity|^depth$|divergence",
+        r"^mean (i|d)$|^(intensity|depth)$|^(mean (intensity|depth) )?divergences?$",
         "Kullback-Leibler divergence between the histograms of two frames, nats: how much new "
         "the second one shows.",
     ),
     (r"^return\b", "Sum of the rewards of an episode."),
     (r"^mapped( area)?", "Area of the true surface that the map covers."),
-    (r"^surfels|^(map )?points", "Surface points that the map holds."),
+    (
+        r"^points per level$",
+        "Pixels that tracking looks at in its last iteration; the others look at three tenths.",
+    ),
+    (r"^surfels( stored)?$|^(map )?points$", "Surface points that the map holds."),
     (r"^found\b", "Share of attempts in which a lost camera was found again."),
     (r"^wrong\b", "Share of the answers that were wrong."),
     (r"^relocalisation", "Time from the first frame with something to see to a pose."),
@@ -77,15 +95,23 @@ MEANINGS = (
     (r"^error$", "Why this one failed; empty where it did not."),
     (r"^elapsed", "Time by the clock that this row took."),
     (r"^hypervolume", "Size of the region that the Pareto front dominates; more is better."),
-    (r"^importance", "Share of the variance of the result that the parameter explains."),
-    (r"^share|share$|^processed|^kept", "A share: from 0 to 1, or in per cent where it says so."),
-    (r"^seed", "Seed of scene, path and noise: the same seed gives the same data."),
+    (
+        r"^importance( of)?$",
+        "Share of the parameter in what makes a good value of the objective (PED-ANOVA).",
+    ),
+    (r"^processed frames$", "Number of frames that SLAM processed."),
+    (
+        r"^share|share$|^processed$|^kept frames$",
+        "A share: from 0 to 1, or in per cent where it says so.",
+    ),
+    (r"^seed$", "Seed of scene, path and noise: the same seed gives the same data."),
     (r"^noise$", "Noise model of the depth camera."),
     (r"^(planner|backend|system|variant|setting|policy)$", "What is compared."),
     (r"^(scene|sequence|recording)$", "What it ran on."),
     (r"^frames?$", "Frames that were given."),
     (r"^(attempts|episodes|cases|values|count|states|motions)$", "Number of observations."),
-    (r"^(value|low|high)$", "Estimate, and the ends of its 95 % interval."),
+    (r"^value$", "Value of what the row names."),
+    (r"^(low|high)$", "End of the 95 % interval."),
 )
 """Pattern of a key or heading (lower case, blanks for underscores, without unit); sentence."""
 
@@ -94,6 +120,7 @@ _UNITS = (
     (r"_m_s$", "m/s", 1.0),
     (r"_deg_s$", "deg/s", 1.0),
     (r"_per_s$", "1/s", 1.0),
+    (r"_deg_per_m$", "deg/m", 1.0),
     (r"_mm$", "mm", 1.0),
     (r"(^|_)ms$", "ms", 1.0),
     (r"_m2$", "m²", 1.0),
@@ -112,9 +139,19 @@ _UNITS = (
 _CAPITALS = re.compile(r"\b(ate|rpe|rer|rcm|ext|mem|ene|icp|rgb|cpu|gpu|fps)\b")
 
 
-def meaning(name: str) -> str:
-    """What the column of a key or heading means; empty where that is not known."""
-    plain = re.sub(r"\[.*?\]|%", " ", name.lower().replace("_", " "))
+def meaning(name: str, own: Meanings = ()) -> str:
+    """What the column of a key or heading means; empty where that is not known.
+
+    Args:
+        name: key or heading.
+        own: of a kind of result, before ``MEANINGS``. A pattern is one of all of the name, unit
+            included, in lower case with blanks for underscores; an empty sentence: no explanation.
+    """
+    whole = name.lower().replace("_", " ")
+    for pattern, text in own:
+        if re.fullmatch(pattern, whole):
+            return text
+    plain = re.sub(r"\[.*?\]|%", " ", whole)
     for part in reversed(re.split(r"\.|: ", plain)):
         words = " ".join(part.split())
         for pattern, text in MEANINGS:
@@ -138,6 +175,12 @@ def heading(key: str) -> str:
     name, _ = unit(key)
     label = ": ".join([*(_words(part) for part in prefix), _words(last)])
     return f"{label} [{name}]" if name else label
+
+
+def with_unit(label: str) -> str:
+    """A heading whose last words are a unit, with that in brackets: ``turn deg s``."""
+    match = re.fullmatch(r"([a-z ]+?) (deg s|m s|per s|m)", label)
+    return f"{match[1]} [{unit('_' + match[2].replace(' ', '_'))[0]}]" if match else label
 
 
 def _words(key: str) -> str:

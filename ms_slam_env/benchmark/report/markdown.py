@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from ms_slam_env.benchmark.report.blocks import Block, Cell, Prose, Table
-from ms_slam_env.benchmark.report.glossary import meaning
+from ms_slam_env.benchmark.report.glossary import meaning, with_unit
 
 _RULE = re.compile(r"^\|?[\s:|-]+\|?$")
 _NUMBER = re.compile(r"^[<>≤≥~]?\s*(-?\d+(?:\.\d+)?(?:e[-+]?\d+)?)")
@@ -56,7 +56,7 @@ def blocks_of(text: str) -> list[Block]:
 
 def table(title: str, header: str, lines: list[str]) -> Table:
     """A table from its lines; rows are cut or filled to the width of the header."""
-    columns = tuple(_cells(header))
+    columns = tuple(with_unit(text) for text in _cells(header))
     rows = []
     for line in lines:
         cells = [cell(text) for text in _cells(line)][: len(columns)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from ms_slam_env.benchmark.report.blocks import (
     Table,
 )
 from ms_slam_env.benchmark.report.discovery import PICTURES, Result
+from ms_slam_env.benchmark.report.glossary import Meanings, meaning
 from ms_slam_env.benchmark.report.kinds import kind_of
 from ms_slam_env.benchmark.report.kinds.base import Kind
 from ms_slam_env.benchmark.report.kinds.generic import Generic, facts, row_tables, settings
@@ -50,6 +52,8 @@ def section_of(result: Result) -> Section:
     given = settings(result.content)
     if given is not None:
         blocks.append(given)
+    meanings = kind.meanings(result.content)
+    blocks = [_explained(block, meanings) for block in blocks]
     pictures = tuple(
         Picture(path.name, PICTURES[path.suffix.lower()], path.read_bytes())
         for path in result.pictures
@@ -60,6 +64,15 @@ def section_of(result: Result) -> Section:
     return Section(
         result.title, kind.name, kind.about, tuple(blocks), provenance_lines(result.provenance)
     )
+
+
+def _explained(block: Block, own: Meanings) -> Block:
+    """A table with the meanings that its columns have in this kind of result."""
+    if not isinstance(block, Table) or not own:
+        return block
+    names = dict.fromkeys((*block.columns, *block.meanings))
+    found = {name: meaning(name, own) for name in names}
+    return replace(block, meanings={name: text for name, text in found.items() if text})
 
 
 def _text_of(path: Path) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 
 from ms_slam_env.benchmark.report.blocks import Block, Figure
 from ms_slam_env.benchmark.report.discovery import Result
+from ms_slam_env.benchmark.report.glossary import Meanings
 
 
 class Kind(ABC):
@@ -31,3 +32,7 @@ class Kind(ABC):
     def tables(self, result: Result) -> list[Block]:
         """Tables that the folder's Markdown and the JSON rows do not hold already."""
         return []
+
+    def meanings(self, content: dict[str, Any]) -> Meanings:
+        """Of columns that mean something else here than in the glossary; see ``meaning``."""
+        return ()

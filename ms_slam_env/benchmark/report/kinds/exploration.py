@@ -11,7 +11,7 @@ from ms_slam_env.benchmark.report.bars import bar_figure
 from ms_slam_env.benchmark.report.blocks import Block, Code, Figure, Plot
 from ms_slam_env.benchmark.report.discovery import Result
 from ms_slam_env.benchmark.report.flatten import cell_of, flatten
-from ms_slam_env.benchmark.report.glossary import heading, unit
+from ms_slam_env.benchmark.report.glossary import Meanings, heading, unit
 from ms_slam_env.benchmark.report.kinds.base import Kind
 from ms_slam_env.exploration.objectives import FAILURE
 
@@ -27,7 +27,10 @@ class Exploration(Kind):
     about = (
         "Configurations of SLAM are tried out, each trial a run over the same sequences. The "
         "Pareto front holds those that no other one beats in every objective: left of it nothing "
-        "is faster at the same error, below it nothing is more accurate in the same time."
+        "is faster at the same error, below it nothing is more accurate in the same time. Chosen "
+        "from the front: fastest, the least cost whose error is not above the default's; most "
+        "accurate, the least error whose cost is not above the default's; knee, farthest below "
+        "the line between the ends of the front, on logarithmic axes."
     )
 
     def fits(self, content: dict[str, Any]) -> bool:
@@ -71,6 +74,30 @@ class Exploration(Kind):
             if path.parent == result.folder and path.is_file():
                 found.append(Code(path.name, path.read_text(encoding="utf-8")))
         return found
+
+    def meanings(self, content: dict[str, Any]) -> Meanings:
+        """Time, memory and divergence as an exploration measures them."""
+        return evaluation_meanings(content)
+
+
+def evaluation_meanings(content: Mapping[str, Any]) -> Meanings:
+    """What the figures of a configuration mean, by the clock of the result's settings."""
+    config = content.get("config")
+    clock = config.get("clock") if isinstance(config, Mapping) else None
+    time = "time by the clock" if clock == "wall" else "processor time"
+    of_sequence = (
+        f"Time of a frame of the sequence: the median {time} of a processed frame, times the "
+        "share of the frames that are processed."
+    )
+    differ = "divergence between consecutive processed frames of the sequences, nats."
+    return (
+        (r"(.*: )?(ext \[ms/frame of the sequence\]|load( ms| \[ms\]))", of_sequence),
+        (r"(.*: )?ext( ms| \[ms(/frame)?\])", f"Median {time} of a processed frame."),
+        (r"(ate m|ext ms|load ms) ratio", "Ratio to that of the default configuration."),
+        (r"(.*: )?mem( mb| \[mb\])", "Memory that SLAM itself took, at its peak."),
+        (r"m i", f"Largest intensity {differ}"),
+        (r"m d", f"Largest depth {differ}"),
+    )
 
 
 def pareto_figure(

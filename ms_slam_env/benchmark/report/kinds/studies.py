@@ -14,8 +14,9 @@ from ms_slam_env.benchmark.report.blocks import Figure
 from ms_slam_env.benchmark.report.curves import curve_figure
 from ms_slam_env.benchmark.report.discovery import Result
 from ms_slam_env.benchmark.report.flatten import Record, flatten
-from ms_slam_env.benchmark.report.glossary import heading
+from ms_slam_env.benchmark.report.glossary import Meanings, heading
 from ms_slam_env.benchmark.report.kinds.base import Kind
+from ms_slam_env.benchmark.report.kinds.exploration import evaluation_meanings
 from ms_slam_env.benchmark.report.kinds.scatter import scatter_plot
 
 
@@ -97,6 +98,10 @@ class Rates(Kind):
         ]
         return [figure for figure in drawn if figure is not None]
 
+    def meanings(self, content: dict[str, Any]) -> Meanings:
+        """Time, memory and divergence as an exploration measures them."""
+        return evaluation_meanings(content)
+
 
 class Difficulty(Kind):
     """Motions in several scenes."""
@@ -129,6 +134,19 @@ class Difficulty(Kind):
             title = f"{kind} divergence"
             found.append(bar_figure(own, title, ["where", "motion"], keys))
         return [figure for figure in found if figure is not None]
+
+    def meanings(self, content: dict[str, Any]) -> Meanings:
+        """What the frames show and how the camera moves."""
+        return (
+            (r"turn \[deg/s\]", "How fast the camera turns."),
+            (r"speed \[m/s\]", "How fast the camera moves."),
+            (
+                r"image motion \[deg/s\]",
+                "Mean angle by which the surface points of a frame move in the camera's view.",
+            ),
+            (r"contrast", "Standard deviation of the grey values, mean over the frames."),
+            (r"depth \[m\]", "Depth that the frames show, mean over the frames."),
+        )
 
 
 def histories_figure(histories: dict[str, list[list[float]]]) -> Figure:

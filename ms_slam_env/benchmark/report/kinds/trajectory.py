@@ -15,6 +15,7 @@ from ms_slam_env.benchmark.report.blocks import Figure, Plot
 from ms_slam_env.benchmark.report.curves import curve_figure
 from ms_slam_env.benchmark.report.discovery import Result
 from ms_slam_env.benchmark.report.flatten import Record, flatten
+from ms_slam_env.benchmark.report.glossary import Meanings
 from ms_slam_env.benchmark.report.kinds.base import Kind
 from ms_slam_env.errors import InputError
 from ms_slam_env.metrics import umeyama
@@ -50,6 +51,13 @@ class Run(Kind):
         found = trajectory_figures(folder / "groundtruth.txt", estimates)
         costs = cost_figure(folder / "frames.csv")
         return [*found, *([costs] if costs else [])]
+
+    def meanings(self, content: dict[str, Any]) -> Meanings:
+        """Times of a run."""
+        return (
+            (r"ms (median|p95)", "Processor time a frame: median, 95th percentile."),
+            (r"mem( mb| \[mb\])", "Memory that SLAM itself took, mean over the frames."),
+        )
 
 
 class Evaluation(Kind):
@@ -87,6 +95,10 @@ class Evaluation(Kind):
             else None,
         ]
         return [*found, *(figure for figure in more if figure is not None)]
+
+    def meanings(self, content: dict[str, Any]) -> Meanings:
+        """Of the table of errors."""
+        return ((r"error", "Which measure of the error the row holds."),)
 
 
 def trajectory_figures(truth: Path, estimates: dict[str, Path], align: str = "se3") -> list[Figure]:

@@ -8,6 +8,7 @@ from ms_slam_env.benchmark.report.bars import bar_figure
 from ms_slam_env.benchmark.report.blocks import Figure
 from ms_slam_env.benchmark.report.discovery import Result
 from ms_slam_env.benchmark.report.flatten import flatten
+from ms_slam_env.benchmark.report.glossary import Meanings, meaning
 from ms_slam_env.benchmark.report.kinds.base import Kind
 from ms_slam_env.benchmark.report.kinds.scatter import scatter_plot
 
@@ -57,3 +58,12 @@ class Usme(Kind):
             plot = scatter_plot(runs, "ext_ms", "ate_m", medians=False)
             found.append(Figure("Error against time", "One mark a sequence.", (plot,), 440))
         return [figure for figure in found if figure is not None]
+
+    def meanings(self, content: dict[str, Any]) -> Meanings:
+        """Of the tables of the suite."""
+        return (
+            (r"noise \[%\]", meaning("noise_ratio")),
+            (r"scene", "Kind of scene that the sequence was rendered in."),
+            (r"95 % \[ms\]", "95th percentile of the execution time a frame, by the clock."),
+            (r"mem \[mb\]", meaning("mem_peak_mb")),
+        )
