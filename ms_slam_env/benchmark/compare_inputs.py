@@ -156,7 +156,7 @@ def evenly_picked(count: int) -> NDArray[np.int64]:
 def seen_surface(
     views: Iterator[tuple[Float64, NDArray[np.float32]]],
     intrinsics: Intrinsics,
-    cutoff_m: float = 3.0,
+    cutoff_m: float = 4.0,
 ) -> Float64:
     """Points (M, 3) of what ``views`` saw: pairs of T_world_camera (4, 4) and depth (H, W) metres.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from ms_slam_env.camera import xtion
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
 from ms_slam_env.sequences import HandheldPath
+from ms_slam_env.slam.surfel import SurfelConfig
 
 RESULT = dict.fromkeys(
     [
@@ -78,6 +80,11 @@ def test_bad_input_is_refused_before_anything_runs(
 def test_a_folder_without_truth_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError):
         load(str(tmp_path), "160x120", HandheldPath(10))
+
+
+def test_the_true_surface_reaches_as_far_as_slam_looks():
+    reach = inspect.signature(seen_surface).parameters["cutoff_m"].default
+    assert reach == SurfelConfig().depth_cutoff_m
 
 
 def test_seen_surface_of_a_plane() -> None:
