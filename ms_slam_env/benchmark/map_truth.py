@@ -20,7 +20,7 @@ from ms_slam_env.scenes.rays import RayCaster
 
 Float64 = NDArray[np.float64]
 
-RADIUS_M = 3.0  # the depth cutoff of SLAM: what the first view could reach, in every direction
+RADIUS_M = 3.0  # what a first view reaches, in every direction; part of the protocol
 REACH_M = 1.0
 SURFACE_SPACING_M = 0.01  # half the smaller threshold of the F-score
 REFERENCE_SPACING_M = 0.03

@@ -164,8 +164,8 @@ def _start(recording: Recording) -> Float64 | None:
 def measure(track: Track, recording: Recording) -> dict[str, Any]:
     """Metrics of a run, finished or not; those against the truth only where there is one.
 
-    ``frames``, ``lost_frames``, ``processed_frames``, processor time a frame (``ms_median``,
-    ``ms_p95``), ``path_m`` of the estimate; ``ate_m`` (RMSE after SE(3) alignment), ``ate_max_m``,
+    ``frames``, ``lost_frames``, ``processed_frames``, ``path_m`` of the estimate;
+    ``ate_m`` (RMSE after SE(3) alignment), ``ate_max_m``,
     ``ate_rad`` (RMSE of the orientation after it, None where the path is a line), ``rpe_m``,
     ``rpe_rad``; the costs by the names of ``CostMeter.summary``.
     """
@@ -177,8 +177,6 @@ def measure(track: Track, recording: Recording) -> dict[str, Any]:
         "frames": len(poses),
         "lost_frames": int(len(poses) - sum(track.tracking_ok)),
         "processed_frames": sum(track.processed),
-        "ms_median": cost["cpu_ms_median"],
-        "ms_p95": cost["cpu_ms_p95"],
         "path_m": metrics.path_length(poses),
         **cost,
     }

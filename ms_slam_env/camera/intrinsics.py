@@ -49,6 +49,23 @@ class Intrinsics:
         """(height, width), the shape of an image array."""
         return self.height, self.width
 
+    def every_nth(self, n: int) -> Intrinsics:
+        """Intrinsics of the image that keeps every ``n``-th row and column, from the first on.
+
+        Raises:
+            InputError: ``n`` below 1.
+        """
+        if n < 1:
+            raise InputError(f"n = {n} must be >= 1")
+        return Intrinsics(
+            fx=self.fx / n,
+            fy=self.fy / n,
+            cx=self.cx / n,
+            cy=self.cy / n,
+            width=-(-self.width // n),
+            height=-(-self.height // n),
+        )
+
     def scaled(self, factor: float) -> Intrinsics:
         """Intrinsics of the image resampled by ``factor`` (0.5 halves it), same field of view.
 

@@ -105,3 +105,17 @@ def test_a_frame_takes_zero_as_no_reading():
 def test_bad_frames_are_refused(color, depth, match):
     with pytest.raises(InputError, match=match):
         RGBDFrame(color, depth)
+
+
+@given(st.integers(1, 7))
+def test_every_nth_pixel_has_the_ray_it_had(n: int) -> None:
+    whole = Intrinsics(fx=281.0, fy=280.0, cx=80.3, cy=59.1, width=161, height=118)
+    rays = whole.rays()[::n, ::n]
+    kept = whole.every_nth(n)
+    assert kept.shape == rays.shape[:2]
+    np.testing.assert_allclose(kept.rays(), rays, rtol=1e-12, atol=1e-12)
+
+
+def test_every_nth_needs_a_positive_number() -> None:
+    with pytest.raises(InputError, match="n = 0 must be >= 1"):
+        xtion().every_nth(0)

@@ -29,7 +29,7 @@ from ms_slam_env.slam.frame_management import (
     make_config,
 )
 from ms_slam_env.slam.frame_management.budget import BudgetFilter
-from ms_slam_env.slam.frame_management.change import Change, ChangeConfig, thinned
+from ms_slam_env.slam.frame_management.change import Change, ChangeConfig
 from ms_slam_env.slam.frame_management.every_frame import EveryFrame
 
 CAMERA = xtion("80x60")
@@ -156,7 +156,7 @@ def test_regular_skipping_keeps_the_share(every):
 def _slow_change(current: RGBDFrame, reference: RGBDFrame, weight: float) -> float:
     """The divergences of the frames' every second row and column, by the plain functions."""
     config = DivergenceConfig()
-    intrinsics = thinned(CAMERA, 2)
+    intrinsics = CAMERA.every_nth(2)
     images, depths = [], []
     for frame in (current, reference):
         grey, depth = intensity_image(frame.color)[::2, ::2], frame.depth[::2, ::2]

@@ -10,7 +10,6 @@ import numpy as np
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.config import check_range
 from ms_slam_env.divergence import DivergenceConfig, Histograms, make_divergence
-from ms_slam_env.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ class Change:
     def __init__(self, config: ChangeConfig, intrinsics: Intrinsics) -> None:
         self._intrinsics = intrinsics
         self._stride = max(1, intrinsics.width // config.width)
-        self._measure = make_divergence(config.divergence, thinned(intrinsics, self._stride))
+        self._measure = make_divergence(config.divergence, intrinsics.every_nth(self._stride))
         self._weights = np.array([1.0, config.depth_weight])
         self._reference: Histograms | None = None
         self._current: Histograms | None = None
@@ -94,21 +93,3 @@ class Change:
             self._reference = None
         else:
             self._reference = Histograms(state["intensity"].copy(), state["normals"].copy())
-
-
-def thinned(intrinsics: Intrinsics, stride: int) -> Intrinsics:
-    """Intrinsics of the image of which every ``stride``-th row and column is kept, from the first.
-
-    Raises:
-        InputError: a stride below 1.
-    """
-    if stride < 1:
-        raise InputError(f"stride = {stride} must be >= 1")
-    return Intrinsics(
-        fx=intrinsics.fx / stride,
-        fy=intrinsics.fy / stride,
-        cx=intrinsics.cx / stride,
-        cy=intrinsics.cy / stride,
-        width=-(-intrinsics.width // stride),
-        height=-(-intrinsics.height // stride),
-    )

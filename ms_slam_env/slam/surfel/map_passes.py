@@ -22,7 +22,6 @@ from ms_slam_env.slam.surfel.splat_renderer import (
     Culler,
     SplatParameters,
     SplatRenderer,
-    every_nth,
     splat_camera,
 )
 from ms_slam_env.slam.surfel.surfel_arrays import SeenWindow, Surfels, VisibleList
@@ -112,7 +111,7 @@ class MapPasses:
             arrays.visible,
             arrays.discs,
             arrays.batch,
-            every_nth(self._intrinsics, stride),
+            self._intrinsics.every_nth(stride),
             replace(
                 parameters, min_px=parameters.min_px / stride, max_px=parameters.max_px / stride
             ),

@@ -51,18 +51,6 @@ def splat_camera(intrinsics: Intrinsics, parameters: SplatParameters) -> SplatCa
     return camera
 
 
-def every_nth(intrinsics: Intrinsics, n: int) -> Intrinsics:
-    """Intrinsics of the image that keeps every ``n``-th row and column, from the first on."""
-    return Intrinsics(
-        fx=intrinsics.fx / n,
-        fy=intrinsics.fy / n,
-        cx=intrinsics.cx / n,
-        cy=intrinsics.cy / n,
-        width=-(-intrinsics.width // n),
-        height=-(-intrinsics.height // n),
-    )
-
-
 class Culler:
     """Lists the surfels that cameras can see, one camera for each of ``envs`` maps.
 
