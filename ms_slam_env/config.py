@@ -13,6 +13,43 @@ from ms_slam_env.errors import InputError, unknown
 
 T = TypeVar("T")
 
+_RANGE = "range"
+_CHOICES = "choices"
+
+
+def bounded(default: T, low: float, high: float) -> T:
+    """A field of a :class:`Checked` dataclass: numbers in [low, high], by default ``default``.
+
+    A field declared ``int`` takes no fractions; one that may be None is only checked otherwise.
+    """
+    return dataclasses.field(default=default, metadata={_RANGE: (low, high)})
+
+
+def chosen(default: T, *choices: T) -> T:
+    """A field of a :class:`Checked` dataclass: one of ``choices``, by default ``default``."""
+    return dataclasses.field(default=default, metadata={_CHOICES: choices})
+
+
+class Checked:
+    """A dataclass that refuses values outside what its fields state.
+
+    A subclass with conditions of its own calls ``super().__post_init__()`` before it checks them.
+    """
+
+    def __post_init__(self) -> None:
+        """Refuse values outside what :func:`bounded` and :func:`chosen` say.
+
+        Raises:
+            InputError: naming class, field, value, and the permitted range or choices.
+        """
+        for field in dataclasses.fields(self):  # type: ignore[arg-type]
+            may_be_none = "None" in str(field.type) and getattr(self, field.name) is None
+            if _RANGE in field.metadata and not may_be_none:
+                check_range(self, field.name, *field.metadata[_RANGE])
+            if _CHOICES in field.metadata and not may_be_none:
+                check_choice(self, field.name, field.metadata[_CHOICES])
+
+
 
 class Named(ABC):
     """A dataclass of which some values have a name that can stand for them."""

@@ -7,20 +7,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ms_slam_env.config import check_range
+from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.surfel import SurfelConfig
 
 
 @dataclass(frozen=True)
-class Options:
-    count: int = 2
-    length_m: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_range(self, "count", 0, 5)
-        check_range(self, "length_m", 0, 5)
+class Options(Checked):
+    count: int = bounded(2, 0, 5)
+    length_m: float = bounded(1.0, 0, 5)
+    limit: int | None = bounded(None, 0, 5)
+    kind: str = chosen("fast", "fast", "robust")
 
 
 @pytest.mark.parametrize("value", [0, 5, np.int64(3)])
@@ -39,6 +37,18 @@ def test_a_fraction_is_no_integer() -> None:
     Options(length_m=2.5)
     with pytest.raises(InputError, match=r"Options.count = 2.5 must be an integer"):
         Options(count=2.5)  # type: ignore[arg-type]
+
+
+def test_only_a_field_that_may_be_none_takes_none() -> None:
+    assert Options(limit=None).limit is None
+    with pytest.raises(InputError, match=r"Options.limit = 6 is outside \[0, 5\]"):
+        Options(limit=6)
+
+
+def test_an_unknown_choice_is_refused_with_the_valid_ones() -> None:
+    assert Options(kind="robust").kind == "robust"
+    with pytest.raises(InputError, match=r"unknown Options.kind 'slow'; valid choices: fast, robust"):
+        Options(kind="slow")
 
 
 @pytest.mark.parametrize(
