@@ -50,7 +50,6 @@ class Checked:
                 check_choice(self, field.name, field.metadata[_CHOICES])
 
 
-
 class Named(ABC):
     """A dataclass of which some values have a name that can stand for them."""
 
