@@ -51,7 +51,7 @@ from stable_baselines3.common.vec_env import (
 from tqdm import tqdm
 
 import ms_slam_env  # registers the ids, in a worker process too
-from ms_slam_env.benchmark.command_line import parse
+from ms_slam_env.command_line import parse
 from ms_slam_env.errors import InputError, unknown
 
 VALIDATION_SEED = 1_000_000  # of the first validation episode; training draws from small seeds

@@ -13,11 +13,11 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "ms_slam_env"
 FLOW = (
-    "geometry -> camera -> divergence -> scenes, robot -> sensor -> slam -> sequences -> metrics"
-    " -> env -> exploration -> benchmark -> cli"
+    "geometry -> camera -> divergence -> scenes, robot -> sensor -> slam -> mapping -> sequences"
+    " -> metrics -> report -> evaluation -> env -> exploration -> experiments -> benchmark -> cli"
 )
 LEVEL = {name: level for level, name in enumerate(re.split(r" -> |, ", FLOW))}
-BELOW_ALL = {"errors", "config", "timings", "_warp"}
+BELOW_ALL = {"errors", "config", "command_line", "timings", "_warp"}
 ABOVE_ALL = {"registration", ""}  # "" is ms_slam_env/__init__.py
 NEVER = {"baselines", "agents", "ms_slam_baselines", "ms_slam_agents", "evo"}
 ONLY_INSIDE_FUNCTIONS = {

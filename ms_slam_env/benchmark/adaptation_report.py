@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from ms_slam_env.benchmark import statistics
 from ms_slam_env.benchmark.figures import (
     caption,
     colour,
@@ -20,8 +19,9 @@ from ms_slam_env.benchmark.figures import (
     save,
 )
 from ms_slam_env.benchmark.planner_report import Column
-from ms_slam_env.benchmark.records import Row
 from ms_slam_env.benchmark.table import format_interval, markdown_table
+from ms_slam_env.report import statistics
+from ms_slam_env.report.records import Row
 
 COLUMNS = (
     Column("cpu_ms", "processor time a frame [ms]"),

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, cast
 
 from ms_slam_env.benchmark import arm_experiment_report as report
-from ms_slam_env.benchmark.command_line import exit_code, parse, report_failures
 from ms_slam_env.benchmark.episode import (
     DEFAULT_STEP_DEG,
     DEFAULT_STEP_M,
@@ -31,13 +30,14 @@ from ms_slam_env.benchmark.map_consistency_picture import save_map_picture
 from ms_slam_env.benchmark.options import parse_options
 from ms_slam_env.benchmark.planner_benchmark import DEFAULT_PLANNERS, check_names, seed_list
 from ms_slam_env.benchmark.planners import make_planner
-from ms_slam_env.benchmark.provenance import provenance
-from ms_slam_env.benchmark.records import write_json
 from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
+from ms_slam_env.command_line import exit_code, parse, report_failures
 from ms_slam_env.config import check_range
 from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.errors import InputError
 from ms_slam_env.metrics.consistency import ConsistencyRule
+from ms_slam_env.report.provenance import provenance
+from ms_slam_env.report.records import write_json
 
 PROGRAM = "python -m ms_slam_env.benchmark.arm_experiment"
 SCENES = ("window", "table", "wall", "carpet")

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from ms_slam_env import scenes
 from ms_slam_env.benchmark.arm_mesh import LABEL, floor_below, scene_with
-from ms_slam_env.benchmark.command_line import exit_code, parse
 from ms_slam_env.camera import Intrinsics, xtion
+from ms_slam_env.command_line import exit_code, parse
 from ms_slam_env.config import check_range
 from ms_slam_env.env.config import EnvConfig
 from ms_slam_env.errors import InputError, UnreachableError

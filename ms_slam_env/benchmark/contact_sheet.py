@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import scenes
-from ms_slam_env.benchmark.command_line import exit_code, parse
 from ms_slam_env.camera import Intrinsics, xtion
+from ms_slam_env.command_line import exit_code, parse
 from ms_slam_env.scenes import Scene
 from ms_slam_env.sensor import RGBDSensor
 

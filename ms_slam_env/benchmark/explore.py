@@ -13,8 +13,6 @@ from ms_slam_env.benchmark.explore_evaluation import SlamEvaluator
 from ms_slam_env.benchmark.explore_figures import save_figures
 from ms_slam_env.benchmark.explore_judge import DEFAULT, judge
 from ms_slam_env.benchmark.explore_report import table
-from ms_slam_env.benchmark.provenance import provenance
-from ms_slam_env.benchmark.records import write_json
 from ms_slam_env.errors import InputError
 from ms_slam_env.exploration import ExplorationSettings, explore, make_space
 from ms_slam_env.exploration.front import (
@@ -26,6 +24,8 @@ from ms_slam_env.exploration.front import (
 )
 from ms_slam_env.exploration.ledger import Ledger
 from ms_slam_env.metrics.cost import energy_counters
+from ms_slam_env.report.provenance import provenance
+from ms_slam_env.report.records import write_json
 from ms_slam_env.slam.configuration import SlamConfiguration, write_configuration
 
 

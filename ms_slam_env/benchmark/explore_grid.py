@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from ms_slam_env.benchmark.explore_evaluation import Row, SlamEvaluator
-from ms_slam_env.benchmark.records import RecordFile, spec_key
 from ms_slam_env.errors import InputError
 from ms_slam_env.exploration import Float, Integer, SearchSpace
+from ms_slam_env.report.records import RecordFile, spec_key
 
 
 @dataclass(frozen=True)

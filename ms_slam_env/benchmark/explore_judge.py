@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from ms_slam_env.benchmark.explore_evaluation import Row, SlamEvaluator
-from ms_slam_env.benchmark.records import RecordFile, spec_key
-from ms_slam_env.benchmark.statistics import bootstrap_interval
 from ms_slam_env.exploration.objectives import FAILURE
+from ms_slam_env.report.records import RecordFile, spec_key
+from ms_slam_env.report.statistics import bootstrap_interval
 from ms_slam_env.slam.configuration import SlamConfiguration
 
 DEFAULT = "default"

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from ms_slam_env.benchmark.planner_report import Column, finished, summarise
-from ms_slam_env.benchmark.records import Row
+from ms_slam_env.report.records import Row
 
 PANELS = (
     Column("f_score_5cm", "F-score at 5 cm [%]", 100),

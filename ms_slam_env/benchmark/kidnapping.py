@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import scenes, slam
-from ms_slam_env.benchmark.command_line import exit_code, parse, report_failures
 from ms_slam_env.benchmark.kidnapping_report import about_the_maps, as_table, summarise
 from ms_slam_env.benchmark.kidnapping_scenarios import (
     ALL_SETTINGS,
@@ -30,14 +29,15 @@ from ms_slam_env.benchmark.kidnapping_scenarios import (
     map_path,
 )
 from ms_slam_env.benchmark.planner_benchmark import seed_list
-from ms_slam_env.benchmark.provenance import provenance
-from ms_slam_env.benchmark.records import write_json
 from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
 from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
+from ms_slam_env.command_line import exit_code, parse, report_failures
 from ms_slam_env.config import check_range
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.geometry import invert, relative_angle
 from ms_slam_env.metrics import ate_rmse, relocalisation_times
+from ms_slam_env.report.provenance import provenance
+from ms_slam_env.report.records import write_json
 from ms_slam_env.scenes import ROOMS, SCENES, Scene
 from ms_slam_env.sensor import FRAME_RATE_HZ, RGBDSensor
 from ms_slam_env.slam import SlamBackend

@@ -18,7 +18,7 @@ import numpy as np
 from matplotlib.colors import Normalize
 from matplotlib.patches import Rectangle
 
-from ms_slam_env.benchmark.command_line import exit_code, parse
+from ms_slam_env.command_line import exit_code, parse
 from ms_slam_env.robot import NUM_ROTATIONS, NUM_TRANSLATIONS, ROTATIONS, TRANSLATIONS
 
 PROGRAM = "python -m ms_slam_env.benchmark.lookahead_figure"

@@ -17,14 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import scenes
-from ms_slam_env.benchmark.command_line import exit_code, parse
-from ms_slam_env.benchmark.provenance import provenance
 from ms_slam_env.camera import RGBDFrame, xtion
+from ms_slam_env.command_line import exit_code, parse
 from ms_slam_env.config import check_range
 from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.env.config import EnvConfig, LookaheadConfig
 from ms_slam_env.env.lookahead import Lookahead
 from ms_slam_env.errors import InputError
+from ms_slam_env.report.provenance import provenance
 from ms_slam_env.robot.motions import NUM_MOTIONS, decompose
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sequences import handheld_trajectory

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 from ms_slam_env.benchmark import multi_robot_report as report
-from ms_slam_env.benchmark.command_line import exit_code, parse, report_failures
 from ms_slam_env.benchmark.map_merging import MergeConfig
 from ms_slam_env.benchmark.multi_robot_run import (
     SHARED,
@@ -29,10 +28,11 @@ from ms_slam_env.benchmark.multi_robot_run import (
     run_team,
 )
 from ms_slam_env.benchmark.planner_benchmark import seed_list
-from ms_slam_env.benchmark.provenance import provenance
-from ms_slam_env.benchmark.records import write_json
 from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
 from ms_slam_env.camera import xtion
+from ms_slam_env.command_line import exit_code, parse, report_failures
+from ms_slam_env.report.provenance import provenance
+from ms_slam_env.report.records import write_json
 from ms_slam_env.scenes.registry import check_name
 from ms_slam_env.sensor.noise import noise_config
 

@@ -18,10 +18,10 @@ from ms_slam_env.benchmark.episode import (
 )
 from ms_slam_env.benchmark.options import parse_options
 from ms_slam_env.benchmark.planners import check_planner
-from ms_slam_env.benchmark.provenance import provenance
-from ms_slam_env.benchmark.records import Row, write_json
 from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.report.provenance import provenance
+from ms_slam_env.report.records import Row, write_json
 from ms_slam_env.scenes import SCENES, SEED_SPLITS
 from ms_slam_env.scenes.registry import check_name
 from ms_slam_env.scenes.triangle_soup import load_soup

@@ -17,9 +17,9 @@ from typing import Any
 
 from tqdm import tqdm
 
-from ms_slam_env.benchmark.provenance import git_commit
-from ms_slam_env.benchmark.records import RecordFile, Row, spec_key
 from ms_slam_env.errors import InputError
+from ms_slam_env.report.provenance import git_commit
+from ms_slam_env.report.records import RecordFile, Row, spec_key
 
 RECORDS = "episodes.jsonl"
 _NAMING = ("planner", "scene", "sequence", "backend", "seed")  # what a person calls the work by

@@ -15,9 +15,9 @@ from tqdm import tqdm
 from ms_slam_env import metrics, slam
 from ms_slam_env.benchmark.frame_records import FRAMES, write_frames
 from ms_slam_env.benchmark.point_cloud import write_ply
-from ms_slam_env.benchmark.provenance import provenance
-from ms_slam_env.benchmark.records import write_json
 from ms_slam_env.geometry import invert
+from ms_slam_env.report.provenance import provenance
+from ms_slam_env.report.records import write_json
 from ms_slam_env.sequences import associate
 from ms_slam_env.sequences.recording import Recording
 from ms_slam_env.sequences.tum import TRAJECTORY_HEADER, trajectory_line, write_trajectory

@@ -21,15 +21,15 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from ms_slam_env import scenes, slam
-from ms_slam_env.benchmark.command_line import exit_code, parse
-from ms_slam_env.benchmark.provenance import provenance
 from ms_slam_env.benchmark.slam_peers_open3d import Open3DSlam
 from ms_slam_env.benchmark.slam_peers_opencv import OpenCVOdometry
 from ms_slam_env.benchmark.slam_peers_report import markdown_report
 from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
+from ms_slam_env.command_line import exit_code, parse
 from ms_slam_env.config import check_range
 from ms_slam_env.errors import InputError
 from ms_slam_env.metrics import ate_rmse, path_length
+from ms_slam_env.report.provenance import provenance
 from ms_slam_env.scenes import Scene
 from ms_slam_env.sequences import (
     Sequence,

@@ -21,13 +21,13 @@ from tqdm import tqdm
 
 from ms_slam_env import scenes
 from ms_slam_env.benchmark import slam_speed_child
-from ms_slam_env.benchmark.command_line import exit_code, parse
-from ms_slam_env.benchmark.provenance import provenance
-from ms_slam_env.benchmark.records import write_json
 from ms_slam_env.benchmark.slam_speed_report import markdown_report, save_figure, summarise
 from ms_slam_env.camera import xtion
+from ms_slam_env.command_line import exit_code, parse
 from ms_slam_env.config import check_range
 from ms_slam_env.errors import InputError
+from ms_slam_env.report.provenance import provenance
+from ms_slam_env.report.records import write_json
 from ms_slam_env.sequences import handheld_trajectory, render_sequence
 
 PROGRAM = "python -m ms_slam_env.benchmark.slam_speed"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from ms_slam_env.benchmark.statistics import Interval
+from ms_slam_env.report.statistics import Interval
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

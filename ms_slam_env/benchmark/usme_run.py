@@ -237,6 +237,6 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    from ms_slam_env.benchmark.command_line import exit_code
+    from ms_slam_env.command_line import exit_code
 
     sys.exit(exit_code(main, _NAME))

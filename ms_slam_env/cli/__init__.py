@@ -38,7 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             f"ms-slam: error: unknown command {command!r}; valid choices: {valid}", file=sys.stderr
         )
         return 2
-    from ms_slam_env.benchmark.command_line import exit_code
+    from ms_slam_env.command_line import exit_code
 
     return exit_code(lambda: import_module(f"ms_slam_env.cli.{command}").main(rest))
 

@@ -10,7 +10,6 @@ from typing import Annotated
 
 import tyro
 
-from ms_slam_env.benchmark.command_line import parse, report_failures
 from ms_slam_env.benchmark.episode import DEFAULT_STEP_DEG, DEFAULT_STEP_M
 from ms_slam_env.benchmark.planner_benchmark import (
     DEFAULT_PLANNERS,
@@ -18,6 +17,7 @@ from ms_slam_env.benchmark.planner_benchmark import (
     PlannerBenchmark,
     run_planner_benchmark,
 )
+from ms_slam_env.command_line import parse, report_failures
 
 
 @dataclass(frozen=True)

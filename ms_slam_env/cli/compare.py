@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from ms_slam_env.benchmark.command_line import parse, report_failures
 from ms_slam_env.benchmark.compare import Comparison, run_comparison
+from ms_slam_env.command_line import parse, report_failures
 
 
 @dataclass(frozen=True)

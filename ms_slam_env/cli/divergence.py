@@ -9,7 +9,7 @@ from pathlib import Path
 
 import tyro
 
-from ms_slam_env.benchmark.command_line import parse
+from ms_slam_env.command_line import parse
 
 
 @dataclass(frozen=True)
@@ -37,10 +37,10 @@ def main(arguments: Sequence[str]) -> int:
     """Measure, write and print the table."""
     args = parse(Arguments, arguments, "ms-slam divergence")
     from ms_slam_env.benchmark import sequence_divergence as measure
-    from ms_slam_env.benchmark.provenance import provenance
-    from ms_slam_env.benchmark.records import write_json
     from ms_slam_env.divergence import DivergenceConfig
     from ms_slam_env.errors import InputError
+    from ms_slam_env.report.provenance import provenance
+    from ms_slam_env.report.records import write_json
     from ms_slam_env.sequences.recording import open_recording
 
     if not args.sequences:

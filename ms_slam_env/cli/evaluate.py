@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from ms_slam_env.benchmark.command_line import parse
+from ms_slam_env.command_line import parse
 from ms_slam_env.errors import InputError
 
 
@@ -86,8 +86,8 @@ def main(arguments: Sequence[str]) -> int:
         raise InputError(
             "Missing files: ESTIMATE GROUNDTRUTH, or --map ESTIMATE --true-map GROUNDTRUTH"
         )
-    from ms_slam_env.benchmark.provenance import provenance
-    from ms_slam_env.benchmark.records import write_json
+    from ms_slam_env.report.provenance import provenance
+    from ms_slam_env.report.records import write_json
 
     result: dict[str, Any] = {}
     parts: list[str] = []

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ms_slam_env.benchmark.command_line import parse
+from ms_slam_env.command_line import parse
 
 
 @dataclass(frozen=True)

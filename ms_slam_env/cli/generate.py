@@ -10,7 +10,7 @@ from typing import Any
 
 import tyro
 
-from ms_slam_env.benchmark.command_line import parse
+from ms_slam_env.command_line import parse
 from ms_slam_env.errors import InputError
 from ms_slam_env.sequences.handheld_path import HandheldPath
 

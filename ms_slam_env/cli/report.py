@@ -8,7 +8,7 @@ from pathlib import Path
 
 import tyro
 
-from ms_slam_env.benchmark.command_line import parse
+from ms_slam_env.command_line import parse
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import tyro
 
-from ms_slam_env.benchmark.command_line import parse, report_failures
 from ms_slam_env.benchmark.usme import UsmeOptions, make_suite, run_suite
+from ms_slam_env.command_line import parse, report_failures
 from ms_slam_env.errors import unknown
 
 _Options = tyro.conf.OmitArgPrefixes[UsmeOptions]

@@ -23,9 +23,9 @@ from ms_slam_env.benchmark.planners import (
     planner_class,
     planner_names,
 )
-from ms_slam_env.benchmark.statistics import Interval
 from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.errors import InputError
+from ms_slam_env.report.statistics import Interval
 
 SPEC = EpisodeSpec("random", "table", seed=2000, steps=4)
 CLOCKS = ("decision_ms",)

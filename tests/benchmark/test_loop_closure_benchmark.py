@@ -71,7 +71,7 @@ def test_a_run_closes_its_loop_and_draws_the_map(tmp_path: Path) -> None:
 
 
 def test_bad_recordings_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    from ms_slam_env.benchmark.command_line import exit_code
+    from ms_slam_env.command_line import exit_code
 
     for text, message in (
         ("living_room:2000", "scene:seed:path"),

@@ -12,10 +12,10 @@ import pytest
 from ms_slam_env.benchmark import planner_benchmark, planner_report, step_size, table_two
 from ms_slam_env.benchmark.figures import colours, labels, save_planner_figures
 from ms_slam_env.benchmark.planner_benchmark import PlannerBenchmark, write_report
-from ms_slam_env.benchmark.records import Row, spec_key
-from ms_slam_env.benchmark.statistics import Interval
 from ms_slam_env.benchmark.table import format_interval, format_number, markdown_table
 from ms_slam_env.errors import InputError
+from ms_slam_env.report.records import Row, spec_key
+from ms_slam_env.report.statistics import Interval
 
 CONFIG = PlannerBenchmark(planners=("random", "greedy"), scenes=("table", "wall"), episodes=3)
 

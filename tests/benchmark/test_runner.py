@@ -19,9 +19,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ms_slam_env.benchmark.episode import EpisodeSpec
-from ms_slam_env.benchmark.records import RecordFile, spec_key, write_json
 from ms_slam_env.benchmark.runner import RECORDS, failures, names, run_all
 from ms_slam_env.errors import InputError
+from ms_slam_env.report.records import RecordFile, spec_key, write_json
 
 
 def test_rows_come_in_the_order_of_the_specs(tmp_path: Path) -> None:

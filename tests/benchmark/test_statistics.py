@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from ms_slam_env.benchmark import statistics
-from ms_slam_env.benchmark.statistics import Interval
+from ms_slam_env.report import statistics
+from ms_slam_env.report.statistics import Interval
 
 
 def test_median_interval_has_the_coverage_of_order_statistics() -> None:

@@ -14,9 +14,9 @@ import pytest
 
 from ms_slam_env.benchmark import planner_benchmark
 from ms_slam_env.benchmark.planner_report import DETAILS, HEADLINE
-from ms_slam_env.benchmark.records import Row
 from ms_slam_env.cli import COMMANDS, main
 from ms_slam_env.geometry import make_pose, so3_exp
+from ms_slam_env.report.records import Row
 from ms_slam_env.sequences import associate, write_trajectory
 
 

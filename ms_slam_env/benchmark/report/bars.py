@@ -9,7 +9,7 @@ from ms_slam_env.benchmark.report import plots
 from ms_slam_env.benchmark.report.blocks import Figure, Plot
 from ms_slam_env.benchmark.report.flatten import Record, Value, number
 from ms_slam_env.benchmark.report.glossary import heading, unit
-from ms_slam_env.benchmark.statistics import Interval
+from ms_slam_env.report.statistics import Interval
 
 _MAX_SERIES = 10
 _MAX_LABELS = 60

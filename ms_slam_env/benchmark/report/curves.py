@@ -10,7 +10,7 @@ from ms_slam_env.benchmark.report.bars import spans
 from ms_slam_env.benchmark.report.blocks import Figure, Plot
 from ms_slam_env.benchmark.report.flatten import Record, number
 from ms_slam_env.benchmark.report.glossary import heading, unit
-from ms_slam_env.benchmark.statistics import Interval
+from ms_slam_env.report.statistics import Interval
 
 
 def curve_figure(

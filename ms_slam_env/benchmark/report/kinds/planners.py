@@ -7,15 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from ms_slam_env.benchmark import figures, statistics
+from ms_slam_env.benchmark import figures
 from ms_slam_env.benchmark.planner_report import DETAILS, HEADLINE
-from ms_slam_env.benchmark.records import Row
 from ms_slam_env.benchmark.report import plots
 from ms_slam_env.benchmark.report.bars import bar_figure
 from ms_slam_env.benchmark.report.blocks import Figure
 from ms_slam_env.benchmark.report.discovery import Result
 from ms_slam_env.benchmark.report.flatten import Record, flatten
 from ms_slam_env.benchmark.report.kinds.base import Kind
+from ms_slam_env.report import statistics
+from ms_slam_env.report.records import Row
 
 _FLOOR_MM = 0.05  # errors below are drawn here on logarithmic axes
 _HOVER = "ATE %{x:.3g} mm, F-score %{y:.3g} %<extra>%{fullData.name}</extra>"

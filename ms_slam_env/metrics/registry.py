@@ -1,0 +1,151 @@
+"""What every key of a result means: one heading, one unit, one definition, everywhere.
+
+The entries stand in ``registry.yaml`` beside this file. Whatever writes a result checks its keys
+here, and every table, figure and report takes heading, unit and explanation from here.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import cache
+from importlib import resources
+from typing import Any
+
+import yaml
+
+from ms_slam_env.errors import InputError
+
+RESULTS_VERSIONS = {
+    1: "before results had a version: by algorithms and measures that have changed since",
+    2: "the algorithms of release 0.1, maps judged against surface as far away as SLAM looks",
+}
+"""Version to what its algorithms are.
+
+A new one is added whenever a change of algorithms changes the numbers of an experiment.
+"""
+RESULTS_VERSION = max(RESULTS_VERSIONS)
+
+_SCALES = {
+    ("m", "mm"): 1e3,
+    ("m", "cm"): 1e2,
+    ("rad", "deg"): 180 / math.pi,
+    ("rad", "mrad"): 1e3,
+    ("s", "ms"): 1e3,
+    ("share", "%"): 1e2,
+    ("count", "1000"): 1e-3,
+}
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One key of a result.
+
+    Attributes:
+        key: name in JSON files; a unit that could be doubted is its last part.
+        heading: of a column or an axis, without unit.
+        definition: one or two sentences for somebody who does not know it.
+        unit: that values are stored in: ``m``, ``share`` (0 to 1), ``count``, ``flag`` (true or
+            false), ``text`` and so on; empty for a number without unit.
+        shown: unit that tables and figures show it in, ``unit`` if empty.
+        alignment: of trajectories or maps before they are compared: ``SE(3)``, ``none``, ...
+        better: ``lower`` or ``higher``; empty where neither is.
+        source: paper and equation, or where else it is defined.
+        digits: significant digits shown.
+        repeatable: whether the same code gives the same value again; times and energies do not.
+    """
+
+    key: str
+    heading: str
+    definition: str
+    unit: str = ""
+    shown: str = ""
+    alignment: str = ""
+    better: str = ""
+    source: str = ""
+    digits: int = 2
+    repeatable: bool = True
+
+    @property
+    def shown_unit(self) -> str:
+        """Unit in tables and figures; empty for counts, texts and pure numbers."""
+        unit = self.shown or {"share": "%", "flag": "%"}.get(self.unit, self.unit)
+        return "" if unit in ("count", "text") else unit
+
+    @property
+    def scale(self) -> float:
+        """Factor from the stored to the shown unit."""
+        shown = self.shown_unit
+        stored = "share" if self.unit == "flag" else self.unit
+        return 1.0 if shown in ("", stored) else _SCALES[stored, shown]
+
+    @property
+    def label(self) -> str:
+        """Heading with the shown unit, for a column or an axis."""
+        unit = self.shown_unit
+        return f"{self.heading} [{unit}]" if unit else self.heading
+
+    @property
+    def explanation(self) -> str:
+        """Definition with alignment, direction and source."""
+        parts = [self.definition]
+        if self.alignment:
+            aligned = "No alignment" if self.alignment == "none" else f"Alignment: {self.alignment}"
+            parts.append(f"{aligned}.")
+        if self.better:
+            parts.append(f"{self.better.capitalize()} is better.")
+        if self.source:
+            parts.append(f"Source: {self.source}.")
+        return " ".join(parts)
+
+
+@cache
+def registry() -> Mapping[str, Metric]:
+    """All metrics by key, in the order of the file.
+
+    Raises:
+        ValueError: an entry of another form, or a unit that cannot be shown as it says.
+    """
+    text = resources.files(__package__).joinpath("registry.yaml").read_text(encoding="utf-8")
+    metrics: dict[str, Metric] = {}
+    known = {field.name for field in fields(Metric)}
+    for key, entry in yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader)).items():
+        if not set(entry) <= known:
+            raise ValueError(f"metric {key}: {', '.join(set(entry) - known)} is no field")
+        metrics[key] = Metric(key, **entry)
+        if not math.isfinite(metrics[key].scale) or metrics[key].better not in (
+            *("", "lower", "higher"),
+        ):
+            raise ValueError(f"metric {key}: bad scale or direction")
+    return metrics
+
+
+def metric(key: str) -> Metric:
+    """The metric of a key.
+
+    Raises:
+        InputError: an unknown key; the message names similar ones.
+    """
+    found = registry().get(key)
+    if found is None:
+        similar = difflib.get_close_matches(key, registry(), n=3)
+        hint = f"; similar: {', '.join(similar)}" if similar else ""
+        raise InputError(f"unknown metric {key!r}: not in metrics/registry.yaml{hint}")
+    return found
+
+
+def check_keys(result: Any) -> None:
+    """Refuse a result, at any depth, with a key that the registry does not know.
+
+    Raises:
+        InputError: naming the key.
+    """
+    if isinstance(result, Mapping):
+        for key, value in result.items():
+            metric(key)
+            check_keys(value)
+    elif isinstance(result, (list, tuple)):
+        for value in result:
+            check_keys(value)

@@ -1,0 +1,1 @@
+"""Results: their statistics, tables, charts and records, and the page that shows them."""
