@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.camera import xtion
 from ms_slam_env.config import check_range
-from ms_slam_env.env.worlds import get_scene
+from ms_slam_env.sensor.scene_cache import get_scene
 from ms_slam_env.sequences import HandheldPath, RenderedSequence, render_sequence
 from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
 

@@ -29,11 +29,11 @@ from ms_slam_env.camera import XTION_SIZES, Intrinsics, RGBDFrame
 from ms_slam_env.command_line import exit_code, parse, report_failures
 from ms_slam_env.config import check_range
 from ms_slam_env.divergence import DivergenceConfig
-from ms_slam_env.env.worlds import get_scene
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import write_json
 from ms_slam_env.sensor.noise import noise_config
+from ms_slam_env.sensor.scene_cache import get_scene
 from ms_slam_env.sequences import place_trajectory, read_trajectory, render_sequence
 from ms_slam_env.sequences.recording import open_recording
 

@@ -28,15 +28,15 @@ from ms_slam_env.command_line import exit_code, parse, report_failures
 from ms_slam_env.divergence import Divergence, DivergenceConfig, Histograms, make_divergence
 from ms_slam_env.env.config import EnvConfig, LookaheadConfig
 from ms_slam_env.env.lookahead import Lookahead
-from ms_slam_env.env.worlds import get_scene
 from ms_slam_env.errors import InputError
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import write_json
 from ms_slam_env.robot import CAMERA_RADIUS_M
-from ms_slam_env.robot.motions import decompose
+from ms_slam_env.robot.action_primitives import decompose
 from ms_slam_env.scenes import ROOMS
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sensor import RGBDSensor
+from ms_slam_env.sensor.scene_cache import get_scene
 from ms_slam_env.sequences import handheld_trajectory
 
 Float64 = NDArray[np.float64]

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from ms_slam_env.benchmark.compare_inputs import Input, load, seen_surface
 from ms_slam_env.camera import xtion
 from ms_slam_env.config import check_range
-from ms_slam_env.env.worlds import get_scene
 from ms_slam_env.errors import InputError
 from ms_slam_env.scenes.base import Scene
+from ms_slam_env.sensor.scene_cache import get_scene
 from ms_slam_env.sequences import HandheldPath, render_sequence
 from ms_slam_env.sequences.path_shape import hand_tremor, resample
 from ms_slam_env.sequences.trajectories import free_path

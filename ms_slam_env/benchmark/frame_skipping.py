@@ -25,12 +25,12 @@ from ms_slam_env.benchmark.table import format_interval, format_number, markdown
 from ms_slam_env.camera import intensity_image, xtion
 from ms_slam_env.command_line import exit_code, parse, report_failures
 from ms_slam_env.divergence import DivergenceConfig, make_divergence
-from ms_slam_env.env.worlds import get_scene
 from ms_slam_env.errors import InputError
 from ms_slam_env.report import statistics
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import Row, write_json
 from ms_slam_env.report.statistics import Interval
+from ms_slam_env.sensor.scene_cache import get_scene
 from ms_slam_env.sequences import Sequence as FrameSequence
 from ms_slam_env.sequences import handheld_trajectory, render_sequence
 

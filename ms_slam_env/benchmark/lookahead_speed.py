@@ -25,7 +25,7 @@ from ms_slam_env.env.config import EnvConfig, LookaheadConfig
 from ms_slam_env.env.lookahead import Lookahead
 from ms_slam_env.errors import InputError
 from ms_slam_env.report.provenance import provenance
-from ms_slam_env.robot.motions import NUM_MOTIONS, decompose
+from ms_slam_env.robot.action_primitives import NUM_MOTIONS, decompose
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sequences import handheld_trajectory
 from ms_slam_env.slam.surfel import SurfelSlam

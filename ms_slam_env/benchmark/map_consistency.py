@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.benchmark.map_truth import SURFACE_SPACING_M
 from ms_slam_env.env import ActiveSlamEnv
-from ms_slam_env.env.worlds import get_scene
 from ms_slam_env.metrics.consistency import (
     ConsistencyRule,
     MapConsistency,
@@ -21,6 +20,7 @@ from ms_slam_env.metrics.reconstruction import voxel_firsts
 from ms_slam_env.metrics.sightings import LabelledView, count_votes, distinct_placements
 from ms_slam_env.scenes.sampling import sample_surface
 from ms_slam_env.sensor import RGBDSensor
+from ms_slam_env.sensor.scene_cache import get_scene
 
 Float64 = NDArray[np.float64]
 

@@ -26,7 +26,6 @@ from ms_slam_env.benchmark.planner_report import finished
 from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
 from ms_slam_env.benchmark.table import format_interval, markdown_table
 from ms_slam_env.command_line import exit_code, parse, report_failures
-from ms_slam_env.env.worlds import get_sensor
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, se3_exp, se3_log
 from ms_slam_env.metrics.consistency import ConsistencyRule
@@ -36,6 +35,7 @@ from ms_slam_env.report.records import Row, write_json
 from ms_slam_env.report.statistics import Interval
 from ms_slam_env.robot import FreeCamera
 from ms_slam_env.scenes.base import Scene
+from ms_slam_env.sensor.scene_cache import get_sensor
 
 PROGRAM = "python -m ms_slam_env.benchmark.map_consistency_check"
 Float64 = NDArray[np.float64]

@@ -14,9 +14,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.env.worlds import get_scene
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.rays import RayCaster
+from ms_slam_env.sensor.scene_cache import get_scene
 
 Float64 = NDArray[np.float64]
 

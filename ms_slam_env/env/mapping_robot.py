@@ -19,12 +19,12 @@ from ms_slam_env.env.frame_source import FrameSource
 from ms_slam_env.env.perturbed_frames import frames_with
 from ms_slam_env.env.pose_sources import POSE_SOURCES
 from ms_slam_env.env.state import EpisodeState, check_same_settings
-from ms_slam_env.env.worlds import get_scene, get_sensor
 from ms_slam_env.errors import InputError, UnreachableError
 from ms_slam_env.geometry import invert
-from ms_slam_env.robot import Movement
+from ms_slam_env.robot import MotionResult
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sensor import RGBDSensor
+from ms_slam_env.sensor.scene_cache import get_scene, get_sensor
 from ms_slam_env.slam.base import SlamBackend
 from ms_slam_env.timings import Timings
 
@@ -96,7 +96,7 @@ class MappingRobot(EpisodeRecord):
             return ""
         return f"too few depth readings there in scene {name}: SLAM has nothing to map"
 
-    def _observe_world(self, movement: Movement) -> float:
+    def _observe_world(self, movement: MotionResult) -> float:
         """Take and track the frames of a motion; return the newly mapped area, m2."""
         episode = self._current()
         begin = episode.time_s

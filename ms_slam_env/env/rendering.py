@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.env.dots import BACKGROUND
-from ms_slam_env.env.outside_view import ESTIMATE_COLOR, draw_outside
+from ms_slam_env.env.point_renderer import BACKGROUND
+from ms_slam_env.env.third_person_view import ESTIMATE_COLOR, draw_third_person
 from ms_slam_env.robot import describe
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class Renderer:
         return _caption(image, f"depth, 0 to {_MAX_DEPTH_M:g} m, black: no reading")
 
     def _map(self, env: ActiveSlamEnv) -> Image:
-        picture, count = draw_outside(env, _MAP)
+        picture, count = draw_third_person(env, _MAP)
         return _caption(picture, f"map: {count} points; path: true wide green, estimated thin red")
 
     def _plots(self, env: ActiveSlamEnv) -> list[Image]:

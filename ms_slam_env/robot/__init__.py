@@ -1,8 +1,6 @@
 """Motions and embodiments of the camera."""
 
-from ms_slam_env.robot.base import Embodiment, Movement
-from ms_slam_env.robot.free_camera import CAMERA_RADIUS_M, FixedTranslation, FreeCamera
-from ms_slam_env.robot.motions import (
+from ms_slam_env.robot.action_primitives import (
     NUM_MOTIONS,
     NUM_ROTATIONS,
     NUM_TRANSLATIONS,
@@ -11,6 +9,8 @@ from ms_slam_env.robot.motions import (
     decompose,
     describe,
 )
+from ms_slam_env.robot.base import Embodiment, MotionResult
+from ms_slam_env.robot.free_camera import CAMERA_RADIUS_M, FixedTranslation, FreeCamera
 
 __all__ = [
     "CAMERA_RADIUS_M",
@@ -22,7 +22,7 @@ __all__ = [
     "Embodiment",
     "FixedTranslation",
     "FreeCamera",
-    "Movement",
+    "MotionResult",
     "decompose",
     "describe",
 ]

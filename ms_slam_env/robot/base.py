@@ -16,7 +16,7 @@ FRAME_PERIOD_S = 1 / 30
 
 
 @dataclass(frozen=True)
-class Movement:
+class MotionResult:
     """What one action brought: where the camera was when its ``k >= 1`` frames were taken.
 
     Attributes:
@@ -34,10 +34,10 @@ class Movement:
     energy_j: float = 0.0
 
     @staticmethod
-    def at_once(made: bool, T_world_camera: Float64) -> Movement:
+    def at_once(made: bool, T_world_camera: Float64) -> MotionResult:
         """One frame, one frame period later, at a pose (4, 4) that is known exactly."""
         pose = np.array(T_world_camera, dtype=np.float64)[None]
-        return Movement(made, pose, pose.copy(), np.array([FRAME_PERIOD_S]))
+        return MotionResult(made, pose, pose.copy(), np.array([FRAME_PERIOD_S]))
 
 
 class Embodiment(ABC):
@@ -74,7 +74,7 @@ class Embodiment(ABC):
         """(n,) whether each motion can be made without touching anything."""
 
     @abstractmethod
-    def move(self, action: int) -> Movement:
+    def move(self, action: int) -> MotionResult:
         """Make motion ``action``, as far as nothing blocks it."""
 
     @abstractmethod

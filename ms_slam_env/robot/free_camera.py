@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from ms_slam_env.errors import UnreachableError
 from ms_slam_env.geometry import invert
-from ms_slam_env.robot.base import Embodiment, Movement
-from ms_slam_env.robot.free_room import outside, words
-from ms_slam_env.robot.motions import (
+from ms_slam_env.robot.action_primitives import (
     NUM_ROTATIONS,
     NUM_TRANSLATIONS,
     TRANSLATION_DIRECTIONS,
     decompose,
 )
+from ms_slam_env.robot.base import Embodiment, MotionResult
+from ms_slam_env.robot.free_room import outside, words
 from ms_slam_env.scenes.base import Scene
 
 Float64 = NDArray[np.float64]
@@ -78,13 +78,13 @@ class FreeCamera(Embodiment):
             self._masks = np.repeat(np.array(free), NUM_ROTATIONS)
         return self._masks.copy()
 
-    def move(self, action: int) -> Movement:
+    def move(self, action: int) -> MotionResult:
         """Make motion ``action`` if nothing blocks it."""
         made = bool(self.action_masks()[action])
         if made:
             self.T_world_camera = self.T_world_camera @ self._motions[action]
             self._masks = None
-        return Movement.at_once(made, self.T_world_camera)
+        return MotionResult.at_once(made, self.T_world_camera)
 
     def get_state(self) -> dict[str, Any]:
         """The pose."""
@@ -153,13 +153,13 @@ class FixedTranslation(Embodiment):
         """(7,) all true: turning is always possible and the line turns back by itself."""
         return np.ones(NUM_ROTATIONS, dtype=bool)
 
-    def move(self, action: int) -> Movement:
+    def move(self, action: int) -> MotionResult:
         """Step along the line and turn; always possible."""
         step = self._translation()
         self.T_world_camera = self.T_world_camera @ self.candidate_motions()[action]
         if step @ self._direction < 0:
             self._direction = -self._direction
-        return Movement.at_once(True, self.T_world_camera)
+        return MotionResult.at_once(True, self.T_world_camera)
 
     def get_state(self) -> dict[str, Any]:
         """The pose and the line."""

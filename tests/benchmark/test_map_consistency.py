@@ -23,9 +23,9 @@ from ms_slam_env.benchmark.map_consistency_picture import (
     render_points,
     save_map_picture,
 )
-from ms_slam_env.env.worlds import get_sensor
 from ms_slam_env.geometry import invert, make_pose, transform_points
 from ms_slam_env.metrics.consistency import MapConsistency, ObjectConsistency
+from ms_slam_env.sensor.scene_cache import get_sensor
 
 
 def map_with_offset(offset_m: float) -> tuple[JudgedMap, np.ndarray]:

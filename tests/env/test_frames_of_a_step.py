@@ -8,7 +8,7 @@ from ms_slam_env.env.embodiments import EMBODIMENTS, EmbodimentType
 from ms_slam_env.errors import InputError, UnreachableError
 from ms_slam_env.geometry import invert, make_pose, so3_exp
 from ms_slam_env.metrics import ate_rmse
-from ms_slam_env.robot import FreeCamera, Movement
+from ms_slam_env.robot import FreeCamera, MotionResult
 
 OPTIONS = {"scene": "living_room", "scene_seed": 0, "step_m": 0.06, "step_rad": 0.06}
 FRAMES = 3
@@ -33,7 +33,7 @@ class SlowCamera(FreeCamera):
         poses = np.stack([*between, self.T_world_camera])
         kinematic = np.stack([self.kinematic @ invert(start) @ pose @ DRIFT for pose in poses])
         self.kinematic = kinematic[-1]
-        return Movement(made, poses, kinematic, 0.1 * np.arange(1, FRAMES + 1), energy_j=2.0)
+        return MotionResult(made, poses, kinematic, 0.1 * np.arange(1, FRAMES + 1), energy_j=2.0)
 
 
 def motion(T_world_a, T_world_b, share):

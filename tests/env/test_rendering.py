@@ -6,8 +6,8 @@ import pytest
 
 import ms_slam_env  # noqa: F401 -- registers
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.env import outside_view, rendering
-from ms_slam_env.env.dots import BACKGROUND, draw_dots, project
+from ms_slam_env.env import rendering, third_person_view
+from ms_slam_env.env.point_renderer import BACKGROUND, project, render_points
 from ms_slam_env.geometry import look_at
 from ms_slam_env.robot.arm import load_arm
 from ms_slam_env.robot.arm.shape import arm_parts, surface_dots
@@ -26,7 +26,7 @@ def test_a_near_surface_hides_a_far_one_whatever_the_order(near_first):
     red = np.tile(np.uint8([200, 0, 0]), (len(near), 1))
     blue = np.tile(np.uint8([0, 0, 200]), (len(far), 1))
     both = [(near, red, 0.03), (far, blue, 0.01)][:: 1 if near_first else -1]
-    picture = draw_dots(
+    picture = render_points(
         CAMERA,
         np.eye(4),
         np.concatenate([points for points, _, _ in both]),
@@ -44,7 +44,7 @@ def test_small_gaps_are_closed_and_large_ones_are_not():
     across = np.abs(points[:, 0])
     points = points[(np.abs(across - 0.3) > 0.012) & (across > 0.1)]
     grey = np.full((len(points), 3), 90, np.uint8)
-    row = draw_dots(CAMERA, np.eye(4), points, grey, np.full(len(points), 0.005))[50]
+    row = render_points(CAMERA, np.eye(4), points, grey, np.full(len(points), 0.005))[50]
     assert (row[45:55] == BACKGROUND).all()
     assert (row[10:35] == 90).all()
 
@@ -56,7 +56,7 @@ def test_everything_that_must_be_seen_is_in_the_picture():
         start = look_at(rng.uniform(-1, 1, 3), rng.uniform(-1, 1, 3))
         points = rng.uniform(-1, 1, (500, 3)) * rng.uniform(0.3, 4, 3)
         must = start[:3, 3] + rng.uniform(-1, 1, (50, 3))
-        pose = outside_view._point_of_view(start, points, must, camera)
+        pose = third_person_view._point_of_view(start, points, must, camera)
         pixels, depth = project(camera, pose, must)
         assert (depth > 0).all()
         assert ((pixels > 0) & (pixels < 479)).all()

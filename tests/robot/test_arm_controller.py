@@ -7,13 +7,13 @@ from numpy.testing import assert_allclose
 from test_arm_model import ARMS
 
 from ms_slam_env.geometry import make_pose, relative_angle, so3_exp
+from ms_slam_env.robot.action_primitives import decompose
 from ms_slam_env.robot.arm import ArmConfig, load_arm
 from ms_slam_env.robot.arm.chain import segment_distance
 from ms_slam_env.robot.arm.clearance import Clearance
 from ms_slam_env.robot.arm.controller import LIMIT_MARGIN_RAD, Controller
 from ms_slam_env.robot.arm.path import CameraPath
 from ms_slam_env.robot.arm.surroundings import Surroundings
-from ms_slam_env.robot.motions import decompose
 
 MOTIONS = decompose(0.08, np.radians(10))
 CONFIG = ArmConfig(clearance_m=0.02)

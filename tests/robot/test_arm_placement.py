@@ -8,15 +8,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ms_slam_env.env.worlds import get_scene
 from ms_slam_env.errors import InputError, UnreachableError
 from ms_slam_env.geometry import invert, look_at, make_pose, so3_exp, transform_points
+from ms_slam_env.robot.action_primitives import decompose
 from ms_slam_env.robot.arm import ArmConfig, load_arm
 from ms_slam_env.robot.arm.placement import COLUMN_RADIUS_M, place_arm, reach_m, standing_chain
 from ms_slam_env.robot.arm.postures import PITCHES, postures_at, turn_upright
 from ms_slam_env.robot.arm.reach import Reach
 from ms_slam_env.robot.arm.surroundings import Surroundings
-from ms_slam_env.robot.motions import decompose
+from ms_slam_env.sensor.scene_cache import get_scene
 
 MOTIONS = decompose(0.12, np.radians(12))
 CONFIG = ArmConfig()

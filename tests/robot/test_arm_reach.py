@@ -7,12 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ms_slam_env.geometry import invert, make_pose, so3_exp, transform_points
+from ms_slam_env.robot.action_primitives import decompose
 from ms_slam_env.robot.arm import ArmConfig, load_arm
 from ms_slam_env.robot.arm.capsules import with_column
 from ms_slam_env.robot.arm.inverse import solve_pose
 from ms_slam_env.robot.arm.reach import MOST_STRETCH, REASONS, Reach
 from ms_slam_env.robot.arm.surroundings import Surroundings
-from ms_slam_env.robot.motions import decompose
 
 MOTIONS = decompose(0.12, np.radians(12))
 CONFIG = ArmConfig()
@@ -339,6 +339,6 @@ def _lowest(arm, q):
 
 
 def _mesh_scene():
-    from ms_slam_env.env.worlds import get_scene
+    from ms_slam_env.sensor.scene_cache import get_scene
 
     return get_scene("wall", 1000)

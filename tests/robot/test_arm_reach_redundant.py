@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from arm_reference import follow
 
+from ms_slam_env.robot.action_primitives import decompose
 from ms_slam_env.robot.arm import ArmConfig, load_arm
 from ms_slam_env.robot.arm.controller import Controller
 from ms_slam_env.robot.arm.reach import LIMIT_MARGIN_RAD, MOST_STRETCH, Reach
 from ms_slam_env.robot.arm.surroundings import Surroundings
-from ms_slam_env.robot.motions import decompose
 
 MOTIONS = decompose(0.12, np.radians(12))
 CONFIG = ArmConfig()

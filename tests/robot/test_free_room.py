@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from ms_slam_env.env.worlds import get_scene
 from ms_slam_env.robot.free_room import enclosed, floor_height, outside
+from ms_slam_env.sensor.scene_cache import get_scene
 
 
 @pytest.mark.parametrize(

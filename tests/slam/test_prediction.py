@@ -9,7 +9,7 @@ from surfel_scenes import SMALL, build_map, device_poses, ray_cast
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import make_pose, so3_exp
-from ms_slam_env.robot.motions import decompose
+from ms_slam_env.robot.action_primitives import decompose
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.prediction import mean_pose, wide_intrinsics
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap

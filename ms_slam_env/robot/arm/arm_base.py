@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env.robot.action_primitives import NUM_MOTIONS, decompose
 from ms_slam_env.robot.arm.config import ArmConfig
 from ms_slam_env.robot.arm.model import load_arm
 from ms_slam_env.robot.arm.placement import place_arm, reach_m, standing_chain
 from ms_slam_env.robot.arm.reach import Reach, ReachResult
 from ms_slam_env.robot.arm.surroundings import Surroundings
 from ms_slam_env.robot.base import Embodiment
-from ms_slam_env.robot.motions import NUM_MOTIONS, decompose
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.timings import Timings
 

@@ -15,7 +15,7 @@ from ms_slam_env.robot.arm.controller import Controller, Plan, checked_ticks
 from ms_slam_env.robot.arm.dynamics import ArmDynamics, Motion
 from ms_slam_env.robot.arm.imperfections import Imperfections
 from ms_slam_env.robot.arm.reach import MOST_STRETCH
-from ms_slam_env.robot.base import Movement
+from ms_slam_env.robot.base import MotionResult
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.timings import Timings
 
@@ -88,7 +88,7 @@ class DynamicArm(ArmEmbodiment):
         """The commanded joint angles and the camera there."""
         return self.q_command, self.chain.camera_pose(self.q_command)
 
-    def move(self, action: int) -> Movement:
+    def move(self, action: int) -> MotionResult:
         """Make motion ``action`` if the mask allows it, else hold still for a frame."""
         probe = self.probe()
         if probe.ok[action]:
@@ -128,7 +128,7 @@ class DynamicArm(ArmEmbodiment):
         with self.timings.stage("ik"):
             return self.controller.plan(q, T_base_camera @ self.motions[action], least_s)
 
-    def _execute(self, plan: Plan) -> tuple[Movement, bool, Float64]:
+    def _execute(self, plan: Plan) -> tuple[MotionResult, bool, Float64]:
         """Follow a plan; return what happened, whether the arm stopped to protect itself, and the
         joint angles (t, n) of the links after every step."""
         times = frame_times(plan.duration_s, self.config)
@@ -149,8 +149,8 @@ class DynamicArm(ArmEmbodiment):
         stopped = tick is not None
         made = plan.followed and not stopped
         seconds = steps * self.dynamics.timestep_s
-        movement = Movement(made, poses, kinematic, seconds, motion.energy_j)
-        return movement, stopped, q_link
+        result = MotionResult(made, poses, kinematic, seconds, motion.energy_j)
+        return result, stopped, q_link
 
     def _run(self, q_command: Float64, tick_s: float, steps: int) -> tuple[Motion, Float64]:
         """Physics along a command (k + 1, n), and joint angles (t, n) of the links."""

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.robot.arm.arm_base import ArmEmbodiment, frame_times
 from ms_slam_env.robot.arm.inverse import solve_pose
-from ms_slam_env.robot.base import Movement
+from ms_slam_env.robot.base import MotionResult
 
 Float64 = NDArray[np.float64]
 
@@ -15,7 +15,7 @@ Float64 = NDArray[np.float64]
 class KinematicArm(ArmEmbodiment):
     """The arm's kinematics alone: limits, furniture and speed count, mass and errors do not."""
 
-    def move(self, action: int) -> Movement:
+    def move(self, action: int) -> MotionResult:
         """Make motion ``action`` if the arm can, with the frames that arrive meanwhile.
 
         Action 0 and a masked action rest for one period of the camera, or for
@@ -34,7 +34,7 @@ class KinematicArm(ArmEmbodiment):
             q[times >= duration] = solve_pose(self.chain, q[-1:], target).q[0]
         self.set_joints(q[-1])
         poses = self.T_world_base @ self.chain.camera_pose(q)
-        return Movement(made, poses, poses.copy(), times)
+        return MotionResult(made, poses, poses.copy(), times)
 
     @staticmethod
     def _along(waypoints: Float64, share_of_time: Float64) -> Float64:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.errors import InputError, UnreachableError
 from ms_slam_env.geometry import invert, make_pose, so3_exp, transform_points
+from ms_slam_env.robot.action_primitives import decompose
 from ms_slam_env.robot.arm.capsules import with_column
 from ms_slam_env.robot.arm.chain import Chain
 from ms_slam_env.robot.arm.config import ArmConfig
@@ -29,7 +30,6 @@ from ms_slam_env.robot.arm.postures import (
 from ms_slam_env.robot.arm.reach import LIMIT_MARGIN_RAD, Reach
 from ms_slam_env.robot.arm.surroundings import Surroundings
 from ms_slam_env.robot.free_room import enclosed, outside, words
-from ms_slam_env.robot.motions import decompose
 from ms_slam_env.scenes.base import Scene
 
 Float64 = NDArray[np.float64]

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ms_slam_env.robot.action_primitives import decompose
 from ms_slam_env.robot.arm.chain import Chain, segment_distance
 from ms_slam_env.robot.arm.config import ArmConfig
 from ms_slam_env.robot.arm.reach import Reach
 from ms_slam_env.robot.arm.surroundings import Surroundings
-from ms_slam_env.robot.motions import decompose
 
 Float64 = NDArray[np.float64]
 

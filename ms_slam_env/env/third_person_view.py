@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.env.dots import draw_dots, project
+from ms_slam_env.env.point_renderer import project, render_points
 from ms_slam_env.geometry import look_at, transform_points
 from ms_slam_env.robot.arm.arm_base import ArmEmbodiment
 from ms_slam_env.robot.arm.shape import arm_parts, column_parts, surface_dots
@@ -37,7 +37,7 @@ _TO_LIGHT = np.array([0.35, -0.3, 0.89])
 _FRUSTUM_M = 0.15
 
 
-def draw_outside(env: ActiveSlamEnv, size: int) -> tuple[Image, int]:
+def draw_third_person(env: ActiveSlamEnv, size: int) -> tuple[Image, int]:
     """The picture (size, size, 3), and how many points the map has."""
     points, colors = env.slam.surface_points(), env.slam.surface_colors()
     truth, estimate = env.trajectory_truth, env.trajectory_estimate
@@ -47,7 +47,7 @@ def draw_outside(env: ActiveSlamEnv, size: int) -> tuple[Image, int]:
     must = np.concatenate([arm_points, truth[:, :3, 3], _frustum(truth[-1])])
     camera = Intrinsics(size, size, 0.5 * (size - 1), 0.5 * (size - 1), size, size)
     pose = _point_of_view(truth[0], points[low], must, camera)
-    picture = draw_dots(
+    picture = render_points(
         camera,
         pose,
         np.concatenate([points[low], arm_points]),

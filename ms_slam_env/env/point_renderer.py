@@ -30,7 +30,7 @@ def project(
     return pixels, local[:, 2]
 
 
-def draw_dots(
+def render_points(
     camera: Intrinsics, T_world_camera: Float64, points: Float64, colors: Image, dots_m: Float64
 ) -> Image:
     """Points (N, 3) with colours (N, 3) as dots of diameters (N,), a picture (H, W, 3)."""

@@ -6,7 +6,7 @@ import pytest
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose, look_at, relative_angle
 from ms_slam_env.robot import FreeCamera
-from ms_slam_env.robot.motions import (
+from ms_slam_env.robot.action_primitives import (
     NUM_MOTIONS,
     NUM_ROTATIONS,
     ROTATIONS,
