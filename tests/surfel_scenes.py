@@ -7,8 +7,8 @@ import numpy as np
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.preprocessing import LiveFrame
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
-from ms_slam_env.slam.surfel.types import LiveFrame
 
 SMALL = Intrinsics(fx=40.0, fy=42.0, cx=19.3, cy=14.8, width=40, height=30)
 WALL_NORMAL = np.array([0.3, -0.2, -1.0]) / np.linalg.norm([0.3, -0.2, -1.0])

@@ -30,7 +30,7 @@ from ms_slam_env.errors import unknown
 from ms_slam_env.geometry import invert, transform_points
 from ms_slam_env.metrics import voxel_thin
 from ms_slam_env.metrics.cloud_registration import register_clouds
-from ms_slam_env.slam.surfel.relocalisation.likeness import measure_likeness
+from ms_slam_env.slam.surfel.photometric_consistency import measure_likeness
 
 Float64 = NDArray[np.float64]
 

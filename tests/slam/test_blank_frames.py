@@ -10,7 +10,7 @@ from ms_slam_env import slam
 from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.geometry import look_at, make_pose, so3_exp
 from ms_slam_env.sensor import RGBDSensor
-from ms_slam_env.slam.surfel.blank import BlankFrames, is_blank
+from ms_slam_env.slam.surfel.photometry import BlankFrames, is_blank
 
 CAMERA = xtion("160x120")
 START = look_at([-0.8, -0.8, 1.2], [1.2, 0.1, 0.5])

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from surfel_scenes import SMALL, device_poses, fuse, live_frame
 
 from ms_slam_env.geometry import invert, make_pose, so3_exp, transform_points
-from ms_slam_env.slam.surfel.blocks import BLOCK
 from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.frustum_culling import BLOCK
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 
 CONFIG = SurfelConfig(max_surfels=3000, compaction_interval=2, unstable_window=3)

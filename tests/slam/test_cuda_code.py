@@ -16,20 +16,21 @@ from ms_slam_env._warp import wp
 
 HOPPER = 90
 MODULES = (
-    "blocks",
-    "discs",
+    "acceptance",
+    "frustum_culling",
     "fusion",
-    "fusion_update",
+    "map_deformation",
     "normal_equations",
     "photometry",
-    "prediction_kernels",
-    "preprocess",
+    "pose_hypotheses",
+    "preprocessing",
     "pyramid",
-    "removal",
-    "solve",
-    "splat",
+    "solver",
+    "splatting",
+    "surfel_culling",
+    "view_warping",
 )
-IN_REGISTERS = ("blocks", "fusion_update", "splat")
+IN_REGISTERS = ("frustum_culling", "fusion", "splatting")
 
 
 @pytest.mark.parametrize("name", MODULES)

@@ -8,23 +8,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ms_slam_env.geometry import make_pose, so3_exp, transform_points
-from ms_slam_env.slam.surfel.loops.deformation_graph import (
+from ms_slam_env.slam.surfel.deformation_graph import (
     NEIGHBOURS,
-    DeformationGraph,
-    identity,
-    sample_graph,
-)
-from ms_slam_env.slam.surfel.loops.energy import (
     TWIST_M,
     W_CON,
     W_REG,
     W_ROT,
     Constraints,
+    DeformationGraph,
     Energy,
+    identity,
     join,
     no_constraints,
     optimise,
     pack,
+    sample_graph,
     unpack,
 )
 

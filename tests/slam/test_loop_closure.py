@@ -14,10 +14,15 @@ from ms_slam_env.geometry import invert, look_at, make_pose, relative_angle, se3
 from ms_slam_env.sequences import render_sequence
 from ms_slam_env.slam.ferns import Candidate
 from ms_slam_env.slam.surfel import SurfelConfig
-from ms_slam_env.slam.surfel.loops import LoopConfig
-from ms_slam_env.slam.surfel.loops.constraints import creation_times
-from ms_slam_env.slam.surfel.loops.deformation_graph import Deformation, identity, sample_graph
-from ms_slam_env.slam.surfel.loops.energy import pack, unpack
+from ms_slam_env.slam.surfel.config import LoopConfig
+from ms_slam_env.slam.surfel.deformation_graph import (
+    Deformation,
+    identity,
+    pack,
+    sample_graph,
+    unpack,
+)
+from ms_slam_env.slam.surfel.map_deformation import creation_times
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
 
 CAMERA = xtion("160x120")

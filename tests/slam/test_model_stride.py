@@ -10,9 +10,9 @@ from ms_slam_env._warp import wp
 from ms_slam_env.camera import xtion
 from ms_slam_env.geometry import make_pose, so3_exp
 from ms_slam_env.slam.surfel.config import SurfelConfig
-from ms_slam_env.slam.surfel.mirror import Mirror
+from ms_slam_env.slam.surfel.device import Mirror
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
-from ms_slam_env.slam.surfel.tracking import model_stride
+from ms_slam_env.slam.surfel.tracker import model_stride
 
 POSES = np.stack(
     [make_pose(so3_exp([0.01 * k, -0.02 * k, 0.0]), [0.02 * k, 0.0, 0.01 * k]) for k in range(4)]

@@ -27,8 +27,8 @@ from ms_slam_env.slam.surfel.photometry import (
     geometry_only,
     same_exposure,
 )
-from ms_slam_env.slam.surfel.preprocess import Preprocessor
-from ms_slam_env.slam.surfel.solve import gauss_newton_step
+from ms_slam_env.slam.surfel.preprocessing import Preprocessor
+from ms_slam_env.slam.surfel.solver import gauss_newton_step
 
 CAMERA = xtion("160x120")
 START = look_at([-0.8, -0.8, 1.2], [1.2, 0.1, 0.5])

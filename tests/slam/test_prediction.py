@@ -11,8 +11,8 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import make_pose, so3_exp
 from ms_slam_env.robot.action_primitives import decompose
 from ms_slam_env.slam.surfel.config import SurfelConfig
-from ms_slam_env.slam.surfel.prediction import mean_pose, wide_intrinsics
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
+from ms_slam_env.slam.surfel.view_prediction import mean_pose, wide_intrinsics
 
 LUMA = np.array([0.299, 0.587, 0.114])
 WIDE_PATH = np.stack(

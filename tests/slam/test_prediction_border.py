@@ -4,8 +4,8 @@ import numpy as np
 
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.slam.surfel.prediction_kernels import EMPTY, PointCloud, scatter_points
-from ms_slam_env.slam.surfel.splat import SplatCamera
+from ms_slam_env.slam.surfel.surfels import SplatCamera
+from ms_slam_env.slam.surfel.view_warping import EMPTY, PointCloud, scatter_points
 
 CAMERA = Intrinsics(fx=71.3, fy=70.9, cx=39.5, cy=29.5, width=80, height=60)
 

@@ -13,8 +13,8 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at, make_pose, relative_angle, so3_exp
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
-from ms_slam_env.slam.surfel.relocalisation import FernRelocalisation, Images
-from ms_slam_env.slam.surfel.relocalisation.likeness import LikenessLimits, measure_likeness
+from ms_slam_env.slam.surfel.photometric_consistency import LikenessLimits, measure_likeness
+from ms_slam_env.slam.surfel.relocalization import FernRelocalisation, Images
 
 CAMERA = xtion("160x120")
 OPTIONS = {"max_surfels": 120_000, "depth_cutoff_m": 4.0}

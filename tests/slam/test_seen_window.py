@@ -6,8 +6,8 @@ import numpy as np
 from surfel_scenes import SMALL, device_poses, fuse, live_frame
 
 from ms_slam_env.slam.surfel.config import SurfelConfig
-from ms_slam_env.slam.surfel.surfel_arrays import any_time
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
+from ms_slam_env.slam.surfel.surfels import any_time
 
 POSES = np.tile(np.eye(4), (2, 1, 1))
 

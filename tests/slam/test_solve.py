@@ -17,7 +17,7 @@ from ms_slam_env.slam.surfel.normal_equations import (
     Photometry,
 )
 from ms_slam_env.slam.surfel.photometry import same_exposure
-from ms_slam_env.slam.surfel.solve import gauss_newton_step, reduce_sums
+from ms_slam_env.slam.surfel.solver import gauss_newton_step, reduce_sums
 
 
 def _sums(H: np.ndarray, g: np.ndarray) -> np.ndarray:

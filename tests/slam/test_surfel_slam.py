@@ -13,7 +13,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at, make_pose, so3_exp
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
-from ms_slam_env.slam.surfel.motions import motion_weight
+from ms_slam_env.slam.surfel.pose_hypotheses import motion_weight
 
 CAMERA = xtion("160x120")
 START = look_at([-0.8, -0.8, 1.2], [1.2, 0.1, 0.5])

@@ -11,19 +11,14 @@ from ms_slam_env.camera import Intrinsics, xtion
 from ms_slam_env.geometry import invert, look_at, relative_angle, se3_exp
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.surfel import normal_equations as ne
+from ms_slam_env.slam.surfel.acceptance import APPEARANCE, FEW_POINTS, REASONS, make_limits
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.photometry import same_exposure
-from ms_slam_env.slam.surfel.preprocess import Preprocessor
-from ms_slam_env.slam.surfel.seeds import NUM_SEEDS, tracking_seeds
-from ms_slam_env.slam.surfel.solve import reduce_sums
-from ms_slam_env.slam.surfel.tracking import Tracker
-from ms_slam_env.slam.surfel.types import LiveFrame, ModelView
-from ms_slam_env.slam.surfel.verdict import (
-    APPEARANCE,
-    FEW_POINTS,
-    REASONS,
-    make_limits,
-)
+from ms_slam_env.slam.surfel.pose_hypotheses import NUM_SEEDS, tracking_seeds
+from ms_slam_env.slam.surfel.preprocessing import LiveFrame, Preprocessor
+from ms_slam_env.slam.surfel.rendering import ModelView
+from ms_slam_env.slam.surfel.solver import reduce_sums
+from ms_slam_env.slam.surfel.tracker import Tracker
 
 SMALL = Intrinsics(fx=24.0, fy=24.0, cx=15.5, cy=11.5, width=32, height=24)
 T_WORLD_MODEL = look_at([-0.8, -0.8, 1.2], [1.2, 0.1, 0.5])

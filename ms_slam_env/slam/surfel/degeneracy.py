@@ -19,7 +19,6 @@ from ms_slam_env._warp import wp
 mat66d = wp.types.matrix(shape=(6, 6), dtype=wp.float64)
 mat76d = wp.types.matrix(shape=(7, 6), dtype=wp.float64)
 vec6d = wp.types.vector(length=6, dtype=wp.float64)
-
 NORMAL_NOISE = wp.constant(wp.float64(0.3))  # share of that mean that is worth nothing
 LEAST_INFORMATION = wp.constant(wp.float64(0.5))  # per matched point, 1/m^2: 2 cm of 5000 points
 OPEN_VARIANCE = wp.constant(wp.float64(0.03 * 0.03))  # m^2, of a frame's predicted motion

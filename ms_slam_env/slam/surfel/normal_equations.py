@@ -1,3 +1,4 @@
+# mypy: disable-error-code="empty-body"
 """One fused pass of joint geometric and photometric alignment: normal equations and statistics.
 
 ElasticFusion section IV: E = E_icp + w_rgb E_rgb, linearised at the current estimate. The pass
@@ -37,12 +38,14 @@ that are freed from it.) The photometric c is the maximum-likelihood scale of Ca
 distribution, where the mean weight is 1/2, but at least ``cauchy_rgb``. The term is divided by
 (c / least c)^2: images that are blurred or badly registered count less. ``Photometry.trust`` is
 one more factor.
+
+On the CPU the work is done for many points at once, by short loops over local arrays, which the
+compiler turns into operations on eight points. A thread of a GPU takes one point at a time.
 """
 
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
-from ms_slam_env.slam.surfel.point_sums import Photometry, Weights, sum_points
 
 NUM_SUMS = 71
 """Sums of a pass: geometric term, statistics, exposure, photometric term.
@@ -63,11 +66,283 @@ SUM_ROUGH = 41  # of the textured: 1 - robust weight; half their number at the r
 SUM_PHOTOMETRIC = 42  # the photometric term's
 SUM_TILTED = 69  # geometric weights times 1 - cosine of the angle between the normals
 SUM_EXPOSURE_SQUARED = 70  # of w r^2 over exposed points
-
-
 OFF = wp.constant(0)  # states of a hypothesis, in ``active``: takes no part
 RUNNING = wp.constant(1)
 RESTING = wp.constant(2)  # converged at its level, wakes at the next
+
+
+@wp.struct
+class Weights:
+    """Scales of the residuals; see ``normal_equations``. Reciprocals save divisions per pixel."""
+
+    icp: float
+    rgb: float
+    per_depth_noise: float  # 1 / depth_noise_m
+    per_cauchy_icp: float  # 1 / sigmas
+    per_cauchy_rgb: float  # 1 / sigmas
+    grey_variance: float  # of the intensity, grey levels^2
+    pixel_variance: float  # of the place in the image, pixels^2
+    distance_m: float
+    cos_angle: float
+    inlier_sigmas: float
+    texture: float  # grey levels per pixel
+    alike: float  # grey levels
+    least_scale: float  # least c of photometric residuals, in sigmas
+
+
+@wp.struct
+class Photometry:
+    """How the live grey values relate to the model's: I_live ~ gain I_model + bias."""
+
+    gain: float
+    bias: float  # grey levels
+    scale: float  # c of the photometric loss, in sigmas: half of all textured residuals exceed it
+    reference: float  # the same as it usually is, over its least value; the unit of the verdict
+    trust: float  # weight of the photometric term, [0, 1]
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+constexpr int LANES = 1;  // points at a time
+#else
+constexpr int LANES = 64;
+typedef float eight __attribute__((vector_size(32), aligned(4)));
+#endif
+const float fx = focal[0], fy = focal[1], cx = centre[0], cy = centre[1];
+const int live_width = live_size[0];
+const float u_limit = (float)(live_width - 1), v_limit = (float)(live_size[1] - 1);
+const float* models = (const float*)model_vertices.data;
+const float* model_n = (const float*)model_normals.data;
+const float* lives = (const float*)live_vertices.data + 3 * size_t(live_image);
+const float* live_n = (const float*)live_normals.data + 3 * size_t(live_image);
+const float* gradients = (const float*)live_gradient.data + 3 * size_t(live_image);
+const float per_scale = 1.0f / wp::max(light.scale, weights.least_scale);
+const float narrowing = weights.least_scale * per_scale;
+const float rgb = weights.rgb * light.trust * narrowing * narrowing;
+const float per_reference = weights.per_cauchy_rgb / light.reference;
+const float alike_limit = weights.alike * wp::min(light.reference, 2.0f);
+
+// Six rows of eight: a row of H, the component of g, and a zero that makes it eight.
+float system[48] = {}, photometric[48] = {};
+float cost = 0, squared = 0, sum_w = 0, sum_wm = 0, sum_wmm = 0, sum_wr = 0, sum_wmr = 0, rough = 0;
+float tilted = 0, sum_wrr = 0;
+int points = 0, visible = 0, matched = 0, inliers = 0, textured = 0, alike = 0, apart = 0;
+
+for (int first = start; first < end; first += LANES * stride) {
+    const int left = (end - first + stride - 1) / stride;
+    const int n = left < LANES ? left : LANES;
+    // Where the points are in the live image.
+    float x[LANES], y[LANES], z[LANES], u[LANES], v[LANES];
+    int is_point[LANES], is_visible[LANES];
+    for (int k = 0; k < n; ++k) {
+        const float* p = models + 3 * size_t(first + k * stride);
+        x[k] = p[0];
+        y[k] = p[1];
+        z[k] = p[2];
+    }
+    for (int k = 0; k < n; ++k) {
+        const float px = x[k], py = y[k], pz = z[k];
+        x[k] = R.data[0][0] * px + R.data[0][1] * py + R.data[0][2] * pz + t[0];
+        y[k] = R.data[1][0] * px + R.data[1][1] * py + R.data[1][2] * pz + t[1];
+        z[k] = R.data[2][0] * px + R.data[2][1] * py + R.data[2][2] * pz + t[2];
+        const float per_z = 1.0f / z[k];
+        u[k] = fx * x[k] * per_z + cx;
+        v[k] = fy * y[k] * per_z + cy;
+        is_point[k] = pz > 0.0f;
+        is_visible[k] = (pz > 0.0f) & (z[k] > 0.05f) & (u[k] >= 0.0f) & (v[k] >= 0.0f)
+            & (u[k] < u_limit) & (v[k] < v_limit);
+        points += is_point[k];
+    }
+    int which[LANES];
+    int seen = 0;
+    for (int k = 0; k < n; ++k) {
+        which[seen] = k;
+        seen += is_visible[k];
+    }
+    visible += seen;
+
+    // What is there: the live surface, interpolated grey values and gradients, the model's own.
+    float lx[LANES], ly[LANES], lz[LANES], lnx[LANES], lny[LANES], lnz[LANES];
+    float nx[LANES], ny[LANES], nz[LANES], grey[LANES], right[LANES], down[LANES];
+    float corners[4][3][LANES];
+    for (int m = 0; m < seen; ++m) {
+        const int k = which[m];
+        const int nearest = (int)(v[k] + 0.5f) * live_width + (int)(u[k] + 0.5f);
+        lx[m] = lives[3 * nearest];
+        ly[m] = lives[3 * nearest + 1];
+        lz[m] = lives[3 * nearest + 2];
+        lnx[m] = live_n[3 * nearest];
+        lny[m] = live_n[3 * nearest + 1];
+        lnz[m] = live_n[3 * nearest + 2];
+        const size_t i = first + k * stride;
+        nx[m] = model_n[3 * i];
+        ny[m] = model_n[3 * i + 1];
+        nz[m] = model_n[3 * i + 2];
+        grey[m] = model_intensity.data[i];
+        const int column = (int)u[k], row = (int)v[k];
+        right[m] = u[k] - (float)column;
+        down[m] = v[k] - (float)row;
+        const float* top = gradients + 3 * (row * live_width + column);
+        const float* low = top + 3 * live_width;
+        for (int c = 0; c < 3; ++c) {
+            corners[0][c][m] = top[c];
+            corners[1][c][m] = top[3 + c];
+            corners[2][c][m] = low[c];
+            corners[3][c][m] = low[3 + c];
+        }
+        x[m] = x[k];  // k >= m
+        y[m] = y[k];
+        z[m] = z[k];
+    }
+
+    // Residuals, weights and derivatives. No branches: noise would make each a guess. What does
+    // not apply gets the weight 0.
+    float r[LANES], w[LANES], ax[LANES], ay[LANES], az[LANES];
+    float r2[LANES], w2[LANES], gx[LANES], gy[LANES], gz[LANES], bx[LANES], by[LANES], bz[LANES];
+    float cost_icp[LANES], cost_rgb[LANES], square[LANES], coarse[LANES];
+    float exposed[LANES], centred[LANES], tilt[LANES];
+    for (int m = 0; m < seen; ++m) {
+        const float per_z = 1.0f / z[m];
+        const float per_sigma = weights.per_depth_noise * per_z * per_z;
+        const float gap = fabsf(lz[m] - z[m]);
+        const bool is_matched = lz[m] > 0.0f;
+        const bool is_other = is_matched & (gap > weights.distance_m);  // of another colour too
+        const float a = R.data[0][0] * nx[m] + R.data[0][1] * ny[m] + R.data[0][2] * nz[m];
+        const float b = R.data[1][0] * nx[m] + R.data[1][1] * ny[m] + R.data[1][2] * nz[m];
+        const float c = R.data[2][0] * nx[m] + R.data[2][1] * ny[m] + R.data[2][2] * nz[m];
+        nx[m] = a;
+        ny[m] = b;
+        nz[m] = c;
+        const float alignment = a * lnx[m] + b * lny[m] + c * lnz[m];
+        const bool is_near = is_matched & !is_other & (alignment > weights.cos_angle);
+        r[m] = a * (lx[m] - x[m]) + b * (ly[m] - y[m]) + c * (lz[m] - z[m]);
+        const float normalised = r[m] * per_sigma;
+        const float ratio = normalised * weights.per_cauchy_icp;
+        const float robust = 1.0f / (1.0f + ratio * ratio);
+        const float unlike = is_other ? 3.0f : is_matched ? 1.0f : 0.5f;
+        cost_icp[m] = is_near ? 1.0f - robust : unlike;
+        const bool is_inlier = is_near & (fabsf(normalised) < weights.inlier_sigmas);
+        square[m] = is_inlier ? r[m] * r[m] : 0.0f;
+        w[m] = is_near ? weights.icp * robust * per_sigma * per_sigma : 0.0f;
+        tilt[m] = w[m] * (1.0f - alignment);
+        ax[m] = ly[m] * c - lz[m] * b;
+        ay[m] = lz[m] * a - lx[m] * c;
+        az[m] = lx[m] * b - ly[m] * a;
+        matched += is_matched;
+        apart += is_matched & (gap * per_sigma > 8.0f);
+        inliers += is_inlier;
+
+        float sample[3];  // I, dI/du, dI/dv
+        for (int i = 0; i < 3; ++i) {
+            const float top = corners[0][i][m] + right[m] * (corners[1][i][m] - corners[0][i][m]);
+            const float low = corners[2][i][m] + right[m] * (corners[3][i][m] - corners[2][i][m]);
+            sample[i] = top + down[m] * (low - top);
+        }
+        const float expected = light.gain * grey[m] + light.bias;
+        const float positive = expected > 0.0f ? expected : 0.0f;
+        r2[m] = sample[0] - (positive < 255.0f ? positive : 255.0f);
+        const float slope_squared = sample[1] * sample[1] + sample[2] * sample[2];
+        const float per_variance
+            = 1.0f / (weights.grey_variance + weights.pixel_variance * slope_squared);
+        const float sigmas = r2[m] * r2[m] * per_variance;  // squared
+        const float robust2 = 1.0f / (1.0f + sigmas * per_scale * per_scale);
+        const float usual = 1.0f / (1.0f + sigmas * per_reference * per_reference);
+        cost_rgb[m] = is_other ? 0.0f : 2.0f * (1.0f - usual);
+        const float slope = fabsf(sample[1]) + fabsf(sample[2]);
+        const bool is_textured = !is_other & (slope > weights.texture);
+        coarse[m] = is_textured ? 1.0f - robust2 : 0.0f;
+        textured += is_textured;
+        alike += is_textured & (fabsf(r2[m]) < alike_limit);
+        const bool is_exposed = !is_other & (sample[0] > 2.0f) & (sample[0] < 250.0f);
+        exposed[m] = is_exposed ? robust2 * per_variance : 0.0f;
+        centred[m] = grey[m] - 128.0f;
+        const float du = sample[1] * fx * per_z, dv = sample[2] * fy * per_z;
+        gx[m] = -du;
+        gy[m] = -dv;
+        gz[m] = (du * x[m] + dv * y[m]) * per_z;
+        bx[m] = y[m] * gz[m] - z[m] * gy[m];
+        by[m] = z[m] * gx[m] - x[m] * gz[m];
+        bz[m] = x[m] * gy[m] - y[m] * gx[m];
+        w2[m] = is_textured ? rgb * robust2 * per_variance : 0.0f;
+    }
+
+    // Sums, in the order of the points: weight J J^T and weight J residual.
+    for (int m = 0; m < seen; ++m) {
+        cost += cost_icp[m];
+        cost += cost_rgb[m];
+        squared += square[m];
+        rough += coarse[m];
+        tilted += tilt[m];
+        sum_w += exposed[m];
+        sum_wm += exposed[m] * centred[m];
+        sum_wmm += exposed[m] * centred[m] * centred[m];
+        sum_wr += exposed[m] * r2[m];
+        sum_wmr += exposed[m] * centred[m] * r2[m];
+        sum_wrr += exposed[m] * r2[m] * r2[m];
+#if defined(__CUDA_ARCH__)
+        const float J[8] = {nx[m], ny[m], nz[m], ax[m], ay[m], az[m], r[m], 0.0f};
+        const float G[8] = {gx[m], gy[m], gz[m], bx[m], by[m], bz[m], r2[m], 0.0f};
+        for (int i = 0; i < 6; ++i) {
+            for (int j = 0; j < 8; ++j) {
+                system[8 * i + j] += w[m] * J[i] * J[j];
+                photometric[8 * i + j] += w2[m] * G[i] * G[j];
+            }
+        }
+#else
+        const eight J = {nx[m], ny[m], nz[m], ax[m], ay[m], az[m], r[m], 0.0f};
+        const eight G = {gx[m], gy[m], gz[m], bx[m], by[m], bz[m], r2[m], 0.0f};
+        eight* H = (eight*)system;
+        eight* P = (eight*)photometric;
+        for (int i = 0; i < 6; ++i) {
+            H[i] += w[m] * J[i] * J;
+            P[i] += w2[m] * G[i] * G;
+        }
+#endif
+    }
+}
+
+float* out = partial.data + size_t(row) * partial.shape[3];
+int at = 0;
+for (int i = 0; i < 6; ++i) {  // upper triangle by rows of six, five, four, ...
+    for (int j = i; j < 6; ++j, ++at) {
+        out[at] = system[8 * i + j];
+        out[42 + at] = photometric[8 * i + j];
+    }
+    out[21 + i] = system[8 * i + 6];
+    out[63 + i] = photometric[8 * i + 6];
+}
+const float statistics[15] = {
+    cost, (float)points, (float)visible, (float)matched, (float)inliers, squared, (float)textured,
+    (float)alike, (float)apart, sum_w, sum_wm, sum_wmm, sum_wr, sum_wmr, rough};
+for (int i = 0; i < 15; ++i) out[27 + i] = statistics[i];
+out[69] = tilted;
+out[70] = sum_wrr;
+""")
+def sum_points(
+    model_vertices: wp.array(dtype=wp.vec3),
+    model_normals: wp.array(dtype=wp.vec3),
+    model_intensity: wp.array(dtype=wp.float32),
+    live_vertices: wp.array(dtype=wp.vec3),
+    live_normals: wp.array(dtype=wp.vec3),
+    live_gradient: wp.array(dtype=wp.vec3),
+    start: int,
+    end: int,
+    stride: int,
+    live_image: int,
+    live_size: wp.vec2i,
+    focal: wp.vec2,
+    centre: wp.vec2,
+    R: wp.mat33,
+    t: wp.vec3,
+    weights: Weights,
+    light: Photometry,
+    partial: wp.array4d(dtype=wp.float32),
+    row: int,
+):
+    """Sum the terms of the model points from ``start`` to ``end`` into a row of ``partial``.
+
+    ``R`` and ``t`` are T_live_model.
+    """
 
 
 @wp.kernel

@@ -11,8 +11,7 @@ import itertools
 from dataclasses import dataclass
 
 from ms_slam_env._warp import wp
-from ms_slam_env.slam.surfel.launches import Launches
-from ms_slam_env.slam.surfel.memory import fetch, put
+from ms_slam_env.slam.surfel.device import Launches, fetch, put
 
 EDGE_FRACTION = 0.03  # pixels of a block further behind the front one than this are another surface
 

@@ -2,7 +2,7 @@
 
 ElasticFusion (Whelan et al., RSS 2015, figure 2). While tracking is lost the
 pose is held, nothing is fused, and every frame is tried against the map around the last good pose
-and around keyframes that resemble it (``relocalisation``).
+and around keyframes that resemble it (``relocalization``).
 The view that frames are tracked against shows living surfels of every age: with steps of
 centimetres a view seldom lasts until its surfels are stable.
 """
@@ -21,25 +21,7 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import check_pose, invert
 from ms_slam_env.slam.base import Float64, TrackResult
 from ms_slam_env.slam.ferns import Candidate
-from ms_slam_env.slam.surfel.alignment import Alignment, accept_any_fit
-from ms_slam_env.slam.surfel.blank import BLANK, REASON, BlankFrames
-from ms_slam_env.slam.surfel.config import SurfelConfig
-from ms_slam_env.slam.surfel.front_end import FrontEnd, FrontEnds, check_change
-from ms_slam_env.slam.surfel.inputs import check_guesses, check_images, check_poses
-from ms_slam_env.slam.surfel.loops.make import make_loop_closure
-from ms_slam_env.slam.surfel.mirror import Mirror
-from ms_slam_env.slam.surfel.motions import damped, motion_weight
-from ms_slam_env.slam.surfel.photometry import (
-    follow,
-    geometry_only,
-    same_exposure,
-)
-from ms_slam_env.slam.surfel.relocalisation import Images, make_relocalisation
-from ms_slam_env.slam.surfel.seeds import NUM_SEEDS, relocalisation_seeds, tracking_seeds
-from ms_slam_env.slam.surfel.surfel_map import SurfelMap
-from ms_slam_env.slam.surfel.tracking import NUM_FIRST, model_stride
-from ms_slam_env.slam.surfel.types import LiveFrame, ModelView
-from ms_slam_env.slam.surfel.verdict import (
+from ms_slam_env.slam.surfel.acceptance import (
     APPEARANCE,
     OK,
     REASONS,
@@ -47,9 +29,37 @@ from ms_slam_env.slam.surfel.verdict import (
     STAT_DEGENERATE,
     STAT_INLIER_FRACTION,
     STAT_RESIDUAL_M,
+    Alignment,
+    accept_any_fit,
     geometric_limits,
     make_limits,
 )
+from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.device import Mirror
+from ms_slam_env.slam.surfel.loop_closure import make_loop_closure
+from ms_slam_env.slam.surfel.photometry import (
+    BLANK,
+    REASON,
+    BlankFrames,
+    follow,
+    geometry_only,
+    same_exposure,
+)
+from ms_slam_env.slam.surfel.pipeline import FrontEnd, FrontEnds, check_change
+from ms_slam_env.slam.surfel.pose_hypotheses import (
+    NUM_SEEDS,
+    check_guesses,
+    check_poses,
+    damped,
+    motion_weight,
+    relocalisation_seeds,
+    tracking_seeds,
+)
+from ms_slam_env.slam.surfel.preprocessing import LiveFrame, check_images
+from ms_slam_env.slam.surfel.relocalization import Images, make_relocalisation
+from ms_slam_env.slam.surfel.rendering import ModelView
+from ms_slam_env.slam.surfel.surfel_map import SurfelMap
+from ms_slam_env.slam.surfel.tracker import NUM_FIRST, model_stride
 
 RETRIES = 2  # further searches within a frame whose tracking failed
 FEWEST_READINGS = 0.05  # share of the first frame's pixels that must have depth

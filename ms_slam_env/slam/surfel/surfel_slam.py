@@ -45,7 +45,7 @@ class SurfelSlam(SlamBackend):
         not hold them: it is set where they are in force.
 
         Args:
-            config: differs in nothing that ``front_end.FIXED`` names. Loop closure keeps the
+            config: differs in nothing that ``pipeline.FIXED`` names. Loop closure keeps the
                 parameters that it was made with, and ferns the depths that they ask for.
             image_size: (width, height) that frames are reduced to before anything else; None for
                 the size they have. ``track`` takes frames of the camera's own size all the same,

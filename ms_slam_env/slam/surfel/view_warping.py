@@ -1,5 +1,4 @@
 # ruff: noqa: UP018, RUF046
-# Warp code: float(0.0) declares a variable that changes.
 """Kernels of the candidates' views: warp the points of a layered depth image into many cameras.
 
 The front surface and the surface behind it, rendered from one reference pose with a wider field of
@@ -11,8 +10,7 @@ surfels into every view.
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
-from ms_slam_env.slam.surfel.discs import SplatCamera
-from ms_slam_env.slam.surfel.surfel_arrays import rotation_of, translation_of
+from ms_slam_env.slam.surfel.surfels import SplatCamera, rotation_of, translation_of
 
 EMPTY = wp.constant(wp.int64(0x7FFFFFFFFFFFFFFF))
 DEPTH_BINS_PER_M = wp.constant(10.0)  # points in one depth bin compete by distance to the pixel

@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert
-from ms_slam_env.slam.surfel.alignment import Alignment
+from ms_slam_env.slam.surfel.acceptance import NUM_STATS, Alignment, Limits, judge
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.degeneracy import mat66d
-from ms_slam_env.slam.surfel.launches import Launches
-from ms_slam_env.slam.surfel.mirror import Mirror
+from ms_slam_env.slam.surfel.device import Launches, Mirror
 from ms_slam_env.slam.surfel.normal_equations import (
     NUM_SUMS,
     OFF,
@@ -29,19 +28,13 @@ from ms_slam_env.slam.surfel.normal_equations import (
     accumulate,
 )
 from ms_slam_env.slam.surfel.photometry import same_exposure
+from ms_slam_env.slam.surfel.pose_hypotheses import choose, widen_search
+from ms_slam_env.slam.surfel.preprocessing import LiveFrame
 from ms_slam_env.slam.surfel.pyramid import Level, Pyramid
-from ms_slam_env.slam.surfel.solve import gauss_newton_step, reduce_sums
-from ms_slam_env.slam.surfel.types import LiveFrame, ModelView
-from ms_slam_env.slam.surfel.verdict import (
-    NUM_STATS,
-    Limits,
-    choose,
-    judge,
-    widen_search,
-)
+from ms_slam_env.slam.surfel.rendering import ModelView
+from ms_slam_env.slam.surfel.solver import gauss_newton_step, reduce_sums
 
 Float64 = NDArray[np.float64]
-
 SEARCH_POINTS = 400
 SEARCH_ITERATIONS = 5
 NUM_FIRST = 2  # seeds tried first, with the guess if any: at rest and at constant velocity
@@ -170,7 +163,7 @@ class Tracker:
             model: rendered at ``T_world_model``.
             T_world_model: (B, 4, 4).
             seeds: (B, K, 4, 4) starting poses T_model_live.
-            limits: (B,) structured array of ``verdict.Limits``.
+            limits: (B,) structured array of ``acceptance.Limits``.
             guesses: (B, 4, 4) one more starting pose T_world_live, NaN for an env without; None
                 if no env has one.
             photometry: (B,) ``Photometry`` to start from; exposed like the model if None.

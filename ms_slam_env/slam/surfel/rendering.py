@@ -7,23 +7,36 @@ from typing import Any
 
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.slam.surfel.blocks import Blocks, list_blocks
-from ms_slam_env.slam.surfel.discs import Discs, SplatCamera, project_discs
-from ms_slam_env.slam.surfel.splat import (
+from ms_slam_env.slam.surfel.frustum_culling import Blocks, Culler
+from ms_slam_env.slam.surfel.splatting import (
+    Discs,
     Sums,
-    cull,
     list_hidden,
+    project_discs,
     resolve,
     splat_attributes,
     splat_depth,
 )
-from ms_slam_env.slam.surfel.surfel_arrays import (
-    SeenWindow,
-    Surfels,
-    VisibleList,
-    any_time,
-)
-from ms_slam_env.slam.surfel.types import ModelView
+from ms_slam_env.slam.surfel.surfels import SeenWindow, SplatCamera, Surfels, VisibleList
+
+
+@dataclass(frozen=True)
+class ModelView:
+    """The map rendered from one pose per env, on the device.
+
+    The view may hold only every n-th row and column of the camera's image.
+
+    Attributes:
+        vertices: (B, H, W) vec3 camera frame of the rendering pose; z = 0 where the map is empty.
+        normals: (B, H, W) vec3 unit normals, same frame, towards the camera; 0 where empty.
+        intensity: (B, H, W) float32 in [0, 255]; 0 where empty.
+        color: (B, H, W) vec3 RGB in [0, 255]; 0 where empty.
+    """
+
+    vertices: wp.array
+    normals: wp.array
+    intensity: wp.array
+    color: wp.array
 
 
 @dataclass(frozen=True)
@@ -49,48 +62,6 @@ def splat_camera(intrinsics: Intrinsics, parameters: SplatParameters) -> SplatCa
     camera.min_px, camera.max_px = parameters.min_px, parameters.max_px
     camera.max_weight = parameters.max_weight
     return camera
-
-
-class Culler:
-    """Lists the surfels that cameras can see, one camera for each of ``envs`` maps.
-
-    Only those last seen within ``window``, whose times may be set anew at any moment; None: all.
-    """
-
-    def __init__(
-        self,
-        surfels: Surfels,
-        blocks: Blocks,
-        visible: VisibleList,
-        envs: int,
-        camera: SplatCamera,
-        workers: int,
-        device: str,
-        window: SeenWindow | None = None,
-    ) -> None:
-        self._blocks = blocks
-        self._visible = visible
-        window = window or any_time(surfels.count.shape[0], device)
-        self._arguments: tuple[Any, ...] = (0, wp.zeros(envs, dtype=wp.mat44, device=device), 0.0)
-        first_env, poses, margin_px = self._arguments
-        shared = [surfels, blocks, first_env, poses, camera, margin_px, workers]
-        self._launches = [
-            wp.launch(kernel, (envs, workers), inputs, device=device, record_cmd=True)
-            for kernel, inputs in ((list_blocks, shared), (cull, [*shared, window, visible]))
-        ]
-
-    def __call__(self, poses: wp.array, first_env: int = 0, margin_px: float = 0.0) -> None:
-        """Fill the list for ``poses`` (envs,) T_world_camera of the envs from ``first_env`` on."""
-        self._blocks.num_listed.zero_()
-        self._visible.count.zero_()
-        changing = (first_env, poses, margin_px)
-        for index, new, old in zip((2, 3, 5), changing, self._arguments, strict=True):
-            if new is not old:
-                for launch in self._launches:
-                    launch.set_param_at_index(index, new)
-        self._arguments = changing
-        for launch in self._launches:
-            launch.launch()
 
 
 class SplatRenderer:

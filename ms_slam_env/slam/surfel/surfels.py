@@ -14,7 +14,6 @@ ATTRIBUTES = {
     "seen": wp.int32,
 }
 """Arrays (B, capacity) of ``Surfels`` and their types."""
-
 COUNTERS = ("count", "dead", "dropped")
 """Arrays (B,) int32 of ``Surfels``."""
 
@@ -116,3 +115,38 @@ def depth_tolerance(distance_at_1m: float, z: float):
     2012); the constant part allows for errors of the pose.
     """
     return distance_at_1m * (0.7 + 0.3 * z * z)
+
+
+@wp.struct
+class SplatCamera:
+    """Image size, focal lengths (px), principal point (px), and how discs are drawn.
+
+    Attributes:
+        width: columns.
+        height: rows.
+        focal: (fx, fy).
+        centre: (cx, cy).
+        z_near: nearest depth drawn, metres.
+        z_far: farthest depth drawn, metres.
+        tolerance_m: discs this far behind the nearest one belong to the same surface (at 1 m).
+        min_px: smallest drawn radius.
+        max_px: largest drawn radius.
+        max_weight: confidence above which a disc weighs no more.
+    """
+
+    width: int
+    height: int
+    focal: wp.vec2
+    centre: wp.vec2
+    z_near: float
+    z_far: float
+    tolerance_m: float
+    min_px: float
+    max_px: float
+    max_weight: float
+
+
+@wp.func
+def floor_int(x: float) -> int:
+    """Largest integer not above x >= -100; truncation is much faster than ``wp.floor``."""
+    return int(x + 100.0) - 100

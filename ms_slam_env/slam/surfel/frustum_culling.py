@@ -1,4 +1,5 @@
-"""Blocks of successive surfels with their bounding boxes, so that a frame need not look at all.
+# mypy: disable-error-code="empty-body"
+"""Which surfels a camera may see: blocks of surfels with bounding boxes, then one by one.
 
 New surfels are appended frame by frame, so those of a block were made close together. A camera
 tests the box of a block first: the cost of listing what is in view follows what is near the view,
@@ -7,18 +8,23 @@ surfels a little; other boxes stay as they are. The same holds for the time when
 unstable surfel is due for removal.
 """
 
-# mypy: disable-error-code="empty-body"
-
 from __future__ import annotations
 
+from typing import Any
+
 from ms_slam_env._warp import wp
-from ms_slam_env.slam.surfel.discs import SplatCamera
-from ms_slam_env.slam.surfel.surfel_arrays import Surfels, rotation_of, translation_of
+from ms_slam_env.slam.surfel.surfels import (
+    SeenWindow,
+    SplatCamera,
+    Surfels,
+    VisibleList,
+    any_time,
+    rotation_of,
+    translation_of,
+)
 
-BLOCK = 128
+BLOCK = wp.constant(128)
 """Surfels of a block."""
-
-_BLOCK = wp.constant(BLOCK)
 
 
 @wp.struct
@@ -59,7 +65,7 @@ def allocate_blocks(batch: int, capacity: int, device: str) -> Blocks:
 @wp.func
 def num_blocks(count: int):
     """Blocks that ``count`` slots fill or begin."""
-    return (count + _BLOCK - 1) / _BLOCK
+    return (count + BLOCK - 1) / BLOCK
 
 
 @wp.struct
@@ -232,18 +238,18 @@ def bound_blocks(
     """
     b, worker = wp.tid()
     count = wp.min(surfels.count[b], capacity)
-    fresh = blocks.bounded[b] / _BLOCK
+    fresh = blocks.bounded[b] / BLOCK
     j = int(worker)
     while j < blocks.num_listed[b]:
         block = blocks.listed[b, j]
-        first = block * _BLOCK
+        first = block * BLOCK
         if block < fresh and first < count:
-            bound(surfels, blocks, b, first, wp.min(_BLOCK, count - first), threshold)
+            bound(surfels, blocks, b, first, wp.min(BLOCK, count - first), threshold)
         j += workers
     block = fresh + worker
     while block < num_blocks(count):
-        first = block * _BLOCK
-        bound(surfels, blocks, b, first, wp.min(_BLOCK, count - first), threshold)
+        first = block * BLOCK
+        bound(surfels, blocks, b, first, wp.min(BLOCK, count - first), threshold)
         block += workers
 
 
@@ -252,3 +258,152 @@ def set_bounded(surfels: Surfels, blocks: Blocks, capacity: int) -> None:
     """Note that all boxes hold."""
     b = wp.tid()
     blocks.bounded[b] = wp.min(surfels.count[b], capacity)
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+constexpr int LANES = 1;  // surfels at a time
+#else
+constexpr int LANES = 64;
+#endif
+const int n = end - first < LANES ? end - first : LANES;
+const size_t start = size_t(b) * surfels.radius.shape[1] + first;
+const float* positions = (const float*)surfels.position.data + 3 * start;
+const float* normals = (const float*)surfels.normal.data + 3 * start;
+const float* confidence = surfels.confidence.data + start;
+const int* seen = surfels.seen.data + start;
+const wp::mat33 R = frustum.R;
+const wp::vec3 t = frustum.t;
+float x[LANES], y[LANES], z[LANES];
+int inside[LANES];
+int found = 0;
+for (int k = 0; k < n; ++k) {
+    const float px = positions[3 * k], py = positions[3 * k + 1], pz = positions[3 * k + 2];
+    x[k] = R.data[0][0] * px + R.data[0][1] * py + R.data[0][2] * pz + t[0];
+    y[k] = R.data[1][0] * px + R.data[1][1] * py + R.data[1][2] * pz + t[1];
+    z[k] = R.data[2][0] * px + R.data[2][1] * py + R.data[2][2] * pz + t[2];
+    inside[k] = (z[k] > frustum.z_near) & (z[k] < frustum.z_far)
+        & (x[k] > frustum.low_u * z[k]) & (x[k] < frustum.high_u * z[k])
+        & (y[k] > frustum.low_v * z[k]) & (y[k] < frustum.high_v * z[k])
+        & (confidence[k] > 0.0f) & (seen[k] >= seen_from) & (seen[k] <= seen_to);
+    found += inside[k];
+}
+if (found == 0) return n;
+float nx[LANES], ny[LANES], nz[LANES];
+for (int k = 0; k < n; ++k) {
+    const float px = normals[3 * k], py = normals[3 * k + 1], pz = normals[3 * k + 2];
+    nx[k] = R.data[0][0] * px + R.data[0][1] * py + R.data[0][2] * pz;
+    ny[k] = R.data[1][0] * px + R.data[1][1] * py + R.data[1][2] * pz;
+    nz[k] = R.data[2][0] * px + R.data[2][1] * py + R.data[2][2] * pz;
+    inside[k] &= nx[k] * x[k] + ny[k] * y[k] + nz[k] * z[k] < 0.0f;
+}
+int which[LANES];
+found = 0;
+for (int k = 0; k < n; ++k) {
+    which[found] = k;
+    found += inside[k];
+}
+const size_t place = size_t(row) * visible.index.shape[1]
+    + wp::atomic_add(visible.count.data + row, found);
+for (int m = 0; m < found; ++m) {
+    const int k = which[m];
+    visible.index.data[place + m] = first + k;
+    visible.position.data[place + m] = wp::vec3(x[k], y[k], z[k]);
+    visible.normal.data[place + m] = wp::vec3(nx[k], ny[k], nz[k]);
+    visible.radius.data[place + m] = surfels.radius.data[start + k];
+}
+return n;
+""")
+def list_some(
+    surfels: Surfels,
+    b: int,
+    first: int,
+    end: int,
+    frustum: Frustum,
+    seen_from: int,
+    seen_to: int,
+    row: int,
+    visible: VisibleList,
+) -> int:
+    """List the visible ones of the surfels from ``first`` on; how many were looked at.
+
+    Several at a time on the CPU, at most to ``end``; a thread of a GPU looks at one.
+    """
+
+
+@wp.kernel
+def cull(
+    surfels: Surfels,
+    blocks: Blocks,
+    first_env: int,
+    poses: wp.array(dtype=wp.mat44),
+    camera: SplatCamera,
+    margin_px: float,
+    workers: int,
+    window: SeenWindow,
+    visible: VisibleList,
+) -> None:
+    """List the living surfels of a window in front of the camera, facing it, within its frustum.
+
+    Those of the blocks that ``list_blocks`` listed; ``poses[k]`` is T_world_camera of env
+    ``first_env + k``. A single worker, as on the CPU, keeps the order of the map.
+    """
+    k, worker = wp.tid()
+    b = first_env + k
+    frustum = frustum_of(poses[k], camera, margin_px)
+    count = surfels.count[b]
+    seen_from = window.seen_from[b]
+    seen_to = window.seen_to[b]
+    slots = blocks.num_listed[k] * BLOCK
+    j = int(worker)
+    while j < slots:
+        block = j / BLOCK
+        i = blocks.listed[k, block] * BLOCK + j - block * BLOCK
+        looked_at = 1
+        if i < count:
+            end = wp.min((i / BLOCK + 1) * BLOCK, count)
+            end = wp.where(workers == 1, end, i + 1)
+            looked_at = list_some(surfels, b, i, end, frustum, seen_from, seen_to, k, visible)
+        j += wp.where(workers == 1, looked_at, workers)
+
+
+class Culler:
+    """Lists the surfels that cameras can see, one camera for each of ``envs`` maps.
+
+    Only those last seen within ``window``, whose times may be set anew at any moment; None: all.
+    """
+
+    def __init__(
+        self,
+        surfels: Surfels,
+        blocks: Blocks,
+        visible: VisibleList,
+        envs: int,
+        camera: SplatCamera,
+        workers: int,
+        device: str,
+        window: SeenWindow | None = None,
+    ) -> None:
+        self._blocks = blocks
+        self._visible = visible
+        window = window or any_time(surfels.count.shape[0], device)
+        self._arguments: tuple[Any, ...] = (0, wp.zeros(envs, dtype=wp.mat44, device=device), 0.0)
+        first_env, poses, margin_px = self._arguments
+        shared = [surfels, blocks, first_env, poses, camera, margin_px, workers]
+        self._launches = [
+            wp.launch(kernel, (envs, workers), inputs, device=device, record_cmd=True)
+            for kernel, inputs in ((list_blocks, shared), (cull, [*shared, window, visible]))
+        ]
+
+    def __call__(self, poses: wp.array, first_env: int = 0, margin_px: float = 0.0) -> None:
+        """Fill the list for ``poses`` (envs,) T_world_camera of the envs from ``first_env`` on."""
+        self._blocks.num_listed.zero_()
+        self._visible.count.zero_()
+        changing = (first_env, poses, margin_px)
+        for index, new, old in zip((2, 3, 5), changing, self._arguments, strict=True):
+            if new is not old:
+                for launch in self._launches:
+                    launch.set_param_at_index(index, new)
+        self._arguments = changing
+        for launch in self._launches:
+            launch.launch()

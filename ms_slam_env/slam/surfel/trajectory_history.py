@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.geometry import invert, relative_angle
-from ms_slam_env.slam.surfel.loops.base import Float64, Int32
-from ms_slam_env.slam.surfel.loops.deformation_graph import Deformation
-from ms_slam_env.slam.surfel.loops.energy import Constraints, join, no_constraints
+from ms_slam_env.slam.surfel.deformation_graph import Constraints, Deformation, join, no_constraints
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
+
+Float64 = NDArray[np.float64]
+Int32 = NDArray[np.int32]
 
 ANCHORS = 12  # points of the map that hold a frame's pose
 KEPT_CONSTRAINTS = 1000  # relative ones, of the newest loops

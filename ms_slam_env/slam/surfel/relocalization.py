@@ -1,27 +1,141 @@
-"""Relocalisation from keyframes that resemble the lost frame."""
+"""Finding the pose again once tracking is lost: from keyframes anywhere in the map, or not."""
 
 from __future__ import annotations
 
-from typing import Any
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.geometry import make_pose, relative_angle, so3_exp
+from ms_slam_env.geometry import relative_angle
 from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.ferns import Candidate, FernConfig, FernDatabase
-from ms_slam_env.slam.surfel.relocalisation.base import (
-    Bool,
-    Images,
-    Int32,
-    Relocalisation,
-    Searcher,
+from ms_slam_env.slam.surfel.acceptance import OK, STAT_COST, Alignment, make_limits
+from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.photometric_consistency import LikenessLimits, measure_likeness
+from ms_slam_env.slam.surfel.pose_hypotheses import (
+    _AT_REST,
+    NUM_SEEDS,
+    SEEDS,
+    tracking_seeds,
 )
-from ms_slam_env.slam.surfel.relocalisation.likeness import LikenessLimits, measure_likeness
-from ms_slam_env.slam.surfel.seeds import NUM_SEEDS, tracking_seeds
-from ms_slam_env.slam.surfel.tracking import Alignment
-from ms_slam_env.slam.surfel.verdict import OK, STAT_COST, make_limits
+from ms_slam_env.slam.surfel.rendering import ModelView
+
+Bool = NDArray[np.bool_]
+Int32 = NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Images:
+    """Frames as sensed.
+
+    Attributes:
+        color: (B, H, W, 3) uint8.
+        depth: (B, H, W) float32 metres; 0 = no reading.
+    """
+
+    color: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+
+
+class Searcher(Protocol):
+    """What relocalisation may ask of the SLAM about the current frames."""
+
+    def align_from(self, origins: Float64, seeds: Float64, limits: NDArray[np.void]) -> Alignment:
+        """Align with the maps as seen from ``origins`` (B, 4, 4).
+
+        ``seeds`` (B, K, 4, 4) are relative to those; ``limits`` (B,) are ``acceptance.Limits``.
+        """
+
+    def render(self, poses: Float64) -> ModelView:
+        """The maps as seen from ``poses`` (B, 4, 4)."""
+
+
+class Relocalisation(ABC):
+    """Where a lost frame is searched besides around the last good pose, for B envs."""
+
+    @abstractmethod
+    def remember(self, frames: Images, poses: Float64, time: Int32, tracked: Bool) -> None:
+        """Take note of the frames that were ``tracked`` (B,) at ``poses`` (B, 4, 4)."""
+
+    @abstractmethod
+    def believes(self, frames: Images, poses: Float64, found: Bool, searcher: Searcher) -> Bool:
+        """Which of the frames that were ``found`` (B,) again are really at ``poses`` (B, 4, 4)."""
+
+    @abstractmethod
+    def search(
+        self, frames: Images, lost: Bool, searcher: Searcher
+    ) -> tuple[Bool, Alignment] | None:
+        """Search the maps for the frames of the envs that are ``lost`` (B,).
+
+        Returns:
+            Which of them were found (B,), and where; None if none was.
+        """
+
+    @abstractmethod
+    def similar(self, env: int, frames: Images, before: int) -> list[Candidate]:
+        """The best few keyframes from before a time that resemble an env's frame, best first."""
+
+    @abstractmethod
+    def move(self, env: int, time: Int32, poses: Float64) -> None:
+        """Follow a map that was bent: frames ``time`` (N,) were taken at ``poses`` (N, 4, 4)."""
+
+    @abstractmethod
+    def adapt(self, intrinsics: Intrinsics, depth_cutoff_m: float) -> None:
+        """Expect frames of another size, and a map of readings up to another distance."""
+
+    @abstractmethod
+    def clear(self, env: int) -> None:
+        """Forget everything about one env."""
+
+    @abstractmethod
+    def get_state(self) -> dict[str, Any]:
+        """Everything needed to go on bit-exactly, as NumPy arrays."""
+
+    @abstractmethod
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state of the same variant, batch and camera."""
+
+
+class LocalSearch(Relocalisation):
+    """Nothing besides what the SLAM does anyway."""
+
+    def remember(self, frames: Images, poses: Float64, time: Int32, tracked: Bool) -> None:
+        """Nothing to remember."""
+
+    def believes(self, frames: Images, poses: Float64, found: Bool, searcher: Searcher) -> Bool:
+        """All of them: the tracker's verdict is final."""
+        return found
+
+    def search(
+        self, frames: Images, lost: Bool, searcher: Searcher
+    ) -> tuple[Bool, Alignment] | None:
+        """Nowhere else to search."""
+        return None
+
+    def similar(self, env: int, frames: Images, before: int) -> list[Candidate]:
+        """No keyframes."""
+        return []
+
+    def move(self, env: int, time: Int32, poses: Float64) -> None:
+        """Nothing to move."""
+
+    def adapt(self, intrinsics: Intrinsics, depth_cutoff_m: float) -> None:
+        """It asks for neither."""
+
+    def clear(self, env: int) -> None:
+        """Nothing to forget."""
+
+    def get_state(self) -> dict[str, Any]:
+        """Nothing to keep."""
+        return {}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Nothing to restore."""
+
 
 TRIALS = 3  # keyframes tried a frame
 ROUNDS = 3  # frames until the same ones are tried again
@@ -31,23 +145,6 @@ GOOD_COST = 1.6  # with one that costs less the other keyframes are left untried
 _LOOKED_AT = 40  # keyframes among which those tried are chosen
 _STEP_M, _STEP_RAD = 0.03, np.radians(3.0)  # frames between such steps are no new keyframes
 _APART_M, _APART_RAD = 0.10, np.radians(10.0)  # two of them differ by at least so much
-
-
-def _turn(pan_deg: float, tilt_deg: float, roll_deg: float = 0.0) -> Float64:
-    return make_pose(so3_exp(np.radians([tilt_deg, pan_deg, roll_deg])), np.zeros(3))
-
-
-_HERE = np.eye(4)
-_AXES = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
-_TURNS_DEG = (  # pan, tilt, roll
-    [14 * np.array(axis) for axis in _AXES],
-    [(12, 12, 0), (12, -12, 0), (-12, 12, 0), (-12, -12, 0), (25, 0, 0), (-25, 0, 0)],
-    [22 * np.array(axis) for axis in _AXES],
-)
-SEEDS = np.stack([[_HERE, _HERE, *(_turn(*turn) for turn in turns)] for turns in _TURNS_DEG])
-"""Starts (3, 8, 4, 4) relative to a keyframe, in turns; a turn stands for a sideways step too."""
-
-_AT_REST = np.tile(_HERE, (NUM_SEEDS, 1, 1))
 _STRICT = make_limits(np.ones(1, dtype=bool), np.zeros(1, dtype=np.int32))
 
 
@@ -71,7 +168,8 @@ class FernRelocalisation(Relocalisation):
     """Searches from the keyframes that resemble the lost frame (Glocker et al., TVCG 2015).
 
     The best of a few alignments is refined, and believed if the map's view from there is like the
-    frame (``likeness``) and the next frame is found close by. Only then is anything fused.
+    frame (``photometric_consistency``) and the next frame is found close by. Only then is anything
+    fused.
     """
 
     def __init__(self, batch: int, intrinsics: Intrinsics, depth_cutoff_m: float) -> None:
@@ -249,3 +347,10 @@ def _spread(candidates: list[Candidate], count: int) -> list[Candidate]:
 def _is_close(a: Float64, b: Float64) -> bool:
     near = np.linalg.norm(a[:3, 3] - b[:3, 3]) <= _APART_M
     return bool(near and relative_angle(a[:3, :3], b[:3, :3]) <= _APART_RAD)
+
+
+def make_relocalisation(batch: int, intrinsics: Intrinsics, config: SurfelConfig) -> Relocalisation:
+    """The relocalisation ``config.relocalisation`` for B envs with one camera model."""
+    if config.relocalisation == "local":
+        return LocalSearch()
+    return FernRelocalisation(batch, intrinsics, config.depth_cutoff_m)

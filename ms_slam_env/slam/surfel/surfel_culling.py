@@ -7,11 +7,10 @@ many.
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
-from ms_slam_env.slam.surfel.blocks import BLOCK, Blocks, num_blocks
-from ms_slam_env.slam.surfel.memory import fetch, put
-from ms_slam_env.slam.surfel.surfel_arrays import Surfels
+from ms_slam_env.slam.surfel.device import fetch, put
+from ms_slam_env.slam.surfel.frustum_culling import BLOCK, Blocks, num_blocks
+from ms_slam_env.slam.surfel.surfels import Surfels
 
-BLOCK_SIZE = wp.constant(BLOCK)
 NEVER = wp.constant(2**31 - 1)
 
 
@@ -62,8 +61,8 @@ def expire(
     block = int(worker)
     while block < num_blocks(count):
         if blocks.expiry[b, block] < oldest:
-            i = block * BLOCK_SIZE
-            end = wp.min(i + BLOCK_SIZE, count)
+            i = block * BLOCK
+            end = wp.min(i + BLOCK, count)
             expiry = int(NEVER)
             while i < end:
                 confidence = fetch(surfels.confidence, b, i)

@@ -12,16 +12,14 @@ from dataclasses import dataclass
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.surfel.config import SurfelConfig
-from ms_slam_env.slam.surfel.map_passes import MapPasses
 from ms_slam_env.slam.surfel.photometry import ExposureCorrection
-from ms_slam_env.slam.surfel.preprocess import Preprocessor
-from ms_slam_env.slam.surfel.seeds import NUM_SEEDS
-from ms_slam_env.slam.surfel.surfel_map import SurfelMap
-from ms_slam_env.slam.surfel.tracking import Tracker, model_stride
+from ms_slam_env.slam.surfel.pose_hypotheses import NUM_SEEDS
+from ms_slam_env.slam.surfel.preprocessing import Preprocessor
+from ms_slam_env.slam.surfel.surfel_map import MapPasses, SurfelMap
+from ms_slam_env.slam.surfel.tracker import Tracker, model_stride
 
 FIXED = ("max_surfels", "relocalisation", "loop_closure", "loops")
 """Fields of ``SurfelConfig`` that a running SLAM keeps: they shape what it has stored."""
-
 _KEPT = 8  # front ends: each has the buffers of its images
 
 

@@ -1,22 +1,17 @@
-"""Choosing between hypotheses, and judging whether a frame was tracked: on the device."""
+"""What aligning a frame with the map found, and whether that is believed: on the device."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env._warp import wp
-from ms_slam_env.slam.surfel.degeneracy import (
-    eigen,
-    is_constrained,
-    mat66d,
-    pose_covariance,
-    vec6d,
-)
-from ms_slam_env.slam.surfel.normal_equations import OFF, RUNNING, Photometry
-from ms_slam_env.slam.surfel.solve import (
+from ms_slam_env.slam.surfel.degeneracy import eigen, is_constrained, mat66d, pose_covariance, vec6d
+from ms_slam_env.slam.surfel.photometry import BLANK
+from ms_slam_env.slam.surfel.solver import (
     cholesky,
     cholesky_solve,
     invert_rigid,
@@ -42,7 +37,6 @@ REASONS = {
     APPEARANCE: "the frame's intensity does not fit the map",
     IMPLAUSIBLE: "the motion is implausibly large",
 }
-
 STAT_INLIER_FRACTION = 0
 STAT_RESIDUAL_M = 1
 STAT_OVERLAP = 2
@@ -53,11 +47,6 @@ STAT_COST = 6  # mean truncated cost of the visible points, in [0, 3]
 STAT_CONFLICT = 7  # chi squared between the poses that the two terms ask for
 STAT_DEGENERATE = 8  # number of directions that are not constrained
 NUM_STATS = 9
-
-
-GUESS = wp.constant(2)  # index of the guess among the first seeds, after rest and constant velocity
-CLEARLY_BETTER = wp.constant(wp.float64(0.97))  # ratios of scores
-CLEARLY_WORSE = wp.constant(wp.float64(1.03))
 
 
 @wp.struct
@@ -74,78 +63,6 @@ class Limits:
     degenerate: wp.int32  # most directions that may be unconstrained
     motion_m: wp.float64
     motion_cos: wp.float64
-
-
-@wp.func
-def _score(sums: wp.array3d(dtype=wp.float64), b: int, k: int):
-    """Mean truncated cost per model point; a point out of view costs a fixed share."""
-    points = sums[b, k, 28]
-    visible = sums[b, k, 29]
-    if points < wp.float64(1.0):
-        return wp.float64(1.0e9)
-    return (sums[b, k, 27] + wp.float64(0.8) * (points - visible)) / points
-
-
-@wp.kernel
-def widen_search(
-    first_active: wp.array2d(dtype=wp.int32),
-    good_score: wp.float64,
-    first_sums: wp.array3d(dtype=wp.float64),
-    more_sums: wp.array3d(dtype=wp.float64),
-    more_active: wp.array2d(dtype=wp.int32),
-):
-    """Switch on the further seeds (B, K2) unless one of the first (B, K1) fits well already."""
-    b = wp.tid()
-    best = wp.float64(1.0e9)
-    for k in range(first_sums.shape[1]):
-        if first_active[b, k] == OFF:
-            first_sums[b, k, 28] = wp.float64(0.0)  # no points: the worst score
-        best = wp.min(best, _score(first_sums, b, k))
-    for k in range(more_active.shape[1]):
-        if best > good_score:
-            more_active[b, k] = RUNNING
-        else:
-            more_active[b, k] = OFF
-            more_sums[b, k, 28] = wp.float64(0.0)  # no points: the worst score
-
-
-@wp.kernel
-def choose(
-    first_sums: wp.array3d(dtype=wp.float64),
-    first_pose: wp.array2d(dtype=wp.mat44d),
-    first_light: wp.array2d(dtype=Photometry),
-    more_sums: wp.array3d(dtype=wp.float64),
-    more_pose: wp.array2d(dtype=wp.mat44d),
-    more_light: wp.array2d(dtype=Photometry),
-    pose: wp.array2d(dtype=wp.mat44d),  # (B, 1)
-    photometry: wp.array2d(dtype=Photometry),  # (B, 1)
-    active: wp.array2d(dtype=wp.int32),  # (B, 1)
-):
-    """Go on with the seed whose points fit best; it becomes the one hypothesis.
-
-    The first seeds are at rest, at constant velocity, and the guess.
-    """
-    b = wp.tid()
-    # Where the view leaves directions open all starts fit alike: prefer what is predicted.
-    best = first_pose[b, 1]
-    light = first_light[b, 1]
-    best_score = _score(first_sums, b, 1)
-    for n in range(1, first_pose.shape[1]):
-        k = wp.where(n == 1, 0, n)
-        score = _score(first_sums, b, k)
-        if score < best_score * wp.where(k == GUESS, CLEARLY_WORSE, CLEARLY_BETTER):
-            best_score = score
-            best = first_pose[b, k]
-            light = first_light[b, k]
-    for k in range(more_pose.shape[1]):
-        score = _score(more_sums, b, k)
-        if score < best_score * CLEARLY_BETTER:
-            best_score = score
-            best = more_pose[b, k]
-            light = more_light[b, k]
-    pose[b, 0] = best
-    photometry[b, 0] = light
-    active[b, 0] = RUNNING
 
 
 @wp.func
@@ -301,3 +218,47 @@ def geometric_limits(lost: NDArray[np.int32]) -> NDArray[Any]:
     limits["alike"], limits["cost"], limits["degenerate"] = 0.0, np.inf, 3
     limits["motion_m"], limits["motion_cos"] = 0.15, np.cos(np.radians(10.0))
     return limits
+
+
+Float64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """What ``Tracker.align`` found for B envs.
+
+    Attributes:
+        T_world_live: (B, 4, 4) pose after alignment, good or not.
+        T_model_live: (B, 4, 4) the same, relative to the pose of the model view.
+        verdict: (B,) codes of ``REASONS``; 0 = tracked.
+        stats: (B, NUM_STATS) figures behind the verdict.
+        photometry: (B,) how the live grey values relate to the model's, ``Photometry`` each.
+        covariance: (B, 6, 6) of the twist (rho, phi), metres and radians, with the true pose
+            T_world_live exp(twist).
+    """
+
+    T_world_live: Float64
+    T_model_live: Float64
+    verdict: NDArray[np.int32]
+    stats: Float64
+    photometry: NDArray[Any]
+    covariance: Float64
+
+    def replace(self, where: NDArray[np.bool_], other: Alignment) -> Alignment:
+        """Take the envs ``where`` (B,) from ``other``."""
+        return Alignment(
+            T_world_live=np.where(where[:, None, None], other.T_world_live, self.T_world_live),
+            T_model_live=np.where(where[:, None, None], other.T_model_live, self.T_model_live),
+            verdict=np.where(where, other.verdict, self.verdict),
+            stats=np.where(where[:, None], other.stats, self.stats),
+            photometry=np.where(where, other.photometry, self.photometry),
+            covariance=np.where(where[:, None, None], other.covariance, self.covariance),
+        )
+
+
+def accept_any_fit(alignment: Alignment) -> Alignment:
+    """The same with a good verdict wherever there was something to align at all."""
+    usable = (alignment.verdict != FEW_POINTS) & (alignment.verdict != BLANK)
+    usable &= np.isfinite(alignment.T_world_live).all(axis=(1, 2))
+    unusable = np.where(alignment.verdict == BLANK, BLANK, FEW_POINTS)
+    return replace(alignment, verdict=np.where(usable, OK, unusable).astype(np.int32))

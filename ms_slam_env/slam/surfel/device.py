@@ -1,21 +1,94 @@
-"""Reading and writing flat arrays without checks, for loops over pixels and surfels.
+# mypy: disable-error-code="no-redef, empty-body"
+# ruff: noqa: F811
+"""Arrays on the device: unchecked access in kernels, host-device buffers, recorded launches.
 
 Warp's own indexing takes negative indices and any strides, which costs more than most of the
 arithmetic here, and keeps the compiler from working on eight pixels at once. So does Warp's
 ``for ... in range``, whose step is a variable: inner loops that matter are ``while`` loops. On one
 core of an AMD EPYC a loop over 19,200 pixels with five operations each took 43 microseconds with
-indexing and ``for``, 32 with ``while``, 5 with ``while`` and these functions.
-
-Arrays are one-dimensional and contiguous, such as ``array.flatten()``; indices are not checked.
+indexing and ``for``, 32 with ``while``, 5 with ``while``, ``fetch`` and ``put``. Their arrays are
+one-dimensional and contiguous, such as ``array.flatten()``, or rows; indices are not checked.
 """
-
-# ruff: noqa: F811
-# mypy: disable-error-code="no-redef, empty-body"
-# Warp tells overloads of a function apart by the types of their arguments.
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
 from ms_slam_env._warp import wp
+
+
+class Mirror:
+    """A device array; on a CPU the host works on its memory.
+
+    There ``assign`` and ``numpy`` of a small array cost 5 to 15 microseconds a call, most of it
+    for finding out what the array is; here that is done once.
+
+    Attributes:
+        array: the device array, zeros at first.
+    """
+
+    def __init__(self, shape: int | tuple[int, ...], dtype: Any, device: str) -> None:
+        """Allocate an array."""
+        self.array = wp.zeros(shape, dtype=dtype, device=device)
+        self._memory: NDArray[Any] | None = None
+        if wp.get_device(device).is_cpu:
+            self._memory = self.array.numpy()
+
+    def write(self, values: ArrayLike) -> None:
+        """Set all values."""
+        if self._memory is None:
+            self.array.assign(values)
+        else:
+            np.copyto(self._memory, values)
+
+    def read(self) -> NDArray[Any]:
+        """A copy of the values."""
+        return (self.array.numpy() if self._memory is None else self._memory).copy()
+
+
+class Launches:
+    """Launches by key, for kernels whose arguments are the same objects every time."""
+
+    def __init__(self, device: str) -> None:
+        """Start with nothing recorded."""
+        self._device = device
+        self._commands: dict[Hashable, wp.Launch] = {}
+
+    def clear(self) -> None:
+        """Forget all: the arguments have become other objects."""
+        self._commands.clear()
+
+    def replay(self, key: Hashable) -> bool:
+        """Launch what was recorded under ``key``; False if nothing was."""
+        command = self._commands.get(key)
+        if command is None:
+            return False
+        command.launch()
+        return True
+
+    def record(
+        self,
+        key: Hashable,
+        kernel: Any,
+        dim: int | Sequence[int],
+        inputs: Sequence[Any],
+        outputs: Sequence[Any],
+    ) -> None:
+        """Launch a kernel and keep the launch under ``key``."""
+        command = wp.launch(
+            kernel,
+            dim=dim,
+            inputs=inputs,
+            outputs=outputs,
+            device=self._device,
+            record_cmd=True,
+        )
+        self._commands[key] = command
+        command.launch()
 
 
 @wp.func_native("return values.data[i];")

@@ -8,16 +8,37 @@ noise of a structured-light sensor is uniform in it.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
+from ms_slam_env.errors import InputError
 from ms_slam_env.slam.surfel.config import SurfelConfig
-from ms_slam_env.slam.surfel.launches import Launches
-from ms_slam_env.slam.surfel.memory import fetch, put
-from ms_slam_env.slam.surfel.mirror import Mirror
-from ms_slam_env.slam.surfel.types import LiveFrame
+from ms_slam_env.slam.surfel.device import Launches, Mirror, fetch, put
+
+
+@dataclass(frozen=True)
+class LiveFrame:
+    """The sensor's frames of B envs after preprocessing, on the device.
+
+    Attributes:
+        raw_depth: (B, H, W) float32 metres as sensed; 0 = no reading or beyond the cutoff.
+        depth: (B, H, W) float32 metres, bilaterally filtered and cut off; 0 = no reading.
+        vertices: (B, H, W) vec3 back-projected ``depth``, camera frame; z = 0 where invalid.
+        normals: (B, H, W) vec3 unit normals, camera frame, towards the camera; 0 where invalid.
+        color: (B, H, W) vec3 RGB in [0, 255].
+        intensity: (B, H, W) float32 in [0, 255] (BT.601 luma of ``color``).
+    """
+
+    raw_depth: wp.array
+    depth: wp.array
+    vertices: wp.array
+    normals: wp.array
+    color: wp.array
+    intensity: wp.array
 
 
 @wp.kernel
@@ -290,3 +311,16 @@ class Preprocessor:
             [inverse, *size, self._normal_step, edge, focal, centre],
             [frame.depth.flatten(), frame.vertices.flatten(), frame.normals.flatten()],
         )
+
+
+def check_images(
+    color: NDArray[np.uint8], depth: NDArray[np.float32], batch: int, intrinsics: Intrinsics
+) -> None:
+    """Refuse another batch or image size than (B, H, W), and depth that is no depth."""
+    size = (batch, *intrinsics.shape)
+    if color.shape != (*size, 3) or depth.shape != size:
+        raise InputError(
+            f"colour {color.shape} and depth {depth.shape} must be {(*size, 3)} and {size}"
+        )
+    if not (depth.min() >= 0 and depth.max() < np.inf):
+        raise InputError("depth holds NaN, infinite or negative values; 0 means no reading")

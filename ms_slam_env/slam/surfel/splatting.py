@@ -1,6 +1,6 @@
+# mypy: disable-error-code="empty-body"
 # ruff: noqa: UP018, RUF046
-# Warp code: int(0) declares a variable that changes.
-"""Kernels that render surfels: cull, z-buffer of discs, average of the front surface, resolve.
+"""Kernels that render surfels: footprints, z-buffer, average of the front surface, resolve.
 
 Two passes over the visible discs: the first finds the nearest surface of every pixel, the second
 averages all discs within the depth tolerance behind it (the visibility splatting of Botsch et al.,
@@ -13,126 +13,145 @@ keeps the camera in registers. Image buffers are flat, which saves most of their
 arithmetic.
 """
 
-# mypy: disable-error-code="empty-body"
-
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
-from ms_slam_env.slam.surfel.blocks import BLOCK, Blocks, Frustum, frustum_of
-from ms_slam_env.slam.surfel.discs import Discs, SplatCamera, floor_int
-from ms_slam_env.slam.surfel.memory import fetch, put, raise_to
-from ms_slam_env.slam.surfel.surfel_arrays import SeenWindow, Surfels, VisibleList, depth_tolerance
+from ms_slam_env.slam.surfel.device import fetch, put, raise_to
+from ms_slam_env.slam.surfel.surfels import (
+    SplatCamera,
+    Surfels,
+    VisibleList,
+    depth_tolerance,
+    floor_int,
+)
 
-BLOCK_SIZE = wp.constant(BLOCK)
-Sums = wp.types.vector(length=8, dtype=wp.float32)
-"""Weighted sums of a pixel: normal (3), weight, colour (3), depth."""
 
+@wp.struct
+class Discs:
+    """The surfels of a list in the image, arrays (B, capacity), and those that meet a pixel.
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-constexpr int LANES = 1;  // surfels at a time
-#else
-constexpr int LANES = 64;
-#endif
-const int n = end - first < LANES ? end - first : LANES;
-const size_t start = size_t(b) * surfels.radius.shape[1] + first;
-const float* positions = (const float*)surfels.position.data + 3 * start;
-const float* normals = (const float*)surfels.normal.data + 3 * start;
-const float* confidence = surfels.confidence.data + start;
-const int* seen = surfels.seen.data + start;
-const wp::mat33 R = frustum.R;
-const wp::vec3 t = frustum.t;
-float x[LANES], y[LANES], z[LANES];
-int inside[LANES];
-int found = 0;
-for (int k = 0; k < n; ++k) {
-    const float px = positions[3 * k], py = positions[3 * k + 1], pz = positions[3 * k + 2];
-    x[k] = R.data[0][0] * px + R.data[0][1] * py + R.data[0][2] * pz + t[0];
-    y[k] = R.data[1][0] * px + R.data[1][1] * py + R.data[1][2] * pz + t[1];
-    z[k] = R.data[2][0] * px + R.data[2][1] * py + R.data[2][2] * pz + t[2];
-    inside[k] = (z[k] > frustum.z_near) & (z[k] < frustum.z_far)
-        & (x[k] > frustum.low_u * z[k]) & (x[k] < frustum.high_u * z[k])
-        & (y[k] > frustum.low_v * z[k]) & (y[k] < frustum.high_v * z[k])
-        & (confidence[k] > 0.0f) & (seen[k] >= seen_from) & (seen[k] <= seen_to);
-    found += inside[k];
-}
-if (found == 0) return n;
-float nx[LANES], ny[LANES], nz[LANES];
-for (int k = 0; k < n; ++k) {
-    const float px = normals[3 * k], py = normals[3 * k + 1], pz = normals[3 * k + 2];
-    nx[k] = R.data[0][0] * px + R.data[0][1] * py + R.data[0][2] * pz;
-    ny[k] = R.data[1][0] * px + R.data[1][1] * py + R.data[1][2] * pz;
-    nz[k] = R.data[2][0] * px + R.data[2][1] * py + R.data[2][2] * pz;
-    inside[k] &= nx[k] * x[k] + ny[k] * y[k] + nz[k] * z[k] < 0.0f;
-}
-int which[LANES];
-found = 0;
-for (int k = 0; k < n; ++k) {
-    which[found] = k;
-    found += inside[k];
-}
-const size_t place = size_t(row) * visible.index.shape[1]
-    + wp::atomic_add(visible.count.data + row, found);
-for (int m = 0; m < found; ++m) {
-    const int k = which[m];
-    visible.index.data[place + m] = first + k;
-    visible.position.data[place + m] = wp::vec3(x[k], y[k], z[k]);
-    visible.normal.data[place + m] = wp::vec3(nx[k], ny[k], nz[k]);
-    visible.radius.data[place + m] = surfels.radius.data[start + k];
-}
-return n;
-""")
-def list_some(
-    surfels: Surfels,
-    b: int,
-    first: int,
-    end: int,
-    frustum: Frustum,
-    seen_from: int,
-    seen_to: int,
-    row: int,
-    visible: VisibleList,
-) -> int:
-    """List the visible ones of the surfels from ``first`` on; how many were looked at.
-
-    Several at a time on the CPU, at most to ``end``; a thread of a GPU looks at one.
+    Attributes:
+        u: column of the centre.
+        v: row of the centre.
+        inverse: inverse depth of the centre.
+        slope_u: change of inverse depth per column.
+        slope_v: change of inverse depth per row.
+        rim: squared radius, square metres.
+        left: first column that the disc may cover; ``right``, ``top`` and ``bottom`` likewise.
+        right: last column.
+        top: first row.
+        bottom: last row.
+        drawn: places in the list of the discs that may cover a pixel.
+        num_drawn: (B,) how many those are.
     """
+
+    u: wp.array2d(dtype=wp.float32)
+    v: wp.array2d(dtype=wp.float32)
+    inverse: wp.array2d(dtype=wp.float32)
+    slope_u: wp.array2d(dtype=wp.float32)
+    slope_v: wp.array2d(dtype=wp.float32)
+    rim: wp.array2d(dtype=wp.float32)
+    left: wp.array2d(dtype=wp.int32)
+    right: wp.array2d(dtype=wp.int32)
+    top: wp.array2d(dtype=wp.int32)
+    bottom: wp.array2d(dtype=wp.int32)
+    drawn: wp.array2d(dtype=wp.int32)
+    num_drawn: wp.array(dtype=wp.int32)
+
+
+def allocate_discs(batch: int, capacity: int, device: str) -> Discs:
+    """Working memory for lists of up to ``capacity`` surfels."""
+    discs = Discs()
+    for name in ("u", "v", "inverse", "slope_u", "slope_v", "rim"):
+        setattr(discs, name, wp.zeros((batch, capacity), dtype=wp.float32, device=device))
+    for name in ("left", "right", "top", "bottom", "drawn"):
+        setattr(discs, name, wp.zeros((batch, capacity), dtype=wp.int32, device=device))
+    discs.num_drawn = wp.zeros(batch, dtype=wp.int32, device=device)
+    return discs
+
+
+@wp.func
+def half_extent(p: wp.vec3, n: wp.vec3, across: float, tilt: float, radius: float, focal: float):
+    """How far a disc at p reaches from its centre in columns or rows.
+
+    A tilted disc is an ellipse: an offset d in its plane moves the column by (f / z) a . d with
+    a = (1, 0, -x / z), at most |d| times a's part in the plane. ``across`` is x or y, ``tilt`` the
+    normal's component there. The twentieth part more allows for perspective.
+    """
+    ratio = across / p[2]
+    part = tilt - ratio * n[2]
+    in_plane = wp.sqrt(wp.max(1.0 + ratio * ratio - part * part, 0.0))
+    return 1.05 * focal * radius / p[2] * in_plane
+
+
+@wp.func
+def drawn_radius(radius: float, z: float, camera: SplatCamera):
+    """Radius in metres after the limits in pixels."""
+    pixel = z / camera.focal[0]
+    return wp.clamp(radius, camera.min_px * pixel, camera.max_px * pixel)
 
 
 @wp.kernel
-def cull(
-    surfels: Surfels,
-    blocks: Blocks,
-    first_env: int,
-    poses: wp.array(dtype=wp.mat44),
-    camera: SplatCamera,
-    margin_px: float,
-    workers: int,
-    window: SeenWindow,
-    visible: VisibleList,
-) -> None:
-    """List the living surfels of a window in front of the camera, facing it, within its frustum.
+def project_discs(visible: VisibleList, camera: SplatCamera, workers: int, discs: Discs) -> None:
+    """Footprints of the listed surfels.
 
-    Those of the blocks that ``list_blocks`` listed; ``poses[k]`` is T_world_camera of env
-    ``first_env + k``. A single worker, as on the CPU, keeps the order of the map.
+    Several short loops without branches: the compiler turns them into operations on many surfels
+    at once, which it does not for loops that write many arrays.
     """
     k, worker = wp.tid()
-    b = first_env + k
-    frustum = frustum_of(poses[k], camera, margin_px)
-    count = surfels.count[b]
-    seen_from = window.seen_from[b]
-    seen_to = window.seen_to[b]
-    slots = blocks.num_listed[k] * BLOCK_SIZE
-    j = int(worker)
-    while j < slots:
-        block = j / BLOCK_SIZE
-        i = blocks.listed[k, block] * BLOCK_SIZE + j - block * BLOCK_SIZE
-        looked_at = 1
-        if i < count:
-            end = wp.min((i / BLOCK_SIZE + 1) * BLOCK_SIZE, count)
-            end = wp.where(workers == 1, end, i + 1)
-            looked_at = list_some(surfels, b, i, end, frustum, seen_from, seen_to, k, visible)
-        j += wp.where(workers == 1, looked_at, workers)
+    fx = camera.focal[0]
+    fy = camera.focal[1]
+    cx = camera.centre[0]
+    cy = camera.centre[1]
+    share = (visible.count[k] + workers - 1) / workers
+    start = worker * share
+    end = wp.min(start + share, visible.count[k])
+    j = int(start)
+    while j < end:
+        p = fetch(visible.position, k, j)
+        inverse = 1.0 / p[2]
+        put(discs.inverse, k, j, inverse)
+        put(discs.u, k, j, fx * p[0] * inverse + cx)
+        put(discs.v, k, j, fy * p[1] * inverse + cy)
+        j += 1
+    j = int(start)
+    while j < end:
+        n = fetch(visible.normal, k, j)
+        # n . ray = (n . p) / z for rays with z = 1: inverse depth is (n / (n . p)) . ray.
+        plane = 1.0 / wp.min(wp.dot(n, fetch(visible.position, k, j)), -1.0e-6)
+        put(discs.slope_u, k, j, n[0] * plane / fx)
+        put(discs.slope_v, k, j, n[1] * plane / fy)
+        j += 1
+    j = int(start)
+    while j < end:
+        z = fetch(visible.position, k, j)[2]
+        radius = drawn_radius(fetch(visible.radius, k, j), z, camera)
+        put(discs.rim, k, j, radius * radius)
+        j += 1
+    j = int(start)
+    while j < end:
+        p = fetch(visible.position, k, j)
+        n = fetch(visible.normal, k, j)
+        radius = drawn_radius(fetch(visible.radius, k, j), p[2], camera)
+        reach = half_extent(p, n, p[0], n[0], radius, fx)
+        u = fx * p[0] / p[2] + cx
+        put(discs.left, k, j, wp.max(floor_int(u - reach) + 1, 0))
+        put(discs.right, k, j, wp.min(floor_int(u + reach), camera.width - 1))
+        j += 1
+    j = int(start)
+    while j < end:
+        p = fetch(visible.position, k, j)
+        n = fetch(visible.normal, k, j)
+        radius = drawn_radius(fetch(visible.radius, k, j), p[2], camera)
+        reach = half_extent(p, n, p[1], n[1], radius, fy)
+        v = fy * p[1] / p[2] + cy
+        put(discs.top, k, j, wp.max(floor_int(v - reach) + 1, 0))
+        put(discs.bottom, k, j, wp.min(floor_int(v + reach), camera.height - 1))
+        j += 1
+
+
+Sums = wp.types.vector(length=8, dtype=wp.float32)
+"""Weighted sums of a pixel: normal (3), weight, colour (3), depth."""
 
 
 @wp.func

@@ -12,9 +12,16 @@ from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert
-from ms_slam_env.slam.surfel.blocks import Blocks
-from ms_slam_env.slam.surfel.discs import Discs
-from ms_slam_env.slam.surfel.prediction_kernels import (
+from ms_slam_env.slam.surfel.frustum_culling import Blocks
+from ms_slam_env.slam.surfel.rendering import (
+    ModelView,
+    SplatParameters,
+    SplatRenderer,
+    splat_camera,
+)
+from ms_slam_env.slam.surfel.splatting import Discs
+from ms_slam_env.slam.surfel.surfels import Surfels, VisibleList, allocate_visible
+from ms_slam_env.slam.surfel.view_warping import (
     EMPTY,
     PointCloud,
     collect_points,
@@ -22,12 +29,8 @@ from ms_slam_env.slam.surfel.prediction_kernels import (
     resolve_views,
     scatter_points,
 )
-from ms_slam_env.slam.surfel.splat_renderer import SplatParameters, SplatRenderer, splat_camera
-from ms_slam_env.slam.surfel.surfel_arrays import Surfels, VisibleList, allocate_visible
-from ms_slam_env.slam.surfel.types import ModelView
 
 Float64 = NDArray[np.float64]
-
 MAX_MARGIN = 1.0  # a reference view wider than the views by more than their own size is refused
 NEAREST_M = 0.5  # surfaces closer than this may leave the reference view's margin
 SIZE_STEP_PX = 8  # reference views come in such steps, so that few sets of buffers are needed

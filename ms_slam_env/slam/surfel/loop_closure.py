@@ -1,0 +1,387 @@
+"""Loop closure by deformation: the map is bent where its present part meets an older one again.
+
+ElasticFusion (Whelan et al., RSS 2015, sections IV to VI). Surfels not seen for ``window`` frames
+are inactive: frames are neither tracked against them nor fused into them. Every few frames
+
+- local: where the inactive part is in view, the live frame is registered with it as it was with
+  the active part before; both poses differ by the drift since;
+- global: where that gave nothing, keyframes that resemble the frame say where else in the inactive
+  part it may be, and it is registered there.
+
+If the registration is good, the deformation graph takes the active part there while it holds the
+inactive one, and what is in view becomes one surface, active again. The paper registers the active
+part's rendering in place of the live frame; the frame has no holes, and its noise is common to
+both poses.
+
+A closed loop makes the estimated pose jump by the drift that it takes back.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env._warp import wp
+from ms_slam_env.geometry import invert, relative_angle
+from ms_slam_env.slam.ferns import Candidate
+from ms_slam_env.slam.surfel.acceptance import OK, STAT_SIGMA, Alignment, make_limits
+from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.device import Mirror
+from ms_slam_env.slam.surfel.map_deformation import MapBender
+from ms_slam_env.slam.surfel.pose_hypotheses import NUM_SEEDS, relocalisation_seeds, tracking_seeds
+from ms_slam_env.slam.surfel.preprocessing import LiveFrame
+from ms_slam_env.slam.surfel.rendering import SplatRenderer
+from ms_slam_env.slam.surfel.surfel_map import SurfelMap
+from ms_slam_env.slam.surfel.surfels import EARLIEST, any_time
+from ms_slam_env.slam.surfel.tracker import Tracker, model_stride
+from ms_slam_env.slam.surfel.trajectory_history import Past, motion_size, past_from_state
+
+Float64 = NDArray[np.float64]
+Int32 = NDArray[np.int32]
+Bool = NDArray[np.bool_]
+
+
+class SimilarViews(Protocol):
+    """Finds keyframes that resemble the frame just tracked."""
+
+    def __call__(self, env: int, before: int) -> list[Candidate]:
+        """Those of one env that were taken before a frame, the most similar first."""
+
+
+class LoopClosure(ABC):
+    """Recognises places seen before and bends the maps of B envs so that they meet again."""
+
+    @abstractmethod
+    def reset(self, env: int) -> None:
+        """Forget one env."""
+
+    @abstractmethod
+    def select(self, lost: Int32) -> bool:
+        """Choose the surfels that the next frames are tracked against and fused into.
+
+        Args:
+            lost: (B,) frames since tracking was lost; 0 = tracked.
+
+        Returns:
+            Whether the choice changed.
+        """
+
+    @abstractmethod
+    def record(self, poses: Float64, time: Int32, fused: Bool) -> None:
+        """Take note of frames.
+
+        Args:
+            poses: (B, 4, 4) T_world_camera.
+            time: (B,) numbers of the frames.
+            fused: (B,) whether the frame was fused.
+        """
+
+    @abstractmethod
+    def close(
+        self, live: LiveFrame, poses: Float64, time: Int32, tracked: Bool, similar: SimilarViews
+    ) -> Bool:
+        """Look for loops after frames were fused and recorded; correct maps and ``poses`` in place.
+
+        Args:
+            live: the frames just fused.
+            poses: (B, 4, 4) T_world_camera; those of closed loops are overwritten.
+            time: (B,) numbers of the frames.
+            tracked: (B,) whether the frame was tracked and fused.
+            similar: finds the keyframes that resemble an env's frame.
+
+        Returns:
+            (B,) which envs closed a loop.
+        """
+
+    @abstractmethod
+    def trajectory(self, env: int) -> tuple[Int32, Float64]:
+        """Frames (N,) and poses (N, 4, 4) of the past as the closures since have bent them.
+
+        Empty where no trajectory is kept.
+        """
+
+    @abstractmethod
+    def get_state(self) -> dict[str, Any]:
+        """Everything needed to go on bit-exactly."""
+
+    @abstractmethod
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state that ``get_state`` returned."""
+
+
+class NoLoopClosure(LoopClosure):
+    """Frames are tracked against everything in the map, old and new alike; nothing is bent."""
+
+    def __init__(self, batch: int) -> None:
+        """For ``batch`` envs."""
+        self._never = np.zeros(batch, dtype=bool)
+
+    def reset(self, env: int) -> None:
+        """There is nothing to forget."""
+
+    def select(self, lost: Int32) -> bool:
+        """All surfels, always."""
+        return False
+
+    def record(self, poses: Float64, time: Int32, fused: Bool) -> None:
+        """Nothing is kept."""
+
+    def close(
+        self, live: LiveFrame, poses: Float64, time: Int32, tracked: Bool, similar: SimilarViews
+    ) -> Bool:
+        """Never."""
+        return self._never
+
+    def trajectory(self, env: int) -> tuple[Int32, Float64]:
+        """Nothing is kept: poses are final when they are returned."""
+        return np.zeros(0, dtype=np.int32), np.zeros((0, 4, 4))
+
+    def get_state(self) -> dict[str, Any]:
+        """Nothing."""
+        return {}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Nothing."""
+
+
+SETTLED_M, SETTLED_DEG = 0.02, 2.0  # largest motion of a repeated registration
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where frames lie in the inactive part.
+
+    Attributes:
+        found: (B,) whether the registration succeeded.
+        T_world_live: (B, 4, 4) pose.
+        sigma: (B,) standard deviation of its worst direction, metres and radians.
+    """
+
+    found: Bool
+    T_world_live: Float64
+    sigma: Float64
+
+
+def _placement(found: Bool, alignment: Alignment) -> Placement:
+    return Placement(found, alignment.T_world_live, alignment.stats[:, STAT_SIGMA])
+
+
+def _nowhere(batch: int) -> Placement:
+    return Placement(
+        np.zeros(batch, dtype=bool), np.tile(np.eye(4), (batch, 1, 1)), np.zeros(batch)
+    )
+
+
+class InactiveRegistration:
+    """Registers the frames of B envs with the inactive part of their maps."""
+
+    def __init__(
+        self, surfel_map: SurfelMap, inactive: SplatRenderer, config: SurfelConfig, device: str
+    ) -> None:
+        """Own a tracker; ``inactive`` renders the inactive surfels."""
+        self.config = config.loops
+        self.batch = surfel_map.batch
+        self._inactive = inactive
+        intrinsics = surfel_map.intrinsics
+        stride = model_stride(intrinsics, config)
+        self._tracker = Tracker(self.batch, NUM_SEEDS, intrinsics, config, device, stride)
+        self._poses = Mirror(self.batch, wp.mat44, device)
+
+    def set_frame(self, live: LiveFrame) -> None:
+        """Take the frames that are registered next."""
+        self._tracker.set_frame(live)
+
+    def covered(self, poses: Float64, due: Bool) -> Bool:
+        """Which of the envs that are ``due`` (B,) see enough of the inactive part from ``poses``.
+
+        The view of it is at hand then.
+        """
+        self._poses.write(poses)
+        self._inactive.cull(self._poses.array)
+        pixels = self._inactive.intrinsics.width * self._inactive.intrinsics.height
+        counts = self._inactive.visible.count.numpy()
+        due = due & (counts > 0.1 * self.config.coverage * pixels)
+        if not due.any():
+            return due
+        view = self._inactive.splat()
+        shares = (view.vertices.numpy()[..., 2] > 0).mean(axis=(1, 2))
+        return due & (shares >= self.config.coverage)
+
+    def near(self, poses: Float64) -> Placement:
+        """Register with the view that ``covered`` rendered from ``poses``."""
+        found = self._align(poses, tracking_seeds(np.eye(4)), self._limits(self.config.largest_m))
+        return _placement(found.verdict == OK, found)
+
+    def from_keyframes(self, starts: Float64) -> Placement:
+        """Register from poses (B, 4, 4) that are rough and may be wrong, NaN for an env without.
+
+        What is found must be found again from there.
+        """
+        given = np.isfinite(starts[:, 0, 0])
+        origins = np.where(given[:, None, None], starts, np.eye(4))
+        limits = self._limits(0.6)
+        given &= self.covered(origins, given)
+        if not given.any():
+            return _nowhere(self.batch)
+        first = self._align(origins, relocalisation_seeds(0), limits)
+        good = given & (first.verdict == OK)
+        origins = np.where(good[:, None, None], first.T_world_live, np.eye(4))
+        good &= self.covered(origins, good)
+        if not good.any():
+            return _nowhere(self.batch)
+        again = self._align(origins, tracking_seeds(np.eye(4)), self._limits(0.1))
+        good &= again.verdict == OK
+        for env in np.flatnonzero(good):
+            good[env] = _is_settled(origins[env], again.T_world_live[env])
+        return _placement(good, again)
+
+    def _align(self, origins: Float64, seeds: Float64, limits: NDArray[Any]) -> Alignment:
+        stack = np.tile(seeds, (self.batch, 1, 1, 1))
+        return self._tracker.align(self._inactive.view, origins, stack, limits)
+
+    def _limits(self, motion_m: float) -> NDArray[Any]:
+        limits = make_limits(np.ones(self.batch, bool), np.zeros(self.batch, np.int32))
+        limits["sigma"] = self.config.sigma
+        limits["inliers"] = self.config.inliers
+        limits["motion_m"] = motion_m
+        limits["motion_cos"] = np.cos(np.radians(self.config.largest_deg))
+        return limits
+
+
+def _is_settled(a: Float64, b: Float64) -> bool:
+    near = np.linalg.norm(a[:3, 3] - b[:3, 3]) <= SETTLED_M
+    return bool(near and relative_angle(a[:3, :3], b[:3, :3]) <= np.radians(SETTLED_DEG))
+
+
+SIGNIFICANT = 3.0  # drift, in standard deviations of the registration, that is worth bending for
+VIEW_APART_M, VIEW_APART_DEG = 1.0, 60.0  # views of one place differ by less
+
+
+class DeformationLoopClosure(LoopClosure):
+    """Closes loops of B envs by embedded deformation."""
+
+    def __init__(self, surfel_map: SurfelMap, config: SurfelConfig, device: str = "cpu") -> None:
+        """Close loops of the maps in ``surfel_map`` with ``config.loops``."""
+        self.map = surfel_map
+        self.config = config.loops
+        self.batch = surfel_map.batch
+        stride = model_stride(surfel_map.intrinsics, config)
+        self._window = any_time(self.batch, device)  # of the inactive surfels
+        inactive = surfel_map.model_renderer(stride, self._window)
+        active = surfel_map.model_renderer(stride, surfel_map.active)
+        self._registration = InactiveRegistration(surfel_map, inactive, config, device)
+        self._bender = MapBender(surfel_map, inactive, active, config, device)
+        self._seen_from = np.full(self.batch, EARLIEST, dtype=np.int32)
+        self._past = [Past() for _ in range(self.batch)]
+
+    def reset(self, env: int) -> None:
+        """Forget one env."""
+        self._past[env] = Past()
+
+    def select(self, lost: Int32) -> bool:
+        """The active surfels, or all while tracking is lost."""
+        last = np.array([past.last for past in self._past])
+        seen_from = np.where(lost > 0, EARLIEST, last - self.config.window).astype(np.int32)
+        changed = not np.array_equal(seen_from, self._seen_from)
+        if changed:
+            self._seen_from = seen_from
+            self.map.active.seen_from.assign(seen_from)
+        return changed
+
+    def record(self, poses: Float64, time: Int32, fused: Bool) -> None:
+        """Remember the poses of the frames just fused."""
+        for env in np.flatnonzero(fused):
+            self._past[env].record(self.map, int(env), int(time[env]), poses[env])
+
+    def close(
+        self, live: LiveFrame, poses: Float64, time: Int32, tracked: Bool, similar: SimilarViews
+    ) -> Bool:
+        """Look for loops where it is time to, and close them; see the base class."""
+        closed = np.zeros(self.batch, dtype=bool)
+        due = tracked & (time > self.config.window) & (time % self.config.interval == 0)
+        if not due.any():
+            return closed
+        self._window.seen_to.assign(time - self.config.window - 1)
+        self._registration.set_frame(live)
+        near = self._registration.covered(poses, due)
+        if near.any():
+            there = self._registration.near(poses)
+            for env in np.flatnonzero(near & there.found):
+                closed[env] = self._close(int(env), poses, there)
+                due[env] = False
+        due &= time % self.config.global_interval == 0
+        for env in np.flatnonzero(due):
+            closed[env] = self._close_from_keyframes(int(env), poses, similar)
+        return closed
+
+    def _close_from_keyframes(self, env: int, poses: Float64, similar: SimilarViews) -> bool:
+        """Look for the frame where similar ones were taken, and close a loop there."""
+        past = self._past[env]
+        for candidate in similar(env, past.last - self.config.window):
+            if candidate.dissimilarity > self.config.dissimilarity:
+                break
+            allowed_m = self.config.drift_share * past.path_m(candidate.time)
+            if not _may_be_the_same(poses[env], candidate.T_world_camera, allowed_m):
+                continue
+            starts = np.full((self.batch, 4, 4), np.nan)
+            starts[env] = candidate.T_world_camera
+            there = self._registration.from_keyframes(starts)
+            drift = np.linalg.norm(there.T_world_live[env, :3, 3] - poses[env, :3, 3])
+            if there.found[env] and drift <= allowed_m:
+                return self._close(env, poses, there)
+        return False
+
+    def _close(self, env: int, poses: Float64, there: Placement) -> bool:
+        """Bend map, pose and past of one env; returns whether that was believed and done."""
+        past, corrected = self._past[env], there.T_world_live[env]
+        drift = motion_size(invert(poses[env]) @ corrected)
+        if drift < self.config.smallest_m:
+            self._bender.join_parts(env, poses[env], past.last)
+            return False
+        if drift < SIGNIFICANT * there.sigma[env] or not past.confirms(
+            poses[env], corrected, self.config.agreement_m, 2 * self.config.global_interval
+        ):
+            return False
+        bent = self._bender.bend(env, poses[env], corrected, past.joined)
+        if bent is None:
+            return False
+        deformation, joined = bent
+        past.move(deformation, joined, corrected)
+        poses[env] = corrected
+        self._bender.join_parts(env, corrected, past.last)
+        return True
+
+    def trajectory(self, env: int) -> tuple[Int32, Float64]:
+        """Tracked frames (N,) and their poses (N, 4, 4), bent by the closures since."""
+        return self._past[env].trajectory()
+
+    def get_state(self) -> dict[str, Any]:
+        """Everything needed to go on bit-exactly, as NumPy arrays."""
+        return {"past": [past.get_state() for past in self._past]}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state that ``get_state`` returned."""
+        self._past = [past_from_state(past) for past in state["past"]]
+
+
+def _may_be_the_same(pose: Float64, keyframe: Float64, drift_m: float) -> bool:
+    """Whether a keyframe may show what is in view from ``pose``, which has drifted."""
+    apart = np.linalg.norm(pose[:3, 3] - keyframe[:3, 3])
+    angle = relative_angle(pose[:3, :3], keyframe[:3, :3])
+    return bool(apart <= VIEW_APART_M + drift_m and angle <= np.radians(VIEW_APART_DEG))
+
+
+_MAKERS: dict[str, Callable[[SurfelMap, SurfelConfig, str], LoopClosure]] = {
+    "none": lambda surfel_map, config, device: NoLoopClosure(surfel_map.batch),
+    "deformation": DeformationLoopClosure,
+}
+
+
+def make_loop_closure(surfel_map: SurfelMap, config: SurfelConfig, device: str) -> LoopClosure:
+    """The loop closure ``config.loop_closure`` for the maps in ``surfel_map``."""
+    return _MAKERS[config.loop_closure](surfel_map, config, device)
