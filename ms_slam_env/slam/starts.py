@@ -6,7 +6,7 @@ import numpy as np
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import make_pose, so3_exp
-from ms_slam_env.slam.agreement import DepthImage, measure_agreement
+from ms_slam_env.slam.alignment_check import DepthImage, measure_alignment
 from ms_slam_env.slam.base import Float64
 
 TURN_RAD = np.radians(10.0)
@@ -46,5 +46,5 @@ def start_motions(
 def _score(
     frame: DepthImage, reference: DepthImage, motion: Float64, intrinsics: Intrinsics
 ) -> float:
-    found = measure_agreement(frame, reference, motion, intrinsics, _SAMPLES)
-    return found.overlap * (found.inlier_fraction + found.alike_fraction)
+    found = measure_alignment(frame, reference, motion, intrinsics, _SAMPLES)
+    return found.overlap * (found.inlier_ratio + found.photometric_inlier_ratio)

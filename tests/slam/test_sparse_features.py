@@ -10,7 +10,7 @@ from surfel_scenes import WALL_NORMAL, WALL_POINT
 
 from ms_slam_env.camera import intensity_image, xtion
 from ms_slam_env.geometry import invert, make_pose, se3_exp, so3_exp
-from ms_slam_env.slam.agreement import DepthImage
+from ms_slam_env.slam.alignment_check import DepthImage
 from ms_slam_env.slam.sparse.config import SparseConfig
 from ms_slam_env.slam.sparse.features import FeatureExtractor, Features, InverseDepth
 from ms_slam_env.slam.sparse.matching import hamming_distance, match_anywhere, match_near

@@ -9,7 +9,7 @@ import numpy as np
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
-from ms_slam_env.slam.agreement import DepthImage
+from ms_slam_env.slam.alignment_check import DepthImage
 from ms_slam_env.slam.base import Float64
 
 

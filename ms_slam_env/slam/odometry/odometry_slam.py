@@ -8,7 +8,7 @@ keyframes' readings at their estimated poses; errors add up from keyframe to key
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,20 +16,22 @@ from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.geometry import check_pose, invert, relative_angle
-from ms_slam_env.slam.agreement import (
+from ms_slam_env.slam.alignment_check import (
     FEWEST_READINGS,
-    Agreement,
-    AgreementLimits,
+    NO_ALIGNMENT,
+    VIEW_REASONS,
+    VIEW_THRESHOLDS,
+    AcceptanceThresholds,
+    AlignmentStatistics,
     DepthImage,
-    measure_agreement,
+    evaluate_alignment,
+    measure_alignment,
 )
 from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult, Views
 from ms_slam_env.slam.odometry.aligner import Aligner, PreparedImage
 from ms_slam_env.slam.odometry.config import OdometryConfig
 from ms_slam_env.slam.starts import start_motions
 from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
-
-_NOTHING = Agreement(0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -48,10 +50,11 @@ class OdometrySlam(SlamBackend):
         self.intrinsics = intrinsics
         self.config = config or OdometryConfig()
         self._aligner = Aligner(intrinsics, self.config.depth_cutoff_m)
-        self._limits = AgreementLimits(
+        self._thresholds = replace(
+            VIEW_THRESHOLDS,
             overlap=self.config.least_overlap,
-            inliers=self.config.least_inliers,
-            alike=self.config.least_alike,
+            inlier_ratio=self.config.least_inliers,
+            photometric_inlier_ratio=self.config.least_alike,
         )
         self._map = SurfelSlam(
             intrinsics,
@@ -85,23 +88,23 @@ class OdometrySlam(SlamBackend):
         if self._key is None or self._last is None:
             return self._start(frame, image)
         if image.readings < FEWEST_READINGS:
-            return self._lose("the frame has too few depth readings", _NOTHING)
+            return self._lose("the frame has too few depth readings", NO_ALIGNMENT)
         prepared = self._aligner.prepare(image)
-        reason, agreement = "", _NOTHING
+        reason, statistics = "", NO_ALIGNMENT
         for reference in self._sensed(self._key, self._last):
-            T, agreement, reason = self._align(prepared, reference, self._limits)
+            T, statistics, reason = self._align(prepared, reference, self._thresholds)
             if not reason:
-                return self._accept(frame, _Placed(T, prepared), agreement)
+                return self._accept(frame, _Placed(T, prepared), statistics)
         for reference in self._rendered(image, self._last, guess):
-            lax = self._limits.worth_another_look
-            T, agreement, reason = self._align(prepared, reference, lax)
+            lax = self._thresholds.tentative
+            T, statistics, reason = self._align(prepared, reference, lax)
             if reason:
                 continue
             for closer in self._views(T[None]):
-                T, agreement, reason = self._align(prepared, closer, self._limits.confirmation)
+                T, statistics, reason = self._align(prepared, closer, self._thresholds.confirmation)
                 if not reason:
-                    return self._accept(frame, _Placed(T, prepared), agreement)
-        return self._lose(reason or "too little of the map is in view", agreement)
+                    return self._accept(frame, _Placed(T, prepared), statistics)
+        return self._lose(reason or "too little of the map is in view", statistics)
 
     def fuse(self, frame: RGBDFrame, T_world_camera: ArrayLike) -> TrackResult:
         """Fuse ``frame`` as a keyframe at a known pose (4, 4), without tracking.
@@ -156,17 +159,23 @@ class OdometrySlam(SlamBackend):
                 yield _Placed(pose, self._aligner.prepare(image))
 
     def _align(
-        self, frame: PreparedImage, reference: _Placed, limits: AgreementLimits
-    ) -> tuple[Float64, Agreement, str]:
+        self, frame: PreparedImage, reference: _Placed, thresholds: AcceptanceThresholds
+    ) -> tuple[Float64, AlignmentStatistics, str]:
         """T_world_frame, what it explains, and why it is not to be believed or nothing."""
         T = self._aligner.align(frame, reference.prepared)
         if T is None:
             reason = "no motion aligns the frame with the view before it"
-            return reference.T_world_image, _NOTHING, reason
-        agreement = measure_agreement(frame.image, reference.prepared.image, T, self.intrinsics)
-        return reference.T_world_image @ T, agreement, limits.reason(agreement, T)
+            return reference.T_world_image, NO_ALIGNMENT, reason
+        statistics = measure_alignment(frame.image, reference.prepared.image, T, self.intrinsics)
+        return (
+            reference.T_world_image @ T,
+            statistics,
+            VIEW_REASONS[evaluate_alignment(statistics, thresholds)],
+        )
 
-    def _accept(self, frame: RGBDFrame, placed: _Placed, agreement: Agreement) -> TrackResult:
+    def _accept(
+        self, frame: RGBDFrame, placed: _Placed, statistics: AlignmentStatistics
+    ) -> TrackResult:
         """Move on to a frame whose pose was found."""
         assert self._key is not None
         relocalised, self._lost = self._lost, False
@@ -184,19 +193,19 @@ class OdometrySlam(SlamBackend):
             T_world_camera=self._pose.copy(),
             tracking_ok=True,
             relocalised=relocalised,
-            inlier_fraction=agreement.inlier_fraction,
-            residual_m=agreement.residual_m,
+            inlier_fraction=statistics.inlier_ratio,
+            residual_m=statistics.residual_m,
         )
 
-    def _lose(self, reason: str, agreement: Agreement) -> TrackResult:
+    def _lose(self, reason: str, statistics: AlignmentStatistics) -> TrackResult:
         """Hold the pose and the images that frames are aligned with."""
         self._motion = np.eye(4)
         self._lost = True
         return TrackResult(
             T_world_camera=self._pose.copy(),
             tracking_ok=False,
-            inlier_fraction=agreement.inlier_fraction,
-            residual_m=agreement.residual_m,
+            inlier_fraction=statistics.inlier_ratio,
+            residual_m=statistics.residual_m,
             reason=reason,
         )
 

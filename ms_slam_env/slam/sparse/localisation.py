@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, transform_points
-from ms_slam_env.slam.agreement import DepthImage
+from ms_slam_env.slam.alignment_check import DepthImage
 from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.sparse.config import SparseConfig
 from ms_slam_env.slam.sparse.features import Features, InverseDepth

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from ms_slam_env.slam.agreement import DepthImage
+from ms_slam_env.slam.alignment_check import DepthImage
 from ms_slam_env.slam.base import Float32
 
 _SIZE = (16, 12)  # of a thumbnail, pixels

@@ -16,7 +16,12 @@ from scipy.spatial import cKDTree
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.geometry import check_pose, invert, relative_angle
-from ms_slam_env.slam.agreement import FEWEST_READINGS, Agreement, DepthImage
+from ms_slam_env.slam.alignment_check import (
+    FEWEST_READINGS,
+    NO_ALIGNMENT,
+    AlignmentStatistics,
+    DepthImage,
+)
 from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult, Views
 from ms_slam_env.slam.sparse.config import SparseConfig
 from ms_slam_env.slam.sparse.dense_map import DenseMap
@@ -32,7 +37,7 @@ from ms_slam_env.slam.sparse.localisation import (
 from ms_slam_env.slam.sparse.loop_closure import LoopCloser
 from ms_slam_env.slam.sparse.retrieval import most_alike, thumbnail
 from ms_slam_env.slam.sparse.sparse_map import SparseMap, make_keyframe
-from ms_slam_env.slam.sparse.verification import NOTHING, Verifier
+from ms_slam_env.slam.sparse.verification import Verifier
 
 _LOOKALIKES = 4  # keyframes in which a lost camera is sought
 _SOONER = 0.25  # share of a keyframe's distance that is enough where matches are few
@@ -92,15 +97,15 @@ class SparseSlam(SlamBackend):
         if not self._map.keyframes:
             return self._start(frame, live)
         if live.image.readings < FEWEST_READINGS:
-            return self._lose("the frame has too few depth readings", NOTHING)
-        reason, agreement = "", NOTHING
+            return self._lose("the frame has too few depth readings", NO_ALIGNMENT)
+        reason, statistics = "", NO_ALIGNMENT
         for fix in self._fixes(live, guess):
             verdict = self._verifier.judge(fix, live)
             if not verdict.reason:
-                return self._accept(frame, live, fix, verdict.agreement)
-            reason, agreement = verdict.reason, verdict.agreement
+                return self._accept(frame, live, fix, verdict.statistics)
+            reason, statistics = verdict.reason, verdict.statistics
         nothing = f"fewer than {self.config.least_matches} of the frame's corners match the map"
-        return self._lose(reason or nothing, agreement)
+        return self._lose(reason or nothing, statistics)
 
     def fuse(self, frame: RGBDFrame, T_world_camera: ArrayLike) -> TrackResult:
         """Make ``frame`` a keyframe at a known pose (4, 4), which optimisation leaves.
@@ -177,7 +182,7 @@ class SparseSlam(SlamBackend):
         return [int(k) for k in np.argsort(away, kind="stable")[:count]]
 
     def _accept(
-        self, frame: RGBDFrame, live: LiveFrame, fix: Fix, agreement: Agreement
+        self, frame: RGBDFrame, live: LiveFrame, fix: Fix, statistics: AlignmentStatistics
     ) -> TrackResult:
         """Move on to a frame whose pose was found."""
         relocalised, self._lost = self._lost, False
@@ -192,8 +197,8 @@ class SparseSlam(SlamBackend):
             T_world_camera=self._pose.copy(),
             tracking_ok=True,
             relocalised=relocalised,
-            inlier_fraction=agreement.inlier_fraction,
-            residual_m=agreement.residual_m,
+            inlier_fraction=statistics.inlier_ratio,
+            residual_m=statistics.residual_m,
         )
 
     def _is_new(self, fix: Fix) -> bool:
@@ -224,15 +229,15 @@ class SparseSlam(SlamBackend):
         self._pose = keyframe.T_world_camera.copy()
         self._dense.place(self._map.keyframes)
 
-    def _lose(self, reason: str, agreement: Agreement) -> TrackResult:
+    def _lose(self, reason: str, statistics: AlignmentStatistics) -> TrackResult:
         """Hold the pose and the map."""
         self._motion = np.eye(4)
         self._lost = True
         return TrackResult(
             T_world_camera=self._pose.copy(),
             tracking_ok=False,
-            inlier_fraction=agreement.inlier_fraction,
-            residual_m=agreement.residual_m,
+            inlier_fraction=statistics.inlier_ratio,
+            residual_m=statistics.residual_m,
             reason=reason,
         )
 

@@ -6,14 +6,20 @@ from dataclasses import dataclass
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert
-from ms_slam_env.slam.agreement import Agreement, AgreementLimits, measure_agreement
+from ms_slam_env.slam.alignment_check import (
+    NO_ALIGNMENT,
+    VIEW_REASONS,
+    AcceptanceThresholds,
+    AlignmentStatistics,
+    evaluate_alignment,
+    measure_alignment,
+)
 from ms_slam_env.slam.sparse.config import SparseConfig
 from ms_slam_env.slam.sparse.localisation import Fix, LiveFrame
 from ms_slam_env.slam.sparse.sparse_map import SparseMap
 
 _SAMPLES = 1000  # readings that a pose is judged by
 _LEAST_EXPLAINED = 0.25  # share of the matches
-NOTHING = Agreement(0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -21,11 +27,11 @@ class Verdict:
     """What an image says about a pose.
 
     Attributes:
-        agreement: with the keyframe beside it.
+        statistics: of the alignment with the keyframe beside it.
         reason: why the pose is not believed; empty if it is.
     """
 
-    agreement: Agreement
+    statistics: AlignmentStatistics
     reason: str
 
 
@@ -41,12 +47,10 @@ class Verifier:
         self._map = sparse_map
         self._least = config.least_matches
         self._intrinsics: Intrinsics = sparse_map.intrinsics
-        self._limits = AgreementLimits(
+        self._thresholds = AcceptanceThresholds(
             overlap=config.least_overlap,
-            inliers=config.least_inliers,
-            alike=config.least_alike,
-            motion_m=float("inf"),  # a keyframe may be anywhere that sees the same
-            motion_rad=float("inf"),
+            inlier_ratio=config.least_inliers,
+            photometric_inlier_ratio=config.least_alike,
         )
 
     def judge(self, fix: Fix, frame: LiveFrame) -> Verdict:
@@ -54,13 +58,13 @@ class Verifier:
         explained = len(fix.point_ids)
         if explained < self._least:
             reason = f"only {explained} corners match the map, of {self._least} needed"
-            return Verdict(NOTHING, reason)
+            return Verdict(NO_ALIGNMENT, reason)
         if explained < _LEAST_EXPLAINED * fix.matches:
             reason = f"only {explained} of {fix.matches} matching corners fit one pose"
-            return Verdict(NOTHING, reason)
+            return Verdict(NO_ALIGNMENT, reason)
         keyframe = self._map.keyframes[fix.reference]
         motion = invert(keyframe.T_world_camera) @ fix.T_world_camera
-        agreement = measure_agreement(
+        statistics = measure_alignment(
             frame.image, keyframe.image(), motion, self._intrinsics, _SAMPLES
         )
-        return Verdict(agreement, self._limits.reason(agreement, motion))
+        return Verdict(statistics, VIEW_REASONS[evaluate_alignment(statistics, self._thresholds)])

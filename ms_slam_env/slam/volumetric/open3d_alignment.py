@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ms_slam_env.slam.agreement import DepthImage
+from ms_slam_env.slam.alignment_check import DepthImage
 from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.volumetric.frame_to_model import FrameToModel
 from ms_slam_env.slam.volumetric.voxel_grid import CastView, VoxelGrid, camera_matrix

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.slam.agreement import DepthImage
+from ms_slam_env.slam.alignment_check import DepthImage
 from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.odometry.aligner import Aligner
 from ms_slam_env.slam.volumetric.frame_to_model import FrameToModel

@@ -8,6 +8,7 @@ fused. While tracking is lost the pose is held and nothing is fused.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,12 +17,16 @@ from numpy.typing import ArrayLike, NDArray
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose, invert
-from ms_slam_env.slam.agreement import (
+from ms_slam_env.slam.alignment_check import (
     FEWEST_READINGS,
-    Agreement,
-    AgreementLimits,
+    NO_ALIGNMENT,
+    VIEW_REASONS,
+    VIEW_THRESHOLDS,
+    AcceptanceThresholds,
+    AlignmentStatistics,
     DepthImage,
-    measure_agreement,
+    evaluate_alignment,
+    measure_alignment,
 )
 from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult, Views
 from ms_slam_env.slam.starts import start_motions
@@ -31,7 +36,6 @@ from ms_slam_env.slam.volumetric.open3d_alignment import Open3DAlignment
 from ms_slam_env.slam.volumetric.opencv_alignment import OpenCVAlignment
 from ms_slam_env.slam.volumetric.voxel_grid import DEPTH_SCALE, CastView, VoxelGrid
 
-_NOTHING = Agreement(0.0, 0.0, 0.0, 0.0)
 _FULL_WEIGHT = 3  # observations that tracking asks of the model, as soon as there are as many
 
 
@@ -46,10 +50,11 @@ class VolumetricSlam(SlamBackend):
         """
         self.intrinsics = intrinsics
         self.config = config or VolumetricConfig()
-        self._limits = AgreementLimits(
+        self._thresholds = replace(
+            VIEW_THRESHOLDS,
             overlap=self.config.least_overlap,
-            inliers=self.config.least_inliers,
-            alike=self.config.least_alike,
+            inlier_ratio=self.config.least_inliers,
+            photometric_inlier_ratio=self.config.least_alike,
         )
         self._grid = VoxelGrid(intrinsics, self.config)
         self._aligner: FrameToModel = (
@@ -88,23 +93,23 @@ class VolumetricSlam(SlamBackend):
         enough = float((depth > 0).mean()) >= FEWEST_READINGS
         if not enough:
             which = "frame" if self._fused else "first frame"
-            return self._lose(f"the {which} has too few depth readings", _NOTHING)
+            return self._lose(f"the {which} has too few depth readings", NO_ALIGNMENT)
         if self._fused == 0:
             return self.fuse(frame, self._pose)
-        reason, agreement = "", _NOTHING
+        reason, statistics = "", NO_ALIGNMENT
         grey = intensity_image(frame.color).astype(np.float32)
         image = DepthImage((depth / np.float32(DEPTH_SCALE)).astype(np.float32), grey)
         for pose, view in self._views(image, guess):
             afar = view is not self._view
-            limits = self._limits.worth_another_look if afar else self._limits
-            T, agreement, reason = self._align(image, pose, view, limits)
+            thresholds = self._thresholds.tentative if afar else self._thresholds
+            T, statistics, reason = self._align(image, pose, view, thresholds)
             if afar and not reason:
-                T, agreement, reason = self._align(
-                    image, T, self._cast(T), self._limits.confirmation
+                T, statistics, reason = self._align(
+                    image, T, self._cast(T), self._thresholds.confirmation
                 )
             if not reason:
-                return self._accept(frame, depth, T, agreement)
-        return self._lose(reason, agreement)
+                return self._accept(frame, depth, T, statistics)
+        return self._lose(reason, statistics)
 
     def _views(
         self, image: DepthImage, guess: Float64 | None
@@ -121,7 +126,11 @@ class VolumetricSlam(SlamBackend):
             yield pose, self._cast(pose)
 
     def _accept(
-        self, frame: RGBDFrame, depth: NDArray[np.uint16], T: Float64, agreement: Agreement
+        self,
+        frame: RGBDFrame,
+        depth: NDArray[np.uint16],
+        T: Float64,
+        statistics: AlignmentStatistics,
     ) -> TrackResult:
         """Move on to a frame whose pose T_world_camera was found."""
         relocalised, self._lost = self._lost, False
@@ -132,8 +141,8 @@ class VolumetricSlam(SlamBackend):
             T_world_camera=T.copy(),
             tracking_ok=True,
             relocalised=relocalised,
-            inlier_fraction=agreement.inlier_fraction,
-            residual_m=agreement.residual_m,
+            inlier_fraction=statistics.inlier_ratio,
+            residual_m=statistics.residual_m,
         )
 
     def fuse(self, frame: RGBDFrame, T_world_camera: ArrayLike) -> TrackResult:
@@ -169,27 +178,31 @@ class VolumetricSlam(SlamBackend):
         return self._grid.cast(pose, weight, self.intrinsics)
 
     def _align(
-        self, image: DepthImage, pose: Float64, view: CastView, limits: AgreementLimits
-    ) -> tuple[Float64, Agreement, str]:
+        self, image: DepthImage, pose: Float64, view: CastView, thresholds: AcceptanceThresholds
+    ) -> tuple[Float64, AlignmentStatistics, str]:
         """T_world_camera (4, 4), what it explains, and why it is not to be believed or nothing."""
         reference = DepthImage(view.depth, view.intensity)
         if reference.readings < FEWEST_READINGS:
-            return pose, _NOTHING, "too little of the model is in view"
+            return pose, NO_ALIGNMENT, "too little of the model is in view"
         T_model_camera = self._aligner.align(image, view)
         if T_model_camera is None:
-            return pose, _NOTHING, "no motion aligns the frame with the model"
-        agreement = measure_agreement(image, reference, T_model_camera, self.intrinsics)
-        return pose @ T_model_camera, agreement, limits.reason(agreement, T_model_camera)
+            return pose, NO_ALIGNMENT, "no motion aligns the frame with the model"
+        statistics = measure_alignment(image, reference, T_model_camera, self.intrinsics)
+        return (
+            pose @ T_model_camera,
+            statistics,
+            VIEW_REASONS[evaluate_alignment(statistics, thresholds)],
+        )
 
-    def _lose(self, reason: str, agreement: Agreement) -> TrackResult:
+    def _lose(self, reason: str, statistics: AlignmentStatistics) -> TrackResult:
         """Hold the pose."""
         self._motion = np.eye(4)
         self._lost = self._fused > 0
         return TrackResult(
             T_world_camera=self._pose.copy(),
             tracking_ok=False,
-            inlier_fraction=agreement.inlier_fraction,
-            residual_m=agreement.residual_m,
+            inlier_fraction=statistics.inlier_ratio,
+            residual_m=statistics.residual_m,
             reason=reason,
         )
 

@@ -1,0 +1,146 @@
+"""Whether an alignment is believed, against closed-form views of a plane."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from surfel_scenes import ray_cast
+
+from ms_slam_env._warp import wp
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.geometry import make_pose, relative_angle, so3_exp
+from ms_slam_env.slam.alignment_check import (
+    VIEW_THRESHOLDS,
+    AlignmentStatistics,
+    DepthImage,
+    DeviceStatistics,
+    DeviceThresholds,
+    TrackingStatus,
+    evaluate_alignment,
+    evaluate_on_device,
+    measure_alignment,
+)
+from ms_slam_env.slam.starts import start_motions
+
+CAMERA = Intrinsics(fx=80.0, fy=84.0, cx=39.3, cy=29.8, width=80, height=60)
+REST = np.eye(4)
+MOVED = make_pose(so3_exp([0.01, 0.03, -0.02]), [0.04, -0.02, 0.03])
+
+
+def _view(T_world_camera: np.ndarray) -> DepthImage:
+    """A tilted textured wall."""
+    depth, _, color = ray_cast(T_world_camera, CAMERA, box=False)
+    return DepthImage(depth.astype(np.float32), color.mean(-1).astype(np.float32))
+
+
+def test_the_true_motion_explains_everything_that_is_in_view():
+    found = measure_alignment(_view(MOVED), _view(REST), MOVED, CAMERA)
+    assert found.overlap > 0.85
+    assert found.inlier_ratio == 1
+    assert found.photometric_inlier_ratio == 1
+    assert found.residual_m < 1e-6  # the planes through neighbouring pixels are the wall
+    assert evaluate_alignment(found, VIEW_THRESHOLDS) == TrackingStatus.OK
+
+
+@given(offset_m=st.floats(0.0, 0.05))
+def test_the_residual_is_the_distance_to_the_plane(offset_m):
+    depth = np.full(CAMERA.shape, 2.0, dtype=np.float32)
+    wall = DepthImage(depth, np.zeros_like(depth))
+    moved = make_pose(np.eye(3), [0.0, 0.0, offset_m])
+    found = measure_alignment(wall, wall, moved, CAMERA)
+    assert found.inlier_ratio == 1
+    assert found.residual_m == pytest.approx(offset_m, abs=1e-6)
+
+
+def test_a_darker_frame_agrees_and_another_texture_does_not():
+    reference = _view(REST)
+    darker = DepthImage(reference.depth, reference.intensity - 40)
+    assert measure_alignment(darker, reference, REST, CAMERA).photometric_inlier_ratio == 1
+    noise = np.random.default_rng(0).uniform(0, 255, CAMERA.shape).astype(np.float32)
+    found = measure_alignment(DepthImage(reference.depth, noise), reference, REST, CAMERA)
+    assert found.inlier_ratio == 1
+    assert found.photometric_inlier_ratio < 0.5
+    assert evaluate_alignment(found, VIEW_THRESHOLDS) == TrackingStatus.PHOTOMETRIC_MISMATCH
+
+
+def test_what_does_not_fit_is_named():
+    reference = _view(REST)
+    away = make_pose(so3_exp([0.0, np.pi, 0.0]), np.zeros(3))
+    assert measure_alignment(reference, reference, away, CAMERA).overlap == 0
+    found = measure_alignment(reference, reference, away, CAMERA)
+    assert evaluate_alignment(found, VIEW_THRESHOLDS) == TrackingStatus.LITTLE_OVERLAP
+    far = make_pose(np.eye(3), [0.0, 0.35, 0.0])
+    found = measure_alignment(_view(far), reference, far, CAMERA)
+    assert evaluate_alignment(found, VIEW_THRESHOLDS) == TrackingStatus.IMPLAUSIBLE_MOTION
+    near = DepthImage(reference.depth * np.float32(0.8), reference.intensity)
+    found = measure_alignment(near, reference, REST, CAMERA)
+    assert evaluate_alignment(found, VIEW_THRESHOLDS) == TrackingStatus.GEOMETRIC_MISMATCH
+
+
+def test_pixels_without_a_reading_count_neither_way():
+    reference, frame = _view(REST), _view(REST)
+    frame.depth[:, :40] = 0
+    reference.depth[:30] = 0
+    found = measure_alignment(frame, reference, REST, CAMERA)
+    assert found.overlap == pytest.approx(0.5, abs=0.05)
+    assert found.inlier_ratio == 1
+
+
+def test_starts_go_on_first_and_then_from_near_the_motion():
+    turn, step = so3_exp([0.0, np.radians(11.0), 0.0]), [0.09, 0.01, 0.0]
+    moved = make_pose(turn, step)
+    frames = []
+    for pose in (moved, REST):
+        depth, _, color = ray_cast(pose, CAMERA)
+        frames.append(DepthImage(depth.astype(np.float32), color.mean(-1).astype(np.float32)))
+    starts = start_motions(*frames, MOVED, CAMERA)
+    np.testing.assert_array_equal(starts[0], MOVED)
+    angles = [np.degrees(relative_angle(start[:3, :3], turn)) for start in starts[1:]]
+    steps = [np.linalg.norm(start[:3, 3] - step) for start in starts[1:]]
+    assert any(angle < 2 and step < 0.12 for angle, step in zip(angles, steps, strict=True))
+
+
+def test_a_repetition_must_hardly_move_but_may_look_less_alike():
+    still = AlignmentStatistics(
+        overlap=0.9,
+        inlier_ratio=1.0,
+        photometric_inlier_ratio=0.95 * VIEW_THRESHOLDS.photometric_inlier_ratio,
+        rotation_cos=1.0,
+    )
+    moving = replace(still, motion_m=0.05)
+    assert evaluate_alignment(still, VIEW_THRESHOLDS) == TrackingStatus.PHOTOMETRIC_MISMATCH
+    assert evaluate_alignment(moving, VIEW_THRESHOLDS.tentative) == TrackingStatus.OK
+    confirmation = VIEW_THRESHOLDS.confirmation
+    assert evaluate_alignment(still, confirmation) == TrackingStatus.OK
+    assert evaluate_alignment(moving, confirmation) == TrackingStatus.IMPLAUSIBLE_MOTION
+
+
+@wp.kernel
+def _evaluate(
+    statistics: wp.array(dtype=DeviceStatistics),
+    thresholds: wp.array(dtype=DeviceThresholds),
+    status: wp.array(dtype=wp.int32),
+):
+    b = wp.tid()
+    status[b] = evaluate_on_device(statistics[b], thresholds[b])
+
+
+def test_kernels_decide_as_the_host_does():
+    rng = np.random.default_rng(0)
+    count, demanded = 300, replace(VIEW_THRESHOLDS, matches=0.1, sigma_m=0.9, cost=0.9)
+    names = [field.name for field in fields(AlignmentStatistics)]
+    values = rng.uniform(0, 1, (count, len(names))) ** 0.2
+    statistics = np.array([tuple(row) for row in values], dtype=DeviceStatistics.numpy_dtype())
+    status = wp.zeros(count, dtype=wp.int32)
+    arrays = [
+        wp.array(statistics, dtype=DeviceStatistics),
+        wp.array(demanded.repeated(count), dtype=DeviceThresholds),
+    ]
+    wp.launch(_evaluate, dim=count, inputs=arrays, outputs=[status])
+    expected = [evaluate_alignment(AlignmentStatistics(*row.tolist()), demanded) for row in values]
+    assert len(set(expected)) > 4
+    np.testing.assert_array_equal(status.numpy(), expected)
