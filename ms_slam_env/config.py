@@ -6,8 +6,10 @@ import dataclasses
 import inspect
 import numbers
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar, get_origin, get_type_hints
+
+import yaml
 
 from ms_slam_env.errors import InputError, unknown
 
@@ -164,3 +166,56 @@ def check_choice(owner: object, name: str, choices: tuple[str, ...]) -> None:
     value = getattr(owner, name)
     if value not in choices:
         raise unknown(f"{type(owner).__name__}.{name}", value, choices)
+
+
+def parse_value(text: str, name: str) -> Any:
+    """The YAML value of option ``name``.
+
+    Raises:
+        InputError: text that is not YAML.
+    """
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise InputError(f"option {name!r}: {text!r} is not a YAML value") from None
+
+
+def parse_named(text: str, kind: str) -> tuple[str, dict[str, Any]]:
+    """Split ``NAME,option=value,...`` into the name and the options; values are YAML scalars.
+
+    Args:
+        text: to be split.
+        kind: of thing that has this name, for the error message.
+
+    Raises:
+        InputError: an option without ``=``, or a value that is not YAML.
+    """
+    name, *parts = text.split(",")
+    options = {}
+    for part in parts:
+        option, equals, value = part.partition("=")
+        if not equals or not option.isidentifier():
+            raise InputError(f"{kind} {text!r}: {part!r} is not option=value")
+        options[option] = parse_value(value, option)
+    return name, options
+
+
+def nested_options(texts: Sequence[str]) -> dict[str, Any]:
+    """Nested mapping from texts ``name.name=value``; values are YAML.
+
+    Raises:
+        InputError: no ``=``, a value that is not YAML, or a name that is value and mapping.
+    """
+    result: dict[str, Any] = {}
+    for text in texts:
+        path, equals, value = text.partition("=")
+        *parents, name = path.split(".")
+        if not equals:
+            raise InputError(f"option {text!r} is not name=value")
+        inner = result
+        for parent in parents:
+            inner = inner.setdefault(parent, {})
+            if not isinstance(inner, dict):
+                raise InputError(f"option {path!r}: {parent} already has a value")
+        inner[name] = parse_value(value, path)
+    return result

@@ -18,7 +18,7 @@ FLOW = (
     " -> metrics -> report -> evaluation -> env -> exploration -> experiments -> benchmark -> cli"
 )
 LEVEL = {name: level for level, name in enumerate(re.split(r" -> |, ", FLOW))}
-BELOW_ALL = {"errors", "config", "command_line", "timings", "_warp"}
+BELOW_ALL = {"errors", "config", "command_line", "parallel", "timings", "_warp"}
 ABOVE_ALL = {"registration", ""}  # "" is ms_slam_env/__init__.py
 NEVER = {"baselines", "agents", "ms_slam_baselines", "ms_slam_agents", "evo"}
 ONLY_INSIDE_FUNCTIONS = {

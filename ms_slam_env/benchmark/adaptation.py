@@ -6,7 +6,6 @@ Saeedi et al., ICRA 2017, section V-B. Run as ``python -m ms_slam_env.benchmark.
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import metrics, slam
-from ms_slam_env.benchmark.adaptation_inputs import Stretches
 from ms_slam_env.benchmark.adaptation_report import comparison, save_figures, summarise, tables
 from ms_slam_env.benchmark.planner_benchmark import check_names, seed_list
 from ms_slam_env.benchmark.planner_report import finished
@@ -24,8 +22,10 @@ from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
 from ms_slam_env.camera import XTION_SIZES, Intrinsics, RGBDFrame, xtion
 from ms_slam_env.command_line import exit_code, parse, report_failures
 from ms_slam_env.config import check_range
+from ms_slam_env.evaluation.run_sequence import Step, run_sequence
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import Row, write_json
+from ms_slam_env.sequences import MotionSegments, open_sequence
 from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
 from ms_slam_env.slam.adaptation import (
     AdaptiveSlam,
@@ -33,7 +33,7 @@ from ms_slam_env.slam.adaptation import (
     DivergenceAdaptationConfig,
 )
 from ms_slam_env.slam.adaptation.divergence import DivergenceController
-from ms_slam_env.slam.base import SlamBackend, TrackResult
+from ms_slam_env.slam.base import SlamBackend
 from ms_slam_env.slam.configuration import SlamConfiguration, write_configuration
 
 PROGRAM = "python -m ms_slam_env.benchmark.adaptation"
@@ -62,7 +62,7 @@ class AdaptationSpec:
 
     scene: str
     seed: int
-    stretches: Stretches
+    stretches: MotionSegments
     image_size: str
     adaptation: DivergenceAdaptationConfig
 
@@ -79,7 +79,7 @@ class Arguments:
     """Split that the seeds come from."""
     image_size: str = "320x240"
     """Of the camera."""
-    stretches: Stretches = field(default_factory=Stretches)
+    stretches: MotionSegments = field(default_factory=MotionSegments)
     """How the camera is carried."""
     configurations: tuple[Path, ...] = ()
     """YAML files, from fast to robust; none for the default three."""
@@ -122,7 +122,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the experiment; return the exit code."""
     args = parse(Arguments, arguments, PROGRAM)
     check_names(("random",), args.scenes)
-    rows = run_all(args.specs(), run_sequence, args.out, args.workers, "sequences")
+    rows = run_all(args.specs(), run_competitors, args.out, args.workers, "sequences")
     check_any_finished(rows)
     done = finished(rows)
     summary = summarise(done)
@@ -150,14 +150,15 @@ def _brief(row: Row) -> Row:
     return {key: value for key, value in row.items() if key != "traceback"}
 
 
-def run_sequence(spec: AdaptationSpec) -> dict[str, Any]:
+def run_competitors(spec: AdaptationSpec) -> dict[str, Any]:
     """Render once; run every competitor on the same frames.
 
     Returns:
         ``runs``, by competitor: figures of ``judge``; ``violent``, per frame; and of the adaptive
         run per frame ``change`` (nats) and ``level``.
     """
-    sequence = spec.stretches.render(spec.scene, spec.seed, spec.image_size)
+    name = f"{spec.scene}:{spec.seed}"
+    sequence = open_sequence(name, spec.image_size, path=spec.stretches)
     frames = list(sequence.frames)
     violent = spec.stretches.is_violent()
     runs = {}
@@ -220,22 +221,19 @@ def judge(
         were predicted for them; ``ate_max_m``; ``processed`` and ``lost``, shares of the frames;
         ``ext_violent_ms`` and ``ext_quiet_ms``. Then the level and the change of every frame.
     """
-    backend.reset(truth[0])
-    results: list[TrackResult] = []
-    seconds, levels, changes = [], [], []
-    for frame in frames:
-        begin = time.process_time()
-        results.append(backend.track(frame))
-        seconds.append(time.process_time() - begin)
+    levels: list[int] = []
+    changes: list[float] = []
+
+    def note(step: Step) -> None:
         assert isinstance(backend, AdaptiveSlam)
         levels.append(backend.level)
         controller = backend.controller
         changes.append(controller.change if isinstance(controller, DivergenceController) else 0.0)
-    online = np.stack([result.T_world_camera for result in results])
-    processed = np.array([result.processed for result in results])
+
+    run = run_sequence(backend, frames, start=truth[0], on_step=note)
+    online, processed, ms = run.estimates, run.processed, run.cpu_ms
     kept = np.flatnonzero(processed)
     filled = PoseInterpolation(kept.astype(np.float64), online[kept])(np.arange(len(frames)))
-    ms = 1e3 * np.array(seconds)
     ate = metrics.ate_statistics(filled, truth)
     figures = {
         "cpu_ms": float(ms.mean()),
@@ -245,7 +243,7 @@ def judge(
         "ate_max_m": ate.max,
         "ate_online_m": metrics.ate_rmse(online, truth),
         "processed": float(processed.mean()),
-        "lost": float(np.mean([not result.tracking_ok for result in results])),
+        "lost": float(np.mean(~run.tracking_ok)),
     }
     return figures, levels, changes
 

@@ -7,17 +7,16 @@ from pathlib import Path
 from typing import Any
 
 from ms_slam_env import slam
-from ms_slam_env.benchmark.compare_inputs import SequenceName, parse_sequence
 from ms_slam_env.benchmark.compare_report import save_figure, summarise, tables
 from ms_slam_env.benchmark.compare_run import CompareSpec, run_apart
-from ms_slam_env.benchmark.options import parse_named
 from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
 from ms_slam_env.camera import XTION_SIZES
-from ms_slam_env.config import check_range
+from ms_slam_env.config import check_range, parse_named
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import write_json
-from ms_slam_env.scenes import ROOMS, SCENES
+from ms_slam_env.scenes import ROOMS
+from ms_slam_env.sequences import check_sequence
 
 DEFAULT_SEQUENCES = (
     "living_room:2000:none",
@@ -69,11 +68,7 @@ class Comparison:
             if not getattr(self, name):
                 raise InputError(f"Comparison.{name} is empty")
         for text in self.sequences:
-            named = parse_sequence(text)
-            if isinstance(named, SequenceName) and not (
-                named.scene in SCENES or Path(named.scene).is_file()
-            ):
-                raise unknown("scene", named.scene, (*SCENES, "a mesh file"))
+            check_sequence(text)
         for text in self.backends:
             name, _ = parse_named(text, "backend")
             if name not in slam.BACKENDS:

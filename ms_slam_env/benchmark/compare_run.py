@@ -12,21 +12,16 @@ import os
 import subprocess
 import sys
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ms_slam_env.errors import InputError
-
-if TYPE_CHECKING:
-    from ms_slam_env.benchmark.compare_inputs import Input
-    from ms_slam_env.metrics import CostMeter
-    from ms_slam_env.slam import SlamBackend
+from ms_slam_env.parallel import limit_threads, thread_environment
 
 WARM_UP = 5  # frames left out of the timing: buffers grow, kernels are loaded
 THRESHOLDS_M = (0.02, 0.05)
 _NAME = "compare_run"
-_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True)
@@ -73,7 +68,7 @@ def run_module(name: str, spec: dict[str, Any], threads: int) -> dict[str, Any]:
         InputError: bad input, as the process said.
         RuntimeError: it failed otherwise; the last line of its complaint.
     """
-    environment = os.environ | dict.fromkeys(_THREAD_VARIABLES, str(threads))
+    environment = os.environ | thread_environment(threads)
     done = subprocess.run(
         [sys.executable, "-m", f"ms_slam_env.benchmark.{name}"],
         input=json.dumps(spec),
@@ -103,13 +98,15 @@ def run_here(spec: CompareSpec) -> dict[str, Any]:
     """
     from ms_slam_env import metrics, slam
     from ms_slam_env.benchmark import compare_inputs
+    from ms_slam_env.evaluation.run_sequence import run_sequence
     from ms_slam_env.sequences import HandheldPath
 
     path = HandheldPath(spec.frames, speed_m_s=spec.speed_m_s, turn_deg_s=spec.turn_deg_s)
     given = compare_inputs.load(spec.sequence, spec.image_size, path)
     costs = metrics.CostMeter(str(spec.params.get("device", "cpu")))
     system = slam.make(spec.backend, given.intrinsics, **spec.params)
-    estimates, tracked = _track(system, given, costs)
+    run = run_sequence(system, given, meter=costs)
+    estimates = run.estimates
     cost = costs.summary(skip=WARM_UP)
     ate = metrics.ate_statistics(estimates, given.poses)
     return {
@@ -120,25 +117,13 @@ def run_here(spec: CompareSpec) -> dict[str, Any]:
         "ate_unaligned_m": metrics.ate_rmse(estimates, given.poses, align="none"),
         "rpe_m": metrics.rpe_rmse(estimates, given.poses),
         "rpe_rad": metrics.rpe_rmse(estimates, given.poses, kind="rotation"),
-        "lost": 1.0 - float(np.mean(tracked)),
+        "lost": run.lost,
         **cost,
         "cpu_ms": cost["cpu_ms_median"],
         "ms": cost["ext_ms_median"],
         "memory_mb": cost["mem_peak_mb"],
         **_map_quality(system.surface_points(), given.surface),
     }
-
-
-def _track(system: SlamBackend, given: Input, costs: CostMeter) -> tuple[np.ndarray, list[bool]]:
-    """Poses (N, 4, 4), and whether tracked; ``costs`` measures the frames."""
-    system.reset(given.poses[0])
-    estimates, tracked = [], []
-    for frame in given.frames:
-        with costs.frame():
-            result = system.track(frame)
-        estimates.append(result.T_world_camera)
-        tracked.append(result.tracking_ok)
-    return np.stack(estimates), tracked
 
 
 def _map_quality(points: np.ndarray, surface: np.ndarray) -> dict[str, Any]:
@@ -156,15 +141,6 @@ def _map_quality(points: np.ndarray, surface: np.ndarray) -> dict[str, Any]:
         "map_error_mm": 1e3 * float(np.median(distances)),
         **dict(zip(names, values, strict=True)),
     }
-
-
-def limit_threads(threads: int) -> None:
-    """Keep this process on so many cores, whatever its libraries think."""
-    import cv2
-
-    cv2.setNumThreads(threads)
-    if hasattr(os, "sched_setaffinity"):  # pools that ignore the variables (TBB) obey this
-        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:threads])
 
 
 def main() -> int:

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 import ms_slam_env
 from ms_slam_env import metrics
 from ms_slam_env.benchmark.map_truth import reference_of, true_surface
-from ms_slam_env.benchmark.options import parse_named
 from ms_slam_env.benchmark.planners import make_planner, planner_class
-from ms_slam_env.config import check_choice, check_range
+from ms_slam_env.config import check_choice, check_range, parse_named
 from ms_slam_env.env import ActiveSlamEnv, Planner
 from ms_slam_env.errors import InputError
 from ms_slam_env.registration import ADAPTIVE_ID

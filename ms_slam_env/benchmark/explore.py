@@ -8,7 +8,6 @@ from typing import Any
 
 from tqdm import tqdm
 
-from ms_slam_env.benchmark.compare_inputs import check_sequence
 from ms_slam_env.benchmark.explore_evaluation import SlamEvaluator
 from ms_slam_env.benchmark.explore_figures import save_figures
 from ms_slam_env.benchmark.explore_judge import DEFAULT, judge
@@ -26,6 +25,7 @@ from ms_slam_env.exploration.ledger import Ledger
 from ms_slam_env.metrics.cost import energy_counters
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import write_json
+from ms_slam_env.sequences import check_sequence
 from ms_slam_env.slam.configuration import SlamConfiguration, write_configuration
 
 

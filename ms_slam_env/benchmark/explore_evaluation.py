@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
@@ -19,9 +18,11 @@ from ms_slam_env.camera import XTION_SIZES
 from ms_slam_env.config import check_choice, check_range
 from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.evaluation.run_sequence import run_sequence
 from ms_slam_env.exploration.objectives import FAILURE
 from ms_slam_env.metrics.cost import CostMeter
-from ms_slam_env.sequences import HandheldPath
+from ms_slam_env.parallel import limited_threads
+from ms_slam_env.sequences import HandheldPath, parse_sequence
 from ms_slam_env.slam.configuration import SlamConfiguration
 
 CLOCKS = {"processor": "cpu_ms_median", "wall": "ext_ms_median"}
@@ -31,7 +32,6 @@ Row = dict[str, Any]
 
 _WARM_UP = 5  # frames left out of the timing: buffers grow, kernels are loaded
 _WARM_UP_FRAMES = 15
-_ALL_CORES = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class SlamEvaluator:
         if not self.sequences:
             raise InputError("no sequence to explore on")
         for text in self.sequences:
-            compare_inputs.parse_sequence(text)
+            parse_sequence(text)
         check_range(self, "frames", 10, 100_000)
         check_range(self, "speed_m_s", 0.0, 10.0)
         check_range(self, "turn_deg_s", 0.0, 1000.0)
@@ -107,48 +107,40 @@ class SlamEvaluator:
         _warm_up(
             configuration.slam, size, str(configuration.slam_config.get("device", "cpu")), given
         )
-        _limit_threads(configuration.threads)
         try:
-            return {**row, **self._run(configuration, given)}
+            with limited_threads(configuration.threads):
+                return {**row, **self._run(configuration, given)}
         except InputError:
             raise
         except (RuntimeError, ArithmeticError, ValueError, MemoryError) as error:
             return {**row, "lost": 1.0, FAILURE: f"{text}: {error or type(error).__name__}"}
-        finally:
-            _limit_threads(None)
 
     def _run(self, configuration: SlamConfiguration, given: Input) -> Row:
         device = str(configuration.slam_config.get("device", "cpu"))
         meter = CostMeter(device)
         system = slam.make(configuration.slam, given.intrinsics, **configuration.slam_config)
-        system.reset(given.poses[0])
-        truth = given.poses[:: configuration.keep_every]
-        estimates, tracked = [], []
-        for frame in given.frames[:: configuration.keep_every]:
-            with meter.frame():
-                result = system.track(frame)
-            estimates.append(result.T_world_camera)
-            tracked.append(result.tracking_ok)
-        ate = metrics.ate_statistics(np.stack(estimates), truth)
-        costs = meter.summary(min(_WARM_UP, len(estimates) - 1))
+        every = configuration.keep_every
+        frames, truth = given.frames[::every], given.poses[::every]
+        run = run_sequence(system, frames, start=truth[0], meter=meter)
+        ate = metrics.ate_statistics(run.estimates, truth)
+        costs = meter.summary(min(_WARM_UP, len(run) - 1))
         ext_ms = costs[CLOCKS[self.clock]]
-        lost = 1.0 - float(np.mean(tracked))
         row: Row = {
-            "frames": len(estimates),
+            "frames": len(run),
             "ate_m": ate.rmse,
             "ate_max_m": ate.max,
             "ext_ms": ext_ms,
-            "load_ms": ext_ms * len(estimates) / len(given.frames),
+            "load_ms": ext_ms * len(run) / len(given.frames),
             "mem_mb": costs["mem_peak_mb"],
             "energy_j": costs["ene_frame_j"],
-            "lost": lost,
+            "lost": run.lost,
         }
         if self.map_error:
             row["map_error_mm"] = _map_error_mm(system.surface_points(), given.surface)
         if not math.isfinite(ate.rmse):
             row[FAILURE] = "the trajectory is not finite"
-        elif lost > self.max_lost:
-            row[FAILURE] = f"tracking lost in {100 * lost:.0f} % of the frames"
+        elif run.lost > self.max_lost:
+            row[FAILURE] = f"tracking lost in {100 * run.lost:.0f} % of the frames"
         return row
 
 
@@ -194,9 +186,7 @@ def _warm_up(backend: str, size: str, device: str, given: Input) -> None:
         system = slam.make(
             backend, given.intrinsics, **({} if device == "cpu" else {"device": device})
         )
-        system.reset(given.poses[0])
-        for frame in given.frames[:_WARM_UP_FRAMES]:
-            system.track(frame)
+        run_sequence(system, given.frames[:_WARM_UP_FRAMES], start=given.poses[0])
 
 
 def _map_error_mm(points: np.ndarray, surface: np.ndarray) -> float | None:
@@ -207,9 +197,3 @@ def _map_error_mm(points: np.ndarray, surface: np.ndarray) -> float | None:
         return None
     distances = reconstruction.nearest_distances(reconstruction.voxel_thin(points, 0.01), surface)
     return 1e3 * float(np.median(distances))
-
-
-def _limit_threads(threads: int | None) -> None:
-    """Keep this process on so many cores; on all that it began with if None."""
-    if _ALL_CORES is not None:
-        os.sched_setaffinity(0, sorted(_ALL_CORES)[:threads])

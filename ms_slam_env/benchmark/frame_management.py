@@ -13,7 +13,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from ms_slam_env import slam
-from ms_slam_env.benchmark.frame_management_inputs import parse_uneven
 from ms_slam_env.benchmark.frame_management_report import (
     flat_runs,
     save_figure,
@@ -29,7 +28,7 @@ from ms_slam_env.config import check_range
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import write_json
-from ms_slam_env.scenes.registry import check_name
+from ms_slam_env.sequences import check_sequence
 
 PROGRAM = "python -m ms_slam_env.benchmark.frame_management"
 
@@ -48,7 +47,7 @@ class Arguments:
         "corridor:2006",
         "table:2007",
     )
-    """scene:seed (quiet, walking and fast stretches), scene:seed:steady, or folders."""
+    """scene:seed (quiet, walking and fast segments), scene:seed:steady, or folders."""
     managements: tuple[str, ...] = (
         "none",
         *(f"regular,every={n}" for n in (2, 3, 4)),
@@ -73,8 +72,7 @@ class Arguments:
             if not getattr(self, name):
                 raise InputError(f"{name} is empty")
         for text in self.sequences:
-            if not Path(text).is_dir():
-                check_name(parse_uneven(text)[0])
+            check_sequence(text)
         for text in self.managements:
             if parse_frame_management(text).uses_clock:
                 raise InputError(f"{text!r} measures time: no two runs are alike")

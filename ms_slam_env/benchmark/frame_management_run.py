@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from ms_slam_env import metrics, slam
-from ms_slam_env.benchmark.compare_inputs import Input
-from ms_slam_env.benchmark.compare_run import limit_threads
+from ms_slam_env.benchmark.compare_inputs import Input, load
 from ms_slam_env.benchmark.episode import LOST_ERROR_M
-from ms_slam_env.benchmark.frame_management_inputs import load_uneven
 from ms_slam_env.benchmark.options import parse_frame_management
+from ms_slam_env.evaluation.run_sequence import run_sequence
 from ms_slam_env.metrics import reconstruction
+from ms_slam_env.parallel import limit_threads
+from ms_slam_env.sequences import UnevenPath
 from ms_slam_env.slam.frame_management import FrameManagementConfig, RegularConfig
 
 THRESHOLDS_M = (0.02, 0.05)
@@ -49,7 +50,7 @@ def run_filters(spec: FilterSpec) -> dict[str, Any]:
         None where the filter is regular itself.
     """
     limit_threads(1)
-    given = load_uneven(spec.sequence, spec.image_size, spec.frames)
+    given = load(spec.sequence, spec.image_size, UnevenPath(spec.frames))
     runs = []
     for text in spec.managements:
         config = parse_frame_management(text)
@@ -74,24 +75,19 @@ def run_one(config: FrameManagementConfig, backend: str, given: Input) -> dict[s
         included, and ``filter_ms``, the filter's own.
     """
     system = config.manage(slam.make(backend, given.intrinsics))
-    system.reset(given.poses[0])
-    begin = time.process_time()
-    results = [system.track(frame) for frame in given.frames]
-    cpu_ms = 1e3 * (time.process_time() - begin) / len(results)
-    estimate = np.stack([result.T_world_camera for result in results])
-    kept = np.array([result.processed for result in results])
+    run = run_sequence(system, given)
+    estimate, kept = run.estimates, run.processed
     errors = metrics.absolute_errors(estimate[kept], given.poses[kept], align="none")
-    lost = 1.0 - float(np.mean([result.tracking_ok for result in results]))
     return {
-        "frames": len(results),
+        "frames": len(run),
         "processed": float(kept.mean()),
-        "lost": lost,
+        "lost": run.lost,
         "ate_m": metrics.ate_rmse(estimate, given.poses),
         "ate_processed_m": metrics.ate_rmse(estimate[kept], given.poses[kept]),
         "largest_error_m": float(errors.max()),
         "failed": bool(errors.max() > LOST_ERROR_M),
         **_map_quality(system.surface_points(), given.surface),
-        "cpu_ms": cpu_ms,
+        "cpu_ms": float(run.cpu_ms.mean()),
         "filter_ms": _filter_ms(config, given),
     }
 

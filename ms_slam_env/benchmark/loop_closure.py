@@ -15,12 +15,11 @@ from typing import Any
 import numpy as np
 
 from ms_slam_env.benchmark.loop_closure_run import NOISES, PATHS, LoopSpec, run_loop
-from ms_slam_env.benchmark.options import nested_options
 from ms_slam_env.benchmark.planner_report import finished
 from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
 from ms_slam_env.benchmark.table import format_number, markdown_table
 from ms_slam_env.command_line import exit_code, parse, report_failures
-from ms_slam_env.config import from_dict
+from ms_slam_env.config import from_dict, nested_options
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import Row, write_json

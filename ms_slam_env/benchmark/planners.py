@@ -9,7 +9,7 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from ms_slam_env.benchmark.options import parse_named
+from ms_slam_env.config import parse_named
 from ms_slam_env.env.planner import Planner
 from ms_slam_env.errors import InputError, unknown
 

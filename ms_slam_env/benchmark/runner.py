@@ -18,19 +18,12 @@ from typing import Any
 from tqdm import tqdm
 
 from ms_slam_env.errors import InputError
+from ms_slam_env.parallel import available_cores, thread_environment
 from ms_slam_env.report.provenance import git_commit
 from ms_slam_env.report.records import RecordFile, Row, spec_key
 
 RECORDS = "episodes.jsonl"
 _NAMING = ("planner", "scene", "sequence", "backend", "seed")  # what a person calls the work by
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
-
-
-def available_cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def run_all(
@@ -136,8 +129,8 @@ def _run_missing(
     workers: int,
     finish: Callable[[Row], None],
 ) -> None:
-    for name in _ONE_THREAD:  # inherited by the workers, which read it at import
-        os.environ.setdefault(name, "1")
+    for name, one in thread_environment(1).items():  # inherited, and read when libraries load
+        os.environ.setdefault(name, one)
     waiting = list(todo.items())[::-1]
     busy = {}
     try:

@@ -20,7 +20,7 @@ from ms_slam_env.benchmark.table import format_number, markdown_table
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.divergence import DivergenceConfig, make_divergence
 from ms_slam_env.errors import InputError
-from ms_slam_env.sequences.recording import Recording
+from ms_slam_env.sequences import Sequence as RGBDSequence
 
 Float64 = NDArray[np.float64]
 
@@ -92,7 +92,7 @@ def consecutive_divergences(
 
 
 def sequence_divergence(
-    recording: Recording, config: DivergenceConfig | None = None, every: int = 1
+    sequence: RGBDSequence, config: DivergenceConfig | None = None, every: int = 1
 ) -> SequenceDivergence:
     """Divergence of every frame from the one before, taking every ``every``-th frame.
 
@@ -101,19 +101,19 @@ def sequence_divergence(
     """
     if isinstance(every, bool) or not isinstance(every, int) or every < 1:
         raise InputError(f"every must be an integer >= 1, got {every!r}")
-    picked = range(0, len(recording), every)
+    picked = range(0, len(sequence), every)
     if len(picked) < 2:
         raise InputError(
-            f"sequence {recording.name}: {len(recording)} frames, every {every}th: "
+            f"sequence {sequence.name}: {len(sequence)} frames, every {every}th: "
             "a divergence needs two"
         )
-    frames = (recording.frame(k) for k in tqdm(picked, desc=recording.name, unit="frame"))
+    frames = (sequence.frames[k] for k in tqdm(picked, desc=sequence.name, unit="frame"))
     config = config or DivergenceConfig()
-    values = consecutive_divergences(frames, recording.intrinsics, [config])[:, 0]
-    if not recording.has_color:
+    values = consecutive_divergences(frames, sequence.intrinsics, [config])[:, 0]
+    if not sequence.has_color:
         values[:, 0] = np.nan
-    times = recording.timestamps[list(picked)]
-    return SequenceDivergence(recording.name, times[1:] - times[0], values, np.diff(times))
+    times = sequence.timestamps[list(picked)]
+    return SequenceDivergence(sequence.name, times[1:] - times[0], values, np.diff(times))
 
 
 _SHOWN = {

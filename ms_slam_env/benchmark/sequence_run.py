@@ -1,27 +1,26 @@
-"""A SLAM backend over a recorded sequence: trajectory, map and metrics in a folder."""
+"""A SLAM backend over a sequence: trajectory, map and metrics in a folder."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from ms_slam_env import metrics, slam
 from ms_slam_env.benchmark.frame_records import FRAMES, write_frames
 from ms_slam_env.benchmark.point_cloud import write_ply
+from ms_slam_env.evaluation.run_sequence import SequenceRun
 from ms_slam_env.geometry import invert
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import write_json
-from ms_slam_env.sequences import associate
+from ms_slam_env.sequences import Sequence, associate
 from ms_slam_env.sequences.recording import Recording
 from ms_slam_env.sequences.tum import TRAJECTORY_HEADER, trajectory_line, write_trajectory
-from ms_slam_env.slam.base import TrackResult
 from ms_slam_env.slam.frame_management import EveryFrameConfig, FrameManagementConfig
 
 Float64 = NDArray[np.float64]
@@ -37,33 +36,15 @@ TRUTH = "groundtruth.txt"
 MAX_DIFFERENCE_S = 0.02
 
 
-@dataclass
-class Track:
-    """What SLAM said, frame by frame."""
-
-    costs: metrics.CostMeter
-    times: list[float] = field(default_factory=list)
-    poses: list[Float64] = field(default_factory=list)
-    tracking_ok: list[bool] = field(default_factory=list)
-    processed: list[bool] = field(default_factory=list)
-
-    def append(self, timestamp: float, result: TrackResult) -> None:
-        """Add a frame."""
-        self.times.append(timestamp)
-        self.poses.append(result.T_world_camera)
-        self.tracking_ok.append(result.tracking_ok)
-        self.processed.append(result.processed)
-
-
-def run_sequence(
-    recording: Recording,
+def run_to_folder(
+    sequence: Sequence,
     backend: str,
     params: dict[str, Any],
     out: Path,
     fed: Mapping[str, Any] | None = None,
     management: FrameManagementConfig | None = None,
 ) -> dict[str, Any]:
-    """Track every frame of ``recording`` and write what came of it to ``out``.
+    """Track every frame of ``sequence`` and write what came of it to ``out``.
 
     Those that ``management`` drops are not processed; their poses are predicted.
     SLAM starts at the true pose of the first frame where that is known, else at the identity.
@@ -82,114 +63,97 @@ def run_sequence(
     """
     costs = metrics.CostMeter(str(params.get("device", "cpu")))
     management = management or EveryFrameConfig()
-    system = management.manage(slam.make(backend, recording.intrinsics, **params))
-    system.reset(_start(recording))
+    system = management.manage(slam.make(backend, sequence.intrinsics, **params))
+    run = SequenceRun(system, sequence, meter=costs, progress=sequence.name)
     out.mkdir(parents=True, exist_ok=True)
     for old in (TRAJECTORY, CORRECTED, TRUTH, MAP, METRICS, FRAMES):
         (out / old).unlink(missing_ok=True)
-    track = Track(costs)
+    recording = sequence.frames if isinstance(sequence.frames, Recording) else None
     result: dict[str, Any] = {"complete": False}
     about = {
-        "sequence": recording.name,
-        "layout": recording.layout,
+        "sequence": sequence.name,
+        "layout": "rendered" if recording is None else recording.layout,
         "backend": backend,
         "params": params,
         **(fed or {}),
         "frame_management": asdict(management),
-        "registration": None if recording.registration is None else str(recording.registration),
-        "image_size": f"{recording.intrinsics.width}x{recording.intrinsics.height}",
+        "registration": _registration(recording),
+        "image_size": f"{sequence.intrinsics.width}x{sequence.intrinsics.height}",
         **provenance(),
     }
     try:
         with (out / UNFINISHED).open("w", encoding="utf-8") as file:
             file.write(TRAJECTORY_HEADER + "\n")
-            _track_all(recording, system, track, file)
+            for step in run:
+                pose = step.result.T_world_camera
+                file.write(trajectory_line(step.frame.timestamp, pose) + "\n")
+                file.flush()
         write_ply(out / MAP, system.surface_points(), system.map_attributes())
-        corrected = _corrected(track, system)
+        corrected = run.corrected()
         if corrected is not None:
-            write_trajectory(out / CORRECTED, corrected.times, np.stack(corrected.poses))
-            corrections = measure(corrected, recording)
+            write_trajectory(out / CORRECTED, run.timestamps, corrected)
+            corrections = trajectory_errors(run, corrected, sequence)
             result.update(
                 (f"{name}_corrected", corrections[name])
                 for name in ("ate_m", "rpe_m")
                 if name in corrections
             )
-        if recording.truth is not None and recording.truth_times is not None:
-            write_trajectory(out / TRUTH, recording.truth_times, recording.truth)
+        truth = sequence.true_trajectory()
+        if truth is not None:
+            write_trajectory(out / TRUTH, *truth)
         os.replace(out / UNFINISHED, out / TRAJECTORY)
         result["complete"] = True
     except BaseException as error:
         result["error"] = str(error) or type(error).__name__
         raise
     finally:
-        result.update(measure(track, recording))
-        write_frames(out / FRAMES, track.times, track.tracking_ok, track.costs.frames)
+        result.update(measure(run, sequence))
+        write_frames(out / FRAMES, run.timestamps, run.tracking_ok.tolist(), run.costs)
         write_json(out / METRICS, {**result, **about})
     return result
 
 
-def _track_all(recording: Recording, system: slam.SlamBackend, track: Track, file: TextIO) -> None:
-    with tqdm(total=len(recording), desc=recording.name, unit="frame") as bar:
-        for frame in recording:
-            with track.costs.frame():
-                result = system.track(frame)
-            track.append(frame.timestamp, result)
-            file.write(trajectory_line(frame.timestamp, result.T_world_camera) + "\n")
-            file.flush()
-            bar.set_postfix_str("tracking" if result.tracking_ok else "LOST", refresh=False)
-            bar.update()
-
-
-def _corrected(track: Track, system: slam.SlamBackend) -> Track | None:
-    """The run with the poses that the finished map has; None if the backend corrects none."""
-    frames, poses = system.corrected_trajectory()
-    if not len(frames):
+def _registration(recording: Recording | None) -> str | None:
+    """How colour was brought into the depth camera, in words; None where it was not."""
+    if recording is None or recording.registration is None:
         return None
-    final = list(track.poses)
-    for frame, pose in zip(frames, poses, strict=True):
-        final[frame] = pose
-    return replace(track, poses=final)
+    return str(recording.registration)
 
 
-def _start(recording: Recording) -> Float64 | None:
-    """The true pose of the first frame, where one is near in time."""
-    if recording.truth is None or recording.truth_times is None:
-        return None
-    nearest = int(np.abs(recording.truth_times - recording.timestamps[0]).argmin())
-    if abs(recording.truth_times[nearest] - recording.timestamps[0]) > MAX_DIFFERENCE_S:
-        return None
-    return recording.truth[nearest]
-
-
-def measure(track: Track, recording: Recording) -> dict[str, Any]:
+def measure(run: SequenceRun, sequence: Sequence) -> dict[str, Any]:
     """Metrics of a run, finished or not; those against the truth only where there is one.
 
-    ``frames``, ``lost_frames``, ``processed_frames``, ``path_m`` of the estimate;
-    ``ate_m`` (RMSE after SE(3) alignment), ``ate_max_m``,
-    ``ate_rad`` (RMSE of the orientation after it, None where the path is a line), ``rpe_m``,
-    ``rpe_rad``; the costs by the names of ``CostMeter.summary``.
+    ``frames``, ``lost_frames``, ``processed_frames``, ``path_m`` of the estimate; what
+    `trajectory_errors` gives; the costs by the names of ``CostMeter.summary``.
     """
-    if not track.times:
+    if not len(run) or run.meter is None:
         return {"frames": 0}
-    poses = np.stack(track.poses)
-    cost = track.costs.summary()
-    result: dict[str, Any] = {
-        "frames": len(poses),
-        "lost_frames": int(len(poses) - sum(track.tracking_ok)),
-        "processed_frames": sum(track.processed),
-        "path_m": metrics.path_length(poses),
-        **cost,
+    return {
+        "frames": len(run),
+        "lost_frames": run.lost_frames,
+        "processed_frames": int(run.processed.sum()),
+        "path_m": metrics.path_length(run.estimates),
+        **run.meter.summary(),
+        **trajectory_errors(run, run.estimates, sequence),
     }
-    if recording.truth is None or recording.truth_times is None:
-        return result
-    times = np.array(track.times)
-    estimate, truth = associate(times, recording.truth_times, MAX_DIFFERENCE_S)
-    if len(estimate) < 2:
-        return result
-    P, Q = poses[estimate], recording.truth[truth]
+
+
+def trajectory_errors(run: SequenceRun, poses: Float64, sequence: Sequence) -> dict[str, Any]:
+    """Errors of poses (N, 4, 4) against the true ones; empty with fewer than two of these.
+
+    ``compared`` poses; ``ate_m`` (RMSE after SE(3) alignment), ``ate_max_m``, ``ate_rad`` (RMSE of
+    the orientation after it, None where the path is a line), ``ate_unaligned_m``, ``rpe_m``,
+    ``rpe_rad``.
+    """
+    truth = sequence.true_trajectory()
+    if truth is None:
+        return {}
+    own, true = associate(np.array(run.timestamps), truth[0], MAX_DIFFERENCE_S)
+    if len(own) < 2:
+        return {}
+    P, Q = poses[own], truth[1][true]
     ate = metrics.ate_statistics(P, Q)
     return {
-        **result,
         "compared": len(P),
         "ate_m": ate.rmse,
         "ate_max_m": ate.max,

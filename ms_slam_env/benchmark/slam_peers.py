@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 import time
 from collections.abc import Callable
@@ -15,7 +14,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
@@ -29,6 +27,7 @@ from ms_slam_env.command_line import exit_code, parse
 from ms_slam_env.config import check_range
 from ms_slam_env.errors import InputError
 from ms_slam_env.metrics import ate_rmse, path_length
+from ms_slam_env.parallel import limit_threads
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.scenes import Scene
 from ms_slam_env.sequences import (
@@ -159,19 +158,6 @@ class PeersReport:
     missing: dict[str, str] = field(default_factory=dict)
     results: list[PeerResult] = field(default_factory=list)
     growth: list[dict[str, Any]] = field(default_factory=list)
-
-
-def limit_threads(threads: int) -> None:
-    """Give every library of this process the same number of cores.
-
-    Open3D reads the variables when it is imported, which therefore happens later.
-    """
-    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[variable] = str(threads)
-    cv2.setNumThreads(threads)
-    if hasattr(os, "sched_setaffinity"):  # pools that ignore the variables (TBB) obey this
-        cores = sorted(os.sched_getaffinity(0))[:threads]
-        os.sched_setaffinity(0, cores)
 
 
 def run_peer(peer: Peer, sequence: Sequence, size: str) -> PeerResult:

@@ -10,12 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.benchmark.compare_inputs import evenly_picked, seen_surface
 from ms_slam_env.errors import InputError
-from ms_slam_env.sequences import associate
+from ms_slam_env.evaluation.seen_surface import seen_surface
 from ms_slam_env.sequences.recording import Recording, open_recording
-
-_MAX_DIFFERENCE_S = 0.02
+from ms_slam_env.sequences.sequence import recorded_sequence
 
 Float64 = NDArray[np.float64]
 
@@ -74,8 +72,7 @@ def read_surface(path: Path, samples: int, seed: int = 0) -> SurfaceFile:
 
 def _sequence_surface(recording: Recording, true_depth: Path) -> SurfaceFile:
     """What the frames of a sequence with a true trajectory saw."""
-    truth, truth_times = recording.truth, recording.truth_times
-    if truth is None or truth_times is None:
+    if recording.truth is None or recording.truth_times is None:
         raise InputError(f"sequence {recording.name} has no true trajectory to place its depth by")
     kind = "recorded depth"
     if true_depth.is_dir():
@@ -85,9 +82,8 @@ def _sequence_surface(recording: Recording, true_depth: Path) -> SurfaceFile:
             for entry in recording.entries
         )
         recording = dataclasses.replace(recording, entries=entries)
-    own, true = associate(recording.timestamps, truth_times, _MAX_DIFFERENCE_S)
-    if len(own) == 0:
+    sequence = recorded_sequence(recording)
+    if not sequence.known.any():
         raise InputError(f"sequence {recording.name}: no frame has a true pose")
-    picked = evenly_picked(len(own))
-    views = ((truth[true[k]], recording.frame(int(own[k])).depth) for k in picked)
-    return SurfaceFile(seen_surface(views, recording.intrinsics), kind)
+    placed = sequence.picked(np.flatnonzero(sequence.known))
+    return SurfaceFile(seen_surface(placed), kind)

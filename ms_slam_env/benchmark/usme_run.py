@@ -16,11 +16,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.benchmark.compare_run import WARM_UP, limit_threads, run_module
+from ms_slam_env.benchmark.compare_run import WARM_UP, run_module
 from ms_slam_env.errors import InputError
+from ms_slam_env.parallel import limit_threads
 
 if TYPE_CHECKING:
     from ms_slam_env.camera import RGBDFrame
+    from ms_slam_env.evaluation.run_sequence import SequenceRun
     from ms_slam_env.scenes import Scene
     from ms_slam_env.sequences import RenderedSequence
 
@@ -79,6 +81,7 @@ def run_here(spec: UsmeSpec) -> dict[str, Any]:
     """
     from ms_slam_env import metrics, scenes, slam
     from ms_slam_env.benchmark import usme_suite
+    from ms_slam_env.evaluation.run_sequence import run_sequence
 
     entry = usme_suite.find(spec.sequence)
     scene = scenes.make(entry.scene, spec.seed)
@@ -86,17 +89,16 @@ def run_here(spec: UsmeSpec) -> dict[str, Any]:
     options = {**usme_suite.slam_options(entry.scene, spec.backend), **spec.params}
     costs = metrics.CostMeter(str(options.get("device", "cpu")))
     system = slam.make(spec.backend, sequence.intrinsics, **options)
-    system.reset(sequence.poses[0])
-    estimates, flags, black, times = [], [], [], []
-    for frame in _frames(sequence, spec.folder):
-        with costs.frame():
-            result = system.track(frame)
-        estimates.append(result.T_world_camera)
-        flags.append(bool(result.tracking_ok))
-        black.append(not frame.color.any())
-        times.append(frame.timestamp)
-    poses, truth = np.stack(estimates), sequence.poses
-    tracked, seconds = np.array(flags), np.array(times)
+    black: list[bool] = []
+    run = run_sequence(
+        system,
+        _frames(sequence, spec.folder),
+        start=sequence.poses[0],
+        meter=costs,
+        on_step=lambda step: black.append(not step.frame.color.any()),
+    )
+    poses, truth = run.estimates, sequence.poses
+    tracked, seconds = run.tracking_ok, np.array(run.timestamps)
     ate = metrics.ate_statistics(poses, truth)
     start = metrics.initialisation(seconds, poses, truth, global_scale=1.0)
     end_error = float(np.linalg.norm(poses[-1, :3, 3] - truth[-1, :3, 3]))
@@ -111,8 +113,8 @@ def run_here(spec: UsmeSpec) -> dict[str, Any]:
         "drift": end_error / path,
         "rpe_m": metrics.rpe_rmse(poses, truth),
         "rpe_rad": metrics.rpe_rmse(poses, truth, kind="rotation"),
-        "ate_corrected_m": _corrected_ate(system, poses, truth),
-        "lost": 1.0 - float(tracked.mean()),
+        "ate_corrected_m": _corrected_ate(run, truth),
+        "lost": run.lost,
         "robustness": _robustness(poses, truth, tracked),
         "relocalisation_s": _relocalisation(seconds, np.array(black), tracked),
         "initialisation_s": start.time_s,
@@ -143,15 +145,11 @@ def _frames(sequence: RenderedSequence, folder: str | None) -> Iterator[RGBDFram
     yield from recording
 
 
-def _corrected_ate(system: Any, poses: Float64, truth: Float64) -> float | None:
+def _corrected_ate(run: SequenceRun, truth: Float64) -> float | None:
     from ms_slam_env import metrics
 
-    frames, corrected = system.corrected_trajectory()
-    if not len(frames):
-        return None
-    final = poses.copy()
-    final[np.asarray(frames)] = corrected
-    return metrics.ate_rmse(final, truth)
+    corrected = run.corrected()
+    return None if corrected is None else metrics.ate_rmse(corrected, truth)
 
 
 def _robustness(poses: Float64, truth: Float64, tracked: NDArray[np.bool_]) -> float | None:

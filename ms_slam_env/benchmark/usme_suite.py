@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.benchmark.options import parse_named
 from ms_slam_env.camera import xtion
+from ms_slam_env.config import parse_named
 from ms_slam_env.errors import unknown
 from ms_slam_env.scenes import LARGE_SCENES, Scene
 from ms_slam_env.sequences import (

@@ -14,13 +14,13 @@ from ms_slam_env.command_line import parse
 
 @dataclass(frozen=True)
 class Arguments:
-    """How hard recorded sequences are: divergence from frame to frame, as in the paper's Table I.
+    """How hard sequences are: divergence from frame to frame, as in the paper's Table I.
 
     Layouts are those of ms-slam run. Writes divergence.json, table.md and divergence.png.
     """
 
-    sequences: tyro.conf.Positional[tuple[Path, ...]]
-    """Folders of sequences."""
+    sequences: tyro.conf.Positional[tuple[str, ...]]
+    """Folders of recordings, or scene:seed[:noise[+perturbation ...]]."""
     image_size: str = "native"
     """Reduce the images to this size, such as 160x120."""
     layout: str = "auto"
@@ -41,14 +41,13 @@ def main(arguments: Sequence[str]) -> int:
     from ms_slam_env.errors import InputError
     from ms_slam_env.report.provenance import provenance
     from ms_slam_env.report.records import write_json
-    from ms_slam_env.sequences.recording import open_recording
+    from ms_slam_env.sequences import open_sequence
 
     if not args.sequences:
         raise InputError("no sequence given")
     config = DivergenceConfig.paper() if args.paper else DivergenceConfig()
-    recordings = [open_recording(path, args.layout) for path in args.sequences]
-    sized = [recording.at_size(args.image_size) for recording in recordings]
-    measured = [measure.sequence_divergence(recording, config, args.every) for recording in sized]
+    opened = [open_sequence(name, args.image_size, layout=args.layout) for name in args.sequences]
+    measured = [measure.sequence_divergence(one, config, args.every) for one in opened]
     settings = {"divergence": asdict(config), "image_size": args.image_size, "every": args.every}
     sequences = measure.content(measured)
     write_json(args.out / "divergence.json", {**provenance(), **settings, "sequences": sequences})

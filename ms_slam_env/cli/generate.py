@@ -78,8 +78,8 @@ def main(arguments: Sequence[str]) -> int:
     if args.planner is None and args.episode != EpisodeOptions():
         raise InputError("the options of an episode need --planner")
     from ms_slam_env import __version__, scenes
-    from ms_slam_env.benchmark.options import parse_named
     from ms_slam_env.camera import xtion
+    from ms_slam_env.config import parse_named
     from ms_slam_env.sensor.noise import noise_config
     from ms_slam_env.sequences import make_perturbation, read_trajectory, render_sequence
     from ms_slam_env.sequences.writing import write_sequence

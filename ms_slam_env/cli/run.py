@@ -21,15 +21,16 @@ _PRINTED = (
 
 @dataclass(frozen=True)
 class Arguments:
-    """Run a SLAM backend over a recorded RGB-D sequence.
+    """Run a SLAM backend over an RGB-D sequence.
 
     Layouts: TUM RGB-D, ICL-NUIM, 7-Scenes, or folders depth and rgb with an intrinsics.txt of
     "fx fy cx cy width height [depth_scale]". Writes trajectory.txt (TUM), map.ply, metrics.json
     and frames.csv (what each frame cost).
     """
 
-    sequence: tyro.conf.Positional[Path]
-    """Folder of the sequence."""
+    sequence: tyro.conf.Positional[str]
+    """Folder of a recording, or scene:seed[:noise[+perturbation ...]] such as
+    living_room:2000:kinect+misregistration."""
     config: Path | None = None
     """Configuration file (YAML): backend, parameters, image size, which frames and threads."""
     backend: str | None = None
@@ -57,11 +58,12 @@ class Arguments:
 def main(arguments: Sequence[str]) -> int:
     """Run, write, and print what was measured."""
     args = parse(Arguments, arguments, "ms-slam run")
-    from ms_slam_env.benchmark.compare_run import limit_threads
-    from ms_slam_env.benchmark.options import nested_options, parse_frame_management
-    from ms_slam_env.benchmark.sequence_run import run_sequence
-    from ms_slam_env.sequences.recording import open_recording, parse_calibration
-    from ms_slam_env.sequences.recording.recording import NATIVE
+    from ms_slam_env.benchmark.options import parse_frame_management
+    from ms_slam_env.benchmark.sequence_run import run_to_folder
+    from ms_slam_env.config import nested_options
+    from ms_slam_env.parallel import limit_threads
+    from ms_slam_env.sequences import open_sequence
+    from ms_slam_env.sequences.recording import parse_calibration
     from ms_slam_env.slam.configuration import SlamConfiguration, merged, read_configuration
 
     management = parse_frame_management(args.frame_management)
@@ -73,16 +75,22 @@ def main(arguments: Sequence[str]) -> int:
     given = None
     if args.intrinsics is not None:
         given = parse_calibration(args.intrinsics.replace(",", " ").split(), "--intrinsics")
-    recording = open_recording(args.sequence, args.layout, given, args.register)
-    recording = recording.at_size(args.image_size or slam.image_size or NATIVE)
-    recording = recording.every(slam.keep_every)
-    if recording.registration is not None:
-        print(recording.registration, file=sys.stderr)
+    sequence = open_sequence(
+        args.sequence,
+        args.image_size or slam.image_size,
+        every=slam.keep_every,
+        layout=args.layout,
+        intrinsics=given,
+        register=args.register,
+    )
+    registration = getattr(sequence.frames, "registration", None)
+    if registration is not None:
+        print(registration, file=sys.stderr)
     if slam.threads is not None:
         limit_threads(slam.threads)
     params = merged(slam.slam_config, nested_options(args.params))
     fed = {"keep_every": slam.keep_every, "threads": slam.threads}
-    result = run_sequence(recording, slam.slam, params, args.out, fed, management)
+    result = run_to_folder(sequence, slam.slam, params, args.out, fed, management)
     for name in _PRINTED:
         if result.get(name) is not None:
             print(f"{name:16} {result[name]:.4g}")

@@ -1,4 +1,8 @@
-"""RGB-D sequences: hand-held trajectories, rendering with perturbations, files.
+"""RGB-D sequences: recordings on disk, camera paths, rendering with perturbations, files.
+
+By name, as every command takes it: a folder, or scene:seed[:word[+word ...]] (``naming``)::
+
+    sequence = open_sequence("living_room:2000:kinect+misregistration", "320x240")
 
 Rendered, streamed and reproducible bit for bit::
 
@@ -18,7 +22,10 @@ MovingObjects, FastMotion, Illumination``, or
 """
 
 from ms_slam_env.sequences.association import associate
+from ms_slam_env.sequences.camera_path import CameraPath
 from ms_slam_env.sequences.handheld_path import HandheldPath
+from ms_slam_env.sequences.naming import check_sequence, open_sequence, parse_sequence
+from ms_slam_env.sequences.paced_paths import MotionSegments, UnevenPath, WanderingPath
 from ms_slam_env.sequences.perturbations import (
     PERTURBATIONS,
     AutoExposure,
@@ -48,6 +55,7 @@ __all__ = [
     "PERTURBATIONS",
     "AutoExposure",
     "BlackFrames",
+    "CameraPath",
     "DepthDropout",
     "DepthQuantisation",
     "ExposureJumps",
@@ -58,6 +66,7 @@ __all__ = [
     "Illumination",
     "Misregistration",
     "MotionBlur",
+    "MotionSegments",
     "MovingObjects",
     "Perturbation",
     "Placement",
@@ -66,9 +75,14 @@ __all__ = [
     "RollingShutter",
     "RoutePath",
     "Sequence",
+    "UnevenPath",
+    "WanderingPath",
     "associate",
+    "check_sequence",
     "handheld_trajectory",
     "make_perturbation",
+    "open_sequence",
+    "parse_sequence",
     "place_trajectory",
     "read_trajectory",
     "render_sequence",

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.config import check_range
+from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
 from ms_slam_env.scenes.base import Scene
+from ms_slam_env.sequences.camera_path import CameraPath
 from ms_slam_env.sequences.loops import closed_paths
 from ms_slam_env.sequences.path_shape import frame_times, hand_tremor, resample
 from ms_slam_env.sequences.trajectories import RADIUS_M, free_path
@@ -23,7 +24,7 @@ _PACE_PERIODS_S = (2.3, 5.1, 11.7)
 
 
 @dataclass(frozen=True)
-class HandheldPath:
+class HandheldPath(Checked, CameraPath):
     """How a camera is carried through a scene.
 
     At every instant it moves at the pace that whichever of the two speeds permits that is reached
@@ -45,29 +46,23 @@ class HandheldPath:
         InputError: a value out of range.
     """
 
-    frames: int = 300
-    rate_hz: float = 30.0
-    speed_m_s: float = 0.5
-    turn_deg_s: float = 30.0
-    variation: float = 0.3
-    max_step_m: float = 0.04
-    max_turn_deg: float = 2.0
+    frames: int = bounded(300, 2, 1_000_000)
+    rate_hz: float = bounded(30.0, 0.1, 10_000.0)
+    speed_m_s: float = bounded(0.5, 1e-3, 100.0)
+    turn_deg_s: float = bounded(30.0, 1e-2, 1e4)
+    variation: float = bounded(0.3, 0.0, 0.9)
+    max_step_m: float = bounded(0.04, 1e-4, 10.0)
+    max_turn_deg: float = bounded(2.0, 1e-3, 180.0)
     loop: bool = False
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        check_range(self, "frames", 2, 1_000_000)
-        check_range(self, "rate_hz", 0.1, 10_000.0)
-        check_range(self, "speed_m_s", 1e-3, 100.0)
-        check_range(self, "turn_deg_s", 1e-2, 1e4)
-        check_range(self, "variation", 0.0, 0.9)
-        check_range(self, "max_step_m", 1e-4, 10.0)
-        check_range(self, "max_turn_deg", 1e-3, 180.0)
 
     @property
     def timestamps(self) -> Float64:
         """(frames,) seconds."""
         return np.arange(self.frames) / self.rate_hz
+
+    def motion(self, scene: Scene, seed: int) -> tuple[Float64, Float64]:
+        """Times (N,) in seconds and poses T_world_camera (N, 4, 4)."""
+        return self.timestamps, self.poses(scene, seed)
 
     def poses(self, scene: Scene, seed: int) -> Float64:
         """T_world_camera (frames, 4, 4); the same scene and seed give the same path.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections.abc
+import copy
 from collections.abc import Iterable
 from typing import overload
 
@@ -86,6 +87,16 @@ class RenderedFrames(collections.abc.Sequence[RGBDFrame]):
             self._seed,
             self._metering,
         )
+
+    def picked(self, indices: NDArray[np.integer]) -> RenderedFrames:
+        """The frames of these numbers (M,) only, each as it was."""
+        some = copy.copy(self)
+        some.kept, some.timestamps = self.kept[indices], self.timestamps[indices]
+        some.poses = self.poses[indices]
+        some.object_trajectories = {
+            name: poses[indices] for name, poses in self.object_trajectories.items()
+        }
+        return some
 
     @property
     def labels(self) -> tuple[str, ...]:

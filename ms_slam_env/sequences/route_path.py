@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from ms_slam_env.config import check_range
+from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.geometry import look_at
 from ms_slam_env.scenes.base import Scene
+from ms_slam_env.sequences.camera_path import CameraPath
 from ms_slam_env.sequences.path_shape import frame_times, hand_tremor, resample, unit
 from ms_slam_env.sequences.trajectories import RADIUS_M
 
@@ -26,7 +27,7 @@ _ATTEMPTS = 20
 
 
 @dataclass(frozen=True)
-class RoutePath:
+class RoutePath(Checked, CameraPath):
     """A way along named places of a scene.
 
     At every instant the camera moves at the pace that whichever of the two speeds permits that is
@@ -50,27 +51,20 @@ class RoutePath:
     """
 
     via: tuple[str, ...]
-    rate_hz: float = 10.0
-    speed_m_s: float = 1.4
-    turn_deg_s: float = 25.0
-    variation: float = 0.2
-    height_m: float = 1.6
-    down_deg: float = 6.0
-    sway_deg: float = 8.0
-    stray_m: float = 0.25
+    rate_hz: float = bounded(10.0, 0.1, 10_000.0)
+    speed_m_s: float = bounded(1.4, 1e-3, 100.0)
+    turn_deg_s: float = bounded(25.0, 1e-2, 1e5)
+    variation: float = bounded(0.2, 0.0, 0.9)
+    height_m: float = bounded(1.6, 0.3, 3.0)
+    down_deg: float = bounded(6.0, -60.0, 60.0)
+    sway_deg: float = bounded(8.0, 0.0, 60.0)
+    stray_m: float = bounded(0.25, 0.0, 2.0)
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
+        super().__post_init__()
         if len(self.via) < 2:
             raise InputError(f"RoutePath.via = {self.via!r} must name at least two places")
-        check_range(self, "rate_hz", 0.1, 10_000.0)
-        check_range(self, "speed_m_s", 1e-3, 100.0)
-        check_range(self, "turn_deg_s", 1e-2, 1e5)
-        check_range(self, "variation", 0.0, 0.9)
-        check_range(self, "height_m", 0.3, 3.0)
-        check_range(self, "down_deg", -60.0, 60.0)
-        check_range(self, "sway_deg", 0.0, 60.0)
-        check_range(self, "stray_m", 0.0, 2.0)
 
     def with_frames_scaled(self, scale: float) -> RoutePath:
         """The same way in ``scale`` times as many frames, so that much slower."""

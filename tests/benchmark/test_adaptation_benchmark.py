@@ -10,14 +10,14 @@ import pytest
 
 from ms_slam_env import slam
 from ms_slam_env.benchmark import adaptation
-from ms_slam_env.benchmark.adaptation_inputs import Stretches
 from ms_slam_env.benchmark.adaptation_report import comparison, summarise, tables
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import relative_angle
+from ms_slam_env.sequences import MotionSegments, open_sequence
 from ms_slam_env.slam.adaptation import make_config
 from ms_slam_env.slam.configuration import read_configuration
 
-SHORT = Stretches(frames=24, quiet=12, violent=10, factor=8.0, rate_hz=30.0)
+SHORT = MotionSegments(frames=24, quiet=12, violent=10, factor=8.0, rate_hz=30.0)
 
 
 def test_the_same_path_is_travelled_faster_in_haste():
@@ -27,12 +27,12 @@ def test_the_same_path_is_travelled_faster_in_haste():
     assert pace.max() == pytest.approx(8.0, rel=0.2)
     assert not violent[:12].any()
     assert violent[15:19].all()
-    assert (Stretches(frames=50, violent=0).pace() == 1.0).all()
+    assert (MotionSegments(frames=50, violent=0).pace() == 1.0).all()
 
 
 def test_a_sequence_moves_at_its_pace_and_is_the_same_twice():
-    sequence = SHORT.render("table", 1000, "80x60")
-    again = SHORT.render("table", 1000, "80x60")  # the scene is kept, the frames are not
+    sequence = open_sequence("table:1000", "80x60", path=SHORT)
+    again = open_sequence("table:1000", "80x60", path=SHORT)
     np.testing.assert_array_equal(sequence.poses, again.poses)
     np.testing.assert_array_equal(sequence.frames[5].depth, again.frames[5].depth)
     np.testing.assert_allclose(np.diff(sequence.frames.timestamps), 1 / 30)
@@ -45,7 +45,7 @@ def test_a_sequence_moves_at_its_pace_and_is_the_same_twice():
 
 
 def test_judging_an_adaptive_run():
-    sequence = SHORT.render("table", 1000, "160x120")
+    sequence = open_sequence("table:1000", "160x120", path=SHORT)
     frames = list(sequence.frames)
     backend = make_config(
         "divergence",
@@ -103,7 +103,7 @@ def test_one_command_writes_table_figures_and_configurations(tmp_path, capsys):
         ("--image-size 1x1", "unknown image size"),
         ("--scenes mars", "unknown scene"),
         ("--thresholds 0.1", "thresholds"),
-        ("--stretches.factor 0", "Stretches.factor = 0.0 is outside"),
+        ("--stretches.factor 0", "MotionSegments.factor = 0.0 is outside"),
         ("--configurations a.yaml b.yaml", "a.yaml: cannot be read"),
     ],
 )

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from ms_slam_env.benchmark import compare_run
 from ms_slam_env.benchmark.compare import Comparison, run_comparison
-from ms_slam_env.benchmark.compare_inputs import SequenceName, load, parse_sequence, seen_surface
 from ms_slam_env.benchmark.compare_report import medians, summarise, tables
 from ms_slam_env.benchmark.compare_run import CompareSpec, run_apart
-from ms_slam_env.camera import xtion
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
-from ms_slam_env.sequences import HandheldPath
-from ms_slam_env.slam.surfel import SurfelConfig
 
 RESULT = dict.fromkeys(
     [
@@ -45,22 +39,13 @@ def row(sequence: str, backend: str, value: float | None, error: str | None = No
     return {"key": f"{sequence}{backend}{value}", "spec": spec, "result": result, "error": error}
 
 
-def test_names_of_sequences(tmp_path: Path) -> None:
-    assert parse_sequence("table:7") == SequenceName("table", 7, "kinect", ())
-    assert parse_sequence("table:7:none") == SequenceName("table", 7, "none", ())
-    assert parse_sequence("table:7:none+motion-blur+depth-dropout") == SequenceName(
-        "table", 7, "none", ("motion-blur", "depth-dropout")
-    )
-    assert parse_sequence(str(tmp_path)) == tmp_path
-
-
 @pytest.mark.parametrize(
     ("argument", "value", "message"),
     [
         ("sequences", ("table",), "neither a folder nor scene:seed"),
         ("sequences", ("table:x",), "neither a folder nor scene:seed"),
         ("sequences", ("table:1:fog",), "'fog'; valid choices: kinect"),
-        ("sequences", ("table:1:none+fog",), "'fog'; valid choices: rolling-shutter"),
+        ("sequences", ("table:1:none+fog",), "'fog'; valid choices: .*rolling-shutter"),
         ("sequences", ("attic:1",), "valid choices: living_room"),
         ("sequences", (), "Comparison.sequences is empty"),
         ("backends", ("lidar",), "valid choices: surfel"),
@@ -75,30 +60,6 @@ def test_bad_input_is_refused_before_anything_runs(
 ) -> None:
     with pytest.raises(InputError, match=message):
         Comparison(**{argument: value})  # type: ignore[arg-type]
-
-
-def test_a_folder_without_truth_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError):
-        load(str(tmp_path), "160x120", HandheldPath(10))
-
-
-def test_the_true_surface_reaches_as_far_as_slam_looks():
-    reach = inspect.signature(seen_surface).parameters["cutoff_m"].default
-    assert reach == SurfelConfig().depth_cutoff_m
-
-
-def test_seen_surface_of_a_plane() -> None:
-    intrinsics = xtion("80x60")
-    depth = np.full(intrinsics.shape, 2.0, dtype=np.float32)
-    depth[:, :10] = 5.0  # beyond the cutoff
-    depth[:10] = 0.0  # no reading
-    T = np.eye(4)
-    T[:3, 3] = (1.0, 2.0, 3.0)
-    points = seen_surface(iter([(T, depth)]), intrinsics)
-    np.testing.assert_allclose(points[:, 2], 5.0)
-    left = 1.0 + 2.0 * (10 - intrinsics.cx) / intrinsics.fx
-    top = 2.0 + 2.0 * (10 - intrinsics.cy) / intrinsics.fy
-    np.testing.assert_allclose(points.min(axis=0)[:2], [left, top], atol=1e-6)
 
 
 def test_a_run_in_a_process_of_its_own_and_its_table(tmp_path: Path) -> None:

@@ -17,12 +17,13 @@ from ms_slam_env.benchmark.frame_skipping import (
     run_sequence,
     suggest_targets,
 )
-from ms_slam_env.benchmark.options import parse_named, parse_options
+from ms_slam_env.benchmark.options import parse_options
 from ms_slam_env.benchmark.planners import (
     make_planner,
     planner_class,
     planner_names,
 )
+from ms_slam_env.config import parse_named
 from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.errors import InputError
 from ms_slam_env.report.statistics import Interval

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from ms_slam_env import slam
-from ms_slam_env.benchmark import compare_inputs, explore_evaluation, explore_samplers
+from ms_slam_env.benchmark import explore_evaluation, explore_samplers
 from ms_slam_env.benchmark.explore import Exploration, run_exploration
 from ms_slam_env.benchmark.explore_divergence import main as divergence_main
 from ms_slam_env.benchmark.explore_evaluation import SlamEvaluator, summarise
@@ -17,13 +17,13 @@ from ms_slam_env.benchmark.sequence_divergence import sequence_divergence
 from ms_slam_env.camera import xtion
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
+from ms_slam_env.evaluation.seen_surface import seen_surface
 from ms_slam_env.exploration import ExplorationSettings, make_space
 from ms_slam_env.geometry import look_at
 from ms_slam_env.metrics import ate_rmse
 from ms_slam_env.metrics.cost import energy_counters
 from ms_slam_env.metrics.reconstruction import voxel_thin
-from ms_slam_env.sequences import HandheldPath, render_sequence
-from ms_slam_env.sequences.recording import open_recording
+from ms_slam_env.sequences import open_sequence, render_sequence
 from ms_slam_env.sequences.writing import write_sequence
 from ms_slam_env.slam.configuration import SlamConfiguration, read_configuration
 
@@ -57,16 +57,16 @@ def evaluator(sequences):
 def test_measures_what_a_run_by_hand_gives(evaluator, sequences):
     configuration = SlamConfiguration(slam_config={"icp_rgb_weight": 0.2}, keep_every=2)
     row = evaluator(configuration)
-    recording = open_recording(sequences[0])
-    frames = list(recording)[::2]
-    system = slam.make("surfel", recording.intrinsics, icp_rgb_weight=0.2)
-    system.reset(recording.truth[0])
+    sequence = open_sequence(sequences[0])
+    frames = list(sequence.frames)[::2]
+    system = slam.make("surfel", sequence.intrinsics, icp_rgb_weight=0.2)
+    system.reset(sequence.poses[0])
     poses = np.stack([system.track(frame).T_world_camera for frame in frames])
-    assert row["ate_m"] == pytest.approx(ate_rmse(poses, recording.truth[::2]), rel=1e-9)
-    divergences = sequence_divergence(recording, every=2).divergences
+    assert row["ate_m"] == pytest.approx(ate_rmse(poses, sequence.poses[::2]), rel=1e-9)
+    divergences = sequence_divergence(sequence, every=2).divergences
     assert (row["M_I"], row["M_D"]) == tuple(pytest.approx(m) for m in divergences.max(axis=0))
     assert row["load_ms"] == pytest.approx(row["ext_ms"] / 2)
-    surface = compare_inputs.load(sequences[0], "80x60", HandheldPath(90)).surface
+    surface = seen_surface(sequence)
     distances, _ = cKDTree(surface).query(voxel_thin(system.surface_points(), 0.01))
     assert row["map_error_mm"] == pytest.approx(1e3 * np.median(distances))
     assert row["mem_mb"] is None or row["mem_mb"] > 0

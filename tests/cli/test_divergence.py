@@ -14,8 +14,7 @@ from ms_slam_env.cli import main
 from ms_slam_env.divergence import DivergenceConfig, depth_divergence, intensity_divergence
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at
-from ms_slam_env.sequences import render_sequence
-from ms_slam_env.sequences.recording import open_recording
+from ms_slam_env.sequences import open_sequence, render_sequence
 
 FRAMES = 5
 
@@ -55,11 +54,11 @@ def test_values_are_those_of_the_functions(folder, capsys, tmp_path):
     assert main(["divergence", str(folder), "--paper", "--out", str(out)]) == 0
     assert "| box | intensity |" in capsys.readouterr().out
     content = json.loads((out / "divergence.json").read_text())["sequences"][0]
-    recording = open_recording(folder)
-    read = list(recording)
+    sequence = open_sequence(folder)
+    read = list(sequence.frames)
     pairs = list(zip(read[1:], read, strict=False))
     intensity = [intensity_divergence(a, b) for a, b in pairs]
-    depth = [depth_divergence(a, b, recording.intrinsics) for a, b in pairs]
+    depth = [depth_divergence(a, b, sequence.intrinsics) for a, b in pairs]
     np.testing.assert_allclose(content["intensity"], intensity, rtol=1e-5)
     np.testing.assert_allclose(content["depth"], depth, rtol=1e-5)
     numbers = content["statistics"]["intensity"]
@@ -73,15 +72,15 @@ def test_values_are_those_of_the_functions(folder, capsys, tmp_path):
 
 def test_without_colour_there_is_no_intensity_divergence(frames, tmp_path):
     bare = write_folder(tmp_path / "bare", frames, xtion("80x60"), with_color=False)
-    found = sequence_divergence(open_recording(bare), DivergenceConfig.paper())
+    found = sequence_divergence(open_sequence(bare), DivergenceConfig.paper())
     assert np.isnan(found.divergences[:, 0]).all()
     assert found.statistics()["intensity"]["max"] is None
     assert found.statistics()["depth"]["max"] > 0
 
 
 def test_fewer_frames_diverge_more(folder):
-    recording = open_recording(folder)
-    one, two = (sequence_divergence(recording, every=n) for n in (1, 2))
+    sequence = open_sequence(folder)
+    one, two = (sequence_divergence(sequence, every=n) for n in (1, 2))
     assert len(two.times) == 2
     assert two.divergences[:, 0].mean() > one.divergences[:, 0].mean()
 
@@ -99,4 +98,4 @@ def test_bad_input(folder, capsys):
     assert main(["divergence", str(folder), "--every", "9"]) == 2
     assert "a divergence needs two" in capsys.readouterr().err
     with pytest.raises(InputError, match="every must be"):
-        sequence_divergence(open_recording(folder), every=0)
+        sequence_divergence(open_sequence(folder), every=0)

@@ -199,7 +199,7 @@ def test_manages_frames(sequence, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["run", "nowhere"], "no sequence at nowhere: not a folder"),
+        (["run", "nowhere"], "sequence 'nowhere' is neither a folder nor scene:seed"),
         (["run", "SEQUENCE", "--backend", "orb"], "unknown SLAM backend 'orb'; valid choices: su"),
         (["run", "SEQUENCE", "--params", "speed"], "option 'speed' is not name=value"),
         (["run", "SEQUENCE", "--params", "speed=1"], "'slam_config.speed'; valid choices"),

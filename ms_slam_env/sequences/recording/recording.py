@@ -5,10 +5,10 @@ from __future__ import annotations
 import dataclasses
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +55,7 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class Recording:
+class Recording(Sequence[RGBDFrame]):
     """Frames in order of time; each is decoded when it is asked for.
 
     Attributes:
@@ -133,6 +133,22 @@ class Recording:
     def every(self, n: int) -> Recording:
         """Return the same recording with every ``n``-th frame, the first among them."""
         return dataclasses.replace(self, entries=self.entries[::n])
+
+    def picked(self, indices: NDArray[np.integer]) -> Recording:
+        """Return the same recording with the frames of these numbers (M,) only, increasing."""
+        return dataclasses.replace(self, entries=tuple(self.entries[int(k)] for k in indices))
+
+    @overload
+    def __getitem__(self, index: int) -> RGBDFrame: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> tuple[RGBDFrame, ...]: ...
+
+    def __getitem__(self, index: int | slice) -> RGBDFrame | tuple[RGBDFrame, ...]:
+        """Decode a frame, or several; see `frame`."""
+        if isinstance(index, slice):
+            return tuple(self.frame(number) for number in range(len(self))[index])
+        return self.frame(index)
 
     def frame(self, index: int) -> RGBDFrame:
         """Decode frame ``index``: depth in metres, 0 = no reading; colour black if there is none.

@@ -1,0 +1,1 @@
+"""Run a sequence through SLAM, and judge what came of it."""

@@ -1,0 +1,225 @@
+"""The loop over a sequence: every frame through SLAM, and a record of what it said and cost.
+
+All at once, with what a comparison needs::
+
+    sequence = open_sequence("living_room:2000", with_truth=True)
+    meter = CostMeter()                                  # before the SLAM, whose memory it counts
+    run = run_sequence(slam.make("surfel", sequence.intrinsics), sequence, meter=meter)
+    ate_rmse(run.estimates, run.true_poses), run.lost, run.cpu_ms, run.backend.surface_points()
+
+Frame by frame, to look in between, to stop early, to feed the SLAM in another way::
+
+    run = SequenceRun(backend, sequence)
+    for step in run:                                     # step.index, step.frame, step.result
+        if step.result.tracking_ok: break                # what was recorded so far stays in run
+
+After a kidnapping, from the pose and with the map that the SLAM has::
+
+    run_sequence(backend, frames, reset=False)
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Iterator, Sized
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from tqdm import tqdm
+
+from ms_slam_env.camera import RGBDFrame
+from ms_slam_env.metrics.cost import CostMeter
+from ms_slam_env.metrics.cost.meter import FrameCost
+from ms_slam_env.sequences.sequence import Sequence
+from ms_slam_env.slam.base import SlamBackend, TrackResult
+
+Float64 = NDArray[np.float64]
+
+Track = Callable[[RGBDFrame], TrackResult]
+
+
+@dataclass(frozen=True)
+class Step:
+    """One frame that SLAM has tracked.
+
+    Attributes:
+        index: of the frame in the run.
+        frame: as it was shown.
+        result: what SLAM said.
+    """
+
+    index: int
+    frame: RGBDFrame
+    result: TrackResult
+
+
+class SequenceRun:
+    """A run of a SLAM over a sequence, and its record; iterate over it to let it go on.
+
+    The record holds the frames tracked so far, also after a ``break`` or an error in the middle;
+    iterating again goes on behind the last of them. Frames are not kept.
+
+    Args:
+        backend: the SLAM, behind its frame selection or adaptation if it has one.
+        frames: a sequence, whose true poses are recorded too, or N frames without.
+        start: (4, 4) T_world_camera of the first frame; by default its true pose where that is
+            known, else the identity.
+        reset: False goes on from where the SLAM is, with its map and without ``start``.
+        meter: measures each frame, made before the SLAM; without one time alone is measured.
+        track: called in the place of ``backend.track``.
+        progress: shown at a progress bar with whether SLAM is tracking; no bar if empty.
+
+    Attributes:
+        backend: the SLAM.
+        results: N results.
+        timestamps: N seconds.
+        costs: N costs of tracking one frame; memory and energy NaN without a meter.
+    """
+
+    def __init__(
+        self,
+        backend: SlamBackend,
+        frames: Sequence | Iterable[RGBDFrame],
+        *,
+        start: ArrayLike | None = None,
+        reset: bool = True,
+        meter: CostMeter | None = None,
+        track: Track | None = None,
+        progress: str = "",
+    ) -> None:
+        self.backend = backend
+        self.results: list[TrackResult] = []
+        self.timestamps: list[float] = []
+        self.meter = meter
+        self._track = track or backend.track
+        self._stopwatch = _Stopwatch()
+        self._true_poses: Float64 | None = None
+        self._total: int | None = len(frames) if isinstance(frames, Sized) else None
+        self._progress = progress
+        if isinstance(frames, Sequence):
+            self._true_poses = frames.poses
+            start = frames.start if start is None else start
+            frames = frames.frames
+        self._frames = iter(frames)
+        if reset:
+            backend.reset(start)
+
+    def __iter__(self) -> Iterator[Step]:
+        """Track frame after frame."""
+        clock = self.meter or self._stopwatch
+        with tqdm(
+            desc=self._progress,
+            total=self._total,
+            initial=len(self.results),
+            unit="frame",
+            disable=not self._progress,
+        ) as bar:
+            for frame in self._frames:
+                with clock.frame():
+                    result = self._track(frame)
+                self.results.append(result)
+                self.timestamps.append(frame.timestamp)
+                yield Step(len(self.results) - 1, frame, result)
+                bar.set_postfix_str("tracking" if result.tracking_ok else "LOST", refresh=False)
+                bar.update()
+
+    def __len__(self) -> int:
+        """Number of frames tracked so far."""
+        return len(self.results)
+
+    @property
+    def costs(self) -> list[FrameCost]:
+        """Cost of each frame."""
+        return (self.meter or self._stopwatch).frames
+
+    @property
+    def estimates(self) -> Float64:
+        """(N, 4, 4) estimated T_world_camera, each as it was given with its frame."""
+        return np.array([r.T_world_camera for r in self.results]).reshape(-1, 4, 4)
+
+    @property
+    def true_poses(self) -> Float64:
+        """(N, 4, 4) true T_world_camera; NaN where it is not known."""
+        if self._true_poses is None:
+            return np.full((len(self), 4, 4), np.nan)
+        return self._true_poses[: len(self)]
+
+    @property
+    def tracking_ok(self) -> NDArray[np.bool_]:
+        """(N,) whether SLAM was tracking."""
+        return np.array([result.tracking_ok for result in self.results], dtype=bool)
+
+    @property
+    def processed(self) -> NDArray[np.bool_]:
+        """(N,) whether SLAM has seen the frame; False where frame selection dropped it."""
+        return np.array([result.processed for result in self.results], dtype=bool)
+
+    @property
+    def lost_frames(self) -> int:
+        """Number of frames without tracking."""
+        return int(len(self) - self.tracking_ok.sum())
+
+    @property
+    def lost(self) -> float:
+        """Share of the frames without tracking."""
+        return 1.0 - float(np.mean(self.tracking_ok))
+
+    @property
+    def cpu_ms(self) -> Float64:
+        """(N,) milliseconds of processor time, of all threads, in which a frame was tracked."""
+        return 1e3 * np.array([cost.cpu_s for cost in self.costs])
+
+    @property
+    def wall_ms(self) -> Float64:
+        """(N,) milliseconds by the clock in which a frame was tracked."""
+        return 1e3 * np.array([cost.ext_s for cost in self.costs])
+
+    def corrected(self) -> Float64 | None:
+        """(N, 4, 4) T_world_camera as the map has them now; None if the SLAM corrects none."""
+        frames, poses = self.backend.corrected_trajectory()
+        if not len(frames):
+            return None
+        final = self.estimates
+        final[np.asarray(frames)] = poses
+        return final
+
+
+def run_sequence(
+    backend: SlamBackend,
+    frames: Sequence | Iterable[RGBDFrame],
+    *,
+    start: ArrayLike | None = None,
+    reset: bool = True,
+    meter: CostMeter | None = None,
+    track: Track | None = None,
+    progress: str = "",
+    on_step: Callable[[Step], None] = lambda step: None,
+) -> SequenceRun:
+    """Track every frame; arguments as those of `SequenceRun`.
+
+    ``on_step`` is called after each frame.
+    """
+    run = SequenceRun(
+        backend, frames, start=start, reset=reset, meter=meter, track=track, progress=progress
+    )
+    for step in run:
+        on_step(step)
+    return run
+
+
+class _Stopwatch:
+    """Measures time alone, without the processes' memory and energy that a `CostMeter` reads."""
+
+    def __init__(self) -> None:
+        self.frames: list[FrameCost] = []
+
+    @contextmanager
+    def frame(self) -> Iterator[None]:
+        """Measure the enclosed work as one frame."""
+        clock, processor = time.perf_counter(), time.process_time()
+        yield
+        cpu_s, ext_s = time.process_time() - processor, time.perf_counter() - clock
+        self.frames.append(FrameCost(ext_s, cpu_s, math.nan, {}))

@@ -1,0 +1,47 @@
+"""The true surface that the frames of a sequence saw: what maps are judged against."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.metrics.reconstruction import voxel_thin
+from ms_slam_env.sequences import Sequence
+
+Float64 = NDArray[np.float64]
+
+SURFACE_SPACING_M = 0.01
+CUTOFF_M = 4.0
+"""Readings beyond do not count as seen: the farthest that SLAM itself looks by default."""
+
+_MOST_VIEWS = 60  # neighbours see the same
+
+
+def seen_surface(sequence: Sequence, cutoff_m: float = CUTOFF_M) -> Float64:
+    """Points (M, 3), `SURFACE_SPACING_M` apart, of what at most 60 frames saw up to ``cutoff_m``.
+
+    The depth is the noise-free one of a rendered sequence and the recorded one else, placed by the
+    true poses, which must be known.
+
+    Raises:
+        InputError: no reading at all.
+    """
+    picked = np.unique(np.linspace(0, len(sequence) - 1, _MOST_VIEWS).astype(np.int64))
+    clouds = [
+        back_projected(
+            sequence.true_depth(int(k)), sequence.poses[k], sequence.intrinsics, cutoff_m
+        )
+        for k in picked
+    ]
+    return voxel_thin(np.concatenate(clouds), SURFACE_SPACING_M)
+
+
+def back_projected(
+    depth: NDArray[np.float32], T_world_camera: Float64, intrinsics: Intrinsics, cutoff_m: float
+) -> Float64:
+    """Points (M, 3) in the world of the readings up to ``cutoff_m`` of depth (H, W) in metres."""
+    valid = (depth > 0) & (depth <= cutoff_m)
+    return (intrinsics.rays()[valid] * depth[valid, None]) @ T_world_camera[
+        :3, :3
+    ].T + T_world_camera[:3, 3]

@@ -1,0 +1,188 @@
+"""One way to name a sequence, for all commands: the folder of a recording, or a generated one.
+
+``scene:seed[:word[+word ...]]``: a scene (a name or a mesh file), the seed of scene, path, noise
+and perturbations, then in any order the noise of the sensor, the path of the camera and what
+perturbs the frames, each with options if it has any::
+
+    living_room:2000
+    living_room:2000:none
+    living_room:2000:kinect+misregistration+motion-blur,exposure_s=0.02
+    small_house.glb:7:uneven,frames=120+depth-dropout
+
+What is left out is Kinect noise, the path that the command has for its sequences, and nothing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ms_slam_env import scenes
+from ms_slam_env.camera import Intrinsics, xtion
+from ms_slam_env.config import from_dict, parse_named
+from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.scenes.registry import check_name
+from ms_slam_env.sensor import NOISE_MODELS
+from ms_slam_env.sequences.camera_path import CameraPath
+from ms_slam_env.sequences.handheld_path import HandheldPath
+from ms_slam_env.sequences.paced_paths import MotionSegments, UnevenPath, WanderingPath
+from ms_slam_env.sequences.perturbations import PERTURBATIONS, Perturbation, make_perturbation
+from ms_slam_env.sequences.recording import Calibration, open_recording
+from ms_slam_env.sequences.recording.recording import NATIVE
+from ms_slam_env.sequences.recording.registration import Registration
+from ms_slam_env.sequences.sequence import Sequence, recorded_sequence, render_sequence
+
+PATHS: dict[str, type[CameraPath]] = {
+    "handheld": HandheldPath,
+    "steady": HandheldPath,
+    "uneven": UnevenPath,
+    "segments": MotionSegments,
+    "wander": WanderingPath,
+}
+"""Word to path of the camera; ``steady`` is the older word for ``handheld``."""
+
+RENDERED_SIZE = "160x120"
+"""Image size of a rendered sequence where none is asked for."""
+
+_GRAMMAR = (
+    "is neither a folder nor scene:seed[:noise[+perturbation ...]], such as table:2000, "
+    "table:2000:none or table:2000:kinect+rolling-shutter"
+)
+
+
+@dataclass(frozen=True)
+class SequenceName:
+    """A rendered sequence, as it was named.
+
+    Attributes:
+        scene: its name, or a mesh file.
+        seed: of scene, path, noise and perturbations.
+        noise: of the sensor.
+        perturbations: applied in this order.
+        path: word of the camera's path; None leaves it to the command.
+        path_options: options of that path.
+    """
+
+    scene: str
+    seed: int
+    noise: str = "kinect"
+    perturbations: tuple[Perturbation, ...] = ()
+    path: str | None = None
+    path_options: Mapping[str, Any] = field(default_factory=dict)
+
+    def camera_path(self, default: CameraPath) -> CameraPath:
+        """The path: ``default`` where none is named; as many frames as that where none are said."""
+        if self.path is None:
+            return default
+        frames = getattr(default, "frames", None)
+        given = {} if frames is None else {"frames": frames}
+        return from_dict(PATHS[self.path], given | dict(self.path_options), self.path)
+
+
+def parse_sequence(text: str | Path) -> SequenceName | Path:
+    """What ``text`` names: a folder, or a rendered sequence.
+
+    Raises:
+        InputError: neither; an unknown word (the message lists what may stand there), or a bad
+            option. Scenes are checked where they are made, or by `check_sequence`.
+    """
+    if Path(text).is_dir():
+        return Path(text)
+    scene, *rest = str(text).split(":")
+    if not 1 <= len(rest) <= 2 or not rest[0].isdigit():
+        raise InputError(f"sequence {str(text)!r} {_GRAMMAR}")
+    named = SequenceName(scene, int(rest[0]))
+    for word in rest[1].split("+") if len(rest) == 2 else ():
+        named = _with_word(named, word, str(text))
+    return named
+
+
+def _with_word(named: SequenceName, word: str, text: str) -> SequenceName:
+    """``named`` with one word more; a noise model stands before the perturbations or nowhere."""
+    name, options = parse_named(word, f"part of sequence {text!r}")
+    if name in NOISE_MODELS and not options and not named.perturbations:
+        return dataclasses.replace(named, noise=name)
+    if name in PATHS and named.path is None:
+        made = dataclasses.replace(named, path=name, path_options=options)
+        made.camera_path(HandheldPath())  # refuses bad options here
+        return made
+    if name not in PERTURBATIONS:
+        free = () if named.path else PATHS
+        raise unknown(f"part of sequence {text!r}", name, (*NOISE_MODELS, *PERTURBATIONS, *free))
+    made_perturbations = (*named.perturbations, make_perturbation(name, options))
+    return dataclasses.replace(named, perturbations=made_perturbations)
+
+
+def check_sequence(text: str | Path) -> None:
+    """Refuse, before any work is done, what `open_sequence` with ``with_truth`` would refuse.
+
+    Raises:
+        InputError: as `parse_sequence`; an unknown scene, no recording, or one without truth.
+    """
+    named = parse_sequence(text)
+    if isinstance(named, SequenceName):
+        check_name(named.scene)
+    else:
+        recorded_sequence(open_recording(named)).where_known()
+
+
+def open_sequence(
+    name: str | Path,
+    image_size: str | None = None,
+    *,
+    path: CameraPath | None = None,
+    every: int = 1,
+    with_truth: bool = False,
+    layout: str = "auto",
+    intrinsics: Intrinsics | Calibration | None = None,
+    register: bool | Registration | None = None,
+) -> Sequence:
+    """The sequence that ``name`` names; frames are decoded or rendered when they are asked for.
+
+    Args:
+        name: a folder, or ``scene:seed[:word[+word ...]]`` as this module describes.
+        image_size: such as 160x120; ``native`` or None: that of the images on disk, of rendered
+            ones `RENDERED_SIZE`.
+        path: of the camera of rendered sequences whose names do not say it; hand-held by default.
+        every: take every n-th frame.
+        with_truth: leave out frames whose true pose is not known, and refuse a recording that has
+            no two others. Otherwise their ``poses`` are NaN.
+        layout: of the folder, as `open_recording` takes it; so are the next two.
+        intrinsics: of the images on disk.
+        register: whether colour is brought into the depth camera.
+
+    Raises:
+        InputError: a sequence that cannot be made or read; ``every`` below 1.
+    """
+    if every < 1:
+        raise InputError(f"every = {every} must be at least 1")
+    named = parse_sequence(name)
+    if isinstance(named, SequenceName):
+        size = RENDERED_SIZE if image_size in (None, NATIVE) else image_size
+        sequence = _rendered(named, size, path or HandheldPath())
+    else:
+        recording = open_recording(named, layout, intrinsics, register)
+        sequence = recorded_sequence(recording.at_size(image_size or NATIVE))
+    if with_truth:
+        sequence = sequence.where_known()
+    return sequence if every == 1 else sequence.picked(np.arange(0, len(sequence), every))
+
+
+def _rendered(named: SequenceName, image_size: str, default: CameraPath) -> Sequence:
+    intrinsics = xtion(image_size)
+    scene = scenes.make(named.scene, named.seed)
+    times, poses = named.camera_path(default).motion(scene, named.seed)
+    return render_sequence(
+        scene,
+        poses,
+        intrinsics,
+        named.noise,
+        named.seed,
+        perturbations=named.perturbations,
+        timestamps=times,
+    )

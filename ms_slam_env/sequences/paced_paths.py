@@ -1,0 +1,145 @@
+"""Hand-held cameras whose pace changes on the way: calm and in haste, still and in a hurry."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.config import Checked, bounded
+from ms_slam_env.scenes.base import Scene
+from ms_slam_env.sequences.camera_path import CameraPath
+from ms_slam_env.sequences.handheld_path import HandheldPath
+from ms_slam_env.sequences.path_shape import hand_tremor, resample
+from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
+from ms_slam_env.sequences.trajectories import free_path, handheld_trajectory
+
+Float64 = NDArray[np.float64]
+
+PACES = (0.1, 1.0, 4.0)
+"""Of an `UnevenPath`: nearly still, walking, in a hurry; multiples of its mean pace."""
+
+_RATE_HZ = 30.0
+_SEGMENT_S = (0.8, 2.0)  # shortest and longest time at one pace
+_EASING_S = 0.25  # in which one pace gives way to the next
+_RAMP = 6  # frames over which the pace of motion segments changes
+
+
+@dataclass(frozen=True)
+class UnevenPath(Checked, CameraPath):
+    """A camera carried at 0.5 m/s or 30 deg/s, now and then ten times slower or four times faster.
+
+    Attributes:
+        frames: number of poses, 30 a second.
+        speed_m_s: of the middle pace where it does not turn.
+        turn_deg_s: of the middle pace where it turns.
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    frames: int = bounded(300, 30, 100_000)
+    speed_m_s: float = bounded(0.5, 1e-3, 100.0)
+    turn_deg_s: float = bounded(30.0, 1e-2, 1e4)
+
+    def paces(self, seed: int) -> Float64:
+        """Pace (frames,) at each frame: segments of 0.8 to 2 s, every pace once a round."""
+        rng = np.random.default_rng([seed, 79])
+        rates: list[float] = []
+        while len(rates) < self.frames:
+            for pace in rng.permutation(PACES):
+                rates += [pace] * int(_RATE_HZ * rng.uniform(*_SEGMENT_S))
+        width = int(_EASING_S * _RATE_HZ)
+        padded = np.concatenate([[rates[0]] * width, rates])
+        return np.convolve(padded, np.ones(width) / width, "valid")[: self.frames]
+
+    def poses(self, scene: Scene, seed: int) -> Float64:
+        """T_world_camera (frames, 4, 4); the same scene and seed give the same path.
+
+        Raises:
+            InputError: no free path.
+        """
+        progress = np.concatenate([[0.0], np.cumsum(self.paces(seed)[1:])])
+        rng = np.random.default_rng([seed, 80])
+        tremor = hand_tremor(self.frames, rng)
+        step_m, rot_rad = self.speed_m_s / _RATE_HZ, np.radians(self.turn_deg_s) / _RATE_HZ
+        path, times = free_path(scene, float(progress[-1]), rng, step_m, rot_rad)
+        return resample(path, times, progress, tremor)
+
+    def motion(self, scene: Scene, seed: int) -> tuple[Float64, Float64]:
+        """Times (N,) in seconds and poses T_world_camera (N, 4, 4)."""
+        return np.arange(self.frames) / _RATE_HZ, self.poses(scene, seed)
+
+
+@dataclass(frozen=True)
+class MotionSegments(Checked, CameraPath):
+    """A hand-held path, carried calmly and, now and then, in haste.
+
+    Attributes:
+        frames: length of the sequence.
+        rate_hz: of the frames.
+        speed_m_s: mean speed of the calm camera where it does not turn.
+        turn_deg_s: mean speed of its rotation where it turns.
+        quiet: frames of a calm segment; the sequence begins with one.
+        violent: frames of a hasty segment after it.
+        factor: how many times faster the same path is travelled in haste.
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    frames: int = bounded(240, 4, 100_000)
+    rate_hz: float = bounded(15.0, 0.1, 1000)
+    speed_m_s: float = bounded(0.1, 1e-3, 100)
+    turn_deg_s: float = bounded(7.5, 1e-2, 1e4)
+    quiet: int = bounded(75, 1, 100_000)
+    violent: int = bounded(30, 0, 100_000)
+    factor: float = bounded(20.0, 1, 1000)
+
+    def pace(self) -> Float64:
+        """(frames,) times faster than calm, with smooth changes."""
+        place = np.arange(self.frames) % (self.quiet + self.violent)
+        into = np.minimum(place - self.quiet + 1, self.quiet + self.violent - place) / _RAMP
+        share = 0.5 * (1.0 - np.cos(np.pi * np.clip(into, 0.0, 1.0)))
+        return 1.0 + (self.factor - 1.0) * share
+
+    def is_violent(self) -> NDArray[np.bool_]:
+        """(frames,) whether the pace is nearer to that of haste."""
+        return self.pace() > 0.5 * (1.0 + self.factor)
+
+    def motion(self, scene: Scene, seed: int) -> tuple[Float64, Float64]:
+        """Times (N,) in seconds and poses T_world_camera (N, 4, 4)."""
+        progress = np.concatenate([[0.0], np.cumsum(self.pace()[1:])])  # in calm frames
+        calm = HandheldPath(
+            frames=math.ceil(progress[-1]) + 2,
+            rate_hz=self.rate_hz,
+            speed_m_s=self.speed_m_s,
+            turn_deg_s=self.turn_deg_s,
+        )
+        path = PoseInterpolation(*calm.motion(scene, seed))
+        return np.arange(self.frames) / self.rate_hz, path(progress / self.rate_hz)
+
+
+@dataclass(frozen=True)
+class WanderingPath(Checked, CameraPath):
+    """A hand-held camera that is always as fast as two limits permit: ``handheld_trajectory``.
+
+    Attributes:
+        frames: number of poses, 30 a second.
+        step_m: largest translation from frame to frame, without the tremor.
+        step_deg: largest rotation from frame to frame, without the tremor.
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    frames: int = bounded(300, 2, 1_000_000)
+    step_m: float = bounded(0.015, 1e-4, 10.0)
+    step_deg: float = bounded(1.0, 1e-3, 180.0)
+
+    def motion(self, scene: Scene, seed: int) -> tuple[Float64, Float64]:
+        """Times (N,) in seconds and poses T_world_camera (N, 4, 4)."""
+        poses = handheld_trajectory(scene, self.frames, seed, self.step_m, self.step_deg)
+        return np.arange(self.frames) / _RATE_HZ, poses
