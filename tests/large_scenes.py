@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cache
 
 from ms_slam_env import scenes
-from ms_slam_env.scenes.large_scene import LargeScene
+from ms_slam_env.scenes.mesh_scene import LargeScene
 
 SEED = 1000
 

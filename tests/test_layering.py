@@ -35,14 +35,6 @@ ONLY_INSIDE_FUNCTIONS = {
 }
 STILL_IN_A_CIRCLE = {
     *(f"ms_slam_env.env.{name}" for name in ("active_slam", "rendering", "third_person_view")),
-    *(
-        f"ms_slam_env.scenes.{name}"
-        for name in (
-            *("city_street", "corridor", "factory_hall", "large_scene", "living_room", "mesh_file"),
-            *("mesh_scene", "outdoors.light", "outdoors.sky", "registry", "residential_street"),
-            *("tabletop", "tabletop_carpet", "tabletop_table", "tabletop_wall", "tabletop_window"),
-        )
-    ),
     *("ms_slam_env.slam", "ms_slam_env.slam.configuration"),
     "ms_slam_env.slam.adaptation",
     *(f"ms_slam_env.slam.adaptation.{n}" for n in ("agent", "config", "divergence", "none")),

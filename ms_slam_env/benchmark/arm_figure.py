@@ -25,7 +25,7 @@ from ms_slam_env.env.config import EnvConfig
 from ms_slam_env.errors import InputError, UnreachableError
 from ms_slam_env.geometry import invert, look_at, transform_points
 from ms_slam_env.robot.arm import ArmConfig
-from ms_slam_env.robot.arm.kinematic_arm import KinematicArm
+from ms_slam_env.robot.arm.arm import KinematicArm
 from ms_slam_env.robot.arm.shape import arm_parts, column_parts
 from ms_slam_env.scenes import Scene
 from ms_slam_env.sensor import RGBDSensor

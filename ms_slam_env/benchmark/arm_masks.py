@@ -36,9 +36,9 @@ from ms_slam_env.geometry import invert, relative_angle
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import write_json
 from ms_slam_env.robot.arm import ArmConfig
+from ms_slam_env.robot.arm.base_placement import COLUMN_RADIUS_M
 from ms_slam_env.robot.arm.dynamic_arm import DynamicArm
-from ms_slam_env.robot.arm.placement import COLUMN_RADIUS_M
-from ms_slam_env.robot.arm.reach import REASONS
+from ms_slam_env.robot.arm.feasibility import REASONS
 from ms_slam_env.scenes import SCENES, Scene
 from ms_slam_env.timings import Timings
 

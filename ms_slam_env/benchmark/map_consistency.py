@@ -18,7 +18,7 @@ from ms_slam_env.metrics.consistency import (
 )
 from ms_slam_env.metrics.reconstruction import voxel_firsts
 from ms_slam_env.metrics.sightings import LabelledView, count_votes, distinct_placements
-from ms_slam_env.scenes.sampling import sample_surface
+from ms_slam_env.scenes.mesh_queries import sample_surface
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sensor.scene_cache import get_scene
 

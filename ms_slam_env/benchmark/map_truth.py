@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.scenes.base import Scene
-from ms_slam_env.scenes.rays import RayCaster
+from ms_slam_env.scenes.mesh_queries import RayCaster
 from ms_slam_env.sensor.scene_cache import get_scene
 
 Float64 = NDArray[np.float64]

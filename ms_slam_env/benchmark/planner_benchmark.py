@@ -23,8 +23,8 @@ from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import Row, write_json
 from ms_slam_env.scenes import SCENES, SEED_SPLITS
+from ms_slam_env.scenes.mesh_file import load_soup
 from ms_slam_env.scenes.registry import check_name
-from ms_slam_env.scenes.triangle_soup import load_soup
 
 DEFAULT_PLANNERS = ("random", "stationary", "greedy", "max-information")
 DEFAULT_SCENES = ("living_room", "corridor", "table", "wall")

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.divergence.base import Divergence
 from ms_slam_env.divergence.config import MEASURES, DivergenceConfig
 from ms_slam_env.divergence.counting import Histograms
-from ms_slam_env.divergence.earth_movers import EarthMoversDivergence
-from ms_slam_env.divergence.kl import KLDivergence
+from ms_slam_env.divergence.measures import (
+    Divergence,
+    EarthMoversDivergence,
+    KLDivergence,
+    WindowedKLDivergence,
+)
 from ms_slam_env.divergence.pairwise import depth_divergence, intensity_divergence, ms_parameters
-from ms_slam_env.divergence.windowed_kl import WindowedKLDivergence
 
 _VARIANTS: dict[str, type[Divergence]] = {
     "kl": KLDivergence,

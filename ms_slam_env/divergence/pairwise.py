@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.divergence.config import DivergenceConfig
 from ms_slam_env.divergence.counting import HistogramCounter, grouping_matrix, normalise
-from ms_slam_env.divergence.kl import kl_divergence
+from ms_slam_env.divergence.measures import kl_divergence
 from ms_slam_env.errors import InputError
 
 _PAPER = DivergenceConfig.paper()

@@ -16,8 +16,8 @@ from ms_slam_env.robot import (
     FreeCamera,
 )
 from ms_slam_env.robot.arm import ArmConfig, load_arm
+from ms_slam_env.robot.arm.arm import KinematicArm
 from ms_slam_env.robot.arm.dynamic_arm import DynamicArm
-from ms_slam_env.robot.arm.kinematic_arm import KinematicArm
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.timings import Timings
 

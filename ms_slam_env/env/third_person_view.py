@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.env.point_renderer import project, render_points
 from ms_slam_env.geometry import look_at, transform_points
-from ms_slam_env.robot.arm.arm_base import ArmEmbodiment
+from ms_slam_env.robot.arm.arm import ArmEmbodiment
 from ms_slam_env.robot.arm.shape import arm_parts, column_parts, surface_dots
-from ms_slam_env.robot.free_room import floor_height
+from ms_slam_env.scenes.base import floor_height
 
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv

@@ -16,8 +16,7 @@ from ms_slam_env.robot.action_primitives import (
     decompose,
 )
 from ms_slam_env.robot.base import Embodiment, MotionResult
-from ms_slam_env.robot.free_room import outside, words
-from ms_slam_env.scenes.base import Scene
+from ms_slam_env.scenes.base import Scene, outside, words
 
 Float64 = NDArray[np.float64]
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from ms_slam_env.scenes.builder import MeshBuilder
-from ms_slam_env.scenes.large_scene import LargeScene
-from ms_slam_env.scenes.outdoors import facades, planting, street_furniture
-from ms_slam_env.scenes.outdoors.light import daylight_scene
+from ms_slam_env.scenes.mesh_scene import LargeScene
+from ms_slam_env.scenes.outdoors import houses, street_furniture
+from ms_slam_env.scenes.outdoors.daylight import daylight_scene
 from ms_slam_env.scenes.outdoors.plan import KERB_M, Plot, StreetPlan
-from ms_slam_env.scenes.textures import masonry, street
+from ms_slam_env.scenes.textures import interior, outdoor
 
 _CELL_M = 0.55
 _PLACES = (("SW", "S", "SE"), ("NW", "N", "NE"))
@@ -32,13 +32,13 @@ def city_street(seed: int) -> LargeScene:
         margin_m=7.5,
     )
     build = MeshBuilder(_CELL_M)
-    road = build.material(street.asphalt(rng), (6.4, 6.4))
-    pavement = build.material(street.paving(rng, 6), (3.0, 3.0))
-    kerb = build.material(masonry.plaster(rng, (150, 148, 142), 4.0, 256), (0.9, 0.9))
-    yard = build.material(street.paving(rng, 4, 256), (4.0, 4.0))
+    road = build.material(outdoor.asphalt(rng), (6.4, 6.4))
+    pavement = build.material(outdoor.paving(rng, 6), (3.0, 3.0))
+    kerb = build.material(interior.plaster(rng, (150, 148, 142), 4.0, 256), (0.9, 0.9))
+    yard = build.material(outdoor.paving(rng, 4, 256), (4.0, 4.0))
     plan.ground(build, road, pavement, kerb, yard)
     _markings(build, plan)
-    of = facades.town_finishes(build, rng)
+    of = houses.town_finishes(build, rng)
     for k, plot in enumerate(plan.blocks()):
         _block(build, rng, of, plot, k)
     for k, plot in enumerate(plan.surroundings()):
@@ -50,11 +50,11 @@ def city_street(seed: int) -> LargeScene:
         for row, names in enumerate(_PLACES)
         for column, name in enumerate(names)
     }
-    return daylight_scene("city_street", seed, build, rng, plan, places, _WAYS)
+    return daylight_scene(city_street, seed, build, rng, plan, places, _WAYS)
 
 
 def _block(
-    build: MeshBuilder, rng: np.random.Generator, of: facades.TownFinishes, plot: Plot, index: int
+    build: MeshBuilder, rng: np.random.Generator, of: houses.TownFinishes, plot: Plot, index: int
 ) -> None:
     """Terraces back to back along the two long sides, end houses along the short ones."""
     w, d = plot.width_m, plot.depth_m
@@ -74,7 +74,7 @@ def _block(
 def _terrace(
     build: MeshBuilder,
     rng: np.random.Generator,
-    of: facades.TownFinishes,
+    of: houses.TownFinishes,
     length: float,
     depth: float,
     name: str,
@@ -87,7 +87,7 @@ def _terrace(
         with build.frame((edges[k], rng.choice([0.0, 0.0, 0.3]), 0.0)):
             wide = edges[k + 1] - edges[k]
             storeys = int(rng.integers(2, 5))
-            facades.town_house(build, rng, of, wide, depth, storeys, f"{name} house {k}")
+            houses.town_house(build, rng, of, wide, depth, storeys, f"{name} house {k}")
 
 
 def _markings(build: MeshBuilder, plan: StreetPlan) -> None:
@@ -118,8 +118,8 @@ def _markings(build: MeshBuilder, plan: StreetPlan) -> None:
 
 def _kerbside(build: MeshBuilder, rng: np.random.Generator, plan: StreetPlan) -> None:
     """Parked cars on one side of each street; lamps, trees, signs, benches, bins on pavements."""
-    bark = build.material(street.bark(rng), (0.5, 0.5))
-    leaves = planting.foliage(build, rng)
+    bark = build.material(outdoor.bark(rng), (0.5, 0.5))
+    leaves = street_furniture.foliage(build, rng)
     p = plan.pavement_m
     for k, (middle, yaw, length) in enumerate(plan.kerbsides()):
         with build.frame(middle, yaw):
@@ -134,7 +134,7 @@ def _kerbside(build: MeshBuilder, rng: np.random.Generator, plan: StreetPlan) ->
             for n, at in enumerate((-0.2, 0.22)):
                 with build.frame((at * length, -p + 0.5, 0.0), rng.uniform(0, 6)):
                     high = rng.uniform(4.2, 5.6)
-                    planting.tree(build, rng, bark, leaves, high, f"street tree {k}.{n}")
+                    street_furniture.tree(build, rng, bark, leaves, high, f"street tree {k}.{n}")
             with build.frame((rng.uniform(-0.12, -0.05) * length, -p + 0.45, 0.0)):
                 street_furniture.bin_(build, rng, f"bin {k}")
             with build.frame((rng.uniform(0.06, 0.14) * length, -p + 0.6, 0.0), np.pi):

@@ -6,12 +6,11 @@ import numpy as np
 
 from ms_slam_env.scenes.base import Float64
 from ms_slam_env.scenes.builder import Material, MeshBuilder
-from ms_slam_env.scenes.finishes import floor_material, wall_colour
-from ms_slam_env.scenes.furniture import decor, seating, storage, tableware
+from ms_slam_env.scenes.furniture import decor, pieces, small_things
 from ms_slam_env.scenes.lighting import Light, Lighting, Panel, auto_exposure, light_mesh
 from ms_slam_env.scenes.mesh_scene import MeshScene, free_space_around
-from ms_slam_env.scenes.room import Room
-from ms_slam_env.scenes.textures import masonry
+from ms_slam_env.scenes.room import Room, floor_material, wall_colour
+from ms_slam_env.scenes.textures import interior
 from ms_slam_env.scenes.textures.noise import hsv
 
 _KEY = 0.18
@@ -25,11 +24,13 @@ def corridor(seed: int) -> MeshScene:
     room = Room((rng.uniform(8.0, 10.0), rng.uniform(1.75, 2.0), rng.uniform(2.4, 2.6)))
     build = MeshBuilder()
     colour = wall_colour(rng)
-    paint = build.material(masonry.plaster(rng, colour), (2.0, 2.0))
-    lower = build.material(masonry.plaster(rng, 0.72 * colour, 1.3), (1.5, 1.5))
-    ceiling = build.material(masonry.plaster(rng, (236, 235, 230), 0.7), (2.0, 2.0))
+    paint = build.material(interior.plaster(rng, colour), (2.0, 2.0))
+    lower = build.material(interior.plaster(rng, 0.72 * colour, 1.3), (1.5, 1.5))
+    ceiling = build.material(interior.plaster(rng, (236, 235, 230), 0.7), (2.0, 2.0))
     if rng.random() < 0.5:
-        floor = build.material(masonry.tiles(rng, hsv(0.1, 0.1, rng.uniform(0.5, 0.8))), (1.6, 1.6))
+        floor = build.material(
+            interior.tiles(rng, hsv(0.1, 0.1, rng.uniform(0.5, 0.8))), (1.6, 1.6)
+        )
     else:
         floor = floor_material(build, rng)
     trim = build.plain((226, 222, 212))
@@ -53,7 +54,7 @@ def corridor(seed: int) -> MeshScene:
         side = d if draw.random() < 0.5 else 0.0
         return eye, np.array([np.clip(eye[0] + ahead, 0.1, w - 0.1), side, draw.uniform(0.7, 1.4)])
 
-    return MeshScene("corridor", seed, mesh, free_space_around(mesh, line), start, exposure)
+    return MeshScene(corridor, seed, mesh, free_space_around(mesh, line), start, exposure)
 
 
 def _walls(
@@ -109,11 +110,11 @@ def _console(
     """Chest of drawers, or a chair, against the wall."""
     with room.at_wall(build, wall, along, gap=0.02):
         if rng.random() < 0.6:
-            storage.drawers(build, rng, 0.7, 0.8, f"chest of drawers {k}")
+            pieces.drawers(build, rng, 0.7, 0.8, f"chest of drawers {k}")
             with build.frame((rng.uniform(-0.2, 0.2), -0.22, 0.8)):
-                tableware.vase(build, rng, 0.3, f"vase {k}")
+                small_things.vase(build, rng, 0.3, f"vase {k}")
         else:
-            seating.chair(build, rng, f"chair {k}")
+            pieces.chair(build, rng, f"chair {k}")
 
 
 def _lamps(build: MeshBuilder, rng: np.random.Generator, room: Room) -> list[Light]:

@@ -7,8 +7,8 @@ import numpy as np
 from ms_slam_env.scenes.base import Float64
 from ms_slam_env.scenes.builder import MeshBuilder
 from ms_slam_env.scenes.furniture import decor, industrial
-from ms_slam_env.scenes.large_scene import LargeScene
 from ms_slam_env.scenes.lighting import Light, Lighting, Panel, auto_exposure, light_mesh
+from ms_slam_env.scenes.mesh_scene import LargeScene
 from ms_slam_env.scenes.room import Room
 from ms_slam_env.scenes.textures import industrial as finish
 from ms_slam_env.scenes.textures.noise import hsv
@@ -72,7 +72,7 @@ def factory_hall(seed: int) -> LargeScene:
         target[2] = draw.uniform(0.6, 1.8)
         return eye, target
 
-    return LargeScene("factory_hall", seed, mesh, start, exposure, places, eyes, lid_m=6.5)
+    return LargeScene(factory_hall, seed, mesh, start, exposure, places, eyes, lid_m=6.5)
 
 
 def _places(room: Room, x0: float, y0: float, length: float, width: float) -> dict[str, Float64]:

@@ -15,7 +15,7 @@ from scipy.stats import qmc
 
 from ms_slam_env.scenes.base import Float32, Float64, TexturedMesh
 from ms_slam_env.scenes.builder import Geometry
-from ms_slam_env.scenes.rays import RayCaster
+from ms_slam_env.scenes.mesh_queries import RayCaster
 
 _FAR_M = 100.0
 _SHADOW_END = 0.999  # a shadow ray stops just before the light, which may be a surface itself

@@ -6,12 +6,11 @@ import numpy as np
 
 from ms_slam_env.scenes.base import Float64
 from ms_slam_env.scenes.builder import MeshBuilder
-from ms_slam_env.scenes.finishes import floor_material, wall_colour, wall_material
-from ms_slam_env.scenes.furniture import decor, electronics, seating, storage, tables, tableware
+from ms_slam_env.scenes.furniture import decor, pieces, small_things
 from ms_slam_env.scenes.lighting import Lamp, Lighting, Panel, Sun, auto_exposure, light_mesh
 from ms_slam_env.scenes.mesh_scene import MeshScene, free_space_around
-from ms_slam_env.scenes.room import PANE, Room, Window
-from ms_slam_env.scenes.textures import masonry, wood
+from ms_slam_env.scenes.room import PANE, Room, Window, floor_material, wall_colour, wall_material
+from ms_slam_env.scenes.textures import interior
 
 _KEY = 0.18
 
@@ -29,7 +28,7 @@ def living_room(seed: int) -> MeshScene:
     window_wall = 4 - shelf_wall
     window = Window(rng.uniform(-0.4, 0.4), 0.85, rng.uniform(1.4, 1.9), 1.35)
     walls = (special, plain, plain, plain)
-    ceiling = build.material(masonry.plaster(rng, (238, 236, 230), 0.7), (2.0, 2.0))
+    ceiling = build.material(interior.plaster(rng, (238, 236, 230), 0.7), (2.0, 2.0))
     skirting = build.plain((232, 228, 218))
     room.shell(build, floor_material(build, rng), walls, ceiling, {window_wall: window}, skirting)
     _seating_side(build, rng, room)
@@ -46,22 +45,22 @@ def _seating_side(build: MeshBuilder, rng: np.random.Generator, room: Room) -> N
     width = rng.uniform(1.8, 2.3)
     along = rng.uniform(-0.3, 0.3)
     with room.at_wall(build, 0, along, gap=0.06):
-        seating.sofa(build, rng, width, 3 if width > 2.0 else 2)
+        pieces.sofa(build, rng, width, 3 if width > 2.0 else 2)
         with build.frame((0, -1.55, 0)):
             decor.rug(build, rng, rng.uniform(2.0, 2.6), rng.uniform(1.4, 1.7))
         table_w, table_d, table_h = rng.uniform(0.9, 1.2), rng.uniform(0.5, 0.65), 0.42
-        board = build.material(wood.board(rng), (0.9, 0.9))
+        board = build.material(interior.board(rng), (0.9, 0.9))
         with build.frame((rng.uniform(-0.1, 0.1), -1.3, 0.012)):
-            tables.table(build, table_w, table_d, table_h, board, "coffee table")
+            pieces.table(build, table_w, table_d, table_h, board, "coffee table")
             radii = [0.17, 0.15, 0.055, 0.055, 0.15]
             half = table_w / 2
-            spots = tables.place(rng, (-half, -table_d), (half, 0), radii)
+            spots = pieces.place(rng, (-half, -table_d), (half, 0), radii)
             things = (
-                lambda: tableware.lying_book(build, rng, "magazine", 0.012),
-                lambda: tableware.bowl(build, rng, "bowl"),
-                lambda: tableware.cup(build, rng, "cup 0"),
-                lambda: tableware.cup(build, rng, "cup 1"),
-                lambda: tableware.lying_book(build, rng, "book", 0.03),
+                lambda: small_things.lying_book(build, rng, "magazine", 0.012),
+                lambda: small_things.bowl(build, rng, "bowl"),
+                lambda: small_things.cup(build, rng, "cup 0"),
+                lambda: small_things.cup(build, rng, "cup 1"),
+                lambda: small_things.lying_book(build, rng, "book", 0.03),
             )
             for spot, thing in zip(spots, things, strict=True):
                 if spot is not None:
@@ -82,9 +81,9 @@ def _television_side(build: MeshBuilder, rng: np.random.Generator, room: Room) -
     side = 1 if rng.random() < 0.5 else -1
     along = 0.35 * side
     with room.at_wall(build, 2, along, gap=0.02):
-        top = storage.tv_stand(build, rng, rng.uniform(1.3, 1.6))
+        top = pieces.tv_stand(build, rng, rng.uniform(1.3, 1.6))
         with build.frame((0, 0, top)):
-            electronics.television(build, rng, rng.uniform(0.95, 1.2))
+            small_things.television(build, rng, rng.uniform(0.95, 1.2))
     with room.at_wall(build, 2, along, z=1.75):
         decor.picture_frame(build, rng, rng.uniform(0.6, 0.9), 0.4, "picture above TV")
     half = room.length(2) / 2
@@ -105,15 +104,15 @@ def _shelf_side(build: MeshBuilder, rng: np.random.Generator, room: Room, wall: 
     count = int(rng.integers(1, 3))
     for k in range(count):
         with room.at_wall(build, wall, side * (0.95 - 0.96 * k), gap=0.01):
-            storage.bookshelf(build, rng, 0.95, rng.uniform(1.75, 2.1), 5, f"bookshelf {k}")
+            pieces.bookshelf(build, rng, 0.95, rng.uniform(1.75, 2.1), 5, f"bookshelf {k}")
     along = -side * (1.0 if count == 2 else 0.45)
     height = rng.uniform(0.75, 0.9)
     with room.at_wall(build, wall, along, gap=0.01):
-        storage.drawers(build, rng, 0.8, height, "chest of drawers")
+        pieces.drawers(build, rng, 0.8, height, "chest of drawers")
         with build.frame((-0.22, -0.2, height)):
-            tableware.vase(build, rng, 0.28, "vase")
+            small_things.vase(build, rng, 0.28, "vase")
         with build.frame((0.2, -0.22, height)):
-            tableware.lying_book(build, rng, "book on drawers", 0.04)
+            small_things.lying_book(build, rng, "book on drawers", 0.04)
     with room.at_wall(build, wall, along, z=1.55):
         decor.picture_frame(build, rng, 0.55, 0.7, "picture over drawers")
 
@@ -135,7 +134,7 @@ def _window_side(
     with room.at_wall(build, wall, along, z=window.sill, gap=-0.02):
         decor.plant(build, rng, 0.38, "sill plant")
     with room.at_wall(build, wall, rng.uniform(-0.5, 0.2), gap=0.45):
-        seating.sofa(build, rng, 0.85, 1, "armchair")
+        pieces.sofa(build, rng, 0.85, 1, "armchair")
 
 
 def _lit(
@@ -190,7 +189,7 @@ def _lit(
         return eye, target
 
     return MeshScene(
-        "living_room",
+        living_room,
         seed,
         mesh,
         free_space_around(mesh, centre + np.array([0.0, 0.0, 0.3])),

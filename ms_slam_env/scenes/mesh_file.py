@@ -2,21 +2,201 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.scenes.base import Float64
 from ms_slam_env.scenes.builder import Geometry
-from ms_slam_env.scenes.enclosure import Enclosed
-from ms_slam_env.scenes.free_space import VOXEL_M, FreeSpace
+from ms_slam_env.scenes.free_space import VOXEL_M, Enclosed, FreeSpace
 from ms_slam_env.scenes.lighting import Lamp, Lighting, auto_exposure, light_mesh
+from ms_slam_env.scenes.mesh_queries import RayCaster, sample_surface
 from ms_slam_env.scenes.mesh_scene import MeshScene
-from ms_slam_env.scenes.rays import RayCaster
-from ms_slam_env.scenes.sampling import sample_surface
-from ms_slam_env.scenes.triangle_soup import Soup, load_soup, split_long_edges
+
+_GREY = np.array([190, 190, 190], np.uint8)
+_MAX_TRIANGLES = 900_000
+_MAX_TEXTURE = 1024  # larger images are shrunk to this side
+_BLOCK = 4  # texels a side for a triangle with a colour at each corner
+
+
+@dataclass(frozen=True)
+class Soup:
+    """Triangles that share no vertices.
+
+    Attributes:
+        corners: (F, 3, 3) metres.
+        uv: (F, 3, 2) u along columns, v along rows from the top.
+        texture: (F,) index into ``textures``.
+        label: (F,) index into ``labels``.
+        textures: (h, w, 3) uint8 sRGB images.
+        labels: names of the file's parts.
+    """
+
+    corners: Float64
+    uv: Float64
+    texture: NDArray[np.int64]
+    label: NDArray[np.int64]
+    textures: tuple[NDArray[np.uint8], ...]
+    labels: tuple[str, ...]
+
+
+def load_soup(path: Path) -> Soup:
+    """Read a mesh file.
+
+    Raises:
+        InputError: no such file, not readable as a mesh, or without a triangle.
+    """
+    if not path.is_file():
+        raise InputError(f"mesh file {str(path)!r} does not exist")
+    try:
+        parts = trimesh.load_scene(path).dump()
+    except Exception as error:  # the loaders of the many formats raise anything
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"mesh file {str(path)!r} cannot be read: {reason}") from error
+    corners, uvs, texture, label = [], [], [], []
+    images: list[NDArray[np.uint8]] = []
+    labels: list[str] = []
+    for k, part in enumerate(parts):
+        if not isinstance(part, trimesh.Trimesh) or len(part.faces) == 0:
+            continue
+        triangles = np.asarray(part.vertices, dtype=np.float64)[part.faces]
+        area = np.linalg.norm(
+            np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1
+        )
+        keep = np.isfinite(triangles).all((1, 2)) & (area > 1e-12)
+        uv, image = _appearance(part)
+        corners.append(triangles[keep])
+        uvs.append(uv[keep])
+        texture.append(np.full(keep.sum(), len(images)))
+        label.append(np.full(keep.sum(), len(labels)))
+        images.append(image)
+        labels.append(str(part.metadata.get("name") or f"part {k}"))
+    if sum(len(c) for c in corners) == 0:
+        raise InputError(f"mesh file {str(path)!r} has no triangles")
+    return Soup(
+        np.concatenate(corners),
+        np.concatenate(uvs),
+        np.concatenate(texture),
+        np.concatenate(label),
+        tuple(images),
+        tuple(labels),
+    )
+
+
+def split_long_edges(soup: Soup, max_edge_m: float) -> Soup:
+    """Bisect the longest edge of triangles until all are at most ``max_edge_m`` long."""
+    data = np.concatenate([soup.corners, soup.uv], 2)  # (F, 3, 5)
+    index = np.arange(len(data))
+    while len(data) < _MAX_TRIANGLES:
+        edge = np.linalg.norm(data[:, [1, 2, 0], :3] - data[:, :, :3], axis=2)  # edge k: k to k+1
+        longest = edge.argmax(1)
+        split = edge.max(1) > max_edge_m
+        if not split.any():
+            break
+        order = (longest[split, None] + np.arange(3)) % 3
+        a, b, c = np.moveaxis(np.take_along_axis(data[split], order[..., None], 1), 1, 0)
+        middle = 0.5 * (a + b)
+        halves = np.stack([np.stack([a, middle, c], 1), np.stack([middle, b, c], 1)])
+        data = np.concatenate([data[~split], *halves])
+        index = np.concatenate([index[~split], index[split], index[split]])
+    return Soup(
+        data[..., :3],
+        data[..., 3:],
+        soup.texture[index],
+        soup.label[index],
+        soup.textures,
+        soup.labels,
+    )
+
+
+def _appearance(part: trimesh.Trimesh) -> tuple[Float64, NDArray[np.uint8]]:
+    """Texture coordinates (F, 3, 2) and image of one part."""
+    visual = part.visual
+    count = len(part.faces)
+    if isinstance(visual, trimesh.visual.TextureVisuals):
+        image, factor = _material(visual.material)
+        if visual.uv is None or image is None:
+            return np.full((count, 3, 2), 0.5), _plain(factor)
+        uv = np.asarray(visual.uv, dtype=np.float64)[part.faces][..., :2]
+        uv = np.nan_to_num(uv)
+        uv[..., 1] = 1.0 - uv[..., 1]  # the loader has v pointing up
+        return uv, _tinted(image, factor)
+    if visual is None or not visual.defined:
+        return np.full((count, 3, 2), 0.5), _plain(_GREY)
+    if visual.kind == "face":
+        colours = np.repeat(np.asarray(visual.face_colors)[:, None, :3], 3, 1)
+    else:
+        colours = np.asarray(visual.vertex_colors)[part.faces][..., :3]
+    if (colours == colours[0, 0]).all():
+        return np.full((count, 3, 2), 0.5), _plain(colours[0, 0])
+    return _colour_atlas(colours.astype(np.float32))
+
+
+def _material(material: Any) -> tuple[NDArray[np.uint8] | None, Float64]:
+    """Image (h, w, 3) or None, and sRGB colour (3,) in [0, 255], of a file's material.
+
+    The image is multiplied by the colour. glTF gives it in linear light and multiplies there,
+    nearly the same as multiplying the sRGB values, for the curve is close to a power.
+    """
+    if isinstance(material, trimesh.visual.material.PBRMaterial):
+        image, factor = material.baseColorTexture, material.baseColorFactor
+        if factor is not None:
+            linear = np.asarray(factor, dtype=np.float64)[:3] / 255.0
+            factor = 255.0 * np.where(
+                linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055
+            )
+    else:
+        image = getattr(material, "image", None)
+        factor = None if image is not None else getattr(material, "main_color", None)
+    if factor is None:
+        factor = _GREY if image is None else np.full(3, 255)
+    pixels = None if image is None else np.asarray(image.convert("RGB"))
+    return pixels, np.asarray(factor, dtype=np.float64)[:3]
+
+
+def _tinted(image: NDArray[np.uint8], factor: Float64) -> NDArray[np.uint8]:
+    """Image of bounded size, multiplied by a colour (3,) in [0, 255]."""
+    shrink = _MAX_TEXTURE / max(image.shape[:2])
+    result: Any = image
+    if shrink < 1.0:
+        result = cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    if (factor < 255.0).any():
+        result = np.rint(result * (factor / 255.0)).astype(np.uint8)
+    return result
+
+
+def _colour_atlas(colours: NDArray[np.float32]) -> tuple[Float64, NDArray[np.uint8]]:
+    """Give each triangle a small block of texels that interpolates its corners' colours.
+
+    Args:
+        colours: (F, 3, 3) at the corners, in [0, 255].
+    """
+    count = len(colours)
+    side = int(np.ceil(np.sqrt(count)))
+    step = np.arange(_BLOCK, dtype=np.float32) / (_BLOCK - 1)
+    j, i = np.meshgrid(step, step, indexing="ij")
+    weight = np.stack([1 - i - j, i, j], -1)  # corner 0 top left, 1 right, 2 below
+    texels = np.clip(np.einsum("yxk,fkc->fyxc", weight, colours), 0, 255)
+    atlas = np.zeros((side * side, _BLOCK, _BLOCK, 3), np.uint8)
+    atlas[:count] = np.rint(texels)
+    image = atlas.reshape(side, side, _BLOCK, _BLOCK, 3).swapaxes(1, 2)
+    image = image.reshape(side * _BLOCK, side * _BLOCK, 3)
+    block = np.stack([np.arange(count) % side, np.arange(count) // side], -1)  # column, row
+    corner = np.array([[0.5, 0.5], [_BLOCK - 0.5, 0.5], [0.5, _BLOCK - 0.5]])
+    uv = (block[:, None] * _BLOCK + corner) / (side * _BLOCK)
+    return uv, np.ascontiguousarray(image)
+
+
+def _plain(rgb: Any) -> NDArray[np.uint8]:
+    return np.broadcast_to(np.asarray(rgb, dtype=np.float64), (4, 4, 3)).astype(np.uint8).copy()
+
 
 _MAX_EDGE_M = 0.3
 _LAMPS = 10
@@ -61,7 +241,8 @@ def from_file(path: Path, seed: int = 0) -> MeshScene:
         angle, drop = draw.uniform(-np.pi, np.pi), draw.uniform(0.0, 0.4)
         return eye, eye + np.array([np.cos(angle), np.sin(angle), -drop])
 
-    return MeshScene(str(path), seed, mesh, free, start, exposure)
+    maker = partial(from_file, path)
+    return MeshScene(maker, seed, mesh, free, start, exposure, name=str(path))
 
 
 def _turn_to_free_space(soup: Soup, free: FreeSpace) -> Soup:

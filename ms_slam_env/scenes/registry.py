@@ -14,10 +14,7 @@ from ms_slam_env.scenes.factory_hall import factory_hall
 from ms_slam_env.scenes.living_room import living_room
 from ms_slam_env.scenes.mesh_file import from_file
 from ms_slam_env.scenes.residential_street import residential_street
-from ms_slam_env.scenes.tabletop_carpet import carpet
-from ms_slam_env.scenes.tabletop_table import table
-from ms_slam_env.scenes.tabletop_wall import wall
-from ms_slam_env.scenes.tabletop_window import window
+from ms_slam_env.scenes.tabletops import carpet, table, wall, window
 
 _ROOMS = {
     "living_room": living_room,

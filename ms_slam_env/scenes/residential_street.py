@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ms_slam_env.scenes.builder import Material, MeshBuilder
-from ms_slam_env.scenes.large_scene import LargeScene
-from ms_slam_env.scenes.outdoors import houses, planting, street_furniture
-from ms_slam_env.scenes.outdoors.light import daylight_scene
+from ms_slam_env.scenes.mesh_scene import LargeScene
+from ms_slam_env.scenes.outdoors import houses, street_furniture
+from ms_slam_env.scenes.outdoors.daylight import daylight_scene
 from ms_slam_env.scenes.outdoors.plan import KERB_M, Plot, StreetPlan
-from ms_slam_env.scenes.textures import masonry, street
+from ms_slam_env.scenes.textures import interior, outdoor
 
 _CELL_M = 0.45
 _PLACES = (("SW", "S", "SE"), ("W", "C", "E"), ("NW", "N", "NE"))
@@ -47,9 +47,9 @@ def residential_street(seed: int) -> LargeScene:
     _ground(build, rng, plan)
     of = _Kinds(
         houses.finishes(build, rng),
-        tuple(planting.foliage(build, rng) for _ in range(3)),
-        tuple(planting.fence_boards(build, rng) for _ in range(4)),
-        build.material(street.bark(rng), (0.5, 0.5)),
+        tuple(street_furniture.foliage(build, rng) for _ in range(3)),
+        tuple(street_furniture.fence_boards(build, rng) for _ in range(4)),
+        build.material(outdoor.bark(rng), (0.5, 0.5)),
     )
     for k, plot in enumerate(plan.blocks()):
         _block(build, rng, plot, k, of)
@@ -61,7 +61,7 @@ def residential_street(seed: int) -> LargeScene:
         for row, names in enumerate(_PLACES)
         for column, name in enumerate(names)
     }
-    return daylight_scene("residential_street", seed, build, rng, plan, places, _ways())
+    return daylight_scene(residential_street, seed, build, rng, plan, places, _ways())
 
 
 def _ways() -> tuple[tuple[str, str], ...]:
@@ -71,10 +71,10 @@ def _ways() -> tuple[tuple[str, str], ...]:
 
 
 def _ground(build: MeshBuilder, rng: np.random.Generator, plan: StreetPlan) -> None:
-    road = build.material(street.asphalt(rng), (6.4, 6.4))
-    pavement = build.material(street.paving(rng), (2.2, 2.2))
-    kerb = build.material(masonry.plaster(rng, (168, 164, 156), 4.0, 256), (0.9, 0.9))
-    lawn = build.material(street.grass(rng), (3.0, 3.0))
+    road = build.material(outdoor.asphalt(rng), (6.4, 6.4))
+    pavement = build.material(outdoor.paving(rng), (2.2, 2.2))
+    kerb = build.material(interior.plaster(rng, (168, 164, 156), 4.0, 256), (0.9, 0.9))
+    lawn = build.material(outdoor.grass(rng), (3.0, 3.0))
     plan.ground(build, road, pavement, kerb, lawn)
 
 
@@ -113,7 +113,7 @@ def _block(
                 with build.frame((cx, cy, 0.0), rng.uniform(0, 6)):
                     tree_height = rng.uniform(3.6, 5.2)
                     kind = of.leaves[int(rng.integers(3))]
-                    planting.tree(
+                    street_furniture.tree(
                         build, rng, of.bark, kind, tree_height, f"garden tree {index}.{k}"
                     )
 
@@ -130,15 +130,17 @@ def _garden_edge(
         with build.frame((low, 0.12, 0.0)):
             if kind < 0.42:
                 leaf = of.leaves[int(rng.integers(3))]
-                planting.hedge(build, leaf, high - low, rng.uniform(0.8, 1.25), f"hedge {name}.{k}")
+                street_furniture.hedge(
+                    build, leaf, high - low, rng.uniform(0.8, 1.25), f"hedge {name}.{k}"
+                )
             elif kind < 0.78:
                 boards, tall = of.boards[int(rng.integers(4))], rng.uniform(0.8, 1.3)
-                planting.fence(build, boards, high - low, tall, f"fence {name}.{k}")
+                street_furniture.fence(build, boards, high - low, tall, f"fence {name}.{k}")
             else:
                 for n, at in enumerate(np.arange(0.4, high - low - 0.2, 1.1)):
                     with build.frame((at, 0.35, 0.0), rng.uniform(0, 6)):
                         leaf, size = of.leaves[int(rng.integers(3))], rng.uniform(0.35, 0.6)
-                        planting.bush(build, rng, leaf, size, f"bush {name}.{k}.{n}")
+                        street_furniture.bush(build, rng, leaf, size, f"bush {name}.{k}.{n}")
 
 
 def _row_of_houses(
@@ -165,11 +167,15 @@ def _row_of_houses(
                 with build.frame((x + wide + gap / 2, rng.uniform(0.8, 2.0), 0.0)):
                     kind = of.leaves[int(rng.integers(3))]
                     high = rng.uniform(3.6, 5.5)
-                    planting.tree(build, rng, of.bark, kind, high, f"row {index} tree {number}")
+                    street_furniture.tree(
+                        build, rng, of.bark, kind, high, f"row {index} tree {number}"
+                    )
             x += wide + gap
             number += 1
         with build.frame((0.0, plot.depth_m - 0.6, 0.0)):
-            planting.hedge(build, of.leaves[index % 3], plot.width_m, 2.6, f"tall hedge {index}")
+            street_furniture.hedge(
+                build, of.leaves[index % 3], plot.width_m, 2.6, f"tall hedge {index}"
+            )
 
 
 def _kerbside(
@@ -190,7 +196,7 @@ def _kerbside(
             with build.frame((0.36 * length, -0.8 * plan.pavement_m, 0.0)):
                 kind, high = of.leaves[int(rng.integers(3))], rng.uniform(3.4, 4.4)
                 if rng.random() < 0.7:
-                    planting.tree(build, rng, of.bark, kind, high, f"street tree {k}")
+                    street_furniture.tree(build, rng, of.bark, kind, high, f"street tree {k}")
             with build.frame((rng.uniform(-0.2, 0.2) * length, -0.32, 0.0), rng.uniform(-0.3, 0.3)):
                 street_furniture.bin_(build, rng, f"bin {k}")
             with build.frame((0.47 * length, -0.25, 0.0)):

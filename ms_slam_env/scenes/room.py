@@ -1,4 +1,4 @@
-"""The shell of a room: floor, ceiling, four walls with or without a window, skirting."""
+"""A room: floor, ceiling, walls with or without a window, skirting, and their finishes."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import numpy as np
 
 from ms_slam_env.scenes.base import Float64
 from ms_slam_env.scenes.builder import Material, MeshBuilder
+from ms_slam_env.scenes.textures import interior
+from ms_slam_env.scenes.textures.noise import hsv
 
 PANE = "window pane"
 _REVEAL_M = 0.18
@@ -132,3 +134,30 @@ def add_window(build: MeshBuilder, window: Window) -> None:
         build.quad(
             (a, deep - 0.02, low), (b - a, 0, 0), (0, 0, high - low), build.plain((255,) * 3)
         )
+
+
+def floor_material(build: MeshBuilder, rng: np.random.Generator) -> Material:
+    """Wooden planks, 2 x 1.2 m of them."""
+    tone = interior.TONES[rng.integers(len(interior.TONES))]
+    return build.material(interior.planks(rng, tone), (2.0, 1.2))
+
+
+def wall_colour(rng: np.random.Generator) -> Float64:
+    """Return a quiet light paint."""
+    return hsv(
+        rng.choice([0.09, 0.12, 0.16, 0.3, 0.55, 0.6]),
+        rng.uniform(0.04, 0.22),
+        rng.uniform(0.74, 0.92),
+    )
+
+
+def wall_material(
+    build: MeshBuilder, rng: np.random.Generator, colour: Float64, papered: bool
+) -> Material:
+    """Plaster in ``colour``; if ``papered``, wallpaper or brick instead."""
+    if not papered:
+        return build.material(interior.plaster(rng, colour), (2.0, 2.0))
+    if rng.random() < 0.25:
+        return build.material(interior.brick(rng, hsv(0.03, 0.5, 0.62)), (0.75, 0.6))
+    accent = np.clip(colour * rng.uniform(0.6, 0.85, 3), 0, 255)
+    return build.material(interior.wallpaper(rng, colour, accent), (0.9, 0.9))

@@ -12,8 +12,13 @@ from embreex.rtcore_scene import EmbreeScene
 
 from ms_slam_env._warp import wp
 from ms_slam_env.scenes.base import TexturedMesh
-from ms_slam_env.sensor.embree import PacketScene, embree_library
-from ms_slam_env.sensor.packets import TILE_HEIGHT, TILE_WIDTH, cast_tiles
+from ms_slam_env.sensor.embree import (
+    TILE_HEIGHT,
+    TILE_WIDTH,
+    PacketScene,
+    cast_tiles,
+    embree_library,
+)
 from ms_slam_env.sensor.rays import Pinhole, cast_rays, generate_rays
 
 

@@ -10,11 +10,9 @@ from numpy.typing import NDArray
 
 from ms_slam_env._warp import wp
 from ms_slam_env.scenes.base import TexturedMesh
-from ms_slam_env.sensor.bodies import Body
-from ms_slam_env.sensor.body_cast import BodyCast
+from ms_slam_env.sensor.bodies import Body, BodyCast
 from ms_slam_env.sensor.casters import Hits, RayCaster
-from ms_slam_env.sensor.nearer import keep_nearer
-from ms_slam_env.sensor.rays import Pinhole
+from ms_slam_env.sensor.rays import Pinhole, keep_nearer
 from ms_slam_env.sensor.shading import Surfaces
 
 Float64 = NDArray[np.float64]

@@ -6,10 +6,9 @@ import math
 
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
+from ms_slam_env.sensor.native import PCG, VECTOR_FLAGS, VECTORISE
 from ms_slam_env.sensor.noise import NATIVE_WIDTH, NoiseConfig
-from ms_slam_env.sensor.random_numbers import PCG
 from ms_slam_env.sensor.rays import Pinhole, pose_of_row
-from ms_slam_env.sensor.spans import VECTOR_FLAGS, VECTORISE
 
 _MAX_LATERAL_ANGLE = math.radians(80.0)  # the published fit ends there
 _AXIAL_KNEE = math.radians(60.0)

@@ -15,11 +15,10 @@ from ms_slam_env.sensor.bodies import Body
 from ms_slam_env.sensor.casters import Hits, RayCaster
 from ms_slam_env.sensor.changes import ChangingLight, ChangingView
 from ms_slam_env.sensor.depth_noise import DepthNoise, measure_depth, projector_shadow
+from ms_slam_env.sensor.native import normal_table, span_of
 from ms_slam_env.sensor.noise import NoiseConfig
-from ms_slam_env.sensor.random_numbers import normal_table
 from ms_slam_env.sensor.rays import Pinhole
 from ms_slam_env.sensor.shading import Surfaces, shade, true_geometry
-from ms_slam_env.sensor.spans import span_of
 from ms_slam_env.sensor.textures import (
     decode_table,
     encode_table,

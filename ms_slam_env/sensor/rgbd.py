@@ -19,8 +19,8 @@ from ms_slam_env.sensor.casters import RayCaster, make_caster
 from ms_slam_env.sensor.changes import ChangingLight
 from ms_slam_env.sensor.depth_noise import make_depth_noise
 from ms_slam_env.sensor.images import Changes, Images, Tables, upload_surfaces
+from ms_slam_env.sensor.native import frame_key
 from ms_slam_env.sensor.noise import NoiseConfig, noise_config
-from ms_slam_env.sensor.random_numbers import frame_key
 from ms_slam_env.sensor.rays import make_pinhole
 
 FRAME_RATE_HZ = 30.0

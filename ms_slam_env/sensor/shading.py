@@ -7,9 +7,8 @@ Raw-Data", IEEE TIP 2008.
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
-from ms_slam_env.sensor.random_numbers import PCG
+from ms_slam_env.sensor.native import PCG, VECTOR_FLAGS, VECTORISE
 from ms_slam_env.sensor.rays import Pinhole, camera_centre, pose_of_row, world_ray
-from ms_slam_env.sensor.spans import VECTOR_FLAGS, VECTORISE
 from ms_slam_env.sensor.textures import ENCODE_STEPS
 
 _MIN_COSINE = 0.1  # beyond 84 degrees the footprint is not stretched further

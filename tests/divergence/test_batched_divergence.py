@@ -16,7 +16,7 @@ from ms_slam_env.divergence import (
     make_divergence,
     ms_parameters,
 )
-from ms_slam_env.divergence.earth_movers import SphereTransport, earth_movers_1d
+from ms_slam_env.divergence.measures import SphereTransport, earth_movers_1d
 from ms_slam_env.divergence.sphere import bin_directions, bin_weights
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import so3_exp

@@ -1,4 +1,4 @@
-"""A slow, obvious version of what ``Reach`` decides, for tests."""
+"""A slow, obvious version of what ``Feasibility`` decides, for tests."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation, Slerp
 
+from ms_slam_env.robot.arm.cartesian_path import progress
 from ms_slam_env.robot.arm.chain import Chain, segment_distance
+from ms_slam_env.robot.arm.clearance import ClearanceField
 from ms_slam_env.robot.arm.config import ArmConfig
-from ms_slam_env.robot.arm.path import progress
-from ms_slam_env.robot.arm.reach import DAMPING, LIMIT_MARGIN_RAD, MOST_STRETCH
-from ms_slam_env.robot.arm.surroundings import Surroundings
+from ms_slam_env.robot.arm.feasibility import DAMPING, LIMIT_MARGIN_RAD, MOST_STRETCH
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def solve(
 
 def follow(
     chain: Chain,
-    surroundings: Surroundings,
+    clearance_field: ClearanceField,
     config: ArmConfig,
     q: np.ndarray,
     target: np.ndarray,
@@ -84,7 +84,7 @@ def follow(
         off_m, off_rad = max(off_m, metres), max(off_rad, radians)
     joints = np.stack(ways)
     speed = np.abs(np.diff(joints, axis=0)) * (waypoints - 1) / duration
-    furniture, apart = spares(chain, surroundings, joints[1:], config.clearance_m)
+    furniture, apart = spares(chain, clearance_field, joints[1:], config.clearance_m)
     return SlowWay(
         joints,
         off_m,
@@ -96,7 +96,7 @@ def follow(
 
 
 def spares(
-    chain: Chain, surroundings: Surroundings, joints: np.ndarray, clearance_m: float
+    chain: Chain, clearance_field: ClearanceField, joints: np.ndarray, clearance_m: float
 ) -> tuple[float, float]:
     """Least distance of links to furniture, and of pairs of links beyond what they need."""
     furniture, apart = np.inf, np.inf
@@ -106,7 +106,7 @@ def spares(
         ends = chain.capsules(q)
         for i in moving:
             points = ends[i, 0] + np.linspace(0, 1, 40)[:, None] * (ends[i, 1] - ends[i, 0])
-            free = surroundings.distance(points).min() - chain.capsule_radius[i]
+            free = clearance_field.distance(points).min() - chain.capsule_radius[i]
             furniture = min(furniture, free)
         first, second = chain.self_pairs.T
         gap = segment_distance(ends[first], ends[second])

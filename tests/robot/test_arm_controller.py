@@ -9,11 +9,10 @@ from test_arm_model import ARMS
 from ms_slam_env.geometry import make_pose, relative_angle, so3_exp
 from ms_slam_env.robot.action_primitives import decompose
 from ms_slam_env.robot.arm import ArmConfig, load_arm
+from ms_slam_env.robot.arm.cartesian_path import CartesianPath
 from ms_slam_env.robot.arm.chain import segment_distance
-from ms_slam_env.robot.arm.clearance import Clearance
+from ms_slam_env.robot.arm.clearance import ClearanceField, LinkClearance
 from ms_slam_env.robot.arm.controller import LIMIT_MARGIN_RAD, Controller
-from ms_slam_env.robot.arm.path import CameraPath
-from ms_slam_env.robot.arm.surroundings import Surroundings
 
 MOTIONS = decompose(0.08, np.radians(10))
 CONFIG = ArmConfig(clearance_m=0.02)
@@ -43,8 +42,8 @@ def mico():
 
 
 def controller_of(arm, *balls, config=CONFIG):
-    surroundings = Surroundings(Balls(*balls), np.eye(4), 1.5)
-    return Controller(arm, arm.chain, surroundings, config)
+    clearance_field = ClearanceField(Balls(*balls), np.eye(4), 1.5)
+    return Controller(arm, arm.chain, clearance_field, config)
 
 
 def speeds(plan):
@@ -67,7 +66,7 @@ def test_every_small_motion_is_followed_at_legal_speed(arm):
         if plan.followed:
             followed += 1
             times = plan.tick_s * np.arange(len(plan.q))
-            way = CameraPath(start, start @ motion, 0.2, np.radians(36), 1.5).at(times)
+            way = CartesianPath(start, start @ motion, 0.2, np.radians(36), 1.5).at(times)
             cameras = arm.chain.camera_pose(plan.q)
             assert np.linalg.norm(cameras[:, :3, 3] - way[:, :3, 3], axis=1).max() < 0.002
             assert off_rad < np.radians(0.2)
@@ -148,8 +147,8 @@ def surface_distance(arm, q, ball):
 
 def test_gaps_are_on_the_safe_side(arm):
     ball = (np.array([0.3, 0.3, 0.6]), 0.1)
-    surroundings = Surroundings(Balls(ball), np.eye(4), 1.5)
-    clearance = Clearance(arm.chain, surroundings, 0.02)
+    clearance_field = ClearanceField(Balls(ball), np.eye(4), 1.5)
+    clearance = LinkClearance(arm.chain, clearance_field, 0.02)
     rng = np.random.default_rng(0)
     q = arm.home + rng.uniform(-1.5, 1.5, (200, arm.chain.num_joints))
     gaps, least = clearance.gaps(q), clearance.least(q)

@@ -8,8 +8,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from ms_slam_env.robot.arm import load_arm
+from ms_slam_env.robot.arm.cartesian_path import progress
 from ms_slam_env.robot.arm.dynamics import ArmDynamics, smooth
-from ms_slam_env.robot.arm.path import progress
 
 MASS, LENGTH, KP, KV, GEAR = 2.0, 0.5, 400.0, 30.0, 2.0
 LIFT = f"""

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from ms_slam_env.config import from_dict
 from ms_slam_env.errors import InputError
 from ms_slam_env.robot.arm import ArmConfig, ArmNoise
-from ms_slam_env.robot.arm.imperfections import VIBRATION_PERIOD_S, Imperfections, play
+from ms_slam_env.robot.arm.dynamics import VIBRATION_PERIOD_S, Imperfections, play
 
 PERFECT = ArmNoise(0, 0, 0, 0, 0, 0)
 SHARE = np.array([1.0, 0.5, 0.25])

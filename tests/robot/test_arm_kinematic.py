@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.geometry import look_at, relative_angle
 from ms_slam_env.robot.arm import ArmConfig
-from ms_slam_env.robot.arm.arm_base import frame_times
+from ms_slam_env.robot.arm.arm import KinematicArm, frame_times
 from ms_slam_env.robot.arm.controller import Controller
-from ms_slam_env.robot.arm.kinematic_arm import KinematicArm
 from ms_slam_env.timings import Timings
 
 START = look_at([0.0, -0.8, 1.2], [1.2, 0.2, 0.7])
@@ -58,7 +57,7 @@ def test_a_redundant_arm_goes_where_the_controller_would_send_it(box_scene):
     arm = make_arm(box_scene, **SECOND_ARM)
     for _ in range(12):
         action = int(np.flatnonzero(arm.action_masks())[-1])
-        controller = Controller(arm.model, arm.chain, arm.surroundings, arm.config)
+        controller = Controller(arm.model, arm.chain, arm.clearance_field, arm.config)
         target = arm.chain.camera_pose(arm.q) @ arm.motions[action]
         plan = controller.plan(arm.q, target, float(arm.probe().duration_s[action]))
         arm.move(action)

@@ -12,10 +12,10 @@ from ms_slam_env.errors import InputError, UnreachableError
 from ms_slam_env.geometry import invert, look_at, make_pose, so3_exp, transform_points
 from ms_slam_env.robot.action_primitives import decompose
 from ms_slam_env.robot.arm import ArmConfig, load_arm
-from ms_slam_env.robot.arm.placement import COLUMN_RADIUS_M, place_arm, reach_m, standing_chain
-from ms_slam_env.robot.arm.postures import PITCHES, postures_at, turn_upright
-from ms_slam_env.robot.arm.reach import Reach
-from ms_slam_env.robot.arm.surroundings import Surroundings
+from ms_slam_env.robot.arm.base_placement import COLUMN_RADIUS_M, place_arm, reach_m, standing_chain
+from ms_slam_env.robot.arm.clearance import ClearanceField
+from ms_slam_env.robot.arm.feasibility import Feasibility
+from ms_slam_env.robot.arm.inverse_kinematics import PITCHES, ik_seeds_at, turn_upright
 from ms_slam_env.sensor.scene_cache import get_scene
 
 MOTIONS = decompose(0.12, np.radians(12))
@@ -33,7 +33,7 @@ def rng():
 
 def possible(arm, scene, config, T_world_base, q):
     chain = standing_chain(arm, config)
-    reach = Reach(chain, Surroundings(scene, T_world_base, reach_m(chain)), config)
+    reach = Feasibility(chain, ClearanceField(scene, T_world_base, reach_m(chain)), config)
     return int(reach.probe(q, chain.camera_pose(q) @ MOTIONS).ok.sum())
 
 
@@ -90,7 +90,7 @@ def test_it_is_the_same_every_time(arm, box_scene):
 def test_postures_have_their_pitch_and_no_roll_and_stand_apart(arm):
     chain = standing_chain(arm, CONFIG)
     for index in (4, 9):
-        good = postures_at(chain, tuple(arm.home), ArmConfig(), index)
+        good = ik_seeds_at(chain, tuple(arm.home), ArmConfig(), index)
         camera = chain.camera_pose(good.q)
         np.testing.assert_allclose(np.arcsin(camera[:, 2, 2]), PITCHES[index], atol=1e-6)
         np.testing.assert_allclose(camera[:, 2, 0], 0, atol=1e-8)  # no roll: right is level

@@ -5,11 +5,10 @@ from large_scenes import SEED, large_scene
 from ms_slam_env import scenes
 from ms_slam_env.camera import xtion
 from ms_slam_env.geometry import check_pose
-from ms_slam_env.scenes.large_scene import SKY, LargeScene
 from ms_slam_env.scenes.lighting import SkyLight
-from ms_slam_env.scenes.mesh_scene import MIN_START_CLEARANCE_M
+from ms_slam_env.scenes.mesh_queries import RayCaster
+from ms_slam_env.scenes.mesh_scene import MIN_START_CLEARANCE_M, SKY, LargeScene
 from ms_slam_env.scenes.outdoors.plan import StreetPlan
-from ms_slam_env.scenes.rays import RayCaster
 from ms_slam_env.sensor import RGBDSensor
 
 OUTDOORS = ("residential_street", "city_street")

@@ -3,7 +3,7 @@ import pytest
 
 from ms_slam_env.scenes.builder import MeshBuilder
 from ms_slam_env.scenes.lighting import Lamp, Lighting, Panel, Sun, light_mesh
-from ms_slam_env.scenes.rays import RayCaster
+from ms_slam_env.scenes.mesh_queries import RayCaster
 
 _UP = np.array([[0.0, 0.0, 1.0]])
 _DARK = {"ambient": (0.0, 0.0, 0.0), "bounce_gain": 0.0}

@@ -8,8 +8,8 @@ from PIL import Image
 from ms_slam_env import scenes
 from ms_slam_env.errors import InputError
 from ms_slam_env.scenes.free_space import FreeSpace, Holding
-from ms_slam_env.scenes.sampling import sample_surface
-from ms_slam_env.scenes.triangle_soup import load_soup, split_long_edges
+from ms_slam_env.scenes.mesh_file import load_soup, split_long_edges
+from ms_slam_env.scenes.mesh_queries import sample_surface
 
 _HOUSE = Path(__file__).parents[3] / "shared" / "data" / "small_house.glb"
 

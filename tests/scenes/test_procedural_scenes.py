@@ -7,8 +7,8 @@ import pytest
 from ms_slam_env import scenes
 from ms_slam_env.geometry import check_pose
 from ms_slam_env.scenes import base
+from ms_slam_env.scenes.mesh_queries import RayCaster
 from ms_slam_env.scenes.mesh_scene import MIN_START_CLEARANCE_M, START_DEPTH_M
-from ms_slam_env.scenes.rays import RayCaster
 
 
 @pytest.fixture(scope="module", params=scenes.ROOMS)

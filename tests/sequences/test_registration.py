@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from ms_slam_env.camera import Intrinsics, intensity_image, xtion
-from ms_slam_env.camera.reduction import reduce_color, reduce_depth
+from ms_slam_env.camera.frame import reduce_color, reduce_depth
 from ms_slam_env.errors import InputError
 from ms_slam_env.sensor import NoNoise
 from ms_slam_env.sequences import Misregistration, handheld_trajectory, render_sequence

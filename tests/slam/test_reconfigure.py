@@ -9,7 +9,7 @@ import pytest
 from box_scene import BoxScene
 
 from ms_slam_env.camera import RGBDFrame, xtion
-from ms_slam_env.camera.reduction import reduce_color, reduce_depth
+from ms_slam_env.camera.frame import reduce_color, reduce_depth
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at, make_pose, so3_exp
 from ms_slam_env.sensor import RGBDSensor

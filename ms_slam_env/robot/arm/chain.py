@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -12,6 +13,8 @@ from ms_slam_env.geometry import hat
 
 Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
+
+_NEIGHBOURS = 2  # links this near touch by construction, or joint limits keep them apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,3 +127,29 @@ def segment_distance(a: Float64, b: Float64) -> Float64:
     s = np.where((t == clamped) & ~ball, s, again)
     gap = r + d1 * s[..., None] - d2 * clamped[..., None]
     return np.sqrt((gap * gap).sum(-1))
+
+
+def separate_pairs(chain: Chain, home: Float64) -> Chain:
+    """The chain with its ``self_pairs``: capsules more than two links apart, free at ``home``."""
+    m = len(chain.capsule_link)
+    first, second = np.triu_indices(m, 1)
+    far = np.abs(chain.capsule_link[first] - chain.capsule_link[second]) > _NEIGHBOURS
+    first, second = first[far], second[far]
+    ends = chain.capsules(home)
+    gap = segment_distance(ends[first], ends[second])
+    gap = gap - chain.capsule_radius[first] - chain.capsule_radius[second]
+    free = gap > 0
+    pairs = np.stack([first[free], second[free]], axis=1).astype(np.int32)
+    return dataclasses.replace(chain, self_pairs=pairs, self_gap=gap[free])
+
+
+def with_column(chain: Chain, home: Float64, radius_m: float, height_m: float) -> Chain:
+    """The chain whose base stands on an upright column that its links must not touch."""
+    column = np.array([[[0.0, 0.0, -radius_m], [0.0, 0.0, -max(height_m, radius_m)]]])
+    extended = dataclasses.replace(
+        chain,
+        capsule_link=np.append(chain.capsule_link, 0).astype(np.int32),
+        capsule_ends=np.concatenate([chain.capsule_ends, column]),
+        capsule_radius=np.append(chain.capsule_radius, radius_m),
+    )
+    return separate_pairs(extended, home)

@@ -1,31 +1,137 @@
-"""How far an arm's links are from where they may not go, and limits that keep them from it."""
+"""The clearance field around an arm, and the gaps its links keep to furniture and themselves."""
 
 from __future__ import annotations
+
+from typing import Protocol
 
 import mink
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env.geometry import invert, transform_points
 from ms_slam_env.robot.arm.chain import Chain, segment_distance
-from ms_slam_env.robot.arm.surroundings import Surroundings
+from ms_slam_env.scenes.mesh_scene import MeshScene
 
+Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+
+_VOXEL_M = 0.05
+_SLACK = 0.5  # of a voxel
+
+
+class HasClearance(Protocol):
+    """A world of which distances are known."""
+
+    def clearance(self, points: Float64) -> Float64:
+        """Distance (N,) from points (N, 3) to the nearest surface, 0 inside things."""
+
+
+class ClearanceField:
+    """Distances to the scene's surface in a cube around the arm's base.
+
+    The grid is aligned with the world. For a scene that keeps a grid itself it is a part of that
+    grid, so that no second interpolation adds an error; other scenes are sampled.
+
+    ``distance`` errs to the safe side: ``slack_m`` = half a voxel is taken off. Against the surface
+    of six scenes, a scene's grid is too large by more than 0.7 voxels at less than 1 % of points
+    (below 30 cm; by 1.4 voxels at worst, where furniture bends within a voxel).
+
+    Attributes:
+        T_world_base: (4, 4) the arm's base.
+        grid: (nx, ny, nz) float32 metres, slack taken off, at least 0; 0 inside things.
+        origin: (3,) centre of the first voxel in the world.
+        voxel_m: edge of a voxel.
+        slack_m: metres taken off every distance.
+    """
+
+    def __init__(self, scene: HasClearance, T_world_base: Float64, reach_m: float) -> None:
+        self.T_world_base = np.array(T_world_base, dtype=np.float64)
+        self._T_base_world = invert(self.T_world_base)
+        centre = self.T_world_base[:3, 3]
+        if isinstance(scene, MeshScene):
+            self.voxel_m = scene.free_space.voxel_m
+            self.origin, distance = _part(scene, centre, reach_m)
+        else:
+            self.voxel_m = _VOXEL_M
+            self.origin, distance = _sampled(scene, centre, reach_m)
+        self.slack_m = _SLACK * self.voxel_m
+        self.grid: Float32 = np.maximum(distance - np.float32(self.slack_m), np.float32(0))
+
+    def distance(self, points_base: Float64) -> Float64:
+        """Distances (N,) of points (N, 3) of the base's frame; 0 inside things or off the grid."""
+        values, f, inside = self._corners(points_base)
+        along_x = values[:, 0] + (values[:, 1] - values[:, 0]) * f[:, 0, None, None]
+        along_y = along_x[:, 0] + (along_x[:, 1] - along_x[:, 0]) * f[:, 1, None]
+        result = along_y[:, 0] + (along_y[:, 1] - along_y[:, 0]) * f[:, 2]
+        return np.where(inside, result, 0.0)
+
+    def gradient(self, points_base: Float64) -> Float64:
+        """Derivative (N, 3) of ``distance`` in the base's frame; 0 off the grid."""
+        values, f, inside = self._corners(points_base)
+        weight = np.stack([1 - f, f], axis=1)  # (N, 2, 3)
+        x, y, z = weight[..., 0], weight[..., 1], weight[..., 2]
+        slope = np.stack(
+            [
+                np.einsum("nyz,ny,nz->n", values[:, 1] - values[:, 0], y, z),
+                np.einsum("nxz,nx,nz->n", values[:, :, 1] - values[:, :, 0], x, z),
+                np.einsum("nxy,nx,ny->n", values[..., 1] - values[..., 0], x, y),
+            ],
+            axis=1,
+        )
+        return np.where(inside[:, None], slope / self.voxel_m @ self.T_world_base[:3, :3], 0.0)
+
+    def _corners(self, points_base: Float64) -> tuple[Float64, Float64, NDArray[np.bool_]]:
+        """Values (N, 2, 2, 2) around points (N, 3), place (N, 3) between, whether on the grid."""
+        world = transform_points(self.T_world_base, np.reshape(points_base, (-1, 3)))
+        place = (world - self.origin) / self.voxel_m
+        limit = np.array(self.grid.shape) - 1
+        clipped = np.clip(place, 0.0, limit)
+        base = np.minimum(clipped.astype(np.int64), limit - 1)
+        x, y, z = (np.stack([base[:, k], base[:, k] + 1], axis=1) for k in range(3))
+        values = self.grid[x[:, :, None, None], y[:, None, :, None], z[:, None, None, :]]
+        return values.astype(np.float64), clipped - base, (place == clipped).all(axis=1)
+
+
+def _part(scene: MeshScene, centre: Float64, reach_m: float) -> tuple[Float64, Float32]:
+    """Origin (3,) and values of the part of the scene's own grid that is within reach.
+
+    The grid's own border is 0 all around, so a part that is empty is one voxel of it.
+    """
+    free = scene.free_space
+    low = np.floor((centre - reach_m - free.origin) / free.voxel_m).astype(int)
+    high = np.ceil((centre + reach_m - free.origin) / free.voxel_m).astype(int) + 1
+    last = np.array(free.distance.shape)
+    low = np.clip(low, 0, last - 2)
+    high = np.clip(high, low + 2, last)
+    part = free.distance[low[0] : high[0], low[1] : high[1], low[2] : high[2]]
+    return free.origin + low * free.voxel_m, part
+
+
+def _sampled(scene: HasClearance, centre: Float64, reach_m: float) -> tuple[Float64, Float32]:
+    """Origin (3,) and values of a grid over the cube within reach."""
+    origin = centre - reach_m
+    count = int(np.ceil(2 * reach_m / _VOXEL_M)) + 1
+    ticks = np.arange(count) * _VOXEL_M
+    points = np.stack(np.meshgrid(*(origin[k] + ticks for k in range(3)), indexing="ij"), axis=-1)
+    values = scene.clearance(points.reshape(-1, 3)).reshape(count, count, count)
+    return origin, values.astype(np.float32)
+
 
 _SHORTEST_PART_M = 0.03  # of a capsule, between two balls that cover it
 _NEAR_M = 0.05  # a gap beyond this is not limited
 _STEP_RAD = 1e-5  # of the differences that stand for derivatives
 
 
-class Clearance:
+class LinkClearance:
     """Gaps between what an arm's links need and what they have.
 
     Links are the chain's capsules, covered by balls. They need ``clearance_m`` to furniture and to
     each other; pairs that are closer than that at the arm's home need half that gap.
     """
 
-    def __init__(self, chain: Chain, surroundings: Surroundings, clearance_m: float) -> None:
+    def __init__(self, chain: Chain, clearance_field: ClearanceField, clearance_m: float) -> None:
         self._chain = chain
-        self._surroundings = surroundings
+        self._field = clearance_field
         moving = np.flatnonzero(chain.capsule_link > 0)
         ends, radius = chain.capsule_ends[moving], chain.capsule_radius[moving]
         length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
@@ -51,7 +157,7 @@ class Clearance:
         ends = self._chain.capsules(q)
         result = np.minimum(self._self(ends).min(axis=-1, initial=0.0), 0.0)
         middles = ends[..., self._moving, :, :].mean(axis=-2)
-        spare = self._surroundings.distance(middles.reshape(-1, 3)).reshape(middles.shape[:-1])
+        spare = self._field.distance(middles.reshape(-1, 3)).reshape(middles.shape[:-1])
         near = np.flatnonzero((spare < self._far).any(axis=-1))
         if len(near):
             balls = self._furniture(ends[near])
@@ -75,7 +181,7 @@ class Clearance:
 
     def _furniture(self, ends: Float64) -> Float64:
         centres = self._balls(ends)
-        distance = self._surroundings.distance(centres.reshape(-1, 3))
+        distance = self._field.distance(centres.reshape(-1, 3))
         return np.asarray(distance.reshape(centres.shape[:-1]) - self._cover)
 
     def _self(self, ends: Float64) -> Float64:
@@ -93,7 +199,7 @@ class ClearanceLimit(mink.Limit):
     """
 
     def __init__(
-        self, clearance: Clearance, qpos: NDArray[np.int32], dof: NDArray[np.int32], gain: float
+        self, clearance: LinkClearance, qpos: NDArray[np.int32], dof: NDArray[np.int32], gain: float
     ) -> None:
         self._clearance = clearance
         self._qpos, self._dof = qpos, dof

@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ms_slam_env.robot.arm.cartesian_path import CartesianPath
 from ms_slam_env.robot.arm.chain import Chain
-from ms_slam_env.robot.arm.clearance import Clearance, ClearanceLimit
+from ms_slam_env.robot.arm.clearance import ClearanceField, ClearanceLimit, LinkClearance
 from ms_slam_env.robot.arm.config import ArmConfig
+from ms_slam_env.robot.arm.feasibility import DAMPING, LIMIT_MARGIN_RAD
 from ms_slam_env.robot.arm.model import ArmModel
-from ms_slam_env.robot.arm.path import CameraPath
-from ms_slam_env.robot.arm.reach import DAMPING, LIMIT_MARGIN_RAD
-from ms_slam_env.robot.arm.surroundings import Surroundings
 
 Float64 = NDArray[np.float64]
 
@@ -67,14 +66,14 @@ class Controller:
     """
 
     def __init__(
-        self, model: ArmModel, chain: Chain, surroundings: Surroundings, config: ArmConfig
+        self, model: ArmModel, chain: Chain, clearance_field: ClearanceField, config: ArmConfig
     ) -> None:
         """Control an arm.
 
         Args:
             model: the arm.
             chain: the model's, with what else its links must not touch.
-            surroundings: furniture around it.
+            clearance_field: furniture around it.
             config: speeds, rate and clearance.
         """
         self._model = model
@@ -82,7 +81,7 @@ class Controller:
         self._config = config
         self._configuration = mink.Configuration(model.mj)
         self._task = mink.FrameTask(model.camera_site, "site", 1.0, 1.0)
-        self.clearance = Clearance(chain, surroundings, config.clearance_m)
+        self.clearance = LinkClearance(chain, clearance_field, config.clearance_m)
         self._lower = chain.lower + LIMIT_MARGIN_RAD
         self._upper = chain.upper - LIMIT_MARGIN_RAD
         self._up, self._down = np.zeros(model.mj.nv), np.zeros(model.mj.nv)
@@ -95,7 +94,7 @@ class Controller:
         It lasts as long as the camera's speed asks for, at least ``least_duration_s``.
         """
         config = self._config
-        path = CameraPath(
+        path = CartesianPath(
             self._chain.camera_pose(q),
             T_base_target,
             config.speed_m_s,
@@ -111,7 +110,7 @@ class Controller:
             plan = self._follow(path, q, [self._links])
         return plan
 
-    def _follow(self, path: CameraPath, q: Float64, limits: Sequence[mink.Limit]) -> Plan:
+    def _follow(self, path: CartesianPath, q: Float64, limits: Sequence[mink.Limit]) -> Plan:
         ticks = max(2, int(np.ceil(path.duration_s * self._config.control_hz - 1e-9)))
         tick_s = path.duration_s / ticks
         targets = path.at(tick_s * np.arange(1.0, ticks + 1.0))

@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.geometry import relative_angle, transform_points
-from ms_slam_env.robot.arm.arm_base import ArmEmbodiment, frame_times
+from ms_slam_env.robot.arm.arm import ArmEmbodiment, frame_times
 from ms_slam_env.robot.arm.config import ArmConfig
 from ms_slam_env.robot.arm.controller import Controller, Plan, checked_ticks
-from ms_slam_env.robot.arm.dynamics import ArmDynamics, Motion
-from ms_slam_env.robot.arm.imperfections import Imperfections
-from ms_slam_env.robot.arm.reach import MOST_STRETCH
+from ms_slam_env.robot.arm.dynamics import ArmDynamics, Imperfections, Motion
+from ms_slam_env.robot.arm.feasibility import MOST_STRETCH
 from ms_slam_env.robot.base import MotionResult
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.timings import Timings
@@ -70,7 +69,7 @@ class DynamicArm(ArmEmbodiment):
     def stand_at(self, T_world_base: Float64) -> None:
         """Move the base to a pose (4, 4) and look around from there."""
         super().stand_at(T_world_base)
-        self.controller = Controller(self.model, self.chain, self.surroundings, self.config)
+        self.controller = Controller(self.model, self.chain, self.clearance_field, self.config)
 
     def start_at(self, q: Float64, rng: np.random.Generator) -> None:
         """Hold the arm at joint angles (n,) until it has settled under its load."""

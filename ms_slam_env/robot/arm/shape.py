@@ -10,8 +10,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from ms_slam_env.robot.arm.base_placement import COLUMN_RADIUS_M
 from ms_slam_env.robot.arm.model import ArmModel
-from ms_slam_env.robot.arm.placement import COLUMN_RADIUS_M
 
 Float64 = NDArray[np.float64]
 

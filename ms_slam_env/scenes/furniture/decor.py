@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ms_slam_env.scenes.builder import MeshBuilder
-from ms_slam_env.scenes.furniture.tableware import glaze
-from ms_slam_env.scenes.textures import fabric, foliage, masonry, wood
+from ms_slam_env.scenes.furniture.small_things import glaze
+from ms_slam_env.scenes.textures import fabric, interior, outdoor
 from ms_slam_env.scenes.textures.noise import hsv
 from ms_slam_env.scenes.textures.pictures import picture
 
@@ -21,7 +21,7 @@ def picture_frame(
     border = (
         build.plain(hsv(0.1, 0.1, rng.uniform(0.05, 0.95)))
         if kind < 0.5
-        else build.material(wood.board(rng, size=256), (0.5, 0.5))
+        else build.material(interior.board(rng, size=256), (0.5, 0.5))
     )
     w, h, b, deep = width_m / 2, height_m / 2, rng.uniform(0.015, 0.045), 0.025
     with build.object(name):
@@ -54,9 +54,9 @@ def plant(build: MeshBuilder, rng: np.random.Generator, height_m: float, name: s
             glaze(build, rng),
             20,
         )
-        soil = build.material(foliage.soil(rng), (0.2, 0.2))
+        soil = build.material(outdoor.soil(rng), (0.2, 0.2))
         build.lathe([(0.89 * r, 0.85 * pot_h), (0, 0.88 * pot_h)], soil, 20)
-    blade = build.material(foliage.leaf(rng))
+    blade = build.material(outdoor.leaf(rng))
     wide = rng.uniform(0.05, 0.11) * height_m
     t = np.linspace(0, 1, 6)
     with build.object(name):
@@ -150,7 +150,7 @@ def curtain_cloth(rng: np.random.Generator) -> np.ndarray:
 
 def door(build: MeshBuilder, rng: np.random.Generator, name: str, rgb: np.ndarray) -> None:
     """Panelled door, 0.85 x 2.05 m, in its casing, on the wall at y = 0."""
-    paint = build.material(masonry.plaster(rng, rgb, 0.8, 256), (1.0, 1.0))
+    paint = build.material(interior.plaster(rng, rgb, 0.8, 256), (1.0, 1.0))
     trim = build.plain((228, 224, 214))
     metal = build.plain((150, 148, 140))
     with build.object(name):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ms_slam_env.scenes.builder import Material, MeshBuilder
-from ms_slam_env.scenes.textures import industrial, wood
+from ms_slam_env.scenes.textures import industrial, interior
 from ms_slam_env.scenes.textures.noise import hsv
 
 RACK_DEPTH_M = 1.1
@@ -42,8 +42,8 @@ def stock(build: MeshBuilder, rng: np.random.Generator) -> Stock:
         ),
         upright=build.plain((38, 74, 138)),
         beam=build.plain((222, 108, 30)),
-        deck=build.material(wood.board(rng, (170, 150, 120), 256), (0.8, 0.8)),
-        pallet=build.material(wood.board(rng, (182, 146, 96), 256), (0.6, 0.6)),
+        deck=build.material(interior.board(rng, (170, 150, 120), 256), (0.8, 0.8)),
+        pallet=build.material(interior.board(rng, (182, 146, 96), 256), (0.6, 0.6)),
         hazard=build.material(industrial.hazard(), (0.4, 0.4)),
     )
 

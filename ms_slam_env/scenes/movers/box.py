@@ -6,7 +6,7 @@ import numpy as np
 
 from ms_slam_env.scenes.builder import MeshBuilder
 from ms_slam_env.scenes.movers.shape import Joint, Shape, assemble
-from ms_slam_env.scenes.textures import printed
+from ms_slam_env.scenes.textures import pictures
 from ms_slam_env.scenes.textures.noise import hsv, noise, shade
 
 _SIZE_M = (0.18, 0.36)  # of a side
@@ -39,7 +39,7 @@ def _side(rng: np.random.Generator, paper: np.ndarray, size: int = 256) -> np.nd
     for _ in range(int(rng.integers(1, 4))):
         h, w = (int(rng.uniform(0.2, 0.5) * size) for _ in range(2))
         y, x = int(rng.uniform(0.03, 0.97) * (size - h)), int(rng.uniform(0.03, 0.97) * (size - w))
-        draw = printed.page if rng.random() < 0.5 else printed.cover
+        draw = pictures.page if rng.random() < 0.5 else pictures.cover
         image[y : y + h, x : x + w] = draw(rng, h, w)
     tape = size // 2
     image[tape - size // 24 : tape + size // 24] = 0.8 * image[tape - size // 24] + 40.0

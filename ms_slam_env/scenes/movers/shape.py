@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from ms_slam_env.scenes.base import Float32, Float64, TexturedMesh
 from ms_slam_env.scenes.builder import Geometry, MeshBuilder
 from ms_slam_env.scenes.lighting import cosine_directions
-from ms_slam_env.scenes.rays import RayCaster
+from ms_slam_env.scenes.mesh_queries import RayCaster
 
 _OPENNESS_RAYS = 24
 _DARKEST = 0.25  # of the light around, where nothing of it arrives directly

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from ms_slam_env.camera import XTION_SIZES, Intrinsics, RGBDFrame
-from ms_slam_env.camera.reduction import reduce_color, reduce_depth
+from ms_slam_env.camera.frame import reduce_color, reduce_depth
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.sequences.recording.registration import Registration
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame
-from ms_slam_env.camera.reduction import reduce_color, reduce_depth
+from ms_slam_env.camera.frame import reduce_color, reduce_depth
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose
 from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult, Views

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.scenes.base import Scene
+from ms_slam_env.scenes.mesh_queries import RayCaster
 from ms_slam_env.scenes.movers import Shape
-from ms_slam_env.scenes.rays import RayCaster
 from ms_slam_env.sequences.perturbations.moving.tracks import (
     Track,
     round_track,

@@ -1,4 +1,4 @@
-"""What every arm that holds the camera shares: its place, its candidate motions, their mask."""
+"""An arm that holds the camera: its place, its candidate motions, their mask; without physics."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.robot.action_primitives import NUM_MOTIONS, decompose
+from ms_slam_env.robot.arm.base_placement import place_arm, reach_m, standing_chain
+from ms_slam_env.robot.arm.clearance import ClearanceField
 from ms_slam_env.robot.arm.config import ArmConfig
+from ms_slam_env.robot.arm.feasibility import Feasibility, FeasibilityResult
+from ms_slam_env.robot.arm.inverse_kinematics import solve_pose
 from ms_slam_env.robot.arm.model import load_arm
-from ms_slam_env.robot.arm.placement import place_arm, reach_m, standing_chain
-from ms_slam_env.robot.arm.reach import Reach, ReachResult
-from ms_slam_env.robot.arm.surroundings import Surroundings
-from ms_slam_env.robot.base import Embodiment
+from ms_slam_env.robot.base import Embodiment, MotionResult
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.timings import Timings
 
@@ -46,8 +47,8 @@ class ArmEmbodiment(Embodiment):
         chain: the arm as it stands: ``model.chain``, and the column below it if there is one.
         motions: (49, 4, 4) the candidate motions ``T_camera_next``.
         T_world_base: (4, 4) where the arm stands.
-        surroundings: furniture around it.
-        reach: which motions it can make.
+        clearance_field: furniture around it.
+        feasibility: which motions it can make.
         q: (n,) joint angles where the arm is.
         T_world_camera: (4, 4) where the camera is.
     """
@@ -80,8 +81,8 @@ class ArmEmbodiment(Embodiment):
     def stand_at(self, T_world_base: Float64) -> None:
         """Move the base to a pose (4, 4) and look around from there."""
         self.T_world_base = np.array(T_world_base, dtype=np.float64)
-        self.surroundings = Surroundings(self.scene, self.T_world_base, reach_m(self.chain))
-        self.reach = Reach(self.chain, self.surroundings, self.config)
+        self.clearance_field = ClearanceField(self.scene, self.T_world_base, reach_m(self.chain))
+        self.feasibility = Feasibility(self.chain, self.clearance_field, self.config)
 
     def start_at(self, q: Float64, rng: np.random.Generator) -> None:
         """Hold the arm at rest at joint angles (n,) at the start of an episode."""
@@ -91,7 +92,7 @@ class ArmEmbodiment(Embodiment):
         """The arm is now at joint angles (n,)."""
         self.q = np.array(q, dtype=np.float64)
         self.T_world_camera = self.T_world_base @ self.chain.camera_pose(self.q)
-        self._probe: ReachResult | None = None
+        self._probe: FeasibilityResult | None = None
 
     def planning_state(self) -> tuple[Float64, Float64]:
         """Joint angles (n,) and camera ``T_base_camera`` (4, 4) that motions are planned from.
@@ -100,12 +101,12 @@ class ArmEmbodiment(Embodiment):
         """
         return self.q, self.chain.camera_pose(self.q)
 
-    def probe(self) -> ReachResult:
+    def probe(self) -> FeasibilityResult:
         """Which of the 49 motions the arm can make from here, and how; worked out once a place."""
         if self._probe is None:
             with self.timings.stage("mask"):
                 q, T_base_camera = self.planning_state()
-                self._probe = self.reach.probe(q, T_base_camera @ self.motions)
+                self._probe = self.feasibility.probe(q, T_base_camera @ self.motions)
         return self._probe
 
     def candidate_motions(self) -> Float64:
@@ -124,3 +125,36 @@ class ArmEmbodiment(Embodiment):
         """Go on from a state that ``get_state`` returned."""
         self.stand_at(state["T_world_base"])
         self.set_joints(state["q"])
+
+
+class KinematicArm(ArmEmbodiment):
+    """The arm's kinematics alone: limits, furniture and speed count, mass and errors do not."""
+
+    def move(self, action: int) -> MotionResult:
+        """Make motion ``action`` if the arm can, with the frames that arrive meanwhile.
+
+        Action 0 and a masked action rest for one period of the camera, or for
+        ``frames_per_action`` of them.
+        """
+        probe = self.probe()
+        made = bool(probe.ok[action])
+        duration = float(probe.duration_s[action]) if made else 0.0
+        times = frame_times(duration, self.config)
+        if duration > 0:
+            q = self._along(probe.q[action], np.minimum(times / duration, 1.0))
+        else:
+            q = np.tile(self.q, (len(times), 1))
+        if made and duration > 0:
+            target = self.chain.camera_pose(self.q) @ self.motions[action]
+            q[times >= duration] = solve_pose(self.chain, q[-1:], target).q[0]
+        self.set_joints(q[-1])
+        poses = self.T_world_base @ self.chain.camera_pose(q)
+        return MotionResult(made, poses, poses.copy(), times)
+
+    @staticmethod
+    def _along(waypoints: Float64, share_of_time: Float64) -> Float64:
+        """Joint angles (k, n) after shares (k,) of the time through waypoints (W, n)."""
+        place = share_of_time * (len(waypoints) - 1)
+        before = np.minimum(place.astype(np.int64), len(waypoints) - 2)
+        part = (place - before)[:, None]
+        return (1 - part) * waypoints[before] + part * waypoints[before + 1]

@@ -1,4 +1,4 @@
-"""Postures in which an arm moves its camera well: where the search for a place begins."""
+"""Inverse kinematics of single poses by damped Newton steps, and the seeds they start from."""
 
 from __future__ import annotations
 
@@ -11,11 +11,59 @@ from scipy.spatial.transform import Rotation
 
 from ms_slam_env.robot.action_primitives import decompose
 from ms_slam_env.robot.arm.chain import Chain, segment_distance
+from ms_slam_env.robot.arm.clearance import ClearanceField
 from ms_slam_env.robot.arm.config import ArmConfig
-from ms_slam_env.robot.arm.reach import Reach
-from ms_slam_env.robot.arm.surroundings import Surroundings
+from ms_slam_env.robot.arm.feasibility import Feasibility
 
 Float64 = NDArray[np.float64]
+
+_DAMPING = 1e-3  # of the pseudo-inverse, metres and radians
+_LARGEST_STEP_RAD = 0.5
+
+
+@dataclass(frozen=True)
+class Solutions:
+    """Joint angles (s, n) and how far the camera is from its target there, (s,) each."""
+
+    q: Float64
+    error_m: Float64
+    error_rad: Float64
+
+    def accurate(self, tolerance_m: float = 1e-6, tolerance_rad: float = 1e-6) -> NDArray[np.bool_]:
+        """(s,) which of them put the camera on the target."""
+        return (self.error_m < tolerance_m) & (self.error_rad < tolerance_rad)
+
+
+def solve_pose(chain: Chain, q: Float64, T_base_camera: Float64, iterations: int = 30) -> Solutions:
+    """Bring the camera to a pose (4, 4) by damped Newton steps from joint angles (s, n).
+
+    Joint limits are not looked at. Wampler, "Manipulator inverse kinematic solutions based on
+    vector formulations and damped least-squares methods" (1986), equation (10).
+    """
+    angles = np.array(q, dtype=np.float64)
+    regularisation = _DAMPING**2 * np.eye(6)
+    for _ in range(iterations):
+        error = _twist(chain.camera_pose(angles), T_base_camera)
+        if (np.abs(error) < 1e-10).all():
+            break
+        J = chain.camera_jacobian(angles)
+        J_transposed = np.swapaxes(J, -1, -2)
+        damped = np.linalg.solve(J @ J_transposed + regularisation, error[..., None])
+        step = (J_transposed @ damped)[..., 0]
+        largest = np.abs(step).max(axis=-1, keepdims=True)
+        angles = angles + step * np.minimum(1.0, _LARGEST_STEP_RAD / np.maximum(largest, 1e-12))
+    error = _twist(chain.camera_pose(angles), T_base_camera)
+    return Solutions(
+        angles, np.linalg.norm(error[..., :3], axis=-1), np.linalg.norm(error[..., 3:], axis=-1)
+    )
+
+
+def _twist(T_now: Float64, T_target: Float64) -> Float64:
+    """(s, 6) translation and rotation vector, in the base frame, from (s, 4, 4) to the target."""
+    turn = T_target[:3, :3] @ np.swapaxes(T_now[..., :3, :3], -1, -2)
+    rotation = Rotation.from_matrix(turn).as_rotvec()
+    return np.concatenate([T_target[:3, 3] - T_now[..., :3, 3], rotation], axis=-1)
+
 
 LIMIT_MARGIN_RAD = 0.15
 """Distance that a posture keeps from joint limits, so that motions are left on both sides."""
@@ -30,13 +78,13 @@ _SAMPLES = 20_000
 _TRIED = 300
 _KEPT = 24
 _APART_M = 0.06  # least distance between the bases of two postures of one pitch
-_DAMPING = 0.02
+_EFFORT_DAMPING = 0.02
 _TOO_HARD = 4.0
 _AT_ONCE = 256
 
 
 @dataclass(frozen=True)
-class Postures:
+class IKSeeds:
     """Good postures of an arm for one pitch of the camera, the best first.
 
     Attributes:
@@ -83,9 +131,9 @@ def sample_joints(chain: Chain, home: tuple[float, ...], config: ArmConfig) -> S
 
 
 @lru_cache(maxsize=256)
-def postures_at(
+def ik_seeds_at(
     chain: Chain, home: tuple[float, ...], config: ArmConfig, pitch_index: int
-) -> Postures:
+) -> IKSeeds:
     """Search for postures with the camera at one of ``PITCHES`` and upright.
 
     Random joint angles are turned until the camera has that pitch and no roll. Of those that leave
@@ -102,15 +150,15 @@ def postures_at(
     q = q[links_apart(chain, q)]
     q = q[np.argsort(effort(chain, q, config.speed_m_s, config.speed_rad_s), kind="stable")]
     q = _spread(chain, q)
-    nowhere = Surroundings(_Nothing(), np.eye(4), 0.5)
-    reach = Reach(chain, nowhere, config)
-    count = np.array([_count_motions(chain, reach, posture) for posture in q], dtype=np.int64)
+    nowhere = ClearanceField(_Nothing(), np.eye(4), 0.5)
+    feasibility = Feasibility(chain, nowhere, config)
+    count = np.array([_count_motions(chain, feasibility, posture) for posture in q], dtype=np.int64)
     best = np.argsort(-count, kind="stable")
-    return Postures(q[best], count[best])
+    return IKSeeds(q[best], count[best])
 
 
-def _count_motions(chain: Chain, reach: Reach, q: Float64) -> int:
-    return int(reach.probe(q, chain.camera_pose(q) @ decompose(STEP_M, STEP_RAD)).ok.sum())
+def _count_motions(chain: Chain, feasibility: Feasibility, q: Float64) -> int:
+    return int(feasibility.probe(q, chain.camera_pose(q) @ decompose(STEP_M, STEP_RAD)).ok.sum())
 
 
 def effort(chain: Chain, q: Float64, speed_m_s: float, speed_rad_s: float) -> Float64:
@@ -132,7 +180,7 @@ def _effort(chain: Chain, q: Float64, rates: Float64) -> Float64:
     R = chain.camera_pose(q)[:, :3, :3]
     twists = np.concatenate([R @ rates[:3], R @ rates[3:]], axis=1)  # (s, 6, 49)
     J_transposed = np.swapaxes(J, -1, -2)
-    inverse = J_transposed @ np.linalg.inv(J @ J_transposed + _DAMPING**2 * np.eye(6))
+    inverse = J_transposed @ np.linalg.inv(J @ J_transposed + _EFFORT_DAMPING**2 * np.eye(6))
     speeds = inverse @ twists
     ratio = np.abs(speeds / chain.speed[:, None]).max(axis=1)  # (s, 49)
     missed = np.linalg.norm(J @ speeds - twists, axis=1)

@@ -1,12 +1,13 @@
-"""Small things that stand on tables and shelves."""
+"""Small things that stand on tables and shelves, and screens."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from ms_slam_env.scenes.builder import Material, MeshBuilder
-from ms_slam_env.scenes.textures import masonry, printed
-from ms_slam_env.scenes.textures.noise import hsv, noise, shade
+from ms_slam_env.scenes.textures import interior, pictures
+from ms_slam_env.scenes.textures.noise import Image, hsv, noise, shade
 from ms_slam_env.scenes.textures.pictures import picture
 
 
@@ -99,7 +100,7 @@ def bottle(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
             glass,
             18,
         )
-        printed_label = build.material(printed.cover(rng, 128, 256))
+        printed_label = build.material(pictures.cover(rng, 128, 256))
         build.lathe([(1.02 * r, 0.15 * h), (1.02 * r, 0.45 * h)], printed_label, 18)
 
 
@@ -134,7 +135,7 @@ def ornament(
     else:
         r = 0.4 * size
         with build.object(name):
-            marble = masonry.tiles(rng, hsv(rng.random(), 0.3, 0.8), 2, 128)
+            marble = interior.tiles(rng, hsv(rng.random(), 0.3, 0.8), 2, 128)
             build.pillow(
                 (-r, -0.13 - r, 0), (r, -0.13 + r, 2 * r), build.material(marble, (0.2, 0.2)), 1.0
             )
@@ -143,7 +144,7 @@ def ornament(
 def lying_book(build: MeshBuilder, rng: np.random.Generator, name: str, thick_m: float) -> None:
     """Book or magazine lying on its back, cover up, centred on the origin."""
     w, h = rng.uniform(0.13, 0.22), rng.uniform(0.19, 0.29)
-    cover = build.material(printed.cover(rng, 256, 256))
+    cover = build.material(pictures.cover(rng, 256, 256))
     pages = build.plain((228, 222, 205))
     with build.object(name), build.frame((0, 0, 0), yaw=rng.uniform(-np.pi, np.pi)):
         build.box((-w / 2, -h / 2, 0), (w / 2, h / 2, thick_m), pages, "z", top=cover)
@@ -151,7 +152,7 @@ def lying_book(build: MeshBuilder, rng: np.random.Generator, name: str, thick_m:
 
 def paper(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
     """Printed sheet of paper, centred on the origin."""
-    sheet = build.material(printed.page(rng, 256, 192))
+    sheet = build.material(pictures.page(rng, 256, 192))
     with build.object(name), build.frame((0, 0, 0.0015), yaw=rng.uniform(-0.5, 0.5)):
         build.quad((-0.105, -0.148, 0), (0.21, 0, 0), (0, 0.297, 0), sheet)
 
@@ -179,3 +180,73 @@ def pen_pot(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
                 (0.02 * np.cos(angle), 0.02 * np.sin(angle), 0.03), yaw=angle - 1.57, pitch=-lean
             ):
                 build.lathe([(0.004, 0), (0.004, 0.15), (0.0, 0.162)], ink, 6)
+
+
+def television(build: MeshBuilder, rng: np.random.Generator, width_m: float) -> None:
+    """Flat television on a foot; its picture has the label "TV screen"."""
+    black = build.plain((24, 24, 26))
+    h, half = 0.57 * width_m, width_m / 2
+    with build.object("TV"):
+        build.box((-0.25, -0.28, 0), (0.25, -0.06, 0.015), black, "z")
+        build.box((-0.05, -0.18, 0.015), (0.05, -0.14, 0.08), black)
+        build.box((-half, -0.19, 0.07), (half, -0.14, 0.07 + h), black)
+    with build.object("TV screen"):
+        film = build.material(pictures.television(rng))
+        build.quad((-half + 0.015, -0.192, 0.09), (width_m - 0.03, 0, 0), (0, 0, h - 0.04), film)
+
+
+def monitor(build: MeshBuilder, rng: np.random.Generator, width_m: float, name: str) -> None:
+    """Computer monitor on a foot; its picture has the label "<name> screen"."""
+    black = build.plain((30, 30, 33))
+    h, half = 0.58 * width_m, width_m / 2
+    with build.object(name):
+        build.lathe(
+            [(0.11, 0), (0.11, 0.012), (0.11, 0.012), (0.02, 0.016), (0.02, 0.12)],
+            black,
+            18,
+            (0, -0.1, 0),
+        )
+        build.box((-half, -0.13, 0.1), (half, -0.1, 0.1 + h), black)
+    with build.object(f"{name} screen"):
+        desktop = build.material(pictures.screen(rng))
+        build.quad((-half + 0.01, -0.132, 0.11), (width_m - 0.02, 0, 0), (0, 0, h - 0.02), desktop)
+
+
+def keys(rng: np.random.Generator) -> Image:
+    """Seen from above: rows of keys with a letter each."""
+    image = np.full((128, 320, 3), 38, np.uint8)
+    for row in range(5):
+        x = 6 + 6 * row % 15
+        while x < 300:
+            wide = 20 if rng.random() < 0.85 else 40
+            cv2.rectangle(
+                image, (x, 6 + 24 * row), (min(x + wide - 4, 312), 25 + 24 * row), (72, 72, 76), -1
+            )
+            cv2.circle(image, (x + 6, 14 + 24 * row), 2, (225, 225, 225), -1)
+            x += wide
+    return image
+
+
+def keyboard(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
+    """Keyboard of 42 x 14 cm."""
+    with build.object(name):
+        side = build.plain((36, 36, 38))
+        top = build.material(keys(rng))
+        build.box((-0.21, -0.14, 0), (0.21, 0, 0.018), side, "z", top=top)
+
+
+def laptop(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
+    """Open laptop; its picture has the label "<name> screen"."""
+    silver = build.plain((150, 152, 156))
+    with build.object(name):
+        build.box((-0.165, -0.23, 0), (0.165, 0, 0.016), silver, "z")
+        build.quad((-0.15, -0.16, 0.0165), (0.3, 0, 0), (0, 0.14, 0), build.material(keys(rng)))
+        build.quad(
+            (-0.045, -0.22, 0.0165), (0.09, 0, 0), (0, 0.05, 0), build.plain((120, 122, 126))
+        )
+    with build.frame((0, 0, 0.012), pitch=-0.3):
+        with build.object(name):
+            build.box((-0.165, -0.004, 0), (0.165, 0.004, 0.225), silver)
+        with build.object(f"{name} screen"):
+            desktop = build.material(pictures.screen(rng))
+            build.quad((-0.155, -0.0045, 0.012), (0.31, 0, 0), (0, 0, 0.2), desktop)

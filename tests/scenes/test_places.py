@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ms_slam_env.robot.free_room import enclosed, floor_height, outside
+from ms_slam_env.scenes.base import enclosed, floor_height, outside
 from ms_slam_env.sensor.scene_cache import get_scene
 
 

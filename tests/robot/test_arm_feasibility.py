@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from ms_slam_env.geometry import invert, make_pose, so3_exp, transform_points
 from ms_slam_env.robot.action_primitives import decompose
 from ms_slam_env.robot.arm import ArmConfig, load_arm
-from ms_slam_env.robot.arm.capsules import with_column
-from ms_slam_env.robot.arm.inverse import solve_pose
-from ms_slam_env.robot.arm.reach import MOST_STRETCH, REASONS, Reach
-from ms_slam_env.robot.arm.surroundings import Surroundings
+from ms_slam_env.robot.arm.chain import with_column
+from ms_slam_env.robot.arm.clearance import ClearanceField
+from ms_slam_env.robot.arm.feasibility import MOST_STRETCH, REASONS, Feasibility
+from ms_slam_env.robot.arm.inverse_kinematics import solve_pose
 
 MOTIONS = decompose(0.12, np.radians(12))
 CONFIG = ArmConfig()
@@ -29,10 +29,10 @@ def furnished(arm):
     """A post beside the camera at home, in the way of some motions."""
     camera = transform_points(BASE, arm.chain.camera_pose(arm.home)[:3, 3])
     post = camera + transform_points(BASE, [[-0.2, 0.1, 0.05]])[0] - BASE[:3, 3]
-    return Surroundings(_Ball(post, 0.08), BASE, 1.4)
+    return ClearanceField(_Ball(post, 0.08), BASE, 1.4)
 
 
-def postures(arm, surroundings, count, seed=0):
+def postures(arm, clearance_field, count, seed=0):
     """Joint angles inside limits at which the links are close to furniture, but free."""
     rng = np.random.default_rng(seed)
     found = []
@@ -43,7 +43,7 @@ def postures(arm, surroundings, count, seed=0):
             -1, 3
         )
         radius = np.repeat(arm.chain.capsule_radius[arm.chain.capsule_link > 0], 9)
-        gap = (surroundings.distance(points) - radius).min()
+        gap = (clearance_field.distance(points) - radius).min()
         if 0.03 < gap < 0.15 and arm.chain.within_limits(q, 0.05):
             found.append(q)
         if len(found) == count:
@@ -52,7 +52,7 @@ def postures(arm, surroundings, count, seed=0):
 
 
 def test_it_agrees_with_the_slow_version(arm, furnished):
-    reach = Reach(arm.chain, furnished, CONFIG)
+    reach = Feasibility(arm.chain, furnished, CONFIG)
     rng = np.random.default_rng(1)
     reasons = set()
     for q in postures(arm, furnished, 8):
@@ -83,7 +83,7 @@ def test_it_agrees_with_the_slow_version(arm, furnished):
 def test_the_ends_are_reached_and_the_starts_kept(arm, furnished):
     q = postures(arm, furnished, 1)[0]
     targets = arm.chain.camera_pose(q) @ MOTIONS
-    result = Reach(arm.chain, furnished, CONFIG).probe(q, targets)
+    result = Feasibility(arm.chain, furnished, CONFIG).probe(q, targets)
     np.testing.assert_array_equal(result.q[:, 0], np.tile(q, (49, 1)))
     ends = arm.chain.camera_pose(result.q[result.ok, -1])
     np.testing.assert_allclose(ends, targets[result.ok], atol=1.8e-3)
@@ -92,7 +92,9 @@ def test_the_ends_are_reached_and_the_starts_kept(arm, furnished):
 
 def test_standing_still_is_possible_and_takes_no_time(arm, furnished):
     q = postures(arm, furnished, 1)[0]
-    result = Reach(arm.chain, furnished, CONFIG).probe(q, arm.chain.camera_pose(q) @ MOTIONS[:1])
+    result = Feasibility(arm.chain, furnished, CONFIG).probe(
+        q, arm.chain.camera_pose(q) @ MOTIONS[:1]
+    )
     assert result.ok.all()
     assert result.duration_s[0] == 0
     np.testing.assert_array_equal(result.q[0], np.tile(q, (result.q.shape[1], 1)))
@@ -101,10 +103,10 @@ def test_standing_still_is_possible_and_takes_no_time(arm, furnished):
 def test_one_and_many_agree_bit_for_bit_and_so_does_a_second_time(arm, furnished):
     q = postures(arm, furnished, 1, seed=5)[0]
     targets = arm.chain.camera_pose(q) @ MOTIONS
-    reach = Reach(arm.chain, furnished, CONFIG)
+    reach = Feasibility(arm.chain, furnished, CONFIG)
     all_at_once = reach.probe(q, targets)
     reach.probe(q + 0.01, targets)
-    again = Reach(arm.chain, furnished, CONFIG).probe(q, targets)
+    again = Feasibility(arm.chain, furnished, CONFIG).probe(q, targets)
     np.testing.assert_array_equal(all_at_once.q[all_at_once.ok], again.q[again.ok])
     np.testing.assert_array_equal(all_at_once.reason, again.reason)
     for k in range(49):
@@ -117,7 +119,7 @@ def test_one_and_many_agree_bit_for_bit_and_so_does_a_second_time(arm, furnished
 
 def test_results_are_not_overwritten_by_the_next_probe(arm, furnished):
     first, second = postures(arm, furnished, 2)
-    reach = Reach(arm.chain, furnished, CONFIG)
+    reach = Feasibility(arm.chain, furnished, CONFIG)
     kept = reach.probe(first, arm.chain.camera_pose(first) @ MOTIONS)
     before = kept.q.copy(), kept.reason.copy(), kept.duration_s.copy()
     reach.probe(second, arm.chain.camera_pose(second) @ MOTIONS)
@@ -126,11 +128,11 @@ def test_results_are_not_overwritten_by_the_next_probe(arm, furnished):
 
 
 def test_the_reason_is_given(arm):
-    open_space = Surroundings(_Nothing(), np.eye(4), 1.3)
+    open_space = ClearanceField(_Nothing(), np.eye(4), 1.3)
     q = arm.home
 
-    def why(target, config=CONFIG, surroundings=open_space, start=q):
-        reach = Reach(arm.chain, surroundings, config)
+    def why(target, config=CONFIG, clearance_field=open_space, start=q):
+        reach = Feasibility(arm.chain, clearance_field, config)
         return REASONS[reach.probe(start, target[None]).reason[0]]
 
     T = arm.chain.camera_pose(q)
@@ -141,15 +143,15 @@ def test_the_reason_is_given(arm):
     pushed = edge.copy()
     pushed[1] -= 0.1
     assert why(arm.chain.camera_pose(pushed), start=edge) == "joint limit"
-    solid = Surroundings(_Below(T[2, 3] - 0.05), np.eye(4), 1.3)
+    solid = ClearanceField(_Below(T[2, 3] - 0.05), np.eye(4), 1.3)
     down = T.copy()
     down[2, 3] -= 0.05
-    assert why(down, surroundings=solid) == "furniture"
+    assert why(down, clearance_field=solid) == "furniture"
 
 
 def test_folding_the_arm_onto_itself_is_refused(arm):
-    open_space = Surroundings(_Nothing(), np.eye(4), 1.3)
-    reach = Reach(arm.chain, open_space, CONFIG)
+    open_space = ClearanceField(_Nothing(), np.eye(4), 1.3)
+    reach = Feasibility(arm.chain, open_space, CONFIG)
     rng = np.random.default_rng(0)
     seen = 0
     for _ in range(200):
@@ -167,8 +169,8 @@ def test_an_arm_that_is_too_close_may_leave_but_not_come_closer(arm):
     q = arm.home
     T = arm.chain.camera_pose(q)
     lowest = _lowest(arm, q)
-    floor = Surroundings(_Below(lowest - 0.01), np.eye(4), 1.3)  # 1 cm instead of 2
-    reach = Reach(arm.chain, floor, CONFIG)
+    floor = ClearanceField(_Below(lowest - 0.01), np.eye(4), 1.3)  # 1 cm instead of 2
+    reach = Feasibility(arm.chain, floor, CONFIG)
     up, down = T.copy(), T.copy()
     up[2, 3] += 0.05
     down[2, 3] -= 0.05
@@ -178,8 +180,8 @@ def test_an_arm_that_is_too_close_may_leave_but_not_come_closer(arm):
 
 
 def test_long_ways_are_cut_finer(arm):
-    open_space = Surroundings(_Nothing(), np.eye(4), 1.3)
-    reach = Reach(arm.chain, open_space, CONFIG)
+    open_space = ClearanceField(_Nothing(), np.eye(4), 1.3)
+    reach = Feasibility(arm.chain, open_space, CONFIG)
     T = arm.chain.camera_pose(arm.home)
     far = reach.probe(arm.home, (T @ make_pose(np.eye(3), [0, 0, -0.4]))[None])
     turned = reach.probe(arm.home, (T @ make_pose(so3_exp([0, 0, 1.0]), [0, 0, 0]))[None])
@@ -188,10 +190,10 @@ def test_long_ways_are_cut_finer(arm):
 
 
 def test_a_slow_joint_stretches_the_motion_up_to_a_limit(arm):
-    open_space = Surroundings(_Nothing(), np.eye(4), 1.3)
+    open_space = ClearanceField(_Nothing(), np.eye(4), 1.3)
     targets = arm.chain.camera_pose(arm.home) @ MOTIONS
-    easy = Reach(arm.chain, open_space, ArmConfig(speed_m_s=0.01, speed_rad_s=0.03))
-    hard = Reach(arm.chain, open_space, ArmConfig(speed_m_s=0.2, speed_rad_s=0.6))
+    easy = Feasibility(arm.chain, open_space, ArmConfig(speed_m_s=0.01, speed_rad_s=0.03))
+    hard = Feasibility(arm.chain, open_space, ArmConfig(speed_m_s=0.2, speed_rad_s=0.6))
     relaxed, hurried = easy.probe(arm.home, targets), hard.probe(arm.home, targets)
     assert (relaxed.ok >= hurried.ok).all()
     at_most = 1.25 * np.maximum(0.12 / 0.2, np.radians(12) / 0.6) * MOST_STRETCH * 1.05
@@ -226,7 +228,7 @@ def test_one_joint_along_the_view_can_only_roll(tmp_path):
     path = tmp_path / "roll.xml"
     path.write_text(ROLLING)
     chain = load_arm(str(path)).chain
-    reach = Reach(chain, Surroundings(_Nothing(), np.eye(4), 1.0), CONFIG)
+    reach = Feasibility(chain, ClearanceField(_Nothing(), np.eye(4), 1.0), CONFIG)
     result = reach.probe(np.zeros(1), chain.camera_pose(np.zeros(1)) @ MOTIONS)
     np.testing.assert_array_equal(np.flatnonzero(result.ok), [0, 1, 2])  # none, right, left
     assert {REASONS[r] for r in result.reason[3:]} == {"unreachable"}
@@ -239,13 +241,13 @@ def test_one_joint_along_the_view_can_only_roll(tmp_path):
 @given(st.integers(0, 1000))
 def test_distances_are_the_scenes_less_the_slack_where_it_is_flat(seed):
     world = _Below(0.3)
-    surroundings = Surroundings(world, BASE, 1.4)
+    clearance_field = ClearanceField(world, BASE, 1.4)
     points = np.random.default_rng(seed).uniform(-0.8, 0.8, (50, 3))
     true = world.clearance(transform_points(BASE, points))
-    got = surroundings.distance(points)
+    got = clearance_field.distance(points)
     assert (got <= true + 1e-6).all()
     flat = true > 0.1
-    np.testing.assert_allclose(got[flat], true[flat] - surroundings.slack_m, atol=1e-5)
+    np.testing.assert_allclose(got[flat], true[flat] - clearance_field.slack_m, atol=1e-5)
 
 
 def test_the_gradient_is_the_slope_of_the_distance(furnished):
@@ -273,17 +275,17 @@ def test_off_the_grid_nothing_is_free(furnished):
 def test_a_scenes_own_grid_is_used_as_it_is():
     scene = _mesh_scene()
     T = make_pose(so3_exp([0, 0, 0.4]), [1.6, 1.6, 1.0])
-    surroundings = Surroundings(scene, T, 1.4)
+    clearance_field = ClearanceField(scene, T, 1.4)
     points = np.random.default_rng(0).uniform(-0.8, 0.8, (500, 3))
-    expected = np.maximum(scene.clearance(transform_points(T, points)) - surroundings.slack_m, 0)
-    got = surroundings.distance(points)
+    expected = np.maximum(scene.clearance(transform_points(T, points)) - clearance_field.slack_m, 0)
+    got = clearance_field.distance(points)
     assert (got >= expected - 1e-5).all()  # the slack is taken off before 0 is cut off
     np.testing.assert_allclose(got[expected > 0.1], expected[expected > 0.1], atol=1e-5)
 
 
 def test_a_base_outside_the_scene_is_surrounded(box_scene):
     scene = _mesh_scene()
-    outside = Surroundings(scene, make_pose(np.eye(3), [50.0, 0, 0]), 0.8)
+    outside = ClearanceField(scene, make_pose(np.eye(3), [50.0, 0, 0]), 0.8)
     np.testing.assert_array_equal(outside.distance(np.zeros((1, 3))), 0)
 
 

@@ -32,7 +32,7 @@ def progress(share_of_time: Float64) -> Float64:
     return np.where(t < RAMP, rising, np.where(t > 1 - RAMP, falling, cruise))
 
 
-class CameraPath:
+class CartesianPath:
     """The way of the camera from one pose to another.
 
     The position moves on a straight line while the orientation turns about one axis, both with

@@ -10,27 +10,25 @@ from numpy.typing import NDArray
 from ms_slam_env.errors import InputError, UnreachableError
 from ms_slam_env.geometry import invert, make_pose, so3_exp, transform_points
 from ms_slam_env.robot.action_primitives import decompose
-from ms_slam_env.robot.arm.capsules import with_column
-from ms_slam_env.robot.arm.chain import Chain
+from ms_slam_env.robot.arm.chain import Chain, with_column
+from ms_slam_env.robot.arm.clearance import ClearanceField
 from ms_slam_env.robot.arm.config import ArmConfig
-from ms_slam_env.robot.arm.inverse import solve_pose
-from ms_slam_env.robot.arm.model import ArmModel
-from ms_slam_env.robot.arm.postures import (
+from ms_slam_env.robot.arm.feasibility import LIMIT_MARGIN_RAD, Feasibility
+from ms_slam_env.robot.arm.inverse_kinematics import (
     PITCHES,
     STEP_M,
     STEP_RAD,
     Samples,
     effort,
+    ik_seeds_at,
     links_apart,
-    postures_at,
     sample_joints,
+    solve_pose,
     turn_upright,
     wrap_joints,
 )
-from ms_slam_env.robot.arm.reach import LIMIT_MARGIN_RAD, Reach
-from ms_slam_env.robot.arm.surroundings import Surroundings
-from ms_slam_env.robot.free_room import enclosed, outside, words
-from ms_slam_env.scenes.base import Scene
+from ms_slam_env.robot.arm.model import ArmModel
+from ms_slam_env.scenes.base import Scene, enclosed, outside, words
 
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -114,7 +112,7 @@ def _stand_anywhere(
     up = T_world_camera[2, :3]
     pitch = np.arcsin(np.clip(up[2], -1, 1))
     nearest = np.argsort(np.abs(PITCHES - pitch), kind="stable")[:_PITCHES_TRIED]
-    postures = [postures_at(chain, tuple(model.home), _planning(config), int(i)) for i in nearest]
+    postures = [ik_seeds_at(chain, tuple(model.home), _planning(config), int(i)) for i in nearest]
     motions = np.concatenate([some.motions for some in postures])
     found = np.concatenate([some.q for some in postures])
     if len(found) == 0:
@@ -187,9 +185,9 @@ def _most_able(
     motions = decompose(STEP_M, STEP_RAD)
     best, most = 0, -1
     for index in range(min(_PROBED, len(q))):
-        surroundings = Surroundings(scene, T_world_base[index], reach_m(chain))
-        reach = Reach(chain, surroundings, config)
-        result = reach.probe(q[index], chain.camera_pose(q[index]) @ motions)
+        clearance_field = ClearanceField(scene, T_world_base[index], reach_m(chain))
+        feasibility = Feasibility(chain, clearance_field, config)
+        result = feasibility.probe(q[index], chain.camera_pose(q[index]) @ motions)
         count = int(result.ok.sum())
         if count > most:
             best, most = index, count

@@ -12,18 +12,18 @@ from scipy.spatial.transform import Rotation
 
 from ms_slam_env._warp import wp
 from ms_slam_env.geometry import invert
+from ms_slam_env.robot.arm.cartesian_path import PEAK_SPEED, progress
 from ms_slam_env.robot.arm.chain import Chain
+from ms_slam_env.robot.arm.clearance import ClearanceField
 from ms_slam_env.robot.arm.config import ArmConfig
-from ms_slam_env.robot.arm.path import PEAK_SPEED, progress
-from ms_slam_env.robot.arm.reach_inverse import Arm, Scratch, vec6
-from ms_slam_env.robot.arm.reach_kernels import Grid, follow, start_deficits
-from ms_slam_env.robot.arm.surroundings import Surroundings
+from ms_slam_env.robot.arm.feasibility_kernels import Grid, follow, start_deficits
+from ms_slam_env.robot.arm.ik_kernels import Arm, Scratch, vec6
 
 Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
 
 REASONS = ("ok", "unreachable", "joint limit", "joint speed", "furniture", "self-collision")
-"""Words for ``ReachResult.reason``."""
+"""Words for ``FeasibilityResult.reason``."""
 
 FEWEST_PARTS = 7
 """A way is cut into at least so many parts between waypoints."""
@@ -49,7 +49,7 @@ _SHORTEST_PART_M = 0.03  # of a capsule, between two balls that cover it
 
 
 @dataclass(frozen=True)
-class ReachResult:
+class FeasibilityResult:
     """What became of ``k`` ways.
 
     Attributes:
@@ -67,13 +67,13 @@ class ReachResult:
     duration_s: Float64
 
 
-class Reach:
+class Feasibility:
     """Follows straight ways of the camera with the joints and says which are possible.
 
     A way is possible if at each of its waypoints inverse kinematics between the joints' limits
     finds joint angles within 1.8 mm and 0.18 degrees of it (the controller allows itself 2 mm and
     0.2), capsules around the links stay ``clearance_m`` away from furniture (beyond the slack of
-    ``Surroundings``) and from each other, and no joint needs more than ``MOST_STRETCH`` times the
+    ``ClearanceField``) and from each other, and no joint needs more than ``MOST_STRETCH`` times the
     duration of the camera's way. Of the joint angles that an arm with spare joints has for a
     waypoint, those nearest to the waypoint before are taken: spare joints bend around limits as in
     the controller, but not around furniture or other links as there, so that a few motions are
@@ -88,16 +88,16 @@ class Reach:
     """
 
     def __init__(
-        self, chain: Chain, surroundings: Surroundings, config: ArmConfig, device: str = "cpu"
+        self, chain: Chain, clearance_field: ClearanceField, config: ArmConfig, device: str = "cpu"
     ) -> None:
         self._chain = chain
         self._config = config
         self._device = device
         self._arm = _arm(chain, config.clearance_m, device)
-        self._grid = _grid(surroundings, device)
+        self._grid = _grid(clearance_field, device)
         self._buffers: dict[tuple[int, int], _Buffers] = {}
 
-    def probe(self, q: Float64, T_base_targets: Float64) -> ReachResult:
+    def probe(self, q: Float64, T_base_targets: Float64) -> FeasibilityResult:
         """Try the straight ways from joint angles (n,) to camera poses (k, 4, 4)."""
         T_start = self._chain.camera_pose(q)
         targets = np.asarray(T_base_targets, dtype=np.float64)
@@ -155,7 +155,7 @@ class Reach:
         waypoints[still] = q
         waypoints[:, 0] = q
         seconds = np.where(still, 0.0, duration * np.where(ok, buffers.stretch.numpy(), 1.0))
-        return ReachResult(ok, reason, waypoints, seconds)
+        return FeasibilityResult(ok, reason, waypoints, seconds)
 
 
 def _parts(step: Float64, turn: Float64) -> int:
@@ -240,13 +240,13 @@ def _arm(chain: Chain, clearance_m: float, device: str) -> Arm:
     return arm
 
 
-def _grid(surroundings: Surroundings, device: str) -> Grid:
-    """The surroundings for the kernel."""
-    T = surroundings.T_world_base
+def _grid(clearance_field: ClearanceField, device: str) -> Grid:
+    """The clearance field for the kernel."""
+    T = clearance_field.T_world_base
     grid = Grid()
-    grid.distance = _array(surroundings.grid, wp.float32, device)
-    grid.R_grid_base = wp.mat33(T[:3, :3] / surroundings.voxel_m)
-    grid.t_grid_base = wp.vec3((T[:3, 3] - surroundings.origin) / surroundings.voxel_m)
+    grid.distance = _array(clearance_field.grid, wp.float32, device)
+    grid.R_grid_base = wp.mat33(T[:3, :3] / clearance_field.voxel_m)
+    grid.t_grid_base = wp.vec3((T[:3, 3] - clearance_field.origin) / clearance_field.voxel_m)
     return grid
 
 

@@ -3,13 +3,13 @@
 """Warp kernel that follows the camera's straight way to every candidate with the joints.
 
 One thread follows one candidate: inverse kinematics from waypoint to waypoint, then the checks,
-in the order of ``REASONS`` of :mod:`ms_slam_env.robot.arm.reach`.
+in the order of ``REASONS`` of :mod:`ms_slam_env.robot.arm.feasibility`.
 """
 
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
-from ms_slam_env.robot.arm.reach_inverse import Arm, Scratch, forward, solve_waypoint
+from ms_slam_env.robot.arm.ik_kernels import Arm, Scratch, forward, solve_waypoint
 
 OK = wp.constant(0)
 UNREACHABLE = wp.constant(1)

@@ -1,4 +1,4 @@
-"""Daylight: sun with cast shadows, open sky, one bounce; and the finished outdoor scene."""
+"""The sky, daylight with cast shadows, and the finished outdoor scene."""
 
 from __future__ import annotations
 
@@ -8,10 +8,35 @@ import numpy as np
 
 from ms_slam_env.scenes.base import Float64
 from ms_slam_env.scenes.builder import MeshBuilder
-from ms_slam_env.scenes.large_scene import SKY, LargeScene
 from ms_slam_env.scenes.lighting import Lighting, SkyLight, Sun, auto_exposure, light_mesh
+from ms_slam_env.scenes.mesh_scene import SKY, LargeScene, SceneMaker
 from ms_slam_env.scenes.outdoors.plan import StreetPlan
-from ms_slam_env.scenes.outdoors.sky import sky_dome
+from ms_slam_env.scenes.textures import outdoor
+
+RADIUS_M = 150.0
+_LOWEST_RAD = np.radians(-12.0)
+
+
+def sky_dome(build: MeshBuilder, rng: np.random.Generator, centre: tuple[float, float]) -> None:
+    """Add a dome of ``RADIUS_M`` seen from inside, with clouds, around ``centre`` (x, y)."""
+    elevation = np.linspace(_LOWEST_RAD, np.pi / 2, 14)[:, None]
+    azimuth = np.linspace(0, 2 * np.pi, 37)[None, :]
+    ring = np.cos(elevation)
+    grid = np.stack(
+        [
+            centre[0] + RADIUS_M * ring * np.cos(azimuth),
+            centre[1] + RADIUS_M * ring * np.sin(azimuth),
+            RADIUS_M * np.sin(elevation) * np.ones_like(azimuth),
+        ],
+        -1,
+    )
+    u = np.broadcast_to(azimuth / (2 * np.pi), grid.shape[:2])
+    up = np.clip(elevation, 0.0, None) / (np.pi / 2)
+    v = np.broadcast_to(0.999 - 0.998 * up, grid.shape[:2])
+    with build.object(SKY):
+        image = build.material(outdoor.sky(rng))
+        build.patch(grid[:, ::-1], image, np.stack([u, v], -1)[:, ::-1], inset=False)
+
 
 _KEY = 0.16
 _MOST_EXPOSED = 0.85
@@ -21,7 +46,7 @@ _DEPTH_OF_VIEW_M = (3.0, 8.0)
 
 
 def daylight_scene(
-    name: str,
+    maker: SceneMaker,
     seed: int,
     build: MeshBuilder,
     rng: np.random.Generator,
@@ -32,7 +57,7 @@ def daylight_scene(
     """Light what was built, from a sun 35 to 55 degrees high, and make the scene.
 
     Args:
-        name: of the scene.
+        maker: of the scene.
         seed: of the scene.
         build: everything but the sky.
         rng: draws the sun's place.
@@ -80,4 +105,4 @@ def daylight_scene(
         target[2] = draw.uniform(0.6, 1.6)
         return eye, target
 
-    return LargeScene(name, seed, mesh, start, exposure, places, eyes, lanes=plan.lanes())
+    return LargeScene(maker, seed, mesh, start, exposure, places, eyes, lanes=plan.lanes())

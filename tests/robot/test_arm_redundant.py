@@ -8,9 +8,9 @@ from arm_reference import follow
 
 from ms_slam_env.robot.action_primitives import decompose
 from ms_slam_env.robot.arm import ArmConfig, load_arm
+from ms_slam_env.robot.arm.clearance import ClearanceField
 from ms_slam_env.robot.arm.controller import Controller
-from ms_slam_env.robot.arm.reach import LIMIT_MARGIN_RAD, MOST_STRETCH, Reach
-from ms_slam_env.robot.arm.surroundings import Surroundings
+from ms_slam_env.robot.arm.feasibility import LIMIT_MARGIN_RAD, MOST_STRETCH, Feasibility
 
 MOTIONS = decompose(0.12, np.radians(12))
 CONFIG = ArmConfig()
@@ -38,8 +38,8 @@ def near_a_limit(second, count, seed=0):
 
 
 def test_a_redundant_arm_bends_around_its_limits_as_the_slow_version_does(second):
-    open_space = Surroundings(_Nothing(), np.eye(4), 2.0)
-    reach = Reach(second.chain, open_space, CONFIG)
+    open_space = ClearanceField(_Nothing(), np.eye(4), 2.0)
+    reach = Feasibility(second.chain, open_space, CONFIG)
     rng = np.random.default_rng(0)
     low, high = second.chain.lower + LIMIT_MARGIN_RAD, second.chain.upper - LIMIT_MARGIN_RAD
     bent = 0
@@ -57,8 +57,8 @@ def test_a_redundant_arm_bends_around_its_limits_as_the_slow_version_does(second
 
 
 def test_mask_and_controller_agree_on_a_redundant_arm(second):
-    open_space = Surroundings(_Nothing(), np.eye(4), 2.0)
-    reach = Reach(second.chain, open_space, CONFIG)
+    open_space = ClearanceField(_Nothing(), np.eye(4), 2.0)
+    reach = Feasibility(second.chain, open_space, CONFIG)
     controller = Controller(second, second.chain, open_space, CONFIG)
     rng = np.random.default_rng(0)
     agrees, apart = [], []
@@ -79,7 +79,7 @@ def test_mask_and_controller_agree_on_a_redundant_arm(second):
 
 def test_a_redundant_arm_keeps_its_limits_and_speeds(second):
     chain = second.chain
-    reach = Reach(chain, Surroundings(_Nothing(), np.eye(4), 2.0), CONFIG)
+    reach = Feasibility(chain, ClearanceField(_Nothing(), np.eye(4), 2.0), CONFIG)
     for q in (second.home, *near_a_limit(second, 6)):
         targets = chain.camera_pose(q) @ MOTIONS
         result = reach.probe(q, targets)
