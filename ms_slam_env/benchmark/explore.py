@@ -21,7 +21,7 @@ from ms_slam_env.exploration.front import (
     importances,
     points_of,
 )
-from ms_slam_env.exploration.ledger import Ledger
+from ms_slam_env.exploration.study_storage import StudyStorage
 from ms_slam_env.metrics.cost import energy_counters
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import write_json
@@ -89,7 +89,7 @@ def run_exploration(
     """
     space = make_space(exploration.parameters, exploration.base)
     with tqdm(total=trials, desc=exploration.settings.sampler, unit="trial") as bar:
-        ledger = explore(
+        storage = explore(
             out,
             space,
             exploration.settings,
@@ -99,29 +99,29 @@ def run_exploration(
             ray_address,
             lambda finished: _show(bar, finished),
         )
-    return write_results(exploration, ledger, out)
+    return write_results(exploration, storage, out)
 
 
 def _show(bar: tqdm, finished: int) -> None:
     bar.update(finished - bar.n)
 
 
-def write_results(exploration: Exploration, ledger: Ledger, out: Path) -> str:
+def write_results(exploration: Exploration, storage: StudyStorage, out: Path) -> str:
     """Write everything but the study; return the table."""
     objectives = exploration.settings.objectives
-    points = points_of(ledger)
-    reference = ledger.reference() or {}
+    points = points_of(storage)
+    reference = storage.reference() or {}
     chosen = choose(points, objectives)
     files = {name: f"{name.replace('_', '-')}.yaml" for name in chosen}
     for name, point in chosen.items():
-        made = _configuration(ledger, point, name, exploration.evaluator.image_size)
+        made = _configuration(storage, point, name, exploration.evaluator.image_size)
         write_configuration(out / files[name], made)
     known = {point.number for point in chosen.values()}
     others = {f"trial {p.number}": p for p in points if p.on_front and p.number not in known}
     judged = {
-        name: ledger.space.configuration(point.params) for name, point in (chosen | others).items()
+        name: storage.space.configuration(point.params) for name, point in (chosen | others).items()
     }
-    configurations = {DEFAULT: ledger.space.base, **judged}
+    configurations = {DEFAULT: storage.space.base, **judged}
     held_out = judge(exploration.evaluator, configurations, exploration.held_out, out)
     history = hypervolume_history(points, reference, objectives)
     content: dict[str, Any] = {
@@ -129,7 +129,7 @@ def write_results(exploration: Exploration, ledger: Ledger, out: Path) -> str:
         "config": {
             **asdict(exploration.evaluator),
             **asdict(exploration.settings),
-            "parameters": {name: str(kind) for name, kind in ledger.space.parameters.items()},
+            "parameters": {name: str(kind) for name, kind in storage.space.parameters.items()},
             "base": asdict(exploration.base),
             "held_out": exploration.held_out,
         },
@@ -137,7 +137,7 @@ def write_results(exploration: Exploration, ledger: Ledger, out: Path) -> str:
         "reference": reference,
         "chosen": {name: {"file": files[name], **point.row()} for name, point in chosen.items()},
         "hypervolume": [float(value) for value in history],
-        "importance": importances(ledger),
+        "importance": importances(storage),
         "held_out": held_out,
         "trials": [point.row() for point in points],
     }
@@ -149,10 +149,10 @@ def write_results(exploration: Exploration, ledger: Ledger, out: Path) -> str:
 
 
 def _configuration(
-    ledger: Ledger, point: Point, purpose: str, image_size: str
+    storage: StudyStorage, point: Point, purpose: str, image_size: str
 ) -> SlamConfiguration:
     """The configuration of ``point`` with where it comes from and the image size it ran at."""
-    made = ledger.space.configuration(point.params)
+    made = storage.space.configuration(point.params)
     about = {
         "purpose": purpose,
         "trial": point.number,

@@ -28,7 +28,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.exploration import make_space
 from ms_slam_env.exploration.front import hypervolume
 from ms_slam_env.exploration.objectives import FAILURE, objective_values
-from ms_slam_env.exploration.samplers import SAMPLERS, make_sampler
+from ms_slam_env.exploration.settings import SAMPLERS, make_sampler
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import RecordFile, spec_key, write_json
 from ms_slam_env.report.statistics import bootstrap_interval

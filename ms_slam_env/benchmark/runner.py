@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import multiprocessing
-import os
-import signal
 import sys
-import threading
-import time
-import traceback
 from collections.abc import Callable, Mapping, Sequence
-from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
 from ms_slam_env.errors import InputError
-from ms_slam_env.parallel import available_cores, thread_environment
+from ms_slam_env.parallel import Outcome, one_thread_unless_set, open_pool, run_each
 from ms_slam_env.report.provenance import git_commit
 from ms_slam_env.report.records import RecordFile, Row, spec_key
 
@@ -51,8 +44,7 @@ def run_all(
         InputError: fewer than one worker, a folder that cannot be made, or a file of results
             that cannot be read.
     """
-    workers = available_cores() if workers is None else workers
-    if workers < 1:
+    if workers is not None and workers < 1:
         raise InputError(f"workers = {workers} must be at least 1")
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -81,7 +73,9 @@ def run_all(
                     name = name_of[row["key"]]
                     bar.write(f"failed: {name}: {row['error']}", file=sys.stderr)
 
-            _run_missing(todo, run, workers, finish)
+            with open_pool(run, workers, environment=one_thread_unless_set()) as pool:
+                for outcome in run_each(pool, todo):
+                    finish(_row(outcome, todo[outcome.key]))
     return [rows[key] for key in keys]
 
 
@@ -123,108 +117,14 @@ def check_any_finished(rows: Sequence[Row]) -> None:
         raise RuntimeError(f"all {len(rows)} failed, the first: {errors[0]}; no report is written")
 
 
-def _run_missing(
-    todo: dict[str, Any],
-    run: Callable[[Any], dict[str, Any]],
-    workers: int,
-    finish: Callable[[Row], None],
-) -> None:
-    for name, one in thread_environment(1).items():  # inherited, and read when libraries load
-        os.environ.setdefault(name, one)
-    waiting = list(todo.items())[::-1]
-    busy = {}
-    try:
-        for _ in range(min(workers, len(waiting))):
-            worker = _Worker(run)
-            busy[worker.pipe] = worker
-            worker.give(*waiting.pop())
-        while busy:
-            answered = wait(list(busy))
-            for pipe in [pipe for pipe in busy if pipe in answered]:
-                worker = busy.pop(pipe)
-                finish(worker.take())
-                if not worker.alive:
-                    worker = _Worker(run)
-                if waiting:
-                    busy[worker.pipe] = worker
-                    worker.give(*waiting.pop())
-                else:
-                    worker.stop()
-    finally:
-        # After an interrupt, what runs at this moment is lost and done again by the next call.
-        for worker in busy.values():
-            worker.stop()
-
-
-class _Worker:
-    """A process that runs one spec after another; its death costs only the spec in its hands."""
-
-    def __init__(self, run: Callable[[Any], dict[str, Any]]) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.pipe, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs, run), daemon=True)
-        self._process.start()
-        theirs.close()  # so that reading ends when the process does
-        self.alive = True
-
-    def give(self, key: str, spec: Any) -> None:
-        """Let the process run a spec."""
-        self._key, self._spec, self._start = key, spec, time.perf_counter()
-        self.pipe.send((key, spec))
-
-    def take(self) -> Row:
-        """Its row; a row with an error if the process died on it."""
-        try:
-            return self.pipe.recv()
-        except (EOFError, ConnectionResetError):
-            self.alive = False
-            self._process.join()
-            row = _empty_row(self._key, self._spec)
-            row["error"] = f"the process died, exit code {self._process.exitcode}"
-            row["elapsed_s"] = round(time.perf_counter() - self._start, 3)
-            return row
-
-    def stop(self) -> None:
-        """End the process."""
-        self._process.terminate()
-        self._process.join()
-        self.pipe.close()
-
-
-def _serve(pipe: Connection, run: Callable[[Any], dict[str, Any]]) -> None:
-    _prepare_worker()
-    while True:
-        try:
-            key, spec = pipe.recv()
-        except EOFError:
-            return
-        pipe.send(_run_one(run, key, spec))
-
-
-def _prepare_worker() -> None:
-    """Leave Ctrl-C to the parent, and end when the parent is gone, even if it was killed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def watch() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
-def _run_one(run: Callable[[Any], dict[str, Any]], key: str, spec: Any) -> Row:
-    start = time.perf_counter()
-    row = _empty_row(key, spec)
-    try:
-        row["result"] = run(spec)
-    except Exception as error:
-        row["error"] = f"{type(error).__name__}: {error}".splitlines()[0]
-        row["traceback"] = traceback.format_exc()
-    row["elapsed_s"] = round(time.perf_counter() - start, 3)
-    return row
-
-
-def _empty_row(key: str, spec: Any) -> Row:
-    return {"key": key, "spec": dataclasses.asdict(spec), "result": None, "error": None}
+def _row(outcome: Outcome, spec: Any) -> Row:
+    """An outcome as it is recorded."""
+    row: Row = {
+        "key": outcome.key,
+        "spec": dataclasses.asdict(spec),
+        "result": outcome.value,
+        "error": outcome.error,
+    }
+    if outcome.traceback:
+        row["traceback"] = outcome.traceback
+    return {**row, "elapsed_s": outcome.elapsed_s}

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ms_slam_env.exploration.ledger import Ledger
+from ms_slam_env.exploration.study_storage import StudyStorage
 
 Float64 = NDArray[np.float64]
 
@@ -50,16 +50,16 @@ class Point:
         }
 
 
-def points_of(ledger: Ledger) -> list[Point]:
+def points_of(storage: StudyStorage) -> list[Point]:
     """The finished trials, in the order of their numbers."""
-    reference = ledger.reference() or {}  # none before the first trial has finished
-    limits = [reference.get(name, math.inf) for name in ledger.settings.objectives]
+    reference = storage.reference() or {}  # none before the first trial has finished
+    limits = [reference.get(name, math.inf) for name in storage.settings.objectives]
     best = {
         trial.number
-        for trial in ledger.study.best_trials
+        for trial in storage.study.best_trials
         if all(value < limit for value, limit in zip(trial.values, limits, strict=True))
     }
-    defaults = ledger.space.defaults()
+    defaults = storage.space.defaults()
     return [
         Point(
             trial.number,
@@ -70,7 +70,7 @@ def points_of(ledger: Ledger) -> list[Point]:
             trial.number in best,
             trial.params == defaults,
         )
-        for trial in ledger.finished()
+        for trial in storage.finished()
     ]
 
 
@@ -139,7 +139,7 @@ def knee(values: ArrayLike) -> int:
     return int(np.argmin(scaled.sum(axis=1)))
 
 
-def importances(ledger: Ledger) -> dict[str, dict[str, float]]:
+def importances(storage: StudyStorage) -> dict[str, dict[str, float]]:
     """Share of each parameter in what makes a good value, by objective.
 
     PED-ANOVA (Watanabe, Bansal, Hutter, IJCAI 2023). Empty while there are too few trials.
@@ -150,12 +150,12 @@ def importances(ledger: Ledger) -> dict[str, dict[str, float]]:
         return lambda trial: trial.values[index]
 
     found = {}
-    for index, name in enumerate(ledger.settings.objectives):
+    for index, name in enumerate(storage.settings.objectives):
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # that low values are taken as good: they are
                 shares = get_param_importances(
-                    ledger.study, evaluator=PedAnovaImportanceEvaluator(), target=target(index)
+                    storage.study, evaluator=PedAnovaImportanceEvaluator(), target=target(index)
                 )
         except (RuntimeError, ValueError):
             continue

@@ -2,16 +2,72 @@
 
 from __future__ import annotations
 
+import importlib.util
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ms_slam_env.config import check_choice, check_range
+from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.exploration.objectives import METRICS, Constraint, Measured, parse_constraint
-from ms_slam_env.exploration.samplers import SAMPLERS
 from ms_slam_env.exploration.space import SearchSpace
 from ms_slam_env.slam.configuration import SlamConfiguration
+
+if TYPE_CHECKING:
+    from optuna.samplers import BaseSampler
+
+
+def _random(seed: int, population: int) -> BaseSampler:
+    from optuna.samplers import RandomSampler
+
+    return RandomSampler(seed=seed)
+
+
+def _nsga2(seed: int, population: int) -> BaseSampler:
+    from optuna.samplers import NSGAIISampler
+
+    return NSGAIISampler(seed=seed, population_size=population)
+
+
+def _tpe(seed: int, population: int) -> BaseSampler:
+    from optuna.samplers import TPESampler
+
+    return TPESampler(seed=seed, multivariate=True)
+
+
+def _gp(seed: int, population: int) -> BaseSampler:
+    from optuna.samplers import GPSampler
+
+    return GPSampler(seed=seed)
+
+
+SAMPLERS: dict[str, Callable[[int, int], BaseSampler]] = {
+    "random": _random,
+    "nsga2": _nsga2,
+    "tpe": _tpe,
+    "gp": _gp,
+}
+"""Name to maker; a maker takes the seed and the size of a population.
+
+``random`` is the paper's; ``nsga2`` evolves a population, ``tpe`` and ``gp`` fit a model.
+"""
+
+
+def make_sampler(name: str, seed: int, population: int) -> BaseSampler:
+    """Make the sampler ``name``.
+
+    Raises:
+        InputError: its library is not installed.
+    """
+    from optuna.exceptions import ExperimentalWarning
+
+    if name == "gp" and importlib.util.find_spec("torch") is None:
+        raise InputError("sampler gp needs PyTorch: pip install 'ms-slam-env[explore]'")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ExperimentalWarning)
+        return SAMPLERS[name](seed, population)
+
 
 Evaluate = Callable[[SlamConfiguration], Measured]
 """Measures a configuration: values of ``METRICS`` by name, ``M_I`` and ``M_D``, and ``failure``, in
@@ -20,7 +76,7 @@ stops the exploration; a failure of SLAM it returns."""
 
 
 @dataclass(frozen=True)
-class ExplorationSettings:
+class ExplorationSettings(Checked):
     """What decides the trials of a study.
 
     Attributes:
@@ -40,24 +96,21 @@ class ExplorationSettings:
 
     objectives: tuple[str, ...] = ("ate_m", "ext_ms")
     constraints: tuple[str, ...] = ()
-    sampler: str = "tpe"
-    seed: int = 0
-    population: int = 16
-    reference_factor: float = 3.0
+    sampler: str = chosen("tpe", *SAMPLERS)
+    seed: int = bounded(0, 0, 2**31)
+    population: int = bounded(16, 2, 10_000)
+    reference_factor: float = bounded(3.0, 1.01, 1000.0)  # the default itself lies inside
     reference: dict[str, float] = field(default_factory=dict)
     context: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Refuse what no study could use."""
+        super().__post_init__()
         for name in self.objectives:
             if name not in METRICS:
                 raise unknown("objective", name, METRICS)
         if len(set(self.objectives)) < max(2, len(self.objectives)):
             raise InputError(f"objectives {list(self.objectives)} must be two or more, each once")
-        check_choice(self, "sampler", tuple(SAMPLERS))
-        check_range(self, "seed", 0, 2**31)
-        check_range(self, "population", 2, 10_000)
-        check_range(self, "reference_factor", 1.01, 1000.0)  # the default itself lies inside
         if self.reference and set(self.reference) != set(self.objectives):
             raise InputError(f"reference {self.reference} must name every objective")
         self.parsed_constraints()

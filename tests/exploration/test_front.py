@@ -62,14 +62,14 @@ def test_the_history_never_falls_and_ignores_what_is_not_feasible(raw):
 
 
 @pytest.fixture(scope="module")
-def ledger(tmp_path_factory):
+def storage(tmp_path_factory):
     folder = tmp_path_factory.mktemp("study")
     settings = ExplorationSettings(sampler="random", constraints=("ate_m<0.04",))
     return explore(folder, fake_space(), settings, FakeEvaluation(lost_from=6.0), 30)
 
 
-def test_the_front_is_what_no_feasible_trial_dominates(ledger):
-    points = points_of(ledger)
+def test_the_front_is_what_no_feasible_trial_dominates(storage):
+    points = points_of(storage)
     assert points[0].is_default
     assert any(not p.feasible for p in points)
     assert any(p.measured.get("failure") for p in points)
@@ -82,13 +82,13 @@ def test_the_front_is_what_no_feasible_trial_dominates(ledger):
             and q.values != p.values
             for q in points
         )
-        limits = ledger.reference().values()
+        limits = storage.reference().values()
         counts = all(value < limit for value, limit in zip(p.values, limits, strict=True))
         assert p.on_front == (p.feasible and counts and not dominated)
 
 
-def test_choices_are_what_their_names_say(ledger):
-    points = points_of(ledger)
+def test_choices_are_what_their_names_say(storage):
+    points = points_of(storage)
     default = points[0]
     chosen = choose(points, ("ate_m", "ext_ms"))
     feasible = [p for p in points if p.feasible]
@@ -113,7 +113,7 @@ def test_the_knee_is_the_corner_of_the_front():
     assert knee([(1.0, 2.0)]) == 0
 
 
-def test_importance_finds_what_matters(ledger):
-    shares = importances(ledger)
+def test_importance_finds_what_matters(storage):
+    shares = importances(storage)
     assert max(shares["ext_ms"], key=shares["ext_ms"].get) == "depth_cutoff_m"
     assert sum(shares["ate_m"].values()) == pytest.approx(1.0)

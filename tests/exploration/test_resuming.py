@@ -11,8 +11,7 @@ from optuna.trial import TrialState
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.exploration import ExplorationSettings, explore, make_space
-from ms_slam_env.exploration.ledger import Ledger
-from ms_slam_env.exploration.ownership import is_alive, process_name
+from ms_slam_env.exploration.study_storage import StudyStorage, is_alive, process_name
 from ms_slam_env.slam.configuration import SlamConfiguration
 
 BUDGET = 12
@@ -101,25 +100,25 @@ def test_an_interrupted_study_draws_what_it_would_have_drawn(tmp_path):
 
 
 def test_a_trial_that_was_given_up_is_redone(tmp_path):
-    ledger = Ledger(tmp_path, fake_space(), ExplorationSettings(sampler="random"))
-    ledger.tell(ledger.ask(5), values(fake_space().defaults()))
-    lost = ledger.ask(5)
-    ledger.give_up(lost, "its process died")
-    again = ledger.ask(5)
+    storage = StudyStorage(tmp_path, fake_space(), ExplorationSettings(sampler="random"))
+    storage.tell(storage.ask(5), values(fake_space().defaults()))
+    lost = storage.ask(5)
+    storage.give_up(lost, "its process died")
+    again = storage.ask(5)
     assert again.params == lost.params
-    ledger.give_up(again, "its process died")
-    third = ledger.ask(5)
+    storage.give_up(again, "its process died")
+    third = storage.ask(5)
     assert third.params == lost.params
-    ledger.give_up(third, "its process died")
-    assert ledger.ask(5).params != lost.params  # it may be what kills processes
+    storage.give_up(third, "its process died")
+    assert storage.ask(5).params != lost.params  # it may be what kills processes
 
 
 def test_trials_from_before_a_restart_are_taken_back(tmp_path):
-    old = Ledger(tmp_path, fake_space(), ExplorationSettings(sampler="random"))
+    old = StudyStorage(tmp_path, fake_space(), ExplorationSettings(sampler="random"))
     old.tell(old.ask(2), values(fake_space().defaults()))
     old.owner = "old-name-of-the-container/1/2"
     forgotten = old.ask(2)
-    new = Ledger(tmp_path, fake_space(), ExplorationSettings(sampler="random"))
+    new = StudyStorage(tmp_path, fake_space(), ExplorationSettings(sampler="random"))
     again = new.ask(2)
     assert again.params == forgotten.params
     old.tell(forgotten, {"ate_m": 9.9})  # too late: it counts as failed
@@ -129,48 +128,48 @@ def test_trials_from_before_a_restart_are_taken_back(tmp_path):
 
 
 def test_results_wait_for_the_default(tmp_path):
-    ledger = Ledger(tmp_path, fake_space(), ExplorationSettings())
-    first = ledger.ask(9)
+    storage = StudyStorage(tmp_path, fake_space(), ExplorationSettings())
+    first = storage.ask(9)
     assert first.params == fake_space().defaults()
-    assert ledger.ask(9) is None
-    ledger.tell(first, {"ate_m": 0.02, "ext_ms": 5.0})
-    assert ledger.reference() == {"ate_m": pytest.approx(0.06), "ext_ms": pytest.approx(15.0)}
-    second, third = ledger.ask(3), ledger.ask(3)
-    assert ledger.ask(3) is None  # three are finished or in living hands
-    ledger.tell(second, {"ate_m": float("nan"), "ext_ms": 99.0, "failure": "lost"})
-    ledger.tell(third, {"ate_m": 0.01})
-    lost, partial = ledger.finished()[1:]
+    assert storage.ask(9) is None
+    storage.tell(first, {"ate_m": 0.02, "ext_ms": 5.0})
+    assert storage.reference() == {"ate_m": pytest.approx(0.06), "ext_ms": pytest.approx(15.0)}
+    second, third = storage.ask(3), storage.ask(3)
+    assert storage.ask(3) is None  # three are finished or in living hands
+    storage.tell(second, {"ate_m": float("nan"), "ext_ms": 99.0, "failure": "lost"})
+    storage.tell(third, {"ate_m": 0.01})
+    lost, partial = storage.finished()[1:]
     assert lost.values == [pytest.approx(0.06), pytest.approx(15.0)]
     assert partial.values == [0.01, pytest.approx(15.0)]
 
 
 def test_a_failed_default_leaves_absolute_references(tmp_path):
-    ledger = Ledger(tmp_path, fake_space(), ExplorationSettings())
-    ledger.tell(ledger.ask(9), {"ate_m": 0.5, "ext_ms": 4.0, "failure": "lost"})
-    assert ledger.reference() == {"ate_m": 1.0, "ext_ms": 12.0}
+    storage = StudyStorage(tmp_path, fake_space(), ExplorationSettings())
+    storage.tell(storage.ask(9), {"ate_m": 0.5, "ext_ms": 4.0, "failure": "lost"})
+    assert storage.reference() == {"ate_m": 1.0, "ext_ms": 12.0}
 
 
 def test_another_exploration_in_the_folder_is_refused(tmp_path):
-    Ledger(tmp_path, fake_space(), ExplorationSettings())
-    Ledger(tmp_path, fake_space(), ExplorationSettings())
+    StudyStorage(tmp_path, fake_space(), ExplorationSettings())
+    StudyStorage(tmp_path, fake_space(), ExplorationSettings())
     with pytest.raises(InputError, match="other settings: seed was 0 and is 1"):
-        Ledger(tmp_path, fake_space(), ExplorationSettings(seed=1))
+        StudyStorage(tmp_path, fake_space(), ExplorationSettings(seed=1))
     smaller = make_space(["keyframe_deg=0:10"], SlamConfiguration(slam="odometry"))
     with pytest.raises(InputError, match="other settings: parameters was"):
-        Ledger(tmp_path, smaller, ExplorationSettings())
+        StudyStorage(tmp_path, smaller, ExplorationSettings())
 
 
 def test_a_file_that_is_no_study_is_one_clear_line(tmp_path):
     (tmp_path / "study.db").write_text("no database at all, but long enough to be read as one" * 9)
     with pytest.raises(InputError, match=r"study\.db: not a study") as caught:
-        Ledger(tmp_path, fake_space(), ExplorationSettings())
+        StudyStorage(tmp_path, fake_space(), ExplorationSettings())
     assert "\n" not in str(caught.value)
 
 
 def test_a_lock_that_cannot_be_taken_is_one_clear_line(tmp_path):
     (tmp_path / "study.lock").mkdir()
     with pytest.raises(InputError, match=r"study\.lock: unable to open"):
-        Ledger(tmp_path, fake_space(), ExplorationSettings())
+        StudyStorage(tmp_path, fake_space(), ExplorationSettings())
 
 
 def test_processes_have_names(processes):

@@ -12,8 +12,8 @@ from ms_slam_env.exploration.front import points_of
 SETTINGS = ExplorationSettings(sampler="random")
 
 
-def check(ledger, budget):
-    points = points_of(ledger)
+def check(storage, budget):
+    points = points_of(storage)
     assert len(points) == budget
     assert len({tuple(point.params.values()) for point in points}) == budget
     for point in points:
@@ -23,10 +23,10 @@ def check(ledger, budget):
 def test_processes_share_a_study_and_one_may_die(tmp_path):
     seen = []
     evaluation = FakeEvaluation(die=str(tmp_path))
-    ledger = explore(
+    storage = explore(
         tmp_path / "study", fake_space(), SETTINGS, evaluation, 8, workers=2, progress=seen.append
     )
-    check(ledger, 8)
+    check(storage, 8)
     assert (tmp_path / "died").exists()
     assert seen[-1] == 8
     # Going on in this process takes up what is there.
@@ -47,10 +47,10 @@ def test_a_local_ray_cluster(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))  # where the evaluation is
     pytest.importorskip("ray", reason="needs the extra ray")
     evaluation = FakeEvaluation(die=str(tmp_path))
-    ledger = explore(
+    storage = explore(
         tmp_path / "study", fake_space(), SETTINGS, evaluation, 8, workers=2, ray_address="local"
     )
-    check(ledger, 8)
+    check(storage, 8)
     assert (tmp_path / "died").exists()  # one process died and its trial was redone
 
 

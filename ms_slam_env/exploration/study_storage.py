@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
+import socket
 import sqlite3
-import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,9 +20,7 @@ import numpy as np
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.exploration.objectives import FAILURE, METRICS, Measured, objective_values
-from ms_slam_env.exploration.ownership import is_alive, process_name
-from ms_slam_env.exploration.samplers import make_sampler
-from ms_slam_env.exploration.settings import ExplorationSettings
+from ms_slam_env.exploration.settings import ExplorationSettings, make_sampler
 from ms_slam_env.exploration.space import SearchSpace
 from ms_slam_env.slam.configuration import SlamConfiguration
 
@@ -38,8 +37,8 @@ MEASURED = "measured"
 """User attribute of a finished trial: everything that its evaluation returned."""
 
 
-class Ledger:
-    """The trials of one study; any number of processes may hold a ledger of one folder.
+class StudyStorage:
+    """The trials of one study; any number of processes may hold one of a folder.
 
     Args:
         folder: of the study; made if it is not there.
@@ -255,6 +254,40 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def wait_a_moment() -> None:
-    """Let others finish."""
-    time.sleep(0.05)
+# -- Which process works on a trial, and whether it still lives ---------------------------------
+
+
+def process_name(pid: int | None = None) -> str:
+    """Name of process ``pid`` (this one if None): host, number, and when it began."""
+    pid = os.getpid() if pid is None else pid
+    return f"{socket.gethostname()}/{pid}/{_start_of(pid)}"
+
+
+def is_alive(name: str) -> bool:
+    """Whether the process called ``name`` lives on this host.
+
+    A study's file lies on one machine: the process of another host is one from before a container
+    was started anew, under a new name.
+    """
+    host, pid, start = name.rsplit("/", 2)
+    if host != socket.gethostname():
+        return False
+    try:
+        os.kill(int(pid), 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass  # it lives, and is another user's
+    return _start_of(int(pid)) == start
+
+
+def _start_of(pid: int) -> str:
+    """Start of a process in clock ticks since boot, from proc(5); empty where there is no proc.
+
+    Numbers of processes are used again. A process that ended and was not waited for counts as none.
+    """
+    try:
+        after_name = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return ""
+    return "ended" if after_name[0] in "ZX" else after_name[19]

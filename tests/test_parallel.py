@@ -1,0 +1,85 @@
+"""Pools of workers: what comes back, what a death costs, and the same on a Ray cluster."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from parallel_work import work
+
+from ms_slam_env.errors import InputError
+from ms_slam_env.parallel import (
+    Outcome,
+    available_cores,
+    limited_threads,
+    open_pool,
+    run_each,
+    thread_environment,
+)
+
+
+def outcomes(specs: list[int], **options) -> dict[int, Outcome]:
+    with open_pool(work, **options) as pool:
+        found = {outcome.key: outcome for outcome in run_each(pool, {spec: spec for spec in specs})}
+        assert pool.busy == 0
+    return found
+
+
+@pytest.mark.parametrize("ray_address", [None, "local"])
+def test_a_death_or_a_complaint_costs_only_its_own_spec(
+    ray_address: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if ray_address:
+        pytest.importorskip("ray", reason="needs the extra ray")
+        monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    environment = thread_environment(3)
+    found = outcomes(
+        [2, 13, -1, -2, 5], workers=2, ray_address=ray_address, environment=environment
+    )
+    assert [found[k].value["square"] for k in (2, 5)] == [4, 25]
+    assert found[5].value["threads"] == "3"
+    assert found[13].died
+    assert found[13].error.startswith("the process died")
+    assert (found[-1].error, found[-1].message) == (
+        "InputError: no square of -1",
+        "no square of -1\nsecond line",
+    )
+    assert found[-1].is_bad_input
+    assert not found[-2].is_bad_input
+    assert found[-2].where.startswith("parallel_work.py:")
+    assert "ValueError" in found[-2].traceback
+    assert all(outcome.value is None for outcome in found.values() if outcome.error)
+
+
+def test_workers_are_kept_or_fresh() -> None:
+    kept = {outcome.value["pid"] for outcome in outcomes([1, 2, 3], workers=1).values()}
+    fresh = {
+        outcome.value["pid"] for outcome in outcomes([1, 2, 3], workers=1, fresh=True).values()
+    }
+    assert (len(kept), len(fresh)) == (1, 3)
+    assert os.getpid() not in kept | fresh
+
+
+def test_waiting_ends_at_its_limit_and_without_work() -> None:
+    with open_pool(work, workers=1) as pool:
+        assert pool.take() == []
+        pool.give("a", 3)
+        assert (pool.idle, pool.busy) == (0, 1)
+        assert pool.take(timeout_s=0.0) == []
+        assert [outcome.key for outcome in pool.take()] == ["a"]
+
+
+def test_there_must_be_a_worker() -> None:
+    with pytest.raises(InputError, match="workers = 0 must be at least 1"):
+        open_pool(work, workers=0)
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the system sets no affinity")
+def test_threads_are_limited_for_a_while() -> None:
+    before = available_cores()
+    with limited_threads(1):
+        assert available_cores() == 1
+    with limited_threads(None):
+        assert available_cores() == before
+    assert available_cores() == before
