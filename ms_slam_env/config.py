@@ -61,13 +61,19 @@ class Named(ABC):
         """The values by name."""
 
 
-class Family(ABC):
-    """An abstract dataclass whose variants are chosen by key ``name``."""
+class Family:
+    """An abstract dataclass whose variants, its concrete subclasses, are chosen by key ``name``."""
+
+    name: str
 
     @classmethod
-    @abstractmethod
-    def variants(cls) -> Mapping[str, type]:
-        """The dataclasses by name."""
+    def variants(cls) -> dict[str, type]:
+        """The dataclasses by name, of the modules that have been imported."""
+        found: dict[str, type] = {}
+        for variant in cls.__subclasses__():
+            is_abstract = inspect.isabstract(variant)
+            found |= variant.variants() if is_abstract else {variant.name: variant}
+        return found
 
 
 def from_dict(cls: type[T], values: Mapping[str, Any], path: str = "") -> T:

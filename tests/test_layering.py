@@ -35,14 +35,6 @@ ONLY_INSIDE_FUNCTIONS = {
 }
 STILL_IN_A_CIRCLE = {
     *(f"ms_slam_env.env.{name}" for name in ("active_slam", "rendering", "third_person_view")),
-    *("ms_slam_env.slam", "ms_slam_env.slam.configuration"),
-    "ms_slam_env.slam.adaptation",
-    *(f"ms_slam_env.slam.adaptation.{n}" for n in ("agent", "config", "divergence", "none")),
-    "ms_slam_env.slam.frame_management",
-    *(
-        f"ms_slam_env.slam.frame_management.{name}"
-        for name in ("budget", "config", "divergence", "every_frame", "regular")
-    ),
 }
 """Modules whose imports are yet to be put in order."""
 FILES = sorted(PACKAGE.rglob("*.py"))

@@ -32,7 +32,7 @@ from ms_slam_env.slam.adaptation import (
     AgentConfig,
     DivergenceAdaptationConfig,
 )
-from ms_slam_env.slam.adaptation.divergence import DivergenceController
+from ms_slam_env.slam.adaptation.controllers import DivergenceController
 from ms_slam_env.slam.base import SlamBackend
 from ms_slam_env.slam.configuration import SlamConfiguration, write_configuration
 

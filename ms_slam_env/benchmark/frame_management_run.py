@@ -17,7 +17,7 @@ from ms_slam_env.evaluation.run_sequence import run_sequence
 from ms_slam_env.metrics import reconstruction
 from ms_slam_env.parallel import limit_threads
 from ms_slam_env.sequences import UnevenPath
-from ms_slam_env.slam.frame_management import FrameManagementConfig, RegularConfig
+from ms_slam_env.slam.frame_selection import FrameSelectionConfig, RegularConfig
 
 THRESHOLDS_M = (0.02, 0.05)
 
@@ -64,7 +64,7 @@ def run_filters(spec: FilterSpec) -> dict[str, Any]:
     return {"runs": runs}
 
 
-def run_one(config: FrameManagementConfig, backend: str, given: Input) -> dict[str, Any]:
+def run_one(config: FrameSelectionConfig, backend: str, given: Input) -> dict[str, Any]:
     """Track the sequence from its true first pose behind a filter and measure.
 
     Returns:
@@ -101,7 +101,7 @@ def _map_quality(points: np.ndarray, surface: np.ndarray) -> Mapping[str, float]
     return dict(zip(names, (found.f_score[t] for t in THRESHOLDS_M), strict=True))
 
 
-def _filter_ms(config: FrameManagementConfig, given: Input) -> float:
+def _filter_ms(config: FrameSelectionConfig, given: Input) -> float:
     """Processor time in which the filter judges a frame."""
     judge = config.make_filter(given.intrinsics)
     judge.admits(given.frames[0], 0, True)  # buffers grow

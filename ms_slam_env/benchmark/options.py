@@ -10,8 +10,8 @@ from ms_slam_env.env.config import make_config
 from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.slam import BACKENDS
-from ms_slam_env.slam.frame_management import FrameManagementConfig
-from ms_slam_env.slam.frame_management import make_config as make_frame_management
+from ms_slam_env.slam.frame_selection import FrameSelectionConfig
+from ms_slam_env.slam.frame_selection import make_config as make_frame_management
 
 OWN_OPTIONS = (
     *("scene", "scene_seed", "split", "observation", "step_m", "step_rad"),
@@ -20,7 +20,7 @@ OWN_OPTIONS = (
 """Options of ``gym.make`` that an episode has other options for, or that its planner decides."""
 
 
-def parse_frame_management(text: str) -> FrameManagementConfig:
+def parse_frame_management(text: str) -> FrameSelectionConfig:
     """The frame management ``NAME,option=value,...``; nested options as in ``change.width=40``.
 
     Raises:

@@ -21,7 +21,7 @@ from ms_slam_env.report.records import write_json
 from ms_slam_env.sequences import Sequence, associate
 from ms_slam_env.sequences.recording import Recording
 from ms_slam_env.sequences.tum import TRAJECTORY_HEADER, trajectory_line, write_trajectory
-from ms_slam_env.slam.frame_management import EveryFrameConfig, FrameManagementConfig
+from ms_slam_env.slam.frame_selection import EveryFrameConfig, FrameSelectionConfig
 
 Float64 = NDArray[np.float64]
 
@@ -42,7 +42,7 @@ def run_to_folder(
     params: dict[str, Any],
     out: Path,
     fed: Mapping[str, Any] | None = None,
-    management: FrameManagementConfig | None = None,
+    management: FrameSelectionConfig | None = None,
 ) -> dict[str, Any]:
     """Track every frame of ``sequence`` and write what came of it to ``out``.
 

@@ -22,7 +22,7 @@ from ms_slam_env.scenes import SEED_SPLITS
 from ms_slam_env.scenes.registry import check_name
 from ms_slam_env.slam.adaptation import AdaptationConfig, NoAdaptationConfig
 from ms_slam_env.slam.configuration import is_file_name, read_configuration
-from ms_slam_env.slam.frame_management import EveryFrameConfig, FrameManagementConfig
+from ms_slam_env.slam.frame_selection import EveryFrameConfig, FrameSelectionConfig
 
 OTHER_OPTIONS = ("embodiment", "render_mode", "max_episode_steps")
 """Options of ``gym.make`` beside the fields of ``EnvConfig``; the last is Gymnasium's own."""
@@ -178,7 +178,7 @@ class EnvConfig:
     slam: str = "surfel"
     slam_config: dict[str, object] = field(default_factory=dict)
     adaptation: AdaptationConfig = field(default_factory=NoAdaptationConfig)
-    frame_management: FrameManagementConfig = field(default_factory=EveryFrameConfig)
+    frame_management: FrameSelectionConfig = field(default_factory=EveryFrameConfig)
     observation: str = "features"
     step_m: float = 0.12
     step_rad: float = math.radians(12)

@@ -10,15 +10,17 @@ from typing import Any
 
 import yaml
 
-from ms_slam_env.camera import XTION_SIZES
-from ms_slam_env.config import check_range, from_dict
+from ms_slam_env.camera import XTION_SIZES, Intrinsics
+from ms_slam_env.config import Checked, bounded, from_dict
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.slam.base import SlamBackend
+from ms_slam_env.slam.registry import check_parameters, make_backend
 
 SUFFIXES = (".yaml", ".yml")
 
 
 @dataclass(frozen=True)
-class SlamConfiguration:
+class SlamConfiguration(Checked):
     """A backend with its parameters, and how it is run.
 
     Attributes:
@@ -39,20 +41,35 @@ class SlamConfiguration:
     slam: str = "surfel"
     slam_config: dict[str, Any] = field(default_factory=dict)
     image_size: str | None = None
-    keep_every: int = 1
-    threads: int | None = None
+    keep_every: int = bounded(1, 1, 1000)
+    threads: int | None = bounded(None, 1, 1024)
     about: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Refuse what no backend could use."""
-        from ms_slam_env.slam import check_parameters
-
+        super().__post_init__()
         check_parameters(self.slam, self.slam_config)
         if self.image_size is not None and self.image_size not in tuple(XTION_SIZES):
             raise unknown("image_size", self.image_size, XTION_SIZES)
-        check_range(self, "keep_every", 1, 1000)
-        if self.threads is not None:
-            check_range(self, "threads", 1, 1024)
+
+
+def make(name: str | Path, intrinsics: Intrinsics, **params: Any) -> SlamBackend:
+    """Make the SLAM backend ``name`` for a camera.
+
+    Args:
+        name: one of ``BACKENDS``, or a configuration file (YAML) that names one with parameters;
+            the frames' size is that of ``intrinsics`` all the same.
+        intrinsics: of every frame.
+        params: of the backend, such as the fields of ``SurfelConfig``; ``device`` = "cpu" or
+            "cuda" where the backend has a choice. They take precedence over those of a file.
+
+    Raises:
+        InputError: unknown backend, unknown parameter or value out of range, or a bad file.
+    """
+    if is_file_name(name):
+        configuration = read_configuration(name)
+        name, params = configuration.slam, merged(configuration.slam_config, params)
+    return make_backend(name, intrinsics, params)
 
 
 def is_file_name(name: object) -> bool:

@@ -24,7 +24,7 @@ from ms_slam_env.slam.adaptation import (
     default_configurations,
     make_config,
 )
-from ms_slam_env.slam.adaptation.divergence import DivergenceController
+from ms_slam_env.slam.adaptation.controllers import DivergenceController
 from ms_slam_env.slam.configuration import SlamConfiguration, write_configuration
 
 CAMERA = xtion("160x120")

@@ -15,7 +15,7 @@ from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at, make_pose, relative_angle, so3_exp
 from ms_slam_env.sensor import RGBDSensor
-from ms_slam_env.slam.frame_management import make_config
+from ms_slam_env.slam.frame_selection import make_config
 
 CAMERA = xtion("160x120")
 START = look_at([-0.8, -0.8, 1.2], [1.2, 0.1, 0.5])

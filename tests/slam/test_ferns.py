@@ -15,13 +15,13 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at, make_pose, so3_exp
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.ferns import (
+    MEAN_LEVEL,
     FernCode,
     FernConfig,
     FernDatabase,
     FernEncoder,
     dissimilarities,
 )
-from ms_slam_env.slam.ferns.encoding import MEAN_LEVEL
 
 CAMERA = xtion("160x120")
 

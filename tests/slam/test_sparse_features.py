@@ -12,10 +12,22 @@ from ms_slam_env.camera import intensity_image, xtion
 from ms_slam_env.geometry import invert, make_pose, se3_exp, so3_exp
 from ms_slam_env.slam.alignment_check import DepthImage
 from ms_slam_env.slam.sparse.config import SparseConfig
-from ms_slam_env.slam.sparse.features import FeatureExtractor, Features, InverseDepth
-from ms_slam_env.slam.sparse.matching import hamming_distance, match_anywhere, match_near
-from ms_slam_env.slam.sparse.patches import Patches, cut, find_patches, warp
-from ms_slam_env.slam.sparse.retrieval import most_alike, thumbnail
+from ms_slam_env.slam.sparse.features import (
+    FeatureExtractor,
+    Features,
+    InverseDepth,
+    Patches,
+    cut,
+    find_patches,
+    warp,
+)
+from ms_slam_env.slam.sparse.matching import (
+    hamming_distance,
+    match_anywhere,
+    match_near,
+    most_alike,
+    thumbnail,
+)
 from ms_slam_env.slam.sparse.sparse_map import SparseMap, make_keyframe
 
 CAMERA = xtion("160x120")

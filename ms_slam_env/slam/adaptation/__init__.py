@@ -10,23 +10,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from ms_slam_env.config import from_dict
-from ms_slam_env.slam.adaptation.adaptive_slam import AdaptiveSlam
-from ms_slam_env.slam.adaptation.agent import AgentConfig
-from ms_slam_env.slam.adaptation.config import AdaptationConfig, SwitchingConfig
-from ms_slam_env.slam.adaptation.divergence import DivergenceAdaptationConfig
-from ms_slam_env.slam.adaptation.levels import Level, default_configurations
-from ms_slam_env.slam.adaptation.none import NoAdaptationConfig
-
-ADAPTATIONS: Mapping[str, type[AdaptationConfig]] = {
-    "none": NoAdaptationConfig,
-    "divergence": DivergenceAdaptationConfig,
-    "agent": AgentConfig,
-}
-"""Name to configuration."""
+from ms_slam_env.slam.adaptation.adaptive_slam import AdaptiveSlam, Level, default_configurations
+from ms_slam_env.slam.adaptation.config import (
+    AdaptationConfig,
+    NoAdaptationConfig,
+    SwitchingConfig,
+)
+from ms_slam_env.slam.adaptation.controllers import AgentConfig, DivergenceAdaptationConfig
 
 
 def make_config(name: str, **options: Any) -> AdaptationConfig:
@@ -39,7 +32,6 @@ def make_config(name: str, **options: Any) -> AdaptationConfig:
 
 
 __all__ = [
-    "ADAPTATIONS",
     "AdaptationConfig",
     "AdaptiveSlam",
     "AgentConfig",

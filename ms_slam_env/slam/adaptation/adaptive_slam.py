@@ -2,24 +2,171 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
-from ms_slam_env.camera import RGBDFrame
-from ms_slam_env.slam.adaptation.base import Controller
-from ms_slam_env.slam.adaptation.levels import Level
+from ms_slam_env.camera import XTION_SIZES, Intrinsics, RGBDFrame
+from ms_slam_env.config import from_dict
+from ms_slam_env.errors import InputError
 from ms_slam_env.slam.base import SlamBackend
-from ms_slam_env.slam.frame_management import FrameFilter, ManagedSlam
-from ms_slam_env.slam.surfel import SurfelSlam
+from ms_slam_env.slam.configuration import SlamConfiguration, merged, read_configuration
+from ms_slam_env.slam.frame_selection import FrameFilter, SelectiveSlam
+from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
+
+
+class Controller(ABC):
+    """Chooses before every frame one of the configurations, by index from fast to robust.
+
+    Attributes:
+        index: of the configuration chosen last; of the first one before any frame.
+    """
+
+    index: int
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Forget every frame."""
+
+    @abstractmethod
+    def choose(self, frame: RGBDFrame, is_lost: bool) -> int:
+        """Index of the configuration under which ``frame`` is to be processed.
+
+        Args:
+            frame: the sensor's frame.
+            is_lost: whether SLAM has not started or has lost track.
+        """
+
+    def use(self, index: int) -> None:
+        """Take configuration ``index`` from the next frame on.
+
+        Raises:
+            InputError: this variant chooses by itself.
+        """
+        raise InputError("configurations are chosen from outside under adaptation 'agent' only")
+
+    @abstractmethod
+    def get_state(self) -> dict[str, Any]:
+        """Everything needed to go on bit-exactly, as NumPy arrays and plain values."""
+
+    @abstractmethod
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state that ``get_state`` returned."""
+
+
+MOST = 8
+"""Configurations that may take turns: a running SLAM keeps the buffers of so many."""
+
+
+@dataclass(frozen=True)
+class Level:
+    """One configuration of a running surfel SLAM.
+
+    Attributes:
+        config: its parameters.
+        image_size: (width, height) that frames are reduced to; None: as they come.
+        keep_every: of the frames, one in so many is processed.
+    """
+
+    config: SurfelConfig
+    image_size: tuple[int, int] | None = None
+    keep_every: int = 1
+
+
+def as_configurations(given: Iterable[Any]) -> tuple[SlamConfiguration, ...]:
+    """Configurations given as file, as mapping of ``SlamConfiguration``'s fields, or as such.
+
+    Raises:
+        InputError: something else, a bad file or value, none at all or more than ``MOST``.
+    """
+    if isinstance(given, (str, Mapping)) or not isinstance(given, Iterable):
+        raise InputError(f"configurations = {given!r} must be a list of files or mappings")
+    configurations = tuple(_configuration(one, index) for index, one in enumerate(given))
+    if len(configurations) > MOST:
+        raise InputError(f"configurations has {len(configurations)} entries, at most {MOST} do")
+    return configurations
+
+
+def _configuration(given: Any, index: int) -> SlamConfiguration:
+    if isinstance(given, SlamConfiguration):
+        return given
+    if isinstance(given, (str, Path)):
+        return read_configuration(given)
+    if isinstance(given, Mapping):
+        return from_dict(SlamConfiguration, given, f"configurations[{index}]")
+    raise InputError(f"configurations[{index}] = {given!r} must be a file or a mapping")
+
+
+def make_levels(
+    configurations: Sequence[SlamConfiguration], backend: SlamBackend
+) -> tuple[Level, ...]:
+    """Levels for a backend; what a configuration does not name stays as the backend was made.
+
+    ``threads`` is no matter of a running SLAM and left alone. The backend goes through all of them
+    and is as before at the end, so that what it cannot become is refused here, and its buffers are
+    there when they are needed.
+
+    Raises:
+        InputError: the backend is none whose configuration can change, or a configuration that it
+            cannot take up while it runs.
+    """
+    if not isinstance(backend, SurfelSlam):
+        raise InputError("only the SLAM backend 'surfel' changes its configuration while it runs")
+    own, own_size = backend.config, backend.image_size
+    levels = []
+    for index, configuration in enumerate(configurations):
+        where = f"configurations[{index}]"
+        if configuration.slam != "surfel":
+            raise InputError(f"{where}: slam = {configuration.slam!r} must be 'surfel'")
+        params = dict(configuration.slam_config)
+        if params.pop("device", backend.device) != backend.device:
+            raise InputError(f"{where}: a running SLAM stays on device {backend.device!r}")
+        size = configuration.image_size
+        level = Level(
+            config=from_dict(SurfelConfig, merged(asdict(own), params), where),
+            image_size=None if size is None else XTION_SIZES[size],
+            keep_every=configuration.keep_every,
+        )
+        try:
+            backend.reconfigure(level.config, level.image_size)
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
+        finally:
+            backend.reconfigure(own, own_size)
+        levels.append(level)
+    return tuple(levels)
+
+
+def default_configurations(intrinsics: Intrinsics) -> tuple[SlamConfiguration, ...]:
+    """Three configurations for a camera's images, from fast to robust.
+
+    Images are halved where the camera's are large enough: that is faster and, because every level
+    of the pyramid is coarser, copes with larger motions. Chosen on validation seeds
+    (``python -m ms_slam_env.benchmark.adaptation``). ``about.cost`` is the processor time of
+    a processed frame at 160x120, relative to the last: 6.1, 6.9 and 9.5 ms were measured on one
+    core of a busy machine.
+    """
+    half = intrinsics.width // 2
+    size = next((name for name, wh in XTION_SIZES.items() if wh[0] == half >= 160), None)
+    fast: dict[str, Any] = {"iterations": [1, 1, 2], "points_per_level": 2000}
+    robust: dict[str, Any] = {"iterations": [8, 10, 20], "points_per_level": 20_000}
+    return (
+        SlamConfiguration(slam_config=fast, image_size=size, keep_every=4, about={"cost": 0.65}),
+        SlamConfiguration(image_size=size, keep_every=2, about={"cost": 0.73}),
+        SlamConfiguration(slam_config=robust, image_size=size, about={"cost": 1.0}),
+    )
+
 
 _NEVER = 1_000_000_000  # frames in a row that are dropped at most
 
 
-class AdaptiveSlam(ManagedSlam):
+class AdaptiveSlam(SelectiveSlam):
     """A backend whose controller chooses its configuration before every frame.
 
     A configuration that keeps one frame in n drops the others: their results have ``processed``
-    False and a pose carried on at constant velocity (``ManagedSlam``). The first frame and those
+    False and a pose carried on at constant velocity (``SelectiveSlam``). The first frame and those
     while tracking is lost are always processed.
 
     Args:

@@ -1,17 +1,22 @@
-"""What the configurations of run-time adaptation have in common."""
+"""What the configurations of run-time adaptation have in common, and none."""
 
 from __future__ import annotations
 
 import itertools
-from abc import abstractmethod
-from collections.abc import Mapping
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
 from typing import Any
 
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.config import Family, check_range
+from ms_slam_env.config import Checked, Family, check_range
 from ms_slam_env.errors import InputError
-from ms_slam_env.slam.adaptation.base import Controller
+from ms_slam_env.slam.adaptation.adaptive_slam import (
+    AdaptiveSlam,
+    Controller,
+    as_configurations,
+    default_configurations,
+    make_levels,
+)
 from ms_slam_env.slam.base import SlamBackend
 from ms_slam_env.slam.configuration import SlamConfiguration
 
@@ -31,18 +36,11 @@ def rising(values: Any, name: str, count: int) -> tuple[float, ...]:
 
 
 @dataclass(frozen=True)
-class AdaptationConfig(Family):
+class AdaptationConfig(Checked, Family, ABC):
     """How a running SLAM changes its configuration: Saeedi et al., ICRA 2017, section V-B.
 
     Made from a mapping: ``from_dict(AdaptationConfig, {"name": "divergence", ...})``.
     """
-
-    @classmethod
-    def variants(cls) -> Mapping[str, type]:
-        """The configurations by name."""
-        from ms_slam_env.slam.adaptation import ADAPTATIONS
-
-        return ADAPTATIONS
 
     @abstractmethod
     def adapt(self, backend: SlamBackend, drops_frames: bool = True) -> SlamBackend:
@@ -51,6 +49,17 @@ class AdaptationConfig(Family):
         Raises:
             InputError: a backend or a configuration that cannot change while SLAM runs.
         """
+
+
+@dataclass(frozen=True)
+class NoAdaptationConfig(AdaptationConfig):
+    """The configuration stays as it is."""
+
+    name: str = field(default="none", init=False)
+
+    def adapt(self, backend: SlamBackend, drops_frames: bool = True) -> SlamBackend:
+        """The backend as it is."""
+        return backend
 
 
 @dataclass(frozen=True)
@@ -75,8 +84,7 @@ class SwitchingConfig(AdaptationConfig):
 
     def __post_init__(self) -> None:
         """Read the configurations."""
-        from ms_slam_env.slam.adaptation.levels import as_configurations
-
+        super().__post_init__()
         if self.configurations is not None:
             object.__setattr__(self, "configurations", as_configurations(self.configurations))
             if len(self.configurations) < 2:
@@ -99,8 +107,6 @@ class SwitchingConfig(AdaptationConfig):
 
     def resolved(self, intrinsics: Intrinsics) -> tuple[SlamConfiguration, ...]:
         """The configurations for frames of ``intrinsics``."""
-        from ms_slam_env.slam.adaptation.levels import default_configurations
-
         if self.configurations is None:
             return default_configurations(intrinsics)
         return tuple(self.configurations)
@@ -126,8 +132,5 @@ class SwitchingConfig(AdaptationConfig):
 
     def adapt(self, backend: SlamBackend, drops_frames: bool = True) -> SlamBackend:
         """``backend`` that switches; see ``AdaptiveSlam``."""
-        from ms_slam_env.slam.adaptation.adaptive_slam import AdaptiveSlam
-        from ms_slam_env.slam.adaptation.levels import make_levels
-
         levels = make_levels(self.resolved(backend.intrinsics), backend)
         return AdaptiveSlam(backend, levels, self.make_controller(backend.intrinsics), drops_frames)

@@ -26,18 +26,17 @@ from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult, Views
 from ms_slam_env.slam.sparse.config import SparseConfig
 from ms_slam_env.slam.sparse.dense_map import DenseMap
 from ms_slam_env.slam.sparse.features import FeatureExtractor, InverseDepth
-from ms_slam_env.slam.sparse.gtsam_library import load_gtsam
-from ms_slam_env.slam.sparse.local_mapping import adjust_around
-from ms_slam_env.slam.sparse.localisation import (
+from ms_slam_env.slam.sparse.local_mapping import adjust_around, load_gtsam
+from ms_slam_env.slam.sparse.localization import (
     Fix,
     LiveFrame,
     Localiser,
+    Verifier,
     keyframe_features,
 )
 from ms_slam_env.slam.sparse.loop_closure import LoopCloser
-from ms_slam_env.slam.sparse.retrieval import most_alike, thumbnail
+from ms_slam_env.slam.sparse.matching import most_alike, thumbnail
 from ms_slam_env.slam.sparse.sparse_map import SparseMap, make_keyframe
-from ms_slam_env.slam.sparse.verification import Verifier
 
 _LOOKALIKES = 4  # keyframes in which a lost camera is sought
 _SOONER = 0.25  # share of a keyframe's distance that is enough where matches are few

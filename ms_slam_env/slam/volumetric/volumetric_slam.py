@@ -30,10 +30,8 @@ from ms_slam_env.slam.alignment_check import (
 )
 from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult, Views
 from ms_slam_env.slam.starts import start_motions
+from ms_slam_env.slam.volumetric.alignment import FrameToModel, Open3DAlignment, OpenCVAlignment
 from ms_slam_env.slam.volumetric.config import VolumetricConfig
-from ms_slam_env.slam.volumetric.frame_to_model import FrameToModel
-from ms_slam_env.slam.volumetric.open3d_alignment import Open3DAlignment
-from ms_slam_env.slam.volumetric.opencv_alignment import OpenCVAlignment
 from ms_slam_env.slam.volumetric.voxel_grid import DEPTH_SCALE, CastView, VoxelGrid
 
 _FULL_WEIGHT = 3  # observations that tracking asks of the model, as soon as there are as many

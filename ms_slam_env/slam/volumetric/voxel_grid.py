@@ -1,7 +1,4 @@
-"""A sparse grid of signed distances: fuse frames, cast rays, extract the surface, save, restore.
-
-Curless and Levoy 1996, in blocks that a hash map finds (Niessner et al. 2013), by Open3D.
-"""
+"""A sparse grid of signed distances: fuse frames, cast rays, extract the surface, save, restore."""
 
 from __future__ import annotations
 
@@ -14,10 +11,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics
+from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert
 from ms_slam_env.slam.base import Float32, Float64
 from ms_slam_env.slam.volumetric.config import VolumetricConfig
-from ms_slam_env.slam.volumetric.open3d_library import load_open3d
+
+
+def load_open3d() -> Any:
+    """Open3D, its messages below errors silenced.
+
+    Raises:
+        InputError: it, or a system library that it needs, is not installed.
+    """
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        raise InputError(
+            "the volumetric backend needs Open3D (pip install 'ms-slam-env[open3d]') and, on "
+            f"Debian and Ubuntu, libgl1, libx11-6 and libgomp1 (apt-get install): {error}"
+        ) from error
+    open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
+    return open3d
+
 
 DEPTH_SCALE = 5000.0  # 16-bit depth of 0.2 mm, well below the sensor's noise
 _NEAREST_M = 0.1

@@ -1,9 +1,4 @@
-"""RGB-D odometry against keyframes, as a ``SlamBackend``.
-
-Every frame is aligned with the keyframe; failing that with the last good frame; failing that with
-views of the map, from the caller's guess and from poses around the last one. The map holds the
-keyframes' readings at their estimated poses; errors add up from keyframe to keyframe.
-"""
+"""RGB-D odometry against keyframes, as a backend."""
 
 from __future__ import annotations
 
@@ -11,10 +6,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
+from ms_slam_env.config import check_range
+from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose, invert, relative_angle
 from ms_slam_env.slam.alignment_check import (
     FEWEST_READINGS,
@@ -28,10 +26,99 @@ from ms_slam_env.slam.alignment_check import (
     measure_alignment,
 )
 from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult, Views
-from ms_slam_env.slam.odometry.aligner import Aligner, PreparedImage
-from ms_slam_env.slam.odometry.config import OdometryConfig
 from ms_slam_env.slam.starts import start_motions
 from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
+
+
+@dataclass(frozen=True)
+class OdometryConfig:
+    """Parameters of tracking and of the map of keyframes.
+
+    Attributes:
+        depth_cutoff_m: readings beyond are ignored.
+        keyframe_m: the keyframe is renewed when the camera is this far from it,
+        keyframe_deg: or turned by this much.
+        least_overlap: share of a frame's readings that the image it is aligned with must show,
+        least_inliers: share of those that must fit its depth,
+        least_alike: share of those that must fit its intensity.
+        max_surfels: capacity of the map; None as in ``SurfelConfig``.
+
+    Raises:
+        InputError: a value outside its range.
+    """
+
+    depth_cutoff_m: float = 4.0
+    keyframe_m: float = 0.04
+    keyframe_deg: float = 3.0
+    least_overlap: float = 0.3
+    least_inliers: float = 0.75
+    least_alike: float = 0.9
+    max_surfels: int | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse values outside the ranges."""
+        check_range(self, "depth_cutoff_m", 0.1, 10.0)
+        check_range(self, "keyframe_m", 0.0, 1.0)
+        check_range(self, "keyframe_deg", 0.0, 90.0)
+        check_range(self, "least_overlap", 0.0, 1.0)
+        check_range(self, "least_inliers", 0.0, 1.0)
+        check_range(self, "least_alike", 0.0, 1.0)
+        if self.max_surfels is not None:
+            check_range(self, "max_surfels", 1000, 50_000_000)
+
+
+@dataclass(frozen=True)
+class PreparedImage:
+    """An image and OpenCV's pyramids of it."""
+
+    image: DepthImage
+    pyramids: cv2.OdometryFrame
+
+
+class Aligner:
+    """``cv2.Odometry`` on colour and depth with OpenCV's default settings.
+
+    Args:
+        intrinsics: of both images.
+        depth_cutoff_m: readings beyond are ignored.
+
+    Raises:
+        InputError: OpenCV is older than 5 and has no ``cv2.Odometry``.
+    """
+
+    def __init__(self, intrinsics: Intrinsics, depth_cutoff_m: float) -> None:
+        if int(cv2.__version__.split(".")[0]) < 5:
+            raise InputError(
+                "this backend needs OpenCV 5 (pip install 'opencv-python-headless>=5'), found "
+                f"{cv2.__version__}"
+            )
+        settings = cv2.OdometrySettings()
+        matrix = np.eye(3, dtype=np.float32)
+        matrix[0, 0], matrix[1, 1] = intrinsics.fx, intrinsics.fy
+        matrix[0, 2], matrix[1, 2] = intrinsics.cx, intrinsics.cy
+        settings.setCameraMatrix(matrix)
+        settings.setMaxDepth(depth_cutoff_m)
+        self._odometry = cv2.Odometry(
+            cv2.OdometryType_RGB_DEPTH, settings, cv2.OdometryAlgoType_COMMON
+        )
+
+    def prepare(self, image: DepthImage) -> PreparedImage:
+        """Build the pyramids of an image; ``align`` takes images so prepared."""
+        depth = np.where(image.depth > 0, image.depth, np.float32(np.nan))
+        grey = np.clip(np.rint(image.intensity), 0, 255).astype(np.uint8)
+        pyramids = cv2.OdometryFrame(depth, grey)
+        self._odometry.prepareFrame(pyramids)
+        return PreparedImage(image, pyramids)
+
+    def align(self, frame: PreparedImage, reference: PreparedImage) -> Float64 | None:
+        """T_reference_frame (4, 4), or None if OpenCV found none.
+
+        The search starts at rest: OpenCV 5 ignores an initial guess.
+        """
+        found, T = self._odometry.compute(frame.pyramids, reference.pyramids)
+        if not found or T is None or not np.isfinite(T).all():
+            return None
+        return np.asarray(T, dtype=np.float64)
 
 
 @dataclass(frozen=True)

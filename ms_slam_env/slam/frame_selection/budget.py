@@ -2,16 +2,53 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame
-from ms_slam_env.config import check_range
+from ms_slam_env.config import bounded, check_range
 from ms_slam_env.errors import InputError
-from ms_slam_env.slam.frame_management.base import FrameFilter
-from ms_slam_env.slam.frame_management.change import Change, ChangeConfig
-from ms_slam_env.slam.frame_management.config import DroppingConfig
-from ms_slam_env.slam.frame_management.controller import ThresholdController
+from ms_slam_env.slam.frame_selection.config import DroppingConfig
+from ms_slam_env.slam.frame_selection.divergence import Change, ChangeConfig
+from ms_slam_env.slam.frame_selection.selective_slam import FrameFilter
+
+
+class ThresholdController:
+    """Raises a threshold with what was spent and lowers it with what was allowed.
+
+    The threshold is ``start exp(gain debt)``, the debt being what was spent beyond what was
+    allowed so far: integral control of the logarithm, for changes between frames range over orders
+    of magnitude. As the threshold stays between two limits so does the debt, by at most
+    ln(highest / lowest) / gain, so that the mean of what is spent tends to what is allowed whatever
+    the changes are, provided that they lie between the limits.
+
+    Args:
+        start: the threshold without debt.
+        gain: per processed frame of debt.
+        lowest: the threshold never falls below it; what is left over then is lost.
+        highest: the threshold never rises above it.
+    """
+
+    def __init__(self, start: float, gain: float, lowest: float, highest: float) -> None:
+        self._start = start
+        self._gain = gain
+        self._least = math.log(lowest / start) / gain
+        self._most = math.log(highest / start) / gain
+        self.debt = 0.0
+
+    def reset(self) -> None:
+        """Owe nothing."""
+        self.debt = 0.0
+
+    @property
+    def threshold(self) -> float:
+        """What a change must reach now."""
+        return self._start * math.exp(self._gain * self.debt)
+
+    def update(self, spent: float, allowed: float) -> None:
+        """Book what a frame cost and what it was allowed to, in processed frames."""
+        self.debt = min(max(self.debt + spent - allowed, self._least), self._most)
 
 
 @dataclass(frozen=True)
@@ -43,36 +80,31 @@ class BudgetConfig(DroppingConfig):
     """
 
     name: str = field(default="budget", init=False)
-    share: float = 0.5
-    budget_per_s: float | None = None
-    cost_per_frame: float = 1.0
-    cost_per_look: float = 0.0
+    share: float = bounded(0.5, 1e-4, 1)
+    budget_per_s: float | None = bounded(None, 1e-12, 1e12)
+    cost_per_frame: float = bounded(1.0, 1e-12, 1e12)
+    cost_per_look: float = bounded(0.0, 0, 1e12)
     measured: bool = False
-    gain: float = 0.1
+    gain: float = bounded(0.1, 1e-6, 10)
     threshold: float = 0.01
-    lowest_threshold: float = 1e-4
+    lowest_threshold: float = bounded(1e-4, 1e-9, 1e6)
     highest_threshold: float = 10.0
     change: ChangeConfig = field(default_factory=ChangeConfig)
 
     def __post_init__(self) -> None:
-        """Refuse values out of range and those that contradict each other."""
+        """Refuse values that contradict each other."""
         super().__post_init__()
-        check_range(self, "share", 1e-4, 1)
-        check_range(self, "cost_per_frame", 1e-12, 1e12)
-        check_range(self, "cost_per_look", 0, 1e12)
-        check_range(self, "gain", 1e-6, 10)
-        check_range(self, "lowest_threshold", 1e-9, 1e6)
         check_range(self, "threshold", self.lowest_threshold, 1e6)
         check_range(self, "highest_threshold", self.threshold, 1e6)
         if not isinstance(self.measured, bool):
             raise InputError(f"BudgetConfig.measured = {self.measured!r} must be true or false")
         if self.budget_per_s is not None:
-            check_range(self, "budget_per_s", 1e-12, 1e12)
-        elif self.measured or self.cost_per_frame != 1 or self.cost_per_look != 0:
+            return
+        if self.measured or self.cost_per_frame != 1 or self.cost_per_look != 0:
             raise InputError(
                 "BudgetConfig: costs are of use with budget_per_s only, not with share"
             )
-        elif self.share * (self.max_skip + 1) < 1:
+        if self.share * (self.max_skip + 1) < 1:
             raise InputError(
                 f"BudgetConfig.share = {self.share:g} cannot be kept: max_skip = {self.max_skip} "
                 f"has 1 of {self.max_skip + 1} frames processed"

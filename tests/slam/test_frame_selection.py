@@ -19,18 +19,17 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, look_at, make_pose, se3_exp, se3_log, so3_exp
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.base import SlamBackend, TrackResult, Views
-from ms_slam_env.slam.frame_management import (
-    FRAME_MANAGEMENTS,
+from ms_slam_env.slam.frame_selection import (
     BudgetConfig,
     DivergenceFilterConfig,
-    FrameManagementConfig,
-    ManagedSlam,
+    FrameSelectionConfig,
     RegularConfig,
+    SelectiveSlam,
     make_config,
 )
-from ms_slam_env.slam.frame_management.budget import BudgetFilter
-from ms_slam_env.slam.frame_management.change import Change, ChangeConfig
-from ms_slam_env.slam.frame_management.every_frame import EveryFrame
+from ms_slam_env.slam.frame_selection.budget import BudgetFilter
+from ms_slam_env.slam.frame_selection.config import EveryFrame
+from ms_slam_env.slam.frame_selection.divergence import Change, ChangeConfig
 
 CAMERA = xtion("80x60")
 START = look_at([-0.8, -0.8, 1.2], [1.2, 0.1, 0.5])
@@ -122,7 +121,7 @@ class Recorder(SlamBackend):
 def test_without_management_nothing_changes(frames):
     bare = _surfel()
     assert make_config("none").manage(bare) is bare
-    managed = ManagedSlam(_surfel(), EveryFrame())
+    managed = SelectiveSlam(_surfel(), EveryFrame())
     for frame in [*frames[:8], _black(), *frames[8:10]]:
         a, b = bare.track(frame), managed.track(frame)
         np.testing.assert_array_equal(a.T_world_camera, b.T_world_camera)
@@ -312,7 +311,7 @@ def test_what_lies_below_the_lowest_threshold_is_dropped_however_rich_one_is():
 def test_measured_costs_are_kept_too(monkeypatch):
     """A backend that takes 20 ms a frame and a budget of 0.2 s a second: 10 frames a second."""
     clock = [0.0]
-    module = "ms_slam_env.slam.frame_management.managed_slam.time.process_time"
+    module = "ms_slam_env.slam.frame_selection.selective_slam.time.process_time"
     monkeypatch.setattr(module, lambda: clock[0])
 
     class Slow(Recorder):
@@ -323,7 +322,7 @@ def test_measured_costs_are_kept_too(monkeypatch):
     config = BudgetConfig(budget_per_s=0.2, measured=True, gain=0.1, max_skip=30)
     assert config.uses_clock
     changes = _Changes(list(np.random.default_rng(1).lognormal(-4, 1, 1500)))
-    managed = ManagedSlam(Slow(), BudgetFilter(config, changes), config.max_skip)
+    managed = SelectiveSlam(Slow(), BudgetFilter(config, changes), config.max_skip)
     for k in range(1500):
         managed.track(_tick(k / 30))
     assert abs(clock[0] / 50 - 0.2) < 0.01
@@ -358,7 +357,9 @@ def test_a_dropped_frame_moves_on_as_far_as_the_last_motion():
 
 def test_a_stopped_camera_is_not_carried_on(frames):
     backend = Recorder()
-    managed = ManagedSlam(backend, make_config("regular", every=9).make_filter(CAMERA), max_skip=8)
+    managed = SelectiveSlam(
+        backend, make_config("regular", every=9).make_filter(CAMERA), max_skip=8
+    )
     managed.track(_black())
     for _ in range(8):
         managed.track(_black())
@@ -478,11 +479,11 @@ def test_a_state_goes_on_bit_exactly(name, frames):
 )
 def test_bad_options_are_named(options, message):
     with pytest.raises(InputError, match=message):
-        from_dict(FrameManagementConfig, options)
+        from_dict(FrameSelectionConfig, options)
 
 
 def test_every_variant_has_its_name_and_comes_back_from_its_mapping():
-    for name in FRAME_MANAGEMENTS:
+    for name in FrameSelectionConfig.variants():
         assert make_config(name).name == name
     config = make_config("budget", share=0.3, change={"width": 40})
     assert config == BudgetConfig(share=0.3, change=ChangeConfig(width=40))

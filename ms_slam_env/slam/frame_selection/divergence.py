@@ -1,4 +1,4 @@
-"""How much a frame differs from the last processed one: their divergence, cheaply."""
+"""Frames too similar to the last processed one are dropped: section V-A of the paper."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
-from ms_slam_env.config import check_range
+from ms_slam_env.config import Checked, bounded
 from ms_slam_env.divergence import DivergenceConfig, Histograms, make_divergence
+from ms_slam_env.slam.frame_selection.config import DroppingConfig
+from ms_slam_env.slam.frame_selection.selective_slam import FrameFilter
 
 
 @dataclass(frozen=True)
-class ChangeConfig:
+class ChangeConfig(Checked):
     """How the change between two frames is measured.
 
     The change is delta_I + depth_weight delta_D, nats, of equations (5) and (10): the sum that the
@@ -30,14 +32,9 @@ class ChangeConfig:
         InputError: a value out of range.
     """
 
-    width: int = 80
-    depth_weight: float = 1.0
+    width: int = bounded(80, 8, 10_000)
+    depth_weight: float = bounded(1.0, 0, 1e6)
     divergence: DivergenceConfig = field(default_factory=DivergenceConfig)
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        check_range(self, "width", 8, 10_000)
-        check_range(self, "depth_weight", 0, 1e6)
 
 
 class Change:
@@ -93,3 +90,54 @@ class Change:
             self._reference = None
         else:
             self._reference = Histograms(state["intensity"].copy(), state["normals"].copy())
+
+
+@dataclass(frozen=True)
+class DivergenceFilterConfig(DroppingConfig):
+    """A frame is dropped if its divergence from the last processed frame is below a threshold.
+
+    The paper compares with the previous frame, under which a slow motion would never be seen: each
+    frame is like the one before it. Changes add up against the last frame that SLAM has seen.
+
+    Attributes:
+        threshold: of the change, nats; 0 drops nothing.
+        change: how it is measured.
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    name: str = field(default="divergence", init=False)
+    threshold: float = bounded(0.01, 0, 1e6)
+    change: ChangeConfig = field(default_factory=ChangeConfig)
+
+    def make_filter(self, intrinsics: Intrinsics) -> FrameFilter:
+        """The filter for frames of ``intrinsics``."""
+        return DivergenceFilter(self.threshold, Change(self.change, intrinsics))
+
+
+class DivergenceFilter(FrameFilter):
+    """Admits a frame that differs enough from the last processed one."""
+
+    def __init__(self, threshold: float, change: Change) -> None:
+        self._threshold = threshold
+        self._change = change
+
+    def reset(self) -> None:
+        """Forget the last processed frame."""
+        self._change.reset()
+
+    def admits(self, frame: RGBDFrame, dropped: int, forced: bool = False) -> bool:
+        """Whether its change reaches the threshold."""
+        admitted = self._change.measure(frame) >= self._threshold
+        if admitted or forced:
+            self._change.keep()
+        return admitted
+
+    def get_state(self) -> dict[str, Any]:
+        """The last processed frame's histograms."""
+        return {"change": self._change.get_state()}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on with the last processed frame of a state."""
+        self._change.set_state(state["change"])

@@ -1,13 +1,25 @@
-"""Aligns a frame with a view of the model through Open3D's odometry."""
+"""Aligns a frame with a view of the model: the interface and its two variants."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+
 import numpy as np
 
+from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.alignment_check import DepthImage
 from ms_slam_env.slam.base import Float64
-from ms_slam_env.slam.volumetric.frame_to_model import FrameToModel
+from ms_slam_env.slam.odometry import Aligner
 from ms_slam_env.slam.volumetric.voxel_grid import CastView, VoxelGrid, camera_matrix
+
+
+class FrameToModel(ABC):
+    """Finds the motion between the model's view and a frame."""
+
+    @abstractmethod
+    def align(self, frame: DepthImage, view: CastView) -> Float64 | None:
+        """T_model_camera (4, 4) of a frame, searched from rest; None if there is none."""
+
 
 _ITERATIONS = (10, 5, 3)  # coarse to fine; Open3D's dense SLAM does 6, 3 and 1
 
@@ -51,3 +63,16 @@ class Open3DAlignment(FrameToModel):
             return None
         T = result.transformation.numpy()
         return np.array(T, dtype=np.float64) if np.isfinite(T).all() else None
+
+
+class OpenCVAlignment(FrameToModel):
+    """OpenCV's RGB-D odometry; the same result in every run."""
+
+    def __init__(self, intrinsics: Intrinsics, depth_cutoff_m: float) -> None:
+        """Set the camera and the largest depth used."""
+        self._aligner = Aligner(intrinsics, depth_cutoff_m)
+
+    def align(self, frame: DepthImage, view: CastView) -> Float64 | None:
+        """T_model_camera (4, 4) of a frame against a view of the model, None if there is none."""
+        model = self._aligner.prepare(DepthImage(view.depth, view.intensity))
+        return self._aligner.align(self._aligner.prepare(frame), model)

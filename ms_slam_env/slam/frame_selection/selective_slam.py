@@ -1,8 +1,9 @@
-"""A SLAM backend that is shown only some of the frames."""
+"""A SLAM backend that is shown only some of the frames, and the interface of what chooses them."""
 
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from dataclasses import replace
 from typing import Any
 
@@ -10,13 +11,100 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.camera import RGBDFrame
-from ms_slam_env.geometry import check_pose, invert
+from ms_slam_env.geometry import check_pose, invert, se3_exp, se3_log
 from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult, Views
-from ms_slam_env.slam.frame_management.base import FrameFilter
-from ms_slam_env.slam.frame_management.prediction import Prediction
 
 
-class ManagedSlam(SlamBackend):
+class FrameFilter(ABC):
+    """Decides, frame by frame, whether SLAM processes it.
+
+    The first frame, those while tracking is lost and those after the longest permitted gap are
+    processed whatever the filter says; it is asked about them all the same.
+    """
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Forget every frame."""
+
+    @abstractmethod
+    def admits(self, frame: RGBDFrame, dropped: int, forced: bool = False) -> bool:
+        """Whether ``frame`` is to be processed.
+
+        Args:
+            frame: the sensor's frame.
+            dropped: frames that were dropped since the last processed one.
+            forced: the frame is processed whatever the answer is; the filter takes note.
+        """
+
+    def charge(self, seconds: float) -> None:  # noqa: B027 -- most take no notice
+        """Take note of the processor time that the last frame took, its judgement included."""
+
+    @abstractmethod
+    def get_state(self) -> dict[str, Any]:
+        """Everything needed to go on bit-exactly, as NumPy arrays and plain values."""
+
+    @abstractmethod
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state that ``get_state`` returned."""
+
+
+PREDICTIONS = ("last", "constant-velocity")
+"""Poses that a dropped frame may be given."""
+
+
+class PosePrediction:
+    """Carries the last processed pose on.
+
+    Args:
+        is_moving: on with the velocity between the last two processed frames, but no further than
+            the camera moved between them; else at rest. A frame dropped for its likeness cannot be
+            far away: without the limit a camera that stops is carried on.
+    """
+
+    def __init__(self, is_moving: bool) -> None:
+        self._is_moving = is_moving
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget every pose."""
+        self._pose: Float64 = np.eye(4)
+        self._twist: Float64 = np.zeros(6)  # of the last motion, which took so many frames:
+        self._frames = 1
+
+    def observe(self, T_world_camera: Float64, frames: int, continues: bool) -> None:
+        """Note the pose of a processed frame, ``frames`` after the one before.
+
+        ``continues`` tells whether the motion between them was the camera's: not at the start, and
+        not across lost tracking or a closed loop.
+        """
+        if self._is_moving and continues:
+            self._twist = se3_log(invert(self._pose) @ T_world_camera)
+        else:
+            self._twist = np.zeros(6)
+        self._pose = T_world_camera.copy()
+        self._frames = frames
+
+    def pose(self, frames: int) -> Float64:
+        """T_world_camera (4, 4) ``frames`` after the last processed frame."""
+        if not self._is_moving:
+            return self._pose.copy()
+        return self._pose @ se3_exp(min(1.0, frames / self._frames) * self._twist)
+
+    def guess(self, frames: int) -> Float64 | None:
+        """The same as a guess for tracking; None where no motion is known."""
+        return self.pose(frames) if self._twist.any() else None
+
+    def get_state(self) -> dict[str, Any]:
+        """Pose and last motion."""
+        return {"pose": self._pose.copy(), "twist": self._twist.copy(), "frames": self._frames}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state."""
+        self._pose, self._twist = state["pose"].copy(), state["twist"].copy()
+        self._frames = state["frames"]
+
+
+class SelectiveSlam(SlamBackend):
     """A backend behind a filter: active frame management (Saeedi et al., ICRA 2017, section V-A).
 
     A dropped frame is not shown to the backend; its result has ``processed`` False and a predicted
@@ -44,7 +132,7 @@ class ManagedSlam(SlamBackend):
         self.intrinsics = backend.intrinsics
         self._filter = frame_filter
         self._max_skip = max_skip
-        self._prediction = Prediction(pose == "constant-velocity")
+        self._prediction = PosePrediction(pose == "constant-velocity")
         self._forget()
 
     def _forget(self) -> None:

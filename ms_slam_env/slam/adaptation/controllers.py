@@ -1,4 +1,4 @@
-"""The configuration follows the observed divergence: section V-B of the paper.
+"""What chooses a configuration: the observed divergence (section V-B of the paper), or an agent.
 
 A set of parameters is good up to a maximum information divergence; where more is observed, another
 set is taken up, which costs more and copes with it.
@@ -12,12 +12,12 @@ from math import inf
 from typing import Any
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame
-from ms_slam_env.config import check_choice, check_range
+from ms_slam_env.config import bounded, chosen
 from ms_slam_env.errors import InputError
-from ms_slam_env.slam.adaptation.base import Controller
+from ms_slam_env.slam.adaptation.adaptive_slam import Controller
 from ms_slam_env.slam.adaptation.config import SwitchingConfig, rising
-from ms_slam_env.slam.frame_management import ChangeConfig
-from ms_slam_env.slam.frame_management.change import Change
+from ms_slam_env.slam.frame_selection import ChangeConfig
+from ms_slam_env.slam.frame_selection.divergence import Change
 
 
 @dataclass(frozen=True)
@@ -40,18 +40,15 @@ class DivergenceAdaptationConfig(SwitchingConfig):
 
     name: str = field(default="divergence", init=False)
     thresholds: tuple[float, ...] = (0.004, 0.01)
-    release_share: float = 0.7
-    dwell_frames: int = 6
+    release_share: float = bounded(0.7, 0.001, 1)
+    dwell_frames: int = bounded(6, 1, 1_000_000)
     robust_when_lost: bool = True
-    per: str = "frame"
+    per: str = chosen("frame", "frame", "second")
     change: ChangeConfig = field(default_factory=ChangeConfig)
 
     def __post_init__(self) -> None:
         """Refuse what is no ladder."""
         super().__post_init__()
-        check_range(self, "release_share", 0.001, 1)
-        check_range(self, "dwell_frames", 1, 1_000_000)
-        check_choice(self, "per", ("frame", "second"))
         if not isinstance(self.robust_when_lost, bool):
             raise InputError(f"robust_when_lost = {self.robust_when_lost!r} must be true or false")
         wanted = self.num_configurations - 1
@@ -129,3 +126,49 @@ class DivergenceController(Controller):
         self._measure.set_state(state["measure"])
         self.change, self._time_s = state["change"], state["time_s"]
         self.index, self._recent = state["index"], list(state["recent"])
+
+
+@dataclass(frozen=True)
+class AgentConfig(SwitchingConfig):
+    """``AdaptiveSlam.use(index)`` says which configuration is in force."""
+
+    name: str = field(default="agent", init=False)
+
+    def make_controller(self, intrinsics: Intrinsics) -> Controller:
+        """The controller that is told."""
+        return AgentController(self.num_configurations, self.first)
+
+
+class AgentController(Controller):
+    """Keeps to what it was told last."""
+
+    def __init__(self, count: int, first: int) -> None:
+        """Of ``count`` configurations, start with ``first``."""
+        self._count, self._first = count, first
+        self.reset()
+
+    def reset(self) -> None:
+        """Back to the first."""
+        self.index = self._first
+
+    def choose(self, frame: RGBDFrame, is_lost: bool) -> int:
+        """The index told."""
+        return self.index
+
+    def use(self, index: int) -> None:
+        """Take configuration ``index`` from the next frame on.
+
+        Raises:
+            InputError: there is none of that index.
+        """
+        if not 0 <= index < self._count:
+            raise InputError(f"configuration {index!r} is outside [0, {self._count - 1}]")
+        self.index = int(index)
+
+    def get_state(self) -> dict[str, Any]:
+        """The index."""
+        return {"index": self.index}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on with the index of a state."""
+        self.index = state["index"]

@@ -10,7 +10,7 @@ import pytest
 from ms_slam_env import slam
 from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.errors import InputError
-from ms_slam_env.slam.frame_management import DivergenceFilterConfig, ManagedSlam
+from ms_slam_env.slam.frame_selection import DivergenceFilterConfig, SelectiveSlam
 
 OPTIONS: dict[str, Any] = {
     "scene": "wall",
@@ -36,7 +36,7 @@ def test_none_is_the_default_and_leaves_the_backend_alone():
     runs = []
     for options in ({}, {"frame_management": "none"}, {"frame_management": {"name": "none"}}):
         env = ActiveSlamEnv("free", **OPTIONS, **options)
-        assert not isinstance(env.slam, ManagedSlam)
+        assert not isinstance(env.slam, SelectiveSlam)
         env.reset(seed=0)
         runs.append(_play(env, 3))
         assert env.processed.all()

@@ -1,0 +1,45 @@
+"""Which frames SLAM processes: active frame management (Saeedi et al., ICRA 2017, section V-A).
+
+::
+
+    config = make_config("divergence", threshold=0.02)
+    backend = config.manage(slam.make("surfel", intrinsics))   # a SlamBackend again
+    backend.track(frame).processed
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ms_slam_env.config import from_dict
+from ms_slam_env.slam.frame_selection.budget import BudgetConfig
+from ms_slam_env.slam.frame_selection.config import (
+    EveryFrameConfig,
+    FrameSelectionConfig,
+    RegularConfig,
+)
+from ms_slam_env.slam.frame_selection.divergence import ChangeConfig, DivergenceFilterConfig
+from ms_slam_env.slam.frame_selection.selective_slam import FrameFilter, SelectiveSlam
+
+
+def make_config(name: str, **options: Any) -> FrameSelectionConfig:
+    """The configuration ``name`` with its options, nested ones as mappings.
+
+    Raises:
+        InputError: an unknown name or option (the message lists the valid ones), or a bad value.
+    """
+    family: Any = FrameSelectionConfig  # abstract; the name says which variant it becomes
+    return from_dict(family, {"name": name, **options}, "frame_management")
+
+
+__all__ = [
+    "BudgetConfig",
+    "ChangeConfig",
+    "DivergenceFilterConfig",
+    "EveryFrameConfig",
+    "FrameFilter",
+    "FrameSelectionConfig",
+    "RegularConfig",
+    "SelectiveSlam",
+    "make_config",
+]

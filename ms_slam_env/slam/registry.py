@@ -1,0 +1,86 @@
+"""SLAM backends, by name; each is imported where it is made.
+
+Loading kernels takes a while, and an extra may be missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.config import from_dict
+from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.slam.base import SlamBackend
+
+
+@dataclass(frozen=True)
+class BackendEntry:
+    """Where a backend is.
+
+    Attributes:
+        module: its module below ``ms_slam_env.slam``.
+        backend: name of its class, made of intrinsics and configuration.
+        config: name of the dataclass of its parameters.
+        has_devices: whether it takes a device as well.
+    """
+
+    module: str
+    backend: str
+    config: str
+    has_devices: bool = False
+
+    def load(self, name: str) -> Any:
+        """The class ``name`` of its module."""
+        return getattr(import_module(f"ms_slam_env.slam.{self.module}"), name)
+
+
+BACKENDS = {
+    "surfel": BackendEntry("surfel", "SurfelSlam", "SurfelConfig", has_devices=True),
+    "odometry": BackendEntry("odometry", "OdometrySlam", "OdometryConfig"),
+    "volumetric": BackendEntry("volumetric", "VolumetricSlam", "VolumetricConfig"),
+    "sparse": BackendEntry("sparse", "SparseSlam", "SparseConfig"),
+}
+"""The backends by name."""
+
+
+def make_backend(name: object, intrinsics: Intrinsics, params: Mapping[str, Any]) -> SlamBackend:
+    """The backend ``name`` for a camera; see ``ms_slam_env.slam.make``.
+
+    Raises:
+        InputError: unknown backend, unknown parameter or value out of range.
+    """
+    config = check_parameters(name, params)
+    entry = BACKENDS[str(name)]
+    device = [params.get("device", "cpu")] if entry.has_devices else []
+    made: SlamBackend = entry.load(entry.backend)(intrinsics, config, *device)
+    return made
+
+
+def check_parameters(name: object, params: object) -> Any:
+    """Refuse what ``make_backend`` would refuse, without making a backend.
+
+    Returns:
+        the backend's parameters as its dataclass.
+
+    Raises:
+        InputError: unknown backend, unknown parameter or value out of range.
+    """
+    if not isinstance(name, str) or name not in BACKENDS:
+        raise unknown("SLAM backend", name, BACKENDS)
+    if not isinstance(params, Mapping) or not all(isinstance(key, str) for key in params):
+        raise InputError(f"slam_config = {params!r} must be a mapping of options")
+    entry, options = BACKENDS[name], dict(params)
+    if entry.has_devices:
+        _check_device(options.pop("device", "cpu"))
+    return from_dict(entry.load(entry.config), options, "slam_config")
+
+
+def _check_device(device: object) -> None:
+    from ms_slam_env._warp import wp
+
+    devices = [found.alias for found in wp.get_devices()]
+    if device not in (*devices, "cuda") or (device == "cuda" and not wp.is_cuda_available()):
+        raise unknown("device", device, devices)
