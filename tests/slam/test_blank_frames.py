@@ -10,7 +10,7 @@ from ms_slam_env import slam
 from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.geometry import look_at, make_pose, so3_exp
 from ms_slam_env.sensor import RGBDSensor
-from ms_slam_env.slam.surfel.photometry import BlankFrames, is_blank
+from ms_slam_env.slam.surfel.photometry import InvalidFrameDetector, is_invalid_frame
 
 CAMERA = xtion("160x120")
 START = look_at([-0.8, -0.8, 1.2], [1.2, 0.1, 0.5])
@@ -27,11 +27,11 @@ def _image(mean: float, noise: float) -> np.ndarray:
 )
 def test_what_is_blank(mean, noise, blank):
     both = np.stack([_image(mean, noise), _image(100, 30)])
-    np.testing.assert_array_equal(is_blank(both), [blank, False])
+    np.testing.assert_array_equal(is_invalid_frame(both), [blank, False])
 
 
 def test_only_where_the_first_frame_was_not():
-    frames = BlankFrames(2)
+    frames = InvalidFrameDetector(2)
     black, image = _image(0, 0), _image(100, 30)
     started = np.zeros(2, dtype=bool)
     np.testing.assert_array_equal(frames.find(np.stack([black, image]), started), [False, False])

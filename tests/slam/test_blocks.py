@@ -9,7 +9,7 @@ from surfel_scenes import SMALL, device_poses, fuse, live_frame
 
 from ms_slam_env.geometry import invert, make_pose, so3_exp, transform_points
 from ms_slam_env.slam.surfel.config import SurfelConfig
-from ms_slam_env.slam.surfel.frustum_culling import BLOCK
+from ms_slam_env.slam.surfel.frustum_culling import BLOCK_SIZE
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 
 CONFIG = SurfelConfig(max_surfels=3000, compaction_interval=2, unstable_window=3)
@@ -79,7 +79,7 @@ def test_the_visible_surfels_are_those_of_the_loop_over_all(seed, margin_px, ext
     MAPS.active.seen_to.fill_(int(window[1]))
     poses = np.stack([random_pose(rng, extent_m) for _ in range(2)])
     fast = visible(poses, 0, margin_px)
-    looked_at = MAPS._blocks.num_listed.numpy() * BLOCK
+    looked_at = MAPS._blocks.num_listed.numpy() * BLOCK_SIZE
     look_everywhere()
     slow = visible(poses, 0, margin_px)
     for env in range(2):
@@ -142,7 +142,7 @@ def assert_boxes_hold(surfel_map: SurfelMap) -> None:
     counts = surfels.count.numpy()
     np.testing.assert_array_equal(blocks.bounded.numpy(), counts)
     for env, count in enumerate(counts):
-        block = np.arange(count) // BLOCK
+        block = np.arange(count) // BLOCK_SIZE
         position = surfels.position.numpy()[env, :count]
         confidence = surfels.confidence.numpy()[env, :count]
         alive = confidence > 0
@@ -193,7 +193,7 @@ def test_far_blocks_are_not_looked_at():
     set_surfels([{name: np.concatenate([far[name], near[name]]) for name in near}] * 2)
     poses = np.tile(make_pose(np.eye(3), [0, 0, -3]), (2, 1, 1))
     visible(poses, 0, 1.0)
-    assert (MAPS._blocks.num_listed.numpy() <= 500 / BLOCK + 2).all()
+    assert (MAPS._blocks.num_listed.numpy() <= 500 / BLOCK_SIZE + 2).all()
 
 
 def test_unstable_surfels_expire_at_the_interval_and_gaps_close_when_many():
@@ -218,7 +218,7 @@ def test_unstable_surfels_expire_at_the_interval_and_gaps_close_when_many():
         if time % 4 == 0:
             old_and_unstable = (surfels["confidence"] < 10) & (surfels["seen"] < time - 6)
             expected &= ~old_and_unstable
-            used = -(-int(surfel_map.surfels.count.numpy()[0]) // BLOCK)
+            used = -(-int(surfel_map.surfels.count.numpy()[0]) // BLOCK_SIZE)
             # No block is looked at again for what is gone already.
             assert (surfel_map._blocks.expiry.numpy()[0, :used] >= time - 6).all()
         state = surfel_map.get_state()

@@ -204,7 +204,7 @@ def test_surfels_move_as_the_deformation_says(turn: tuple[list[RGBDFrame], np.nd
     graph = sample_graph(surfels["position"], times, 30)
     rng = np.random.default_rng(0)
     motion = unpack(graph, pack(identity(graph)) + rng.normal(0, 0.05, 12 * len(graph)))
-    system.loops._bender._move_surfels(0, motion, times)
+    system.loops._deformer._move_surfels(0, motion, times)
     moved = system.map.get_state()["surfels"][0]
     np.testing.assert_allclose(
         moved["position"], motion.points(surfels["position"], times), atol=2e-5

@@ -10,7 +10,7 @@ from ms_slam_env._warp import wp
 from ms_slam_env.camera import xtion
 from ms_slam_env.geometry import make_pose, so3_exp
 from ms_slam_env.slam.surfel.config import SurfelConfig
-from ms_slam_env.slam.surfel.device import Mirror
+from ms_slam_env.slam.surfel.device import HostDeviceBuffer
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.tracker import model_stride
 
@@ -43,7 +43,7 @@ def test_the_view_is_as_thin_as_the_last_iteration_allows(size, stride):
 
 
 def test_a_mirror_writes_and_reads_the_device_array():
-    mirror = Mirror((2,), wp.mat44, "cpu")
+    mirror = HostDeviceBuffer((2,), wp.mat44, "cpu")
     values = np.arange(32.0).reshape(2, 4, 4)
     mirror.write(values)
     np.testing.assert_array_equal(mirror.array.numpy(), values)

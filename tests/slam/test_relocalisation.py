@@ -14,7 +14,7 @@ from ms_slam_env.geometry import look_at, make_pose, relative_angle, so3_exp
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
 from ms_slam_env.slam.surfel.photometric_consistency import LikenessLimits, measure_likeness
-from ms_slam_env.slam.surfel.relocalization import FernRelocalisation, Images
+from ms_slam_env.slam.surfel.relocalization import FernRelocalization, Images
 
 CAMERA = xtion("160x120")
 OPTIONS = {"max_surfels": 120_000, "depth_cutoff_m": 4.0}
@@ -139,14 +139,14 @@ def test_kidnapping_one_env_leaves_the_other_alone(frames, elsewhere):
 
 
 def test_keyframes_follow_a_bent_map():
-    ferns = FernRelocalisation(1, CAMERA, 3.0)
+    ferns = FernRelocalization(1, CAMERA, 3.0)
     rng = np.random.default_rng(0)
     depth = np.ones((1, *CAMERA.shape), dtype=np.float32)
     for time in (3, 5, 9):
         color = np.kron(rng.integers(0, 256, (1, 6, 8, 3)), np.ones((1, 20, 20, 1)))
         frames = Images(color.astype(np.uint8), depth)
         pose = make_pose(np.eye(3), [time, 0.0, 0.0])
-        ferns.remember(frames, pose[None], np.array([time]), np.array([True]))
+        ferns.add_keyframes(frames, pose[None], np.array([time]), np.array([True]))
     bent = np.stack([make_pose(so3_exp([0, 0, 0.1]), [10.0 * time, 1.0, 0.0]) for time in (5, 9)])
     ferns.move(0, np.array([5, 9], dtype=np.int32), bent)
     poses = ferns.databases[0].poses
@@ -155,7 +155,7 @@ def test_keyframes_follow_a_bent_map():
 
 
 def test_a_camera_at_rest_is_not_encoded_again(monkeypatch):
-    ferns = FernRelocalisation(2, CAMERA, 3.0)
+    ferns = FernRelocalization(2, CAMERA, 3.0)
     seen = []
     for env, database in enumerate(ferns.databases):
         monkeypatch.setattr(database, "observe", lambda *_, env=env: seen.append(env))
@@ -165,11 +165,11 @@ def test_a_camera_at_rest_is_not_encoded_again(monkeypatch):
         poses = np.stack(
             [make_pose(np.eye(3), [step, 0, 0]), make_pose(so3_exp([0, turn, 0]), [9, 9, 9])]
         )
-        ferns.remember(nothing, poses, np.zeros(2, np.int32), np.array([True, True]))
+        ferns.add_keyframes(nothing, poses, np.zeros(2, np.int32), np.array([True, True]))
     assert seen == [0, 1, 0, 1]
-    ferns.remember(nothing, poses + 0, np.zeros(2, np.int32), np.array([True, False]))
+    ferns.add_keyframes(nothing, poses + 0, np.zeros(2, np.int32), np.array([True, False]))
     ferns.clear(1)
-    ferns.remember(nothing, poses, np.zeros(2, np.int32), np.array([False, True]))
+    ferns.add_keyframes(nothing, poses, np.zeros(2, np.int32), np.array([False, True]))
     assert seen == [0, 1, 0, 1, 1]
 
 

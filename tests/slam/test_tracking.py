@@ -11,10 +11,15 @@ from ms_slam_env.camera import Intrinsics, xtion
 from ms_slam_env.geometry import invert, look_at, relative_angle, se3_exp
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.surfel import normal_equations as ne
-from ms_slam_env.slam.surfel.acceptance import APPEARANCE, FEW_POINTS, REASONS, make_limits
+from ms_slam_env.slam.surfel.acceptance import (
+    APPEARANCE,
+    FEW_POINTS,
+    REASONS,
+    acceptance_thresholds,
+)
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.photometry import same_exposure
-from ms_slam_env.slam.surfel.pose_hypotheses import NUM_SEEDS, tracking_seeds
+from ms_slam_env.slam.surfel.pose_hypotheses import NUM_HYPOTHESES, tracking_hypotheses
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame, Preprocessor
 from ms_slam_env.slam.surfel.rendering import ModelView
 from ms_slam_env.slam.surfel.solver import reduce_sums
@@ -75,7 +80,7 @@ def _device_sums(data, T, weights, stride=1, columns=1 << 20, light=LIGHT):
     sums = wp.zeros((1, 1, ne.NUM_SUMS), dtype=wp.float64)
     active = wp.array([[ne.RUNNING]], dtype=wp.int32)
     wp.launch(
-        ne.accumulate,
+        ne.accumulate_normal_equations,
         dim=(1, 1, rows, pieces),
         inputs=[
             *images, size, size, wp.vec2(SMALL.fx, SMALL.fy), wp.vec2(SMALL.cx, SMALL.cy), weights,
@@ -220,7 +225,7 @@ class _Pair:
         self.sensor = RGBDSensor(BoxScene(), self.camera, noise=noise)
         config = SurfelConfig(depth_cutoff_m=5.0)
         self.preprocessors = [Preprocessor(1, self.camera, config) for _ in range(2)]
-        self.tracker = Tracker(1, NUM_SEEDS, self.camera, config)
+        self.tracker = Tracker(1, NUM_HYPOTHESES, self.camera, config)
 
     def live(self, which: int, pose: np.ndarray) -> LiveFrame:
         frame = self.sensor.capture(pose, which)
@@ -229,8 +234,8 @@ class _Pair:
     def align(self, model: LiveFrame, live: LiveFrame):
         view = ModelView(model.vertices, model.normals, model.intensity, model.color)
         self.tracker.set_frame(live)
-        limits = make_limits(np.zeros(1, dtype=bool), np.zeros(1, dtype=np.int32))
-        seeds = tracking_seeds(np.eye(4))[None]
+        limits = acceptance_thresholds(np.zeros(1, dtype=bool), np.zeros(1, dtype=np.int32))
+        seeds = tracking_hypotheses(np.eye(4))[None]
         return self.tracker.align(view, T_WORLD_MODEL[None], seeds, limits)
 
 

@@ -12,7 +12,7 @@ one-dimensional and contiguous, such as ``array.flatten()``, or rows; indices ar
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,8 +20,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env._warp import wp
 
+Dim = int | Sequence[int]
 
-class Mirror:
+
+class HostDeviceBuffer:
     """A device array; on a CPU the host works on its memory.
 
     There ``assign`` and ``numpy`` of a small array cost 5 to 15 microseconds a call, most of it
@@ -50,8 +52,12 @@ class Mirror:
         return (self.array.numpy() if self._memory is None else self._memory).copy()
 
 
-class Launches:
-    """Launches by key, for kernels whose arguments are the same objects every time."""
+class KernelLaunchCache:
+    """Recorded launches by key, for kernels whose arguments are the same objects every time.
+
+    Packing the arguments of a launch costs more time than a small kernel (24 against 4
+    microseconds measured on one core); tracking repeats the same hundred launches every frame.
+    """
 
     def __init__(self, device: str) -> None:
         """Start with nothing recorded."""
@@ -62,33 +68,33 @@ class Launches:
         """Forget all: the arguments have become other objects."""
         self._commands.clear()
 
-    def replay(self, key: Hashable) -> bool:
-        """Launch what was recorded under ``key``; False if nothing was."""
+    def launch(
+        self, key: Hashable, kernel: Any, arguments: Callable[[], tuple[Dim, Sequence[Any]]]
+    ) -> None:
+        """Launch what was recorded under ``key``, or else ``kernel``, and record that.
+
+        ``arguments`` gives the number of threads and what the kernel takes.
+        """
         command = self._commands.get(key)
         if command is None:
-            return False
+            dim, inputs = arguments()
+            command = record_launch(kernel, dim, inputs, self._device)
+            self._commands[key] = command
         command.launch()
-        return True
 
-    def record(
-        self,
-        key: Hashable,
-        kernel: Any,
-        dim: int | Sequence[int],
-        inputs: Sequence[Any],
-        outputs: Sequence[Any],
-    ) -> None:
-        """Launch a kernel and keep the launch under ``key``."""
-        command = wp.launch(
-            kernel,
-            dim=dim,
-            inputs=inputs,
-            outputs=outputs,
-            device=self._device,
-            record_cmd=True,
-        )
-        self._commands[key] = command
-        command.launch()
+
+def record_launch(kernel: Any, dim: Dim, inputs: Sequence[Any], device: str) -> wp.Launch:
+    """A launch to be repeated; nothing is launched yet."""
+    return wp.launch(kernel, dim=dim, inputs=inputs, device=device, record_cmd=True)
+
+
+def threads_per_row(width: int, device: str, gpu_columns: int = 1) -> tuple[int, int]:
+    """Columns of an image that one thread goes through, and how many threads a row has.
+
+    The CPU runs one thread after another: whole rows. A GPU wants many threads.
+    """
+    columns = gpu_columns if wp.get_device(device).is_cuda else width
+    return columns, -(-width // columns)
 
 
 @wp.func_native("return values.data[i];")

@@ -23,13 +23,13 @@ from ms_slam_env.slam.surfel.surfels import (
     translation_of,
 )
 
-BLOCK = wp.constant(128)
+BLOCK_SIZE = wp.constant(128)
 """Surfels of a block."""
 
 
 @wp.struct
-class Blocks:
-    """Blocks of B maps: arrays (B, capacity / BLOCK, rounded up).
+class CullingBlocks:
+    """Blocks of B maps: arrays (B, capacity / BLOCK_SIZE, rounded up).
 
     Attributes:
         low: lower corner of the bounding box, world frame.
@@ -49,10 +49,10 @@ class Blocks:
     bounded: wp.array(dtype=wp.int32)
 
 
-def allocate_blocks(batch: int, capacity: int, device: str) -> Blocks:
-    """Blocks of empty maps."""
-    blocks = Blocks()
-    shape = (batch, -(-capacity // BLOCK))
+def allocate_culling_blocks(batch: int, capacity: int, device: str) -> CullingBlocks:
+    """CullingBlocks of empty maps."""
+    blocks = CullingBlocks()
+    shape = (batch, -(-capacity // BLOCK_SIZE))
     blocks.low = wp.zeros(shape, dtype=wp.vec3, device=device)
     blocks.high = wp.zeros(shape, dtype=wp.vec3, device=device)
     blocks.expiry = wp.zeros(shape, dtype=wp.int32, device=device)
@@ -64,8 +64,8 @@ def allocate_blocks(batch: int, capacity: int, device: str) -> Blocks:
 
 @wp.func
 def num_blocks(count: int):
-    """Blocks that ``count`` slots fill or begin."""
-    return (count + BLOCK - 1) / BLOCK
+    """CullingBlocks that ``count`` slots fill or begin."""
+    return (count + BLOCK_SIZE - 1) / BLOCK_SIZE
 
 
 @wp.struct
@@ -149,8 +149,8 @@ int* listed = blocks.listed.data + size_t(row) * blocks.listed.shape[1]
 for (int m = 0; m < found; ++m) listed[m] = first + which[m];
 return n;
 """)
-def list_some_blocks(
-    blocks: Blocks, b: int, first: int, end: int, frustum: Frustum, row: int
+def list_some_visible_blocks(
+    blocks: CullingBlocks, b: int, first: int, end: int, frustum: Frustum, row: int
 ) -> int:
     """List those of the blocks from ``first`` on that reach into a frustum; how many were tested.
 
@@ -159,9 +159,9 @@ def list_some_blocks(
 
 
 @wp.kernel
-def list_blocks(
+def list_visible_blocks(
     surfels: Surfels,
-    blocks: Blocks,
+    blocks: CullingBlocks,
     first_env: int,
     poses: wp.array(dtype=wp.mat44),
     camera: SplatCamera,
@@ -179,7 +179,7 @@ def list_blocks(
     block = int(worker)
     while block < count:
         end = wp.where(workers == 1, count, block + 1)
-        tested = list_some_blocks(blocks, b, block, end, frustum, k)
+        tested = list_some_visible_blocks(blocks, b, block, end, frustum, k)
         block += wp.where(workers == 1, tested, workers)
 
 
@@ -222,15 +222,15 @@ const size_t block = size_t(b) * blocks.expiry.shape[1] + first / BLOCK_SIZE;
 blocks.low.data[block] = wp::vec3(low[0], low[1], low[2]);
 blocks.high.data[block] = wp::vec3(high[0], high[1], high[2]);
 blocks.expiry.data[block] = expiry;
-""".replace("BLOCK_SIZE", str(BLOCK))
+""".replace("BLOCK_SIZE", str(BLOCK_SIZE))
 )
-def bound(surfels: Surfels, blocks: Blocks, b: int, first: int, n: int, threshold: float):
+def bound(surfels: Surfels, blocks: CullingBlocks, b: int, first: int, n: int, threshold: float):
     """Set box and expiry of the block of the ``n`` surfels from ``first`` on."""
 
 
 @wp.kernel
 def bound_blocks(
-    surfels: Surfels, blocks: Blocks, capacity: int, threshold: float, workers: int
+    surfels: Surfels, blocks: CullingBlocks, capacity: int, threshold: float, workers: int
 ) -> None:
     """Take anew the boxes of the listed blocks and of all whose slots are not bounded yet.
 
@@ -238,23 +238,23 @@ def bound_blocks(
     """
     b, worker = wp.tid()
     count = wp.min(surfels.count[b], capacity)
-    fresh = blocks.bounded[b] / BLOCK
+    fresh = blocks.bounded[b] / BLOCK_SIZE
     j = int(worker)
     while j < blocks.num_listed[b]:
         block = blocks.listed[b, j]
-        first = block * BLOCK
+        first = block * BLOCK_SIZE
         if block < fresh and first < count:
-            bound(surfels, blocks, b, first, wp.min(BLOCK, count - first), threshold)
+            bound(surfels, blocks, b, first, wp.min(BLOCK_SIZE, count - first), threshold)
         j += workers
     block = fresh + worker
     while block < num_blocks(count):
-        first = block * BLOCK
-        bound(surfels, blocks, b, first, wp.min(BLOCK, count - first), threshold)
+        first = block * BLOCK_SIZE
+        bound(surfels, blocks, b, first, wp.min(BLOCK_SIZE, count - first), threshold)
         block += workers
 
 
 @wp.kernel
-def set_bounded(surfels: Surfels, blocks: Blocks, capacity: int) -> None:
+def set_bounded(surfels: Surfels, blocks: CullingBlocks, capacity: int) -> None:
     """Note that all boxes hold."""
     b = wp.tid()
     blocks.bounded[b] = wp.min(surfels.count[b], capacity)
@@ -314,7 +314,7 @@ for (int m = 0; m < found; ++m) {
 }
 return n;
 """)
-def list_some(
+def list_some_visible(
     surfels: Surfels,
     b: int,
     first: int,
@@ -334,7 +334,7 @@ def list_some(
 @wp.kernel
 def cull(
     surfels: Surfels,
-    blocks: Blocks,
+    blocks: CullingBlocks,
     first_env: int,
     poses: wp.array(dtype=wp.mat44),
     camera: SplatCamera,
@@ -345,7 +345,7 @@ def cull(
 ) -> None:
     """List the living surfels of a window in front of the camera, facing it, within its frustum.
 
-    Those of the blocks that ``list_blocks`` listed; ``poses[k]`` is T_world_camera of env
+    Those of the blocks that ``list_visible_blocks`` listed; ``poses[k]`` is T_world_camera of env
     ``first_env + k``. A single worker, as on the CPU, keeps the order of the map.
     """
     k, worker = wp.tid()
@@ -354,20 +354,22 @@ def cull(
     count = surfels.count[b]
     seen_from = window.seen_from[b]
     seen_to = window.seen_to[b]
-    slots = blocks.num_listed[k] * BLOCK
+    slots = blocks.num_listed[k] * BLOCK_SIZE
     j = int(worker)
     while j < slots:
-        block = j / BLOCK
-        i = blocks.listed[k, block] * BLOCK + j - block * BLOCK
+        block = j / BLOCK_SIZE
+        i = blocks.listed[k, block] * BLOCK_SIZE + j - block * BLOCK_SIZE
         looked_at = 1
         if i < count:
-            end = wp.min((i / BLOCK + 1) * BLOCK, count)
+            end = wp.min((i / BLOCK_SIZE + 1) * BLOCK_SIZE, count)
             end = wp.where(workers == 1, end, i + 1)
-            looked_at = list_some(surfels, b, i, end, frustum, seen_from, seen_to, k, visible)
+            looked_at = list_some_visible(
+                surfels, b, i, end, frustum, seen_from, seen_to, k, visible
+            )
         j += wp.where(workers == 1, looked_at, workers)
 
 
-class Culler:
+class FrustumCuller:
     """Lists the surfels that cameras can see, one camera for each of ``envs`` maps.
 
     Only those last seen within ``window``, whose times may be set anew at any moment; None: all.
@@ -376,7 +378,7 @@ class Culler:
     def __init__(
         self,
         surfels: Surfels,
-        blocks: Blocks,
+        blocks: CullingBlocks,
         visible: VisibleList,
         envs: int,
         camera: SplatCamera,
@@ -392,7 +394,10 @@ class Culler:
         shared = [surfels, blocks, first_env, poses, camera, margin_px, workers]
         self._launches = [
             wp.launch(kernel, (envs, workers), inputs, device=device, record_cmd=True)
-            for kernel, inputs in ((list_blocks, shared), (cull, [*shared, window, visible]))
+            for kernel, inputs in (
+                (list_visible_blocks, shared),
+                (cull, [*shared, window, visible]),
+            )
         ]
 
     def __call__(self, poses: wp.array, first_env: int = 0, margin_px: float = 0.0) -> None:

@@ -29,17 +29,25 @@ from numpy.typing import NDArray
 from ms_slam_env._warp import wp
 from ms_slam_env.geometry import invert, relative_angle
 from ms_slam_env.slam.ferns import Candidate
-from ms_slam_env.slam.surfel.acceptance import OK, STAT_SIGMA, Alignment, make_limits
+from ms_slam_env.slam.surfel.acceptance import Alignment, Stat, acceptance_thresholds
 from ms_slam_env.slam.surfel.config import SurfelConfig
-from ms_slam_env.slam.surfel.device import Mirror
-from ms_slam_env.slam.surfel.map_deformation import MapBender
-from ms_slam_env.slam.surfel.pose_hypotheses import NUM_SEEDS, relocalisation_seeds, tracking_seeds
+from ms_slam_env.slam.surfel.device import HostDeviceBuffer
+from ms_slam_env.slam.surfel.map_deformation import MapDeformer
+from ms_slam_env.slam.surfel.pose_hypotheses import (
+    NUM_HYPOTHESES,
+    relocalization_hypotheses,
+    tracking_hypotheses,
+)
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
 from ms_slam_env.slam.surfel.rendering import SplatRenderer
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.surfels import EARLIEST, any_time
 from ms_slam_env.slam.surfel.tracker import Tracker, model_stride
-from ms_slam_env.slam.surfel.trajectory_history import Past, motion_size, past_from_state
+from ms_slam_env.slam.surfel.trajectory_history import (
+    TrajectoryHistory,
+    history_from_state,
+    motion_size,
+)
 
 Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
@@ -168,7 +176,7 @@ class Placement:
 
 
 def _placement(found: Bool, alignment: Alignment) -> Placement:
-    return Placement(found, alignment.T_world_live, alignment.stats[:, STAT_SIGMA])
+    return Placement(found, alignment.T_world_live, alignment.stats[:, Stat.SIGMA])
 
 
 def _nowhere(batch: int) -> Placement:
@@ -189,8 +197,8 @@ class InactiveRegistration:
         self._inactive = inactive
         intrinsics = surfel_map.intrinsics
         stride = model_stride(intrinsics, config)
-        self._tracker = Tracker(self.batch, NUM_SEEDS, intrinsics, config, device, stride)
-        self._poses = Mirror(self.batch, wp.mat44, device)
+        self._tracker = Tracker(self.batch, NUM_HYPOTHESES, intrinsics, config, device, stride)
+        self._poses = HostDeviceBuffer(self.batch, wp.mat44, device)
 
     def set_frame(self, live: LiveFrame) -> None:
         """Take the frames that are registered next."""
@@ -214,8 +222,10 @@ class InactiveRegistration:
 
     def near(self, poses: Float64) -> Placement:
         """Register with the view that ``covered`` rendered from ``poses``."""
-        found = self._align(poses, tracking_seeds(np.eye(4)), self._limits(self.config.largest_m))
-        return _placement(found.verdict == OK, found)
+        found = self._align(
+            poses, tracking_hypotheses(np.eye(4)), self._limits(self.config.largest_m)
+        )
+        return _placement(found.tracked, found)
 
     def from_keyframes(self, starts: Float64) -> Placement:
         """Register from poses (B, 4, 4) that are rough and may be wrong, NaN for an env without.
@@ -228,24 +238,24 @@ class InactiveRegistration:
         given &= self.covered(origins, given)
         if not given.any():
             return _nowhere(self.batch)
-        first = self._align(origins, relocalisation_seeds(0), limits)
-        good = given & (first.verdict == OK)
+        first = self._align(origins, relocalization_hypotheses(0), limits)
+        good = given & first.tracked
         origins = np.where(good[:, None, None], first.T_world_live, np.eye(4))
         good &= self.covered(origins, good)
         if not good.any():
             return _nowhere(self.batch)
-        again = self._align(origins, tracking_seeds(np.eye(4)), self._limits(0.1))
-        good &= again.verdict == OK
+        again = self._align(origins, tracking_hypotheses(np.eye(4)), self._limits(0.1))
+        good &= again.tracked
         for env in np.flatnonzero(good):
             good[env] = _is_settled(origins[env], again.T_world_live[env])
         return _placement(good, again)
 
-    def _align(self, origins: Float64, seeds: Float64, limits: NDArray[Any]) -> Alignment:
-        stack = np.tile(seeds, (self.batch, 1, 1, 1))
+    def _align(self, origins: Float64, hypotheses: Float64, limits: NDArray[Any]) -> Alignment:
+        stack = np.tile(hypotheses, (self.batch, 1, 1, 1))
         return self._tracker.align(self._inactive.view, origins, stack, limits)
 
     def _limits(self, motion_m: float) -> NDArray[Any]:
-        limits = make_limits(np.ones(self.batch, bool), np.zeros(self.batch, np.int32))
+        limits = acceptance_thresholds(np.ones(self.batch, bool), np.zeros(self.batch, np.int32))
         limits["sigma"] = self.config.sigma
         limits["inliers"] = self.config.inliers
         limits["motion_m"] = motion_m
@@ -275,17 +285,17 @@ class DeformationLoopClosure(LoopClosure):
         inactive = surfel_map.model_renderer(stride, self._window)
         active = surfel_map.model_renderer(stride, surfel_map.active)
         self._registration = InactiveRegistration(surfel_map, inactive, config, device)
-        self._bender = MapBender(surfel_map, inactive, active, config, device)
+        self._deformer = MapDeformer(surfel_map, inactive, active, config, device)
         self._seen_from = np.full(self.batch, EARLIEST, dtype=np.int32)
-        self._past = [Past() for _ in range(self.batch)]
+        self._histories = [TrajectoryHistory() for _ in range(self.batch)]
 
     def reset(self, env: int) -> None:
         """Forget one env."""
-        self._past[env] = Past()
+        self._histories[env] = TrajectoryHistory()
 
     def select(self, lost: Int32) -> bool:
         """The active surfels, or all while tracking is lost."""
-        last = np.array([past.last for past in self._past])
+        last = np.array([history.last for history in self._histories])
         seen_from = np.where(lost > 0, EARLIEST, last - self.config.window).astype(np.int32)
         changed = not np.array_equal(seen_from, self._seen_from)
         if changed:
@@ -296,7 +306,7 @@ class DeformationLoopClosure(LoopClosure):
     def record(self, poses: Float64, time: Int32, fused: Bool) -> None:
         """Remember the poses of the frames just fused."""
         for env in np.flatnonzero(fused):
-            self._past[env].record(self.map, int(env), int(time[env]), poses[env])
+            self._histories[env].record(self.map, int(env), int(time[env]), poses[env])
 
     def close(
         self, live: LiveFrame, poses: Float64, time: Int32, tracked: Bool, similar: SimilarViews
@@ -321,11 +331,11 @@ class DeformationLoopClosure(LoopClosure):
 
     def _close_from_keyframes(self, env: int, poses: Float64, similar: SimilarViews) -> bool:
         """Look for the frame where similar ones were taken, and close a loop there."""
-        past = self._past[env]
-        for candidate in similar(env, past.last - self.config.window):
+        history = self._histories[env]
+        for candidate in similar(env, history.last - self.config.window):
             if candidate.dissimilarity > self.config.dissimilarity:
                 break
-            allowed_m = self.config.drift_share * past.path_m(candidate.time)
+            allowed_m = self.config.drift_share * history.path_m(candidate.time)
             if not _may_be_the_same(poses[env], candidate.T_world_camera, allowed_m):
                 continue
             starts = np.full((self.batch, 4, 4), np.nan)
@@ -338,35 +348,35 @@ class DeformationLoopClosure(LoopClosure):
 
     def _close(self, env: int, poses: Float64, there: Placement) -> bool:
         """Bend map, pose and past of one env; returns whether that was believed and done."""
-        past, corrected = self._past[env], there.T_world_live[env]
+        history, corrected = self._histories[env], there.T_world_live[env]
         drift = motion_size(invert(poses[env]) @ corrected)
         if drift < self.config.smallest_m:
-            self._bender.join_parts(env, poses[env], past.last)
+            self._deformer.join_parts(env, poses[env], history.last)
             return False
-        if drift < SIGNIFICANT * there.sigma[env] or not past.confirms(
+        if drift < SIGNIFICANT * there.sigma[env] or not history.confirms(
             poses[env], corrected, self.config.agreement_m, 2 * self.config.global_interval
         ):
             return False
-        bent = self._bender.bend(env, poses[env], corrected, past.joined)
-        if bent is None:
+        deformed = self._deformer.deform(env, poses[env], corrected, history.joined)
+        if deformed is None:
             return False
-        deformation, joined = bent
-        past.move(deformation, joined, corrected)
+        deformation, joined = deformed
+        history.move(deformation, joined, corrected)
         poses[env] = corrected
-        self._bender.join_parts(env, corrected, past.last)
+        self._deformer.join_parts(env, corrected, history.last)
         return True
 
     def trajectory(self, env: int) -> tuple[Int32, Float64]:
         """Tracked frames (N,) and their poses (N, 4, 4), bent by the closures since."""
-        return self._past[env].trajectory()
+        return self._histories[env].trajectory()
 
     def get_state(self) -> dict[str, Any]:
         """Everything needed to go on bit-exactly, as NumPy arrays."""
-        return {"past": [past.get_state() for past in self._past]}
+        return {"past": [history.get_state() for history in self._histories]}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state that ``get_state`` returned."""
-        self._past = [past_from_state(past) for past in state["past"]]
+        self._histories = [history_from_state(history) for history in state["past"]]
 
 
 def _may_be_the_same(pose: Float64, keyframe: Float64, drift_m: float) -> bool:

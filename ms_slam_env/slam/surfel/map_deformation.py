@@ -22,7 +22,7 @@ from ms_slam_env.slam.surfel.deformation_graph import (
     optimise,
     sample_graph,
 )
-from ms_slam_env.slam.surfel.device import Mirror
+from ms_slam_env.slam.surfel.device import HostDeviceBuffer
 from ms_slam_env.slam.surfel.rendering import SplatRenderer
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.surfels import (
@@ -244,7 +244,7 @@ def merge(
 FEWEST_CONSTRAINTS = 12
 
 
-class MapBender:
+class MapDeformer:
     """Bends the maps of B envs, one at a time.
 
     Args:
@@ -271,9 +271,9 @@ class MapBender:
         self._tolerance_m = config.fusion_distance_m
         self._stable = config.confidence_threshold
         self._min_cosine = float(np.cos(np.radians(config.fusion_angle_deg)))
-        self._poses = Mirror(surfel_map.batch, wp.mat44, device)
+        self._poses = HostDeviceBuffer(surfel_map.batch, wp.mat44, device)
 
-    def bend(
+    def deform(
         self, env: int, pose: Float64, corrected: Float64, earlier: Constraints
     ) -> tuple[Deformation, Constraints] | None:
         """Take what is seen from ``pose`` to where it is seen from ``corrected``, if believable.

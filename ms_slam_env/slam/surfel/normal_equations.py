@@ -45,27 +45,40 @@ compiler turns into operations on eight points. A thread of a GPU takes one poin
 
 from __future__ import annotations
 
+from enum import IntEnum
+
 from ms_slam_env._warp import wp
 
-NUM_SUMS = 71
-"""Sums of a pass: geometric term, statistics, exposure, photometric term.
 
-A term has 21 sums of H (upper triangle by rows) and 6 of g = J^T W r.
-"""
-SUM_COST = 27  # truncated robust cost of the visible points, in [0, 3] each
-SUM_POINTS = 28  # model points looked at
-SUM_VISIBLE = 29  # of those, inside the live image
-SUM_MATCHED = 30  # of those, with a live vertex
-SUM_INLIERS = 31  # of those, within the gates and a few sigmas of the model's plane
-SUM_SQUARED_M2 = 32  # squared point-to-plane residuals of the inliers, m^2
-SUM_TEXTURED = 33  # visible, with a marked intensity gradient
-SUM_ALIKE = 34  # of those, with a small photometric residual
-SUM_APART = 35  # matched, but the live surface is clearly nearer or farther than the model's
-SUM_EXPOSURE = 36  # sums of w, w m, w m^2, w r, w m r over exposed points, m = I_p - 128
-SUM_ROUGH = 41  # of the textured: 1 - robust weight; half their number at the right scale
-SUM_PHOTOMETRIC = 42  # the photometric term's
-SUM_TILTED = 69  # geometric weights times 1 - cosine of the angle between the normals
-SUM_EXPOSURE_SQUARED = 70  # of w r^2 over exposed points
+class Sum(IntEnum):
+    """Places of a pass's sums; H takes 21 (upper triangle by rows), g = J^T W r six."""
+
+    GEOMETRIC_HESSIAN = 0
+    GEOMETRIC_GRADIENT = 21
+    COST = 27  # truncated robust cost of the visible points, in [0, 3] each
+    POINTS = 28  # model points looked at
+    VISIBLE = 29  # of those, inside the live image
+    MATCHED = 30  # of those, with a live vertex
+    INLIERS = 31  # of those, within the gates and a few sigmas of the model's plane
+    SQUARED_M2 = 32  # squared point-to-plane residuals of the inliers, m^2
+    TEXTURED = 33  # visible, with a marked intensity gradient
+    PHOTOMETRIC_INLIERS = 34  # of those, with a small photometric residual
+    DEPTH_CONFLICTS = 35  # matched, but the live surface is clearly nearer or farther
+    EXPOSURE_W = 36  # exposed points: robust weight w
+    EXPOSURE_WM = 37  # w m, with m = I_p - 128
+    EXPOSURE_WMM = 38
+    EXPOSURE_WR = 39  # w r, with r the photometric residual
+    EXPOSURE_WMR = 40
+    ROUGH = 41  # of the textured: 1 - robust weight; half their number at the right scale
+    PHOTOMETRIC_HESSIAN = 42
+    PHOTOMETRIC_GRADIENT = 63
+    TILTED = 69  # geometric weights times 1 - cosine of the angle between the normals
+    EXPOSURE_WRR = 70
+
+
+NUM_SUMS = 71
+_PLACES = "".join(f"constexpr int SUM_{place.name} = {place.value};\n" for place in Sum)
+
 OFF = wp.constant(0)  # states of a hypothesis, in ``active``: takes no part
 RUNNING = wp.constant(1)
 RESTING = wp.constant(2)  # converged at its level, wakes at the next
@@ -86,7 +99,7 @@ class Weights:
     cos_angle: float
     inlier_sigmas: float
     texture: float  # grey levels per pixel
-    alike: float  # grey levels
+    photometric_inlier: float  # largest residual of an inlier, grey levels
     least_scale: float  # least c of photometric residuals, in sigmas
 
 
@@ -97,11 +110,13 @@ class Photometry:
     gain: float
     bias: float  # grey levels
     scale: float  # c of the photometric loss, in sigmas: half of all textured residuals exceed it
-    reference: float  # the same as it usually is, over its least value; the unit of the verdict
+    reference: float  # the same as it usually is, over its least value; the unit of the acceptance
     trust: float  # weight of the photometric term, [0, 1]
 
 
-@wp.func_native("""
+@wp.func_native(
+    _PLACES
+    + """
 #if defined(__CUDA_ARCH__)
 constexpr int LANES = 1;  // points at a time
 #else
@@ -116,17 +131,18 @@ const float* model_n = (const float*)model_normals.data;
 const float* lives = (const float*)live_vertices.data + 3 * size_t(live_image);
 const float* live_n = (const float*)live_normals.data + 3 * size_t(live_image);
 const float* gradients = (const float*)live_gradient.data + 3 * size_t(live_image);
-const float per_scale = 1.0f / wp::max(light.scale, weights.least_scale);
+const float per_scale = 1.0f / wp::max(photometry.scale, weights.least_scale);
 const float narrowing = weights.least_scale * per_scale;
-const float rgb = weights.rgb * light.trust * narrowing * narrowing;
-const float per_reference = weights.per_cauchy_rgb / light.reference;
-const float alike_limit = weights.alike * wp::min(light.reference, 2.0f);
+const float rgb = weights.rgb * photometry.trust * narrowing * narrowing;
+const float per_reference = weights.per_cauchy_rgb / photometry.reference;
+const float photometric_limit = weights.photometric_inlier * wp::min(photometry.reference, 2.0f);
 
 // Six rows of eight: a row of H, the component of g, and a zero that makes it eight.
 float system[48] = {}, photometric[48] = {};
 float cost = 0, squared = 0, sum_w = 0, sum_wm = 0, sum_wmm = 0, sum_wr = 0, sum_wmr = 0, rough = 0;
 float tilted = 0, sum_wrr = 0;
-int points = 0, visible = 0, matched = 0, inliers = 0, textured = 0, alike = 0, apart = 0;
+int points = 0, visible = 0, matched = 0, inliers = 0, textured = 0;
+int photometric_inliers = 0, depth_conflicts = 0;
 
 for (int first = start; first < end; first += LANES * stride) {
     const int left = (end - first + stride - 1) / stride;
@@ -229,7 +245,7 @@ for (int first = start; first < end; first += LANES * stride) {
         ay[m] = lz[m] * a - lx[m] * c;
         az[m] = lx[m] * b - ly[m] * a;
         matched += is_matched;
-        apart += is_matched & (gap * per_sigma > 8.0f);
+        depth_conflicts += is_matched & (gap * per_sigma > 8.0f);
         inliers += is_inlier;
 
         float sample[3];  // I, dI/du, dI/dv
@@ -238,7 +254,7 @@ for (int first = start; first < end; first += LANES * stride) {
             const float low = corners[2][i][m] + right[m] * (corners[3][i][m] - corners[2][i][m]);
             sample[i] = top + down[m] * (low - top);
         }
-        const float expected = light.gain * grey[m] + light.bias;
+        const float expected = photometry.gain * grey[m] + photometry.bias;
         const float positive = expected > 0.0f ? expected : 0.0f;
         r2[m] = sample[0] - (positive < 255.0f ? positive : 255.0f);
         const float slope_squared = sample[1] * sample[1] + sample[2] * sample[2];
@@ -252,7 +268,7 @@ for (int first = start; first < end; first += LANES * stride) {
         const bool is_textured = !is_other & (slope > weights.texture);
         coarse[m] = is_textured ? 1.0f - robust2 : 0.0f;
         textured += is_textured;
-        alike += is_textured & (fabsf(r2[m]) < alike_limit);
+        photometric_inliers += is_textured & (fabsf(r2[m]) < photometric_limit);
         const bool is_exposed = !is_other & (sample[0] > 2.0f) & (sample[0] < 250.0f);
         exposed[m] = is_exposed ? robust2 * per_variance : 0.0f;
         centred[m] = grey[m] - 128.0f;
@@ -305,20 +321,32 @@ float* out = partial.data + size_t(row) * partial.shape[3];
 int at = 0;
 for (int i = 0; i < 6; ++i) {  // upper triangle by rows of six, five, four, ...
     for (int j = i; j < 6; ++j, ++at) {
-        out[at] = system[8 * i + j];
-        out[42 + at] = photometric[8 * i + j];
+        out[SUM_GEOMETRIC_HESSIAN + at] = system[8 * i + j];
+        out[SUM_PHOTOMETRIC_HESSIAN + at] = photometric[8 * i + j];
     }
-    out[21 + i] = system[8 * i + 6];
-    out[63 + i] = photometric[8 * i + 6];
+    out[SUM_GEOMETRIC_GRADIENT + i] = system[8 * i + 6];
+    out[SUM_PHOTOMETRIC_GRADIENT + i] = photometric[8 * i + 6];
 }
-const float statistics[15] = {
-    cost, (float)points, (float)visible, (float)matched, (float)inliers, squared, (float)textured,
-    (float)alike, (float)apart, sum_w, sum_wm, sum_wmm, sum_wr, sum_wmr, rough};
-for (int i = 0; i < 15; ++i) out[27 + i] = statistics[i];
-out[69] = tilted;
-out[70] = sum_wrr;
-""")
-def sum_points(
+out[SUM_COST] = cost;
+out[SUM_POINTS] = (float)points;
+out[SUM_VISIBLE] = (float)visible;
+out[SUM_MATCHED] = (float)matched;
+out[SUM_INLIERS] = (float)inliers;
+out[SUM_SQUARED_M2] = squared;
+out[SUM_TEXTURED] = (float)textured;
+out[SUM_PHOTOMETRIC_INLIERS] = (float)photometric_inliers;
+out[SUM_DEPTH_CONFLICTS] = (float)depth_conflicts;
+out[SUM_EXPOSURE_W] = sum_w;
+out[SUM_EXPOSURE_WM] = sum_wm;
+out[SUM_EXPOSURE_WMM] = sum_wmm;
+out[SUM_EXPOSURE_WR] = sum_wr;
+out[SUM_EXPOSURE_WMR] = sum_wmr;
+out[SUM_ROUGH] = rough;
+out[SUM_TILTED] = tilted;
+out[SUM_EXPOSURE_WRR] = sum_wrr;
+"""
+)
+def accumulate_points(
     model_vertices: wp.array(dtype=wp.vec3),
     model_normals: wp.array(dtype=wp.vec3),
     model_intensity: wp.array(dtype=wp.float32),
@@ -335,7 +363,7 @@ def sum_points(
     R: wp.mat33,
     t: wp.vec3,
     weights: Weights,
-    light: Photometry,
+    photometry: Photometry,
     partial: wp.array4d(dtype=wp.float32),
     row: int,
 ):
@@ -346,7 +374,7 @@ def sum_points(
 
 
 @wp.kernel
-def accumulate(
+def accumulate_normal_equations(
     model_vertices: wp.array(dtype=wp.vec3),
     model_normals: wp.array(dtype=wp.vec3),
     model_intensity: wp.array(dtype=wp.float32),
@@ -381,7 +409,7 @@ def accumulate(
     start = piece * columns + (row_index % 2) * (stride // 2)
     model_row = (b * model_size[1] + row_index * stride) * width
     pieces = (width + columns - 1) // columns
-    sum_points(
+    accumulate_points(
         model_vertices,
         model_normals,
         model_intensity,

@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.slam.surfel.device import Launches, Mirror, fetch, put
+from ms_slam_env.slam.surfel.device import (
+    HostDeviceBuffer,
+    KernelLaunchCache,
+    fetch,
+    put,
+    threads_per_row,
+)
 from ms_slam_env.slam.surfel.normal_equations import Photometry
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
 
@@ -46,7 +52,9 @@ def geometry_only(lights: NDArray[Any]) -> NDArray[Any]:
     return blind
 
 
-def follow(before: np.void, frame: np.void, conflict: float, least_scale: float) -> np.void:
+def next_photometry(
+    before: np.void, frame: np.void, conflict: float, least_scale: float
+) -> np.void:
     """Photometry of an env after a frame was tracked with ``before`` and ended as ``frame``.
 
     ``conflict`` is chi squared between the poses that depth and grey values ask for. A recording
@@ -108,12 +116,11 @@ class ExposureCorrection:
     def __init__(self, batch: int, intrinsics: Intrinsics, device: str) -> None:
         """Allocate for ``batch`` envs with one camera model."""
         self._size = intrinsics.shape
-        # The CPU runs one thread after another: whole rows. A GPU wants many threads.
-        self._columns = 1 if wp.get_device(device).is_cuda else intrinsics.width
-        self._dim = (batch * intrinsics.height, -(-intrinsics.width // self._columns))
-        self._per_gain = Mirror(batch, wp.float32, device)
-        self._bias = Mirror(batch, wp.float32, device)
-        self._launches = Launches(device)
+        self._columns, threads = threads_per_row(intrinsics.width, device)
+        self._dim = (batch * intrinsics.height, threads)
+        self._per_gain = HostDeviceBuffer(batch, wp.float32, device)
+        self._bias = HostDeviceBuffer(batch, wp.float32, device)
+        self._launches = KernelLaunchCache(device)
 
     def __call__(self, live: LiveFrame, lights: NDArray[Any]) -> None:
         """Change ``live.color`` in place where ``lights`` (B,) differ from the map's exposure."""
@@ -122,27 +129,19 @@ class ExposureCorrection:
             return
         self._per_gain.write(1.0 / gain)
         self._bias.write(bias)
-        if not self._launches.replay("correct"):
-            self._launches.record(
-                "correct",
-                _correct,
-                self._dim,
-                [self._per_gain.array, self._bias.array, *self._size, self._columns],
-                [live.color.flatten()],
-            )
+        inputs = [self._per_gain.array, self._bias.array, *self._size, self._columns]
+        color = live.color
+        self._launches.launch("correct", _correct, lambda: (self._dim, [*inputs, color.flatten()]))
 
 
 Bool = NDArray[np.bool_]
-BLANK = 100
-"""Code of the verdict on such a frame."""
-REASON = "the image is black or blank"
 _EVERY = 4  # rows and columns that are looked at
 _CONSTANT = 0.5  # largest standard deviation of an image that no sensor took, grey levels
 _DARK, _BRIGHT = 16.0, 240.0  # means below and above which an image
 _FAINT = 4.0  # of at most this standard deviation is black or glare
 
 
-def is_blank(color: NDArray[np.uint8]) -> Bool:
+def is_invalid_frame(color: NDArray[np.uint8]) -> Bool:
     """Which images (B, H, W, 3) show nothing: one colour throughout, or black, or glare.
 
     A plain wall is neither: its image has the sensor's noise and a middling brightness.
@@ -156,7 +155,7 @@ def is_blank(color: NDArray[np.uint8]) -> Bool:
     return (spread < _CONSTANT) | (extreme & (spread < _FAINT))
 
 
-class BlankFrames:
+class InvalidFrameDetector:
     """Tells the blank frames of B envs, where frames are not always so.
 
     Recordings without colour have blank images from the first frame on.
@@ -168,6 +167,6 @@ class BlankFrames:
 
     def find(self, color: NDArray[np.uint8], started: Bool) -> Bool:
         """Which frames (B, H, W, 3) are blank; the first of an env says whether it has colour."""
-        blank = is_blank(color)
+        blank = is_invalid_frame(color)
         self.colorless = np.where(started, self.colorless, blank)
         return blank & ~self.colorless

@@ -1,6 +1,6 @@
 """What of a surfel SLAM depends on its configuration and the size of its frames, but not the map.
 
-A running SLAM may change to another front end: it goes on with the same surfels, poses and
+A running SLAM may change to another pipeline: it goes on with the same surfels, poses and
 keyframes.
 """
 
@@ -13,18 +13,18 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.photometry import ExposureCorrection
-from ms_slam_env.slam.surfel.pose_hypotheses import NUM_SEEDS
+from ms_slam_env.slam.surfel.pose_hypotheses import NUM_HYPOTHESES
 from ms_slam_env.slam.surfel.preprocessing import Preprocessor
-from ms_slam_env.slam.surfel.surfel_map import MapPasses, SurfelMap
+from ms_slam_env.slam.surfel.surfel_map import MapKernels, SurfelMap
 from ms_slam_env.slam.surfel.tracker import Tracker, model_stride
 
 FIXED = ("max_surfels", "relocalisation", "loop_closure", "loops")
 """Fields of ``SurfelConfig`` that a running SLAM keeps: they shape what it has stored."""
-_KEPT = 8  # front ends: each has the buffers of its images
+_KEPT = 8  # pipelines: each has the buffers of its images
 
 
 @dataclass(frozen=True)
-class FrontEnd:
+class Pipeline:
     """Buffers and launches for frames of one size under one configuration.
 
     Attributes:
@@ -33,7 +33,7 @@ class FrontEnd:
         preprocess: of the frames.
         tracker: of the frames against the map's views.
         correct_exposure: of the frames before they are fused.
-        passes: over the map.
+        map_kernels: over the map.
     """
 
     intrinsics: Intrinsics
@@ -41,19 +41,19 @@ class FrontEnd:
     preprocess: Preprocessor
     tracker: Tracker
     correct_exposure: ExposureCorrection
-    passes: MapPasses
+    map_kernels: MapKernels
 
 
-class FrontEnds:
-    """Front ends of one map, made when they are first asked for and kept for the next time."""
+class PipelineCache:
+    """Pipelines of one map, made when they are first asked for and kept for the next time."""
 
     def __init__(self, surfel_map: SurfelMap) -> None:
         """For the SLAM with this map."""
         self._map = surfel_map
-        self._made: OrderedDict[tuple[Intrinsics, SurfelConfig], FrontEnd] = OrderedDict()
+        self._made: OrderedDict[tuple[Intrinsics, SurfelConfig], Pipeline] = OrderedDict()
 
-    def get(self, intrinsics: Intrinsics, config: SurfelConfig) -> FrontEnd:
-        """The front end for frames of ``intrinsics`` under ``config``."""
+    def get(self, intrinsics: Intrinsics, config: SurfelConfig) -> Pipeline:
+        """The pipeline for frames of ``intrinsics`` under ``config``."""
         key = (intrinsics, config)
         if key not in self._made:
             self._made[key] = self._make(intrinsics, config)
@@ -62,19 +62,19 @@ class FrontEnds:
             self._made.popitem(last=False)
         return self._made[key]
 
-    def _make(self, intrinsics: Intrinsics, config: SurfelConfig) -> FrontEnd:
+    def _make(self, intrinsics: Intrinsics, config: SurfelConfig) -> Pipeline:
         batch, device = self._map.batch, self._map.device
         stride = model_stride(intrinsics, config)
-        is_first = not self._made  # the map was made with these passes
-        return FrontEnd(
+        is_first = not self._made  # the map was made with these kernels
+        return Pipeline(
             intrinsics=intrinsics,
             config=config,
             preprocess=Preprocessor(batch, intrinsics, config, device),
-            tracker=Tracker(batch, NUM_SEEDS, intrinsics, config, device, stride),
+            tracker=Tracker(batch, NUM_HYPOTHESES, intrinsics, config, device, stride),
             correct_exposure=ExposureCorrection(batch, intrinsics, device),
-            passes=self._map.passes
+            map_kernels=self._map.kernels
             if is_first
-            else self._map.make_passes(intrinsics, config, stride),
+            else self._map.make_kernels(intrinsics, config, stride),
         )
 
 

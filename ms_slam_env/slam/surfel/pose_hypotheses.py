@@ -14,9 +14,10 @@ from ms_slam_env._warp import wp
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose, make_pose, se3_exp, se3_log, so3_exp
 from ms_slam_env.slam.base import Float64
-from ms_slam_env.slam.surfel.normal_equations import OFF, RUNNING, Photometry
+from ms_slam_env.slam.surfel.normal_equations import OFF, RUNNING, Photometry, Sum
 
-NUM_SEEDS = 8
+NUM_HYPOTHESES = 8
+NUM_FIRST = 2  # tried first, with the guess if any: at rest and at constant velocity
 PAN_RAD = np.radians(8.0)
 ROLL_RAD = np.radians(8.0)
 
@@ -36,28 +37,28 @@ _TURNS = np.stack(
 )
 
 
-def tracking_seeds(last_motion: Float64) -> Float64:
-    """Starts T_model_live (NUM_SEEDS, 4, 4): at rest, at constant velocity, turned six ways.
+def tracking_hypotheses(last_motion: Float64) -> Float64:
+    """Starts T_model_live (NUM_HYPOTHESES, 4, 4): at rest, at constant velocity, turned six ways.
 
     A turn stands for a sideways step too: both shift the image.
     """
     return np.concatenate([np.eye(4)[None], last_motion[None], _TURNS])
 
 
-def relocalisation_seeds(attempt: int) -> Float64:
-    """Starts (NUM_SEEDS, 4, 4) of one attempt; successive attempts search wider and wider.
+def relocalization_hypotheses(attempt: int) -> Float64:
+    """Starts (NUM_HYPOTHESES, 4, 4) of one attempt; successive attempts search wider and wider.
 
     Each holds the pose of the model view and turns with steps drawn from a fixed sequence, the
     same in every run.
     """
     rng = np.random.default_rng(attempt)
     reach = min(1.0, 0.4 + 0.05 * attempt)
-    seeds = [np.eye(4)]
-    for _ in range(NUM_SEEDS - 1):
+    hypotheses = [np.eye(4)]
+    for _ in range(NUM_HYPOTHESES - 1):
         turn = rng.uniform(-1, 1, 3) * np.radians([25.0, 35.0, 15.0]) * reach
         step = rng.uniform(-1, 1, 3) * 0.25 * reach
-        seeds.append(make_pose(so3_exp(turn), step))
-    return np.stack(seeds)
+        hypotheses.append(make_pose(so3_exp(turn), step))
+    return np.stack(hypotheses)
 
 
 def _turn(pan_deg: float, tilt_deg: float, roll_deg: float = 0.0) -> Float64:
@@ -71,9 +72,11 @@ _TURNS_DEG = (  # pan, tilt, roll
     [(12, 12, 0), (12, -12, 0), (-12, 12, 0), (-12, -12, 0), (25, 0, 0), (-25, 0, 0)],
     [22 * np.array(axis) for axis in _AXES],
 )
-SEEDS = np.stack([[_HERE, _HERE, *(_turn(*turn) for turn in turns)] for turns in _TURNS_DEG])
+KEYFRAME_HYPOTHESES = np.stack(
+    [[_HERE, _HERE, *(_turn(*turn) for turn in turns)] for turns in _TURNS_DEG]
+)
 """Starts (3, 8, 4, 4) relative to a keyframe, in turns; a turn stands for a sideways step too."""
-_AT_REST = np.tile(_HERE, (NUM_SEEDS, 1, 1))
+AT_REST = np.tile(_HERE, (NUM_HYPOTHESES, 1, 1))
 DECAY = 0.9  # from frame to frame, of a motion that is predicted only
 
 
@@ -116,7 +119,9 @@ def check_guesses(guesses: Sequence[ArrayLike | None] | None, batch: int) -> Flo
     )
 
 
-GUESS = wp.constant(2)  # index of the guess among the first seeds, after rest and constant velocity
+INITIAL_GUESS = wp.constant(
+    2
+)  # index of the guess among the first hypotheses, after rest and constant velocity
 CLEARLY_BETTER = wp.constant(wp.float64(0.97))  # ratios of scores
 CLEARLY_WORSE = wp.constant(wp.float64(1.03))
 
@@ -124,70 +129,70 @@ CLEARLY_WORSE = wp.constant(wp.float64(1.03))
 @wp.func
 def _score(sums: wp.array3d(dtype=wp.float64), b: int, k: int):
     """Mean truncated cost per model point; a point out of view costs a fixed share."""
-    points = sums[b, k, 28]
-    visible = sums[b, k, 29]
+    points = sums[b, k, Sum.POINTS]
+    visible = sums[b, k, Sum.VISIBLE]
     if points < wp.float64(1.0):
         return wp.float64(1.0e9)
-    return (sums[b, k, 27] + wp.float64(0.8) * (points - visible)) / points
+    return (sums[b, k, Sum.COST] + wp.float64(0.8) * (points - visible)) / points
 
 
 @wp.kernel
-def widen_search(
+def expand_hypotheses(
     first_active: wp.array2d(dtype=wp.int32),
     good_score: wp.float64,
     first_sums: wp.array3d(dtype=wp.float64),
     more_sums: wp.array3d(dtype=wp.float64),
     more_active: wp.array2d(dtype=wp.int32),
 ):
-    """Switch on the further seeds (B, K2) unless one of the first (B, K1) fits well already."""
+    """Switch on the further hypotheses (B, K2) unless one of the first (B, K1) fits well."""
     b = wp.tid()
     best = wp.float64(1.0e9)
     for k in range(first_sums.shape[1]):
         if first_active[b, k] == OFF:
-            first_sums[b, k, 28] = wp.float64(0.0)  # no points: the worst score
+            first_sums[b, k, Sum.POINTS] = wp.float64(0.0)  # no points: the worst score
         best = wp.min(best, _score(first_sums, b, k))
     for k in range(more_active.shape[1]):
         if best > good_score:
             more_active[b, k] = RUNNING
         else:
             more_active[b, k] = OFF
-            more_sums[b, k, 28] = wp.float64(0.0)  # no points: the worst score
+            more_sums[b, k, Sum.POINTS] = wp.float64(0.0)  # no points: the worst score
 
 
 @wp.kernel
-def choose(
+def select_hypothesis(
     first_sums: wp.array3d(dtype=wp.float64),
     first_pose: wp.array2d(dtype=wp.mat44d),
-    first_light: wp.array2d(dtype=Photometry),
+    first_photometry: wp.array2d(dtype=Photometry),
     more_sums: wp.array3d(dtype=wp.float64),
     more_pose: wp.array2d(dtype=wp.mat44d),
-    more_light: wp.array2d(dtype=Photometry),
+    more_photometry: wp.array2d(dtype=Photometry),
     pose: wp.array2d(dtype=wp.mat44d),  # (B, 1)
     photometry: wp.array2d(dtype=Photometry),  # (B, 1)
     active: wp.array2d(dtype=wp.int32),  # (B, 1)
 ):
     """Go on with the seed whose points fit best; it becomes the one hypothesis.
 
-    The first seeds are at rest, at constant velocity, and the guess.
+    The first hypotheses are at rest, at constant velocity, and the guess.
     """
     b = wp.tid()
     # Where the view leaves directions open all starts fit alike: prefer what is predicted.
     best = first_pose[b, 1]
-    light = first_light[b, 1]
+    best_photometry = first_photometry[b, 1]
     best_score = _score(first_sums, b, 1)
     for n in range(1, first_pose.shape[1]):
         k = wp.where(n == 1, 0, n)
         score = _score(first_sums, b, k)
-        if score < best_score * wp.where(k == GUESS, CLEARLY_WORSE, CLEARLY_BETTER):
+        if score < best_score * wp.where(k == INITIAL_GUESS, CLEARLY_WORSE, CLEARLY_BETTER):
             best_score = score
             best = first_pose[b, k]
-            light = first_light[b, k]
+            best_photometry = first_photometry[b, k]
     for k in range(more_pose.shape[1]):
         score = _score(more_sums, b, k)
         if score < best_score * CLEARLY_BETTER:
             best_score = score
             best = more_pose[b, k]
-            light = more_light[b, k]
+            best_photometry = more_photometry[b, k]
     pose[b, 0] = best
-    photometry[b, 0] = light
+    photometry[b, 0] = best_photometry
     active[b, 0] = RUNNING

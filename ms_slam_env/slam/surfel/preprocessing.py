@@ -17,7 +17,13 @@ from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.surfel.config import SurfelConfig
-from ms_slam_env.slam.surfel.device import Launches, Mirror, fetch, put
+from ms_slam_env.slam.surfel.device import (
+    HostDeviceBuffer,
+    fetch,
+    put,
+    record_launch,
+    threads_per_row,
+)
 
 
 @dataclass(frozen=True)
@@ -235,8 +241,8 @@ class Preprocessor:
         self.config = config
         self.device = device
         shape = (batch, *intrinsics.shape)
-        self._raw_color = Mirror((*shape, 3), wp.uint8, device)
-        self._raw_depth = Mirror(shape, wp.float32, device)
+        self._raw_color = HostDeviceBuffer((*shape, 3), wp.uint8, device)
+        self._raw_depth = HostDeviceBuffer(shape, wp.float32, device)
         self._inverse_depth = wp.zeros(shape, dtype=wp.float32, device=device)
         self.frame = LiveFrame(
             raw_depth=self._raw_depth.array,
@@ -254,70 +260,48 @@ class Preprocessor:
         self._spatial_weights = wp.array(weights, dtype=wp.float32, device=device)
         # A finer image has noisier slopes over one pixel; keep the baseline of 160 columns.
         self._normal_step = max(1, intrinsics.width // 160)
-        # The CPU runs one thread after another: whole rows. A GPU wants many threads.
-        self._columns = 1 if wp.get_device(device).is_cuda else intrinsics.width
-        self._launches = Launches(device)
-        self._dim = (batch * intrinsics.height, -(-intrinsics.width // self._columns))
+        self._columns, threads = threads_per_row(intrinsics.width, device)
+        self._dim = (batch * intrinsics.height, threads)
+        self._stages = self._record()
 
     def __call__(self, color: NDArray[np.uint8], depth: NDArray[np.float32]) -> LiveFrame:
         """Preprocess colour (B, H, W, 3) uint8 and depth (B, H, W) float32 m into one LiveFrame.
 
         The frame's buffers are those of the last call.
         """
-        frame = self.frame
+        check_images(color, depth, self._raw_depth.array.shape)
         self._raw_color.write(color)
         self._raw_depth.write(depth)
-        if not self._launches.replay("convert"):
-            self._record()
-            return frame
-        for stage in ("filter columns", "filter rows", "surface"):
-            self._launches.replay(stage)
-        return frame
+        for launch in self._stages:
+            launch.launch()
+        return self.frame
 
-    def _record(self) -> None:
-        """Run the stages for the first time and keep their launches: all buffers stay."""
+    def _record(self) -> list[wp.Launch]:
+        """The stages; all buffers stay."""
         frame, config, camera, dim = self.frame, self.config, self.intrinsics, self._dim
         size = [camera.height, camera.width, self._columns]
         inverse, filtered = self._inverse_depth.flatten(), self._filtered.flatten()
-        self._launches.record(
-            "convert",
-            _convert,
-            dim,
-            [
-                frame.raw_depth.flatten(),
-                self._raw_color.array.flatten(),
-                config.depth_cutoff_m,
-                *size[1:],
-            ],
-            [inverse, frame.color.flatten(), frame.intensity.flatten()],
-        )
+        sensed = [frame.raw_depth.flatten(), self._raw_color.array.flatten()]
+        color = [frame.color.flatten(), frame.intensity.flatten()]
         per_cutoff_squared = 1.0 / (2.0 * config.bilateral_sigma_m) ** 2
+        rule = [self._spatial_weights, per_cutoff_squared]
         working = [self._weights.flatten(), self._shifts.flatten()]
-        passes = {"filter columns": (inverse, 0, filtered), "filter rows": (filtered, 1, inverse)}
-        for name, (source, along_rows, target) in passes.items():
-            self._launches.record(
-                name,
-                _filter,
-                dim,
-                [source, *size, along_rows, self._spatial_weights, per_cutoff_squared, *working],
-                [target],
-            )
         edge = config.normal_edge_per_m * self._normal_step * 160 / camera.width
-        focal, centre = wp.vec2(camera.fx, camera.fy), wp.vec2(camera.cx, camera.cy)
-        self._launches.record(
-            "surface",
-            _surface,
-            dim,
-            [inverse, *size, self._normal_step, edge, focal, centre],
-            [frame.depth.flatten(), frame.vertices.flatten(), frame.normals.flatten()],
-        )
+        pinhole = [wp.vec2(camera.fx, camera.fy), wp.vec2(camera.cx, camera.cy)]
+        surface = [frame.depth.flatten(), frame.vertices.flatten(), frame.normals.flatten()]
+        stages = [
+            (_convert, [*sensed, config.depth_cutoff_m, *size[1:], inverse, *color]),
+            (_filter, [inverse, *size, 0, *rule, *working, filtered]),
+            (_filter, [filtered, *size, 1, *rule, *working, inverse]),
+            (_surface, [inverse, *size, self._normal_step, edge, *pinhole, *surface]),
+        ]
+        return [record_launch(kernel, dim, inputs, self.device) for kernel, inputs in stages]
 
 
 def check_images(
-    color: NDArray[np.uint8], depth: NDArray[np.float32], batch: int, intrinsics: Intrinsics
+    color: NDArray[np.uint8], depth: NDArray[np.float32], size: tuple[int, ...]
 ) -> None:
-    """Refuse another batch or image size than (B, H, W), and depth that is no depth."""
-    size = (batch, *intrinsics.shape)
+    """Refuse another ``size`` than (B, H, W), and depth that is no depth."""
     if color.shape != (*size, 3) or depth.shape != size:
         raise InputError(
             f"colour {color.shape} and depth {depth.shape} must be {(*size, 3)} and {size}"

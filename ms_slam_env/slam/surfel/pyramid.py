@@ -7,11 +7,12 @@ its 2x2 block that are valid and lie near the front-most of them.
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
 
 from ms_slam_env._warp import wp
-from ms_slam_env.slam.surfel.device import Launches, fetch, put
+from ms_slam_env.slam.surfel.device import fetch, put, record_launch, threads_per_row
 
 EDGE_FRACTION = 0.03  # pixels of a block further behind the front one than this are another surface
 
@@ -137,65 +138,48 @@ class Pyramid:
         device: str = "cpu",
     ) -> None:
         """Allocate ``num_levels`` levels of images (B, H, W) with (H, W) = ``shape``."""
-        self._launches = Launches(device)
-        # The CPU runs one thread after another: whole rows. A GPU wants many threads.
-        self._columns = 1 if wp.get_device(device).is_cuda else shape[1]
+        self._device = device
+        self._columns, _ = threads_per_row(shape[1], device)
+        self._launches: list[wp.Launch] = []
         self._levels: list[Level] = []
-        self._coarse: list[Level] = []
+
+        def image(dtype: Any) -> wp.array:
+            return wp.zeros(size, dtype=dtype, device=device)
+
         size = (batch, *shape)
-        self._gradient = wp.zeros(size, dtype=wp.vec3, device=device) if with_gradient else None
+        self._gradient = image(wp.vec3) if with_gradient else None
+        self._coarse: list[Level] = []
         for _ in range(1, num_levels):
             size = (batch, size[1] // 2, size[2] // 2)
-            self._coarse.append(
-                Level(
-                    vertices=wp.zeros(size, dtype=wp.vec3, device=device),
-                    normals=wp.zeros(size, dtype=wp.vec3, device=device),
-                    intensity=wp.zeros(size, dtype=wp.float32, device=device),
-                    gradient=wp.zeros(size, dtype=wp.vec3, device=device)
-                    if with_gradient
-                    else None,
-                )
-            )
+            gradient = image(wp.vec3) if with_gradient else None
+            self._coarse.append(Level(image(wp.vec3), image(wp.vec3), image(wp.float32), gradient))
 
     def build(self, vertices: wp.array, normals: wp.array, intensity: wp.array) -> list[Level]:
         """All levels, finest first, of images (B, H, W); the coarse ones overwrite the last."""
         if not self._levels or self._levels[0].vertices is not vertices:
-            self._launches.clear()
             self._levels = [Level(vertices, normals, intensity, self._gradient), *self._coarse]
-        for index, (fine, coarse) in enumerate(itertools.pairwise(self._levels)):
-            key = ("downsample", index)
-            if not self._launches.replay(key):
-                self._launches.record(
-                    key,
-                    _downsample,
-                    self._dim(coarse),
-                    [
-                        *(a.flatten() for a in (fine.vertices, fine.normals, fine.intensity)),
-                        *fine.vertices.shape[1:],
-                        EDGE_FRACTION,
-                        self._columns,
-                    ],
-                    [
-                        coarse.vertices.flatten(),
-                        coarse.normals.flatten(),
-                        coarse.intensity.flatten(),
-                    ],
-                )
-        for index, level in enumerate(self._levels):
-            if level.gradient is None:
-                continue
-            key = ("gradient", index)
-            if not self._launches.replay(key):
-                self._launches.record(
-                    key,
-                    _intensity_gradient,
-                    self._dim(level),
-                    [level.intensity.flatten(), *level.intensity.shape[1:], self._columns],
-                    [level.gradient.flatten()],
-                )
+            self._launches = [self._downsampling(*pair) for pair in pairwise(self._levels)]
+            self._launches += [
+                self._differentiation(level.intensity, level.gradient)
+                for level in self._levels
+                if level.gradient is not None
+            ]
+        for launch in self._launches:
+            launch.launch()
         return self._levels
 
-    def _dim(self, level: Level) -> tuple[int, int]:
-        """Threads of a kernel that writes ``level``: a piece of a row each."""
-        batch, height, width = level.vertices.shape
+    def _downsampling(self, fine: Level, coarse: Level) -> wp.Launch:
+        source = [fine.vertices.flatten(), fine.normals.flatten(), fine.intensity.flatten()]
+        target = [coarse.vertices.flatten(), coarse.normals.flatten(), coarse.intensity.flatten()]
+        size = fine.vertices.shape[1:]
+        inputs = [*source, *size, EDGE_FRACTION, self._columns, *target]
+        return record_launch(_downsample, self._dim(coarse.intensity), inputs, self._device)
+
+    def _differentiation(self, intensity: wp.array, gradient: wp.array) -> wp.Launch:
+        inputs = [intensity.flatten(), *intensity.shape[1:], self._columns, gradient.flatten()]
+        return record_launch(_intensity_gradient, self._dim(intensity), inputs, self._device)
+
+    def _dim(self, image: wp.array) -> tuple[int, int]:
+        """Threads of a kernel that writes ``image`` (B, h, w): a piece of a row each."""
+        batch, height, width = image.shape
         return batch * height, -(-width // self._columns)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -13,14 +12,14 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import relative_angle
 from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.ferns import Candidate, FernConfig, FernDatabase
-from ms_slam_env.slam.surfel.acceptance import OK, STAT_COST, Alignment, make_limits
+from ms_slam_env.slam.surfel.acceptance import Alignment, Stat, acceptance_thresholds
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.photometric_consistency import LikenessLimits, measure_likeness
 from ms_slam_env.slam.surfel.pose_hypotheses import (
-    _AT_REST,
-    NUM_SEEDS,
-    SEEDS,
-    tracking_seeds,
+    AT_REST,
+    KEYFRAME_HYPOTHESES,
+    NUM_HYPOTHESES,
+    tracking_hypotheses,
 )
 from ms_slam_env.slam.surfel.rendering import ModelView
 
@@ -41,100 +40,64 @@ class Images:
     depth: NDArray[np.float32]
 
 
-class Searcher(Protocol):
-    """What relocalisation may ask of the SLAM about the current frames."""
+class FrameAligner(Protocol):
+    """What relocalization may ask of the SLAM about the current frames."""
 
-    def align_from(self, origins: Float64, seeds: Float64, limits: NDArray[np.void]) -> Alignment:
+    def align_from(
+        self, origins: Float64, hypotheses: Float64, thresholds: NDArray[Any]
+    ) -> Alignment:
         """Align with the maps as seen from ``origins`` (B, 4, 4).
 
-        ``seeds`` (B, K, 4, 4) are relative to those; ``limits`` (B,) are ``acceptance.Limits``.
+        ``hypotheses`` (B, K, 4, 4) are relative to those; ``thresholds`` (B,) are
+        ``AcceptanceThresholds``.
         """
 
     def render(self, poses: Float64) -> ModelView:
         """The maps as seen from ``poses`` (B, 4, 4)."""
 
 
-class Relocalisation(ABC):
-    """Where a lost frame is searched besides around the last good pose, for B envs."""
+class Relocalization:
+    """Where a lost frame of B envs is searched besides around the last good pose.
 
-    @abstractmethod
-    def remember(self, frames: Images, poses: Float64, time: Int32, tracked: Bool) -> None:
+    This is the variant that searches nowhere else: "local".
+    """
+
+    def add_keyframes(self, frames: Images, poses: Float64, time: Int32, tracked: Bool) -> None:
         """Take note of the frames that were ``tracked`` (B,) at ``poses`` (B, 4, 4)."""
 
-    @abstractmethod
-    def believes(self, frames: Images, poses: Float64, found: Bool, searcher: Searcher) -> Bool:
+    def verify(self, frames: Images, poses: Float64, found: Bool, aligner: FrameAligner) -> Bool:
         """Which of the frames that were ``found`` (B,) again are really at ``poses`` (B, 4, 4)."""
+        return found
 
-    @abstractmethod
-    def search(
-        self, frames: Images, lost: Bool, searcher: Searcher
+    def relocalize(
+        self, frames: Images, lost: Bool, aligner: FrameAligner
     ) -> tuple[Bool, Alignment] | None:
         """Search the maps for the frames of the envs that are ``lost`` (B,).
 
         Returns:
             Which of them were found (B,), and where; None if none was.
         """
-
-    @abstractmethod
-    def similar(self, env: int, frames: Images, before: int) -> list[Candidate]:
-        """The best few keyframes from before a time that resemble an env's frame, best first."""
-
-    @abstractmethod
-    def move(self, env: int, time: Int32, poses: Float64) -> None:
-        """Follow a map that was bent: frames ``time`` (N,) were taken at ``poses`` (N, 4, 4)."""
-
-    @abstractmethod
-    def adapt(self, intrinsics: Intrinsics, depth_cutoff_m: float) -> None:
-        """Expect frames of another size, and a map of readings up to another distance."""
-
-    @abstractmethod
-    def clear(self, env: int) -> None:
-        """Forget everything about one env."""
-
-    @abstractmethod
-    def get_state(self) -> dict[str, Any]:
-        """Everything needed to go on bit-exactly, as NumPy arrays."""
-
-    @abstractmethod
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state of the same variant, batch and camera."""
-
-
-class LocalSearch(Relocalisation):
-    """Nothing besides what the SLAM does anyway."""
-
-    def remember(self, frames: Images, poses: Float64, time: Int32, tracked: Bool) -> None:
-        """Nothing to remember."""
-
-    def believes(self, frames: Images, poses: Float64, found: Bool, searcher: Searcher) -> Bool:
-        """All of them: the tracker's verdict is final."""
-        return found
-
-    def search(
-        self, frames: Images, lost: Bool, searcher: Searcher
-    ) -> tuple[Bool, Alignment] | None:
-        """Nowhere else to search."""
         return None
 
     def similar(self, env: int, frames: Images, before: int) -> list[Candidate]:
-        """No keyframes."""
+        """The best few keyframes from before a time that resemble an env's frame, best first."""
         return []
 
-    def move(self, env: int, time: Int32, poses: Float64) -> None:
-        """Nothing to move."""
+    def move_keyframes(self, env: int, time: Int32, poses: Float64) -> None:
+        """Follow a map that was deformed: frames ``time`` (N,) were at ``poses`` (N, 4, 4)."""
 
     def adapt(self, intrinsics: Intrinsics, depth_cutoff_m: float) -> None:
-        """It asks for neither."""
+        """Expect frames of another size, and a map of readings up to another distance."""
 
     def clear(self, env: int) -> None:
-        """Nothing to forget."""
+        """Forget everything about one env."""
 
     def get_state(self) -> dict[str, Any]:
-        """Nothing to keep."""
+        """Everything needed to go on bit-exactly, as NumPy arrays."""
         return {}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Nothing to restore."""
+        """Go on from a state of the same variant, batch and camera."""
 
 
 TRIALS = 3  # keyframes tried a frame
@@ -145,26 +108,26 @@ GOOD_COST = 1.6  # with one that costs less the other keyframes are left untried
 _LOOKED_AT = 40  # keyframes among which those tried are chosen
 _STEP_M, _STEP_RAD = 0.03, np.radians(3.0)  # frames between such steps are no new keyframes
 _APART_M, _APART_RAD = 0.10, np.radians(10.0)  # two of them differ by at least so much
-_STRICT = make_limits(np.ones(1, dtype=bool), np.zeros(1, dtype=np.int32))
+_STRICT = acceptance_thresholds(np.ones(1, dtype=bool), np.zeros(1, dtype=np.int32))
 
 
-def _lax_limits() -> NDArray[Any]:
-    """Limits of an alignment that is repeated and checked before it is believed.
+def _lax_thresholds() -> NDArray[Any]:
+    """Thresholds of an alignment that is repeated and checked before it is believed.
 
     A keyframe's view hides what the camera sees from elsewhere, so that even a perfect alignment
     with it leaves much unexplained.
     """
-    limits = make_limits(np.ones(1, dtype=bool), np.full(1, 7, dtype=np.int32))
-    for name, value in {"overlap": 0.3, "inliers": 0.35, "alike": 0.35, "apart": 0.6}.items():
-        limits[name] = value
-    limits["cost"] = HOPELESS_COST
-    return limits
+    thresholds = acceptance_thresholds(np.ones(1, dtype=bool), np.full(1, 7, dtype=np.int32))
+    lax = {"overlap": 0.3, "inliers": 0.35, "photometric_inliers": 0.35, "depth_conflicts": 0.6}
+    for name, value in {**lax, "cost": HOPELESS_COST}.items():
+        thresholds[name] = value
+    return thresholds
 
 
-_LAX = _lax_limits()
+_LAX = _lax_thresholds()
 
 
-class FernRelocalisation(Relocalisation):
+class FernRelocalization(Relocalization):
     """Searches from the keyframes that resemble the lost frame (Glocker et al., TVCG 2015).
 
     The best of a few alignments is refined, and believed if the map's view from there is like the
@@ -182,7 +145,7 @@ class FernRelocalisation(Relocalisation):
         self._attempts = np.zeros(batch, dtype=np.int32)  # since tracking was lost
         self._looked_from: Float64 = np.full((batch, 4, 4), np.nan)  # the last frame encoded
 
-    def remember(self, frames: Images, poses: Float64, time: Int32, tracked: Bool) -> None:
+    def add_keyframes(self, frames: Images, poses: Float64, time: Int32, tracked: Bool) -> None:
         """Keep the tracked frames that resemble no keyframe; look at one every few centimetres."""
         self._tentative[tracked] = np.nan
         self._attempts[tracked] = 0
@@ -192,11 +155,11 @@ class FernRelocalisation(Relocalisation):
             color, depth = frames.color[env], frames.depth[env]
             self.databases[env].observe(color, depth, poses[env], int(time[env]))
 
-    def believes(self, frames: Images, poses: Float64, found: Bool, searcher: Searcher) -> Bool:
+    def verify(self, frames: Images, poses: Float64, found: Bool, aligner: FrameAligner) -> Bool:
         """Those that are like the map's view from there."""
         if not found.any():
             return found
-        view = searcher.render(np.where(found[:, None, None], poses, np.eye(4)))
+        view = aligner.render(np.where(found[:, None, None], poses, np.eye(4)))
         intensity, depth = view.intensity.numpy(), view.vertices.numpy()[..., 2]
         believed = found.copy()
         for env in np.flatnonzero(found):
@@ -206,8 +169,8 @@ class FernRelocalisation(Relocalisation):
             believed[env] = self.limits.accept(likeness)
         return believed
 
-    def search(
-        self, frames: Images, lost: Bool, searcher: Searcher
+    def relocalize(
+        self, frames: Images, lost: Bool, aligner: FrameAligner
     ) -> tuple[Bool, Alignment] | None:
         """Confirm the poses that the last frames were found at, or find poses to confirm."""
         if not lost.any():
@@ -215,41 +178,41 @@ class FernRelocalisation(Relocalisation):
         found, alignment = np.zeros(len(lost), dtype=bool), None
         expected = lost & _has_pose(self._tentative)
         if expected.any():
-            seeds = tracking_seeds(np.eye(4))
-            alignment = _align(searcher, self._tentative, seeds, _STRICT)
-            found = expected & (alignment.verdict == OK)
-            found = self.believes(frames, alignment.T_world_live, found, searcher)
+            hypotheses = tracking_hypotheses(np.eye(4))
+            alignment = _align(aligner, self._tentative, hypotheses, _STRICT)
+            found = expected & alignment.tracked
+            found = self.verify(frames, alignment.T_world_live, found, aligner)
         self._tentative[lost] = np.nan
         missing = lost & ~found
         if missing.any():
-            self._refine(frames, self._find(frames, missing, searcher), searcher)
+            self._refine(frames, self._find(frames, missing, aligner), aligner)
             self._attempts[missing] += 1
         return (found, alignment) if alignment is not None and found.any() else None
 
-    def _find(self, frames: Images, lost: Bool, searcher: Searcher) -> Float64:
+    def _find(self, frames: Images, lost: Bool, aligner: FrameAligner) -> Float64:
         """Poses (B, 4, 4) that the best alignments with keyframes' views lead to; NaN: none."""
-        seeds = SEEDS[self._attempts % len(SEEDS)]
+        hypotheses = KEYFRAME_HYPOTHESES[self._attempts % len(KEYFRAME_HYPOTHESES)]
         best = np.full((len(lost), 4, 4), np.nan)
         cost = np.full(len(lost), np.inf)
         for starts in self._keyframes_to_try(frames, lost):
             wanted = _has_pose(starts) & (cost > GOOD_COST)
             if not wanted.any():
                 break
-            found = _align(searcher, starts, seeds, _LAX)
-            better = wanted & (found.verdict == OK) & (found.stats[:, STAT_COST] < cost)
+            found = _align(aligner, starts, hypotheses, _LAX)
+            better = wanted & found.tracked & (found.stats[:, Stat.COST] < cost)
             best[better] = found.T_world_live[better]
-            cost[better] = found.stats[better, STAT_COST]
+            cost[better] = found.stats[better, Stat.COST]
         return best
 
-    def _refine(self, frames: Images, poses: Float64, searcher: Searcher) -> None:
+    def _refine(self, frames: Images, poses: Float64, aligner: FrameAligner) -> None:
         """Align again with the views from ``poses`` (B, 4, 4); keep what is like them."""
         for _ in range(REFINEMENTS):
             wanted = _has_pose(poses)
             if not wanted.any():
                 return
-            again = _align(searcher, poses, _AT_REST, _LAX)
-            wanted &= again.verdict == OK
-            believed = self.believes(frames, again.T_world_live, wanted, searcher)
+            again = _align(aligner, poses, AT_REST, _LAX)
+            wanted &= again.tracked
+            believed = self.verify(frames, again.T_world_live, wanted, aligner)
             self._tentative[believed] = again.T_world_live[believed]
             going_on = wanted & ~believed
             poses = np.where(going_on[:, None, None], again.T_world_live, np.nan)
@@ -271,7 +234,7 @@ class FernRelocalisation(Relocalisation):
         color, depth = frames.color[env], frames.depth[env]
         return _spread(self.databases[env].candidates(color, depth, _LOOKED_AT, before), TRIALS)
 
-    def move(self, env: int, time: Int32, poses: Float64) -> None:
+    def move_keyframes(self, env: int, time: Int32, poses: Float64) -> None:
         """Put the keyframes where their frames are now."""
         database = self.databases[env]
         moved = database.poses
@@ -325,12 +288,14 @@ def _has_moved(before: Float64, now: Float64) -> Bool:
     return ~near  # comparisons with NaN are false
 
 
-def _align(searcher: Searcher, starts: Float64, seeds: Float64, limits: NDArray[Any]) -> Alignment:
+def _align(
+    aligner: FrameAligner, starts: Float64, hypotheses: Float64, limits: NDArray[Any]
+) -> Alignment:
     """Align from ``starts`` (B, 4, 4); what comes out where those are NaN means nothing."""
     batch = len(starts)
     origins = np.where(np.isfinite(starts), starts, np.eye(4))
-    seeds = np.broadcast_to(seeds, (batch, NUM_SEEDS, 4, 4))
-    return searcher.align_from(origins, seeds, np.repeat(limits, batch))
+    hypotheses = np.broadcast_to(hypotheses, (batch, NUM_HYPOTHESES, 4, 4))
+    return aligner.align_from(origins, hypotheses, np.repeat(limits, batch))
 
 
 def _spread(candidates: list[Candidate], count: int) -> list[Candidate]:
@@ -349,8 +314,8 @@ def _is_close(a: Float64, b: Float64) -> bool:
     return bool(near and relative_angle(a[:3, :3], b[:3, :3]) <= _APART_RAD)
 
 
-def make_relocalisation(batch: int, intrinsics: Intrinsics, config: SurfelConfig) -> Relocalisation:
-    """The relocalisation ``config.relocalisation`` for B envs with one camera model."""
+def make_relocalization(batch: int, intrinsics: Intrinsics, config: SurfelConfig) -> Relocalization:
+    """The relocalization ``config.relocalisation`` for B envs with one camera model."""
     if config.relocalisation == "local":
-        return LocalSearch()
-    return FernRelocalisation(batch, intrinsics, config.depth_cutoff_m)
+        return Relocalization()
+    return FernRelocalization(batch, intrinsics, config.depth_cutoff_m)

@@ -7,12 +7,12 @@ from typing import Any
 
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.slam.surfel.frustum_culling import Blocks, Culler
+from ms_slam_env.slam.surfel.frustum_culling import CullingBlocks, FrustumCuller
 from ms_slam_env.slam.surfel.splatting import (
-    Discs,
+    SplatFootprints,
     Sums,
     list_hidden,
-    project_discs,
+    project_footprints,
     resolve,
     splat_attributes,
     splat_depth,
@@ -89,9 +89,9 @@ class SplatRenderer:
     def __init__(
         self,
         surfels: Surfels,
-        blocks: Blocks,
+        blocks: CullingBlocks,
         visible: VisibleList,
-        discs: Discs,
+        discs: SplatFootprints,
         envs: int,
         intrinsics: Intrinsics,
         parameters: SplatParameters,
@@ -110,7 +110,9 @@ class SplatRenderer:
         pixels = envs * intrinsics.width * intrinsics.height
         self._z_buffer = wp.zeros(pixels, dtype=wp.float32, device=device)
         self._sums = wp.zeros(pixels, dtype=Sums, device=device)
-        self._culler = Culler(surfels, blocks, visible, envs, self.camera, workers, device, window)
+        self._culler = FrustumCuller(
+            surfels, blocks, visible, envs, self.camera, workers, device, window
+        )
         self._splats = {id(visible): self._record_splats(surfels, visible)}
         self._first_env = {id(visible): 0}
         self._surfels = surfels
@@ -150,7 +152,7 @@ class SplatRenderer:
 
         shared = [surfels, listed, 0, camera, workers, discs]
         return (
-            record(project_discs, [listed, camera, workers, discs]),
+            record(project_footprints, [listed, camera, workers, discs]),
             record(splat_depth, [listed, camera, workers, discs, z_buffer]),
             record(splat_attributes, [*shared, z_buffer, self._sums]),
         )

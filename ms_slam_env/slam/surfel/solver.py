@@ -15,7 +15,7 @@ from ms_slam_env.slam.surfel.degeneracy import (
     turning_length,
     vec6d,
 )
-from ms_slam_env.slam.surfel.normal_equations import RESTING, RUNNING, Photometry
+from ms_slam_env.slam.surfel.normal_equations import RESTING, RUNNING, Photometry, Sum
 
 
 @wp.kernel
@@ -52,13 +52,13 @@ def load_hessian(sums: wp.array3d(dtype=wp.float64), b: int, k: int, first: int)
 @wp.func
 def load_terms(sums: wp.array3d(dtype=wp.float64), b: int, k: int):
     """Both terms' H and g for a rotation times a length, and that length in metres."""
-    A = load_hessian(sums, b, k, 0)
-    B = load_hessian(sums, b, k, 42)
+    A = load_hessian(sums, b, k, Sum.GEOMETRIC_HESSIAN)
+    B = load_hessian(sums, b, k, Sum.PHOTOMETRIC_HESSIAN)
     g_a = vec6d()
     g_b = vec6d()
     for i in range(6):
-        g_a[i] = sums[b, k, 21 + i]
-        g_b[i] = sums[b, k, 63 + i]
+        g_a[i] = sums[b, k, Sum.GEOMETRIC_GRADIENT + i]
+        g_b[i] = sums[b, k, Sum.PHOTOMETRIC_GRADIENT + i]
     length = turning_length(A + B)
     A = in_metres(A, length)
     B = in_metres(B, length)
@@ -192,7 +192,7 @@ LARGEST_GAIN = wp.constant(wp.float64(5.0))
 
 @wp.func
 def update_photometry(
-    sums: wp.array3d(dtype=wp.float64), b: int, k: int, light: Photometry, least_scale: float
+    sums: wp.array3d(dtype=wp.float64), b: int, k: int, photometry: Photometry, least_scale: float
 ):
     """Gain and bias from the sums of a pass; scale by a step to its fixed point.
 
@@ -202,14 +202,14 @@ def update_photometry(
     At the scale c of Cauchy's distribution the mean weight is 1/2; from far away, c^2 is off by
     about the ratio of (1 - weight) and weight.
     """
-    weight = sums[b, k, 36]
+    weight = sums[b, k, Sum.EXPOSURE_W]
     if weight > wp.float64(0.0):
-        mean = sums[b, k, 37] / weight
-        mean_residual = sums[b, k, 39] / weight
-        variance = sums[b, k, 38] / weight - mean * mean
-        covariance = sums[b, k, 40] / weight - mean * mean_residual
-        spread = sums[b, k, 70] / weight - mean_residual * mean_residual
-        gain64 = wp.float64(light.gain)
+        mean = sums[b, k, Sum.EXPOSURE_WM] / weight
+        mean_residual = sums[b, k, Sum.EXPOSURE_WR] / weight
+        variance = sums[b, k, Sum.EXPOSURE_WMM] / weight - mean * mean
+        covariance = sums[b, k, Sum.EXPOSURE_WMR] / weight - mean * mean_residual
+        spread = sums[b, k, Sum.EXPOSURE_WRR] / weight - mean_residual * mean_residual
+        gain64 = wp.float64(photometry.gain)
         common = covariance + gain64 * variance  # of the live and the model's values
         live_variance = spread + gain64 * (covariance + common)
         # Without contrast, well below 5 grey levels, the gain stays.
@@ -219,14 +219,18 @@ def update_photometry(
         high = wp.max(low, high)
         moved = wp.min(wp.max(gain64, low), high)
         gain = wp.float32(wp.min(wp.max(moved, SMALLEST_GAIN), LARGEST_GAIN))
-        light.bias += wp.float32(mean_residual) - (gain - light.gain) * (wp.float32(mean) + 128.0)
-        light.gain = gain
-    textured = sums[b, k, 33]
+        photometry.bias += wp.float32(mean_residual) - (gain - photometry.gain) * (
+            wp.float32(mean) + 128.0
+        )
+        photometry.gain = gain
+    textured = sums[b, k, Sum.TEXTURED]
     if textured > wp.float64(50.0):
-        rough = sums[b, k, 41] / textured
+        rough = sums[b, k, Sum.ROUGH] / textured
         ratio = wp.sqrt(rough / wp.max(wp.float64(1.0) - rough, wp.float64(1.0e-3)))
-        light.scale = wp.clamp(wp.max(light.scale, least_scale) * wp.float32(ratio), 0.1, 100.0)
-    return light
+        photometry.scale = wp.clamp(
+            wp.max(photometry.scale, least_scale) * wp.float32(ratio), 0.1, 100.0
+        )
+    return photometry
 
 
 @wp.kernel
@@ -243,10 +247,12 @@ def gauss_newton_step(
     """Move every active hypothesis where the data constrain it; stop those that converged."""
     b, k = wp.tid()
     if active[b, k] == RUNNING:
-        light = photometry[b, k]
-        photometry[b, k] = update_photometry(sums, b, k, light, least_scale)
+        before = photometry[b, k]
+        photometry[b, k] = update_photometry(sums, b, k, before, least_scale)
         A, B, g_a, g_b, length = load_terms(sums, b, k)
-        xi = remapped_step(A, B, g_a + g_b, sums[b, k, 69], sums[b, k, 30], damping)
+        xi = remapped_step(
+            A, B, g_a + g_b, sums[b, k, Sum.TILTED], sums[b, k, Sum.MATCHED], damping
+        )
         for i in range(3, 6):
             xi[i] = xi[i] / length
         size = wp.float64(0.0)

@@ -27,7 +27,7 @@ from ms_slam_env.slam.surfel.surfels import (
 
 
 @wp.struct
-class Discs:
+class SplatFootprints:
     """The surfels of a list in the image, arrays (B, capacity), and those that meet a pixel.
 
     Attributes:
@@ -59,9 +59,9 @@ class Discs:
     num_drawn: wp.array(dtype=wp.int32)
 
 
-def allocate_discs(batch: int, capacity: int, device: str) -> Discs:
+def allocate_footprints(batch: int, capacity: int, device: str) -> SplatFootprints:
     """Working memory for lists of up to ``capacity`` surfels."""
-    discs = Discs()
+    discs = SplatFootprints()
     for name in ("u", "v", "inverse", "slope_u", "slope_v", "rim"):
         setattr(discs, name, wp.zeros((batch, capacity), dtype=wp.float32, device=device))
     for name in ("left", "right", "top", "bottom", "drawn"):
@@ -92,7 +92,9 @@ def drawn_radius(radius: float, z: float, camera: SplatCamera):
 
 
 @wp.kernel
-def project_discs(visible: VisibleList, camera: SplatCamera, workers: int, discs: Discs) -> None:
+def project_footprints(
+    visible: VisibleList, camera: SplatCamera, workers: int, discs: SplatFootprints
+) -> None:
     """Footprints of the listed surfels.
 
     Several short loops without branches: the compiler turns them into operations on many surfels
@@ -170,7 +172,7 @@ def splat_depth(
     visible: VisibleList,
     camera: SplatCamera,
     workers: int,
-    discs: Discs,
+    discs: SplatFootprints,
     z_buffer: wp.array(dtype=wp.float32),
 ) -> None:
     """Inverse depth (E * H * W) of the nearest disc at every pixel; list the discs on a pixel."""
@@ -220,7 +222,7 @@ def splat_attributes(
     first_env: int,
     camera: SplatCamera,
     workers: int,
-    discs: Discs,
+    discs: SplatFootprints,
     z_buffer: wp.array(dtype=wp.float32),
     sums: wp.array(dtype=Sums),
 ) -> None:

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from ms_slam_env._warp import wp
 from ms_slam_env.slam.surfel.device import fetch, put
-from ms_slam_env.slam.surfel.frustum_culling import BLOCK, Blocks, num_blocks
+from ms_slam_env.slam.surfel.frustum_culling import BLOCK_SIZE, CullingBlocks, num_blocks
 from ms_slam_env.slam.surfel.surfels import Surfels
 
 NEVER = wp.constant(2**31 - 1)
 
 
 @wp.struct
-class Removal:
+class SurfelCulling:
     """When surfels go.
 
     Attributes:
@@ -38,10 +38,10 @@ def is_crowded(slots: int, capacity: int):
 
 
 @wp.kernel
-def expire(
+def cull_unstable(
     surfels: Surfels,
-    blocks: Blocks,
-    removal: Removal,
+    blocks: CullingBlocks,
+    removal: SurfelCulling,
     mask: wp.array(dtype=wp.int32),
     time: wp.array(dtype=wp.int32),
     workers: int,
@@ -61,8 +61,8 @@ def expire(
     block = int(worker)
     while block < num_blocks(count):
         if blocks.expiry[b, block] < oldest:
-            i = block * BLOCK
-            end = wp.min(i + BLOCK, count)
+            i = block * BLOCK_SIZE
+            end = wp.min(i + BLOCK_SIZE, count)
             expiry = int(NEVER)
             while i < end:
                 confidence = fetch(surfels.confidence, b, i)
@@ -81,7 +81,7 @@ def expire(
 @wp.kernel
 def list_survivors(
     surfels: Surfels,
-    removal: Removal,
+    removal: SurfelCulling,
     mask: wp.array(dtype=wp.int32),
     time: wp.array(dtype=wp.int32),
     workers: int,
@@ -145,7 +145,7 @@ def gather(
 def put_back(
     source: Surfels,
     target: Surfels,
-    blocks: Blocks,
+    blocks: CullingBlocks,
     survivors: wp.array2d(dtype=wp.int32),
     expired: wp.array(dtype=wp.int32),
     kept: wp.array(dtype=wp.int32),

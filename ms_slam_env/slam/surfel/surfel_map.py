@@ -14,9 +14,9 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.base import Views
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.frustum_culling import (
-    Blocks,
-    Culler,
-    allocate_blocks,
+    CullingBlocks,
+    FrustumCuller,
+    allocate_culling_blocks,
     bound_blocks,
     set_bounded,
 )
@@ -33,8 +33,14 @@ from ms_slam_env.slam.surfel.rendering import (
     SplatRenderer,
     splat_camera,
 )
-from ms_slam_env.slam.surfel.splatting import Discs, allocate_discs
-from ms_slam_env.slam.surfel.surfel_culling import Removal, expire, gather, list_survivors, put_back
+from ms_slam_env.slam.surfel.splatting import SplatFootprints, allocate_footprints
+from ms_slam_env.slam.surfel.surfel_culling import (
+    SurfelCulling,
+    cull_unstable,
+    gather,
+    list_survivors,
+    put_back,
+)
 from ms_slam_env.slam.surfel.surfels import (
     ATTRIBUTES,
     COUNTERS,
@@ -51,8 +57,8 @@ _CHANGING = ("poses", "mask", "time", "weight", "live_depth", "live_normals", "l
 
 
 @dataclass(frozen=True)
-class MapArrays:
-    """Device arrays of B maps, shared by all passes.
+class MapBuffers:
+    """Device arrays of B maps, shared by all of its kernels.
 
     Attributes:
         batch: number of maps B.
@@ -76,20 +82,20 @@ class MapArrays:
     device: str
     surfels: Surfels
     spare: Surfels
-    blocks: Blocks
+    blocks: CullingBlocks
     visible: VisibleList
-    discs: Discs
+    discs: SplatFootprints
     survivors: wp.array
     kept: wp.array
     expired: wp.array
     active: SeenWindow
 
 
-class MapPasses:
+class MapKernels:
     """Recorded launches for frames of one size under one configuration."""
 
     def __init__(
-        self, arrays: MapArrays, intrinsics: Intrinsics, config: SurfelConfig, model_stride: int
+        self, arrays: MapBuffers, intrinsics: Intrinsics, config: SurfelConfig, model_stride: int
     ) -> None:
         """Prepare for frames of ``intrinsics``; see ``SurfelMap``."""
         self.config = config
@@ -108,7 +114,7 @@ class MapPasses:
         self._fusion.max_confidence = config.max_confidence
         self.splat_parameters = SplatParameters(tolerance_m=config.fusion_distance_m)
         self._camera = splat_camera(intrinsics, self.splat_parameters)
-        self._cull = Culler(
+        self._cull = FrustumCuller(
             arrays.surfels,
             arrays.blocks,
             arrays.visible,
@@ -201,7 +207,7 @@ class MapPasses:
 
         self._update = record(update_surfels, [arrays.surfels, arrays.visible, *frame])
         self._add = record(add_surfels, [arrays.surfels, capacity, *frame])
-        removal = Removal()
+        removal = SurfelCulling()
         removal.capacity = capacity
         removal.interval = config.compaction_interval
         removal.window = config.unstable_window
@@ -210,7 +216,7 @@ class MapPasses:
         survivors, kept, expired = arrays.survivors, arrays.kept, arrays.expired
         due = [removal, integers, integers, workers, expired]
         self._removal = [
-            record(expire, [surfels, blocks, *due]),
+            record(cull_unstable, [surfels, blocks, *due]),
             record(list_survivors, [surfels, *due, survivors, kept]),
             record(gather, [surfels, spare, survivors, kept, workers]),
             record(put_back, [spare, surfels, blocks, survivors, expired, kept, capacity, workers]),
@@ -245,7 +251,7 @@ class SurfelMap:
         surfels: the maps on the device.
         active: ``fuse`` and ``render_model`` work on the surfels last seen within this window; all
             unless its times are set.
-        passes: how ``fuse`` and ``render_model`` do that.
+        kernels: how ``fuse`` and ``render_model`` do that.
     """
 
     def __init__(
@@ -263,10 +269,10 @@ class SurfelMap:
         self._workers = default_workers(batch, device) if workers is None else workers
         capacity = config.capacity(intrinsics.width)
         self.surfels = allocate_surfels(batch, capacity, device)
-        self._blocks = allocate_blocks(batch, capacity, device)
-        self._discs = allocate_discs(batch, capacity, device)
+        self._blocks = allocate_culling_blocks(batch, capacity, device)
+        self._discs = allocate_footprints(batch, capacity, device)
         self.active = any_time(batch, device)
-        self._arrays = MapArrays(
+        self._arrays = MapBuffers(
             batch=batch,
             capacity=capacity,
             workers=self._workers,
@@ -281,14 +287,14 @@ class SurfelMap:
             expired=wp.zeros(batch, dtype=wp.int32, device=device),
             active=self.active,
         )
-        self.passes = self.make_passes(intrinsics, config, model_stride)
+        self.kernels = self.make_kernels(intrinsics, config, model_stride)
         self._predictor = ViewPredictor(
             self.surfels,
             self._blocks,
             self._arrays.visible,
             self._discs,
             intrinsics,
-            self.passes.splat_parameters,
+            self.kernels.splat_parameters,
             self._workers,
             device,
         )
@@ -296,27 +302,27 @@ class SurfelMap:
     @property
     def config(self) -> SurfelConfig:
         """The parameters in force."""
-        return self.passes.config
+        return self.kernels.config
 
-    def make_passes(
+    def make_kernels(
         self, intrinsics: Intrinsics, config: SurfelConfig, model_stride: int
-    ) -> MapPasses:
+    ) -> MapKernels:
         """Passes for frames of another size or with other parameters; ``use`` puts them in force.
 
         The capacity of the map stays what it is.
         """
-        return MapPasses(self._arrays, intrinsics, config, model_stride)
+        return MapKernels(self._arrays, intrinsics, config, model_stride)
 
-    def use(self, passes: MapPasses) -> None:
-        """Go on with other passes; views are predicted at the sizes of before."""
-        before, after = self.config, passes.config
-        self.passes = passes
+    def use(self, kernels: MapKernels) -> None:
+        """Go on with other kernels; views are predicted at the sizes of before."""
+        before, after = self.config, kernels.config
+        self.kernels = kernels
         if before.confidence_threshold != after.confidence_threshold:
             self.surfels_moved()  # which surfels may expire is a matter of the threshold
 
     def model_renderer(self, stride: int, window: SeenWindow) -> SplatRenderer:
         """Renders every ``stride``-th row and column of what was last seen within ``window``."""
-        return self.passes.model_renderer(stride, window)
+        return self.kernels.model_renderer(stride, window)
 
     def clear(self, env: int | None = None) -> None:
         """Forget the map of one env, or of all."""
@@ -344,13 +350,13 @@ class SurfelMap:
             weight: (B,) float32 in (0, 1], lower for a fast camera (Whelan et al., section 3).
             mask: (B,) int32, 0 leaves an env's map as it is.
         """
-        self.passes.fuse(live, poses, time, weight, mask)
+        self.kernels.fuse(live, poses, time, weight, mask)
 
     def surfels_moved(self) -> None:
         """Look at all surfels anew: something else than ``fuse`` has changed them."""
         self._blocks.bounded.zero_()
         self._blocks.num_listed.zero_()
-        self.passes.bound_blocks()
+        self.kernels.bound_blocks()
 
     def render_model(self, poses: wp.array) -> ModelView:
         """Render every env's map from its pose (B,) mat44 T_world_camera.
@@ -358,7 +364,7 @@ class SurfelMap:
         With every ``model_stride``-th row and column, from the first on. The images are
         overwritten by the next call.
         """
-        return self.passes.render_model(poses)
+        return self.kernels.render_model(poses)
 
     def predict_device(
         self, poses: ArrayLike, scale: float = 1.0, first_env: int = 0

@@ -20,7 +20,7 @@ COUNTERS = ("count", "dead", "dropped")
 
 @wp.struct
 class Surfels:
-    """Discs in the world frame; slots ``count[b]`` and later of env b are free.
+    """SplatFootprints in the world frame; slots ``count[b]`` and later of env b are free.
 
     A surfel with confidence 0 is dead: it keeps its slot until the next compaction.
     """

@@ -2,7 +2,7 @@
 
 ElasticFusion section IV, coarse to fine. In place of the paper's SO(3) pre-alignment, which finds
 rotations only, several starting poses are aligned at the coarsest level with few points, and the
-one that explains the frame best goes on. Nothing waits for the device before the verdict.
+one that explains the frame best goes on. Nothing waits for the device before the decision.
 """
 
 from __future__ import annotations
@@ -15,30 +15,34 @@ from numpy.typing import NDArray
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert
-from ms_slam_env.slam.surfel.acceptance import NUM_STATS, Alignment, Limits, judge
+from ms_slam_env.slam.base import Float64
+from ms_slam_env.slam.surfel.acceptance import (
+    NUM_STATS,
+    AcceptanceThresholds,
+    Alignment,
+    evaluate_alignment,
+)
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.degeneracy import mat66d
-from ms_slam_env.slam.surfel.device import Launches, Mirror
+from ms_slam_env.slam.surfel.device import HostDeviceBuffer, KernelLaunchCache, threads_per_row
 from ms_slam_env.slam.surfel.normal_equations import (
     NUM_SUMS,
     OFF,
     RUNNING,
     Photometry,
     Weights,
-    accumulate,
+    accumulate_normal_equations,
 )
 from ms_slam_env.slam.surfel.photometry import same_exposure
-from ms_slam_env.slam.surfel.pose_hypotheses import choose, widen_search
+from ms_slam_env.slam.surfel.pose_hypotheses import NUM_FIRST, expand_hypotheses, select_hypothesis
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
 from ms_slam_env.slam.surfel.pyramid import Level, Pyramid
 from ms_slam_env.slam.surfel.rendering import ModelView
 from ms_slam_env.slam.surfel.solver import gauss_newton_step, reduce_sums
 
-Float64 = NDArray[np.float64]
 SEARCH_POINTS = 400
 SEARCH_ITERATIONS = 5
-NUM_FIRST = 2  # seeds tried first, with the guess if any: at rest and at constant velocity
-GOOD_SCORE = 0.4  # of a first seed, which makes the other seeds needless
+GOOD_SCORE = 0.4  # of a first hypothesis, which makes the other hypotheses needless
 SPARSE = 0.3  # share of the points that all iterations but the last look at
 SMALLEST_STEP = (2.0e-4, 4.0e-4, 1.0e-3)  # metres and radians, per level, finest first
 DAMPING = 1.0e-6
@@ -62,14 +66,14 @@ def _point_stride(shape: tuple[int, int], points: float) -> int:
 
 
 class _Hypotheses:
-    """Device buffers of K poses per env: pose, state, sums and partial sums."""
+    """Device buffers of K hypotheses per env: poses, states, photometry and sums."""
 
     def __init__(self, batch: int, k: int, slots: int, device: str) -> None:
-        self.poses = Mirror((batch, k), wp.mat44d, device)
-        self.states = Mirror((batch, k), wp.int32, device)
-        self.lights = Mirror((batch, k), Photometry, device)
+        self.poses = HostDeviceBuffer((batch, k), wp.mat44d, device)
+        self.states = HostDeviceBuffer((batch, k), wp.int32, device)
+        self.photometries = HostDeviceBuffer((batch, k), Photometry, device)
         self.pose, self.active = self.poses.array, self.states.array
-        self.light = self.lights.array
+        self.photometry = self.photometries.array
         self.sums = wp.zeros((batch, k, NUM_SUMS), dtype=wp.float64, device=device)
         self.partial = wp.zeros((batch, k, slots, NUM_SUMS), dtype=wp.float32, device=device)
         is_cpu = wp.get_device(device).is_cpu
@@ -86,13 +90,13 @@ class Tracker:
     def __init__(
         self,
         batch: int,
-        num_seeds: int,
+        num_hypotheses: int,
         intrinsics: Intrinsics,
         config: SurfelConfig,
         device: str = "cpu",
         model_stride: int = 1,
     ) -> None:
-        """Allocate for ``batch`` envs that each try ``num_seeds`` starting poses a frame.
+        """Allocate for ``batch`` envs that each try ``num_hypotheses`` starting poses a frame.
 
         The model views hold every ``model_stride``-th row and column of the image (1, 2, 4).
         """
@@ -112,25 +116,25 @@ class Tracker:
         self._model = Pyramid(
             batch, self._model_shapes[0], self._model_level[-1] + 1, False, device
         )
-        # The CPU runs one thread after another: whole rows. A GPU wants many threads.
-        self._columns = 32 if wp.get_device(device).is_cuda else 1 << 20
+        self._columns, _ = threads_per_row(1 << 20, device, gpu_columns=32)
         slots = max(self._slots(level, self._stride(level)) for level in range(num_levels))
         slots = max(slots, self._slots(num_levels - 1, self._search_stride()))
 
         self._first = _Hypotheses(batch, NUM_FIRST + 1, slots, device)  # the last is the guess
-        self._more = _Hypotheses(batch, num_seeds - NUM_FIRST, slots, device)
+        self._more = _Hypotheses(batch, num_hypotheses - NUM_FIRST, slots, device)
         self._one = _Hypotheses(batch, 1, slots, device)
-        self._launches = Launches(device)
+        self._launches = KernelLaunchCache(device)
         self._seen: tuple[LiveFrame | None, ModelView | None] = (None, None)
         self.good_score = GOOD_SCORE
-        self._limits = Mirror(batch, Limits, device)
-        self._T_world_model = Mirror(batch, wp.mat44d, device)
-        self._predicted = Mirror(batch, wp.mat44d, device)
-        self._T_world_live = Mirror(batch, wp.mat44d, device)
-        self._verdict = Mirror(batch, wp.int32, device)
-        self._stats = Mirror((batch, NUM_STATS), wp.float64, device)
-        self._covariance = Mirror(batch, mat66d, device)
+        self._thresholds = HostDeviceBuffer(batch, AcceptanceThresholds, device)
+        self._T_world_model = HostDeviceBuffer(batch, wp.mat44d, device)
+        self._predicted = HostDeviceBuffer(batch, wp.mat44d, device)
+        self._T_world_live = HostDeviceBuffer(batch, wp.mat44d, device)
+        self._status = HostDeviceBuffer(batch, wp.int32, device)
+        self._stats = HostDeviceBuffer((batch, NUM_STATS), wp.float64, device)
+        self._covariance = HostDeviceBuffer(batch, mat66d, device)
         self._live_levels: list[Level] = []
+        self._model_levels: list[Level] = []
         self._weights = [_weights(config, level) for level in range(num_levels)]
 
     def _stride(self, level: int, share: float = 1.0) -> int:
@@ -152,8 +156,8 @@ class Tracker:
         self,
         model: ModelView,
         T_world_model: Float64,
-        seeds: Float64,
-        limits: NDArray[np.void],
+        hypotheses: Float64,
+        thresholds: NDArray[np.void],
         guesses: Float64 | None = None,
         photometry: NDArray[Any] | None = None,
     ) -> Alignment:
@@ -162,77 +166,32 @@ class Tracker:
         Args:
             model: rendered at ``T_world_model``.
             T_world_model: (B, 4, 4).
-            seeds: (B, K, 4, 4) starting poses T_model_live.
-            limits: (B,) structured array of ``acceptance.Limits``.
+            hypotheses: (B, K, 4, 4) starting poses T_model_live.
+            thresholds: (B,) structured array of ``AcceptanceThresholds``.
             guesses: (B, 4, 4) one more starting pose T_world_live, NaN for an env without; None
                 if no env has one.
             photometry: (B,) ``Photometry`` to start from; exposed like the model if None.
         """
         self._expect(self._seen[0], model)
         images = self._model.build(model.vertices, model.normals, model.intensity)
-        levels = [images[index] for index in self._model_level]
-        one = self._one
-        self._start_from(seeds, T_world_model, guesses)
+        self._model_levels = [images[index] for index in self._model_level]
+        self._start_from(hypotheses, T_world_model, guesses)
         self._T_world_model.write(T_world_model)
-        self._limits.write(limits)
-        lights = same_exposure(self.batch) if photometry is None else photometry
+        self._thresholds.write(thresholds)
+        photometry = same_exposure(self.batch) if photometry is None else photometry
         for state in (self._first, self._more):
-            state.lights.write(lights[:, None])
-        coarsest = len(levels) - 1
-        self._search(levels, coarsest)
-        for level in range(coarsest, -1, -1):
-            last = int(level == 0)  # the last iteration sees more points than the others
-            count = self.config.iterations[level] - last
-            self._iterate(levels, level, self._stride(level, SPARSE), one, count)
-        # The verdict is on what the last step starts from, which has all but converged.
-        self._pass(levels, 0, self._stride(0), one)
-        if self.config.iterations[0]:
-            self._step(0, one, last=True)
-        if not self._launches.replay("judge"):
-            self._launches.record(
-                "judge",
-                judge,
-                self.batch,
-                [
-                    one.sums,
-                    one.pose,
-                    self._predicted.array,
-                    self._limits.array,
-                    self._T_world_model.array,
-                ],
-                [
-                    self._T_world_live.array,
-                    self._verdict.array,
-                    self._stats.array,
-                    self._covariance.array,
-                ],
-            )
+            state.photometries.write(photometry[:, None])
+        self._search()
+        self._refine()
+        self._evaluate()
         return Alignment(
             T_world_live=self._T_world_live.read(),
-            T_model_live=one.poses.read()[:, 0],
-            verdict=self._verdict.read(),
+            T_model_live=self._one.poses.read()[:, 0],
+            status=self._status.read(),
             stats=self._stats.read(),
-            photometry=one.lights.read()[:, 0],
+            photometry=self._one.photometries.read()[:, 0],
             covariance=self._covariance.read(),
         )
-
-    def _start_from(self, seeds: Float64, T_world_model: Float64, guesses: Float64 | None) -> None:
-        """Set the poses of all hypotheses; an env without a guess leaves that one out."""
-        first, states = self._first, np.full((self.batch, NUM_FIRST + 1), OFF, dtype=np.int32)
-        states[:, :NUM_FIRST] = RUNNING
-        starts = np.zeros((self.batch, NUM_FIRST + 1, 4, 4))
-        starts[:, :NUM_FIRST] = seeds[:, :NUM_FIRST]
-        if guesses is not None:
-            given = np.isfinite(guesses[:, 0, 0])
-            starts[given, NUM_FIRST] = (invert(T_world_model) @ guesses)[given]
-            states[given, NUM_FIRST] = RUNNING
-        predicted = starts[:, NUM_FIRST - 1].copy()  # at constant velocity, or the guess
-        given = states[:, NUM_FIRST] == RUNNING
-        predicted[given] = starts[given, NUM_FIRST]
-        self._predicted.write(predicted)
-        first.poses.write(starts)
-        first.states.write(states)
-        self._more.poses.write(seeds[:, NUM_FIRST:])
 
     def _expect(self, live: LiveFrame | None, model: ModelView | None) -> None:
         """Forget the recorded launches if these are not the images that they were made for."""
@@ -240,100 +199,135 @@ class Tracker:
             self._launches.clear()
             self._seen = (live, model)
 
-    def _search(self, levels: list[Level], coarsest: int) -> None:
-        """Align seeds at the coarsest level on few points; the best one goes on.
+    def _start_from(
+        self, hypotheses: Float64, T_world_model: Float64, guesses: Float64 | None
+    ) -> None:
+        """Set the poses of all hypotheses; an env without a guess leaves that one out."""
+        states = np.full((self.batch, NUM_FIRST + 1), OFF, dtype=np.int32)
+        states[:, :NUM_FIRST] = RUNNING
+        starts = np.zeros((self.batch, NUM_FIRST + 1, 4, 4))
+        starts[:, :NUM_FIRST] = hypotheses[:, :NUM_FIRST]
+        predicted = starts[:, NUM_FIRST - 1].copy()  # at constant velocity, or the guess
+        if guesses is not None:
+            given = np.isfinite(guesses[:, 0, 0])
+            starts[given, NUM_FIRST] = (invert(T_world_model) @ guesses)[given]
+            states[given, NUM_FIRST] = RUNNING
+            predicted[given] = starts[given, NUM_FIRST]
+        self._predicted.write(predicted)
+        self._first.poses.write(starts)
+        self._first.states.write(states)
+        self._more.poses.write(hypotheses[:, NUM_FIRST:])
 
-        Most frames need the first seeds only; the others run where those fit badly.
+    def _search(self) -> None:
+        """Align hypotheses at the coarsest level on few points; the best one goes on.
+
+        Most frames need the first hypotheses only; the others run where those fit badly.
         """
         first, more, one = self._first, self._more, self._one
-        self._settle(levels, coarsest, first)
-        if not self._launches.replay("widen"):
-            self._launches.record(
-                "widen",
-                widen_search,
+        self._settle(first)
+        self._launches.launch(
+            "expand",
+            expand_hypotheses,
+            lambda: (
                 self.batch,
-                [first.active, self.good_score],
-                [first.sums, more.sums, more.active],
-            )
+                [first.active, self.good_score, first.sums, more.sums, more.active],
+            ),
+        )
         if more.running():
-            self._settle(levels, coarsest, more)
-        if not self._launches.replay("choose"):
-            self._launches.record(
-                "choose",
-                choose,
-                self.batch,
-                [first.sums, first.pose, first.light, more.sums, more.pose, more.light],
-                [one.pose, one.light, one.active],
-            )
+            self._settle(more)
+        found = [(state.sums, state.pose, state.photometry) for state in (first, more)]
+        self._launches.launch(
+            "select",
+            select_hypothesis,
+            lambda: (self.batch, [*found[0], *found[1], one.pose, one.photometry, one.active]),
+        )
 
-    def _settle(self, levels: list[Level], coarsest: int, state: _Hypotheses) -> None:
-        """A few steps for every active seed, and the sums at the pose they lead to."""
-        stride = self._search_stride()
-        self._iterate(levels, coarsest, stride, state, SEARCH_ITERATIONS)
-        self._pass(levels, coarsest, stride, state)
+    def _settle(self, state: _Hypotheses) -> None:
+        """A few steps for every active hypothesis, and the sums at the pose they lead to."""
+        coarsest, stride = len(self._model_levels) - 1, self._search_stride()
+        self._iterate(coarsest, stride, state, SEARCH_ITERATIONS)
+        self._accumulate(coarsest, stride, state)
 
-    def _iterate(
-        self, levels: list[Level], level: int, stride: int, state: _Hypotheses, count: int
-    ) -> None:
+    def _refine(self) -> None:
+        """Align the one hypothesis from the coarsest level to the finest."""
+        for level in range(len(self._model_levels) - 1, -1, -1):
+            last = int(level == 0)  # the last iteration sees more points than the others
+            count = self.config.iterations[level] - last
+            self._iterate(level, self._stride(level, SPARSE), self._one, count)
+        # The decision is on what the last step starts from, which has all but converged.
+        self._accumulate(0, self._stride(0), self._one)
+        if self.config.iterations[0]:
+            self._step(0, self._one, last=True)
+
+    def _evaluate(self) -> None:
+        one, given = self._one, (self._predicted, self._thresholds, self._T_world_model)
+        found = (self._T_world_live, self._status, self._stats, self._covariance)
+        arrays = [buffer.array for buffer in (*given, *found)]
+        self._launches.launch(
+            "evaluate", evaluate_alignment, lambda: (self.batch, [one.sums, one.pose, *arrays])
+        )
+
+    def _iterate(self, level: int, stride: int, state: _Hypotheses, count: int) -> None:
         """At most ``count`` Gauss-Newton iterations at one level; all resting ones wake after."""
         for iteration in range(count):
             running = state.running()
             if running:
-                self._pass(levels, level, stride, state)
+                self._accumulate(level, stride, state)
             self._step(level, state, last=not running or iteration == count - 1)
             if not running:
                 break
 
-    def _pass(self, levels: list[Level], level: int, stride: int, state: _Hypotheses) -> None:
+    def _accumulate(self, level: int, stride: int, state: _Hypotheses) -> None:
         """Accumulate and reduce the sums of every active hypothesis at one level."""
         key = (level, stride, id(state))
-        if self._launches.replay(("accumulate", key)):
-            self._launches.replay(("reduce", key))
-            return
-        camera, model, live = self._cameras[level], levels[level], self._live_levels[level]
         slots = self._slots(level, stride)
+        self._launches.launch(
+            ("accumulate", *key),
+            accumulate_normal_equations,
+            lambda: self._accumulation(level, stride, state),
+        )
+        self._launches.launch(
+            ("reduce", *key),
+            reduce_sums,
+            lambda: (state.sums.shape, [state.partial, slots, state.active, state.sums]),
+        )
+
+    def _accumulation(
+        self, level: int, stride: int, state: _Hypotheses
+    ) -> tuple[tuple[int, ...], list[Any]]:
+        """Threads and arguments of ``accumulate_normal_equations``."""
+        camera, model, live = self._cameras[level], self._model_levels[level], self._live_levels
         height, width = self._model_shapes[level]
         rows = -(-height // stride)
-        self._launches.record(
-            ("accumulate", key),
-            accumulate,
-            (*state.pose.shape, rows, slots // rows),
-            [
-                *_flat(model.vertices, model.normals, model.intensity),
-                *_flat(live.vertices, live.normals, live.gradient),
-                wp.vec2i(width, height),
-                wp.vec2i(camera.width, camera.height),
-                wp.vec2(camera.fx, camera.fy),
-                wp.vec2(camera.cx, camera.cy),
-                self._weights[level],
-                stride,
-                min(self._columns, width),
-                state.pose,
-                state.light,
-                state.active,
-            ],
-            [state.partial],
-        )
-        self._launches.record(
-            ("reduce", key),
-            reduce_sums,
-            state.sums.shape,
-            [state.partial, slots, state.active],
-            [state.sums],
-        )
+        inputs = [
+            *_flat(model.vertices, model.normals, model.intensity),
+            *_flat(live[level].vertices, live[level].normals, live[level].gradient),
+            wp.vec2i(width, height),
+            wp.vec2i(camera.width, camera.height),
+            wp.vec2(camera.fx, camera.fy),
+            wp.vec2(camera.cx, camera.cy),
+            self._weights[level],
+            stride,
+            min(self._columns, width),
+            state.pose,
+            state.photometry,
+            state.active,
+            state.partial,
+        ]
+        return (*state.pose.shape, rows, self._slots(level, stride) // rows), inputs
 
     def _step(self, level: int, state: _Hypotheses, last: bool) -> None:
         """Move every active hypothesis by one Gauss-Newton step."""
-        key = ("step", level, last, id(state))
-        if not self._launches.replay(key):
-            smallest = SMALLEST_STEP[min(level, len(SMALLEST_STEP) - 1)]
-            self._launches.record(
-                key,
-                gauss_newton_step,
+        smallest = SMALLEST_STEP[min(level, len(SMALLEST_STEP) - 1)]
+        rule = [DAMPING, smallest, int(last), self._weights[level].least_scale]
+        self._launches.launch(
+            ("step", level, last, id(state)),
+            gauss_newton_step,
+            lambda: (
                 state.pose.shape,
-                [state.sums, DAMPING, smallest, int(last), self._weights[level].least_scale],
-                [state.pose, state.light, state.active],
-            )
+                [state.sums, *rule, state.pose, state.photometry, state.active],
+            ),
+        )
 
 
 def _flat(*images: Any) -> list[Any]:
@@ -356,6 +350,6 @@ def _weights(config: SurfelConfig, level: int) -> Weights:
     weights.cos_angle = float(np.cos(np.radians(config.icp_angle_deg)))
     weights.inlier_sigmas = 4.0
     weights.texture = 4.0
-    weights.alike = 20.0
+    weights.photometric_inlier = 20.0
     weights.least_scale = config.cauchy_rgb * widening
     return weights

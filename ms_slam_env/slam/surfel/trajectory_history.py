@@ -21,7 +21,7 @@ _CONSTRAINT_ARRAYS = ("sources", "source_times", "targets", "target_times")
 
 
 @dataclass
-class Past:
+class TrajectoryHistory:
     """What is remembered of one env.
 
     Attributes:
@@ -109,9 +109,9 @@ def motion_size(T: Float64) -> float:
     return float(np.linalg.norm(T[:3, 3]) + relative_angle(np.eye(3), T[:3, :3]))
 
 
-def past_from_state(state: dict[str, Any]) -> Past:
+def history_from_state(state: dict[str, Any]) -> TrajectoryHistory:
     """The past that gave this state."""
-    return Past(
+    return TrajectoryHistory(
         [int(frame) for frame in state["frames"]],
         list(state["poses"].copy()),
         list(state["anchors"].copy()),

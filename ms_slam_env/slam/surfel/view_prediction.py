@@ -12,14 +12,14 @@ from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert
-from ms_slam_env.slam.surfel.frustum_culling import Blocks
+from ms_slam_env.slam.surfel.frustum_culling import CullingBlocks
 from ms_slam_env.slam.surfel.rendering import (
     ModelView,
     SplatParameters,
     SplatRenderer,
     splat_camera,
 )
-from ms_slam_env.slam.surfel.splatting import Discs
+from ms_slam_env.slam.surfel.splatting import SplatFootprints
 from ms_slam_env.slam.surfel.surfels import Surfels, VisibleList, allocate_visible
 from ms_slam_env.slam.surfel.view_warping import (
     EMPTY,
@@ -144,9 +144,9 @@ class ViewPredictor:
     def __init__(
         self,
         surfels: Surfels,
-        blocks: Blocks,
+        blocks: CullingBlocks,
         visible: VisibleList,
-        discs: Discs,
+        discs: SplatFootprints,
         intrinsics: Intrinsics,
         parameters: SplatParameters,
         workers: int,

@@ -1,0 +1,253 @@
+"""Where live frames were taken: pose hypotheses aligned with the map, tried in widening circles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ms_slam_env._warp import wp
+from ms_slam_env.slam.base import Float64
+from ms_slam_env.slam.surfel.acceptance import (
+    Alignment,
+    Stat,
+    TrackingStatus,
+    accept_any_fit,
+    acceptance_thresholds,
+    geometric_thresholds,
+)
+from ms_slam_env.slam.surfel.device import HostDeviceBuffer
+from ms_slam_env.slam.surfel.photometry import (
+    InvalidFrameDetector,
+    geometry_only,
+    next_photometry,
+    same_exposure,
+)
+from ms_slam_env.slam.surfel.pipeline import Pipeline
+from ms_slam_env.slam.surfel.pose_hypotheses import (
+    NUM_FIRST,
+    NUM_HYPOTHESES,
+    damped,
+    relocalization_hypotheses,
+    tracking_hypotheses,
+)
+from ms_slam_env.slam.surfel.preprocessing import LiveFrame
+from ms_slam_env.slam.surfel.relocalization import Images, Relocalization
+from ms_slam_env.slam.surfel.rendering import ModelView
+from ms_slam_env.slam.surfel.surfel_map import SurfelMap
+
+RETRIES = 2  # further searches within a frame whose tracking failed
+
+
+@dataclass
+class CameraStates:
+    """What is known of the cameras of B envs, between frames.
+
+    Attributes:
+        poses: (B, 4, 4) T_world_camera.
+        motions: (B, 4, 4) of the last frame, which predict the next.
+        photometry: (B,) how the live grey values relate to the map's.
+        started: (B,) whether a frame has been taken.
+        lost: (B,) frames since tracking was lost.
+        time: (B,) frames taken.
+    """
+
+    poses: Float64
+    motions: Float64
+    photometry: NDArray[Any]
+    started: NDArray[np.bool_]
+    lost: NDArray[np.int32]
+    time: NDArray[np.int32]
+
+    @classmethod
+    def at_rest(cls, batch: int) -> CameraStates:
+        """Cameras at the identity pose that have seen nothing."""
+        identity = np.tile(np.eye(4), (batch, 1, 1))
+        zeros = np.zeros(batch, dtype=np.int32)
+        started = np.zeros(batch, dtype=bool)
+        return cls(identity, identity.copy(), same_exposure(batch), started, zeros, zeros.copy())
+
+    def reset(self, env: int, pose: ArrayLike) -> None:
+        """Start one env anew at a pose (4, 4)."""
+        self.poses[env] = pose
+        self.motions[env] = np.eye(4)
+        self.photometry[env] = same_exposure(1)[0]
+        self.started[env] = False
+        self.lost[env] = 0
+        self.time[env] = 0
+
+    def accept(self, env: int, alignment: Alignment, least_scale: float) -> None:
+        """Move on to where the frame was tracked."""
+        self.poses[env] = alignment.T_world_live[env]
+        # Across a gap the motion is not one frame's.
+        motion = np.eye(4) if self.lost[env] else alignment.T_model_live[env]
+        # What a degenerate view leaves open was predicted itself: let it die away.
+        is_degenerate = alignment.stats[env, Stat.DEGENERATE] > 0
+        self.motions[env] = damped(motion) if is_degenerate else motion
+        self.lost[env] = 0
+        self.photometry[env] = next_photometry(
+            self.photometry[env],
+            alignment.photometry[env],
+            float(alignment.stats[env, Stat.TERM_CONFLICT]),
+            least_scale,
+        )
+
+    def hold(self, env: int) -> None:
+        """Stay where the frame was not tracked."""
+        self.motions[env] = np.eye(4)
+        self.lost[env] += 1
+
+
+class Localizer:
+    """Aligns the frames of B envs with their maps, and keeps the view of the map that it used.
+
+    Attributes:
+        invalid_frames: tells frames with nothing to track in them.
+    """
+
+    def __init__(
+        self, states: CameraStates, surfel_map: SurfelMap, relocalization: Relocalization
+    ) -> None:
+        """``use`` must follow."""
+        self.invalid_frames = InvalidFrameDetector(surfel_map.batch)
+        self._states = states
+        self._map = surfel_map
+        self._relocalization = relocalization
+        self._device_poses = HostDeviceBuffer(surfel_map.batch, wp.mat44, surfel_map.device)
+        self._strict = np.ones(surfel_map.batch, dtype=bool)
+        self._view: ModelView
+        self._view_poses: Float64 | None = None  # of ``_view``; None: the maps have changed since
+
+    def use(self, pipeline: Pipeline) -> None:
+        """Look at frames in this way from now on."""
+        self._tracker = pipeline.tracker
+        self._config = pipeline.config
+        self.forget_view()
+
+    def forget_view(self) -> None:
+        """Render anew next time: the maps have changed, or what of them takes part."""
+        self._view_poses = None
+
+    def render(self, poses: Float64) -> ModelView:
+        """Render the maps from ``poses`` (B, 4, 4), unless that view is at hand."""
+        if self._view_poses is None or not np.array_equal(self._view_poses, poses):
+            self._device_poses.write(poses)
+            self._view = self._map.render_model(self._device_poses.array)
+            self._view_poses = poses.copy()
+        return self._view
+
+    def align_from(
+        self, origins: Float64, hypotheses: Float64, thresholds: NDArray[Any]
+    ) -> Alignment:
+        """Align the current frames with the maps as seen from ``origins`` (B, 4, 4)."""
+        return self._align(origins, hypotheses, thresholds, self._states.photometry)
+
+    def locate(self, live: LiveFrame, frames: Images, guesses: Float64 | None) -> Alignment:
+        """Align the frames: near the last poses, at the guesses, around, at keyframes.
+
+        ``guesses`` (B, 4, 4) are NaN for an env without; None if none has one.
+        """
+        self._tracker.set_frame(live)
+        alignment = self._track(frames, guesses)
+        if not self._config.refuse_bad_fits:
+            alignment = accept_any_fit(alignment)
+        if guesses is not None:
+            alignment = self._search_at_guess(alignment, guesses)
+        alignment = self._search_around(alignment)
+        if self._config.refuse_bad_fits:
+            alignment = self._search_elsewhere(alignment, frames)
+        return alignment
+
+    def _track(self, frames: Images, guesses: Float64 | None) -> Alignment:
+        """Align with the views from the last poses; a lost env searches wider at every frame."""
+        states = self._states
+        lost = states.lost > 0
+        hypotheses = np.stack(
+            [
+                relocalization_hypotheses(int(frames_lost) - 1)
+                if frames_lost
+                else tracking_hypotheses(motion)
+                for motion, frames_lost in zip(states.motions, states.lost, strict=True)
+            ]
+        )
+        thresholds = acceptance_thresholds(lost, states.lost)
+        alignment = self._align(states.poses, hypotheses, thresholds, states.photometry, guesses)
+        invalid = self.invalid_frames.find(frames.color, states.started)
+        alignment = alignment.with_status(invalid, TrackingStatus.INVALID_FRAME)
+        return self._without_color(hypotheses, alignment)
+
+    def _without_color(self, hypotheses: Float64, alignment: Alignment) -> Alignment:
+        """Align the envs whose grey values do not fit by geometry alone, from the nearest poses.
+
+        Lights are switched, cameras glare, and a recording's colour may not be registered with its
+        depth. Geometry must then constrain the pose without help, near to where it is expected.
+        """
+        states = self._states
+        failed = self._failed(alignment) & (alignment.status == TrackingStatus.APPEARANCE)
+        if not failed.any():
+            return alignment
+        near = np.repeat(hypotheses[:, :1], NUM_HYPOTHESES, axis=1)
+        near[:, :NUM_FIRST] = hypotheses[:, :NUM_FIRST]
+        thresholds = geometric_thresholds(states.lost)
+        again = self._align(states.poses, near, thresholds, geometry_only(states.photometry))
+        return alignment.replace(failed & again.tracked, again)
+
+    def _search_at_guess(self, alignment: Alignment, guesses: Float64) -> Alignment:
+        """Align the envs that failed with the view from their guess, under stricter thresholds.
+
+        A large motion leaves little of the last pose's view in sight.
+        """
+        failed = self._failed(alignment) & np.isfinite(guesses[:, 0, 0])
+        if not failed.any():
+            return alignment
+        poses = self._states.poses
+        origins = np.where(failed[:, None, None], guesses, poses)
+        hypotheses = np.tile(tracking_hypotheses(np.eye(4)), (len(poses), 1, 1, 1))
+        again = self.align_from(origins, hypotheses, self._strict_thresholds())
+        return alignment.replace(failed & again.tracked, again.seen_from(poses))
+
+    def _search_around(self, alignment: Alignment) -> Alignment:
+        """Give the envs that failed more hypotheses, under stricter thresholds."""
+        states = self._states
+        for attempt in range(1, 1 + RETRIES):
+            failed = self._failed(alignment)
+            if not failed.any():
+                break
+            hypotheses = np.stack(
+                [relocalization_hypotheses(attempt + RETRIES * int(lost)) for lost in states.lost]
+            )
+            again = self.align_from(states.poses, hypotheses, self._strict_thresholds())
+            alignment = alignment.replace(failed & again.tracked, again)
+        return alignment
+
+    def _search_elsewhere(self, alignment: Alignment, frames: Images) -> Alignment:
+        """Let the relocalization verify and find the envs that were lost before."""
+        lost = self._states.lost > 0
+        again = lost & alignment.tracked
+        verified = self._relocalization.verify(frames, alignment.T_world_live, again, self)
+        alignment = alignment.with_status(again & ~verified, TrackingStatus.APPEARANCE)
+        found = self._relocalization.relocalize(frames, lost & self._failed(alignment), self)
+        if found is None:
+            return alignment
+        where, elsewhere = found
+        return alignment.replace(where, elsewhere.seen_from(self._states.poses))
+
+    def _align(
+        self,
+        origins: Float64,
+        hypotheses: Float64,
+        thresholds: NDArray[Any],
+        photometry: NDArray[Any],
+        guesses: Float64 | None = None,
+    ) -> Alignment:
+        view = self.render(origins)
+        return self._tracker.align(view, origins, hypotheses, thresholds, guesses, photometry)
+
+    def _strict_thresholds(self) -> NDArray[Any]:
+        return acceptance_thresholds(self._strict, self._states.lost)
+
+    def _failed(self, alignment: Alignment) -> NDArray[np.bool_]:
+        is_invalid = alignment.status == TrackingStatus.INVALID_FRAME
+        return self._states.started & ~alignment.tracked & ~is_invalid
