@@ -30,7 +30,7 @@ from ms_slam_env.errors import unknown
 from ms_slam_env.geometry import invert, transform_points
 from ms_slam_env.metrics import voxel_thin
 from ms_slam_env.metrics.cloud_registration import register_clouds
-from ms_slam_env.slam.surfel.photometric_consistency import measure_likeness
+from ms_slam_env.slam.alignment_check import measure_photometric_consistency
 
 Float64 = NDArray[np.float64]
 
@@ -208,8 +208,10 @@ def evaluate_alignment(a: RobotRun, b: RobotRun, T_a_b: Float64, config: MergeCo
             readings += int(valid.sum())
             if here_fits.sum() >= _LOOKS_AT * max(1, valid.sum()):
                 same = np.where(here_fits, depth, np.float32(0))
-                likeness = measure_likeness(frame.color, frame.depth, grey, same, _FAR_M)
-                alike.append(likeness.correlation)
+                found = measure_photometric_consistency(
+                    frame.color, frame.depth, grey, same, _FAR_M
+                )
+                alike.append(found.correlation)
     return Fit(
         overlap=fits / readings if readings else 0.0,
         consistent=fits / (fits + contradictions) if fits else 0.0,

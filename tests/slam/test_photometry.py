@@ -17,8 +17,8 @@ from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.normal_equations import (
     NUM_SUMS,
     RUNNING,
-    SUM_EXPOSURE_SQUARED,
     Photometry,
+    Sum,
 )
 from ms_slam_env.slam.surfel.photometry import (
     ExposureCorrection,
@@ -39,13 +39,14 @@ def _regress(model, live, weight, light, textured_robust=None):
     residual = live - np.clip(light["gain"] * model + light["bias"], 0, 255)
     centred = model - 128.0
     sums = np.zeros(NUM_SUMS)
-    sums[36:41] = [
+    sums[Sum.EXPOSURE_W : Sum.EXPOSURE_WMR + 1] = [
         (weight * term).sum()
         for term in (np.ones_like(model), centred, centred**2, residual, centred * residual)
     ]
-    sums[SUM_EXPOSURE_SQUARED] = (weight * residual**2).sum()
+    sums[Sum.EXPOSURE_WRR] = (weight * residual**2).sum()
     if textured_robust is not None:
-        sums[33], sums[41] = len(textured_robust), (1 - textured_robust).sum()
+        sums[Sum.TEXTURED] = len(textured_robust)
+        sums[Sum.ROUGH] = (1 - textured_robust).sum()
     lights = wp.array(light[:, None], dtype=Photometry)
     wp.launch(
         gauss_newton_step,

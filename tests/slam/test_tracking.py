@@ -10,11 +10,9 @@ from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics, xtion
 from ms_slam_env.geometry import invert, look_at, relative_angle, se3_exp
 from ms_slam_env.sensor import RGBDSensor
+from ms_slam_env.slam.alignment_check import TrackingStatus
 from ms_slam_env.slam.surfel import normal_equations as ne
 from ms_slam_env.slam.surfel.acceptance import (
-    APPEARANCE,
-    FEW_POINTS,
-    REASONS,
     acceptance_thresholds,
 )
 from ms_slam_env.slam.surfel.config import SurfelConfig
@@ -40,7 +38,7 @@ def _weights(icp: float = 1.0, rgb: float = 1.0) -> ne.Weights:
     weights.per_cauchy_icp, weights.per_cauchy_rgb = 0.5, 1.0
     weights.grey_variance, weights.pixel_variance = 0.25, 0.09
     weights.distance_m, weights.cos_angle = 0.1, 0.7
-    weights.inlier_sigmas, weights.texture, weights.alike = 4.0, 4.0, 20.0
+    weights.inlier_sigmas, weights.texture, weights.photometric_inlier = 4.0, 4.0, 20.0
     weights.least_scale = 1.0
     return weights
 
@@ -162,8 +160,8 @@ def test_normal_equations_equal_the_loop_over_points(columns):
     sums = _device_sums(data, T, weights, columns=columns)
     H, g, num_icp, num_rgb = _expected_system(data, T, weights)
     assert num_icp > 300
-    assert num_rgb == sums[ne.SUM_TEXTURED]
-    for term, first in enumerate((0, ne.SUM_PHOTOMETRIC)):
+    assert num_rgb == sums[ne.Sum.TEXTURED]
+    for term, first in enumerate((0, ne.Sum.PHOTOMETRIC_HESSIAN)):
         scale = np.sqrt(np.diag(H[term]))
         actual = np.zeros((6, 6))
         actual[np.triu_indices(6)] = sums[first : first + 21]
@@ -214,7 +212,7 @@ def test_stride_looks_at_a_chessboard_of_points():
     expected = sum(
         (data["model_vertices"][v, c, 2] > 0).sum() for v, c in zip(rows, columns, strict=True)
     )
-    assert _device_sums(data, np.eye(4), weights, stride=2)[ne.SUM_POINTS] == expected
+    assert _device_sums(data, np.eye(4), weights, stride=2)[ne.Sum.POINTS] == expected
 
 
 class _Pair:
@@ -234,9 +232,9 @@ class _Pair:
     def align(self, model: LiveFrame, live: LiveFrame):
         view = ModelView(model.vertices, model.normals, model.intensity, model.color)
         self.tracker.set_frame(live)
-        limits = acceptance_thresholds(np.zeros(1, dtype=bool), np.zeros(1, dtype=np.int32))
-        seeds = tracking_hypotheses(np.eye(4))[None]
-        return self.tracker.align(view, T_WORLD_MODEL[None], seeds, limits)
+        thresholds = acceptance_thresholds(np.zeros(1, dtype=bool), np.zeros(1, dtype=np.int32))
+        hypotheses = tracking_hypotheses(np.eye(4))[None]
+        return self.tracker.align(view, T_WORLD_MODEL[None], hypotheses, thresholds)
 
 
 @pytest.fixture(scope="module")
@@ -258,7 +256,7 @@ def pair() -> _Pair:
 def test_known_motions_are_recovered(pair, twist):
     truth = T_WORLD_MODEL @ se3_exp(twist)
     alignment = pair.align(pair.live(0, T_WORLD_MODEL), pair.live(1, truth))
-    assert REASONS[int(alignment.verdict[0])] == ""
+    assert alignment.tracked.all()
     estimate = alignment.T_world_live[0]
     assert np.linalg.norm(estimate[:3, 3] - truth[:3, 3]) < 0.006
     assert relative_angle(estimate[:3, :3], truth[:3, :3]) < np.radians(0.3)
@@ -269,7 +267,7 @@ def test_a_frame_without_depth_has_too_few_points(pair):
     model = pair.live(0, T_WORLD_MODEL)
     black = np.zeros((1, *pair.camera.shape, 3), dtype=np.uint8)
     live = pair.preprocessors[1](black, np.zeros((1, *pair.camera.shape), dtype=np.float32))
-    assert pair.align(model, live).verdict[0] == FEW_POINTS
+    assert pair.align(model, live).status[0] == TrackingStatus.FEW_POINTS
 
 
 def test_foreign_colours_do_not_fit(pair):
@@ -277,4 +275,4 @@ def test_foreign_colours_do_not_fit(pair):
     frame = pair.sensor.capture(T_WORLD_MODEL, 1)
     noise = np.random.default_rng(0).integers(0, 256, (1, *pair.camera.shape, 3), dtype=np.uint8)
     live = pair.preprocessors[1](noise, frame.depth[None])
-    assert pair.align(model, live).verdict[0] == APPEARANCE
+    assert pair.align(model, live).status[0] == TrackingStatus.PHOTOMETRIC_MISMATCH

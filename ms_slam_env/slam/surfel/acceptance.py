@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,13 @@ from numpy.typing import NDArray
 
 from ms_slam_env._warp import wp
 from ms_slam_env.geometry import invert
+from ms_slam_env.slam.alignment_check import (
+    AcceptanceThresholds,
+    DeviceStatistics,
+    DeviceThresholds,
+    TrackingStatus,
+    evaluate_on_device,
+)
 from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.surfel.degeneracy import (
     eigen,
@@ -30,64 +36,6 @@ from ms_slam_env.slam.surfel.solver import (
     se3_exp,
     se3_log,
 )
-
-
-class TrackingStatus(IntEnum):
-    """Whether a frame was tracked, or else what was wrong; ``REASONS`` has the words."""
-
-    OK = 0
-    FEW_POINTS = 1
-    LITTLE_OVERLAP = 2
-    UNCONSTRAINED = 3
-    GEOMETRY = 4
-    APPEARANCE = 5
-    IMPLAUSIBLE = 6
-    INVALID_FRAME = 100
-
-
-REASONS = {
-    TrackingStatus.OK: "",
-    TrackingStatus.FEW_POINTS: "too few points of the map or of the frame to align",
-    TrackingStatus.LITTLE_OVERLAP: "the frame hardly overlaps the map's view",
-    TrackingStatus.UNCONSTRAINED: "the view does not constrain the pose",
-    TrackingStatus.GEOMETRY: "the frame's depth does not fit the map",
-    TrackingStatus.APPEARANCE: "the frame's intensity does not fit the map",
-    TrackingStatus.IMPLAUSIBLE: "the motion is implausibly large",
-    TrackingStatus.INVALID_FRAME: "the image is black or blank",
-}
-
-
-class Stat(IntEnum):
-    """Places of the figures behind a status."""
-
-    INLIER_RATIO = 0
-    RESIDUAL_M = 1
-    OVERLAP = 2
-    PHOTOMETRIC_INLIER_RATIO = 3
-    DEPTH_CONFLICT_RATIO = 4
-    SIGMA = 5  # standard deviation of the worst translation or rotation component
-    COST = 6  # mean truncated cost of the visible points, in [0, 3]
-    TERM_CONFLICT = 7  # chi squared between the poses that the two terms ask for
-    DEGENERATE = 8  # number of directions that are not constrained
-
-
-NUM_STATS = len(Stat)
-
-
-@wp.struct
-class AcceptanceThresholds:
-    """What a tracked frame must satisfy."""
-
-    points: wp.float64  # least number of matched points
-    overlap: wp.float64
-    inliers: wp.float64  # least ratio
-    photometric_inliers: wp.float64  # least ratio
-    depth_conflicts: wp.float64  # largest ratio
-    cost: wp.float64
-    sigma: wp.float64  # metres, in the worst of the constrained directions
-    degenerate: wp.int32  # most directions that may be unconstrained
-    motion_m: wp.float64
-    motion_cos: wp.float64
 
 
 @wp.func
@@ -156,15 +104,15 @@ def _without_open_directions(
 
 
 @wp.kernel
-def evaluate_alignment(
+def assess_alignment(
     sums: wp.array3d(dtype=wp.float64),
     T_model_live: wp.array2d(dtype=wp.mat44d),  # in, and out where it is degenerate
     predicted: wp.array(dtype=wp.mat44d),  # (B,) T_model_live
-    thresholds: wp.array(dtype=AcceptanceThresholds),  # (B,)
+    thresholds: wp.array(dtype=DeviceThresholds),  # (B,)
     T_world_model: wp.array(dtype=wp.mat44d),  # in: pose of the model view
     T_world_live: wp.array(dtype=wp.mat44d),  # out
-    statuses: wp.array(dtype=wp.int32),
-    stats: wp.array2d(dtype=wp.float64),
+    status: wp.array(dtype=wp.int32),
+    statistics: wp.array(dtype=DeviceStatistics),
     covariance: wp.array(dtype=mat66d),  # (B,) of the twist xi, T_world_live exp(xi)
 ):
     """Compare what the alignment explained with the thresholds; write status, figures and pose.
@@ -172,63 +120,40 @@ def evaluate_alignment(
     Along directions that the view leaves open the pose is the predicted one.
     """
     b = wp.tid()
-    threshold = thresholds[b]
     one = wp.float64(1.0)
     matched = sums[b, 0, Sum.MATCHED]
     tilted = sums[b, 0, Sum.TILTED]
-    inlier_ratio = _ratio(sums, b, Sum.INLIERS, Sum.MATCHED)
-    photometric_inlier_ratio = one
+    found = DeviceStatistics()
+    found.matches = matched
+    found.overlap = _ratio(sums, b, Sum.VISIBLE, Sum.POINTS)
+    found.inlier_ratio = _ratio(sums, b, Sum.INLIERS, Sum.MATCHED)
+    found.depth_conflict_ratio = _ratio(sums, b, Sum.DEPTH_CONFLICTS, Sum.MATCHED)
+    found.photometric_inlier_ratio = one
     if sums[b, 0, Sum.TEXTURED] > wp.float64(50.0):
-        photometric_inlier_ratio = _ratio(sums, b, Sum.PHOTOMETRIC_INLIERS, Sum.TEXTURED)
-    depth_conflict_ratio = _ratio(sums, b, Sum.DEPTH_CONFLICTS, Sum.MATCHED)
-    overlap = _ratio(sums, b, Sum.VISIBLE, Sum.POINTS)
-    cost = _ratio(sums, b, Sum.COST, Sum.VISIBLE)
+        found.photometric_inlier_ratio = _ratio(sums, b, Sum.PHOTOMETRIC_INLIERS, Sum.TEXTURED)
+    found.residual_m = wp.sqrt(_ratio(sums, b, Sum.SQUARED_M2, Sum.INLIERS))
+    found.cost = _ratio(sums, b, Sum.COST, Sum.VISIBLE)
 
     A, B, g_a, g_b, length = load_terms(sums, b, 0)
     E = eigen(A + B)
-    sigma = wp.float64(0.0)
-    degenerate = wp.int32(0)
     for k in range(6):
         if is_constrained(E, k, A, tilted, matched):
-            sigma = wp.max(sigma, one / wp.sqrt(E[6, k]))
+            found.sigma_m = wp.max(found.sigma_m, one / wp.sqrt(E[6, k]))
         else:
-            degenerate += 1
+            found.degenerate_directions += one
+    found.term_conflict = _conflict(A, B, g_a, g_b)
     covariance[b] = pose_covariance(E, A, B, tilted, matched, length)
 
     T = T_model_live[b, 0]
-    if degenerate > 0:
+    if found.degenerate_directions > wp.float64(0.0):
         T = _without_open_directions(T, predicted[b], E, A, tilted, matched, length)
         T_model_live[b, 0] = T
-    distance = wp.sqrt(T[0, 3] * T[0, 3] + T[1, 3] * T[1, 3] + T[2, 3] * T[2, 3])
-    cosine = wp.float64(0.5) * (T[0, 0] + T[1, 1] + T[2, 2] - one)
+    found.motion_m = wp.sqrt(T[0, 3] * T[0, 3] + T[1, 3] * T[1, 3] + T[2, 3] * T[2, 3])
+    found.rotation_cos = wp.float64(0.5) * (T[0, 0] + T[1, 1] + T[2, 2] - one)
 
-    status = int(TrackingStatus.OK)
-    if matched < threshold.points:
-        status = int(TrackingStatus.FEW_POINTS)
-    elif overlap < threshold.overlap:
-        status = int(TrackingStatus.LITTLE_OVERLAP)
-    elif sigma > threshold.sigma or degenerate > threshold.degenerate:
-        status = int(TrackingStatus.UNCONSTRAINED)
-    elif inlier_ratio < threshold.inliers or depth_conflict_ratio > threshold.depth_conflicts:
-        status = int(TrackingStatus.GEOMETRY)
-    elif photometric_inlier_ratio < threshold.photometric_inliers or cost > threshold.cost:
-        status = int(TrackingStatus.APPEARANCE)
-    elif distance > threshold.motion_m or cosine < threshold.motion_cos:
-        status = int(TrackingStatus.IMPLAUSIBLE)
-    statuses[b] = status
+    status[b] = evaluate_on_device(found, thresholds[b])
     T_world_live[b] = orthonormalise(T_world_model[b] * T)
-    stats[b, Stat.INLIER_RATIO] = inlier_ratio
-    stats[b, Stat.RESIDUAL_M] = wp.sqrt(_ratio(sums, b, Sum.SQUARED_M2, Sum.INLIERS))
-    stats[b, Stat.OVERLAP] = overlap
-    stats[b, Stat.PHOTOMETRIC_INLIER_RATIO] = photometric_inlier_ratio
-    stats[b, Stat.DEPTH_CONFLICT_RATIO] = depth_conflict_ratio
-    stats[b, Stat.SIGMA] = sigma
-    stats[b, Stat.COST] = cost
-    stats[b, Stat.TERM_CONFLICT] = _conflict(A, B, g_a, g_b)
-    stats[b, Stat.DEGENERATE] = wp.float64(degenerate)
-
-
-_THRESHOLDS_DTYPE = AcceptanceThresholds.numpy_dtype()  # type: ignore[attr-defined]
+    statistics[b] = found
 
 
 def acceptance_thresholds(strict: NDArray[np.bool_], lost: NDArray[np.int32]) -> NDArray[Any]:
@@ -243,26 +168,24 @@ def acceptance_thresholds(strict: NDArray[np.bool_], lost: NDArray[np.int32]) ->
     frames of five scenes, hand-held with 4 cm and 2 degrees a frame, whose colour was not
     registered with depth, half of them with exposure jumps, rolling shutter and holes besides.
     """
-    thresholds = np.zeros(len(strict), dtype=_THRESHOLDS_DTYPE)
-    thresholds["points"] = 100.0
+    thresholds = AcceptanceThresholds(matches=100.0, sigma_m=0.04).repeated(len(strict))
     thresholds["overlap"] = np.where(strict, 0.4, 0.3)
-    thresholds["inliers"] = np.where(strict, 0.7, 0.65)
-    thresholds["photometric_inliers"] = np.where(strict, 0.75, 0.7)
-    thresholds["depth_conflicts"] = np.where(strict, 0.12, 0.15)
+    thresholds["inlier_ratio"] = np.where(strict, 0.7, 0.65)
+    thresholds["photometric_inlier_ratio"] = np.where(strict, 0.75, 0.7)
+    thresholds["depth_conflict_ratio"] = np.where(strict, 0.12, 0.15)
     thresholds["cost"] = np.where(strict, 1.3, 1.4)
-    thresholds["sigma"] = 0.04
-    thresholds["degenerate"] = np.where(strict, 0, 5)
+    thresholds["degenerate_directions"] = np.where(strict, 0, 5)
     thresholds["motion_m"] = np.minimum(1.0, 0.3 + 0.1 * lost)
-    thresholds["motion_cos"] = np.cos(np.radians(np.minimum(60.0, 30.0 + 10.0 * lost)))
+    thresholds["rotation_cos"] = np.cos(np.radians(np.minimum(60.0, 30.0 + 10.0 * lost)))
     return thresholds
 
 
 def geometric_thresholds(lost: NDArray[np.int32]) -> NDArray[Any]:
     """Thresholds (B,) of an alignment by geometry alone near the expected pose."""
     thresholds = acceptance_thresholds(np.ones(len(lost), dtype=bool), lost)
-    thresholds["photometric_inliers"], thresholds["cost"] = 0.0, np.inf
-    thresholds["degenerate"] = 3
-    thresholds["motion_m"], thresholds["motion_cos"] = 0.15, np.cos(np.radians(10.0))
+    thresholds["photometric_inlier_ratio"], thresholds["cost"] = 0.0, np.inf
+    thresholds["degenerate_directions"] = 3
+    thresholds["motion_m"], thresholds["rotation_cos"] = 0.15, np.cos(np.radians(10.0))
     return thresholds
 
 
@@ -274,7 +197,7 @@ class Alignment:
         T_world_live: (B, 4, 4) pose after alignment, good or not.
         T_model_live: (B, 4, 4) the same, relative to the pose of the model view.
         status: (B,) ``TrackingStatus``.
-        stats: (B, NUM_STATS) figures behind the status.
+        statistics: (B,) figures behind the status, ``AlignmentStatistics`` each.
         photometry: (B,) how the live grey values relate to the model's, ``Photometry`` each.
         covariance: (B, 6, 6) of the twist (rho, phi), metres and radians, with the true pose
             T_world_live exp(twist).
@@ -283,7 +206,7 @@ class Alignment:
     T_world_live: Float64
     T_model_live: Float64
     status: NDArray[np.int32]
-    stats: Float64
+    statistics: NDArray[Any]
     photometry: NDArray[Any]
     covariance: Float64
 
@@ -306,7 +229,7 @@ class Alignment:
             T_world_live=np.where(where[:, None, None], other.T_world_live, self.T_world_live),
             T_model_live=np.where(where[:, None, None], other.T_model_live, self.T_model_live),
             status=np.where(where, other.status, self.status),
-            stats=np.where(where[:, None], other.stats, self.stats),
+            statistics=np.where(where, other.statistics, self.statistics),
             photometry=np.where(where, other.photometry, self.photometry),
             covariance=np.where(where[:, None, None], other.covariance, self.covariance),
         )
@@ -314,8 +237,8 @@ class Alignment:
 
 def accept_any_fit(alignment: Alignment) -> Alignment:
     """The same with a good status wherever there was something to align at all."""
-    is_invalid = alignment.status == TrackingStatus.INVALID_FRAME
-    usable = (alignment.status != TrackingStatus.FEW_POINTS) & ~is_invalid
+    is_blank = alignment.status == TrackingStatus.BLANK
+    usable = (alignment.status != TrackingStatus.FEW_POINTS) & ~is_blank
     usable &= np.isfinite(alignment.T_world_live).all(axis=(1, 2))
-    unusable = np.where(is_invalid, TrackingStatus.INVALID_FRAME, TrackingStatus.FEW_POINTS)
+    unusable = np.where(is_blank, TrackingStatus.BLANK, TrackingStatus.FEW_POINTS)
     return replace(alignment, status=np.where(usable, TrackingStatus.OK, unusable).astype(np.int32))

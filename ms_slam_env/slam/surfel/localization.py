@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env._warp import wp
+from ms_slam_env.slam.alignment_check import TrackingStatus
 from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.surfel.acceptance import (
     Alignment,
-    Stat,
-    TrackingStatus,
     accept_any_fit,
     acceptance_thresholds,
     geometric_thresholds,
@@ -84,13 +83,13 @@ class CameraStates:
         # Across a gap the motion is not one frame's.
         motion = np.eye(4) if self.lost[env] else alignment.T_model_live[env]
         # What a degenerate view leaves open was predicted itself: let it die away.
-        is_degenerate = alignment.stats[env, Stat.DEGENERATE] > 0
+        is_degenerate = alignment.statistics[env]["degenerate_directions"] > 0
         self.motions[env] = damped(motion) if is_degenerate else motion
         self.lost[env] = 0
         self.photometry[env] = next_photometry(
             self.photometry[env],
             alignment.photometry[env],
-            float(alignment.stats[env, Stat.TERM_CONFLICT]),
+            float(alignment.statistics[env]["term_conflict"]),
             least_scale,
         )
 
@@ -175,7 +174,7 @@ class Localizer:
         thresholds = acceptance_thresholds(lost, states.lost)
         alignment = self._align(states.poses, hypotheses, thresholds, states.photometry, guesses)
         invalid = self.invalid_frames.find(frames.color, states.started)
-        alignment = alignment.with_status(invalid, TrackingStatus.INVALID_FRAME)
+        alignment = alignment.with_status(invalid, TrackingStatus.BLANK)
         return self._without_color(hypotheses, alignment)
 
     def _without_color(self, hypotheses: Float64, alignment: Alignment) -> Alignment:
@@ -185,7 +184,7 @@ class Localizer:
         depth. Geometry must then constrain the pose without help, near to where it is expected.
         """
         states = self._states
-        failed = self._failed(alignment) & (alignment.status == TrackingStatus.APPEARANCE)
+        failed = self._failed(alignment) & (alignment.status == TrackingStatus.PHOTOMETRIC_MISMATCH)
         if not failed.any():
             return alignment
         near = np.repeat(hypotheses[:, :1], NUM_HYPOTHESES, axis=1)
@@ -227,7 +226,7 @@ class Localizer:
         lost = self._states.lost > 0
         again = lost & alignment.tracked
         verified = self._relocalization.verify(frames, alignment.T_world_live, again, self)
-        alignment = alignment.with_status(again & ~verified, TrackingStatus.APPEARANCE)
+        alignment = alignment.with_status(again & ~verified, TrackingStatus.PHOTOMETRIC_MISMATCH)
         found = self._relocalization.relocalize(frames, lost & self._failed(alignment), self)
         if found is None:
             return alignment
@@ -249,5 +248,5 @@ class Localizer:
         return acceptance_thresholds(self._strict, self._states.lost)
 
     def _failed(self, alignment: Alignment) -> NDArray[np.bool_]:
-        is_invalid = alignment.status == TrackingStatus.INVALID_FRAME
-        return self._states.started & ~alignment.tracked & ~is_invalid
+        is_blank = alignment.status == TrackingStatus.BLANK
+        return self._states.started & ~alignment.tracked & ~is_blank

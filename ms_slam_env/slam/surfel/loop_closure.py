@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from ms_slam_env._warp import wp
 from ms_slam_env.geometry import invert, relative_angle
 from ms_slam_env.slam.ferns import Candidate
-from ms_slam_env.slam.surfel.acceptance import Alignment, Stat, acceptance_thresholds
+from ms_slam_env.slam.surfel.acceptance import Alignment, acceptance_thresholds
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer
 from ms_slam_env.slam.surfel.map_deformation import MapDeformer
@@ -176,7 +176,7 @@ class Placement:
 
 
 def _placement(found: Bool, alignment: Alignment) -> Placement:
-    return Placement(found, alignment.T_world_live, alignment.stats[:, Stat.SIGMA])
+    return Placement(found, alignment.T_world_live, alignment.statistics["sigma_m"])
 
 
 def _nowhere(batch: int) -> Placement:
@@ -256,10 +256,10 @@ class InactiveRegistration:
 
     def _limits(self, motion_m: float) -> NDArray[Any]:
         limits = acceptance_thresholds(np.ones(self.batch, bool), np.zeros(self.batch, np.int32))
-        limits["sigma"] = self.config.sigma
-        limits["inliers"] = self.config.inliers
+        limits["sigma_m"] = self.config.sigma
+        limits["inlier_ratio"] = self.config.inliers
         limits["motion_m"] = motion_m
-        limits["motion_cos"] = np.cos(np.radians(self.config.largest_deg))
+        limits["rotation_cos"] = np.cos(np.radians(self.config.largest_deg))
         return limits
 
 

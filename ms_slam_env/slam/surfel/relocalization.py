@@ -10,11 +10,14 @@ from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import relative_angle
+from ms_slam_env.slam.alignment_check import (
+    is_photometrically_consistent,
+    measure_photometric_consistency,
+)
 from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.ferns import Candidate, FernConfig, FernDatabase
-from ms_slam_env.slam.surfel.acceptance import Alignment, Stat, acceptance_thresholds
+from ms_slam_env.slam.surfel.acceptance import Alignment, acceptance_thresholds
 from ms_slam_env.slam.surfel.config import SurfelConfig
-from ms_slam_env.slam.surfel.photometric_consistency import LikenessLimits, measure_likeness
 from ms_slam_env.slam.surfel.pose_hypotheses import (
     AT_REST,
     KEYFRAME_HYPOTHESES,
@@ -49,7 +52,7 @@ class FrameAligner(Protocol):
         """Align with the maps as seen from ``origins`` (B, 4, 4).
 
         ``hypotheses`` (B, K, 4, 4) are relative to those; ``thresholds`` (B,) are
-        ``AcceptanceThresholds``.
+        ``DeviceThresholds``.
         """
 
     def render(self, poses: Float64) -> ModelView:
@@ -118,9 +121,9 @@ def _lax_thresholds() -> NDArray[Any]:
     with it leaves much unexplained.
     """
     thresholds = acceptance_thresholds(np.ones(1, dtype=bool), np.full(1, 7, dtype=np.int32))
-    lax = {"overlap": 0.3, "inliers": 0.35, "photometric_inliers": 0.35, "depth_conflicts": 0.6}
-    for name, value in {**lax, "cost": HOPELESS_COST}.items():
-        thresholds[name] = value
+    thresholds["overlap"], thresholds["cost"] = 0.3, HOPELESS_COST
+    thresholds["inlier_ratio"] = thresholds["photometric_inlier_ratio"] = 0.35
+    thresholds["depth_conflict_ratio"] = 0.6
     return thresholds
 
 
@@ -131,15 +134,14 @@ class FernRelocalization(Relocalization):
     """Searches from the keyframes that resemble the lost frame (Glocker et al., TVCG 2015).
 
     The best of a few alignments is refined, and believed if the map's view from there is like the
-    frame (``photometric_consistency``) and the next frame is found close by. Only then is anything
-    fused.
+    frame (``is_photometrically_consistent``) and the next frame is found close by. Only then is
+    anything fused.
     """
 
     def __init__(self, batch: int, intrinsics: Intrinsics, depth_cutoff_m: float) -> None:
         """Start without keyframes."""
         config = FernConfig(far_m=max(depth_cutoff_m, 2 * FernConfig.near_m))
         self.databases = [FernDatabase(intrinsics, config) for _ in range(batch)]
-        self.limits = LikenessLimits()
         self._cutoff_m = depth_cutoff_m
         self._tentative: Float64 = np.full((batch, 4, 4), np.nan)  # to be confirmed; NaN: none
         self._attempts = np.zeros(batch, dtype=np.int32)  # since tracking was lost
@@ -163,10 +165,10 @@ class FernRelocalization(Relocalization):
         intensity, depth = view.intensity.numpy(), view.vertices.numpy()[..., 2]
         believed = found.copy()
         for env in np.flatnonzero(found):
-            likeness = measure_likeness(
+            found_there = measure_photometric_consistency(
                 frames.color[env], frames.depth[env], intensity[env], depth[env], self._cutoff_m
             )
-            believed[env] = self.limits.accept(likeness)
+            believed[env] = is_photometrically_consistent(found_there)
         return believed
 
     def relocalize(
@@ -199,9 +201,9 @@ class FernRelocalization(Relocalization):
             if not wanted.any():
                 break
             found = _align(aligner, starts, hypotheses, _LAX)
-            better = wanted & found.tracked & (found.stats[:, Stat.COST] < cost)
+            better = wanted & found.tracked & (found.statistics["cost"] < cost)
             best[better] = found.T_world_live[better]
-            cost[better] = found.stats[better, Stat.COST]
+            cost[better] = found.statistics["cost"][better]
         return best
 
     def _refine(self, frames: Images, poses: Float64, aligner: FrameAligner) -> None:

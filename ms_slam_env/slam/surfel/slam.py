@@ -19,9 +19,10 @@ from numpy.typing import ArrayLike, NDArray
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import check_pose, invert
+from ms_slam_env.slam.alignment_check import MAP_REASONS, TrackingStatus
 from ms_slam_env.slam.base import Float64, TrackResult
 from ms_slam_env.slam.ferns import Candidate
-from ms_slam_env.slam.surfel.acceptance import REASONS, Alignment, Stat, TrackingStatus
+from ms_slam_env.slam.surfel.acceptance import Alignment
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer
 from ms_slam_env.slam.surfel.localization import CameraStates, Localizer
@@ -167,10 +168,10 @@ class BatchedSurfelSlam:
             T_world_camera=states.poses[env].copy(),
             tracking_ok=tracked,
             relocalised=relocalised,
-            inlier_fraction=float(alignment.stats[env, Stat.INLIER_RATIO]),
-            residual_m=float(alignment.stats[env, Stat.RESIDUAL_M]),
-            reason=REASONS[status],
-            degenerate_directions=int(alignment.stats[env, Stat.DEGENERATE]),
+            inlier_fraction=float(alignment.statistics[env]["inlier_ratio"]),
+            residual_m=float(alignment.statistics[env]["residual_m"]),
+            reason=MAP_REASONS[status],
+            degenerate_directions=int(alignment.statistics[env]["degenerate_directions"]),
             covariance=alignment.covariance[env] if tracked else None,
         )
 

@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert
+from ms_slam_env.slam.alignment_check import DeviceStatistics, DeviceThresholds
 from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.surfel.acceptance import (
-    NUM_STATS,
-    AcceptanceThresholds,
     Alignment,
-    evaluate_alignment,
+    assess_alignment,
 )
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.degeneracy import mat66d
@@ -126,12 +125,12 @@ class Tracker:
         self._launches = KernelLaunchCache(device)
         self._seen: tuple[LiveFrame | None, ModelView | None] = (None, None)
         self.good_score = GOOD_SCORE
-        self._thresholds = HostDeviceBuffer(batch, AcceptanceThresholds, device)
+        self._thresholds = HostDeviceBuffer(batch, DeviceThresholds, device)
         self._T_world_model = HostDeviceBuffer(batch, wp.mat44d, device)
         self._predicted = HostDeviceBuffer(batch, wp.mat44d, device)
         self._T_world_live = HostDeviceBuffer(batch, wp.mat44d, device)
         self._status = HostDeviceBuffer(batch, wp.int32, device)
-        self._stats = HostDeviceBuffer((batch, NUM_STATS), wp.float64, device)
+        self._statistics = HostDeviceBuffer(batch, DeviceStatistics, device)
         self._covariance = HostDeviceBuffer(batch, mat66d, device)
         self._live_levels: list[Level] = []
         self._model_levels: list[Level] = []
@@ -167,7 +166,7 @@ class Tracker:
             model: rendered at ``T_world_model``.
             T_world_model: (B, 4, 4).
             hypotheses: (B, K, 4, 4) starting poses T_model_live.
-            thresholds: (B,) structured array of ``AcceptanceThresholds``.
+            thresholds: (B,) structured array of ``DeviceThresholds``.
             guesses: (B, 4, 4) one more starting pose T_world_live, NaN for an env without; None
                 if no env has one.
             photometry: (B,) ``Photometry`` to start from; exposed like the model if None.
@@ -188,7 +187,7 @@ class Tracker:
             T_world_live=self._T_world_live.read(),
             T_model_live=self._one.poses.read()[:, 0],
             status=self._status.read(),
-            stats=self._stats.read(),
+            statistics=self._statistics.read(),
             photometry=self._one.photometries.read()[:, 0],
             covariance=self._covariance.read(),
         )
@@ -261,10 +260,10 @@ class Tracker:
 
     def _evaluate(self) -> None:
         one, given = self._one, (self._predicted, self._thresholds, self._T_world_model)
-        found = (self._T_world_live, self._status, self._stats, self._covariance)
+        found = (self._T_world_live, self._status, self._statistics, self._covariance)
         arrays = [buffer.array for buffer in (*given, *found)]
         self._launches.launch(
-            "evaluate", evaluate_alignment, lambda: (self.batch, [one.sums, one.pose, *arrays])
+            "assess", assess_alignment, lambda: (self.batch, [one.sums, one.pose, *arrays])
         )
 
     def _iterate(self, level: int, stride: int, state: _Hypotheses, count: int) -> None:

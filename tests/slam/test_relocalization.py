@@ -12,8 +12,11 @@ from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at, make_pose, relative_angle, so3_exp
 from ms_slam_env.sensor import RGBDSensor
+from ms_slam_env.slam.alignment_check import (
+    is_photometrically_consistent,
+    measure_photometric_consistency,
+)
 from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
-from ms_slam_env.slam.surfel.photometric_consistency import LikenessLimits, measure_likeness
 from ms_slam_env.slam.surfel.relocalization import FernRelocalization, Images
 
 CAMERA = xtion("160x120")
@@ -148,7 +151,7 @@ def test_keyframes_follow_a_bent_map():
         pose = make_pose(np.eye(3), [time, 0.0, 0.0])
         ferns.add_keyframes(frames, pose[None], np.array([time]), np.array([True]))
     bent = np.stack([make_pose(so3_exp([0, 0, 0.1]), [10.0 * time, 1.0, 0.0]) for time in (5, 9)])
-    ferns.move(0, np.array([5, 9], dtype=np.int32), bent)
+    ferns.move_keyframes(0, np.array([5, 9], dtype=np.int32), bent)
     poses = ferns.databases[0].poses
     assert poses[0, 0, 3] == 3  # of a frame that the closure does not know
     np.testing.assert_array_equal(poses[1:], bent)
@@ -192,54 +195,58 @@ def _view(T_world_camera: np.ndarray, checks: float = 40.0) -> tuple[np.ndarray,
     return color.astype(np.uint8), depth.astype(np.float32)
 
 
-def _likeness(frame, view):
+def _consistency(frame, view):
     grey = view[0].astype(np.float32) @ np.float32([0.299, 0.587, 0.114])
-    return measure_likeness(*frame, grey, view[1], cutoff_m=10.0)
+    return measure_photometric_consistency(*frame, grey, view[1], cutoff_m=10.0)
 
 
-def test_a_frame_is_like_the_view_from_its_pose_only():
-    limits, frame = LikenessLimits(), _view(np.eye(4))
-    same = _likeness(frame, _view(np.eye(4)))
-    assert same.overlap == same.inliers == 1
+def test_a_frame_is_consistent_with_the_view_from_its_pose_only():
+    frame = _view(np.eye(4))
+    same = _consistency(frame, _view(np.eye(4)))
+    assert same.overlap == same.inlier_ratio == 1
     assert same.correlation == pytest.approx(1, abs=1e-3)
-    assert limits.accept(same)
+    assert is_photometrically_consistent(same)
     # Along the wall: depth is the same there, the texture is not.
     tangent = np.cross([0.3, -0.2, -1.0], [0.0, 1.0, 0.0])
     along = make_pose(np.eye(3), 0.3 * tangent / np.linalg.norm(tangent))
-    shifted = _likeness(frame, _view(along))
-    assert shifted.inliers == 1
+    shifted = _consistency(frame, _view(along))
+    assert shifted.inlier_ratio == 1
     assert shifted.correlation < 0.3
-    assert not limits.accept(shifted)
-    ahead = _likeness(frame, _view(make_pose(np.eye(3), [0.0, 0.0, 0.3])))
-    assert ahead.inliers < 0.05
-    assert not limits.accept(ahead)
+    assert not is_photometrically_consistent(shifted)
+    ahead = _consistency(frame, _view(make_pose(np.eye(3), [0.0, 0.0, 0.3])))
+    assert ahead.inlier_ratio < 0.05
+    assert not is_photometrically_consistent(ahead)
 
 
-def test_likeness_asks_neither_for_exposure_nor_for_texture():
+def test_consistency_asks_neither_for_exposure_nor_for_texture():
     color, depth = _view(np.eye(4))
     dark = (0.5 * color + 10).astype(np.uint8)
-    assert _likeness((dark, depth), (color, depth)).correlation > 0.98
+    assert _consistency((dark, depth), (color, depth)).correlation > 0.98
     plain = np.full_like(color, 90)
-    wall = _likeness((plain, depth), (plain, depth))
+    wall = _consistency((plain, depth), (plain, depth))
     assert wall.texture < 1
     assert wall.relief_m < 1e-3
-    assert not LikenessLimits().accept(wall)  # any other wall looks the same
+    assert not is_photometrically_consistent(wall)  # any other wall looks the same
     relief, _, _ = ray_cast(np.eye(4), VIEW)
     box = relief.astype(np.float32)
-    found = _likeness((plain, box), (plain, box))
+    found = _consistency((plain, box), (plain, box))
     assert found.relief_m > 0.1
-    assert LikenessLimits().accept(found)
-    assert not LikenessLimits().accept(_likeness((plain, box * np.float32(1.1)), (plain, box)))
-    assert not LikenessLimits().accept(_likeness((color, box), (plain, box)))  # the wrong texture
+    assert is_photometrically_consistent(found)
+    assert not is_photometrically_consistent(
+        _consistency((plain, box * np.float32(1.1)), (plain, box))
+    )
+    assert not is_photometrically_consistent(
+        _consistency((color, box), (plain, box))
+    )  # the wrong texture
 
 
-def test_what_does_not_overlap_is_not_alike():
+def test_what_does_not_overlap_is_not_consistent():
     color, depth = _view(np.eye(4))
     hidden = depth.copy()
     hidden[:, 20:] = 0
-    found = _likeness((color, depth), (color, hidden))
+    found = _consistency((color, depth), (color, hidden))
     assert found.overlap == pytest.approx(0.25, abs=0.01)
-    assert not LikenessLimits().accept(found)
-    nothing = _likeness((color, np.zeros_like(depth)), (color, depth))
+    assert not is_photometrically_consistent(found)
+    nothing = _consistency((color, np.zeros_like(depth)), (color, depth))
     assert nothing.overlap == 0
-    assert not LikenessLimits().accept(nothing)
+    assert not is_photometrically_consistent(nothing)

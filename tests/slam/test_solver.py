@@ -13,8 +13,8 @@ from ms_slam_env.slam.surfel.normal_equations import (
     OFF,
     RESTING,
     RUNNING,
-    SUM_PHOTOMETRIC,
     Photometry,
+    Sum,
 )
 from ms_slam_env.slam.surfel.photometry import same_exposure
 from ms_slam_env.slam.surfel.solver import gauss_newton_step, reduce_sums
@@ -25,7 +25,7 @@ def _sums(H: np.ndarray, g: np.ndarray) -> np.ndarray:
     system = np.concatenate([H[np.triu_indices(6)], g])
     sums = np.zeros(NUM_SUMS)
     sums[:27] = 0.25 * system
-    sums[SUM_PHOTOMETRIC : SUM_PHOTOMETRIC + 27] = 0.75 * system
+    sums[Sum.PHOTOMETRIC_HESSIAN : Sum.PHOTOMETRIC_HESSIAN + 27] = 0.75 * system
     return sums
 
 

@@ -53,8 +53,8 @@ def set_surfels(surfels: list[dict[str, np.ndarray]]) -> None:
 
 def visible(poses: np.ndarray, first_env: int, margin_px: float) -> list[dict[str, np.ndarray]]:
     """What is listed for each pose."""
-    MAPS.passes._model_renderer.cull(device_poses(poses), first_env, margin_px)
-    listed = MAPS.passes._model_renderer.visible
+    MAPS.kernels._model_renderer.cull(device_poses(poses), first_env, margin_px)
+    listed = MAPS.kernels._model_renderer.visible
     names = ("index", "position", "normal", "radius")
     return [
         {name: getattr(listed, name).numpy()[k, :count].copy() for name in names}
@@ -96,7 +96,7 @@ def visible_by_definition(
     surfels: dict[str, np.ndarray], pose: np.ndarray, margin_px: float, window: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Slots in view, and those so close to a limit that rounding decides."""
-    renderer = MAPS.passes._model_renderer
+    renderer = MAPS.kernels._model_renderer
     camera, image = renderer.camera, renderer.intrinsics
     p = transform_points(invert(pose), surfels["position"].astype(float))
     facing = -np.sum(p * (surfels["normal"] @ pose[:3, :3]), axis=1)
