@@ -169,11 +169,11 @@ def decide(
     if len(agreeing) < config.least_share * len(hypotheses):
         return Merge(None, "the frames contradict each other", *counts)
     T_a_b, refined_m = mean_pose(agreeing, centre), 0.0
-    fit = evaluate_alignment(a, b, T_a_b, config)
+    fit = judge(a, b, T_a_b, config)
     refined = refine(a, b, T_a_b, config)
     moved_m, moved_deg = pose_difference(refined, T_a_b, centre)
     if moved_m < config.agree_m and moved_deg < config.agree_deg:
-        again = evaluate_alignment(a, b, refined, config)
+        again = judge(a, b, refined, config)
         if again.overlap >= fit.overlap - _SLACK and again.consistent >= fit.consistent - _SLACK:
             T_a_b, fit, refined_m = refined, again, moved_m
     if fit.overlap < config.least_overlap:
@@ -185,7 +185,7 @@ def decide(
     return Merge(T_a_b, "", *counts, fit, refined_m)
 
 
-def evaluate_alignment(a: RobotRun, b: RobotRun, T_a_b: Float64, config: MergeConfig) -> Fit:
+def judge(a: RobotRun, b: RobotRun, T_a_b: Float64, config: MergeConfig) -> Fit:
     """Lay both robots' frames upon the view that the other's map predicts there.
 
     A surface of the map behind the reading may be one that only the map's robot saw, and says
