@@ -156,7 +156,7 @@ def run(spec: RunSpec, pictures: Path | None = None) -> dict[str, Any]:
 
 def _outcome(world: ActiveSlamEnv, judged: JudgedMap) -> dict[str, Any]:
     consistency = judged.consistency
-    lost = ~world.tracked | (world.pose_errors > LOST_ERROR_M)
+    lost = ~world.episode.tracked | (world.episode.pose_errors > LOST_ERROR_M)
     shares = [item.apart_share for item in consistency.objects]
     return {
         "success": consistency.success,
@@ -169,7 +169,7 @@ def _outcome(world: ActiveSlamEnv, judged: JudgedMap) -> dict[str, Any]:
         "lost_frames_share": float(lost.mean()),
         "mapped_area_m2": world.coverage.mapped_area,
         "map_points": len(judged.points),
-        "frames": len(world.timestamps),
+        "frames": len(world.episode.timestamps),
     }
 
 
@@ -178,7 +178,7 @@ def _save_picture(world: ActiveSlamEnv, judged: JudgedMap, spec: RunSpec, folder
     name = spec.planner.replace("/", "_").replace(":", "_")
     save_map_picture(
         judged,
-        world.trajectory_estimate[:, :3, 3],
+        world.episode.trajectory_estimate[:, :3, 3],
         folder / f"{Path(spec.scene).stem}_{name}_{spec.seed}.png",
         f"{Path(spec.scene).stem}, {spec.planner}, seed {spec.seed}",
     )

@@ -128,7 +128,7 @@ def _drive(env: gym.Env[Any, Any], args: Arguments) -> dict[str, Any]:
         if step == args.warm_up:
             begin = time.perf_counter()
         action = rng.choice(np.flatnonzero(info["action_mask"]))
-        before = len(world.timestamps)
+        before = len(world.episode.timestamps)
         world.timings.clear()  # what happens between steps, such as a reset, is not counted
         processor, start = time.process_time(), time.perf_counter()
         _, _, terminated, truncated, info = env.step(action)
@@ -136,7 +136,7 @@ def _drive(env: gym.Env[Any, Any], args: Arguments) -> dict[str, Any]:
         if step >= args.warm_up:
             durations.append(now - start)
             busy += time.process_time() - processor
-            frames += len(world.timestamps) - before
+            frames += len(world.episode.timestamps) - before
             for name, seconds in world.timings.own.items():
                 split[name] = split.get(name, 0.0) + seconds
             if now - begin > args.seconds:

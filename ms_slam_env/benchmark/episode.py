@@ -175,9 +175,9 @@ def measure_trajectory(world: ActiveSlamEnv) -> dict[str, Any]:
     trajectory, ``M_I`` and ``M_D`` (equations 11 and 12), and ``lost``: SLAM reported lost tracking
     at some step, or was off by more than ``LOST_ERROR_M`` without noticing.
     """
-    truth, estimate = world.trajectory_truth, world.trajectory_estimate
+    truth, estimate = world.episode.trajectory_truth, world.episode.trajectory_estimate
     aligned = metrics.ate_statistics(estimate, truth)
-    maxima = world.divergences.max(axis=0)
+    maxima = world.episode.divergences.max(axis=0)
     return {
         "ate_m": aligned.rmse,
         "ate_max_m": aligned.max,
@@ -187,7 +187,7 @@ def measure_trajectory(world: ActiveSlamEnv) -> dict[str, Any]:
         "path_length_m": metrics.path_length(truth),
         "M_I": float(maxima[0]),
         "M_D": float(maxima[1]),
-        "lost": bool(world.pose_errors.max() > LOST_ERROR_M),
+        "lost": bool(world.episode.pose_errors.max() > LOST_ERROR_M),
     }
 
 
@@ -201,7 +201,7 @@ def measure_map(world: ActiveSlamEnv, spec: EpisodeSpec) -> dict[str, float]:
     Judged is the whole map. Surfels that SLAM calls stable were seen in some ten frames: counting
     only those would reward looking at one place for long.
     """
-    x, y, z = map(float, world.trajectory_truth[0][:3, 3])
+    x, y, z = map(float, world.episode.trajectory_truth[0][:3, 3])
     surface = true_surface(spec.scene, spec.seed)
     reference = reference_of(spec.scene, spec.seed, (x, y, z))
     area = {"mapped_area_m2": world.coverage.mapped_area}

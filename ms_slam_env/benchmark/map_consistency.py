@@ -54,9 +54,9 @@ def judge_episode(world: ActiveSlamEnv, rule: ConsistencyRule | None = None) -> 
 
     The frames are rendered again without noise from their true poses, with the objects' labels.
     """
-    frames = np.flatnonzero(world.tracked & world.processed)
+    frames = np.flatnonzero(world.episode.tracked & world.episode.processed)
     picked = frames[np.unique(np.linspace(0, len(frames) - 1, MOST_VIEWS).astype(int))]
-    truth, estimate = world.trajectory_truth, world.trajectory_estimate
+    truth, estimate = world.episode.trajectory_truth, world.episode.trajectory_estimate
     views = [labelled_view(world.sensor, truth[k], estimate[k]) for k in picked]
     return judge_map(
         world.slam.surface_points(), world.slam.surface_colors(), views, world.sensor, rule

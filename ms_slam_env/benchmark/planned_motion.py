@@ -48,10 +48,10 @@ def planned_motion(spec: EpisodeSpec) -> PlannedMotion:
         world = cast(ActiveSlamEnv, env.unwrapped)
         progress = play(env, make_planner(spec.planner, world, spec.seed), spec.seed)
         return PlannedMotion(
-            times_s=world.timestamps,
-            poses=world.trajectory_truth,
+            times_s=world.episode.timestamps,
+            poses=world.episode.trajectory_truth,
             steps=progress["steps"],
-            lost_frames=int((~world.tracked).sum()),
+            lost_frames=int((~world.episode.tracked).sum()),
         )
     finally:
         env.close()

@@ -5,28 +5,38 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import gymnasium
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
-from ms_slam_env.env.config import make_config
+from ms_slam_env import slam as slam_backends
+from ms_slam_env.camera import RGBDFrame, intensity_image, xtion
+from ms_slam_env.divergence import Histograms, make_divergence
+from ms_slam_env.env.actions import ActionDecoder, MotionActions, MotionAndConfigurationActions
+from ms_slam_env.env.camera_feed import make_camera_feed
+from ms_slam_env.env.config import check_same_settings, make_config
+from ms_slam_env.env.coverage import CoverageGrid
 from ms_slam_env.env.embodiments import EMBODIMENTS
+from ms_slam_env.env.episode import Episode
 from ms_slam_env.env.lookahead import Lookahead
-from ms_slam_env.env.mapping_robot import MappingRobot
-from ms_slam_env.env.observations import RobotKnowledge, make_observation
-from ms_slam_env.env.perturbed_frames import frames_with
-from ms_slam_env.env.rendering import Renderer
+from ms_slam_env.env.observations import CONFIGURATION, RobotKnowledge, make_observation
+from ms_slam_env.env.pose_sources import POSE_SOURCES
+from ms_slam_env.env.rendering import draw_moment
 from ms_slam_env.env.reward import Outcome, reward_terms
-from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.errors import InputError, UnreachableError, unknown
 from ms_slam_env.geometry import check_pose, invert
-from ms_slam_env.slam.base import Views
+from ms_slam_env.robot import MotionResult
+from ms_slam_env.sensor.scene_cache import get_scene, get_sensor
+from ms_slam_env.sequences.perturbations.base import Perturbation
+from ms_slam_env.slam.base import SlamBackend, TrackResult, Views
+from ms_slam_env.timings import Timings
 
 Float64 = NDArray[np.float64]
 
 _START_TRIES = 10  # a drawn start sees surface in most of its view: one try is nearly always enough
 
 
-class ActiveSlamEnv(MappingRobot):
+class ActiveSlamEnv(gymnasium.Env[Any, Any]):
     """A camera chooses its next motion while a dense RGB-D SLAM estimates where it is.
 
     Each step the camera makes one of 49 small motions (Saeedi et al., ICRA 2017, section V-D), a
@@ -39,14 +49,21 @@ class ActiveSlamEnv(MappingRobot):
     anticlockwise, yaw clockwise, along and about the axes of the current camera frame.
     ``MSActiveSLAM-FixedTranslation-v0``: ``Discrete(7)``, the rotation; the camera translates along
     a straight line by itself. A masked action does nothing.
+    ``MSActiveSLAM-Adaptive-v0``: ``MultiDiscrete([49, K])``, the motion and which of K SLAM
+    configurations, from fast to robust, its frames are processed under: run-time adaptation
+    (section V-B) as a decision of the agent. Its mask has 49 + K entries, the motions' first: the
+    form that sb3-contrib's MaskablePPO takes; every configuration is always possible.
 
     ## Observation space
     Option ``observation``: ``features`` (vector: state, grey histogram, coarse depth, action mask),
     ``lookahead`` (features and the predicted divergences of every action) or ``rgbd`` (images and
-    state). Only what the robot itself has; see :mod:`ms_slam_env.env.observations`.
+    state). Only what the robot itself has; see :mod:`ms_slam_env.env.observations`. Where the agent
+    chooses the SLAM configuration, also the one in force, one-hot (K,): at the end of the vector,
+    or as ``slam_configuration``.
 
     ## Reward
-    Weighted sum of the terms of :func:`ms_slam_env.env.reward.reward_terms`.
+    Weighted sum of the terms of :func:`ms_slam_env.env.reward.reward_terms`. The costs of SLAM
+    configurations are numbers (``adaptation.costs``) and not a clock's: two runs agree.
 
     ## Start
     A free pose of the scene, drawn from the seed; SLAM starts at the true pose with one frame.
@@ -61,7 +78,8 @@ class ActiveSlamEnv(MappingRobot):
     between the last frames of this step and the one before, nats; ``tracking_ok``;
     ``reward_terms``; ``action_mask`` (n,) bool; ``mapped_area`` m2; ``time`` simulated seconds;
     ``energy`` mechanical work of the motion so far, J; ``scene``, ``scene_seed``.
-    No clock: timings are in ``env.unwrapped.timings``.
+    No clock: timings are in ``env.unwrapped.timings``. Where the agent chooses it:
+    ``slam_configuration``, the index in force.
 
     ## Arguments
     The fields of :class:`ms_slam_env.env.EnvConfig`, by keyword; nested ones as dataclass or
@@ -73,10 +91,13 @@ class ActiveSlamEnv(MappingRobot):
     Args:
         embodiment: ``arm`` (with physics), ``arm-kinematic``, ``free`` or ``fixed-translation``.
         render_mode: None or ``rgb_array``.
+        agent_configures_slam: whether an action has a second part, the SLAM configuration;
+            ``adaptation`` is then ``agent``, by name or as a mapping with its options.
         **options: fields of ``EnvConfig``.
 
     Raises:
-        InputError: an unknown option or choice, or a value out of range.
+        InputError: an unknown option or choice, a value out of range, or another ``adaptation``
+            where the agent chooses the SLAM configuration.
     """
 
     metadata = {  # noqa: RUF012 -- Gymnasium declares it as an instance variable
@@ -85,7 +106,11 @@ class ActiveSlamEnv(MappingRobot):
     }
 
     def __init__(
-        self, embodiment: str = "free", render_mode: str | None = None, **options: Any
+        self,
+        embodiment: str = "free",
+        render_mode: str | None = None,
+        agent_configures_slam: bool = False,
+        **options: Any,
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise InputError(
@@ -94,15 +119,36 @@ class ActiveSlamEnv(MappingRobot):
             )
         if embodiment not in EMBODIMENTS:
             raise unknown("embodiment", embodiment, EMBODIMENTS)
-        self._options = {"embodiment": embodiment, "render_mode": render_mode, **options}
-        super().__init__(embodiment, make_config(options))
+        if agent_configures_slam:
+            options.setdefault("adaptation", "agent")
+        self._arguments = (embodiment, render_mode, agent_configures_slam, options)
         self.render_mode = render_mode
-        self._lookahead = Lookahead(self.config.lookahead, self.config.divergence, self.intrinsics)
-        num_actions = self._embodiment_type.num_actions
-        self.action_space = spaces.Discrete(num_actions)
-        self._observation = make_observation(self.config.observation, self.intrinsics, num_actions)
+        self.config = config = make_config(options)
+        self.intrinsics = xtion(config.image_size)
+        self._rays = self.intrinsics.rays()
+        self.timings = Timings()
+
+        backend = slam_backends.make(config.slam, self.intrinsics, **config.slam_config)
+        # A step's only frame is not to be dropped unless frame management is asked for.
+        adapted = config.adaptation.adapt(backend, drops_frames=False)
+        self.slam: SlamBackend = config.frame_management.manage(adapted)
+        self._embodiment_type = EMBODIMENTS[embodiment]
+        self._embodiment_type.check(config)
+        self.camera_feed = make_camera_feed(())
+        self._pose_source = POSE_SOURCES[config.pose]()
+        self._divergence = make_divergence(config.divergence, self.intrinsics)
+        self._lookahead = Lookahead(config.lookahead, config.divergence, self.intrinsics)
+
+        num_motions = self._embodiment_type.num_motions
+        self._actions: ActionDecoder = MotionActions(num_motions)
+        if agent_configures_slam:
+            self._actions = MotionAndConfigurationActions(num_motions, adapted, config.adaptation)
+        self._observation = make_observation(
+            config.observation, self.intrinsics, num_motions, self._actions.num_configurations
+        )
+        self.action_space = self._actions.space
         self.observation_space = self._observation.space
-        self._renderer = Renderer()
+        self._episode: Episode | None = None
 
     # -- Gymnasium ---------------------------------------------------------------------------
 
@@ -128,39 +174,28 @@ class ActiveSlamEnv(MappingRobot):
             )
         name, scene_seed = self.config.draw_scene(self.np_random)
         self._enter_scene(name, scene_seed)
-        given = options["T_world_camera"] if options else None
-        if given is not None:
-            start = check_pose(given, "reset option T_world_camera")
-            why = self._begin_episode(name, scene_seed, start)
+        start = options["T_world_camera"] if options else None
+        if start is None:
+            self._start_somewhere(name, scene_seed)
         else:
-            for _ in range(_START_TRIES):
-                drawn = self.scene.sample_start(self.np_random)
-                why = self._begin_episode(name, scene_seed, drawn)
-                if not why:
-                    break
-        if why:
-            self._episode = None
-            where = "reset option T_world_camera"
-            if given is None:
-                where = f"none of {_START_TRIES} drawn start poses can be used, the last"
-                if self.config.arm.base is not None:
-                    why += "; give one with reset(options={'T_world_camera': ...})"
-            raise InputError(f"{where}: {why}")
-        return self._build_observation(), self._info()
+            start = check_pose(start, "reset option T_world_camera")
+            why = self._start_at(start, name, scene_seed)
+            if why:
+                raise InputError(f"reset option T_world_camera: {why}")
+        return self._observe(), self._info()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Make one motion and track the frame that follows.
+        """Make one motion, track the frames that it brings, judge what came of it.
 
         Raises:
-            InputError: an action that is not an integer of the action space, or no reset before.
+            InputError: no action of the action space, or no reset before.
         """
-        chosen = self._check_action(action)
-        episode = self._current()
-        episode.action = chosen
+        episode = self.episode
+        episode.action = self._actions.decode(action)
         with self.timings.stage("move"):
-            movement = self.embodiment.move(chosen)
+            motion = self.embodiment.move(episode.action)
         error_before = episode.pose_error
-        new_surface = self._observe_world(movement)
+        new_surface = self._track_motion(motion)
         lost_for_good = episode.steps_lost >= self.config.lost_patience
         outcome = Outcome(
             divergence=episode.divergence,
@@ -168,28 +203,183 @@ class ActiveSlamEnv(MappingRobot):
             new_surface_m2=new_surface,
             tracking_ok=episode.tracking_ok,
             lost_for_good=lost_for_good,
-            blocked=not movement.made,
+            blocked=not motion.made,
+            configuration_cost=self._actions.configuration_cost,
         )
-        episode.reward_terms = self._reward_terms(outcome)
+        episode.reward_terms = reward_terms(outcome, self.config.reward, self.config.targets)
         reward = float(sum(episode.reward_terms.values()))
-        return self._build_observation(), reward, lost_for_good, False, self._info()
+        return self._observe(), reward, lost_for_good, False, self._info()
 
     def render(self) -> NDArray[np.uint8] | None:
         """One picture that explains the moment, (480, 1120, 3) uint8; None without render mode."""
         if self.render_mode is None:
             return None
-        return self._renderer.draw(self)
+        return draw_moment(
+            self.episode, self.config.targets, self.slam, self.embodiment, self.scene
+        )
+
+    # -- One motion --------------------------------------------------------------------------
+
+    def _track_motion(self, motion: MotionResult) -> float:
+        """Take and track the frames of a motion; return the newly mapped area, m2."""
+        episode = self.episode
+        last = episode.frames[-1]
+        times_s = last.time_s + motion.times_s
+        self.camera_feed.set_trajectory(
+            np.concatenate([[last.time_s], times_s]),
+            np.concatenate([last.T_world_camera[None], motion.T_world_camera]),
+        )
+        kinematics = self._T_world_kinematic @ motion.T_world_camera_kinematic
+        moments = zip(motion.T_world_camera, kinematics, times_s, strict=True)
+        new_surface = sum(self._track_frame(*moment) for moment in moments)
+        divergence = episode.frames[-1].divergence
+        if len(times_s) > 1:
+            with self.timings.stage("divergence"):
+                divergence = self._divergence_from(episode.step_histograms)
+        episode.end_step(divergence, motion.energy_j)
+        return new_surface
+
+    def _track_frame(self, T_true: Float64, T_kinematic: Float64, time_s: float) -> float:
+        """Take, track and measure one frame; return the newly mapped area, m2."""
+        episode = self.episode
+        with self.timings.stage("render"):
+            frame = self.camera_feed.capture(T_true, len(episode.frames), time_s)
+        seen = episode.observe(frame, T_true, T_kinematic, time_s)
+        if frame is None:
+            state = episode.tracking_ok, episode.inlier_fraction
+            result = self._pose_source.handle_dropped_frame(seen, *state)
+            episode.record(seen, result, np.zeros(2))
+            return 0.0
+        with self.timings.stage("slam"):
+            if episode.frames:
+                result = self._pose_source.locate(self.slam, seen)
+            else:
+                result = self.slam.track(frame)
+        with self.timings.stage("divergence"):
+            before, episode.histograms = episode.histograms, self._histograms(frame)
+            divergence = self._divergence_from(before)
+        with self.timings.stage("coverage"):
+            new_surface = self._cover(frame, T_true, result)
+        episode.record(seen, result, divergence)
+        return new_surface
+
+    def _histograms(self, frame: RGBDFrame) -> Histograms:
+        grey = intensity_image(frame.color)[None].astype(np.float32)
+        return self._divergence.histograms(grey, frame.depth[None])
+
+    def _divergence_from(self, before: Histograms | None) -> Float64:
+        """(2,) divergence of the last frame from an earlier one; zero from none."""
+        now = self.episode.histograms
+        if before is None or now is None:
+            return np.zeros(2)
+        return self._divergence.divergence(now, before)[0]
+
+    def _cover(self, frame: RGBDFrame, T_true: Float64, result: TrackResult) -> float:
+        """Mark what a frame added to the map; return the newly mapped area, m2."""
+        if not (result.tracking_ok and result.processed):
+            return 0.0
+        depths = frame.depth, self.camera_feed.true_depth()
+        return self.coverage.see(*depths, self._rays, T_true, result.T_world_camera)
+
+    def _observe(self) -> Any:
+        """The observation: what the robot itself knows."""
+        episode, maxima = self.episode, self.config.targets.maxima
+        with self.timings.stage("observation"):
+            return self._observation.build(
+                RobotKnowledge(
+                    frame=episode.last_frame,
+                    T_start_camera=episode.T_start_camera,
+                    divergence=episode.divergence / maxima,
+                    tracking_ok=episode.tracking_ok,
+                    inlier_fraction=episode.inlier_fraction,
+                    lost_share=min(1.0, episode.steps_lost / self.config.lost_patience),
+                    motion=episode.action,
+                    motion_mask=self.embodiment.action_masks(),
+                    configuration=self._actions.configuration,
+                    lookahead=lambda: self.lookahead() / maxima,
+                )
+            )
+
+    def _info(self) -> dict[str, Any]:
+        info = {
+            **self.episode.info(),
+            "action_mask": self.action_masks(),
+            "mapped_area": self.coverage.mapped_area,
+        }
+        if self._actions.num_configurations > 1:
+            info[CONFIGURATION] = self._actions.configuration
+        return info
+
+    # -- The start of an episode -------------------------------------------------------------
+
+    def _enter_scene(self, name: str, scene_seed: int) -> None:
+        self.scene = get_scene(name, scene_seed)
+        self.sensor = get_sensor(name, scene_seed, self.config.image_size, self.config.noise)
+        self.embodiment = self._embodiment_type.build(self.scene, self.config, self.timings)
+        self.coverage = CoverageGrid(self.scene)
+
+    def _start_somewhere(self, name: str, scene_seed: int) -> None:
+        """Begin at the first pose drawn that can be used.
+
+        Raises:
+            InputError: none of some can.
+        """
+        for _ in range(_START_TRIES):
+            why = self._start_at(self.scene.sample_start(self.np_random), name, scene_seed)
+            if not why:
+                return
+        if self.config.arm.base is not None:
+            why += "; give one with reset(options={'T_world_camera': ...})"
+        raise InputError(f"none of {_START_TRIES} drawn start poses can be used, the last: {why}")
+
+    def _start_at(self, start: Float64, name: str, scene_seed: int) -> str:
+        """Put the camera at a pose (4, 4) and take the first frame; return why not, or nothing."""
+        self._episode = None
+        try:
+            self.embodiment.reset(start, self.np_random)
+        except UnreachableError as error:
+            return str(error)
+        noise_seed = int(self.np_random.integers(2**31))
+        self.coverage = CoverageGrid(self.scene)
+        here = self.embodiment.T_world_camera
+        try:
+            self.camera_feed.begin(self.scene, self.sensor, here, noise_seed)
+        except InputError as error:
+            return str(error)
+        self.slam.reset(here)
+        self._T_world_kinematic = here @ invert(self.embodiment.T_world_camera_kinematic)
+        self._episode = Episode(name, scene_seed, noise_seed)
+        self._track_frame(here, here, time_s=0.0)
+        self._episode.end_step(np.zeros(2), energy_j=0.0)
+        if self._episode.tracking_ok:
+            return ""
+        self._episode = None
+        return f"too few depth readings there in scene {name}: SLAM has nothing to map"
+
+    @property
+    def episode(self) -> Episode:
+        """The episode so far: trajectories and measures, which evaluation may read.
+
+        Raises:
+            InputError: the environment was not reset.
+        """
+        if self._episode is None:
+            raise InputError("the environment must be reset before it is used: call env.reset()")
+        return self._episode
 
     # -- What planners use -------------------------------------------------------------------
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """(n,) which actions are possible now; the name is sb3-contrib's."""
-        self._current()
-        return self.embodiment.action_masks()
+        """(n,) which actions are possible now; the name is sb3-contrib's.
+
+        (n + K,) where the agent chooses the SLAM configuration too.
+        """
+        _ = self.episode  # none yet: say so
+        return self._actions.masks(self.embodiment.action_masks())
 
     def candidate_poses(self) -> Float64:
-        """(n, 4, 4) where each action would bring the camera, by SLAM's estimate of now."""
-        return self._current().T_world_camera_estimate @ self.embodiment.candidate_motions()
+        """(n, 4, 4) where each motion would bring the camera, by SLAM's estimate of now."""
+        return self.episode.T_world_camera_estimate @ self.embodiment.candidate_motions()
 
     def predict_candidates(self) -> Views:
         """The view of each candidate as the map predicts it."""
@@ -197,8 +387,8 @@ class ActiveSlamEnv(MappingRobot):
             return self._lookahead.predict(self.slam, self.candidate_poses())
 
     def lookahead(self) -> Float64:
-        """(n, 2) predicted intensity and depth divergence of each action, nats."""
-        episode = self._current()
+        """(n, 2) predicted intensity and depth divergence of each motion, nats."""
+        episode = self.episode
         if episode.predicted_divergences is None:
             with self.timings.stage("lookahead"):
                 episode.predicted_divergences = self._lookahead.divergences(
@@ -209,57 +399,64 @@ class ActiveSlamEnv(MappingRobot):
                 )
         return episode.predicted_divergences.copy()
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Options and, once reset, the episode: device arrays are made anew."""
-        state = None if self._episode is None else self.save_state()
+    def perturb(self, *perturbations: Perturbation) -> None:
+        """Put perturbations on the camera, after those that it has; from the next reset on.
+
+        Raises:
+            InputError: one that changes how the camera moves, which is the agent's business.
+        """
+        self.camera_feed = make_camera_feed((*self.camera_feed.perturbations, *perturbations))
+
+    # -- State -------------------------------------------------------------------------------
+
+    def save_state(self) -> dict[str, Any]:
+        """Everything needed to go on bit-exactly (the time limit's counter excepted)."""
         return {
-            "options": self._options,
-            "perturbations": self.frames.perturbations,
-            "state": state,
+            "settings": self._settings(),
+            "episode": self.episode.copy(),
+            "slam": self.slam.get_state(),
+            "embodiment": self.embodiment.get_state(),
+            "coverage": self.coverage.get_state(),
+            "camera_feed": self.camera_feed.get_state(),
+            "T_world_kinematic": self._T_world_kinematic.copy(),
+            "random": self.np_random.bit_generator.state,
+        }
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Go on from a state that ``save_state`` of an env with the same world and robot returned.
+
+        Raises:
+            InputError: options that shape the state differ; the environment is as it was.
+        """
+        check_same_settings(state["settings"], self._settings())
+        episode: Episode = state["episode"]
+        self._enter_scene(episode.scene, episode.scene_seed)
+        self._episode = episode.copy()
+        self.slam.set_state(state["slam"])
+        self.embodiment.set_state(state["embodiment"])
+        self.coverage.set_state(state["coverage"])
+        start = episode.frames[0].T_world_camera
+        self.camera_feed.set_state(state["camera_feed"], self.scene, self.sensor, start)
+        self._T_world_kinematic = state["T_world_kinematic"].copy()
+        self.np_random.bit_generator.state = state["random"]
+
+    def _settings(self) -> dict[str, Any]:
+        """What two environments must have in common to go on from one state."""
+        settings = self.config.of_state(self._arguments[0])
+        return {**settings, "perturbations": self.camera_feed.perturbations}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Arguments and, once reset, the episode: device arrays are made anew."""
+        return {
+            "arguments": self._arguments,
+            "perturbations": self.camera_feed.perturbations,
+            "state": None if self._episode is None else self.save_state(),
         }
 
     def __setstate__(self, pickled: dict[str, Any]) -> None:
         """Build the environment anew and go on from where the pickled one was."""
-        self.__init__(**pickled["options"])  # type: ignore[misc]
-        self.frames = frames_with(pickled["perturbations"])
+        *arguments, options = pickled["arguments"]
+        self.__init__(*arguments, **options)  # type: ignore[misc]
+        self.perturb(*pickled["perturbations"])
         if pickled["state"] is not None:
             self.load_state(pickled["state"])
-
-    def _reward_terms(self, outcome: Outcome) -> dict[str, float]:
-        """Weighted terms of one step, name to value."""
-        return reward_terms(outcome, self.config.reward, self.config.targets)
-
-    # -- Checks and views --------------------------------------------------------------------
-
-    def _check_action(self, action: Any) -> int:
-        self._current()
-        array = np.asarray(action)
-        is_integer = array.shape == () and np.issubdtype(array.dtype, np.integer)
-        last = self._embodiment_type.num_actions - 1
-        if not is_integer or not 0 <= int(array) <= last:
-            raise InputError(f"action {action!r} is not an integer in [0, {last}]")
-        return int(array)
-
-    def _build_observation(self) -> Any:
-        episode = self._current()
-        with self.timings.stage("observation"):
-            return self._observation.build(
-                RobotKnowledge(
-                    frame=episode.last_frame,
-                    T_start_camera=invert(episode.estimates[0]) @ episode.T_world_camera_estimate,
-                    divergence=episode.divergence / self.config.targets.maxima,
-                    tracking_ok=episode.tracking_ok,
-                    inlier_fraction=episode.inlier_fraction,
-                    lost_share=min(1.0, episode.steps_lost / self.config.lost_patience),
-                    motion=episode.action,
-                    action_mask=self.embodiment.action_masks(),
-                    lookahead=lambda: self.lookahead() / self.config.targets.maxima,
-                )
-            )
-
-    def _info(self) -> dict[str, Any]:
-        return {
-            **self._current().info(),
-            "action_mask": self.action_masks(),
-            "mapped_area": self.coverage.mapped_area,
-        }

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import XTION_SIZES
-from ms_slam_env.config import check_choice, check_range, from_dict
+from ms_slam_env.config import Checked, bounded, check_range, chosen, from_dict
 from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.env.observations import OBSERVATIONS
 from ms_slam_env.env.pose_sources import POSE_SOURCES
@@ -41,7 +41,7 @@ _OF_STATE = (
 
 
 @dataclass(frozen=True)
-class TargetConfig:
+class TargetConfig(Checked):
     """Motion-and-structure parameters and thresholds of the paper's Algorithm 1, line 9.
 
     M_I and M_D are the maxima of hand-held sequences of which every fourth frame was kept, the
@@ -57,19 +57,11 @@ class TargetConfig:
         depth_weight: lambda, significance of depth over intensity.
     """
 
-    M_I: float = 0.03
-    M_D: float = 0.06
-    rho_I: float = 0.35
-    rho_D: float = 1.0
-    depth_weight: float = 0.1
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        check_range(self, "M_I", 1e-6, 100)
-        check_range(self, "M_D", 1e-6, 100)
-        check_range(self, "rho_I", 0, 1)
-        check_range(self, "rho_D", 0, 1)
-        check_range(self, "depth_weight", 0, 1e6)
+    M_I: float = bounded(0.03, 1e-6, 100)
+    M_D: float = bounded(0.06, 1e-6, 100)
+    rho_I: float = bounded(0.35, 0, 1)
+    rho_D: float = bounded(1.0, 0, 1)
+    depth_weight: float = bounded(0.1, 0, 1e6)
 
     @property
     def maxima(self) -> NDArray[np.float64]:
@@ -83,7 +75,7 @@ class TargetConfig:
 
 
 @dataclass(frozen=True)
-class RewardConfig:
+class RewardConfig(Checked):
     """Weights of the reward terms; see :mod:`ms_slam_env.env.reward` for each term.
 
     Attributes:
@@ -98,23 +90,18 @@ class RewardConfig:
             (``MSActiveSLAM-Adaptive-v0``).
     """
 
-    intensity_divergence: float = 0.1
-    depth_divergence: float = 0.1
-    trajectory_error: float = 10.0
-    new_surface: float = 1.0
-    lost: float = 0.5
-    lost_for_good: float = 10.0
-    blocked: float = 0.1
-    compute: float = 0.1
-
-    def __post_init__(self) -> None:
-        """Refuse negative weights."""
-        for name in self.__dataclass_fields__:
-            check_range(self, name, 0, 1e6)
+    intensity_divergence: float = bounded(0.1, 0, 1e6)
+    depth_divergence: float = bounded(0.1, 0, 1e6)
+    trajectory_error: float = bounded(10.0, 0, 1e6)
+    new_surface: float = bounded(1.0, 0, 1e6)
+    lost: float = bounded(0.5, 0, 1e6)
+    lost_for_good: float = bounded(10.0, 0, 1e6)
+    blocked: float = bounded(0.1, 0, 1e6)
+    compute: float = bounded(0.1, 0, 1e6)
 
 
 @dataclass(frozen=True)
-class LookaheadConfig:
+class LookaheadConfig(Checked):
     """How the 49 views are predicted and compared.
 
     Attributes:
@@ -123,17 +110,12 @@ class LookaheadConfig:
         scale: size of the predicted views relative to the camera's image.
     """
 
-    reference: str = "predicted"
-    scale: float = 0.5
-
-    def __post_init__(self) -> None:
-        """Refuse unknown choices and values out of range."""
-        check_choice(self, "reference", ("live", "predicted"))
-        check_range(self, "scale", 0.125, 1)
+    reference: str = chosen("predicted", "live", "predicted")
+    scale: float = bounded(0.5, 0.125, 1)
 
 
 @dataclass(frozen=True)
-class EnvConfig:
+class EnvConfig(Checked):
     """Everything about an environment but its id.
 
     Attributes:
@@ -169,20 +151,20 @@ class EnvConfig:
 
     scene: str | tuple[str, ...] = "living_room"
     scene_seed: int | None = None
-    split: str = "train"
+    split: str = chosen("train", *SEED_SPLITS)
     num_scene_seeds: int = 4
-    image_size: str = "160x120"
-    noise: str = "kinect"
+    image_size: str = chosen("160x120", *XTION_SIZES)
+    noise: str = chosen("kinect", "kinect", "none")
     arm: ArmConfig = field(default_factory=ArmConfig)
-    pose: str = "slam"
+    pose: str = chosen("slam", *POSE_SOURCES)
     slam: str = "surfel"
     slam_config: dict[str, object] = field(default_factory=dict)
     adaptation: AdaptationConfig = field(default_factory=NoAdaptationConfig)
     frame_management: FrameSelectionConfig = field(default_factory=EveryFrameConfig)
-    observation: str = "features"
-    step_m: float = 0.12
-    step_rad: float = math.radians(12)
-    lost_patience: int = 10
+    observation: str = chosen("features", *OBSERVATIONS)
+    step_m: float = bounded(0.12, 0, 1)
+    step_rad: float = bounded(math.radians(12), 0, math.pi / 2)
+    lost_patience: int = bounded(10, 1, 1_000_000)
     divergence: DivergenceConfig = field(default_factory=DivergenceConfig)
     lookahead: LookaheadConfig = field(default_factory=LookaheadConfig)
     targets: TargetConfig = field(default_factory=TargetConfig)
@@ -190,15 +172,8 @@ class EnvConfig:
 
     def __post_init__(self) -> None:
         """Refuse unknown choices and values out of range."""
-        check_choice(self, "split", tuple(SEED_SPLITS))
-        check_choice(self, "image_size", tuple(XTION_SIZES))
-        check_choice(self, "noise", ("kinect", "none"))
-        check_choice(self, "pose", tuple(POSE_SOURCES))
-        check_choice(self, "observation", tuple(OBSERVATIONS))
+        super().__post_init__()
         check_range(self, "num_scene_seeds", 1, len(SEED_SPLITS[self.split]))
-        check_range(self, "step_m", 0, 1)
-        check_range(self, "step_rad", 0, math.pi / 2)
-        check_range(self, "lost_patience", 1, 1_000_000)
         if self.frame_management.uses_clock:
             raise InputError(
                 "frame_management.measured cannot be had in an environment, whose infos must be "
@@ -265,3 +240,17 @@ def _read_slam_config(options: Mapping[str, Any]) -> Mapping[str, Any]:
         raise InputError(f"slam = {options['slam']!r} but {given} configures {file.slam!r}")
     size = {} if file.image_size is None else {"image_size": file.image_size}
     return {**size, **options, "slam": file.slam, "slam_config": file.slam_config}
+
+
+def check_same_settings(saved: Mapping[str, Any], own: Mapping[str, Any]) -> None:
+    """Refuse a state that an environment with other options saved.
+
+    Raises:
+        InputError: naming the first option that differs and both values.
+    """
+    for name, value in own.items():
+        if name not in saved or saved[name] != value:
+            raise InputError(
+                f"the state was saved with {name} = {saved.get(name)!r}, "
+                f"this environment has {value!r}"
+            )

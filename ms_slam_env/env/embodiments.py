@@ -8,15 +8,9 @@ from dataclasses import dataclass
 from ms_slam_env.env.config import EnvConfig
 from ms_slam_env.env.pose_sources import KINEMATIC_SOURCES
 from ms_slam_env.errors import InputError
-from ms_slam_env.robot import (
-    NUM_MOTIONS,
-    NUM_ROTATIONS,
-    Embodiment,
-    FixedTranslation,
-    FreeCamera,
-)
+from ms_slam_env.robot import Embodiment, FixedTranslation, FreeCamera
 from ms_slam_env.robot.arm import ArmConfig, load_arm
-from ms_slam_env.robot.arm.arm import KinematicArm
+from ms_slam_env.robot.arm.arm import ArmEmbodiment, KinematicArm
 from ms_slam_env.robot.arm.dynamic_arm import DynamicArm
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.timings import Timings
@@ -24,30 +18,31 @@ from ms_slam_env.timings import Timings
 
 @dataclass(frozen=True)
 class EmbodimentType:
-    """How many actions an embodiment has, and how to build it in a scene.
+    """How many motions an embodiment has, and how to build it in a scene.
 
     ``check`` raises an InputError if the configuration cannot be built anywhere.
     """
 
-    num_actions: int
+    num_motions: int
     build: Callable[[Scene, EnvConfig, Timings], Embodiment]
     check: Callable[[EnvConfig], None]
 
 
-def _free(scene: Scene, config: EnvConfig, timings: Timings) -> Embodiment:
-    return FreeCamera(scene, config.step_m, config.step_rad)
+def _arm(cls: type[ArmEmbodiment]) -> EmbodimentType:
+    def build(scene: Scene, config: EnvConfig, timings: Timings) -> Embodiment:
+        return cls(scene, config.arm, config.step_m, config.step_rad, timings)
+
+    def check(config: EnvConfig) -> None:  # a bad file is refused before the first reset
+        load_arm(config.arm.model, config.arm.camera_site, config.arm.joint_speed_rad_s)
+
+    return EmbodimentType(cls.num_actions, build, check)
 
 
-def _fixed_translation(scene: Scene, config: EnvConfig, timings: Timings) -> Embodiment:
-    return FixedTranslation(scene, config.step_m, config.step_rad)
+def _free(cls: type[FreeCamera] | type[FixedTranslation]) -> EmbodimentType:
+    def build(scene: Scene, config: EnvConfig, timings: Timings) -> Embodiment:
+        return cls(scene, config.step_m, config.step_rad)
 
-
-def _arm(scene: Scene, config: EnvConfig, timings: Timings) -> Embodiment:
-    return DynamicArm(scene, config.arm, config.step_m, config.step_rad, timings)
-
-
-def _arm_kinematic(scene: Scene, config: EnvConfig, timings: Timings) -> Embodiment:
-    return KinematicArm(scene, config.arm, config.step_m, config.step_rad, timings)
+    return EmbodimentType(cls.num_actions, build, _has_no_arm)
 
 
 def _has_no_arm(config: EnvConfig) -> None:
@@ -59,15 +54,10 @@ def _has_no_arm(config: EnvConfig) -> None:
         raise InputError(f"option 'arm' {hint}; nothing holds a free camera")
 
 
-def _needs_an_arm(config: EnvConfig) -> None:
-    """Read the arm's file, so that a bad one is refused before the first reset."""
-    load_arm(config.arm.model, config.arm.camera_site, config.arm.joint_speed_rad_s)
-
-
 EMBODIMENTS = {
-    "arm": EmbodimentType(NUM_MOTIONS, _arm, _needs_an_arm),
-    "arm-kinematic": EmbodimentType(NUM_MOTIONS, _arm_kinematic, _needs_an_arm),
-    "free": EmbodimentType(NUM_MOTIONS, _free, _has_no_arm),
-    "fixed-translation": EmbodimentType(NUM_ROTATIONS, _fixed_translation, _has_no_arm),
+    "arm": _arm(DynamicArm),
+    "arm-kinematic": _arm(KinematicArm),
+    "free": _free(FreeCamera),
+    "fixed-translation": _free(FixedTranslation),
 }
 """Name of the option ``embodiment`` to type."""

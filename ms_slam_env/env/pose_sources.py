@@ -9,14 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import RGBDFrame
-from ms_slam_env.geometry import invert
 from ms_slam_env.slam.base import SlamBackend, TrackResult
 
 Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Sighting:
+class FrameObservation:
     """A frame and what is known of where it was taken, without looking at it.
 
     Attributes:
@@ -38,66 +37,67 @@ class PoseSource(ABC):
     """Says where a frame was taken and has it fused into the map."""
 
     @abstractmethod
-    def locate(self, slam: SlamBackend, sighting: Sighting) -> TrackResult:
+    def locate(self, slam: SlamBackend, seen: FrameObservation) -> TrackResult:
         """Estimate the pose of a frame that is not the first."""
 
-    def pass_by(self, sighting: Sighting, tracking_ok: bool, inlier_fraction: float) -> TrackResult:
-        """What is known at a moment whose frame was not delivered; nothing is tracked or fused."""
-        pose = self.without_frame(sighting)
-        return TrackResult(pose, tracking_ok, inlier_fraction=inlier_fraction, processed=False)
+    @abstractmethod
+    def predict(self, seen: FrameObservation) -> Float64:
+        """T_world_camera (4, 4) as far as it is known without looking at the frame."""
 
-    def without_frame(self, sighting: Sighting) -> Float64:
-        """T_world_camera (4, 4) at a moment whose frame was not delivered: where it last was."""
-        return sighting.T_world_previous_estimate
+    def handle_dropped_frame(
+        self, seen: FrameObservation, tracking_ok: bool, inlier_fraction: float
+    ) -> TrackResult:
+        """What is known at a moment whose frame was not delivered; nothing is tracked or fused."""
+        pose = self.predict(seen)
+        return TrackResult(pose, tracking_ok, inlier_fraction=inlier_fraction, processed=False)
 
 
 class SlamPose(PoseSource):
     """SLAM tracks the frame; it knows nothing of joints."""
 
-    def locate(self, slam: SlamBackend, sighting: Sighting) -> TrackResult:
+    def locate(self, slam: SlamBackend, seen: FrameObservation) -> TrackResult:
         """Track."""
-        return slam.track(sighting.frame)
+        return slam.track(seen.frame)
+
+    def predict(self, seen: FrameObservation) -> Float64:
+        """Where it last was."""
+        return seen.T_world_previous_estimate
 
 
 class GuessedSlamPose(PoseSource):
     """SLAM tracks the frame, starting from the motion that the kinematics report."""
 
-    def locate(self, slam: SlamBackend, sighting: Sighting) -> TrackResult:
+    def locate(self, slam: SlamBackend, seen: FrameObservation) -> TrackResult:
         """Track from the last estimate, moved as the joints moved."""
-        return slam.track(sighting.frame, self.without_frame(sighting))
+        return slam.track(seen.frame, self.predict(seen))
 
-    def without_frame(self, sighting: Sighting) -> Float64:
+    def predict(self, seen: FrameObservation) -> Float64:
         """The last estimate, moved as the joints moved."""
-        return sighting.T_world_previous_estimate @ sighting.T_previous_camera_kinematic
+        return seen.T_world_previous_estimate @ seen.T_previous_camera_kinematic
 
 
 class KinematicPose(PoseSource):
     """Forward kinematics alone, with their noise and bias; SLAM only maps."""
 
-    def locate(self, slam: SlamBackend, sighting: Sighting) -> TrackResult:
+    def locate(self, slam: SlamBackend, seen: FrameObservation) -> TrackResult:
         """Fuse at the kinematic pose."""
-        return slam.fuse(sighting.frame, sighting.T_world_camera_kinematic)
+        return slam.fuse(seen.frame, self.predict(seen))
 
-    def without_frame(self, sighting: Sighting) -> Float64:
+    def predict(self, seen: FrameObservation) -> Float64:
         """The kinematic pose."""
-        return sighting.T_world_camera_kinematic
+        return seen.T_world_camera_kinematic
 
 
 class TruePose(PoseSource):
     """The true pose: what a perfect tracker would leave to mapping."""
 
-    def locate(self, slam: SlamBackend, sighting: Sighting) -> TrackResult:
+    def locate(self, slam: SlamBackend, seen: FrameObservation) -> TrackResult:
         """Fuse at the true pose."""
-        return slam.fuse(sighting.frame, sighting.T_world_camera)
+        return slam.fuse(seen.frame, self.predict(seen))
 
-    def without_frame(self, sighting: Sighting) -> Float64:
+    def predict(self, seen: FrameObservation) -> Float64:
         """The true pose."""
-        return sighting.T_world_camera
-
-
-def relative_motion(T_world_a: Float64, T_world_b: Float64) -> Float64:
-    """``T_a_b`` (4, 4)."""
-    return invert(T_world_a) @ T_world_b
+        return seen.T_world_camera
 
 
 POSE_SOURCES: dict[str, type[PoseSource]] = {

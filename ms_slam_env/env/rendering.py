@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env.env.config import TargetConfig
+from ms_slam_env.env.episode import Episode
 from ms_slam_env.env.point_renderer import BACKGROUND
 from ms_slam_env.env.third_person_view import ESTIMATE_COLOR, draw_third_person
-from ms_slam_env.robot import describe
-
-if TYPE_CHECKING:
-    from ms_slam_env.env.active_slam import ActiveSlamEnv
+from ms_slam_env.robot import Embodiment, describe
+from ms_slam_env.scenes.base import Scene
+from ms_slam_env.slam.base import SlamBackend
 
 Image = NDArray[np.uint8]
 Float64 = NDArray[np.float64]
@@ -29,55 +30,51 @@ _ERROR_AXIS_M = 0.01
 _DIVERGENCE_AXIS = 2.0  # the plots end at this many times M, or at the largest value
 
 
-class Renderer:
-    """Draws colour, depth, map from outside, divergences against targets, error so far."""
+def draw_moment(
+    episode: Episode,
+    targets: TargetConfig,
+    slam: SlamBackend,
+    embodiment: Embodiment,
+    scene: Scene,
+) -> Image:
+    """Colour, depth, map from outside, divergences against targets, error so far.
 
-    def draw(self, env: ActiveSlamEnv) -> Image:
-        """Return the picture (480, 1120, 3) uint8 of an environment that was reset."""
-        left = np.vstack([self._color(env), self._depth(env)])
-        right = np.vstack(self._plots(env))
-        return np.hstack([left, self._map(env), right])
+    Returns:
+        the picture (480, 1120, 3) uint8.
+    """
+    third_person, count = draw_third_person(episode, slam, embodiment, scene, _MAP)
+    _caption(third_person, f"map: {count} points; path: true wide green, estimated thin red")
+    left = np.vstack([_color(episode, scene), _depth(episode)])
+    return np.hstack([left, third_person, np.vstack(_plots(episode, targets))])
 
-    def _color(self, env: ActiveSlamEnv) -> Image:
-        image = cv2.resize(env.last_frame.color, _PANEL[::-1])
-        motions = len(env.step_divergences) - 1
-        motion = f"motion {motions}: {describe(env.last_motion)}" if motions else "start"
-        state = "" if env.tracking_ok else ", TRACKING LOST"
-        return _caption(image, f"{env.scene.name}, {motion}{state}")
 
-    def _depth(self, env: ActiveSlamEnv) -> Image:
-        depth = env.last_frame.depth
-        grey = (255 * (1 - np.clip(depth / _MAX_DEPTH_M, 0, 1))).astype(np.uint8)
-        colored = cv2.cvtColor(cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB)
-        colored[depth == 0] = 0
-        image = cv2.resize(colored, _PANEL[::-1], interpolation=cv2.INTER_NEAREST)
-        return _caption(image, f"depth, 0 to {_MAX_DEPTH_M:g} m, black: no reading")
+def _color(episode: Episode, scene: Scene) -> Image:
+    image = cv2.resize(episode.last_frame.color, _PANEL[::-1])
+    motions = len(episode.step_divergences) - 1
+    motion = f"motion {motions}: {describe(episode.action)}" if motions else "start"
+    state = "" if episode.tracking_ok else ", TRACKING LOST"
+    return _caption(image, f"{scene.name}, {motion}{state}")
 
-    def _map(self, env: ActiveSlamEnv) -> Image:
-        picture, count = draw_third_person(env, _MAP)
-        return _caption(picture, f"map: {count} points; path: true wide green, estimated thin red")
 
-    def _plots(self, env: ActiveSlamEnv) -> list[Image]:
-        intensity, depth = env.step_divergences.T
-        targets = env.config.targets
-        errors = env.pose_errors
-        return [
-            _plot(
-                intensity,
-                targets.divergence[0],
-                max(_DIVERGENCE_AXIS * targets.M_I, intensity.max()),
-                "intensity divergence",
-                "motions",
-            ),
-            _plot(
-                depth,
-                targets.divergence[1],
-                max(_DIVERGENCE_AXIS * targets.M_D, depth.max()),
-                "depth divergence",
-                "motions",
-            ),
-            _plot(errors, None, max(_ERROR_AXIS_M, errors.max()), "pose error [m]", "frames"),
-        ]
+def _depth(episode: Episode) -> Image:
+    depth = episode.last_frame.depth
+    grey = (255 * (1 - np.clip(depth / _MAX_DEPTH_M, 0, 1))).astype(np.uint8)
+    colored = cv2.cvtColor(cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB)
+    colored[depth == 0] = 0
+    image = cv2.resize(colored, _PANEL[::-1], interpolation=cv2.INTER_NEAREST)
+    return _caption(image, f"depth, 0 to {_MAX_DEPTH_M:g} m, black: no reading")
+
+
+def _plots(episode: Episode, targets: TargetConfig) -> list[Image]:
+    plots = []
+    for k, name in enumerate(("intensity", "depth")):
+        values = episode.step_divergences[:, k]
+        top = max(_DIVERGENCE_AXIS * targets.maxima[k], values.max())
+        target = targets.divergence[k]
+        plots.append(_plot(values, target, top, f"{name} divergence", "motions"))
+    errors = episode.pose_errors
+    top = max(_ERROR_AXIS_M, errors.max())
+    return [*plots, _plot(errors, None, top, "pose error [m]", "frames")]
 
 
 def _plot(values: Float64, target: float | None, top: float, title: str, unit: str) -> Image:

@@ -24,6 +24,7 @@ class Outcome:
         tracking_ok: whether the frame was tracked.
         lost_for_good: whether the episode ends because tracking was lost beyond recovery.
         blocked: whether the action was masked and so did nothing.
+        configuration_cost: of the SLAM configuration, if the agent chooses it.
     """
 
     divergence: NDArray[np.float64]
@@ -32,6 +33,7 @@ class Outcome:
     tracking_ok: bool
     lost_for_good: bool
     blocked: bool
+    configuration_cost: float | None = None
 
 
 def reward_terms(
@@ -47,7 +49,7 @@ def reward_terms(
     distance = np.abs(outcome.divergence - targets.divergence) / targets.maxima
     intensity, depth = np.minimum(distance, _DISTANCE_CAP)
     growth = float(np.clip(outcome.pose_error_growth_m, -_ERROR_CAP_M, _ERROR_CAP_M))
-    return {
+    terms = {
         "intensity_divergence": -weights.intensity_divergence * float(intensity),
         "depth_divergence": -weights.depth_divergence * targets.depth_weight * float(depth),
         "trajectory_error": -weights.trajectory_error * growth,
@@ -56,3 +58,6 @@ def reward_terms(
         "lost_for_good": -weights.lost_for_good * float(outcome.lost_for_good),
         "blocked": -weights.blocked * float(outcome.blocked),
     }
+    if outcome.configuration_cost is not None:
+        terms["compute"] = -weights.compute * outcome.configuration_cost
+    return terms

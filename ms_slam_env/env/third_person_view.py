@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics
+from ms_slam_env.env.episode import Episode
 from ms_slam_env.env.point_renderer import project, render_points
 from ms_slam_env.geometry import look_at, transform_points
+from ms_slam_env.robot import Embodiment
 from ms_slam_env.robot.arm.arm import ArmEmbodiment
 from ms_slam_env.robot.arm.shape import arm_parts, column_parts, surface_dots
-from ms_slam_env.scenes.base import floor_height
-
-if TYPE_CHECKING:
-    from ms_slam_env.env.active_slam import ActiveSlamEnv
+from ms_slam_env.scenes.base import Scene, floor_height
+from ms_slam_env.slam.base import SlamBackend
 
 Image = NDArray[np.uint8]
 Float64 = NDArray[np.float64]
@@ -37,14 +35,17 @@ _TO_LIGHT = np.array([0.35, -0.3, 0.89])
 _FRUSTUM_M = 0.15
 
 
-def draw_third_person(env: ActiveSlamEnv, size: int) -> tuple[Image, int]:
+def draw_third_person(
+    episode: Episode, slam: SlamBackend, embodiment: Embodiment, scene: Scene, size: int
+) -> tuple[Image, int]:
     """The picture (size, size, 3), and how many points the map has."""
-    points, colors = env.slam.surface_points(), env.slam.surface_colors()
-    truth, estimate = env.trajectory_truth, env.trajectory_estimate
-    arm_points, arm_colors = _arm(env)
+    points, colors = slam.surface_points(), slam.surface_colors()
+    truth, estimate = episode.trajectory_truth, episode.trajectory_estimate
+    arm_points, arm_colors = _arm(embodiment, scene)
     ceiling = truth[:, 2, 3].max() + _HEADROOM_M
     low = np.flatnonzero(points[:, 2] < ceiling)
-    must = np.concatenate([arm_points, truth[:, :3, 3], _frustum(truth[-1])])
+    frustum = _frustum(truth[-1])
+    must = np.concatenate([arm_points, truth[:, :3, 3], frustum])
     camera = Intrinsics(size, size, 0.5 * (size - 1), 0.5 * (size - 1), size, size)
     pose = _point_of_view(truth[0], points[low], must, camera)
     picture = render_points(
@@ -55,25 +56,27 @@ def draw_third_person(env: ActiveSlamEnv, size: int) -> tuple[Image, int]:
         np.repeat([_MAP_DOT_M, _ARM_DOT_M], [len(low), len(arm_points)]),
     )
     if len(arm_points) == 0:
-        for corner in _frustum(truth[-1])[1:]:
+        for corner in frustum[1:]:
             _draw_line(picture, camera, pose, np.stack([truth[-1, :3, 3], corner]), _OUTLINE, 1)
-        rim = _frustum(truth[-1])[[1, 2, 3, 4, 1]]
-        _draw_line(picture, camera, pose, rim, _OUTLINE, 1)
+        _draw_line(picture, camera, pose, frustum[[1, 2, 3, 4, 1]], _OUTLINE, 1)
     # the wide line stays visible on both sides of the narrow one where they run together
-    for path, color, width in ((truth, _OUTLINE, 7), (truth, TRUE_COLOR, 5)):
-        _draw_path(picture, camera, pose, path, color, width)
-    _draw_path(picture, camera, pose, estimate, ESTIMATE_COLOR, 2)
+    for path, color, width in (
+        (truth, _OUTLINE, 7),
+        (truth, TRUE_COLOR, 5),
+        (estimate, ESTIMATE_COLOR, 2),
+    ):
+        end = _draw_line(picture, camera, pose, path[:, :3, 3], color, width)
+        cv2.circle(picture, end, 2 + width // 2, color, -1, cv2.LINE_AA)
     return picture, len(points)
 
 
-def _arm(env: ActiveSlamEnv) -> tuple[Float64, Image]:
+def _arm(arm: Embodiment, scene: Scene) -> tuple[Float64, Image]:
     """Shaded dots all over the arm and its column: points (N, 3), colours (N, 3); none without."""
-    arm = env.embodiment
     if not isinstance(arm, ArmEmbodiment):
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     parts = arm_parts(arm.model, arm.q, arm.T_world_base)
     if arm.config.base is None:
-        parts += column_parts(arm.T_world_base[:3, 3], floor_height(env.scene))
+        parts += column_parts(arm.T_world_base[:3, 3], floor_height(scene))
     points, normals, rgb = surface_dots(parts, 0.7 * _ARM_DOT_M)
     light = _AMBIENT + (1 - _AMBIENT) * np.clip(normals @ _TO_LIGHT, 0, 1)
     return points, np.clip(255 * rgb * light[:, None], 0, 255).astype(np.uint8)
@@ -112,18 +115,6 @@ def _frustum(T_world_camera: Float64) -> Float64:
     """A camera's place and four corners (5, 3) of what it sees shortly before it."""
     corners = np.array([(0, 0, 0), (-0.5, -0.4, 1), (0.5, -0.4, 1), (0.5, 0.4, 1), (-0.5, 0.4, 1)])
     return transform_points(T_world_camera, _FRUSTUM_M * corners)
-
-
-def _draw_path(
-    picture: Image,
-    camera: Intrinsics,
-    T_world_camera: Float64,
-    poses: Float64,
-    color: tuple[int, int, int],
-    width: int,
-) -> None:
-    end = _draw_line(picture, camera, T_world_camera, poses[:, :3, 3], color, width)
-    cv2.circle(picture, end, 2 + width // 2, color, -1, cv2.LINE_AA)
 
 
 def _draw_line(

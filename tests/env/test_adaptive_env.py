@@ -10,7 +10,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import ms_slam_env
-from ms_slam_env.env import AdaptiveSlamEnv
+from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.errors import InputError
 
 ID = "MSActiveSLAM-Adaptive-v0"
@@ -42,7 +42,7 @@ def assert_same_steps(one, other):
 def test_the_id_is_listed_and_has_an_arm_unless_told_otherwise():
     assert ID in ms_slam_env.ENV_IDS
     env = gym.make(ID, scene="table", scene_seed=0)
-    assert isinstance(env.unwrapped, AdaptiveSlamEnv)
+    assert type(env.unwrapped) is ActiveSlamEnv
     np.testing.assert_array_equal(env.action_space.nvec, [49, 3])
     env.reset(seed=0)
     assert env.unwrapped.embodiment.__class__.__name__ == "DynamicArm"

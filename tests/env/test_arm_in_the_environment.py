@@ -46,18 +46,18 @@ def test_equal_seeds_give_equal_episodes(env):
     for one in (env, other):
         one.reset(seed=3)
     assert_equal_steps(walk(env, 3), walk(other, 3))
-    assert_array_equal(env.trajectory_kinematics, other.trajectory_kinematics)
+    assert_array_equal(env.episode.trajectory_kinematics, other.episode.trajectory_kinematics)
 
 
 def test_frames_energy_and_timings_are_counted(env):
     env.reset(seed=1)
     env.timings.clear()
     infos = [step[4] for step in walk(env, 4)]
-    assert len(env.trajectory_truth) == 1 + 4 * 2
+    assert len(env.episode.trajectory_truth) == 1 + 4 * 2
     assert (np.diff([info["energy"] for info in infos]) > 0).all()
     assert {"ik", "physics", "mask", "move", "slam", "render"} <= set(env.timings.total)
     off = np.linalg.norm(
-        env.trajectory_truth[:, :3, 3] - env.trajectory_kinematics[:, :3, 3], axis=1
+        env.episode.trajectory_truth[:, :3, 3] - env.episode.trajectory_kinematics[:, :3, 3], axis=1
     )
     assert off[0] < 1e-12
     assert 0 < off[-1] < 0.03

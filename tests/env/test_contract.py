@@ -123,12 +123,12 @@ def test_saved_state_goes_on_to_the_bit_in_a_fresh_env(env_id):
 
 def test_a_state_of_another_camera_is_refused_and_changes_nothing(env):
     env.reset(seed=5)
-    before = env.unwrapped.trajectory_truth
+    before = env.unwrapped.episode.trajectory_truth
     other = gym.make("MSActiveSLAM-FreeCamera-v0", **{**OPTIONS, "noise": "none"})
     other.reset(seed=6)
     with pytest.raises(InputError, match=r"saved with noise = 'none'.*has 'kinect'"):
         env.unwrapped.load_state(other.unwrapped.save_state())
-    np.testing.assert_array_equal(env.unwrapped.trajectory_truth, before)
+    np.testing.assert_array_equal(env.unwrapped.episode.trajectory_truth, before)
 
 
 def test_pickled_env_goes_on_to_the_bit(env):
@@ -228,7 +228,7 @@ def test_lookahead_predicts_every_candidate(reference):
 
 def test_black_frames_end_the_episode_as_lost(env, monkeypatch):
     env.reset(seed=0)
-    frame = env.unwrapped.last_frame
+    frame = env.unwrapped.episode.last_frame
     black = type(frame)(np.zeros_like(frame.color), np.zeros_like(frame.depth), 0.0)
     monkeypatch.setattr(type(env.unwrapped.sensor), "capture", lambda *_, **__: black)
     patience = env.unwrapped.config.lost_patience

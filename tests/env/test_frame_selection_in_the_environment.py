@@ -39,7 +39,7 @@ def test_none_is_the_default_and_leaves_the_backend_alone():
         assert not isinstance(env.slam, SelectiveSlam)
         env.reset(seed=0)
         runs.append(_play(env, 3))
-        assert env.processed.all()
+        assert env.episode.processed.all()
     _assert_alike(runs[0], runs[1])
     _assert_alike(runs[0], runs[2])
 
@@ -55,14 +55,14 @@ def test_every_backend_goes_on_bit_exactly_behind_a_filter(backend):
     _play(env, 3)
     saved = env.save_state()
     first = _play(env, 4, seed=1)
-    processed = env.processed
+    processed = env.episode.processed
     assert processed[0]
     assert 0 < processed.sum() < len(processed)
     other = ActiveSlamEnv("free", **OPTIONS, slam=backend, frame_management=management)
     for again in (env, other):
         again.load_state(saved)
         _assert_alike(first, _play(again, 4, seed=1))
-        np.testing.assert_array_equal(again.processed, processed)
+        np.testing.assert_array_equal(again.episode.processed, processed)
     different = ActiveSlamEnv("free", **OPTIONS, slam=backend, frame_management="regular")
     with pytest.raises(InputError, match="frame_management"):
         different.load_state(saved)
@@ -73,7 +73,7 @@ def test_a_dropped_frame_maps_nothing_and_has_a_predicted_pose():
     env.reset(seed=0)
     forward = 7 * 5
     infos = [env.step(forward)[-1] for _ in range(4)]
-    assert env.processed.tolist() == [True, False, True, False, True]
+    assert env.episode.processed.tolist() == [True, False, True, False, True]
     areas = [info["mapped_area"] for info in infos]
     assert areas[0] == areas[1] - infos[1]["reward_terms"]["new_surface"] / 1.0
     assert areas[2] == areas[1]
@@ -93,15 +93,15 @@ def test_known_and_guessed_poses_are_kept_for_dropped_frames(pose):
     )
     env.reset(seed=0)
     _play(env, 5)
-    dropped = ~env.processed
+    dropped = ~env.episode.processed
     assert dropped.any()
-    estimate = env.trajectory_estimate
+    estimate = env.episode.trajectory_estimate
     if pose == "ground_truth":
-        np.testing.assert_array_equal(estimate, env.trajectory_truth)
+        np.testing.assert_array_equal(estimate, env.episode.trajectory_truth)
     if pose == "kinematics":
-        np.testing.assert_array_equal(estimate[1:], env.trajectory_kinematics[1:])
+        np.testing.assert_array_equal(estimate[1:], env.episode.trajectory_kinematics[1:])
     if pose == "slam-kinematics":
-        assert env.pose_errors.max() < 0.02
+        assert env.episode.pose_errors.max() < 0.02
 
 
 def test_a_configuration_may_be_given_as_such():

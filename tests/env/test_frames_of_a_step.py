@@ -71,26 +71,29 @@ def test_every_frame_reaches_slam_and_is_counted(slow):
     track = env.slam.track
     env.slam.track = lambda frame: tracked.append(frame) or track(frame)
     infos = play(env)
-    assert len(tracked) == len(env.trajectory_truth) == 1 + 4 * FRAMES
-    np.testing.assert_allclose(env.timestamps, 0.1 * np.arange(1 + 4 * FRAMES), atol=1e-12)
-    assert [frame.timestamp for frame in tracked] == list(env.timestamps)
+    assert len(tracked) == len(env.episode.trajectory_truth) == 1 + 4 * FRAMES
+    np.testing.assert_allclose(env.episode.timestamps, 0.1 * np.arange(1 + 4 * FRAMES), atol=1e-12)
+    assert [frame.timestamp for frame in tracked] == list(env.episode.timestamps)
     assert infos[-1]["time"] == pytest.approx(1.2)
     assert [info["energy"] for info in infos] == [2.0, 4.0, 6.0, 8.0]
-    expected = ate_rmse(env.trajectory_estimate, env.trajectory_truth, align="none")
+    expected = ate_rmse(env.episode.trajectory_estimate, env.episode.trajectory_truth, align="none")
     assert infos[-1]["ate"] == pytest.approx(expected, rel=1e-9)
-    np.testing.assert_array_equal(infos[-1]["T_world_camera"], env.trajectory_truth[-1])
+    np.testing.assert_array_equal(infos[-1]["T_world_camera"], env.episode.trajectory_truth[-1])
 
 
 def test_divergence_of_a_step_compares_the_frames_at_its_ends(slow):
     env = ActiveSlamEnv(slow, observation="rgbd", **OPTIONS)
     env.reset(seed=5)
-    first = env.last_frame
+    first = env.episode.last_frame
     *_, info = env.step(7 * 5 + 6)
-    measure = env._measure
-    both = [measure.histograms(grey(frame), frame.depth[None]) for frame in (env.last_frame, first)]
+    measure = env._divergence
+    both = [
+        measure.histograms(grey(frame), frame.depth[None])
+        for frame in (env.episode.last_frame, first)
+    ]
     np.testing.assert_allclose(info["divergence"], measure.divergence(*both)[0], rtol=1e-12)
-    assert len(env.divergences) == 1 + FRAMES
-    assert not np.allclose(env.divergences[-1], info["divergence"])
+    assert len(env.episode.divergences) == 1 + FRAMES
+    assert not np.allclose(env.episode.divergences[-1], info["divergence"])
 
 
 def grey(frame):
@@ -110,8 +113,10 @@ def test_ground_truth_pose_leaves_no_error(slow):
 def test_kinematic_pose_is_the_odometry_tied_to_the_start(slow):
     env = ActiveSlamEnv(slow, pose="kinematics", **OPTIONS)
     infos = play(env)
-    np.testing.assert_allclose(env.trajectory_estimate, env.trajectory_kinematics)
-    np.testing.assert_allclose(env.trajectory_kinematics[0], env.trajectory_truth[0])
+    np.testing.assert_allclose(env.episode.trajectory_estimate, env.episode.trajectory_kinematics)
+    np.testing.assert_allclose(
+        env.episode.trajectory_kinematics[0], env.episode.trajectory_truth[0]
+    )
     # The drift of three frames a step is added up: nothing looks at the images.
     assert 0.004 < infos[-1]["pose_error"] < 0.2
     assert infos[-1]["pose_error"] > infos[0]["pose_error"]

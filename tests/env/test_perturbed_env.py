@@ -49,11 +49,11 @@ def perturbed(*names, **options):
 def play(env, seed=3, actions=ACTIONS):
     """The frames, observations and rewards of an episode."""
     record = [env.reset(seed=seed)[0]]
-    frames = [env.unwrapped.last_frame]
+    frames = [env.unwrapped.episode.last_frame]
     for action in actions:
         observation, reward, *_, info = env.step(action)
         record.append((observation, reward, info))
-        frames.append(env.unwrapped.last_frame)
+        frames.append(env.unwrapped.episode.last_frame)
     return frames, record
 
 
@@ -75,9 +75,9 @@ def test_frames_are_those_of_a_rendered_sequence(name, plain) -> None:
     env = perturbed(name)
     frames, _ = play(env)
     inner = env.unwrapped
-    path = PoseInterpolation(inner.timestamps, inner.trajectory_truth)
+    path = PoseInterpolation(inner.episode.timestamps, inner.episode.trajectory_truth)
     perturbation = make_perturbation(name, STRONG.get(name))
-    seed = inner.frames.get_state()["noise_seed"]
+    seed = inner.camera_feed.get_state()["noise_seed"]
     camera = PerturbedCamera(
         inner.scene, inner.intrinsics, inner.config.noise, Imperfections.of([perturbation])
     )
@@ -89,7 +89,7 @@ def test_frames_are_those_of_a_rendered_sequence(name, plain) -> None:
 
     changed = 0
     for k, frame in enumerate(frames):
-        if not inner.processed[k]:
+        if not inner.episode.processed[k]:
             assert name == "frame-skipping"
             assert k % 2 == 1
             np.testing.assert_array_equal(frame.color, frames[k - 1].color)
@@ -120,14 +120,14 @@ def test_moving_objects_and_light_are_the_same_for_the_same_seed(plain) -> None:
     for (a, reward_a, _), (b, reward_b, _) in zip(record[1:], other[1:], strict=True):
         assert reward_a == reward_b
         np.testing.assert_array_equal(a, b)
-    (mover, *_) = env.unwrapped.frames.movers
+    (mover, *_) = env.unwrapped.camera_feed.movers
     assert mover.name == "box 0"
     assert not np.array_equal(frames[0].depth, plain[0].depth)
     assert not np.array_equal(frames[0].color, frames[-1].color)
     # A second episode of the same environment has other ways.
     before = mover.pose(0.0)
     env.reset(seed=4)
-    assert not np.array_equal(env.unwrapped.frames.movers[0].pose(0.0), before)
+    assert not np.array_equal(env.unwrapped.camera_feed.movers[0].pose(0.0), before)
 
 
 def test_a_saved_state_goes_on_bit_for_bit() -> None:
@@ -137,7 +137,7 @@ def test_a_saved_state_goes_on_bit_for_bit() -> None:
     state = env.unwrapped.save_state()
     copied = pickle.loads(pickle.dumps(env))
     rest = [env.step(a) for a in ACTIONS]
-    frame = env.unwrapped.last_frame
+    frame = env.unwrapped.episode.last_frame
     env.unwrapped.load_state(state)
     fresh = perturbed(*names, pose="slam")
     fresh.unwrapped.load_state(state)
@@ -149,7 +149,7 @@ def test_a_saved_state_goes_on_bit_for_bit() -> None:
             np.testing.assert_array_equal(
                 info["T_world_camera_estimate"], expected[4]["T_world_camera_estimate"]
             )
-        assert_same([other.unwrapped.last_frame], [frame])
+        assert_same([other.unwrapped.episode.last_frame], [frame])
     with pytest.raises(InputError, match="perturbations"):
         perturbed("auto-exposure", pose="slam").unwrapped.load_state(state)
 
@@ -158,7 +158,7 @@ def test_a_frame_that_is_not_delivered_changes_neither_map_nor_estimate() -> Non
     env = Perturbed(ActiveSlamEnv("free", **{**OPTIONS, "pose": "slam"}), "frame-skipping")
     env.reset(seed=3)
     inner = env.unwrapped
-    before, estimate = inner.slam.surface_points().copy(), inner.trajectory_estimate[-1]
+    before, estimate = inner.slam.surface_points().copy(), inner.episode.trajectory_estimate[-1]
     *_, info = env.step(35)
     np.testing.assert_array_equal(inner.slam.surface_points(), before)
     np.testing.assert_array_equal(info["T_world_camera_estimate"], estimate)
@@ -166,24 +166,24 @@ def test_a_frame_that_is_not_delivered_changes_neither_map_nor_estimate() -> Non
     assert info["pose_error"] == pytest.approx(0.03, abs=1e-6)
     np.testing.assert_array_equal(info["divergence"], 0.0)
     env.step(35)
-    assert inner.processed.tolist() == [True, False, True]
+    assert inner.episode.processed.tolist() == [True, False, True]
 
 
 def test_what_moves_waits_for_the_camera_and_is_not_new_surface() -> None:
     env = perturbed("moving-objects")
     env.reset(seed=3)
     inner = env.unwrapped
-    mover = inner.frames.movers[0]
-    T = inner.trajectory_truth[-1].copy()
+    mover = inner.camera_feed.movers[0]
+    T = inner.episode.trajectory_truth[-1].copy()
     T[:3, 3] = mover.middle(0.1)
     before = mover.pose(0.05)
-    inner.frames.set_out(np.array([0.05, 0.1]), np.stack([T, T]))
+    inner.camera_feed.set_trajectory(np.array([0.05, 0.1]), np.stack([T, T]))
     np.testing.assert_array_equal(mover.pose(0.1), before)
-    truth = inner.frames._camera.sensor.ground_truth(inner.trajectory_truth[-1], 0.0)
+    truth = inner.camera_feed._camera.sensor.ground_truth(inner.episode.trajectory_truth[-1], 0.0)
     moving = truth.labels >= len(inner.scene.mesh.labels)
-    inner.frames.set_out(np.zeros(1), inner.trajectory_truth)
-    inner.frames.take(inner.trajectory_truth[-1], 0, 0.0)
-    depth = inner.frames.true_depth()
+    inner.camera_feed.set_trajectory(np.zeros(1), inner.episode.trajectory_truth)
+    inner.camera_feed.capture(inner.episode.trajectory_truth[-1], 0, 0.0)
+    depth = inner.camera_feed.true_depth()
     np.testing.assert_array_equal(depth[moving], 0)
     np.testing.assert_array_equal(depth[~moving], truth.depth[~moving])
 
@@ -236,7 +236,7 @@ def test_every_perturbation_has_an_id() -> None:
 def test_ids_can_be_made(env_id) -> None:
     env = gymnasium.make(env_id, image_size="80x60")
     assert env.action_space.n == 49
-    perturbations = env.unwrapped.frames.perturbations
+    perturbations = env.unwrapped.camera_feed.perturbations
     if "FastMotion" in env_id:
         assert env.unwrapped.config.step_m == pytest.approx(0.24)
     else:
@@ -247,7 +247,7 @@ def test_an_id_passes_the_checker_and_takes_options() -> None:
     env = gymnasium.make(
         "MSActiveSLAM-FreeCamera-MotionBlur-v0", perturbation={"exposure_s": 0.01}, **OPTIONS
     )
-    assert env.unwrapped.frames.perturbations[0].exposure_s == 0.01
+    assert env.unwrapped.camera_feed.perturbations[0].exposure_s == 0.01
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of wrapped environments it says that they are wrapped
         check_env(env, skip_render_check=True)
@@ -277,14 +277,16 @@ def test_the_arm_gives_the_optics_its_path() -> None:
     action = int(np.flatnonzero(mask)[-1])
     env.step(action)
     inner = env.unwrapped
-    assert len(inner.timestamps) >= 2
-    frame = inner.last_frame
+    assert len(inner.episode.timestamps) >= 2
+    frame = inner.episode.last_frame
     plain = gymnasium.make("MSActiveSLAM-v0", **options)
     plain.reset(seed=2)
     plain.step(action)
-    np.testing.assert_array_equal(plain.unwrapped.trajectory_truth, inner.trajectory_truth)
-    np.testing.assert_array_equal(plain.unwrapped.last_frame.depth, frame.depth)
-    assert not np.array_equal(plain.unwrapped.last_frame.color, frame.color)
+    np.testing.assert_array_equal(
+        plain.unwrapped.episode.trajectory_truth, inner.episode.trajectory_truth
+    )
+    np.testing.assert_array_equal(plain.unwrapped.episode.last_frame.depth, frame.depth)
+    assert not np.array_equal(plain.unwrapped.episode.last_frame.color, frame.color)
 
 
 def test_sequences_and_environments_share_the_classes() -> None:
@@ -292,14 +294,14 @@ def test_sequences_and_environments_share_the_classes() -> None:
     env = perturbed("depth-dropout")
     frames, _ = play(env, actions=(0, 0))
     inner = env.unwrapped
-    seed = inner.frames.get_state()["noise_seed"]
+    seed = inner.camera_feed.get_state()["noise_seed"]
     sequence = render_sequence(
         inner.scene,
-        inner.trajectory_truth,
+        inner.episode.trajectory_truth,
         inner.intrinsics,
         inner.config.noise,
         seed,
         perturbations=[make_perturbation("depth-dropout")],
-        timestamps=inner.timestamps,
+        timestamps=inner.episode.timestamps,
     )
     assert_same(frames, list(sequence.frames))

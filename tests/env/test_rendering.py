@@ -108,5 +108,5 @@ def test_the_plots_show_the_divergence_of_motions_beside_their_targets(monkeypat
         values, aim, unit = plotted[column]
         np.testing.assert_array_equal(values, np.array(expected)[:, column])
         assert (aim, unit) == (target, "motions")
-    np.testing.assert_array_equal(plotted[2][0], env.unwrapped.pose_errors)
+    np.testing.assert_array_equal(plotted[2][0], env.unwrapped.episode.pose_errors)
     assert len(plotted[2][0]) == 1 + 2 * 2

@@ -188,7 +188,7 @@ def test_the_environment_runs_with_it():
         np.testing.assert_allclose(info["T_world_camera"], expected, atol=1e-7)
         assert info["tracking_ok"]
         assert not terminated
-    assert len(env.timestamps) > 6  # several frames a motion
+    assert len(env.episode.timestamps) > 6  # several frames a motion
     assert env.timings.calls["mask"] == 6
 
 

@@ -319,7 +319,7 @@ def test_works_in_the_environment(name):
         assert all(info["tracking_ok"] for info in infos)
         views = env.predict_candidates()
         assert views.depth.shape == (49, *views.intrinsics.shape)
-        runs.append((env.trajectory_estimate, views.depth, views.intensity))
+        runs.append((env.episode.trajectory_estimate, views.depth, views.intensity))
     for first, second in zip(*runs, strict=True):
         np.testing.assert_array_equal(first, second)
-    assert env.pose_errors.max() < 0.03
+    assert env.episode.pose_errors.max() < 0.03

@@ -1,4 +1,4 @@
-"""An environment whose camera has imperfections."""
+"""Wrappers of the environments."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from numpy.typing import NDArray
 
 from ms_slam_env.env.active_slam import ActiveSlamEnv
-from ms_slam_env.env.perturbed_frames import frames_with
 from ms_slam_env.errors import InputError
 from ms_slam_env.sequences.perturbations import make_perturbation
 
@@ -40,9 +40,8 @@ class Perturbed(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordCon
         inner = env.unwrapped
         if not isinstance(inner, ActiveSlamEnv):
             raise InputError(f"Perturbed wraps an ActiveSlamEnv, not {type(inner).__name__}")
-        perturbation = make_perturbation(name, options)
-        inner.frames = frames_with((*inner.frames.perturbations, perturbation))
+        inner.perturb(make_perturbation(name, options))
 
-    def action_masks(self) -> np.ndarray:
+    def action_masks(self) -> NDArray[np.bool_]:
         """(n,) which actions are possible now; the name is sb3-contrib's."""
         return self.get_wrapper_attr("unwrapped").action_masks()

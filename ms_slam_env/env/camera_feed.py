@@ -1,14 +1,14 @@
-"""Frames with the imperfections of rendered sequences, taken while an agent moves the camera."""
+"""Where the environment's frames come from: the sensor, as it is or with imperfections."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import RGBDFrame
-from ms_slam_env.env.frame_source import FrameSource, SensorFrames
 from ms_slam_env.errors import InputError
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sensor import RGBDSensor
@@ -19,13 +19,90 @@ from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
 
 Float64 = NDArray[np.float64]
 
-_FRAMES_OF_AN_EPISODE = (
-    151  # one step each and the first: what runs over a whole sequence ends here
-)
+_EPISODE_FRAMES = 151  # one a step and the first: what runs over a whole sequence ends here
 _NEAREST_M = 0.35  # nearer than this to the camera nothing comes by itself
 
 
-class PerturbedFrames(FrameSource):
+class CameraFeed(ABC):
+    """Takes the frames of an episode.
+
+    Attributes:
+        perturbations: of the frames, in order.
+    """
+
+    perturbations: tuple[Perturbation, ...] = ()
+
+    @abstractmethod
+    def begin(
+        self, scene: Scene, sensor: RGBDSensor, T_world_camera: Float64, noise_seed: int
+    ) -> None:
+        """Start an episode in a scene, which ``sensor`` looks at, from a pose (4, 4).
+
+        Raises:
+            InputError: an imperfection that cannot be had there.
+        """
+
+    @abstractmethod
+    def set_trajectory(self, times_s: Float64, poses: Float64) -> None:
+        """Announce the poses (k, 4, 4) of the next frames, after the present one, which is first.
+
+        ``times_s`` (k,) since the start of the episode.
+        """
+
+    @abstractmethod
+    def capture(self, T_world_camera: Float64, index: int, time_s: float) -> RGBDFrame | None:
+        """Take frame ``index`` at an announced pose (4, 4) and time; None if it is not delivered.
+
+        The first frame is always delivered.
+        """
+
+    @abstractmethod
+    def true_depth(self) -> NDArray[np.float32]:
+        """True depth (H, W) of the last frame, metres; 0 = no surface, or one that moves."""
+
+    @abstractmethod
+    def get_state(self) -> dict[str, Any]:
+        """Everything needed to go on bit-exactly."""
+
+    @abstractmethod
+    def set_state(
+        self, state: dict[str, Any], scene: Scene, sensor: RGBDSensor, start: Float64
+    ) -> None:
+        """Go on from a state that ``get_state`` returned in an episode that began at ``start``."""
+
+
+class SensorFeed(CameraFeed):
+    """Every frame as the sensor takes it."""
+
+    def begin(
+        self, scene: Scene, sensor: RGBDSensor, T_world_camera: Float64, noise_seed: int
+    ) -> None:
+        """See the base class."""
+        self._sensor, self._seed = sensor, noise_seed
+
+    def set_trajectory(self, times_s: Float64, poses: Float64) -> None:
+        """Nothing depends on where the camera is between the frames."""
+
+    def capture(self, T_world_camera: Float64, index: int, time_s: float) -> RGBDFrame | None:
+        """See the base class; every frame is delivered."""
+        return self._sensor.capture(T_world_camera, index, time_s, self._seed)
+
+    def true_depth(self) -> NDArray[np.float32]:
+        """See the base class."""
+        return self._sensor.last_true_depth()
+
+    def get_state(self) -> dict[str, Any]:
+        """See the base class."""
+        return {"noise_seed": self._seed}
+
+    def set_state(
+        self, state: dict[str, Any], scene: Scene, sensor: RGBDSensor, start: Float64
+    ) -> None:
+        """See the base class."""
+        self.begin(scene, sensor, start, state["noise_seed"])
+
+
+class PerturbedFeed(CameraFeed):
     """Applies perturbations to each frame, by the same rules as in a rendered sequence.
 
     Between frames the camera moves as ``PoseInterpolation`` says from the frame before to the next
@@ -82,7 +159,7 @@ class PerturbedFrames(FrameSource):
         )
         self._began = began
 
-    def set_out(self, times_s: Float64, poses: Float64) -> None:
+    def set_trajectory(self, times_s: Float64, poses: Float64) -> None:
         """See the base class; what would come too near to the camera waits.
 
         Raises:
@@ -96,11 +173,11 @@ class PerturbedFrames(FrameSource):
                 if mover.distance(here, times_s[k : k + 1])[0] < _NEAREST_M:
                     mover.wait(float(before), float(now - before))
 
-    def take(self, T_world_camera: Float64, index: int, time_s: float) -> RGBDFrame | None:
+    def capture(self, T_world_camera: Float64, index: int, time_s: float) -> RGBDFrame | None:
         """See the base class."""
         if not self._is_delivered(index):
             return None
-        count = max(_FRAMES_OF_AN_EPISODE, index + 1)
+        count = max(_EPISODE_FRAMES, index + 1)
         return self._camera.take(
             self._path,
             time_s,
@@ -166,6 +243,6 @@ class PerturbedFrames(FrameSource):
             mover.set_state(waits)
 
 
-def frames_with(perturbations: tuple[Perturbation, ...]) -> FrameSource:
+def make_camera_feed(perturbations: tuple[Perturbation, ...]) -> CameraFeed:
     """Frames as the sensor takes them, with perturbations if there are any."""
-    return PerturbedFrames(perturbations) if perturbations else SensorFrames()
+    return PerturbedFeed(perturbations) if perturbations else SensorFeed()

@@ -1,0 +1,226 @@
+"""What an episode consists of so far."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.camera import RGBDFrame
+from ms_slam_env.divergence import Histograms
+from ms_slam_env.env.pose_sources import FrameObservation
+from ms_slam_env.geometry import invert
+from ms_slam_env.slam.base import TrackResult
+
+Float64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FrameRecord:
+    """What is kept of a frame.
+
+    Attributes:
+        T_world_camera: (4, 4) the truth.
+        T_world_camera_kinematic: (4, 4) by forward kinematics, tied to the truth at the start.
+        T_world_camera_estimate: (4, 4) as estimated when it was current.
+        tracking_ok: whether tracking held.
+        processed: whether SLAM has seen it.
+        time_s: simulated seconds since the start.
+        divergence: (2,) from the frame before, nats.
+        pose_error: distance between the true and the estimated position, metres.
+    """
+
+    T_world_camera: Float64
+    T_world_camera_kinematic: Float64
+    T_world_camera_estimate: Float64
+    tracking_ok: bool
+    processed: bool
+    time_s: float
+    divergence: Float64
+    pose_error: float
+
+
+@dataclass
+class Episode:
+    """Trajectories, last frame and running measures of an episode of N frames in S steps.
+
+    One step brings one frame or several; its divergence compares its last frame with the last one
+    of the step before.
+
+    Attributes:
+        scene, scene_seed: where it takes place.
+        noise_seed: of the sensor.
+        energy_j: mechanical work of the motion so far.
+        action: index of the last motion; 0 before the first.
+        steps_lost: consecutive steps that tracking has been lost.
+        tracking_ok, inlier_fraction: SLAM's word on the last frame.
+        frames: (N) everything that is kept of each.
+        divergences_of_steps: (S + 1) of the start, zero, and of each step, (2,) nats.
+        reward_terms: of the last step, name to weighted value.
+        histograms, step_histograms: of the last frame, and of the last one of the step before.
+        frame: the last live frame.
+        predicted_divergences: (n, 2) of the candidates, once they have been asked for.
+    """
+
+    scene: str
+    scene_seed: int
+    noise_seed: int
+    energy_j: float = 0.0
+    action: int = 0
+    steps_lost: int = 0
+    tracking_ok: bool = True
+    inlier_fraction: float = 1.0
+    squared_error_sum: float = 0.0
+    frames: list[FrameRecord] = field(default_factory=list)
+    divergences_of_steps: list[Float64] = field(default_factory=list)
+    reward_terms: dict[str, float] = field(default_factory=dict)
+    histograms: Histograms | None = None
+    step_histograms: Histograms | None = None
+    frame: RGBDFrame | None = None
+    predicted_divergences: Float64 | None = None
+
+    # -- Writing -----------------------------------------------------------------------------
+
+    def observe(
+        self, frame: RGBDFrame | None, T_true: Float64, T_kinematic: Float64, time_s: float
+    ) -> FrameObservation:
+        """What is known of a moment; where no frame was delivered the last one is still there."""
+        before = self.frames[-1] if self.frames else None
+        T_last_kinematic = before.T_world_camera_kinematic if before else T_kinematic
+        return FrameObservation(
+            frame=frame or replace(self.last_frame, timestamp=time_s),
+            T_world_camera=T_true,
+            T_world_camera_kinematic=T_kinematic,
+            T_previous_camera_kinematic=invert(T_last_kinematic) @ T_kinematic,
+            T_world_previous_estimate=before.T_world_camera_estimate if before else T_true,
+        )
+
+    def record(self, seen: FrameObservation, result: TrackResult, divergence: Float64) -> None:
+        """Append what one frame brought; ``divergence`` (2,) is from the frame before."""
+        off = result.T_world_camera[:3, 3] - seen.T_world_camera[:3, 3]
+        made = FrameRecord(
+            T_world_camera=seen.T_world_camera.copy(),
+            T_world_camera_kinematic=seen.T_world_camera_kinematic.copy(),
+            T_world_camera_estimate=result.T_world_camera.copy(),
+            tracking_ok=result.tracking_ok,
+            processed=result.processed,
+            time_s=seen.frame.timestamp,
+            divergence=divergence,
+            pose_error=float(np.linalg.norm(off)),
+        )
+        self.frames.append(made)
+        self.frame = seen.frame
+        self.tracking_ok = result.tracking_ok
+        self.inlier_fraction = result.inlier_fraction
+        self.squared_error_sum += made.pose_error**2
+        self.predicted_divergences = None
+
+    def end_step(self, divergence: Float64, energy_j: float) -> None:
+        """Close a step after its last frame; ``divergence`` (2,) is from the step before."""
+        self.divergences_of_steps.append(divergence)
+        self.step_histograms = self.histograms
+        self.energy_j += energy_j
+        self.steps_lost = 0 if self.tracking_ok else self.steps_lost + 1
+
+    def copy(self) -> Episode:
+        """An independent copy."""
+        return copy.deepcopy(self)
+
+    # -- The present -------------------------------------------------------------------------
+
+    @property
+    def last_frame(self) -> RGBDFrame:
+        """The last live frame."""
+        assert self.frame is not None  # reset records a frame before anyone can ask
+        return self.frame
+
+    @property
+    def T_world_camera_estimate(self) -> Float64:
+        """(4, 4) the last estimated pose."""
+        return self.frames[-1].T_world_camera_estimate
+
+    @property
+    def T_start_camera(self) -> Float64:
+        """(4, 4) the last estimated pose, relative to the start."""
+        return invert(self.frames[0].T_world_camera_estimate) @ self.T_world_camera_estimate
+
+    @property
+    def pose_error(self) -> float:
+        """Distance between the true and the estimated position now, metres."""
+        return self.frames[-1].pose_error
+
+    @property
+    def ate(self) -> float:
+        """RMSE of the position over the episode so far, metres, no alignment."""
+        return float(np.sqrt(self.squared_error_sum / len(self.frames)))
+
+    @property
+    def divergence(self) -> Float64:
+        """(2,) intensity and depth divergence of the last step, nats; zero at the start."""
+        return self.divergences_of_steps[-1]
+
+    def info(self) -> dict[str, Any]:
+        """What ``info`` says of the episode itself; the arrays are copies."""
+        return {
+            "T_world_camera": self.frames[-1].T_world_camera.copy(),
+            "T_world_camera_estimate": self.T_world_camera_estimate.copy(),
+            "pose_error": self.pose_error,
+            "ate": self.ate,
+            "divergence": self.divergence.copy(),
+            "tracking_ok": self.tracking_ok,
+            "reward_terms": dict(self.reward_terms),
+            "time": self.frames[-1].time_s,
+            "energy": self.energy_j,
+            "scene": self.scene,
+            "scene_seed": self.scene_seed,
+        }
+
+    # -- The past ----------------------------------------------------------------------------
+
+    @property
+    def trajectory_truth(self) -> Float64:
+        """(N, 4, 4) true poses."""
+        return np.stack([frame.T_world_camera for frame in self.frames])
+
+    @property
+    def trajectory_estimate(self) -> Float64:
+        """(N, 4, 4) poses estimated when they were current."""
+        return np.stack([frame.T_world_camera_estimate for frame in self.frames])
+
+    @property
+    def trajectory_kinematics(self) -> Float64:
+        """(N, 4, 4) poses by forward kinematics, tied to the truth at the first."""
+        return np.stack([frame.T_world_camera_kinematic for frame in self.frames])
+
+    @property
+    def tracked(self) -> NDArray[np.bool_]:
+        """(N,) whether tracking held at each frame; one that was processed is part of the map."""
+        return np.array([frame.tracking_ok for frame in self.frames])
+
+    @property
+    def processed(self) -> NDArray[np.bool_]:
+        """(N,) whether SLAM has seen each frame; frame selection drops the others."""
+        return np.array([frame.processed for frame in self.frames])
+
+    @property
+    def timestamps(self) -> Float64:
+        """(N,) simulated seconds since the start of the episode, of each frame."""
+        return np.array([frame.time_s for frame in self.frames])
+
+    @property
+    def divergences(self) -> Float64:
+        """(N, 2) divergence of each frame from the one before; zero for the first."""
+        return np.stack([frame.divergence for frame in self.frames])
+
+    @property
+    def step_divergences(self) -> Float64:
+        """(S + 1, 2) ``info["divergence"]`` of the start and of each step."""
+        return np.stack(self.divergences_of_steps)
+
+    @property
+    def pose_errors(self) -> Float64:
+        """(N,) distance between true and estimated position at each frame, metres."""
+        return np.array([frame.pose_error for frame in self.frames])

@@ -1,0 +1,72 @@
+"""What Gymnasium calls to make the environments of the registered ids."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+from gymnasium.vector import SyncVectorEnv
+
+from ms_slam_env.env.active_slam import ActiveSlamEnv
+from ms_slam_env.env.config import EnvConfig
+from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.registration import MAX_EPISODE_STEPS
+from ms_slam_env.sequences.perturbations import FastMotion, make_perturbation
+
+_FASTER = 2.0  # of the ids with fast motion, unless their option says otherwise
+
+
+def make_env(perturbed_by: str | None = None, **options: Any) -> ActiveSlamEnv:
+    """Entry point of every id: one environment, ``perturbed_by`` something or not."""
+    if perturbed_by is None:
+        return ActiveSlamEnv(**options)
+    return _make_perturbed(perturbed_by, **options)
+
+
+# Without "human" Gymnasium would warn, wrap the environment and fail at the first reset for want of
+# pygame; with it the environment itself is asked, and refuses in one line.
+make_env.metadata = {"render_modes": ["rgb_array", "human"]}  # type: ignore[attr-defined]
+
+
+class InProcessVectorEnv(SyncVectorEnv):
+    """Vector entry point: ``num_envs`` time-limited environments stepped in this process."""
+
+    def __init__(
+        self, num_envs: int, max_episode_steps: int = MAX_EPISODE_STEPS, **options: Any
+    ) -> None:
+        def make() -> gymnasium.Env[Any, Any]:
+            return gymnasium.wrappers.TimeLimit(make_env(**options), max_episode_steps)
+
+        super().__init__([make] * num_envs)
+
+
+def _make_perturbed(
+    name: str, perturbation: Mapping[str, Any] | None = None, **options: Any
+) -> ActiveSlamEnv:
+    """Build an environment with one perturbation, whose options are ``perturbation``.
+
+    ``fast-motion`` makes every motion of a free camera ``factor`` (2) times as large in the same
+    time; everything else is put on the camera.
+
+    Raises:
+        InputError: an unknown option, or a value out of range.
+    """
+    strength = dict(perturbation or {})
+    if name == "fast-motion":
+        return ActiveSlamEnv(**_hurried(strength, options))
+    env = ActiveSlamEnv(**options)
+    env.perturb(make_perturbation(name, strength))
+    return env
+
+
+def _hurried(strength: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of an environment with larger motions."""
+    for name in strength:
+        if name != "factor":
+            raise unknown("option of fast-motion in an environment", name, ("factor",))
+    if options.get("embodiment") not in ("free", "fixed-translation"):
+        raise InputError("fast-motion needs a free camera: an arm moves as fast as its joints")
+    factor = FastMotion(factor=strength.get("factor", _FASTER)).factor
+    steps = {name: options.get(name, getattr(EnvConfig, name)) for name in ("step_m", "step_rad")}
+    return {**options, **{name: factor * step for name, step in steps.items()}}
