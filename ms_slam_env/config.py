@@ -1,4 +1,4 @@
-"""Frozen-dataclass configuration: from nested mappings, misspelt keys refused at any depth."""
+"""Frozen-dataclass configuration: from nested mappings or texts, misspelt keys refused."""
 
 from __future__ import annotations
 

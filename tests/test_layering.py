@@ -150,7 +150,7 @@ def test_imports_point_to_the_left(path: Path) -> None:
         ("from ms_slam_env import env", "ms_slam_env.metrics.map"),
         ("import ms_slam_env.sensor", "ms_slam_env.scenes.base"),
         ("from ..env import EnvConfig", "ms_slam_env.slam.surfel"),
-        ("def f():\n    import ms_slam_baselines", "ms_slam_env.benchmark.episode"),
+        ("def f():\n    import ms_slam_baselines", "ms_slam_env.experiments.harness.episodes"),
         ("import torch", "ms_slam_env.cli.train"),
         ("from open3d.core import Tensor", "ms_slam_env.slam.volumetric"),
         ("from ms_slam_env.geometry import hat", "ms_slam_env.errors"),

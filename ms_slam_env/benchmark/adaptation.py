@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from ms_slam_env import metrics, slam
 from ms_slam_env.benchmark.adaptation_report import comparison, save_figures, summarise, tables
-from ms_slam_env.benchmark.planner_benchmark import check_names, seed_list
 from ms_slam_env.benchmark.planner_report import finished
-from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
 from ms_slam_env.camera import XTION_SIZES, Intrinsics, RGBDFrame, xtion
 from ms_slam_env.command_line import exit_code, parse, report_failures
 from ms_slam_env.config import check_range
 from ms_slam_env.evaluation.run_sequence import Step, run_sequence
+from ms_slam_env.experiments.harness.episodes import check_names, seed_list
+from ms_slam_env.experiments.harness.rows import check_any_finished, failures, run_all
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import Row, write_json
 from ms_slam_env.sequences import MotionSegments, open_sequence

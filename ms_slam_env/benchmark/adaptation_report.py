@@ -19,9 +19,9 @@ from ms_slam_env.benchmark.figures import (
     save,
 )
 from ms_slam_env.benchmark.planner_report import Column
-from ms_slam_env.benchmark.table import format_interval, markdown_table
 from ms_slam_env.report import statistics
 from ms_slam_env.report.records import Row
+from ms_slam_env.report.tables import format_interval, markdown_table
 
 COLUMNS = (
     Column("cpu_ms", "processor time a frame [ms]"),

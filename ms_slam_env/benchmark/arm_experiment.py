@@ -15,26 +15,28 @@ from pathlib import Path
 from typing import Any, cast
 
 from ms_slam_env.benchmark import arm_experiment_report as report
-from ms_slam_env.benchmark.episode import (
+from ms_slam_env.benchmark.map_consistency import JudgedMap, judge_episode
+from ms_slam_env.benchmark.map_consistency_picture import save_map_picture
+from ms_slam_env.command_line import exit_code, parse, report_failures
+from ms_slam_env.config import check_range
+from ms_slam_env.env import ActiveSlamEnv
+from ms_slam_env.env.planners import make_planner
+from ms_slam_env.errors import InputError
+from ms_slam_env.experiments.harness.episodes import (
+    DEFAULT_PLANNERS,
     DEFAULT_STEP_DEG,
     DEFAULT_STEP_M,
     LOST_ERROR_M,
     EpisodeSpec,
     check_episodes,
+    check_names,
     make_env,
     measure_trajectory,
+    parse_options,
     play,
+    seed_list,
 )
-from ms_slam_env.benchmark.map_consistency import JudgedMap, judge_episode
-from ms_slam_env.benchmark.map_consistency_picture import save_map_picture
-from ms_slam_env.benchmark.options import parse_options
-from ms_slam_env.benchmark.planner_benchmark import DEFAULT_PLANNERS, check_names, seed_list
-from ms_slam_env.benchmark.planners import make_planner
-from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
-from ms_slam_env.command_line import exit_code, parse, report_failures
-from ms_slam_env.config import check_range
-from ms_slam_env.env import ActiveSlamEnv
-from ms_slam_env.errors import InputError
+from ms_slam_env.experiments.harness.rows import check_any_finished, failures, run_all
 from ms_slam_env.metrics.consistency import ConsistencyRule
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import write_json

@@ -13,10 +13,10 @@ from matplotlib.axes import Axes
 
 from ms_slam_env.benchmark.figures import caption, colours, labels, legend_beside, new_figure, save
 from ms_slam_env.benchmark.planner_report import Column, finished
-from ms_slam_env.benchmark.table import format_interval, markdown_table
 from ms_slam_env.report import statistics
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.statistics import Interval
+from ms_slam_env.report.tables import format_interval, markdown_table
 
 Cell = dict[str, Interval]
 Summary = dict[tuple[str, str], Cell]

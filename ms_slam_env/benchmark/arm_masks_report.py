@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.benchmark.table import format_interval, format_number, markdown_table
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.statistics import Interval, bootstrap_interval, share_interval
+from ms_slam_env.report.tables import format_interval, format_number, markdown_table
 from ms_slam_env.robot.arm.feasibility import REASONS
 
 EVERYWHERE = "all"

@@ -9,10 +9,10 @@ from typing import Any
 from ms_slam_env import slam
 from ms_slam_env.benchmark.compare_report import save_figure, summarise, tables
 from ms_slam_env.benchmark.compare_run import CompareSpec, run_apart
-from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
 from ms_slam_env.camera import XTION_SIZES
 from ms_slam_env.config import check_range, parse_named
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.experiments.harness.rows import check_any_finished, failures, run_all
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import write_json
 from ms_slam_env.scenes import ROOMS

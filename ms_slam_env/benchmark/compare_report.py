@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ms_slam_env.benchmark import figures
-from ms_slam_env.benchmark.table import format_number, markdown_table
 from ms_slam_env.report.records import Row
+from ms_slam_env.report.tables import format_number, markdown_table
 
 Cell = dict[str, Any]
 

@@ -14,8 +14,8 @@ from scipy.stats import spearmanr
 from ms_slam_env.benchmark import figures
 from ms_slam_env.benchmark.image_motion import MOTIONS
 from ms_slam_env.benchmark.sequence_divergence import KINDS, statistics_of
-from ms_slam_env.benchmark.table import format_number, markdown_table
 from ms_slam_env.report.records import Row
+from ms_slam_env.report.tables import format_number, markdown_table
 
 Float64 = NDArray[np.float64]
 Found = list[dict[str, Any]]

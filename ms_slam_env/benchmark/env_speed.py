@@ -15,7 +15,6 @@ from typing import Any, cast
 import gymnasium as gym
 import numpy as np
 
-from ms_slam_env.benchmark.table import markdown_table
 from ms_slam_env.command_line import exit_code, parse
 from ms_slam_env.config import check_range
 from ms_slam_env.env import ActiveSlamEnv
@@ -24,6 +23,7 @@ from ms_slam_env.env.observations import OBSERVATIONS
 from ms_slam_env.errors import unknown
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import write_json
+from ms_slam_env.report.tables import markdown_table
 
 PROGRAM = "python -m ms_slam_env.benchmark.env_speed"
 ORDER = ("ik", "physics", "move", "mask", "render", "slam", "divergence", "coverage", "lookahead")

@@ -12,9 +12,9 @@ import imageio.v3 as iio
 import numpy as np
 from tqdm import tqdm
 
-from ms_slam_env.benchmark.episode import DEFAULT_STEP_DEG, DEFAULT_STEP_M
-from ms_slam_env.benchmark.planners import make_planner
 from ms_slam_env.command_line import exit_code, parse
+from ms_slam_env.env.planners import make_planner
+from ms_slam_env.experiments.harness.episodes import DEFAULT_STEP_DEG, DEFAULT_STEP_M
 
 PROGRAM = "python -m ms_slam_env.benchmark.episode_gif"
 

@@ -21,11 +21,11 @@ from tqdm import tqdm
 
 from ms_slam_env.benchmark.explore_evaluation import SlamEvaluator
 from ms_slam_env.benchmark.figures import new_figure, plain_log_ticks, save
-from ms_slam_env.benchmark.table import format_number, markdown_table
 from ms_slam_env.command_line import exit_code, parse
 from ms_slam_env.exploration.objectives import FAILURE
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import write_json
+from ms_slam_env.report.tables import format_number, markdown_table
 from ms_slam_env.slam.configuration import SlamConfiguration, read_configuration
 
 PROGRAM = "python -m ms_slam_env.benchmark.explore_divergence"

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ms_slam_env.benchmark.explore_judge import FIGURES
-from ms_slam_env.benchmark.table import format_number, markdown_table
 from ms_slam_env.exploration.objectives import METRICS
+from ms_slam_env.report.tables import format_number, markdown_table
 
 _SHOWN = ("ate_m", "ate_max_m", "ext_ms", "mem_mb", "energy_j", "map_error_mm", "M_I", "M_D")
 

@@ -22,7 +22,6 @@ from ms_slam_env.benchmark.explore_evaluation import SlamEvaluator
 from ms_slam_env.benchmark.explore_figures import hypervolume_figure
 from ms_slam_env.benchmark.explore_grid import Grid
 from ms_slam_env.benchmark.figures import save
-from ms_slam_env.benchmark.table import markdown_table
 from ms_slam_env.command_line import exit_code, parse
 from ms_slam_env.errors import InputError
 from ms_slam_env.exploration import make_space
@@ -32,6 +31,7 @@ from ms_slam_env.exploration.settings import SAMPLERS, make_sampler
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import RecordFile, spec_key, write_json
 from ms_slam_env.report.statistics import bootstrap_interval
+from ms_slam_env.report.tables import markdown_table
 
 PROGRAM = "python -m ms_slam_env.benchmark.explore_samplers"
 OBJECTIVES = ("ate_m", "load_ms")

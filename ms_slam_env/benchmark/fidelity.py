@@ -20,15 +20,15 @@ from scipy.stats import spearmanr
 
 from ms_slam_env import slam as slam_backends
 from ms_slam_env.benchmark.fidelity_report import as_table, save_figure, summarise
-from ms_slam_env.benchmark.planner_benchmark import check_names, seed_list
 from ms_slam_env.benchmark.planner_report import finished
-from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
 from ms_slam_env.camera import RGBDFrame, intensity_image, xtion
 from ms_slam_env.command_line import exit_code, parse, report_failures
 from ms_slam_env.divergence import Divergence, DivergenceConfig, Histograms, make_divergence
 from ms_slam_env.env.config import EnvConfig, LookaheadConfig
 from ms_slam_env.env.lookahead import Lookahead
 from ms_slam_env.errors import InputError
+from ms_slam_env.experiments.harness.episodes import check_names, seed_list
+from ms_slam_env.experiments.harness.rows import check_any_finished, failures, run_all
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import write_json
 from ms_slam_env.robot import CAMERA_RADIUS_M

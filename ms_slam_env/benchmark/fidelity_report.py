@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from ms_slam_env.benchmark.figures import caption, colour, new_figure, save
-from ms_slam_env.benchmark.table import format_interval, format_number, markdown_table
 from ms_slam_env.report.statistics import Interval, median_interval
+from ms_slam_env.report.tables import format_interval, format_number, markdown_table
 
 KINDS = ("intensity", "depth")
 TARGETS = (0.7, 0.8)

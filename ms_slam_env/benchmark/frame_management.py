@@ -21,11 +21,11 @@ from ms_slam_env.benchmark.frame_management_report import (
 )
 from ms_slam_env.benchmark.frame_management_run import FilterSpec, run_filters
 from ms_slam_env.benchmark.options import parse_frame_management
-from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
 from ms_slam_env.camera import XTION_SIZES
 from ms_slam_env.command_line import exit_code, parse, report_failures
 from ms_slam_env.config import check_range
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.experiments.harness.rows import check_any_finished, failures, run_all
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import write_json
 from ms_slam_env.sequences import check_sequence

@@ -11,9 +11,9 @@ import numpy as np
 
 from ms_slam_env import metrics, slam
 from ms_slam_env.benchmark.compare_inputs import Input, load
-from ms_slam_env.benchmark.episode import LOST_ERROR_M
 from ms_slam_env.benchmark.options import parse_frame_management
 from ms_slam_env.evaluation.run_sequence import run_sequence
+from ms_slam_env.experiments.harness.episodes import LOST_ERROR_M
 from ms_slam_env.metrics import reconstruction
 from ms_slam_env.parallel import limit_threads
 from ms_slam_env.sequences import UnevenPath

@@ -16,20 +16,19 @@ from typing import Any
 import numpy as np
 
 from ms_slam_env import metrics, slam
-from ms_slam_env.benchmark.episode import LOST_ERROR_M
 from ms_slam_env.benchmark.figures import caption, new_figure, save
-from ms_slam_env.benchmark.planner_benchmark import check_names, seed_list
 from ms_slam_env.benchmark.planner_report import Column, finished
-from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
-from ms_slam_env.benchmark.table import format_interval, format_number, markdown_table
 from ms_slam_env.camera import intensity_image, xtion
 from ms_slam_env.command_line import exit_code, parse, report_failures
 from ms_slam_env.divergence import DivergenceConfig, make_divergence
 from ms_slam_env.errors import InputError
+from ms_slam_env.experiments.harness.episodes import LOST_ERROR_M, check_names, seed_list
+from ms_slam_env.experiments.harness.rows import check_any_finished, failures, run_all
 from ms_slam_env.report import statistics
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import Row, write_json
 from ms_slam_env.report.statistics import Interval
+from ms_slam_env.report.tables import format_interval, format_number, markdown_table
 from ms_slam_env.sensor.scene_cache import get_scene
 from ms_slam_env.sequences import Sequence as FrameSequence
 from ms_slam_env.sequences import handheld_trajectory, render_sequence

@@ -28,12 +28,12 @@ from ms_slam_env.benchmark.kidnapping_scenarios import (
     foreign_interruption,
     map_path,
 )
-from ms_slam_env.benchmark.planner_benchmark import seed_list
-from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
 from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
 from ms_slam_env.command_line import exit_code, parse, report_failures
 from ms_slam_env.config import check_range
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.experiments.harness.episodes import seed_list
+from ms_slam_env.experiments.harness.rows import check_any_finished, failures, run_all
 from ms_slam_env.geometry import invert, relative_angle
 from ms_slam_env.metrics import ate_rmse, relocalisation_times
 from ms_slam_env.report.provenance import provenance

@@ -10,9 +10,9 @@ import numpy as np
 
 from ms_slam_env.benchmark.kidnapping_scenarios import FOREIGN
 from ms_slam_env.benchmark.planner_report import finished
-from ms_slam_env.benchmark.table import format_interval, format_number, markdown_table
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.statistics import Interval, median_interval, share_interval
+from ms_slam_env.report.tables import format_interval, format_number, markdown_table
 
 EVERY = "all"
 

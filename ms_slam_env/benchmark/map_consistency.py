@@ -8,8 +8,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ms_slam_env.benchmark.map_truth import SURFACE_SPACING_M
 from ms_slam_env.env import ActiveSlamEnv
+from ms_slam_env.evaluation.map_truth import SURFACE_SPACING_M
 from ms_slam_env.metrics.consistency import (
     ConsistencyRule,
     MapConsistency,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.benchmark import figures
 from ms_slam_env.benchmark.map_evaluation import ComparedMaps
-from ms_slam_env.benchmark.table import format_number, markdown_table
+from ms_slam_env.report.tables import format_number, markdown_table
 
 _FIXED = (
     ("accuracy_cm", "accuracy [cm]", 1.0),

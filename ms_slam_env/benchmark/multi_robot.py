@@ -27,10 +27,10 @@ from ms_slam_env.benchmark.multi_robot_run import (
     place_robots,
     run_team,
 )
-from ms_slam_env.benchmark.planner_benchmark import seed_list
-from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
 from ms_slam_env.camera import xtion
 from ms_slam_env.command_line import exit_code, parse, report_failures
+from ms_slam_env.experiments.harness.episodes import seed_list
+from ms_slam_env.experiments.harness.rows import check_any_finished, failures, run_all
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import write_json
 from ms_slam_env.scenes.registry import check_name

@@ -8,9 +8,9 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.benchmark.episode import EpisodeSpec, make_env, play
-from ms_slam_env.benchmark.planners import check_planner, make_planner
 from ms_slam_env.env import ActiveSlamEnv
+from ms_slam_env.env.planners import check_planner, make_planner
+from ms_slam_env.experiments.harness.episodes import EpisodeSpec, make_env, play
 
 Float64 = NDArray[np.float64]
 

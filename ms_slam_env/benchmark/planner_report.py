@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.benchmark.table import format_interval, markdown_table
 from ms_slam_env.report import statistics
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.statistics import Interval
+from ms_slam_env.report.tables import format_interval, markdown_table
 
 RANKED_BY = "f_score_5cm"
 """Standing still loses it by recall, getting lost by precision."""

@@ -22,13 +22,13 @@ from tqdm import tqdm
 
 from ms_slam_env import slam
 from ms_slam_env.benchmark.figures import caption, colour, new_figure, save
-from ms_slam_env.benchmark.table import markdown_table
 from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.command_line import exit_code, parse
 from ms_slam_env.config import check_range
 from ms_slam_env.geometry import invert, se3_log
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import write_json
+from ms_slam_env.report.tables import markdown_table
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sensor.scene_cache import get_scene
 from ms_slam_env.sequences import handheld_trajectory

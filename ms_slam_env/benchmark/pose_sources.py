@@ -12,25 +12,26 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from ms_slam_env.benchmark.episode import (
+from ms_slam_env.benchmark.planner_report import Column, finished
+from ms_slam_env.command_line import exit_code, parse, report_failures
+from ms_slam_env.env.pose_sources import POSE_SOURCES
+from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.experiments.harness.episodes import (
     DEFAULT_STEP_DEG,
     DEFAULT_STEP_M,
     EpisodeSpec,
     check_episodes,
+    check_names,
+    parse_options,
     run_episode,
+    seed_list,
 )
-from ms_slam_env.benchmark.options import parse_options
-from ms_slam_env.benchmark.planner_benchmark import check_names, seed_list
-from ms_slam_env.benchmark.planner_report import Column, finished
-from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
-from ms_slam_env.benchmark.table import format_interval, markdown_table
-from ms_slam_env.command_line import exit_code, parse, report_failures
-from ms_slam_env.env.pose_sources import POSE_SOURCES
-from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.experiments.harness.rows import check_any_finished, failures, run_all
 from ms_slam_env.report import statistics
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import Row, write_json
 from ms_slam_env.report.statistics import Interval
+from ms_slam_env.report.tables import format_interval, markdown_table
 
 PROGRAM = "python -m ms_slam_env.benchmark.pose_sources"
 REFERENCE = "slam"

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from ms_slam_env.benchmark import figures
-from ms_slam_env.benchmark.table import format_number, markdown_table
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.divergence import DivergenceConfig, make_divergence
 from ms_slam_env.errors import InputError
+from ms_slam_env.report.tables import format_number, markdown_table
 from ms_slam_env.sequences import Sequence as RGBDSequence
 
 Float64 = NDArray[np.float64]

@@ -20,7 +20,6 @@ from tqdm import tqdm
 from ms_slam_env import scenes
 from ms_slam_env._warp import wp
 from ms_slam_env.benchmark.slam_speed import backend_parameters
-from ms_slam_env.benchmark.table import format_number, markdown_table
 from ms_slam_env.camera import xtion
 from ms_slam_env.command_line import exit_code, parse
 from ms_slam_env.config import check_choice, check_range
@@ -28,6 +27,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.metrics import ate_rmse
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import write_json
+from ms_slam_env.report.tables import format_number, markdown_table
 from ms_slam_env.sequences import handheld_trajectory, render_sequence
 from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
 

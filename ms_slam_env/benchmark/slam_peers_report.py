@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ms_slam_env.benchmark.table import format_number, markdown_table
+from ms_slam_env.report.tables import format_number, markdown_table
 
 
 def markdown_report(report: dict[str, Any]) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ms_slam_env.benchmark.figures import caption, colour, new_figure, save
-from ms_slam_env.benchmark.table import format_number, markdown_table
+from ms_slam_env.report.tables import format_number, markdown_table
 
 REST = "rest"
 _BLOCK = ("version", "size", "target")

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.benchmark import figures
-from ms_slam_env.benchmark.table import format_number, markdown_table
 from ms_slam_env.benchmark.trajectory_evaluation import Matched, absolute
+from ms_slam_env.report.tables import format_number, markdown_table
 
 Float64 = NDArray[np.float64]
 

@@ -9,12 +9,12 @@ from typing import Any
 
 from ms_slam_env import __version__, scenes, slam
 from ms_slam_env.benchmark import usme_suite
-from ms_slam_env.benchmark.runner import check_any_finished, failures, run_all
 from ms_slam_env.benchmark.usme_report import label, save_figure, tables
 from ms_slam_env.benchmark.usme_run import UsmeSpec, run_apart
 from ms_slam_env.camera import XTION_SIZES
 from ms_slam_env.config import check_range, parse_named
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.experiments.harness.rows import check_any_finished, failures, run_all
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import Row, write_json
 from ms_slam_env.scenes import Scene

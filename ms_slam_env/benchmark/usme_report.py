@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from ms_slam_env import scenes
 from ms_slam_env.benchmark import figures
-from ms_slam_env.benchmark.table import format_number, markdown_table
 from ms_slam_env.benchmark.usme_suite import SUITE, render
 from ms_slam_env.report.records import Row
+from ms_slam_env.report.tables import format_number, markdown_table
 
 Column = tuple[str, str, float, int]
 """Name of the measure, heading, factor, significant digits."""

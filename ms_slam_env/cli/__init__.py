@@ -11,6 +11,7 @@ COMMANDS = {
     "compare": "run SLAM backends over the same sequences and compare them",
     "divergence": "measure how hard recorded sequences are, from frame to frame",
     "evaluate": "compare an estimated trajectory (TUM file) or map (PLY) with the truth",
+    "experiment": "run one of the project's experiments, or list them",
     "explore": "search the parameters of a SLAM backend for the best compromises",
     "generate": "render an RGB-D sequence with true poses into a folder",
     "report": "turn a folder of results into one HTML page",

@@ -136,9 +136,8 @@ def _motion(args: Arguments, recorded: Any, scene: Any) -> tuple[Any, Any, dict[
 
 def _planned(args: Arguments, planner: str) -> tuple[Any, Any, dict[str, Any]]:
     """The same of a planner's episode."""
-    from ms_slam_env.benchmark.episode import EpisodeSpec
-    from ms_slam_env.benchmark.options import parse_options
     from ms_slam_env.benchmark.planned_motion import planned_motion
+    from ms_slam_env.experiments.harness.episodes import EpisodeSpec, parse_options
 
     motion = planned_motion(
         EpisodeSpec(

@@ -10,9 +10,14 @@ import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ms_slam_env.errors import InputError
 
 Row = dict[str, Any]
+
+_INFINITE = {math.inf: "Infinity", -math.inf: "-Infinity"}
+_FROM_TEXT = {text: number for number, text in _INFINITE.items()}
 
 
 def spec_key(spec: Any) -> str:
@@ -54,7 +59,7 @@ class RecordFile:
         rows: dict[str, Row] = {}
         for number, line in enumerate(complete.split(b"\n") if complete else [], start=1):
             try:
-                row = json.loads(line)
+                row = from_plain(json.loads(line))
                 rows[row["key"]] = row
             except (ValueError, TypeError, KeyError) as error:
                 raise InputError(f"{self.path}, line {number}, is not a result") from error
@@ -63,7 +68,7 @@ class RecordFile:
     def append(self, row: Row) -> None:
         """Add one row; it is on disk when this returns."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        line = json.dumps(row).encode() + b"\n"
+        line = json.dumps(to_plain(row), allow_nan=False).encode() + b"\n"
         descriptor = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
         try:
             os.write(descriptor, line)
@@ -75,20 +80,31 @@ class RecordFile:
 def write_json(path: Path, content: Any) -> None:
     """Write ``content``; an interrupt leaves the old file or the new one, never half of one.
 
-    NaN and infinity, which JSON does not have, become null.
+    See :func:`to_plain` for numbers that JSON does not have.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
-    partial.write_text(json.dumps(_finite(content), indent=1, allow_nan=False) + "\n")
+    partial.write_text(json.dumps(to_plain(content), indent=1, allow_nan=False) + "\n")
     os.replace(partial, path)
 
 
-def _finite(content: Any) -> Any:
-    """``content`` with None in place of every number that is not finite."""
+def to_plain(content: Any) -> Any:
+    """``content`` in JSON's types: NaN (not known) becomes null, infinity (never) a text."""
     if isinstance(content, dict):
-        return {key: _finite(value) for key, value in content.items()}
+        return {key: to_plain(value) for key, value in content.items()}
     if isinstance(content, (list, tuple)):
-        return [_finite(value) for value in content]
+        return [to_plain(value) for value in content]
+    if isinstance(content, np.generic):
+        return to_plain(content.item())
     if isinstance(content, float) and not math.isfinite(content):
-        return None
+        return None if math.isnan(content) else _INFINITE[content]
     return content
+
+
+def from_plain(content: Any) -> Any:
+    """What :func:`to_plain` was given, but None where that had NaN."""
+    if isinstance(content, dict):
+        return {key: from_plain(value) for key, value in content.items()}
+    if isinstance(content, list):
+        return [from_plain(value) for value in content]
+    return _FROM_TEXT.get(content, content) if isinstance(content, str) else content

@@ -20,11 +20,11 @@ from ms_slam_env.benchmark.report.markdown import blocks_of
 from ms_slam_env.benchmark.report.page import page
 from ms_slam_env.benchmark.report.plots import PALETTE
 from ms_slam_env.benchmark.report.sections import section_of
-from ms_slam_env.benchmark.table import format_number, markdown_table
 from ms_slam_env.cli import main
 from ms_slam_env.geometry import look_at
 from ms_slam_env.metrics import absolute_errors
 from ms_slam_env.report.statistics import Interval
+from ms_slam_env.report.tables import format_number, markdown_table
 from ms_slam_env.sequences import write_trajectory
 
 graph_objects = pytest.importorskip("plotly.graph_objects")

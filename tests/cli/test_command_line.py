@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ms_slam_env.benchmark import planner_benchmark
-from ms_slam_env.benchmark.planner_report import DETAILS, HEADLINE
 from ms_slam_env.cli import COMMANDS, main
+from ms_slam_env.experiments.harness import running
+from ms_slam_env.experiments.planners import DETAILS, HEADLINE
 from ms_slam_env.geometry import make_pose, so3_exp
 from ms_slam_env.report.records import Row
 from ms_slam_env.sequences import associate, write_trajectory
@@ -129,9 +129,9 @@ def test_the_installed_command_says_one_line(tmp_path: Path) -> None:
 def test_failed_episodes_are_code_1_and_stay_in_the_results(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    result = {column.metric: 0.5 for column in (*HEADLINE, *DETAILS)}
+    result = dict.fromkeys((*HEADLINE, *DETAILS), 0.5)
     finished = {"result": {**result, "ate_over_time": [0.1]}, "error": None}
-    monkeypatch.setattr(planner_benchmark, "run_all", made_up_rows(failed(), finished))
+    monkeypatch.setattr(running, "run_all", made_up_rows(failed(), finished))
     assert main([*TWO_EPISODES, "--out", str(tmp_path)]) == 1
     assert "1 failed, the first: planner random, scene table, seed 2000" in capsys.readouterr().err
     content = json.loads((tmp_path / "results.json").read_text())
@@ -142,7 +142,7 @@ def test_where_every_episode_failed_the_old_report_stays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "table.md").write_text("good")
-    monkeypatch.setattr(planner_benchmark, "run_all", made_up_rows(failed(), failed()))
+    monkeypatch.setattr(running, "run_all", made_up_rows(failed(), failed()))
     assert main([*TWO_EPISODES, "--out", str(tmp_path)]) == 1
     assert "all 2 failed, the first: planner random, scene tab" in one_line(capsys.readouterr().err)
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("table.md", "good")]
@@ -158,7 +158,7 @@ def failed() -> dict[str, Any]:
 def made_up_rows(first: dict[str, Any], last: dict[str, Any]) -> Callable[..., list[Row]]:
     """A ``run_all`` that runs nothing."""
 
-    def run_all(specs: list[Any], run: object, out: Path, workers: int | None) -> list[Row]:
+    def run_all(specs: list[Any], *_: object) -> list[Row]:
         outcomes = [*[first] * (len(specs) - 1), last]
         return [
             {"key": f"k{i}", "spec": vars(spec), "commit": "c", **outcome}

@@ -8,8 +8,8 @@ from typing import Any
 
 from ms_slam_env.benchmark.report.blocks import Cell, Table
 from ms_slam_env.benchmark.report.glossary import heading, meaning, unit
-from ms_slam_env.benchmark.table import format_interval, format_number
 from ms_slam_env.report.statistics import Interval
+from ms_slam_env.report.tables import format_interval, format_number
 
 Value = str | float | int | bool | Interval | None
 Record = dict[str, Value]

@@ -10,22 +10,26 @@ import numpy as np
 import pytest
 
 from ms_slam_env.benchmark import planner_report
-from ms_slam_env.benchmark.episode import EpisodeSpec, make_env, run_episode
 from ms_slam_env.benchmark.frame_skipping import (
     Arguments,
     SkippingSpec,
     run_sequence,
     suggest_targets,
 )
-from ms_slam_env.benchmark.options import parse_options
-from ms_slam_env.benchmark.planners import (
+from ms_slam_env.config import parse_named
+from ms_slam_env.env.embodiments import EMBODIMENTS
+from ms_slam_env.env.planners import (
     make_planner,
     planner_class,
     planner_names,
 )
-from ms_slam_env.config import parse_named
-from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.errors import InputError
+from ms_slam_env.experiments.harness.episodes import (
+    EpisodeSpec,
+    make_env,
+    parse_options,
+    run_episode,
+)
 from ms_slam_env.report.statistics import Interval
 
 SPEC = EpisodeSpec("random", "table", seed=2000, steps=4)
@@ -78,7 +82,7 @@ def test_a_trained_policy_without_its_extra_says_what_to_install(monkeypatch):
     def missing(name):
         raise ModuleNotFoundError("No module named 'torch'", name="torch")
 
-    monkeypatch.setattr("ms_slam_env.benchmark.planners.import_module", missing)
+    monkeypatch.setattr("ms_slam_env.env.planners.import_module", missing)
     with pytest.raises(
         InputError, match=r"No module named 'torch'; pip install 'ms-slam-env\[train"
     ):

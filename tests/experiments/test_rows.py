@@ -18,9 +18,9 @@ from fake_work import Square, square
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ms_slam_env.benchmark.episode import EpisodeSpec
-from ms_slam_env.benchmark.runner import RECORDS, failures, names, run_all
 from ms_slam_env.errors import InputError
+from ms_slam_env.experiments.harness.episodes import EpisodeSpec
+from ms_slam_env.experiments.harness.rows import RECORDS, failures, names, run_all
 from ms_slam_env.report.records import RecordFile, spec_key, write_json
 
 
@@ -196,4 +196,4 @@ def test_write_json_writes_json(tmp_path: Path) -> None:
         raise AssertionError(f"{constant} is not JSON")
 
     content = json.loads(path.read_text(), parse_constant=refuse)
-    assert content == {"a": [None, 1.5], "b": [{"c": None}, "NaN", None, True]}
+    assert content == {"a": [None, 1.5], "b": [{"c": "Infinity"}, "NaN", None, True]}

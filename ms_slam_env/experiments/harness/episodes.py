@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, cast
 
 import gymnasium as gym
@@ -14,20 +16,34 @@ from numpy.typing import NDArray
 
 import ms_slam_env
 from ms_slam_env import metrics
-from ms_slam_env.benchmark.map_truth import reference_of, true_surface
-from ms_slam_env.benchmark.planners import make_planner, planner_class
-from ms_slam_env.config import check_choice, check_range, parse_named
+from ms_slam_env.config import check_choice, check_range, nested_options, parse_named
 from ms_slam_env.env import ActiveSlamEnv, Planner
-from ms_slam_env.errors import InputError
+from ms_slam_env.env.config import make_config
+from ms_slam_env.env.embodiments import EMBODIMENTS
+from ms_slam_env.env.planners import check_planner, make_planner, planner_class
+from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.evaluation.map_quality import judge_map
+from ms_slam_env.evaluation.map_truth import reference_of, true_surface
 from ms_slam_env.registration import ADAPTIVE_ID
+from ms_slam_env.scenes import SCENES, SEED_SPLITS
+from ms_slam_env.scenes.mesh_file import load_soup
+from ms_slam_env.scenes.registry import check_name
+from ms_slam_env.slam import BACKENDS
 
 Float64 = NDArray[np.float64]
 
+DEFAULT_PLANNERS = ("random", "stationary", "greedy", "max-information")
+DEFAULT_SCENES = ("living_room", "corridor", "table", "wall")
 DEFAULT_STEP_M = 0.12
 DEFAULT_STEP_DEG = 12.0
 LOST_ERROR_M = 0.3  # an estimate this far off is lost even where SLAM does not say so
-THRESHOLDS_M = (0.02, 0.05)
-MAP_VOXEL_M = 0.01  # a surface counts by its area, not by how often it was seen
+
+
+OWN_OPTIONS = (
+    *("scene", "scene_seed", "split", "observation", "step_m", "step_rad"),
+    *("render_mode", "max_episode_steps"),
+)
+"""Options of ``gym.make`` that an episode has other options for, or that its planner decides."""
 
 
 @dataclass(frozen=True)
@@ -208,22 +224,76 @@ def measure_map(world: ActiveSlamEnv, spec: EpisodeSpec) -> dict[str, float]:
     return {**judge_map(world.slam.map_points(), surface, reference), **area}
 
 
-def judge_map(points: Float64, surface: Float64, reference: Float64) -> dict[str, float]:
-    """Map metrics from points (N, 3) of the map, of the true surface and of the reference."""
-    result: dict[str, float] = {}
-    if len(points):
-        cloud = metrics.voxel_thin(points, MAP_VOXEL_M)
-        to_surface = metrics.nearest_distances(cloud, surface)
-        to_map = metrics.nearest_distances(reference, cloud)
-        rer = metrics.rer(cloud, surface)
-    else:
-        to_surface, to_map, rer = np.array([np.inf]), np.array([np.inf]), float("nan")
-    for threshold in THRESHOLDS_M:
-        name = f"{round(100 * threshold)}cm"
-        precision = float((to_surface < threshold).mean())
-        recall = float((to_map < threshold).mean())
-        both = precision + recall
-        result[f"precision_{name}"] = precision
-        result[f"recall_{name}"] = recall
-        result[f"f_score_{name}"] = 2 * precision * recall / both if both else 0.0
-    return {**result, "rcm": result["recall_5cm"], "rer_m": rer, "map_points": len(points)}
+def parse_options(texts: Sequence[str]) -> dict[str, Any]:
+    """Nested mapping of ``EnvConfig``, and ``embodiment``, from texts ``name.name=value``.
+
+    Values are YAML.
+
+    Raises:
+        InputError: no ``=``, an unknown name (the message lists the valid ones), a value out of
+            range, or a name that the benchmark sets itself.
+    """
+    result = nested_options(texts)
+    for name in result:
+        if name in OWN_OPTIONS:
+            raise InputError(f"option {name!r} is not free: the benchmark sets it")
+    embodiment = result.get("embodiment", next(iter(EMBODIMENTS)))
+    if embodiment not in EMBODIMENTS:
+        raise unknown("embodiment", embodiment, EMBODIMENTS)
+    configured = {name: value for name, value in result.items() if name != "embodiment"}
+    backend = make_config(configured, ("embodiment",), OWN_OPTIONS).slam
+    if backend not in BACKENDS:
+        raise unknown("SLAM backend", backend, BACKENDS)
+    return result
+
+
+def check_names(planners: Sequence[str], scenes: Sequence[str]) -> None:
+    """Refuse unknown planners and scenes, and mesh files that cannot be read.
+
+    Raises:
+        InputError: naming the valid choices, or what is wrong with the file.
+    """
+    for kind, names in (("planner", planners), ("scene", scenes)):
+        if not names:
+            raise InputError(f"no {kind} given")
+        if len(set(names)) < len(names):
+            raise InputError(f"a {kind} is given twice: {', '.join(names)}")
+    for planner in planners:
+        check_planner(planner)
+    for scene in scenes:
+        if scene in SCENES:
+            continue
+        check_name(scene)
+        load_soup(Path(scene))
+
+
+def seed_list(split: str, count: int) -> list[int]:
+    """The first ``count`` seeds of a split.
+
+    Raises:
+        InputError: an unknown split, or more seeds than it has.
+    """
+    if split not in SEED_SPLITS:
+        raise unknown("split of seeds", split, SEED_SPLITS)
+    seeds = SEED_SPLITS[split]
+    if not 1 <= count <= len(seeds):
+        raise InputError(f"episodes = {count} is outside [1, {len(seeds)}] of split {split}")
+    return list(seeds[:count])
+
+
+def short_planner_names(planners: Iterable[str]) -> dict[str, str]:
+    """A short text for each planner: its name, with options only where names are the same.
+
+    Paths among the options lose their folders.
+    """
+    names = {planner: planner.split(",") for planner in planners}
+    count = Counter(name for name, *_ in names.values())
+    return {
+        planner: name if count[name] == 1 else ", ".join([name, *map(_without_folders, options)])
+        for planner, (name, *options) in names.items()
+    }
+
+
+def _without_folders(option: str) -> str:
+    name, equals, value = option.partition("=")
+    return name + equals + value.rpartition("/")[2]

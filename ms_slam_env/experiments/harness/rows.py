@@ -15,7 +15,7 @@ from ms_slam_env.parallel import Outcome, one_thread_unless_set, open_pool, run_
 from ms_slam_env.report.provenance import git_commit
 from ms_slam_env.report.records import RecordFile, Row, spec_key
 
-RECORDS = "episodes.jsonl"
+RECORDS = "rows.jsonl"
 _NAMING = ("planner", "scene", "sequence", "backend", "seed")  # what a person calls the work by
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.benchmark.figures import caption, new_figure, save
+from ms_slam_env.report.figures import caption, new_figure, save
 from ms_slam_env.scenes import Scene
 
 Float64 = NDArray[np.float64]

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from box_scene import BOXES, ROOM_HIGH, ROOM_LOW, BoxScene
 
-from ms_slam_env.benchmark import map_truth
-from ms_slam_env.benchmark.episode import judge_map
+from ms_slam_env.evaluation import map_truth
+from ms_slam_env.evaluation.map_quality import judge_map
 
 START = np.array([-1.0, -1.0, 1.2])
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from ms_slam_env import scenes
-from ms_slam_env.benchmark.loop_closure import COLUMNS, Arguments, as_table, main, summarise
-from ms_slam_env.benchmark.loop_closure_run import LoopSpec, _judge, camera_path, run_loop
+from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
+from ms_slam_env.experiments.loop_closure import LoopClosure, LoopSpec, _judge, camera_path
 from ms_slam_env.geometry import make_pose, relative_angle, so3_exp
 
 SPEC = LoopSpec("living_room", 1002, "around", 0.06, 5.0, "kinect", "160x120", "deformation")
@@ -54,44 +54,43 @@ def test_a_closure_is_judged_by_the_old_map() -> None:
 
 def test_a_run_closes_its_loop_and_draws_the_map(tmp_path: Path) -> None:
     picture = tmp_path / "maps" / "loop.png"
-    result = run_loop(LoopSpec(**{**asdict(SPEC), "picture": str(picture)}))
+    result = LoopClosure.run(LoopSpec(**{**asdict(SPEC), "picture": str(picture)}))
     assert result["closures"]
-    assert result["wrong"] == 0
-    assert result["lost"] == 0
-    assert result["final_ate_aligned_m"] < result["ate_aligned_m"]
+    assert result["wrong_closures"] == 0
+    assert result["lost_frames"] == 0
+    assert result["final_ate_m"] < result["ate_m"]
     assert picture.read_bytes().startswith(b"\x89PNG")
     row = {"spec": asdict(SPEC), "result": result, "error": None}
     other = {"spec": {**asdict(SPEC), "closure": "none"}, "result": result, "error": None}
-    table = as_table([row, other])
-    assert table.count("living_room:1002") == 2
-    assert all(heading in table for _, heading, _ in COLUMNS)
-    summary = summarise([row, other])
-    assert summary["recordings"] == 1
-    assert summary["ate_m"]["median"]["none"] == result["ate_m"]
+    medians, every = LoopClosure().tables([row, other])
+    assert every.as_markdown().count("living_room:1002") == 2
+    assert [line["loop_closure"] for line in medians.rows] == ["none", "deformation"]
+    assert medians.rows[0]["ate_m"] == result["ate_m"]
+    (chart,) = LoopClosure().charts([row, other])
+    assert chart.panels[0].series[0].y == [result["ate_m"]]
 
 
 def test_bad_recordings_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    from ms_slam_env.command_line import exit_code
-
     for text, message in (
         ("living_room:2000", "scene:seed:path"),
         ("living_room:2000:spiral:0.02:1:kinect", "spiral"),
         ("living_room:2000:around:0.02:1:loud", "loud"),
         ("living_room:x:around:0.02:1:kinect", "numbers"),
     ):
-        assert exit_code(lambda text=text: main(["--recordings", text, "--out", "/tmp/none"])) == 2
+        command = ["experiment", "loop-closure", "--recordings", text, "--out", "/tmp/none"]
+        assert main(command) == 2
         assert message in capsys.readouterr().err
 
 
 def test_parameters_of_the_slam_reach_it_and_bad_ones_are_refused() -> None:
-    specs = Arguments(options=("loops.window=70", "max_surfels=5000")).specs()
+    specs = LoopClosure(options=("loops.window=70", "max_surfels=5000")).specs()
     assert specs[0].options == {"loops": {"window": 70}, "max_surfels": 5000}
     with pytest.raises(InputError, match="window"):
-        Arguments(options=("loops.windows=70",)).specs()
+        LoopClosure(options=("loops.windows=70",)).specs()
 
 
 def test_both_variants_of_every_recording_are_run() -> None:
-    specs = Arguments(recordings=("corridor:2000:corridor:0.04:3:kinect",)).specs()
+    specs = LoopClosure(recordings=("corridor:2000:corridor:0.04:3:kinect",)).specs()
     assert [(spec.size, spec.closure) for spec in specs] == [
         (size, closure) for size in ("160x120", "320x240") for closure in ("none", "deformation")
     ]

@@ -1,0 +1,86 @@
+"""``ms-slam experiment NAME``."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from ms_slam_env.command_line import parse, report_failures
+from ms_slam_env.errors import InputError
+from ms_slam_env.experiments.harness import (
+    Experiment,
+    experiment_class,
+    experiment_names,
+    run_experiment,
+)
+from ms_slam_env.experiments.harness.checking import check_results, committed_results
+from ms_slam_env.report.results import RESULTS, read_results
+
+
+def main(arguments: Sequence[str]) -> int:
+    """List the experiments, or run one; 1 if a row failed or a committed figure differs."""
+    if not arguments or arguments[0] in ("list", "-h", "--help"):
+        print(listing())
+        return 0 if arguments else 2
+    name, *rest = arguments
+    return run(experiment_class(name), rest, f"ms-slam experiment {name}", Path("results") / name)
+
+
+def run(cls: type[Experiment], arguments: Sequence[str], program: str, out: Path) -> int:
+    """Parse the options of an experiment, run it into ``out`` or where they say, print tables."""
+    args: Any = parse(with_run_options(cls, out), arguments, program)
+    if args.check:
+        return check(cls, args.against)
+    own = {field.name: getattr(args, field.name) for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    outcome = run_experiment(cls(**own), args.out, args.workers)
+    print(outcome.results.as_markdown())
+    print(f"written: {args.out}/{RESULTS}, table.md and figures", file=sys.stderr)
+    return report_failures(outcome.failures)
+
+
+def check(cls: type[Experiment], folder: Path) -> int:
+    """Compare some committed rows with what the code makes of them today."""
+    committed = read_results(folder / RESULTS)
+    if committed.stale:
+        print(committed.stale)
+    differences = check_results(cls, committed)
+    print("\n".join(differences) or f"{folder}: {cls.check_rows} rows run again, nothing differs")
+    return 1 if differences else 0
+
+
+def with_run_options(cls: type[Experiment], out: Path) -> type[Any]:
+    """The experiment's dataclass with the options that every experiment has."""
+    name = cls.__module__.rpartition(".")[2]
+    options: list[tuple[str, Any, str, Any]] = [
+        ("workers", int | None, "Parallel processes (default: the experiment's own).", None),
+        ("out", Path, "Folder of the results; what it holds already is not run again.", out),
+        ("check", bool, "Run some committed rows again and compare.", False),
+        ("against", Path, "Folder of the committed results.", committed_results(name)),
+    ]
+    fields = [
+        (key, Annotated[kind, tyro.conf.arg(help=text)], dataclasses.field(default=default))
+        for key, kind, text, default in options
+    ]
+    made = dataclasses.make_dataclass(cls.__name__, fields, bases=(cls,), frozen=True)
+    made.__doc__ = cls.__doc__
+    return made
+
+
+def listing() -> str:
+    """Every experiment and what it is."""
+    names = experiment_names()
+    if not names:
+        raise InputError("no experiment is installed")
+    width = max(map(len, names))
+    return "\n".join(
+        [
+            "usage: ms-slam experiment NAME [options]; NAME --help lists the options",
+            "",
+            *(f"  {name:<{width}}  {experiment_class(name).title()}" for name in names),
+        ]
+    )

@@ -1,0 +1,1 @@
+"""Experiments: one file each, on one harness; ``ms-slam experiment list`` names them."""

@@ -1,0 +1,87 @@
+"""What an experiment is: specifications, what one of them measures, tables, charts."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+from ms_slam_env.report.charts import Chart
+from ms_slam_env.report.records import Row
+from ms_slam_env.report.tables import Table
+
+
+class Experiment(ABC):
+    """A frozen dataclass whose fields are the options of its command line.
+
+    The first line of its docstring is the title of its results, the rest says what they show.
+
+    Attributes:
+        unit: what a row is, in the plural, for the progress bar.
+        rows_key: of the rows in ``results.json``.
+        workers: processes by default; None: one a core. 1 where times are measured.
+        fresh_process: run each row in a process of its own, because peak memory is one number for
+            the life of a process.
+        check_rows: how many rows ``--check`` runs again.
+    """
+
+    unit: ClassVar[str] = "runs"
+    rows_key: ClassVar[str] = "rows"
+    workers: ClassVar[int | None] = None
+    fresh_process: ClassVar[bool] = False
+    check_rows: ClassVar[int] = 2
+
+    @abstractmethod
+    def specs(self) -> Sequence[Any]:
+        """One frozen dataclass a row, with everything that the row depends on.
+
+        Raises:
+            InputError: options that no row could be run with.
+        """
+
+    @staticmethod
+    @abstractmethod
+    def run(spec: Any) -> dict[str, Any]:
+        """Measure one row: keys of the registry to numbers, flags, texts, or lists of them.
+
+        It runs in a process of its own and depends on ``spec`` alone.
+        """
+
+    @abstractmethod
+    def tables(self, rows: Sequence[Row]) -> Sequence[Table]:
+        """The tables, the most important first, from rows of which some may have failed."""
+
+    def charts(self, rows: Sequence[Row]) -> Sequence[Chart]:
+        """The charts; none by default."""
+        return ()
+
+    def content(self, rows: Sequence[Row]) -> Mapping[str, Any]:
+        """What else belongs into ``results.json``; nothing by default."""
+        return {}
+
+    def write_pictures(self, rows: Sequence[Row], out: Path) -> None:  # noqa: B027
+        """Draw into folder ``out`` what no chart can show; nothing by default."""
+
+    def prepare(self) -> None:  # noqa: B027
+        """Refuse, in seconds, what would make every row fail; nothing by default.
+
+        Raises:
+            InputError: what is wrong.
+        """
+
+    @classmethod
+    def title(cls) -> str:
+        """First line of the docstring."""
+        return _paragraphs(cls)[0]
+
+    @classmethod
+    def about(cls) -> str:
+        """The docstring without its first line."""
+        return " ".join(_paragraphs(cls)[1:])
+
+
+def _paragraphs(cls: type) -> list[str]:
+    """Paragraphs of a docstring, each on one line."""
+    text = cls.__doc__ or cls.__name__
+    return [" ".join(part.split()) for part in text.strip().split("\n\n")]

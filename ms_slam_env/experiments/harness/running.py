@@ -1,0 +1,84 @@
+"""Run an experiment: what is missing in parallel, then everything that is made of the rows."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ms_slam_env.experiments.harness.experiment import Experiment
+from ms_slam_env.experiments.harness.rows import check_any_finished, failures, run_all
+from ms_slam_env.report.records import Row, from_plain, to_plain
+from ms_slam_env.report.results import RESULTS, TABLE, Results, write_results
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run of an experiment came to.
+
+    Attributes:
+        results: as written.
+        failures: errors of the rows that failed, one line each.
+    """
+
+    results: Results
+    failures: Sequence[str]
+
+
+def run_experiment(experiment: Experiment, out: Path, workers: int | None = None) -> Outcome:
+    """Run the rows that ``out`` does not hold yet; write ``results.json``, ``table.md``, figures.
+
+    Args:
+        experiment: with its options.
+        out: folder of the results; finished rows stand there at once, in ``rows.jsonl``.
+        workers: processes; None for the experiment's own default.
+
+    Raises:
+        InputError: options that no row could be run with.
+        RuntimeError: every row failed; the files of an earlier run are left as they are.
+    """
+    specs = experiment.specs()
+    experiment.prepare()
+    rows = run_all(
+        specs,
+        type(experiment).run,
+        out,
+        experiment.workers if workers is None else workers,
+        experiment.unit,
+    )
+    check_any_finished(rows)
+    return Outcome(write_all(experiment, rows, out), failures(rows))
+
+
+def write_all(experiment: Experiment, rows: Sequence[Row], out: Path) -> Results:
+    """Write everything that is made of the rows into folder ``out``."""
+    from ms_slam_env.report.figures import save_charts
+
+    rows = from_plain(to_plain(rows))
+    charts = experiment.charts(rows)
+    results = write_results(
+        out / RESULTS,
+        kind=type(experiment).__module__.rpartition(".")[2],
+        title=experiment.title(),
+        about=experiment.about(),
+        tables=experiment.tables(rows),
+        charts=charts,
+        rows=rows,
+        rows_key=experiment.rows_key,
+        content={"config": as_config(experiment), **experiment.content(rows)},
+    )
+    (out / TABLE).write_text(results.as_markdown(), encoding="utf-8")
+    save_charts(charts, out)
+    experiment.write_pictures(rows, out)
+    return results
+
+
+def as_config(experiment: Any) -> dict[str, Any]:
+    """The options of an experiment as JSON's types."""
+    return {
+        field.name: str(value) if isinstance(value := getattr(experiment, field.name), Path)
+        else value
+        for field in dataclasses.fields(experiment)
+    }  # fmt: skip

@@ -1,0 +1,1 @@
+"""Pictures that no chart can show: maps, scenes, the arm, an episode."""

@@ -1,0 +1,184 @@
+"""The one form of a result on disk: kind, version, provenance, rows or metrics, tables, charts.
+
+``results.json`` (of products such as ``ms-slam run``: ``metrics.json``) holds::
+
+    {"kind": ..., "title": ..., "about": ..., "results_version": ..., "provenance": {...},
+     "config": {...}, "rows": [{"spec": {...}, "result": {...}, "error": null, ...}, ...],
+     "tables": [...], "charts": [...]}
+
+Whatever has a kind and tables is shown by ``ms-slam report``, which knows nothing else of it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ms_slam_env.errors import InputError
+from ms_slam_env.metrics.registry import RESULTS_VERSION, RESULTS_VERSIONS, check_keys
+from ms_slam_env.report.charts import Chart, chart_from_json
+from ms_slam_env.report.provenance import provenance
+from ms_slam_env.report.records import from_plain, write_json
+from ms_slam_env.report.tables import Table, table_from_json
+
+RESULTS = "results.json"
+TABLE = "table.md"
+
+
+@dataclass(frozen=True)
+class Results:
+    """A result that was read or is to be written.
+
+    Attributes:
+        kind: name of the experiment or command.
+        title: what was run, in a few words.
+        about: what it shows, one or two sentences.
+        tables: the first is the most important.
+        charts: the same.
+        rows: of an experiment; empty for others.
+        rows_key: key of the rows in the file.
+        content: everything else: configuration, metrics of a single run.
+        provenance: command, versions, commit, machine, time.
+        version: of the algorithms that made it.
+    """
+
+    kind: str
+    title: str
+    about: str
+    tables: Sequence[Table]
+    charts: Sequence[Chart]
+    rows: Sequence[Mapping[str, Any]]
+    rows_key: str
+    content: Mapping[str, Any]
+    provenance: Mapping[str, Any]
+    version: int = RESULTS_VERSION
+
+    @property
+    def stale(self) -> str:
+        """A sentence where older algorithms than the present ones made the result, else empty."""
+        if self.version >= RESULTS_VERSION:
+            return ""
+        newer = "; ".join(
+            f"version {v}: {text}" for v, text in RESULTS_VERSIONS.items() if v > self.version
+        )
+        return (
+            f"These figures are older than the code (results version {self.version}, "
+            f"{RESULTS_VERSIONS[self.version]}). Since then {newer}."
+        )
+
+    def as_markdown(self) -> str:
+        """The tables, a note where they are out of date, and what made them."""
+        parts = [f"*{self.stale}*\n"] if self.stale else []
+        parts += [table.as_markdown() for table in self.tables]
+        parts.append(made_by(self.provenance, self.rows))
+        return "\n".join(parts)
+
+
+def write_results(
+    path: Path,
+    kind: str,
+    title: str,
+    about: str,
+    tables: Sequence[Table] = (),
+    charts: Sequence[Chart] = (),
+    rows: Sequence[Mapping[str, Any]] = (),
+    rows_key: str = "rows",
+    content: Mapping[str, Any] | None = None,
+    metrics: Mapping[str, Any] | None = None,
+) -> Results:
+    """Write a result file, whole or not at all.
+
+    Args:
+        path: of the file.
+        kind: see :class:`Results`, as the next seven.
+        title: of the result.
+        about: what it shows.
+        tables: of metrics.
+        charts: of metrics.
+        rows: with ``result``, whose keys are checked.
+        rows_key: where the rows stand.
+        content: configuration and the like, not checked.
+        metrics: flat metrics of a single run, which stand at the top of the file.
+
+    Raises:
+        InputError: a result with a key that the registry does not know.
+    """
+    check_keys(metrics or {})
+    for row in rows:
+        check_keys(row["result"] or {})
+    written = Results(
+        kind, title, about, tables, charts, rows, rows_key, content or {}, provenance()
+    )
+    write_json(
+        path,
+        {
+            "kind": kind,
+            "title": title,
+            "about": about,
+            "results_version": RESULTS_VERSION,
+            **(metrics or {}),
+            "provenance": written.provenance,
+            **written.content,
+            "tables": [table.as_json() for table in tables],
+            "charts": [chart.as_json() for chart in charts],
+            **({rows_key: rows, "rows_key": rows_key} if rows else {}),
+        },
+    )
+    return written
+
+
+def read_results(path: Path) -> Results:
+    """Read a result file.
+
+    Raises:
+        InputError: no such file, not a result, or keys that the registry does not know.
+    """
+    try:
+        content = from_plain(json.loads(path.read_text(encoding="utf-8")))
+    except OSError as error:
+        raise InputError(f"cannot read result {path}: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not a JSON file: {str(error).splitlines()[0]}") from None
+    if not is_result(content):
+        raise InputError(f"{path} is not a result of ms-slam: it has no kind and tables")
+    try:
+        rows_key = content.pop("rows_key", "rows")
+        return Results(
+            kind=str(content.pop("kind")),
+            title=str(content.pop("title", "")),
+            about=str(content.pop("about", "")),
+            tables=[table_from_json(table) for table in content.pop("tables")],
+            charts=[chart_from_json(chart) for chart in content.pop("charts", [])],
+            rows=content.pop(rows_key, []),
+            rows_key=rows_key,
+            version=int(content.pop("results_version", 1)),
+            provenance=content.pop("provenance", {}),
+            content=content,
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        if isinstance(error, InputError):
+            raise InputError(f"{path}: {error}") from None
+        raise InputError(f"{path} is not a result of ms-slam: {error!r}") from None
+
+
+def is_result(content: Any) -> bool:
+    """Whether JSON ``content`` has the form of a result."""
+    return (
+        isinstance(content, dict)
+        and isinstance(content.get("kind"), str)
+        and isinstance(content.get("tables"), list)
+    )
+
+
+def made_by(given: Mapping[str, Any], rows: Sequence[Mapping[str, Any]] = ()) -> str:
+    """A line that says which command, version, commits and machine made a result."""
+    commits = {row["commit"] for row in rows if row.get("commit")} or {given.get("commit")}
+    known = sorted(commit for commit in commits if commit)
+    version = given.get("versions", {}).get("ms-slam-env", "")
+    return (
+        f"Made by `{given.get('command', '')}`, version {version}"
+        f"{''.join(f', commit {commit}' for commit in known)}, on {given.get('cpu', '')}.\n"
+    )

@@ -1,0 +1,226 @@
+"""Tables of metrics with intervals: as Markdown, and as JSON that a report shows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from ms_slam_env.metrics.registry import metric
+from ms_slam_env.report.statistics import Interval, median_interval, share_interval
+
+Value = str | float | int | bool | None | Interval
+Row = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table.
+
+    Attributes:
+        name: of its cells in the rows.
+        key: of the metric, which has heading, unit and explanation; ``name`` if empty.
+        heading: in place of the metric's, where several columns show one metric, as in a table with
+            a column a scene.
+    """
+
+    name: str
+    key: str = ""
+    heading: str = ""
+
+    @property
+    def label(self) -> str:
+        """Heading with unit."""
+        of = metric(self.key or self.name)
+        unit = f" [{of.shown_unit}]" if of.shown_unit else ""
+        return f"{self.heading}{unit}" if self.heading else of.label
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table; what the columns mean stands in the registry of metrics.
+
+    Attributes:
+        columns: see :func:`make_table` for a shorter way.
+        rows: column name to value, in the unit that the metric is stored in; None: not known.
+        title: above it.
+        note: a sentence or two below the title.
+
+    Raises:
+        InputError: a column whose key the registry does not know.
+    """
+
+    columns: tuple[Column, ...]
+    rows: tuple[Mapping[str, Value], ...]
+    title: str = ""
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse unknown keys."""
+        for column in self.columns:
+            metric(column.key or column.name)
+
+    def as_json(self) -> dict[str, Any]:
+        """The table as JSON's types."""
+        return {
+            "title": self.title,
+            "note": self.note,
+            "columns": [asdict(column) for column in self.columns],
+            "rows": [
+                {n: asdict(v) if isinstance(v, Interval) else v for n, v in row.items()}
+                for row in self.rows
+            ],
+        }
+
+    def as_markdown(self, level: int = 3) -> str:
+        """Title, note and table."""
+        parts = []
+        if self.title:
+            parts.append(f"{'#' * level} {self.title}\n")
+        if self.note:
+            parts.append(f"{self.note}\n")
+        body = [[format_value(row.get(c.name), c.key or c.name) for c in self.columns]
+                for row in self.rows]  # fmt: skip
+        parts.append(markdown_table([c.label for c in self.columns], body))
+        return "\n".join(parts)
+
+
+def make_table(
+    columns: Iterable[Column | str],
+    rows: Iterable[Mapping[str, Value]],
+    title: str = "",
+    note: str = "",
+) -> Table:
+    """A table whose columns are given by name where the metric's own heading will do."""
+    full = tuple(Column(column) if isinstance(column, str) else column for column in columns)
+    return Table(full, tuple(rows), title, note)
+
+
+def table_from_json(content: Mapping[str, Any]) -> Table:
+    """The table that :meth:`Table.as_json` wrote.
+
+    Raises:
+        InputError: a key that the registry does not know.
+        KeyError, TypeError: content of another form.
+    """
+    rows = [
+        {n: Interval(**v) if isinstance(v, dict) else v for n, v in row.items()}
+        for row in content["rows"]
+    ]
+    columns = [Column(**column) for column in content["columns"]]
+    return make_table(columns, rows, content.get("title", ""), content.get("note", ""))
+
+
+@dataclass(frozen=True)
+class Grouping:
+    """How rows of an experiment become the rows of a table.
+
+    Attributes:
+        by: fields of the specification that a line is about.
+        keys: metrics of the result.
+        label: what the line says for a field, where not the value itself.
+        rank_by: metric that orders the lines, best first; empty: order of appearance.
+        count: key of a column that counts the finished rows of a line; empty: none.
+    """
+
+    by: tuple[str, ...]
+    keys: tuple[str, ...]
+    label: Mapping[str, Callable[[Any], str]] = field(default_factory=dict)
+    rank_by: str = ""
+    count: str = ""
+
+    def table(self, rows: Sequence[Row], title: str = "", note: str = "") -> Table:
+        """Medians (of flags: shares) with 95 % intervals over the finished rows of each line."""
+        lines: list[dict[str, Value]] = []
+        for group, results in grouped(rows, self.by).items():
+            values: dict[str, Value] = {
+                name: self.label[name](value) if name in self.label else value
+                for name, value in zip(self.by, group, strict=True)
+            }
+            if self.count:
+                values[self.count] = len(results)
+            values |= {key: summary(results, key) for key in self.keys}
+            lines.append(values)
+        if self.rank_by:
+            lines.sort(key=lambda line: _rank(line[self.rank_by], metric(self.rank_by).better))
+        counted = (self.count,) if self.count else ()
+        return make_table((*self.by, *counted, *self.keys), lines, title, note)
+
+
+def finished(rows: Iterable[Row]) -> list[Row]:
+    """The rows without an error."""
+    return [row for row in rows if row["error"] is None]
+
+
+def grouped(rows: Iterable[Row], by: Sequence[str]) -> dict[tuple[Any, ...], list[Row]]:
+    """Results of finished rows by the values of fields ``by`` of their specifications."""
+    groups: dict[tuple[Any, ...], list[Row]] = {}
+    for row in finished(rows):
+        groups.setdefault(tuple(row["spec"][name] for name in by), []).append(row["result"])
+    return groups
+
+
+def summary(results: Iterable[Row], key: str) -> Interval:
+    """Median, of flags the share, of a metric with its 95 % interval; NaN without values."""
+    values = [result[key] for result in results if result.get(key) is not None]
+    values = [value for value in values if not math.isnan(value)]
+    return share_interval(values) if metric(key).unit == "flag" else median_interval(values)
+
+
+def _rank(value: Any, better: str) -> float:
+    number = value.value if isinstance(value, Interval) else value
+    if number is None or math.isnan(number):
+        return math.inf
+    return -number if better == "higher" else number
+
+
+def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table, first column left-aligned, the others right."""
+    lines = [_line(header), _line(["---", *["---:"] * (len(header) - 1)])]
+    return "\n".join(lines + [_line(row) for row in rows]) + "\n"
+
+
+def format_value(value: Value, key: str) -> str:
+    """``value`` of metric ``key`` in the unit that it is shown in; ``-`` where it is not known."""
+    of = metric(key)
+    if value is None:
+        return "-"
+    if isinstance(value, str):
+        return value.replace("|", "\\|")
+    if isinstance(value, Interval):
+        return format_interval(value, of.scale, of.digits)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int) and of.scale == 1:
+        return str(value)
+    return format_number(value * of.scale, of.digits)
+
+
+def format_interval(interval: Interval, scale: float = 1.0, digits: int = 2) -> str:
+    """``value [low, high]``, each times ``scale``, rounded to ``digits`` significant digits."""
+    if math.isnan(interval.value):
+        return "-"
+    parts = [
+        format_number(x * scale, digits) for x in (interval.value, interval.low, interval.high)
+    ]
+    return f"{parts[0]} [{parts[1]}, {parts[2]}]"
+
+
+def format_number(value: float, digits: int = 2) -> str:
+    """``value`` with ``digits`` significant digits, never in exponent notation.
+
+    Infinity, which is what a time is worth until something that never came, reads ``never``.
+    """
+    if math.isnan(value):
+        return "-"
+    if value == math.inf:
+        return "never"
+    if value == 0 or not math.isfinite(value):
+        return f"{value:g}"
+    decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
+    return f"{value:.{decimals}f}"
+
+
+def _line(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"

@@ -1,0 +1,143 @@
+"""The harness: finding, running, resuming, checking; one tiny experiment of its own."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ms_slam_env.cli import main
+from ms_slam_env.cli.experiment import run
+from ms_slam_env.errors import InputError
+from ms_slam_env.experiments.harness import Experiment, experiment_class, experiment_names
+from ms_slam_env.experiments.harness.checking import check_results, compare, spec_type
+from ms_slam_env.experiments.harness.running import run_experiment
+from ms_slam_env.metrics.registry import RESULTS_VERSION, check_keys, registry
+from ms_slam_env.report.records import Row
+from ms_slam_env.report.results import read_results
+from ms_slam_env.report.tables import Grouping, Table
+
+LONGEST = 350  # lines of an experiment
+
+
+@dataclass(frozen=True)
+class Wobble:
+    scene: str
+    seed: int
+
+
+@dataclass(frozen=True)
+class Wobbles(Experiment):
+    """Wobbling cameras
+
+    A constant by seed.
+    """
+
+    scenes: tuple[str, ...] = ("table", "wall")
+    """Names."""
+    episodes: int = 2
+    """Seeds for each scene."""
+
+    @staticmethod
+    def run(spec: Wobble) -> dict[str, Any]:
+        if spec.scene == "mars":
+            raise RuntimeError("no air")
+        return {"ate_m": 0.01 * spec.seed, "cpu_ms_median": 5.0, "lost": False}
+
+    def specs(self) -> list[Wobble]:
+        if self.episodes < 1:
+            raise InputError("episodes = 0 is too few")
+        return [Wobble(s, seed) for s in self.scenes for seed in range(1, 1 + self.episodes)]
+
+    def tables(self, rows: Sequence[Row]) -> list[Table]:
+        return [
+            Grouping(("scene",), ("ate_m", "lost"), rank_by="ate_m", count="episodes").table(rows)
+        ]
+
+
+def test_rows_are_kept_and_only_failed_ones_run_again(tmp_path: Path) -> None:
+    outcome = run_experiment(Wobbles(scenes=("table", "mars")), tmp_path, workers=1)
+    assert len(outcome.failures) == 2
+    before = (tmp_path / "rows.jsonl").read_text()
+    again = run_experiment(Wobbles(), tmp_path, workers=1)
+    assert not again.failures
+    assert (tmp_path / "rows.jsonl").read_text().startswith(before)
+    content = json.loads((tmp_path / "results.json").read_text())
+    assert content["results_version"] == RESULTS_VERSION
+    assert content["title"] == "Wobbling cameras"
+    assert content["about"] == "A constant by seed."
+    assert [row["result"]["ate_m"] for row in content["rows"]] == [0.01, 0.02, 0.01, 0.02]
+    assert "| table | 2 | 15.0 [10.0, 20.0] | 0 [0, 66] |" in (tmp_path / "table.md").read_text()
+
+
+def test_the_command_line_is_made_of_the_fields(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--scenes", "wall", "--episodes", "1", "--workers", "1", "--out", str(tmp_path)]
+    assert run(Wobbles, options, "test", tmp_path) == 0
+    assert "| wall | 1 | 10.0 [10.0, 10.0] |" in capsys.readouterr().out
+    with pytest.raises(InputError, match="too few"):
+        run(Wobbles, ["--episodes", "0"], "test", tmp_path)
+    with pytest.raises(InputError, match="episods"):
+        run(Wobbles, ["--episods", "1"], "test", tmp_path)
+
+
+def test_a_check_finds_what_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_experiment(Wobbles(), tmp_path, workers=1)
+    committed = read_results(tmp_path / "results.json")
+    assert check_results(Wobbles, committed) == []
+    changed = lambda spec: {"ate_m": 0.5, "cpu_ms_median": 9.0, "lost": False}  # noqa: E731
+    changed.__annotations__ = {"spec": Wobble}
+    monkeypatch.setattr(Wobbles, "run", staticmethod(changed))
+    found = check_results(Wobbles, committed)
+    assert len(found) == Wobbles.check_rows
+    assert "ate_m was 0.01, is 0.5" in found[0]
+    assert "cpu_ms" not in "".join(found)
+
+
+def test_results_are_compared_to_their_depth() -> None:
+    old = {"closures": [{"before_m": 1.0, "after_m": 0.1}], "lost": True}
+    assert compare(old, {"closures": [{"before_m": 1.001, "after_m": 0.1}], "lost": True}) == []
+    assert compare(old, {"closures": [{"before_m": 1.1, "after_m": 0.1}], "lost": True})
+    assert compare(old, {"closures": [], "lost": True})
+    assert compare(old, {"lost": True}) == ["closures is missing"]
+
+
+def test_unknown_keys_are_refused_at_any_depth() -> None:
+    check_keys({"ate_m": 1.0, "closures": [{"frame": 3}]})
+    for result in ({"ate": 1.0}, {"closures": [{"frames_lost": 3}]}):
+        with pytest.raises(InputError, match="unknown metric"):
+            check_keys(result)
+
+
+def test_every_metric_says_what_it_is() -> None:
+    for of in registry().values():
+        assert of.heading, of.key
+        assert of.definition.endswith("."), of.key
+        assert of.label
+
+
+@pytest.mark.parametrize("name", experiment_names())
+def test_every_experiment_is_complete(name: str) -> None:
+    cls = experiment_class(name.replace("_", "-"))
+    assert cls.title()
+    assert cls.about().endswith(".")
+    assert spec_type(cls) is not dict
+    assert not inspect.isabstract(cls)
+    source = Path(inspect.getfile(cls)).read_text()
+    assert source.count("\n") <= LONGEST, f"{name} is too long for one experiment"
+
+
+def test_experiments_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["experiment", "list"]) == 0
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in experiment_names())
+    assert main(["experiment", "nonsense"]) == 2
+    assert "valid choices: " in capsys.readouterr().err

@@ -1,0 +1,171 @@
+"""The planner benchmark and step sizes: tables, charts and files from rows of known content."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ms_slam_env.errors import InputError
+from ms_slam_env.experiments import planners
+from ms_slam_env.experiments.harness.episodes import seed_list, short_planner_names
+from ms_slam_env.experiments.harness.running import write_all
+from ms_slam_env.experiments.planners import DETAILS, HEADLINE, PlannerBenchmark, score_matrices
+from ms_slam_env.experiments.step_size import StepSize
+from ms_slam_env.report.records import Row, spec_key
+from ms_slam_env.report.results import read_results
+from ms_slam_env.report.statistics import Interval
+
+CONFIG = PlannerBenchmark(planners=("random", "greedy"), scenes=("table", "wall"), episodes=3)
+
+
+def result(score: float) -> dict[str, Any]:
+    metrics: dict[str, Any] = dict.fromkeys((*HEADLINE, *DETAILS), score)
+    return {**metrics, "lost": score < 0.3, "ate_over_time": [0.001, 0.002, score]}
+
+
+def rows_of(config: PlannerBenchmark) -> list[Row]:
+    """Greedy scores 0.5, 0.6, 0.7 by seed, random 0.1, 0.2, 0.3; the same in every scene."""
+    rows = []
+    for spec in config.specs():
+        score = 0.1 * (1 + spec.seed - 2000) + (0.4 if spec.planner == "greedy" else 0.0)
+        rows.append(
+            {
+                "key": spec_key(spec),
+                "spec": vars(spec),
+                "result": result(score),
+                "error": None,
+                "commit": "abc",
+            }
+        )
+    return rows
+
+
+def test_best_f_score_comes_first() -> None:
+    lines: Any = CONFIG.tables(rows_of(CONFIG))[0].rows
+    assert [line["planner"] for line in lines] == ["greedy", "random"]
+    assert lines[0]["f_score_5cm"].value == pytest.approx(0.6)
+    assert lines[1]["lost"].value == pytest.approx(2 / 3)
+
+
+def test_failed_episodes_do_not_count() -> None:
+    rows = rows_of(CONFIG)
+    rows[0] = {**rows[0], "result": None, "error": "ValueError: x"}
+    assert "| random | 5 |" in CONFIG.tables(rows)[0].as_markdown()
+    assert score_matrices(rows)["random"].shape == (2, 2)
+
+
+def test_an_empty_map_has_no_rer_and_no_f_score() -> None:
+    rows = rows_of(CONFIG)
+    for row in rows:
+        row["result"]["rer_m"] = float("nan")
+    line: Any = CONFIG.tables(rows)[1].rows[0]
+    assert np.isnan(line["rer_m"].value)
+
+
+def test_score_matrix_has_episodes_by_scenes() -> None:
+    matrix = score_matrices(rows_of(CONFIG))["greedy"]
+    np.testing.assert_allclose(matrix, [[0.5, 0.5], [0.6, 0.6], [0.7, 0.7]])
+
+
+def test_results_table_and_figures_are_written(tmp_path: Path) -> None:
+    write_all(CONFIG, rows_of(CONFIG), tmp_path)
+    content = json.loads((tmp_path / "results.json").read_text())
+    assert content["kind"] == "planners"
+    assert content["seeds"] == [2000, 2001, 2002]
+    assert content["summary"]["greedy"]["f_score_5cm"]["value"] == pytest.approx(0.6)
+    assert content["provenance"]["versions"]["ms-slam-env"]
+    assert len(content["episodes"]) == 12
+    table = (tmp_path / "table.md").read_text()
+    assert table.index("| greedy | 6 |") < table.index("| random | 6 |")
+    assert "### wall" in table
+    assert "commit abc" in table
+    names = {"planners.png", "f_score_ate.png", "ate_over_time.png"}
+    assert names <= {path.name for path in tmp_path.iterdir()}
+    again = read_results(tmp_path / "results.json")
+    assert [t.as_markdown() for t in again.tables] == [
+        t.as_markdown() for t in CONFIG.tables(rows_of(CONFIG))
+    ]
+    assert again.charts[0].panels[0].series[0].name == "greedy"
+
+
+def test_without_rliable_the_rest_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(planners.statistics, "has_rliable", lambda: False)
+    titles = [table.title for table in CONFIG.tables(rows_of(CONFIG))]
+    assert "Across scenes" not in titles
+    assert "wall" in titles
+
+
+def test_names_are_as_long_as_it_takes_to_tell_planners_apart() -> None:
+    path = "policy-features,path=docs/results/train/policy.zip"
+    assert short_planner_names(["random", path]) == {"random": "random", path: "policy-features"}
+    assert short_planner_names(["greedy", "greedy,rho_I=0.3,file=a/b"]) == {
+        "greedy": "greedy",
+        "greedy,rho_I=0.3,file=a/b": "greedy, rho_I=0.3, file=b",
+    }
+
+
+def test_every_planner_starts_from_the_same_seeds() -> None:
+    seeds: dict[str, list[tuple[str, int]]] = {}
+    for spec in CONFIG.specs():
+        seeds.setdefault(spec.planner, []).append((spec.scene, spec.seed))
+    assert seeds["random"] == seeds["greedy"]
+    assert len(set(seeds["random"])) == 6
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"planners": ("nonsense",)}, "unknown planner 'nonsense'; valid choices: .*greedy"),
+        ({"planners": ()}, "no planner"),
+        ({"planners": ("random", "random")}, "twice"),
+        ({"planners": ("greedy,foo=1",)}, "unknown option of planner greedy 'foo'.*rho_I"),
+        ({"planners": ("greedy,rho_I",)}, "not option=value"),
+        ({"planners": ("os:path",)}, "not a subclass"),
+        ({"planners": ("nowhere:Planner",)}, "cannot be loaded"),
+        ({"scenes": ("mars",)}, "unknown scene 'mars'; valid choices: living_room"),
+        ({"scenes": ("missing.glb",)}, "mesh file 'missing.glb' does not exist"),
+        ({"scenes": ("pyproject.toml",)}, "unknown scene"),
+        ({"seeds": "exam"}, "unknown split of seeds 'exam'; valid choices: train"),
+        ({"episodes": 0}, "episodes = 0"),
+        ({"episodes": 101}, "outside \\[1, 100\\]"),
+        ({"env_id": "CartPole-v1"}, "valid choices: MSActiveSLAM"),
+        ({"options": ("lookahead",)}, "not name=value"),
+        ({"options": ("lookahed.reference=live",)}, "lookahed'; valid choices: .*lookahead"),
+        ({"options": ("lookahead.reference=dead",)}, "valid choices: live, predicted"),
+        ({"options": ("scene=table",)}, "the benchmark sets it"),
+        ({"options": ("step_m=1",)}, "the benchmark sets it"),
+        ({"steps": 0}, "steps"),
+        ({"step_m": float("nan")}, "step_m"),
+    ],
+)
+def test_bad_configurations_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        PlannerBenchmark(**options).specs()
+
+
+def test_step_sizes_have_a_line_each() -> None:
+    experiment = StepSize(planners=("random",), scenes=("table",), sizes=(2, 10), episodes=3)
+    rows = [
+        {"spec": vars(spec), "error": None, "result": result(spec.step_deg / 20)}
+        for spec in experiment.specs()
+    ]
+    (table,) = experiment.tables(rows)
+    assert table.rows[0]["lost"] == Interval(1.0, pytest.approx(0.44, abs=0.01), 1.0)
+    assert "| random | 10 | 0 [0, 56] | 500 [500, 500] |" in table.as_markdown()
+    (chart,) = experiment.charts(rows)
+    assert [panel.series[0].x for panel in chart.panels] == [[2, 10]] * 4
+
+
+def test_options_reach_the_episodes() -> None:
+    texts = ("lookahead.reference=live", "lookahead.scale=1.0", "lost_patience=3")
+    spec = PlannerBenchmark(options=texts).specs()[0]
+    assert spec.options == {"lookahead": {"reference": "live", "scale": 1.0}, "lost_patience": 3}
+    assert spec_key(spec) != spec_key(PlannerBenchmark().specs()[0])
+
+
+def test_seed_list_is_the_start_of_the_split() -> None:
+    assert seed_list("validation", 2) == [1000, 1001]
