@@ -40,14 +40,18 @@ Numbers = dict[str, Any]
 Run = Callable[[Path], Any]
 RUNS: dict[str, Run] = {}
 
-RELATIVE, ABSOLUTE = 1e-4, 1e-7
-"""Of experiments on given poses, or without a map: single precision, differently rounded."""
-TOLERANCES: dict[str, tuple[float, float]] = {}
-"""Of the others (relative, absolute).
+EXACT = (1e-6, 1e-9)
+"""Tolerance (relative, absolute) of plain arithmetic in double precision."""
+DIVERGENCE = (1e-2, 1e-6)
+"""Of what is counted in images: a grey value that is rounded the other way moves divergences by up
+to 0.4 % (its variance most) with numpy's and BLAS's kernels of an older processor."""
+TRACKED = (5e-2, 1e-5)
+"""Of SLAM over a few frames, which amplifies the last bits of the rays and of the linear algebra: a
+pixel more or less is matched or fused, then all that follows differs."""
+CHAOTIC = (2e-1, 1e-4)
+"""Of SLAM that is lost, relocalised or bent by a closed loop, over more frames."""
 
-SLAM amplifies the last bits: a pixel more or less is matched or fused, then all that follows
-differs.
-"""
+TOLERANCES: dict[str, tuple[float, float]] = {}
 
 _UNREPEATABLE = re.compile(
     r"(^|\.)(cpu|ext|ene|mem|load)_"  # of the meters of cost
@@ -57,13 +61,11 @@ _UNREPEATABLE = re.compile(
 )
 
 
-def experiment(
-    name: str, relative: float = RELATIVE, absolute: float = ABSOLUTE
-) -> Callable[[Run], Run]:
-    """Enter a run under the name of its experiment, with its tolerances."""
+def experiment(name: str, tolerance: tuple[float, float] = TRACKED) -> Callable[[Run], Run]:
+    """Enter a run under the name of its experiment, with its tolerance."""
 
     def enter(run: Run) -> Run:
-        RUNS[name], TOLERANCES[name] = run, (relative, absolute)
+        RUNS[name], TOLERANCES[name] = run, tolerance
         return run
 
     return enter
@@ -241,7 +243,7 @@ def compare(_: Path) -> Any:
     }
 
 
-@experiment("usme")
+@experiment("usme", CHAOTIC)
 def usme(folder: Path) -> Any:
     from ms_slam_env.benchmark.usme import UsmeOptions, make_suite
     from ms_slam_env.benchmark.usme_run import UsmeSpec, run_here
@@ -251,14 +253,14 @@ def usme(folder: Path) -> Any:
     return run_here(UsmeSpec(name, "surfel", size, seed, frames_scale=scale, folder=str(made)))
 
 
-@experiment("adaptation")
+@experiment("adaptation", CHAOTIC)
 def adaptation(_: Path) -> Any:
-    from ms_slam_env.benchmark.adaptation import AdaptationSpec, run_sequence
-    from ms_slam_env.benchmark.adaptation_inputs import Stretches
+    from ms_slam_env.benchmark.adaptation import AdaptationSpec, run_competitors
+    from ms_slam_env.sequences import MotionSegments
     from ms_slam_env.slam.adaptation import DivergenceAdaptationConfig
 
-    stretches = Stretches(frames=12, quiet=5, violent=5)
-    return run_sequence(
+    stretches = MotionSegments(frames=12, quiet=5, violent=5)
+    return run_competitors(
         AdaptationSpec("table", 1000, stretches, "80x60", DivergenceAdaptationConfig())
     )
 
@@ -281,7 +283,7 @@ def frame_skipping(_: Path) -> Any:
     }
 
 
-@experiment("kidnapping")
+@experiment("kidnapping", CHAOTIC)
 def kidnapping(_: Path) -> Any:
     from ms_slam_env.benchmark.kidnapping import KidnappingSpec, run_map
 
@@ -289,7 +291,7 @@ def kidnapping(_: Path) -> Any:
     return run_map(KidnappingSpec("table", 1001, "80x60", settings, variants, 1, 50, 3))
 
 
-@experiment("loop_closure")
+@experiment("loop_closure", CHAOTIC)
 def loop_closure(_: Path) -> Any:
     from ms_slam_env.benchmark.loop_closure_run import LoopSpec, run_loop
 
@@ -297,7 +299,7 @@ def loop_closure(_: Path) -> Any:
     return run_loop(LoopSpec(*recording, closure="deformation"))
 
 
-@experiment("multi_robot")
+@experiment("multi_robot", CHAOTIC)
 def multi_robot(_: Path) -> Any:
     from ms_slam_env.benchmark.map_merging import MergeConfig
     from ms_slam_env.benchmark.multi_robot_run import MultiRobotSpec, run_team
@@ -309,7 +311,7 @@ def multi_robot(_: Path) -> Any:
     return run_team(spec)
 
 
-@experiment("pose_covariance")
+@experiment("pose_covariance", CHAOTIC)
 def pose_covariance(folder: Path) -> Any:
     from ms_slam_env.benchmark.pose_covariance import PoseCovarianceConfig, run
 
@@ -328,7 +330,7 @@ def slam_batch(_: Path) -> Any:
     return measure(config, 3, *render(config))
 
 
-@experiment("slam_peers")
+@experiment("slam_peers", CHAOTIC)
 def slam_peers(_: Path) -> Any:
     """Open3D is left out: it adds up in another order each time."""
     from ms_slam_env import scenes
@@ -413,7 +415,7 @@ def map_consistency(_: Path) -> Any:
     return {"points": len(judged.points), "success": judged.consistency.success, **objects}
 
 
-@experiment("map_consistency_check")
+@experiment("map_consistency_check", CHAOTIC)
 def map_consistency_check(_: Path) -> Any:
     from ms_slam_env.benchmark.map_consistency_check import CopySpec, run
     from ms_slam_env.metrics.consistency import ConsistencyRule
@@ -421,7 +423,7 @@ def map_consistency_check(_: Path) -> Any:
     return run(CopySpec("table", 1000, 0.1, 0, ConsistencyRule()))
 
 
-@experiment("map_evaluation")
+@experiment("map_evaluation", EXACT)
 def map_evaluation(folder: Path) -> Any:
     from ms_slam_env.benchmark.map_evaluation import MapOptions, evaluate_maps
     from ms_slam_env.benchmark.point_cloud import write_ply
@@ -504,7 +506,7 @@ class _Formula:
         return {"ate_m": self.height * every * (1.1 - weight), "load_ms": (0.5 + weight**2) / every}
 
 
-@experiment("explore_samplers")
+@experiment("explore_samplers", EXACT)
 def explore_samplers(folder: Path) -> Any:
     """Samplers on a formula: with real runs, an objective is a time."""
     from ms_slam_env.benchmark.explore_grid import Grid
@@ -528,8 +530,7 @@ def _recorded(folder: Path, frames: int) -> Any:
     """A short rendered sequence, written and read again."""
     from ms_slam_env import scenes
     from ms_slam_env.camera import xtion
-    from ms_slam_env.sequences import HandheldPath, render_sequence
-    from ms_slam_env.sequences.recording import open_recording
+    from ms_slam_env.sequences import HandheldPath, open_sequence, render_sequence
     from ms_slam_env.sequences.writing import write_sequence
 
     scene, path = scenes.make("table", 1000), HandheldPath(frames)
@@ -537,29 +538,29 @@ def _recorded(folder: Path, frames: int) -> Any:
         scene, path.poses(scene, 1000), xtion("80x60"), seed=1000, timestamps=path.timestamps
     )
     write_sequence(sequence, folder / "sequence", {})
-    return open_recording(folder / "sequence")
+    return open_sequence(folder / "sequence")
 
 
 @experiment("sequence_run")
 def sequence_run(folder: Path) -> Any:
     from ms_slam_env.benchmark.options import parse_frame_management
-    from ms_slam_env.benchmark.sequence_run import run_sequence
+    from ms_slam_env.benchmark.sequence_run import run_to_folder
 
     recording, every_other = _recorded(folder, 12), parse_frame_management("regular,every=2")
     loops = {"loop_closure": "deformation"}
     found = {
-        "all": run_sequence(recording, "surfel", loops, folder / "all"),
-        "regular": run_sequence(recording, "surfel", {}, folder / "regular", None, every_other),
+        "all": run_to_folder(recording, "surfel", loops, folder / "all"),
+        "regular": run_to_folder(recording, "surfel", {}, folder / "regular", None, every_other),
     }
     trajectory = np.loadtxt(folder / "all" / "trajectory.txt")
-    return {**found, "trajectory": trajectory[::3], "map_bytes": _size(folder / "all" / "map.ply")}
+    return {
+        **found,
+        "trajectory": trajectory[::3],
+        "map_bytes": (folder / "all" / "map.ply").stat().st_size,
+    }
 
 
-def _size(path: Path) -> int:
-    return path.stat().st_size
-
-
-@experiment("sequence_divergence")
+@experiment("sequence_divergence", DIVERGENCE)
 def sequence_divergence(folder: Path) -> Any:
     from ms_slam_env.benchmark.sequence_divergence import content, sequence_divergence
 
@@ -567,7 +568,7 @@ def sequence_divergence(folder: Path) -> Any:
     return content([sequence_divergence(recording, every=every) for every in (1, 2)])
 
 
-@experiment("difficulty")
+@experiment("difficulty", DIVERGENCE)
 def difficulty(folder: Path) -> Any:
     from PIL import Image
 
@@ -596,7 +597,7 @@ def difficulty(folder: Path) -> Any:
     }
 
 
-@experiment("trajectory_evaluation")
+@experiment("trajectory_evaluation", EXACT)
 def trajectory_evaluation(folder: Path) -> Any:
     from ms_slam_env.benchmark.trajectory_evaluation import TrajectoryOptions, evaluate_files
     from ms_slam_env.geometry import se3_exp
