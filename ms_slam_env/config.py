@@ -39,12 +39,14 @@ class Checked:
     """
 
     def __post_init__(self) -> None:
-        """Refuse values outside what :func:`bounded` and :func:`chosen` say.
+        """Refuse values outside what :func:`bounded` and :func:`chosen` say, and false booleans.
 
         Raises:
             InputError: naming class, field, value, and the permitted range or choices.
         """
         for field in dataclasses.fields(self):  # type: ignore[arg-type]
+            if field.type in (bool, "bool"):
+                _check_bool(self, field.name)
             may_be_none = "None" in str(field.type) and getattr(self, field.name) is None
             if _RANGE in field.metadata and not may_be_none:
                 check_range(self, field.name, *field.metadata[_RANGE])
@@ -161,6 +163,12 @@ def check_range(owner: object, name: str, low: float, high: float) -> None:
     declared_int = field is not None and field.type in (int, "int", "int | None")
     if declared_int and not isinstance(value, numbers.Integral):
         raise InputError(f"{type(owner).__name__}.{name} = {value!r} must be an integer")
+
+
+def _check_bool(owner: object, name: str) -> None:
+    value = getattr(owner, name)
+    if not isinstance(value, bool):
+        raise InputError(f"{type(owner).__name__}.{name} = {value!r} must be true or false")
 
 
 def check_choice(owner: object, name: str, choices: tuple[str, ...]) -> None:

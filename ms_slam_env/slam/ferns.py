@@ -19,6 +19,10 @@ from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose
 
+_THRESHOLDS = (32.0, 224.0)  # on colours, after that
+_AVERAGED = 8  # rows and columns of the image, at least, that a reduced pixel is the mean of
+_FIRST_ROWS = 64
+
 
 @dataclass(frozen=True)
 class FernConfig(Checked):
@@ -58,8 +62,6 @@ Float64 = NDArray[np.float64]
 COLOUR_BITS = 7  # red 1, green 2, blue 4
 DEPTH_BIT = 8
 MEAN_LEVEL = 128.0  # frames are made this bright, on average, before they are tested
-_THRESHOLDS = (32.0, 224.0)  # on colours, after that
-_AVERAGED = 8  # rows and columns of the image, at least, that a reduced pixel is the mean of
 
 
 @dataclass(frozen=True)
@@ -129,9 +131,6 @@ def dissimilarities(code: FernCode, bits: UInt8, known: UInt8) -> Float64:
     """
     different = (bits ^ code.bits) & (known & code.known)
     return np.count_nonzero(different, axis=1) / different.shape[1]
-
-
-_FIRST_ROWS = 64
 
 
 @dataclass(frozen=True)

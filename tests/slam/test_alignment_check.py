@@ -25,7 +25,7 @@ from ms_slam_env.slam.alignment_check import (
     evaluate_on_device,
     measure_alignment,
 )
-from ms_slam_env.slam.starts import start_motions
+from ms_slam_env.slam.pose_hypotheses import motion_hypotheses
 
 CAMERA = Intrinsics(fx=80.0, fy=84.0, cx=39.3, cy=29.8, width=80, height=60)
 REST = np.eye(4)
@@ -98,7 +98,7 @@ def test_starts_go_on_first_and_then_from_near_the_motion():
     for pose in (moved, REST):
         depth, _, color = ray_cast(pose, CAMERA)
         frames.append(DepthImage(depth.astype(np.float32), color.mean(-1).astype(np.float32)))
-    starts = start_motions(*frames, MOVED, CAMERA)
+    starts = motion_hypotheses(*frames, MOVED, CAMERA)
     np.testing.assert_array_equal(starts[0], MOVED)
     angles = [np.degrees(relative_angle(start[:3, :3], turn)) for start in starts[1:]]
     steps = [np.linalg.norm(start[:3, 3] - step) for start in starts[1:]]

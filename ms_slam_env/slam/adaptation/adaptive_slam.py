@@ -16,6 +16,8 @@ from ms_slam_env.slam.configuration import SlamConfiguration, merged, read_confi
 from ms_slam_env.slam.frame_selection import FrameFilter, SelectiveSlam
 from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
 
+_NEVER = 1_000_000_000  # frames in a row that are dropped at most
+
 
 class Controller(ABC):
     """Chooses before every frame one of the configurations, by index from fast to robust.
@@ -157,9 +159,6 @@ def default_configurations(intrinsics: Intrinsics) -> tuple[SlamConfiguration, .
         SlamConfiguration(image_size=size, keep_every=2, about={"cost": 0.73}),
         SlamConfiguration(slam_config=robust, image_size=size, about={"cost": 1.0}),
     )
-
-
-_NEVER = 1_000_000_000  # frames in a row that are dropped at most
 
 
 class AdaptiveSlam(SelectiveSlam):

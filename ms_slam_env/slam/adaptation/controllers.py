@@ -49,8 +49,6 @@ class DivergenceAdaptationConfig(SwitchingConfig):
     def __post_init__(self) -> None:
         """Refuse what is no ladder."""
         super().__post_init__()
-        if not isinstance(self.robust_when_lost, bool):
-            raise InputError(f"robust_when_lost = {self.robust_when_lost!r} must be true or false")
         wanted = self.num_configurations - 1
         object.__setattr__(self, "thresholds", rising(self.thresholds, "thresholds", wanted))
 

@@ -96,8 +96,6 @@ class BudgetConfig(DroppingConfig):
         super().__post_init__()
         check_range(self, "threshold", self.lowest_threshold, 1e6)
         check_range(self, "highest_threshold", self.threshold, 1e6)
-        if not isinstance(self.measured, bool):
-            raise InputError(f"BudgetConfig.measured = {self.measured!r} must be true or false")
         if self.budget_per_s is not None:
             return
         if self.measured or self.cost_per_frame != 1 or self.cost_per_look != 0:

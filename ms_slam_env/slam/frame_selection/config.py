@@ -16,6 +16,8 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.slam.base import SlamBackend
 from ms_slam_env.slam.frame_selection.selective_slam import PREDICTIONS, FrameFilter, SelectiveSlam
 
+_ROUNDING = 1e-9  # 13 / 1.3 is less than 10
+
 
 @dataclass(frozen=True)
 class FrameSelectionConfig(Family, ABC):
@@ -95,9 +97,6 @@ class DroppingConfig(Checked, FrameSelectionConfig):
         """``backend`` with this filter in front of it."""
         made = self.make_filter(backend.intrinsics)
         return SelectiveSlam(backend, made, self.max_skip, self.pose)
-
-
-_ROUNDING = 1e-9  # 13 / 1.3 is less than 10
 
 
 @dataclass(frozen=True)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ms_slam_env.config import check_range
-from ms_slam_env.errors import InputError
+from ms_slam_env.config import Checked, bounded
 
 
 @dataclass(frozen=True)
-class SparseConfig:
+class SparseConfig(Checked):
     """Parameters of features, tracking, keyframes and optimisation.
 
     Attributes:
@@ -41,50 +40,24 @@ class SparseConfig:
         InputError: a value outside its range.
     """
 
-    depth_cutoff_m: float = 4.0
-    features: int = 600
-    levels: int = 4
-    fast_threshold: int = 7
-    detection_width: int = 320
-    hamming: int = 60
-    pixel_noise: float = 0.7
-    inverse_depth_noise: float = 0.004
-    least_matches: int = 15
-    least_overlap: float = 0.3
-    least_inliers: float = 0.75
-    least_alike: float = 0.8
-    keyframe_m: float = 0.1
-    keyframe_deg: float = 8.0
-    enough_matches: int = 60
-    window: int = 5
-    loop_gap: int = 10
+    depth_cutoff_m: float = bounded(4.0, 0.1, 10.0)
+    features: int = bounded(600, 50, 10_000)
+    levels: int = bounded(4, 1, 12)
+    fast_threshold: int = bounded(7, 1, 100)
+    detection_width: int = bounded(320, 1, 4000)
+    hamming: int = bounded(60, 1, 256)
+    pixel_noise: float = bounded(0.7, 0.01, 10.0)
+    inverse_depth_noise: float = bounded(0.004, 0.0001, 1.0)
+    least_matches: int = bounded(15, 6, 1000)
+    least_overlap: float = bounded(0.3, 0.0, 1.0)
+    least_inliers: float = bounded(0.75, 0.0, 1.0)
+    least_alike: float = bounded(0.8, 0.0, 1.0)
+    keyframe_m: float = bounded(0.1, 0.0, 10.0)
+    keyframe_deg: float = bounded(8.0, 0.0, 90.0)
+    enough_matches: int = bounded(60, 0, 10_000)
+    window: int = bounded(5, 2, 100)
+    loop_gap: int = bounded(10, 1, 10_000)
     loops: bool = True
-    remap_m: float = 0.005
-    remap_deg: float = 0.3
-    max_surfels: int | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse values outside the ranges."""
-        check_range(self, "depth_cutoff_m", 0.1, 10.0)
-        check_range(self, "features", 50, 10_000)
-        check_range(self, "levels", 1, 12)
-        check_range(self, "fast_threshold", 1, 100)
-        check_range(self, "detection_width", 1, 4000)
-        check_range(self, "hamming", 1, 256)
-        check_range(self, "pixel_noise", 0.01, 10.0)
-        check_range(self, "inverse_depth_noise", 0.0001, 1.0)
-        check_range(self, "least_matches", 6, 1000)
-        check_range(self, "least_overlap", 0.0, 1.0)
-        check_range(self, "least_inliers", 0.0, 1.0)
-        check_range(self, "least_alike", 0.0, 1.0)
-        check_range(self, "keyframe_m", 0.0, 10.0)
-        check_range(self, "keyframe_deg", 0.0, 90.0)
-        check_range(self, "enough_matches", 0, 10_000)
-        check_range(self, "window", 2, 100)
-        check_range(self, "loop_gap", 1, 10_000)
-        if not isinstance(self.loops, bool):
-            raise InputError(f"SparseConfig.loops = {self.loops!r} must be true or false")
-        check_range(self, "remap_m", 0.0, 1.0)
-        check_range(self, "remap_deg", 0.0, 90.0)
-        if self.max_surfels is not None:
-            check_range(self, "max_surfels", 1000, 50_000_000)
+    remap_m: float = bounded(0.005, 0.0, 1.0)
+    remap_deg: float = bounded(0.3, 0.0, 90.0)
+    max_surfels: int | None = bounded(None, 1000, 50_000_000)

@@ -1,4 +1,10 @@
-"""Corners of an image with their ORB descriptors, and the patches around them."""
+"""ORB features of a frame with their depth, and small patches that are registered in another.
+
+ORB's corners lie on whole pixels of their level, and come and go. A patch is warped as the motion
+and its surface demand and then shifted until it fits (Lucas and Kanade; the warp as in SVO, Forster
+et al., ICRA 2014, section IV-B). It stays that of the keyframe that made the point, so that errors
+do not add up from keyframe to keyframe.
+"""
 
 from __future__ import annotations
 
@@ -20,6 +26,15 @@ _CANDIDATES = 2  # corners found per corner kept
 _CELLS = (8, 6)  # across and down, in which corners are kept in equal numbers
 _SLOPE_PX = 2.0  # half the distance over which a slope is measured
 _EDGE_PER_M = 0.03  # a step of inverse depth between neighbours that is an edge, 1/m
+_HALF = 3  # pixels on each side of the patch's centre
+_MARGIN = 6.0  # pixels to the border
+_ITERATIONS = 4
+_LARGEST_ZOOM = 2.0  # between the two images, areas
+_UNLIKE = 0.6  # largest RMS difference of a patch that was found, of its contrast
+_LEAST_NOISE = 1.0  # grey levels
+_SMALLEST_GRADIENT = 1e-2  # keeps blank patches solvable; nothing else feels it
+_LEAST_SIGMA_PX = 0.2  # what warping as a plane, and by a pose not yet exact, leaves
+_LARGEST_SIGMA_PX = 0.7  # a patch that fixes its place less well is on an edge, or blank
 
 
 @dataclass(frozen=True)
@@ -159,17 +174,6 @@ class InverseDepth:
             known = (before > 0) & (after > 0)
             slopes.append(np.where(known, after - before, 0.0) / (2 * _SLOPE_PX))
         return np.stack(slopes, axis=1)
-
-
-_HALF = 3  # pixels on each side of the patch's centre
-_MARGIN = 6.0  # pixels to the border
-_ITERATIONS = 4
-_LARGEST_ZOOM = 2.0  # between the two images, areas
-_UNLIKE = 0.6  # largest RMS difference of a patch that was found, of its contrast
-_LEAST_NOISE = 1.0  # grey levels
-_SMALLEST_GRADIENT = 1e-2  # keeps blank patches solvable; nothing else feels it
-_LEAST_SIGMA_PX = 0.2  # what warping as a plane, and by a pose not yet exact, leaves
-_LARGEST_SIGMA_PX = 0.7  # a patch that fixes its place less well is on an edge, or blank
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,12 @@ from ms_slam_env.slam.sparse.pose import (
 )
 from ms_slam_env.slam.sparse.sparse_map import SparseMap
 
+_BASELINE_M = 0.1  # of the imagined second camera; the result does not depend on it
+_FIXED_SIGMA = 1e-6  # of a pose that stays where it is, metres and radians
+_ITERATIONS = 3
+_ERROR_TOLERANCE = 1e-3  # a smaller relative gain ends the iterations
+_MOST_FIXED = 3  # keyframes beyond the window that hold it in place
+
 
 def load_gtsam() -> Any:
     """GTSAM's module.
@@ -37,12 +43,6 @@ def load_gtsam() -> Any:
             f"the sparse backend needs GTSAM (pip install 'ms-slam-env[gtsam]'): {error}"
         ) from error
     return gtsam
-
-
-_BASELINE_M = 0.1  # of the imagined second camera; the result does not depend on it
-_FIXED_SIGMA = 1e-6  # of a pose that stays where it is, metres and radians
-_ITERATIONS = 3
-_ERROR_TOLERANCE = 1e-3  # a smaller relative gain ends the iterations
 
 
 @dataclass(frozen=True)
@@ -151,9 +151,6 @@ def _robust(gtsam: Any, covariance: Float64) -> Any:
     limit = CHI2_PIXEL if len(covariance) == 2 else CHI2_PIXEL_AND_DEPTH
     huber = gtsam.noiseModel.mEstimator.Huber.Create(float(np.sqrt(limit)))
     return gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Gaussian.Covariance(covariance))
-
-
-_MOST_FIXED = 3  # keyframes beyond the window that hold it in place
 
 
 def adjust_around(sparse_map: SparseMap, keyframe: int, config: SparseConfig) -> None:

@@ -13,7 +13,6 @@ from ms_slam_env.slam.alignment_check import (
     NO_ALIGNMENT,
     VIEW_REASONS,
     AcceptanceThresholds,
-    AlignmentStatistics,
     DepthImage,
     evaluate_alignment,
     measure_alignment,
@@ -34,6 +33,7 @@ from ms_slam_env.slam.sparse.pose import (
     refine_pose,
 )
 from ms_slam_env.slam.sparse.sparse_map import SparseMap
+from ms_slam_env.slam.tracking_template import Attempt
 
 _SAME_PX = 1.0  # corners closer than this to a point's place are that point
 _RADIUS = 0.045  # of the search for a point, share of the image's width
@@ -41,6 +41,8 @@ _NEIGHBOURS = 6  # keyframes, besides the reference, whose points are looked for
 _RANSAC_SIGMAS = 3.0
 _SIGMA_STEP_PX = 0.1
 _CORNER_SHIFT_PX = 1.5  # largest correction of a corner
+_SAMPLES = 1000  # readings that a pose is judged by
+_LEAST_EXPLAINED = 0.25  # share of the matches
 _PATCH_SHIFT_PX = 3.0  # largest distance of a patch from where its point projects to
 
 
@@ -59,6 +61,11 @@ class LiveFrame:
     inverse_depth: InverseDepth
     features: Features
     tree: cKDTree | None
+
+    @property
+    def readings(self) -> float:
+        """Share of the pixels that have depth."""
+        return self.image.readings
 
     def showing(self, features: Features) -> LiveFrame:
         """The same frame with other features."""
@@ -89,7 +96,7 @@ class Fix:
     visible: Int64
 
 
-class Localiser:
+class Localizer:
     """Places frames in a map.
 
     Args:
@@ -102,6 +109,11 @@ class Localiser:
         self._config = config
         self._least = config.least_matches
         self._intrinsics: Intrinsics = sparse_map.intrinsics
+        self._thresholds = AcceptanceThresholds(  # a keyframe may be anywhere that sees the same
+            overlap=config.least_overlap,
+            inlier_ratio=config.least_inliers,
+            photometric_inlier_ratio=config.least_alike,
+        )
 
     def near(self, frame: LiveFrame, T_world_camera: Float64, reference: int) -> Fix | None:
         """Place a frame that is near a pose and sees what the reference keyframe sees.
@@ -162,6 +174,23 @@ class Localiser:
         T, inlier = found
         seen = self._sightings(frame.features, b[inlier])
         return refine_pose(T, points[inlier], seen, self._intrinsics)[0]
+
+    def verify(self, fix: Fix, frame: LiveFrame) -> Attempt[Fix]:
+        """Judge a pose by its matches, and by depth and intensity of the keyframe beside it."""
+        explained = len(fix.point_ids)
+        reason, found = "", NO_ALIGNMENT
+        if explained < self._least:
+            reason = f"only {explained} corners match the map, of {self._least} needed"
+        elif explained < _LEAST_EXPLAINED * fix.matches:
+            reason = f"only {explained} of {fix.matches} matching corners fit one pose"
+        else:
+            keyframe = self._map.keyframes[fix.reference]
+            motion = invert(keyframe.T_world_camera) @ fix.T_world_camera
+            found = measure_alignment(
+                frame.image, keyframe.image(), motion, self._intrinsics, _SAMPLES
+            )
+            reason = VIEW_REASONS[evaluate_alignment(found, self._thresholds)]
+        return Attempt(fix.T_world_camera, found, reason, fix)
 
     def _sightings(self, features: Features, which: Int64) -> Sightings:
         """Measurements of some features."""
@@ -269,55 +298,3 @@ def keyframe_features(
         ),
         np.concatenate([fix.point_ids, np.full(len(rest), -1, dtype=np.int64)]),
     )
-
-
-_SAMPLES = 1000  # readings that a pose is judged by
-_LEAST_EXPLAINED = 0.25  # share of the matches
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """What an image says about a pose.
-
-    Attributes:
-        statistics: of the alignment with the keyframe beside it.
-        reason: why the pose is not believed; empty if it is.
-    """
-
-    statistics: AlignmentStatistics
-    reason: str
-
-
-class Verifier:
-    """Judges poses by their matches, and by the depth and intensity of the keyframe beside them.
-
-    Args:
-        sparse_map: keyframes.
-        config: parameters.
-    """
-
-    def __init__(self, sparse_map: SparseMap, config: SparseConfig) -> None:
-        self._map = sparse_map
-        self._least = config.least_matches
-        self._intrinsics: Intrinsics = sparse_map.intrinsics
-        self._thresholds = AcceptanceThresholds(
-            overlap=config.least_overlap,
-            inlier_ratio=config.least_inliers,
-            photometric_inlier_ratio=config.least_alike,
-        )
-
-    def judge(self, fix: Fix, frame: LiveFrame) -> Verdict:
-        """Compare a frame with the map at the pose found."""
-        explained = len(fix.point_ids)
-        if explained < self._least:
-            reason = f"only {explained} corners match the map, of {self._least} needed"
-            return Verdict(NO_ALIGNMENT, reason)
-        if explained < _LEAST_EXPLAINED * fix.matches:
-            reason = f"only {explained} of {fix.matches} matching corners fit one pose"
-            return Verdict(NO_ALIGNMENT, reason)
-        keyframe = self._map.keyframes[fix.reference]
-        motion = invert(keyframe.T_world_camera) @ fix.T_world_camera
-        statistics = measure_alignment(
-            frame.image, keyframe.image(), motion, self._intrinsics, _SAMPLES
-        )
-        return Verdict(statistics, VIEW_REASONS[evaluate_alignment(statistics, self._thresholds)])

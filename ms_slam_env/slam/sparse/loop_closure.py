@@ -13,13 +13,18 @@ from ms_slam_env.geometry import invert, relative_angle
 from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.sparse.config import SparseConfig
 from ms_slam_env.slam.sparse.local_mapping import load_gtsam
-from ms_slam_env.slam.sparse.localization import Fix, LiveFrame, Localiser, Verifier
+from ms_slam_env.slam.sparse.localization import Fix, LiveFrame, Localizer
 from ms_slam_env.slam.sparse.matching import most_alike
 from ms_slam_env.slam.sparse.pose import orthonormal
 from ms_slam_env.slam.sparse.sparse_map import SparseMap
 
 _FIXED_SIGMA = 1e-6
 _ITERATIONS = 20
+_CANDIDATES = 3  # keyframes that are looked at
+_SHARED_POINTS = 30  # of an edge between keyframes
+# Surer than other edges, which stand for errors that add up, and of which many run side by side.
+_LOOP_M, _LOOP_RAD = 0.002, 0.001
+_SMALL_M, _SMALL_RAD = 0.003, 0.002  # loops off by less need no pose graph
 
 
 @dataclass(frozen=True)
@@ -68,42 +73,32 @@ def optimise_poses(poses: Float64, edges: Sequence[Edge], fixed: NDArray[np.bool
     return optimised
 
 
-_CANDIDATES = 3  # keyframes that are looked at
-_SHARED_POINTS = 30  # of an edge between keyframes
-# Surer than other edges, which stand for errors that add up, and of which many run side by side.
-_LOOP_M, _LOOP_RAD = 0.002, 0.001
-_SMALL_M, _SMALL_RAD = 0.003, 0.002  # loops off by less need no pose graph
-
-
 class LoopCloser:
     """Closes loops of a map.
 
     Args:
         sparse_map: keyframes and points.
-        localiser: places images in it.
-        verifier: judges a place.
+        localizer: places images in it, and verifies the places.
         config: parameters.
     """
 
     def __init__(
         self,
         sparse_map: SparseMap,
-        localiser: Localiser,
-        verifier: Verifier,
+        localizer: Localizer,
         config: SparseConfig,
     ) -> None:
         self._map = sparse_map
-        self._localiser = localiser
-        self._verifier = verifier
+        self._localizer = localizer
         self._config = config
         self.edges: list[Edge] = []  # of all loops closed so far
 
     def close(self, keyframe: int, frame: LiveFrame) -> bool:
         """Close a loop at the keyframe made of ``frame``; whether there was one."""
         for candidate in self._candidates(keyframe):
-            T = self._localiser.by_looks(frame, candidate)
-            fix = None if T is None else self._localiser.near(frame, T, candidate)
-            if fix is None or self._verifier.judge(fix, frame).reason:
+            T = self._localizer.by_looks(frame, candidate)
+            fix = None if T is None else self._localizer.near(frame, T, candidate)
+            if fix is None or self._localizer.verify(fix, frame).reason:
                 continue
             self._join(keyframe, fix)
             return True

@@ -17,6 +17,7 @@ Descriptors = NDArray[np.uint64]
 
 _NEIGHBOURS = 8  # features compared with a projected point at most
 _RATIO = 0.9  # the best match must be this much better than the second best
+_SIZE = (16, 12)  # of a thumbnail, pixels
 
 
 def hamming_distance(a: Descriptors, b: Descriptors) -> Int64:
@@ -87,9 +88,6 @@ def _one_to_one(points: Int64, features: Int64, distance: Int64) -> tuple[Int64,
 
 def _no_match() -> tuple[Int64, Int64]:
     return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-
-
-_SIZE = (16, 12)  # of a thumbnail, pixels
 
 
 def thumbnail(image: DepthImage) -> Float32:

@@ -1,4 +1,4 @@
-"""Sparse SLAM with ORB features, as a ``SlamBackend``.
+"""Sparse SLAM with ORB features, as a backend.
 
 ORB-SLAM2 for RGB-D cameras (Mur-Artal and Tardos, TRO 2017, figure 2) without its threads: every
 frame is matched with the points of the local map; keyframes add points, are adjusted with their
@@ -15,14 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
-from ms_slam_env.geometry import check_pose, invert, relative_angle
-from ms_slam_env.slam.alignment_check import (
-    FEWEST_READINGS,
-    NO_ALIGNMENT,
-    AlignmentStatistics,
-    DepthImage,
-)
-from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult, Views
+from ms_slam_env.geometry import relative_angle
+from ms_slam_env.slam.alignment_check import DepthImage
+from ms_slam_env.slam.base import Float64, Views
 from ms_slam_env.slam.sparse.config import SparseConfig
 from ms_slam_env.slam.sparse.dense_map import DenseMap
 from ms_slam_env.slam.sparse.features import FeatureExtractor, InverseDepth
@@ -30,20 +25,20 @@ from ms_slam_env.slam.sparse.local_mapping import adjust_around, load_gtsam
 from ms_slam_env.slam.sparse.localization import (
     Fix,
     LiveFrame,
-    Localiser,
-    Verifier,
+    Localizer,
     keyframe_features,
 )
 from ms_slam_env.slam.sparse.loop_closure import LoopCloser
 from ms_slam_env.slam.sparse.matching import most_alike, thumbnail
 from ms_slam_env.slam.sparse.sparse_map import SparseMap, make_keyframe
+from ms_slam_env.slam.tracking_template import Attempt, FrameByFrameSlam
 
 _LOOKALIKES = 4  # keyframes in which a lost camera is sought
 _SOONER = 0.25  # share of a keyframe's distance that is enough where matches are few
 _BESIDE = 2  # keyframes beside the guess in which it is sought
 
 
-class SparseSlam(SlamBackend):
+class SparseSlam(FrameByFrameSlam[LiveFrame, Fix]):
     """The sparse SLAM of one camera."""
 
     def __init__(self, intrinsics: Intrinsics, config: SparseConfig | None = None) -> None:
@@ -57,19 +52,21 @@ class SparseSlam(SlamBackend):
         self.config = config or SparseConfig()
         self._extract = FeatureExtractor(intrinsics, self.config)
         self._dense = DenseMap(intrinsics, self.config)
-        self.reset()
+        super().__init__(intrinsics)
 
-    def reset(self, T_world_camera: ArrayLike | None = None) -> None:
-        """Forget everything; the next frame is taken at ``T_world_camera`` (identity if None)."""
-        pose = np.eye(4) if T_world_camera is None else T_world_camera
-        self._pose = np.array(check_pose(pose, "T_world_camera"))
-        self._motion = np.eye(4)
-        self._lost = False
+    @property
+    def _has_map(self) -> bool:
+        return bool(self._map.keyframes)
+
+    @property
+    def _no_attempt(self) -> str:
+        return f"fewer than {self.config.least_matches} of the frame's corners match the map"
+
+    def _clear(self) -> None:
         self._reference = 0
         self._map = SparseMap(self.intrinsics)
-        self._localiser = Localiser(self._map, self.config)
-        self._verifier = Verifier(self._map, self.config)
-        self._loops = LoopCloser(self._map, self._localiser, self._verifier, self.config)
+        self._localizer = Localizer(self._map, self.config)
+        self._loops = LoopCloser(self._map, self._localizer, self.config)
         self._dense.clear()
 
     @property
@@ -82,48 +79,6 @@ class SparseSlam(SlamBackend):
         """Number of loops closed."""
         return len(self._loops.edges)
 
-    def track(self, frame: RGBDFrame, T_world_camera_guess: ArrayLike | None = None) -> TrackResult:
-        """Estimate the pose of ``frame``; a keyframe extends the map. See ``SlamBackend``.
-
-        Raises:
-            InputError: the frame's size is not that of the intrinsics, or the guess is no pose.
-        """
-        self.intrinsics.check_image(frame.depth, "frame")
-        guess = None
-        if T_world_camera_guess is not None:
-            guess = np.array(check_pose(T_world_camera_guess, "T_world_camera_guess"))
-        live = self._prepare(frame)
-        if not self._map.keyframes:
-            return self._start(frame, live)
-        if live.image.readings < FEWEST_READINGS:
-            return self._lose("the frame has too few depth readings", NO_ALIGNMENT)
-        reason, statistics = "", NO_ALIGNMENT
-        for fix in self._fixes(live, guess):
-            verdict = self._verifier.judge(fix, live)
-            if not verdict.reason:
-                return self._accept(frame, live, fix, verdict.statistics)
-            reason, statistics = verdict.reason, verdict.statistics
-        nothing = f"fewer than {self.config.least_matches} of the frame's corners match the map"
-        return self._lose(reason or nothing, statistics)
-
-    def fuse(self, frame: RGBDFrame, T_world_camera: ArrayLike) -> TrackResult:
-        """Make ``frame`` a keyframe at a known pose (4, 4), which optimisation leaves.
-
-        Raises:
-            InputError: the frame's size is not that of the intrinsics, or the pose is none.
-        """
-        self.intrinsics.check_image(frame.depth, "frame")
-        self._pose = np.array(check_pose(T_world_camera, "T_world_camera"))
-        self._motion = np.eye(4)
-        self._lost = False
-        live = self._prepare(frame)
-        if live.image.readings >= FEWEST_READINGS:
-            fix = None
-            if self._map.keyframes:
-                fix = self._localiser.near(live, self._pose, self._nearest(self._pose, 1)[0])
-            self._insert(frame, live, fix, known=True)
-        return TrackResult(self._pose.copy(), True)
-
     def _prepare(self, frame: RGBDFrame) -> LiveFrame:
         depth = frame.depth.astype(np.float32)
         depth = np.where(depth <= self.config.depth_cutoff_m, depth, np.float32(0))
@@ -134,25 +89,23 @@ class SparseSlam(SlamBackend):
         image = DepthImage(depth, grey.astype(np.float32))
         return LiveFrame(image, inverse_depth, features, tree)
 
-    def _start(self, frame: RGBDFrame, live: LiveFrame) -> TrackResult:
-        """Take the first frame at the given pose, if there is something in it."""
-        corners = int((live.features.inverse_depth > 0).sum())
-        reason = ""
-        if live.image.readings < FEWEST_READINGS:
-            reason = "the first frame has too few depth readings"
-        elif corners < self.config.least_matches:
-            reason = f"the first frame has only {corners} corners with depth"
-        if reason:
-            return TrackResult(self._pose.copy(), False, inlier_fraction=0.0, reason=reason)
-        return self.fuse(frame, self._pose)
+    def _why_no_start(self, prepared: LiveFrame) -> str:
+        corners = int((prepared.features.inverse_depth > 0).sum())
+        if corners < self.config.least_matches:
+            return f"the first frame has only {corners} corners with depth"
+        return ""
+
+    def _attempts(self, prepared: LiveFrame, guess: Float64 | None) -> Iterator[Attempt[Fix]]:
+        for fix in self._fixes(prepared, guess):
+            yield self._localizer.verify(fix, prepared)
 
     def _fixes(self, live: LiveFrame, guess: Float64 | None) -> Iterator[Fix]:
         """Poses that the frame may have, in the order in which they are tried."""
-        near, by_looks = self._localiser.near, self._localiser.by_looks
-        starts = [(self._pose @ self._motion, self._reference)]
+        near, by_looks = self._localizer.near, self._localizer.by_looks
+        hypotheses = [(self._pose @ self._motion, self._reference)]
         if guess is not None:
-            starts.append((guess, self._nearest(guess, 1)[0]))
-        for pose, reference in starts:
+            hypotheses.append((guess, self._nearest(guess, 1)[0]))
+        for pose, reference in hypotheses:
             fix = near(live, pose, reference)
             if fix is not None:
                 yield fix
@@ -180,25 +133,19 @@ class SparseSlam(SlamBackend):
         away += 2 * np.arccos(np.clip(cosine, -1, 1))
         return [int(k) for k in np.argsort(away, kind="stable")[:count]]
 
-    def _accept(
-        self, frame: RGBDFrame, live: LiveFrame, fix: Fix, statistics: AlignmentStatistics
-    ) -> TrackResult:
-        """Move on to a frame whose pose was found."""
-        relocalised, self._lost = self._lost, False
-        before = self._pose
-        self._pose = fix.T_world_camera
+    def _start_from(self, frame: RGBDFrame, prepared: LiveFrame) -> None:
+        if prepared.readings >= self.fewest_readings:
+            fix = None
+            if self._has_map:
+                fix = self._localizer.near(prepared, self._pose, self._nearest(self._pose, 1)[0])
+            self._insert(frame, prepared, fix, known=True)
+
+    def _extend(self, frame: RGBDFrame, prepared: LiveFrame, attempt: Attempt[Fix]) -> None:
+        fix = attempt.match
         self._reference = fix.reference
         self._map.count_sightings(fix.visible, fix.point_ids)
-        self._motion = np.eye(4) if relocalised else invert(before) @ self._pose
         if self._is_new(fix):
-            self._insert(frame, live, fix, known=False)
-        return TrackResult(
-            T_world_camera=self._pose.copy(),
-            tracking_ok=True,
-            relocalised=relocalised,
-            inlier_fraction=statistics.inlier_ratio,
-            residual_m=statistics.residual_m,
-        )
+            self._insert(frame, prepared, fix, known=False)
 
     def _is_new(self, fix: Fix) -> bool:
         """Whether a frame is away from the keyframe beside it; sooner where matches are few."""
@@ -228,18 +175,6 @@ class SparseSlam(SlamBackend):
         self._pose = keyframe.T_world_camera.copy()
         self._dense.place(self._map.keyframes)
 
-    def _lose(self, reason: str, statistics: AlignmentStatistics) -> TrackResult:
-        """Hold the pose and the map."""
-        self._motion = np.eye(4)
-        self._lost = True
-        return TrackResult(
-            T_world_camera=self._pose.copy(),
-            tracking_ok=False,
-            inlier_fraction=statistics.inlier_ratio,
-            residual_m=statistics.residual_m,
-            reason=reason,
-        )
-
     def predict(self, poses: ArrayLike, scale: float = 1.0) -> Views:
         """Render the keyframes' depth from ``poses`` (N, 4, 4) at ``scale`` times the size.
 
@@ -264,23 +199,15 @@ class SparseSlam(SlamBackend):
         self._dense.update(self._map.keyframes)
         return self._dense
 
-    def get_state(self) -> dict[str, Any]:
-        """Everything needed to go on bit-exactly, as NumPy arrays and plain values."""
+    def _map_state(self) -> dict[str, Any]:
         return {
-            "pose": self._pose.copy(),
-            "motion": self._motion.copy(),
-            "lost": self._lost,
             "reference": self._reference,
             "map": self._map.get_state(),
             "loops": self._loops.get_state(),
             "dense": self._dense.get_state(),
         }
 
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state of a sparse SLAM of the same intrinsics and configuration."""
-        self._pose = state["pose"].copy()
-        self._motion = state["motion"].copy()
-        self._lost = state["lost"]
+    def _set_map_state(self, state: dict[str, Any]) -> None:
         self._reference = state["reference"]
         self._map.set_state(state["map"])
         self._loops.set_state(state["loops"])

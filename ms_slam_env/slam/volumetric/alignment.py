@@ -12,6 +12,9 @@ from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.odometry import Aligner
 from ms_slam_env.slam.volumetric.voxel_grid import CastView, VoxelGrid, camera_matrix
 
+_ITERATIONS = (10, 5, 3)  # coarse to fine
+_STOCK_ITERATIONS = (6, 3, 1)
+
 
 class FrameToModel(ABC):
     """Finds the motion between the model's view and a frame."""
@@ -19,9 +22,6 @@ class FrameToModel(ABC):
     @abstractmethod
     def align(self, frame: DepthImage, view: CastView) -> Float64 | None:
         """T_model_camera (4, 4) of a frame, searched from rest; None if there is none."""
-
-
-_ITERATIONS = (10, 5, 3)  # coarse to fine; Open3D's dense SLAM does 6, 3 and 1
 
 
 class Open3DAlignment(FrameToModel):
@@ -35,9 +35,8 @@ class Open3DAlignment(FrameToModel):
         self._grid = grid
         self._rgbd_image = grid.open3d.t.geometry.RGBDImage
         self._odometry = grid.open3d.t.pipelines.odometry
-        self._criteria = [
-            self._odometry.OdometryConvergenceCriteria(count) for count in _ITERATIONS
-        ]
+        counts = _STOCK_ITERATIONS if grid.config.stock else _ITERATIONS
+        self._criteria = [self._odometry.OdometryConvergenceCriteria(count) for count in counts]
         self._loss = self._odometry.OdometryLossParams(grid.config.association_m)
         self._start = grid.tensor(np.eye(4))
 

@@ -1,4 +1,7 @@
-"""A sparse grid of signed distances: fuse frames, cast rays, extract the surface, save, restore."""
+"""A sparse grid of signed distances: fuse frames, cast rays, extract the surface, save, restore.
+
+Curless and Levoy 1996, in blocks that a hash map finds (Niessner et al. 2013), by Open3D.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +18,10 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert
 from ms_slam_env.slam.base import Float32, Float64
 from ms_slam_env.slam.volumetric.config import VolumetricConfig
+
+_NEAREST_M = 0.1
+_FRAGMENT_PX = 16  # edge of the pieces in which Open3D draws its blocks
+_SMOOTH_PX = 1.5  # width of the filter of cast depth
 
 
 def load_open3d() -> Any:
@@ -35,10 +42,7 @@ def load_open3d() -> Any:
 
 
 DEPTH_SCALE = 5000.0  # 16-bit depth of 0.2 mm, well below the sensor's noise
-_NEAREST_M = 0.1
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
-_FRAGMENT_PX = 16  # edge of the pieces in which Open3D draws its blocks
-_SMOOTH_PX = 1.5  # width of the filter of cast depth
 
 
 @dataclass(frozen=True)
@@ -68,6 +72,10 @@ class VoxelGrid:
     Raises:
         InputError: Open3D, or a system library that it needs, is not installed.
     """
+
+    # Open3D finds a voxel's reading by cutting off the fraction of its pixel: with centres at
+    # integers that is half a pixel too low.
+    _reading_shift_px = 0.5
 
     def __init__(self, intrinsics: Intrinsics, config: VolumetricConfig) -> None:
         """Allocate an empty grid."""
@@ -112,17 +120,14 @@ class VoxelGrid:
         blocks = self._grid.compute_unique_block_coordinates(
             depth_image, camera_matrix(self, self.intrinsics), extrinsic, *limits
         )
-        # Open3D finds a voxel's reading by cutting off the fraction of its pixel: with centres at
-        # integers that is half a pixel too low.
-        matrix = camera_matrix(self, self.intrinsics, 0.5)
+        matrix = camera_matrix(self, self.intrinsics, self._reading_shift_px)
         self._grid.integrate(blocks, depth_image, color_image, matrix, matrix, extrinsic, *limits)
         self._forget_derived()
 
     def cast(self, pose: Float64, least_weight: float, intrinsics: Intrinsics) -> CastView:
         """Cast the image seen from ``pose`` (4, 4), of voxels observed ``least_weight`` times."""
         if self._block_keys() is None:
-            image = np.zeros((*intrinsics.shape, 3), dtype=np.float32)
-            return CastView(image[..., 0].copy(), image, image.copy())
+            return _nothing(intrinsics)
         self._reserve_fragments(intrinsics)
         # Open3D looks distances up at the voxel below a point, on average half a voxel off along
         # each axis, and interpolates colours and normals at the right place.
@@ -251,6 +256,29 @@ class VoxelGrid:
         index = ("tsdf", "weight", "color").index(name)
         array: NDArray[Any] = self._grid.hashmap().value_tensor(index).numpy()
         return array
+
+
+class StockVoxelGrid(VoxelGrid):
+    """The grid as Open3D's ``t.pipelines.slam.Model`` has it: nothing is corrected."""
+
+    _reading_shift_px = 0.0
+
+    def cast(self, pose: Float64, least_weight: float, intrinsics: Intrinsics) -> CastView:
+        """Cast the image seen from ``pose`` (4, 4), of voxels observed ``least_weight`` times."""
+        if self._block_keys() is None:
+            return _nothing(intrinsics)
+        names = ["depth", "color", "normal"]
+        found = self._ray_cast(pose, least_weight, intrinsics, names)
+        return CastView(
+            depth=found["depth"].numpy()[..., 0] / np.float32(DEPTH_SCALE),
+            color=found["color"].numpy(),
+            normals=-found["normal"].numpy(),
+        )
+
+
+def _nothing(intrinsics: Intrinsics) -> CastView:
+    image = np.zeros((*intrinsics.shape, 3), dtype=np.float32)
+    return CastView(image[..., 0].copy(), image, image.copy())
 
 
 def smooth_depth(depth: Float32, hit: NDArray[np.bool_], voxel_m: float) -> Float32:

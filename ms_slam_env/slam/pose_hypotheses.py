@@ -30,7 +30,7 @@ MOTIONS = np.stack(
 """Motions (49, 4, 4): no turn or one of 10 degrees, with no step or one of 10 cm."""
 
 
-def start_motions(
+def motion_hypotheses(
     frame: DepthImage, reference: DepthImage, T_last_camera: Float64, intrinsics: Intrinsics
 ) -> Float64:
     """Motions T_reference_frame (7, 4, 4) to search from, in the order of trial.

@@ -1,0 +1,200 @@
+"""Track, then accept or lose: the skeleton of the backends that process one frame after another."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ms_slam_env.camera import Intrinsics, RGBDFrame
+from ms_slam_env.geometry import check_pose, invert
+from ms_slam_env.slam.alignment_check import FEWEST_READINGS, NO_ALIGNMENT, AlignmentStatistics
+from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult
+
+
+class PreparedFrame(Protocol):
+    """A frame as a backend tracks it."""
+
+    @property
+    def readings(self) -> float:
+        """Share of the pixels that have depth."""
+
+
+Frame = TypeVar("Frame", bound=PreparedFrame)
+Match = TypeVar("Match")
+
+
+@dataclass(frozen=True)
+class Attempt(Generic[Match]):
+    """A pose that a frame may have.
+
+    Attributes:
+        T_world_camera: (4, 4) the pose.
+        statistics: what it explains of the frame.
+        reason: why it is not accepted; empty if it is.
+        match: what the backend found besides.
+    """
+
+    T_world_camera: Float64
+    statistics: AlignmentStatistics
+    reason: str
+    match: Match
+
+
+class FrameByFrameSlam(SlamBackend, Generic[Frame, Match]):
+    """A backend that tries one pose after another, and takes the first that passes its check.
+
+    A subclass says how a frame is prepared, which poses it may have, and how the map grows. While
+    tracking is lost the pose is held and nothing is fused.
+
+    Attributes:
+        fewest_readings: share of a frame's pixels that must have depth.
+    """
+
+    fewest_readings = FEWEST_READINGS
+
+    def __init__(self, intrinsics: Intrinsics) -> None:
+        """Start empty at the identity pose; to be called when there is a map to clear."""
+        self.intrinsics = intrinsics
+        self.reset()
+
+    def reset(self, T_world_camera: ArrayLike | None = None) -> None:
+        """Forget everything; the next frame is taken at ``T_world_camera`` (identity if None)."""
+        pose = np.eye(4) if T_world_camera is None else T_world_camera
+        self._pose = np.array(check_pose(pose, "T_world_camera"))
+        self._motion = np.eye(4)  # from the frame before to the last one
+        self._lost = False
+        self._clear()
+
+    def track(self, frame: RGBDFrame, T_world_camera_guess: ArrayLike | None = None) -> TrackResult:
+        """Estimate the pose of ``frame`` and extend the map; see ``SlamBackend``.
+
+        Raises:
+            InputError: the frame's size is not that of the intrinsics, or the guess is no pose.
+        """
+        self.intrinsics.check_image(frame.depth, "frame")
+        guess = None
+        if T_world_camera_guess is not None:
+            guess = np.array(check_pose(T_world_camera_guess, "T_world_camera_guess"))
+        prepared = self._prepare(frame)
+        which = "frame" if self._has_map else "first frame"
+        if prepared.readings < self.fewest_readings:
+            return self._lose(f"the {which} has too few depth readings", NO_ALIGNMENT)
+        if not self._has_map:
+            reason = self._why_no_start(prepared)
+            return self._lose(reason, NO_ALIGNMENT) if reason else self._take(frame, prepared)
+        reason, statistics = self._no_attempt, NO_ALIGNMENT
+        for attempt in self._attempts(prepared, guess):
+            if not attempt.reason:
+                return self._accept(frame, prepared, attempt)
+            reason, statistics = attempt.reason, attempt.statistics
+        self._miss(frame, prepared)
+        return self._lose(reason, statistics)
+
+    def fuse(self, frame: RGBDFrame, T_world_camera: ArrayLike) -> TrackResult:
+        """Fuse ``frame`` into the map at a known pose (4, 4), without tracking.
+
+        Raises:
+            InputError: the frame's size is not that of the intrinsics, or the pose is none.
+        """
+        self.intrinsics.check_image(frame.depth, "frame")
+        self._pose = np.array(check_pose(T_world_camera, "T_world_camera"))
+        return self._take(frame, self._prepare(frame))
+
+    def _take(self, frame: RGBDFrame, prepared: Frame) -> TrackResult:
+        """Go on from a frame whose pose is known."""
+        self._motion = np.eye(4)
+        self._lost = False
+        self._start_from(frame, prepared)
+        return TrackResult(self._pose.copy(), True)
+
+    def _accept(self, frame: RGBDFrame, prepared: Frame, attempt: Attempt[Match]) -> TrackResult:
+        """Move on to a frame whose pose was found."""
+        relocalised, self._lost = self._lost, False
+        before, self._pose = self._pose, attempt.T_world_camera
+        self._motion = np.eye(4) if relocalised else invert(before) @ self._pose
+        self._extend(frame, prepared, attempt)
+        return TrackResult(
+            T_world_camera=self._pose.copy(),
+            tracking_ok=True,
+            relocalised=relocalised,
+            inlier_fraction=attempt.statistics.inlier_ratio,
+            residual_m=attempt.statistics.residual_m,
+        )
+
+    def _lose(self, reason: str, statistics: AlignmentStatistics) -> TrackResult:
+        """Hold the pose and the map."""
+        self._motion = np.eye(4)
+        self._lost = self._has_map
+        return TrackResult(
+            T_world_camera=self._pose.copy(),
+            tracking_ok=False,
+            inlier_fraction=statistics.inlier_ratio,
+            residual_m=statistics.residual_m,
+            reason=reason,
+        )
+
+    def get_state(self) -> dict[str, Any]:
+        """Everything needed to go on bit-exactly, as NumPy arrays and plain values."""
+        return {
+            "pose": self._pose.copy(),
+            "motion": self._motion.copy(),
+            "lost": self._lost,
+            **self._map_state(),
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state of a backend of the same intrinsics and configuration."""
+        self._pose = state["pose"].copy()
+        self._motion = state["motion"].copy()
+        self._lost = state["lost"]
+        self._set_map_state(state)
+
+    @property
+    @abstractmethod
+    def _has_map(self) -> bool:
+        """Whether there is something to track against."""
+
+    @property
+    @abstractmethod
+    def _no_attempt(self) -> str:
+        """Why tracking failed where there was no pose to try."""
+
+    @abstractmethod
+    def _clear(self) -> None:
+        """Forget the map."""
+
+    @abstractmethod
+    def _prepare(self, frame: RGBDFrame) -> Frame:
+        """The frame as it is tracked."""
+
+    def _why_no_start(self, prepared: Frame) -> str:
+        """Why a first frame with enough readings cannot start the map; empty if it can."""
+        return ""
+
+    @abstractmethod
+    def _attempts(self, prepared: Frame, guess: Float64 | None) -> Iterator[Attempt[Match]]:
+        """Poses of the frame, in the order in which they are tried."""
+
+    @abstractmethod
+    def _start_from(self, frame: RGBDFrame, prepared: Frame) -> None:
+        """Fuse a frame whose pose is known to be the current one."""
+
+    @abstractmethod
+    def _extend(self, frame: RGBDFrame, prepared: Frame, attempt: Attempt[Match]) -> None:
+        """Fuse a frame, if it is worth it, that was found at the current pose."""
+
+    def _miss(self, frame: RGBDFrame, prepared: Frame) -> None:
+        """Take note of a frame that was found nowhere."""
+
+    @abstractmethod
+    def _map_state(self) -> dict[str, Any]:
+        """The part of the state that is the subclass's own."""
+
+    @abstractmethod
+    def _set_map_state(self, state: dict[str, Any]) -> None:
+        """Go on from ``_map_state``."""
