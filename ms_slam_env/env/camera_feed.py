@@ -13,7 +13,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sequences.perturbations.base import Perturbation
-from ms_slam_env.sequences.perturbations.moving import Mover
+from ms_slam_env.sequences.perturbations.movers import Mover
 from ms_slam_env.sequences.perturbed_camera import Imperfections, PerturbedCamera
 from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
 

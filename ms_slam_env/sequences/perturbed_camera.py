@@ -13,7 +13,6 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sensor import ROLLING_ROWS, ChangingLight, NoiseConfig, RGBDSensor
 from ms_slam_env.sensor.casters import RayCaster, make_caster
-from ms_slam_env.sequences.exposure import LinearLight
 from ms_slam_env.sequences.perturbations.base import (
     FrameSelection,
     ImagePerturbation,
@@ -26,7 +25,8 @@ from ms_slam_env.sequences.perturbations.base import (
     WorldPerturbation,
     random_numbers,
 )
-from ms_slam_env.sequences.perturbations.moving import Mover, bodies_of
+from ms_slam_env.sequences.perturbations.movers import Mover, bodies_of
+from ms_slam_env.sequences.perturbations.optics import LinearLight
 from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
 
 Float64 = NDArray[np.float64]

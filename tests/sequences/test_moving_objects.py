@@ -24,8 +24,7 @@ from ms_slam_env.sequences import (
     render_sequence,
 )
 from ms_slam_env.sequences.perturbations.illumination import WanderingLamp
-from ms_slam_env.sequences.perturbations.moving import bodies_of
-from ms_slam_env.sequences.perturbations.moving.tracks import round_track, straight_track
+from ms_slam_env.sequences.perturbations.movers import bodies_of, round_track, straight_track
 from ms_slam_env.sequences.perturbed_camera import Imperfections
 from ms_slam_env.sequences.writing import write_sequence
 

@@ -32,8 +32,8 @@ from ms_slam_env.sequences import (
     make_perturbation,
     render_sequence,
 )
-from ms_slam_env.sequences.exposure import LinearLight, linear_of_srgb, srgb_of_linear
 from ms_slam_env.sequences.perturbations import Moment
+from ms_slam_env.sequences.perturbations.optics import LinearLight, linear_of_srgb, srgb_of_linear
 
 K = xtion("80x60")
 FRAMES = 6

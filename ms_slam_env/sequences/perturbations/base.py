@@ -18,7 +18,7 @@ from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.errors import InputError
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sensor import ChangingLight
-from ms_slam_env.sequences.perturbations.moving.mover import Mover
+from ms_slam_env.sequences.perturbations.movers import Mover
 from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
 
 Float64 = NDArray[np.float64]

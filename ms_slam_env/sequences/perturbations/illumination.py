@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.config import check_range
+from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.mesh_queries import RayCaster
 from ms_slam_env.scenes.movers import Shape
 from ms_slam_env.sensor import ChangingLight
 from ms_slam_env.sequences.perturbations.base import LightPerturbation, random_numbers
-from ms_slam_env.sequences.perturbations.moving.places import Places
-from ms_slam_env.sequences.perturbations.moving.tracks import Track
+from ms_slam_env.sequences.perturbations.movers import Track
+from ms_slam_env.sequences.perturbations.moving_objects import Places
 from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
 
 Float64 = NDArray[np.float64]
@@ -30,7 +30,7 @@ _SHORTEST_M = 0.3  # between the camera and the lamp
 
 
 @dataclass(frozen=True)
-class Illumination(LightPerturbation):
+class Illumination(Checked, LightPerturbation):
     """The scene's lights go down and up again, and a small lamp wanders about and casts shadows.
 
     Both change linear light before noise and the sRGB curve; depth does not change. The lamp goes
@@ -49,19 +49,11 @@ class Illumination(LightPerturbation):
         InputError: a value out of range.
     """
 
-    dim: float = 0.6
-    period_s: float = 4.0
-    lamp: float = 1.0
-    speed_m_s: float = 0.8
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        check_range(self, "dim", 0.0, 0.98)
-        check_range(self, "period_s", 0.01, 1e6)
-        check_range(self, "lamp", 0.0, 1e3)
-        check_range(self, "speed_m_s", 1e-3, 100.0)
-        check_range(self, "seed", 0, 2**32)
+    dim: float = bounded(0.6, 0.0, 0.98)
+    period_s: float = bounded(4.0, 0.01, 1e6)
+    lamp: float = bounded(1.0, 0.0, 1e3)
+    speed_m_s: float = bounded(0.8, 1e-3, 100.0)
+    seed: int = bounded(0, 0, 2**32)
 
     def light(
         self, scene: Scene, camera: PoseInterpolation, intrinsics: Intrinsics, seed: int

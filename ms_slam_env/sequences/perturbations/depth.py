@@ -1,4 +1,4 @@
-"""Depth images with holes."""
+"""What depth images lack: readings in holes, and steps finer than the disparity's."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from ms_slam_env.camera import RGBDFrame
-from ms_slam_env.config import check_range
+from ms_slam_env.config import Checked, bounded
 from ms_slam_env.sequences.perturbations.base import ImagePerturbation, Moment, random_numbers
 
 _ATTEMPTS = 10_000
 
 
 @dataclass(frozen=True)
-class DepthDropout(ImagePerturbation):
+class DepthDropout(Checked, ImagePerturbation):
     """Holes in patches, along depth edges, and of single pixels; every frame's are its own.
 
     Attributes:
@@ -32,21 +32,12 @@ class DepthDropout(ImagePerturbation):
         InputError: a value out of range.
     """
 
-    patches: float = 0.1
-    patch_size: float = 0.1
-    edge_px: int = 1
-    edge_jump: float = 0.05
-    pixels: float = 0.01
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        check_range(self, "patches", 0.0, 0.95)
-        check_range(self, "patch_size", 0.005, 1.0)
-        check_range(self, "edge_px", 0, 1000)
-        check_range(self, "edge_jump", 1e-4, 1e3)
-        check_range(self, "pixels", 0.0, 1.0)
-        check_range(self, "seed", 0, 2**32)
+    patches: float = bounded(0.1, 0.0, 0.95)
+    patch_size: float = bounded(0.1, 0.005, 1.0)
+    edge_px: int = bounded(1, 0, 1000)
+    edge_jump: float = bounded(0.05, 1e-4, 1e3)
+    pixels: float = bounded(0.01, 0.0, 1.0)
+    seed: int = bounded(0, 0, 2**32)
 
     def holes(self, depth: NDArray[np.float32], moment: Moment) -> NDArray[np.bool_]:
         """Mask (H, W) of the pixels that lose their reading."""
@@ -85,3 +76,38 @@ class DepthDropout(ImagePerturbation):
         """See the base class."""
         depth = np.where(self.holes(frame.depth, moment), np.float32(0), frame.depth)
         return dataclasses.replace(frame, depth=depth)
+
+
+_NATIVE_WIDTH = 640
+
+
+@dataclass(frozen=True)
+class DepthQuantisation(Checked, ImagePerturbation):
+    """Disparity d = f b / z of the 640 pixels wide sensor, rounded to whole steps.
+
+    Source: Khoshelham and Elberink, "Accuracy and Resolution of Kinect Depth Data for Indoor
+    Mapping Applications", Sensors 2012: baseline 7.5 cm, steps of an eighth of a pixel; the
+    depth resolution step / (f b) * z^2 is their section 3.3. The sensor's noise model "kinect" has
+    these steps already; this adds coarser ones, or steps to a sensor without noise.
+
+    Attributes:
+        step_px: step of the disparity in pixels; 0 = off.
+        baseline_m: distance between projector and camera.
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    step_px: float = bounded(0.25, 0.0, 8.0)
+    baseline_m: float = bounded(0.075, 1e-3, 1.0)
+
+    def apply(self, frame: RGBDFrame, moment: Moment) -> RGBDFrame:
+        """See the base class."""
+        if self.step_px == 0:
+            return frame
+        native_fx = moment.intrinsics.fx * _NATIVE_WIDTH / moment.intrinsics.width
+        unit = native_fx * self.baseline_m / self.step_px  # depth times disparity in steps
+        is_read = frame.depth > 0
+        steps = np.rint(unit / np.where(is_read, frame.depth, 1.0).astype(np.float64))
+        depth = np.where(is_read & (steps >= 1), unit / np.maximum(steps, 1), 0.0)
+        return dataclasses.replace(frame, depth=depth.astype(np.float32))

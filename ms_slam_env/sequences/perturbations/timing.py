@@ -1,4 +1,4 @@
-"""Stretches of a path that are travelled faster."""
+"""When frames are taken: a camera in haste, frames left out and lost."""
 
 from __future__ import annotations
 
@@ -7,8 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.config import check_range
-from ms_slam_env.sequences.perturbations.base import MotionPerturbation, random_numbers
+from ms_slam_env.config import Checked, bounded
+from ms_slam_env.sequences.perturbations.base import (
+    FrameSelection,
+    Int64,
+    MotionPerturbation,
+    random_numbers,
+)
 from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
 
 Float64 = NDArray[np.float64]
@@ -18,7 +23,7 @@ _RAMP = 0.25  # share of a stretch over which the speed rises, and falls again
 
 
 @dataclass(frozen=True)
-class FastMotion(MotionPerturbation):
+class FastMotion(Checked, MotionPerturbation):
     """The camera hurries: the same path, in stretches ``factor`` times as fast.
 
     The time between frames does not change, so a hurried path has fewer frames. Speed rises and
@@ -34,17 +39,10 @@ class FastMotion(MotionPerturbation):
         InputError: a value out of range.
     """
 
-    factor: float = 3.0
-    share: float = 0.4
-    length_s: float = 1.0
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        check_range(self, "factor", 1.0, 100.0)
-        check_range(self, "share", 0.0, 1.0)
-        check_range(self, "length_s", 0.01, 1e4)
-        check_range(self, "seed", 0, 2**32)
+    factor: float = bounded(3.0, 1.0, 100.0)
+    share: float = bounded(0.4, 0.0, 1.0)
+    length_s: float = bounded(1.0, 0.01, 1e4)
+    seed: int = bounded(0, 0, 2**32)
 
     def retime(self, path: PoseInterpolation, seed: int) -> PoseInterpolation:
         """See the base class."""
@@ -72,3 +70,29 @@ class FastMotion(MotionPerturbation):
         along = (t - number * period - begins) / length  # 0 to 1 within the stretch
         ramp = np.clip(np.minimum(along, 1.0 - along) / _RAMP, 0.0, 1.0)
         return ramp * ramp * (3.0 - 2.0 * ramp)
+
+
+@dataclass(frozen=True)
+class FrameSkipping(Checked, FrameSelection):
+    """Keeps every n-th frame, and loses some of those at random; the first is always kept.
+
+    Attributes:
+        keep_every: 1 = all.
+        lost: probability that a frame is lost.
+        seed: of the losses, beside the sequence's.
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    keep_every: int = bounded(2, 1, 1_000_000)
+    lost: float = bounded(0.0, 0.0, 0.99)
+    seed: int = bounded(0, 0, 2**32)
+
+    def keep(self, count: int, seed: int) -> Int64:
+        """See the base class."""
+        kept = np.arange(0, count, self.keep_every)
+        rng = random_numbers(seed, self.seed, name="frame-skipping")
+        is_lost = rng.random(len(kept)) < self.lost
+        is_lost[0] = False
+        return kept[~is_lost]
