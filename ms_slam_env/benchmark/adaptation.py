@@ -26,7 +26,7 @@ from ms_slam_env.experiments.harness.rows import check_any_finished, failures, r
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import Row, write_json
 from ms_slam_env.sequences import MotionSegments, open_sequence
-from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
+from ms_slam_env.sequences.trajectory import PoseInterpolation
 from ms_slam_env.slam.adaptation import (
     AdaptiveSlam,
     AgentConfig,

@@ -20,7 +20,12 @@ from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import write_json
 from ms_slam_env.sequences import Sequence, associate
 from ms_slam_env.sequences.recording import Recording
-from ms_slam_env.sequences.tum import TRAJECTORY_HEADER, trajectory_line, write_trajectory
+from ms_slam_env.sequences.trajectory import (
+    MAX_DIFFERENCE_S,
+    TRAJECTORY_HEADER,
+    trajectory_line,
+    write_trajectory,
+)
 from ms_slam_env.slam.frame_selection import EveryFrameConfig, FrameSelectionConfig
 
 Float64 = NDArray[np.float64]
@@ -33,7 +38,6 @@ TRAJECTORY, UNFINISHED, MAP, METRICS = (
 )
 CORRECTED = "trajectory.corrected.txt"
 TRUTH = "groundtruth.txt"
-MAX_DIFFERENCE_S = 0.02
 
 
 def run_to_folder(

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.seen_surface import seen_surface
-from ms_slam_env.sequences.recording import Recording, open_recording
-from ms_slam_env.sequences.sequence import recorded_sequence
+from ms_slam_env.sequences.recording import Recording, open_recording, recorded_sequence
 
 Float64 = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ import tyro
 
 from ms_slam_env.command_line import parse
 from ms_slam_env.errors import InputError
-from ms_slam_env.sequences.handheld_path import HandheldPath
+from ms_slam_env.sequences.paths.handheld import HandheldPath
 
 
 @dataclass(frozen=True)

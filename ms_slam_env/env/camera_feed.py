@@ -15,7 +15,7 @@ from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sequences.perturbations.base import Perturbation
 from ms_slam_env.sequences.perturbations.movers import Mover
 from ms_slam_env.sequences.perturbed_camera import Imperfections, PerturbedCamera
-from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
+from ms_slam_env.sequences.trajectory import PoseInterpolation
 
 Float64 = NDArray[np.float64]
 

@@ -21,11 +21,19 @@ MovingObjects, FastMotion, Illumination``, or
 ``make_perturbation("rolling-shutter", {"readout_s": 0.02})``.
 """
 
-from ms_slam_env.sequences.association import associate
-from ms_slam_env.sequences.camera_path import CameraPath
-from ms_slam_env.sequences.handheld_path import HandheldPath
 from ms_slam_env.sequences.naming import check_sequence, open_sequence, parse_sequence
-from ms_slam_env.sequences.paced_paths import MotionSegments, UnevenPath, WanderingPath
+from ms_slam_env.sequences.paths import (
+    CameraPath,
+    HandheldPath,
+    MotionSegments,
+    Placement,
+    RoutePath,
+    UnevenPath,
+    WanderingPath,
+    handheld_trajectory,
+    place_trajectory,
+    repeated_trajectory,
+)
 from ms_slam_env.sequences.perturbations import (
     PERTURBATIONS,
     AutoExposure,
@@ -44,12 +52,14 @@ from ms_slam_env.sequences.perturbations import (
     RollingShutter,
     make_perturbation,
 )
-from ms_slam_env.sequences.placement import Placement, place_trajectory
-from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
-from ms_slam_env.sequences.route_path import RoutePath
-from ms_slam_env.sequences.sequence import RenderedSequence, Sequence, render_sequence
-from ms_slam_env.sequences.trajectories import handheld_trajectory, repeated_trajectory
-from ms_slam_env.sequences.tum import read_trajectory, write_trajectory
+from ms_slam_env.sequences.rendering import RenderedSequence, render_sequence
+from ms_slam_env.sequences.sequence import Sequence
+from ms_slam_env.sequences.trajectory import (
+    PoseInterpolation,
+    associate,
+    read_trajectory,
+    write_trajectory,
+)
 
 __all__ = [
     "PERTURBATIONS",

@@ -28,14 +28,18 @@ from ms_slam_env.config import from_dict, parse_named
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.scenes.registry import check_name
 from ms_slam_env.sensor import NOISE_MODELS
-from ms_slam_env.sequences.camera_path import CameraPath
-from ms_slam_env.sequences.handheld_path import HandheldPath
-from ms_slam_env.sequences.paced_paths import MotionSegments, UnevenPath, WanderingPath
+from ms_slam_env.sequences.paths import (
+    CameraPath,
+    HandheldPath,
+    MotionSegments,
+    UnevenPath,
+    WanderingPath,
+)
 from ms_slam_env.sequences.perturbations import PERTURBATIONS, Perturbation, make_perturbation
 from ms_slam_env.sequences.recording import Calibration, open_recording
-from ms_slam_env.sequences.recording.recording import NATIVE
-from ms_slam_env.sequences.recording.registration import Registration
-from ms_slam_env.sequences.sequence import Sequence, recorded_sequence, render_sequence
+from ms_slam_env.sequences.recording.recording import NATIVE, Registration, recorded_sequence
+from ms_slam_env.sequences.rendering import render_sequence
+from ms_slam_env.sequences.sequence import Sequence
 
 PATHS: dict[str, type[CameraPath]] = {
     "handheld": HandheldPath,

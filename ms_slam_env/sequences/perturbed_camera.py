@@ -27,7 +27,7 @@ from ms_slam_env.sequences.perturbations.base import (
 )
 from ms_slam_env.sequences.perturbations.movers import Mover, bodies_of
 from ms_slam_env.sequences.perturbations.optics import LinearLight
-from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
+from ms_slam_env.sequences.trajectory import PoseInterpolation
 
 Float64 = NDArray[np.float64]
 

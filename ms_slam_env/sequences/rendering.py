@@ -1,21 +1,23 @@
-"""The frames of a rendered sequence, each rendered when it is asked for."""
+"""Sequences rendered in a scene, each frame when it is asked for."""
 
 from __future__ import annotations
 
 import collections.abc
 import copy
 from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from typing import overload
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.scenes.base import Scene
-from ms_slam_env.sensor import NoiseConfig, TrueView
+from ms_slam_env.sensor import FRAME_RATE_HZ, NoiseConfig, TrueView
 from ms_slam_env.sequences.perturbations.base import Perturbation, random_numbers
 from ms_slam_env.sequences.perturbed_camera import Imperfections, PerturbedCamera
-from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
+from ms_slam_env.sequences.sequence import Sequence
+from ms_slam_env.sequences.trajectory import PoseInterpolation
 
 Float64 = NDArray[np.float64]
 
@@ -119,3 +121,64 @@ class RenderedFrames(collections.abc.Sequence[RGBDFrame]):
                 [self._camera.brightness(T, float(time)) for T, time in path]
             )
         return self._brightness
+
+
+@dataclass(frozen=True)
+class RenderedSequence(Sequence):
+    """A sequence whose frames are rendered when they are asked for.
+
+    Attributes:
+        frames: the renderer; ``frames.truth(index)`` is the noise-free view from a frame's pose,
+            ``frames.kept`` (N,) the frames' indices on the trajectory, ``frames.timestamps`` (N,).
+    """
+
+    frames: RenderedFrames
+
+    @property
+    def timestamps(self) -> Float64:
+        """(N,) seconds."""
+        return self.frames.timestamps
+
+    def true_depth(self, index: int) -> NDArray[np.float32]:
+        """Noise-free depth (H, W) in metres from the true pose of frame ``index``."""
+        return self.frames.truth(index).depth
+
+    def picked(self, indices: NDArray[np.integer]) -> RenderedSequence:
+        """The same sequence with the frames of these numbers (M,) only, increasing."""
+        frames = self.frames.picked(indices)
+        return replace(self, frames=frames, poses=frames.poses)
+
+
+def render_sequence(
+    scene: Scene,
+    trajectory: ArrayLike,
+    intrinsics: Intrinsics,
+    noise: str | NoiseConfig = "kinect",
+    seed: int = 0,
+    name: str | None = None,
+    *,
+    perturbations: Iterable[Perturbation] = (),
+    timestamps: ArrayLike | None = None,
+) -> RenderedSequence:
+    """Take one frame from every pose of a trajectory, less those that a perturbation skips.
+
+    Args:
+        scene: where.
+        trajectory: (N, 4, 4) T_world_camera, of the depth camera.
+        intrinsics: of the frames.
+        noise: of the sensor: "kinect", "none" or a NoiseConfig.
+        seed: of the noise and the perturbations: with the same arguments every frame is the same,
+            bit for bit, in whatever order they are rendered.
+        name: for tables and files.
+        perturbations: applied in this order; first those that select frames, then those of the
+            optics, then those of the images.
+        timestamps: (N,) seconds; index / 30 Hz by default.
+
+    Raises:
+        InputError: a bad pose, time or seed, an unknown noise model, or no perturbation.
+    """
+    poses = np.asarray(trajectory, dtype=np.float64)
+    times = np.arange(len(poses)) / FRAME_RATE_HZ if timestamps is None else timestamps
+    path = PoseInterpolation(times, poses)
+    frames = RenderedFrames(scene, path, intrinsics, noise, seed, perturbations)
+    return RenderedSequence(frames, frames.poses, intrinsics, name or f"{scene.name}-{scene.seed}")

@@ -15,8 +15,8 @@ from tqdm import tqdm
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
-from ms_slam_env.sequences.sequence import RenderedSequence
-from ms_slam_env.sequences.tum import write_trajectory
+from ms_slam_env.sequences.rendering import RenderedSequence
+from ms_slam_env.sequences.trajectory import write_trajectory
 
 DEPTH_SCALE = 5000.0
 """Value of a depth image for one metre, as in the TUM RGB-D benchmark."""

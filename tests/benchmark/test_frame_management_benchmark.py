@@ -13,7 +13,7 @@ from ms_slam_env.benchmark import frame_management
 from ms_slam_env.benchmark.frame_management_report import flat_runs, summarise, table
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import relative_angle
-from ms_slam_env.sequences.paced_paths import PACES, UnevenPath
+from ms_slam_env.sequences.paths.paced import PACES, UnevenPath
 
 
 def test_an_uneven_path_stands_walks_and_hurries(box_scene: BoxScene):

@@ -12,7 +12,7 @@ from box_scene import BoxScene
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, make_pose, relative_angle, se3_exp, so3_exp
 from ms_slam_env.sequences import HandheldPath, place_trajectory
-from ms_slam_env.sequences.placement import upright
+from ms_slam_env.sequences.paths.placement import upright
 
 TREMOR_M = np.sqrt(3) * 2 * np.pi * 0.13 * 0.002  # an upper bound a frame
 

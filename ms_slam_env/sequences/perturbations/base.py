@@ -19,7 +19,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sensor import ChangingLight
 from ms_slam_env.sequences.perturbations.movers import Mover
-from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
+from ms_slam_env.sequences.trajectory import PoseInterpolation
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]

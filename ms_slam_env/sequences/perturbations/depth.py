@@ -16,6 +16,9 @@ from ms_slam_env.sequences.perturbations.base import ImagePerturbation, Moment, 
 _ATTEMPTS = 10_000
 
 
+_NATIVE_WIDTH = 640
+
+
 @dataclass(frozen=True)
 class DepthDropout(Checked, ImagePerturbation):
     """Holes in patches, along depth edges, and of single pixels; every frame's are its own.
@@ -27,9 +30,6 @@ class DepthDropout(Checked, ImagePerturbation):
         edge_jump: depth edge: neighbours differ by more than this share of the nearer one.
         pixels: probability that a single pixel has no reading.
         seed: of the holes, beside the sequence's.
-
-    Raises:
-        InputError: a value out of range.
     """
 
     patches: float = bounded(0.1, 0.0, 0.95)
@@ -78,9 +78,6 @@ class DepthDropout(Checked, ImagePerturbation):
         return dataclasses.replace(frame, depth=depth)
 
 
-_NATIVE_WIDTH = 640
-
-
 @dataclass(frozen=True)
 class DepthQuantisation(Checked, ImagePerturbation):
     """Disparity d = f b / z of the 640 pixels wide sensor, rounded to whole steps.
@@ -93,9 +90,6 @@ class DepthQuantisation(Checked, ImagePerturbation):
     Attributes:
         step_px: step of the disparity in pixels; 0 = off.
         baseline_m: distance between projector and camera.
-
-    Raises:
-        InputError: a value out of range.
     """
 
     step_px: float = bounded(0.25, 0.0, 8.0)

@@ -42,9 +42,6 @@ class AutoExposure(Checked, GainAndBias):
         strength: share of a change of brightness that is compensated; 0 = off, 1 = all of it.
         rate: share of the remaining error that is corrected at each frame.
         largest: gain stays within [1 / largest, largest].
-
-    Raises:
-        InputError: a value out of range.
     """
 
     strength: float = bounded(1.0, 0.0, 1.0)
@@ -68,9 +65,6 @@ class ExposureRamp(Checked, GainAndBias):
     Attributes:
         gain: at the last frame; 1 = no change.
         bias: at the last frame, in steps of 255; 0 = no change.
-
-    Raises:
-        InputError: a value out of range.
     """
 
     gain: float = bounded(0.6, 0.01, 100.0)
@@ -93,9 +87,6 @@ class ExposureJumps(Checked, GainAndBias):
         bias: largest bias up or down, in steps of 255.
         every: frames between two draws.
         seed: of the draws, beside the sequence's.
-
-    Raises:
-        InputError: a value out of range.
     """
 
     gain: float = bounded(1.5, 1.0, 100.0)
@@ -122,9 +113,6 @@ class BlackFrames(Checked, ImagePerturbation):
         length: frames in a row; 0 = off.
         every: frames from the start of one run to the start of the next; 0 = one run only.
         keep_depth: whether depth is still read, as when the light goes out.
-
-    Raises:
-        InputError: a value out of range.
     """
 
     start: int = bounded(60, 0, 10_000_000)

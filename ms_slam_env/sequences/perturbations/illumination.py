@@ -17,7 +17,7 @@ from ms_slam_env.sensor import ChangingLight
 from ms_slam_env.sequences.perturbations.base import LightPerturbation, random_numbers
 from ms_slam_env.sequences.perturbations.movers import Track
 from ms_slam_env.sequences.perturbations.moving_objects import Places
-from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
+from ms_slam_env.sequences.trajectory import PoseInterpolation
 
 Float64 = NDArray[np.float64]
 
@@ -44,9 +44,6 @@ class Illumination(Checked, LightPerturbation):
             in the scene; 0 = off.
         speed_m_s: of the lamp.
         seed: of the lamp's way, beside the sequence's.
-
-    Raises:
-        InputError: a value out of range.
     """
 
     dim: float = bounded(0.6, 0.0, 0.98)

@@ -20,6 +20,10 @@ Float64 = NDArray[np.float64]
 _SPACING_M = 0.02
 
 
+_LIGHT_EVERY_M = 0.3
+_MOST_PROBES = 40
+
+
 @dataclass(frozen=True)
 class Track:
     """A way with its pace.
@@ -106,10 +110,6 @@ def _paced(points: Float64, yaws: Float64, speed_m_s: float, turn_rad_s: float) 
         np.concatenate([zero, np.cumsum(times)]),
         np.concatenate([zero, np.cumsum(ways)]),
     )
-
-
-_LIGHT_EVERY_M = 0.3
-_MOST_PROBES = 40
 
 
 class Mover:

@@ -21,7 +21,7 @@ from ms_slam_env.sequences.perturbations.movers import (
     round_track,
     straight_track,
 )
-from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
+from ms_slam_env.sequences.trajectory import PoseInterpolation
 
 Float64 = NDArray[np.float64]
 
@@ -32,6 +32,19 @@ _INSTANTS = 40  # of the camera's path at which is checked who sees what and who
 _NEAREST_CAMERA_M = 0.35  # between the camera and the object's outline
 _NEAREST_OTHER_M = 0.15
 _SPIN_RAD_S = 0.5
+
+
+_MARGIN_M = 0.03  # kept from the scene's surfaces
+_FLAT_M = 0.06  # the ground may rise or fall by so much along a way, rugs and kerbs included
+_TURN_RAD_S = np.radians(120.0)
+_HALF_WIDTH_M = (0.08, 0.25)
+_WAYS_A_PLACE = (4, 40)  # fewest and most; the more, the fewer places are free
+_AROUND_M = 6.0  # of the camera: there floor and room are looked for
+_SOUNDINGS = 400
+_LANE_STEP_M = 0.25
+_LONGEST_M = {"box": 1.5, "person": 3.0, "car": 40.0}  # from the middle of the way to its end
+_SHORTEST_M = {"box": 0.25, "person": 0.25, "car": 2.0}
+_DEPTHS_M = {"box": (0.9, 3.0), "person": (1.2, 6.0), "car": (4.0, 25.0)}
 
 
 @dataclass(frozen=True)
@@ -154,19 +167,6 @@ def _seen(
         eye = poses[k, :3, 3]
         count += scene.segment_is_free(eye, middle[k], 0.0)
     return count / len(times)
-
-
-_MARGIN_M = 0.03  # kept from the scene's surfaces
-_FLAT_M = 0.06  # the ground may rise or fall by so much along a way, rugs and kerbs included
-_TURN_RAD_S = np.radians(120.0)
-_HALF_WIDTH_M = (0.08, 0.25)
-_WAYS_A_PLACE = (4, 40)  # fewest and most; the more, the fewer places are free
-_AROUND_M = 6.0  # of the camera: there floor and room are looked for
-_SOUNDINGS = 400
-_LANE_STEP_M = 0.25
-_LONGEST_M = {"box": 1.5, "person": 3.0, "car": 40.0}  # from the middle of the way to its end
-_SHORTEST_M = {"box": 0.25, "person": 0.25, "car": 2.0}
-_DEPTHS_M = {"box": (0.9, 3.0), "person": (1.2, 6.0), "car": (4.0, 25.0)}
 
 
 class Places:

@@ -24,9 +24,6 @@ class RollingShutter(Checked, OpticalPerturbation):
     Attributes:
         readout_s: time from the first row to the last; 0 = off. The default is most of the time
             between two frames at 30 Hz.
-
-    Raises:
-        InputError: a value out of range.
     """
 
     readout_s: float = bounded(0.03, 0.0, 10.0)
@@ -46,9 +43,6 @@ class MotionBlur(Checked, OpticalPerturbation):
     Attributes:
         exposure_s: time over which light is gathered; 0 = off.
         samples: instants, evenly spaced.
-
-    Raises:
-        InputError: a value out of range.
     """
 
     exposure_s: float = bounded(0.02, 0.0, 10.0)
@@ -75,9 +69,6 @@ class Misregistration(Checked, OpticalPerturbation):
         baseline_m: the colour camera stands so far along the depth camera's x; 0 = at its place.
         shift_x_px: the colour image lies so many pixels too far to the right.
         shift_y_px: and so many too far down.
-
-    Raises:
-        InputError: a value out of range.
     """
 
     focal_ratio: float = bounded(525.0 / 585.0, 0.1, 10.0)

@@ -14,7 +14,7 @@ from ms_slam_env.sequences.perturbations.base import (
     MotionPerturbation,
     random_numbers,
 )
-from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
+from ms_slam_env.sequences.trajectory import PoseInterpolation
 
 Float64 = NDArray[np.float64]
 
@@ -34,9 +34,6 @@ class FastMotion(Checked, MotionPerturbation):
         share: of the time that is in stretches.
         length_s: of one stretch; shorter where the path is too short for it.
         seed: of when they begin, beside the sequence's.
-
-    Raises:
-        InputError: a value out of range.
     """
 
     factor: float = bounded(3.0, 1.0, 100.0)
@@ -80,9 +77,6 @@ class FrameSkipping(Checked, FrameSelection):
         keep_every: 1 = all.
         lost: probability that a frame is lost.
         seed: of the losses, beside the sequence's.
-
-    Raises:
-        InputError: a value out of range.
     """
 
     keep_every: int = bounded(2, 1, 1_000_000)

@@ -2,15 +2,22 @@
 
 from ms_slam_env.sequences.recording.layouts import LAYOUTS, open_recording
 from ms_slam_env.sequences.recording.listings import Calibration, parse_calibration
-from ms_slam_env.sequences.recording.recording import Entry, Recording
-from ms_slam_env.sequences.recording.registration import Registration
+from ms_slam_env.sequences.recording.recording import (
+    Entry,
+    RecordedSequence,
+    Recording,
+    Registration,
+    recorded_sequence,
+)
 
 __all__ = [
     "LAYOUTS",
     "Calibration",
     "Entry",
+    "RecordedSequence",
     "Recording",
     "Registration",
     "open_recording",
     "parse_calibration",
+    "recorded_sequence",
 ]

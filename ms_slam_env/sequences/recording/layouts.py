@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.sequences.association import associate
 from ms_slam_env.sequences.recording.listings import (
-    MAX_DIFFERENCE_S,
     Calibration,
     Listed,
     calibration,
@@ -25,9 +23,8 @@ from ms_slam_env.sequences.recording.listings import (
     read_matrix,
     rows,
 )
-from ms_slam_env.sequences.recording.recording import Entry, Recording
-from ms_slam_env.sequences.recording.registration import Registration
-from ms_slam_env.sequences.tum import read_trajectory
+from ms_slam_env.sequences.recording.recording import Entry, Recording, Registration
+from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S, associate, read_trajectory
 from ms_slam_env.sequences.writing import UNFINISHED
 
 Float64 = NDArray[np.float64]

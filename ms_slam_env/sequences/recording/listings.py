@@ -16,9 +16,6 @@ from ms_slam_env.geometry import check_pose
 
 Float64 = NDArray[np.float64]
 
-MAX_DIFFERENCE_S = 0.02
-"""Colour and depth further apart in time are not one frame (the tolerance of the TUM tools)."""
-
 
 _ROUNDED = 1e-2  # as for the length of a quaternion
 

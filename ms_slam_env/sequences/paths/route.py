@@ -12,9 +12,8 @@ from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.geometry import look_at
 from ms_slam_env.scenes.base import Scene
-from ms_slam_env.sequences.camera_path import CameraPath
-from ms_slam_env.sequences.path_shape import frame_times, hand_tremor, resample, unit
-from ms_slam_env.sequences.trajectories import RADIUS_M
+from ms_slam_env.sequences.paths.base import CameraPath, frame_times, hand_tremor, resample, unit
+from ms_slam_env.sequences.paths.wandering import RADIUS_M
 
 Float64 = NDArray[np.float64]
 

@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.scenes.base import Scene
-from ms_slam_env.sequences.camera_path import CameraPath
-from ms_slam_env.sequences.handheld_path import HandheldPath
-from ms_slam_env.sequences.path_shape import hand_tremor, resample
-from ms_slam_env.sequences.pose_interpolation import PoseInterpolation
-from ms_slam_env.sequences.trajectories import free_path, handheld_trajectory
+from ms_slam_env.sequences.paths.base import CameraPath, hand_tremor, resample
+from ms_slam_env.sequences.paths.handheld import HandheldPath
+from ms_slam_env.sequences.paths.wandering import free_path
+from ms_slam_env.sequences.trajectory import PoseInterpolation
 
 Float64 = NDArray[np.float64]
 
@@ -35,9 +34,6 @@ class UnevenPath(Checked, CameraPath):
         frames: number of poses, 30 a second.
         speed_m_s: of the middle pace where it does not turn.
         turn_deg_s: of the middle pace where it turns.
-
-    Raises:
-        InputError: a value out of range.
     """
 
     frames: int = bounded(300, 30, 100_000)
@@ -85,9 +81,6 @@ class MotionSegments(Checked, CameraPath):
         quiet: frames of a calm segment; the sequence begins with one.
         violent: frames of a hasty segment after it.
         factor: how many times faster the same path is travelled in haste.
-
-    Raises:
-        InputError: a value out of range.
     """
 
     frames: int = bounded(240, 4, 100_000)
@@ -120,26 +113,3 @@ class MotionSegments(Checked, CameraPath):
         )
         path = PoseInterpolation(*calm.motion(scene, seed))
         return np.arange(self.frames) / self.rate_hz, path(progress / self.rate_hz)
-
-
-@dataclass(frozen=True)
-class WanderingPath(Checked, CameraPath):
-    """A hand-held camera that is always as fast as two limits permit: ``handheld_trajectory``.
-
-    Attributes:
-        frames: number of poses, 30 a second.
-        step_m: largest translation from frame to frame, without the tremor.
-        step_deg: largest rotation from frame to frame, without the tremor.
-
-    Raises:
-        InputError: a value out of range.
-    """
-
-    frames: int = bounded(300, 2, 1_000_000)
-    step_m: float = bounded(0.015, 1e-4, 10.0)
-    step_deg: float = bounded(1.0, 1e-3, 180.0)
-
-    def motion(self, scene: Scene, seed: int) -> tuple[Float64, Float64]:
-        """Times (N,) in seconds and poses T_world_camera (N, 4, 4)."""
-        poses = handheld_trajectory(scene, self.frames, seed, self.step_m, self.step_deg)
-        return np.arange(self.frames) / _RATE_HZ, poses

@@ -1,24 +1,85 @@
-"""Smooth, seeded, hand-held camera trajectories through a scene's free space."""
+"""A hand-held camera that wanders through a scene's free space, looking at what it sees."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
 from ms_slam_env.scenes.base import Scene
-from ms_slam_env.sequences.gaze import Gaze
-from ms_slam_env.sequences.path_shape import dense_path, frame_times, hand_tremor, resample, unit
+from ms_slam_env.sensor import FRAME_RATE_HZ
+from ms_slam_env.sequences.paths.base import (
+    CameraPath,
+    dense_path,
+    frame_times,
+    hand_tremor,
+    resample,
+    unit,
+)
 
 Float64 = NDArray[np.float64]
 
-RADIUS_M = 0.25
-"""Free space kept around the camera."""
+_NEAREST_M = 0.6
+_MAX_SLOPE = 0.8  # sine of the angle above or below the horizon
+_LOOKS = 10
 
+
+RADIUS_M = 0.25
 _HOP_M = (0.35, 0.7)  # distance between waypoints
 _MAX_TURN_RAD = np.radians(50.0)  # between the viewing directions of two waypoints
 _ATTEMPTS = 200
 _LEAP = 0.8
+
+
+class Gaze:
+    """Chooses visible surface points of a scene at a distance that a depth camera sees well."""
+
+    def __init__(self, scene: Scene) -> None:
+        """Sample the scene's surface."""
+        self.scene = scene
+        self.surface, self.labels = scene.surface_points(0.1)
+
+    def choose(
+        self,
+        eye: Float64,
+        cones: Sequence[tuple[Float64, float]],
+        rng: np.random.Generator,
+        farthest_m: float | None = None,
+    ) -> Float64 | None:
+        """A surface point (3,) that ``eye`` (3,) sees; None if there is none.
+
+        Args:
+            eye: position of the camera.
+            cones: unit vectors (3,) and the angles in radians within which it must lie of each.
+            rng: draws among the suitable points.
+            farthest_m: largest distance from the camera; by default that of the scene.
+        """
+        farthest_m = self.scene.gaze_m if farthest_m is None else farthest_m
+        offsets = self.surface - eye
+        distance = np.linalg.norm(offsets, axis=1)
+        slope = np.abs(offsets[:, 2]) / np.maximum(distance, 1e-9)
+        is_suitable = (distance > _NEAREST_M) & (distance < farthest_m) & (slope < _MAX_SLOPE)
+        for axis, angle_rad in cones:
+            is_suitable &= offsets @ axis / np.maximum(distance, 1e-9) > np.cos(angle_rad)
+        suitable = np.flatnonzero(is_suitable)
+        if not len(suitable):
+            return None
+        # Every object is as likely as a whole wall: people look at things.
+        weights = 1.0 / np.bincount(self.labels[suitable])[self.labels[suitable]]
+        count = min(_LOOKS, len(suitable))
+        drawn = rng.choice(suitable, count, replace=False, p=weights / weights.sum())
+        for target in self.surface[drawn]:
+            short = target - self.scene.gaze_gap_m * unit(target - eye)
+            if self.scene.segment_is_free(eye, short, 0.01):
+                return target
+        return None
+
+
+"""Free space kept around the camera."""
 
 
 class Wanderer:
@@ -158,3 +219,23 @@ def repeated_trajectory(
     there = handheld_trajectory(scene, (frames + 1) // 2, seed, speed_m, rot_deg)
     back = there[::-1][: frames // 2]
     return np.tile(np.concatenate([there, back]), (passes, 1, 1))
+
+
+@dataclass(frozen=True)
+class WanderingPath(Checked, CameraPath):
+    """A hand-held camera that is always as fast as two limits permit: ``handheld_trajectory``.
+
+    Attributes:
+        frames: number of poses, 30 a second.
+        step_m: largest translation from frame to frame, without the tremor.
+        step_deg: largest rotation from frame to frame, without the tremor.
+    """
+
+    frames: int = bounded(300, 2, 1_000_000)
+    step_m: float = bounded(0.015, 1e-4, 10.0)
+    step_deg: float = bounded(1.0, 1e-3, 180.0)
+
+    def motion(self, scene: Scene, seed: int) -> tuple[Float64, Float64]:
+        """Times (N,) in seconds and poses T_world_camera (N, 4, 4)."""
+        poses = handheld_trajectory(scene, self.frames, seed, self.step_m, self.step_deg)
+        return np.arange(self.frames) / FRAME_RATE_HZ, poses

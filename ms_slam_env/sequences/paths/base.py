@@ -1,7 +1,8 @@
-"""Smooth camera paths through waypoints, and how fast they are travelled."""
+"""Ways of a camera through a scene: what each can do, and smooth curves through waypoints."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from ms_slam_env.geometry import look_at, relative_angle
+from ms_slam_env.scenes.base import Scene
 
 Float64 = NDArray[np.float64]
 
@@ -77,3 +79,17 @@ def hand_tremor(frames: int, rng: np.random.Generator) -> Float64:
         amplitude = rng.uniform(0.2, 1.0, 3) * _TREMOR_M / len(_TREMOR_RATES)
         total += amplitude * np.sin(2 * np.pi * rate * t + phase)
     return total
+
+
+class CameraPath(ABC):
+    """A way of a camera through a scene: a frozen dataclass of how it is carried."""
+
+    @abstractmethod
+    def motion(self, scene: Scene, seed: int) -> tuple[Float64, Float64]:
+        """Times (N,) in seconds and poses T_world_camera (N, 4, 4).
+
+        The same scene and seed give the same way.
+
+        Raises:
+            InputError: no free way, or one that the scene does not permit.
+        """
