@@ -48,10 +48,17 @@ class Checked:
             if field.type in (bool, "bool"):
                 _check_bool(self, field.name)
             may_be_none = "None" in str(field.type) and getattr(self, field.name) is None
-            if _RANGE in field.metadata and not may_be_none:
-                check_range(self, field.name, *field.metadata[_RANGE])
-            if _CHOICES in field.metadata and not may_be_none:
-                check_choice(self, field.name, field.metadata[_CHOICES])
+            limits = _limits(type(self), field.name)
+            if _RANGE in limits and not may_be_none:
+                check_range(self, field.name, *limits[_RANGE])
+            if _CHOICES in limits and not may_be_none:
+                check_choice(self, field.name, limits[_CHOICES])
+
+
+def _limits(cls: type, name: str) -> Mapping[Any, Any]:
+    """What a field states of its range or choices; one that only changes a default inherits it."""
+    stated = (getattr(base, "__dataclass_fields__", {}).get(name) for base in cls.__mro__)
+    return next((field.metadata for field in stated if field and field.metadata), {})
 
 
 class Named(ABC):

@@ -45,6 +45,16 @@ def test_only_a_field_that_may_be_none_takes_none() -> None:
         Options(limit=6)
 
 
+def test_a_subclass_with_another_default_keeps_the_range() -> None:
+    @dataclass(frozen=True)
+    class More(Options):
+        count: int = 4
+
+    assert More().count == 4
+    with pytest.raises(InputError, match=r"More.count = 6 is outside \[0, 5\]"):
+        More(count=6)
+
+
 def test_an_unknown_choice_is_refused_with_the_valid_ones() -> None:
     assert Options(kind="robust").kind == "robust"
     with pytest.raises(InputError, match=r"unknown Options.kind 'slow'; valid choices: fast, rob"):

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ms_slam_env.config import check_choice, check_range
+from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.errors import InputError
 
 MEASURES = ("kl", "windowed-kl", "earth-movers")
 
 
 @dataclass(frozen=True)
-class DivergenceConfig:
+class DivergenceConfig(Checked):
     """How the histograms of a frame are made and compared.
 
     The defaults are those under which the divergence predicted from the map follows the one that
@@ -42,28 +42,20 @@ class DivergenceConfig:
         InputError: a value outside its range.
     """
 
-    measure: str = "kl"
-    bins: int = 64
-    smoothing: float = 4.0
-    pseudo_count: float = 0.5
-    intensity_pixels: str = "with-depth"
-    inclinations: int = 4
-    alpha_deg: float = 45.0
-    normal_reach_deg: float = 1.4
-    edge_threshold: float = 0.05
+    measure: str = chosen("kl", *MEASURES)
+    bins: int = bounded(64, 2, 256)
+    smoothing: float = bounded(4.0, 0, 64)
+    pseudo_count: float = bounded(0.5, 1e-6, 1e3)
+    intensity_pixels: str = chosen("with-depth", "all", "with-depth")
+    inclinations: int = bounded(4, 2, 32)
+    alpha_deg: float = bounded(45.0, 1, 90)
+    normal_reach_deg: float = bounded(1.4, 0, 10)
+    edge_threshold: float = bounded(0.05, 1e-4, 1)
     windows: tuple[int, int] = (2, 2)
 
     def __post_init__(self) -> None:
         """Refuse values that make no histogram."""
-        check_choice(self, "measure", MEASURES)
-        check_choice(self, "intensity_pixels", ("all", "with-depth"))
-        check_range(self, "bins", 2, 256)
-        check_range(self, "smoothing", 0, 64)
-        check_range(self, "pseudo_count", 1e-6, 1e3)
-        check_range(self, "inclinations", 2, 32)
-        check_range(self, "alpha_deg", 1, 90)
-        check_range(self, "normal_reach_deg", 0, 10)
-        check_range(self, "edge_threshold", 1e-4, 1)
+        super().__post_init__()
         is_grid = isinstance(self.windows, (tuple, list)) and len(self.windows) == 2
         if not is_grid or not all(isinstance(n, int) and 1 <= n <= 16 for n in self.windows):
             raise InputError(

@@ -16,8 +16,8 @@ from ms_slam_env.divergence import kernels
 from ms_slam_env.divergence.config import DivergenceConfig
 from ms_slam_env.divergence.sphere import TABLE_SIZE, cell_weights, dither_offsets
 from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import Float64
 
-Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
 
 

@@ -12,10 +12,7 @@ from ms_slam_env._warp import wp
 
 
 @wp.kernel
-def invert_depth(
-    depth: wp.array3d(dtype=wp.float32),
-    inverse: wp.array3d(dtype=wp.float32),
-):
+def invert_depth(depth: wp.array3d(dtype=wp.float32), inverse: wp.array3d(dtype=wp.float32)):
     """Inverse depth in 1/m; where there is no reading, a number too large to be one."""
     b, v = wp.tid()
     for u in range(depth.shape[2]):
@@ -53,9 +50,7 @@ def plane_normal(
         slope_u = (right - left) * per_pixel
         slope_v = (below - above) * per_pixel
         n = wp.vec3(
-            -focal[0] * slope_u,
-            -focal[1] * slope_v,
-            slope_u * offset[0] + slope_v * offset[1] - w,
+            -focal[0] * slope_u, -focal[1] * slope_v, slope_u * offset[0] + slope_v * offset[1] - w
         )
     return n
 

@@ -12,8 +12,7 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.divergence.config import DivergenceConfig
 from ms_slam_env.divergence.counting import HistogramCounter, Histograms
 from ms_slam_env.divergence.sphere import bin_directions
-
-Float64 = NDArray[np.float64]
+from ms_slam_env.geometry import Float64
 
 
 class Divergence(ABC):

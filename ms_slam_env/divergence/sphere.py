@@ -7,7 +7,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Float64 = NDArray[np.float64]
+from ms_slam_env.geometry import Float64
+
 Float32 = NDArray[np.float32]
 
 TABLE_SIZE = 80

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from ms_slam_env.errors import InputError
-
-Array = NDArray[np.float64]
+from ms_slam_env.geometry.so3 import Float64
 
 _IDENTITY = np.eye(4)
 
 
-def check_pose(T: ArrayLike, name: str = "pose") -> Array:
+def check_pose(T: ArrayLike, name: str = "pose") -> Float64:
     """Return ``T`` as float64 (4, 4) after checking that it is a rigid motion.
 
     Raises:
@@ -39,7 +38,7 @@ def check_pose(T: ArrayLike, name: str = "pose") -> Array:
     return matrix
 
 
-def make_pose(R: ArrayLike, t: ArrayLike) -> Array:
+def make_pose(R: ArrayLike, t: ArrayLike) -> Float64:
     """Return the (4, 4) rigid motion [R | t] of a rotation (3, 3) and a translation (3,) in m."""
     T = np.eye(4)
     T[:3, :3] = R
@@ -47,7 +46,7 @@ def make_pose(R: ArrayLike, t: ArrayLike) -> Array:
     return T
 
 
-def invert(T: ArrayLike) -> Array:
+def invert(T: ArrayLike) -> Float64:
     """Inverse of rigid motions (..., 4, 4) without a general matrix inversion."""
     matrix = np.asarray(T, dtype=np.float64)
     inverse = np.zeros_like(matrix)
@@ -58,7 +57,7 @@ def invert(T: ArrayLike) -> Array:
     return inverse
 
 
-def transform_points(T_a_b: ArrayLike, points_b: ArrayLike) -> Array:
+def transform_points(T_a_b: ArrayLike, points_b: ArrayLike) -> Float64:
     """Map points (..., 3) of frame b into frame a with one motion (4, 4)."""
     T = np.asarray(T_a_b, dtype=np.float64)
     return np.asarray(points_b, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]
@@ -70,7 +69,7 @@ def relative_angle(R_a: ArrayLike, R_b: ArrayLike) -> float:
     return float(Rotation.from_matrix(difference).magnitude())
 
 
-def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
+def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Float64:
     """Camera pose T_world_camera (x right, y down, z forward) at ``eye`` looking at ``target``.
 
     Raises:
@@ -90,12 +89,12 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) 
     return make_pose(np.stack([right, down, forward], axis=1), origin)
 
 
-def pose_from_quaternion(t: ArrayLike, q_xyzw: ArrayLike) -> Array:
+def pose_from_quaternion(t: ArrayLike, q_xyzw: ArrayLike) -> Float64:
     """Pose (4, 4) from a translation (3,) in m and a quaternion (qx, qy, qz, qw)."""
     return make_pose(Rotation.from_quat(np.asarray(q_xyzw, dtype=np.float64)).as_matrix(), t)
 
 
-def quaternion_from_pose(T: ArrayLike) -> Array:
+def quaternion_from_pose(T: ArrayLike) -> Float64:
     """Quaternion (qx, qy, qz, qw), of unit length with qw >= 0, of a pose (4, 4)."""
     R = np.asarray(T, dtype=np.float64)[:3, :3]
     return Rotation.from_matrix(R).as_quat(canonical=True)

@@ -10,28 +10,28 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-Array = NDArray[np.float64]
+Float64 = NDArray[np.float64]
 
 _SMALL_ANGLE = 1e-5  # below this the closed forms lose digits to cancellation; use their series
 
 
-def hat(phi: ArrayLike) -> Array:
+def hat(phi: ArrayLike) -> Float64:
     """Return the (3, 3) skew matrix with ``hat(phi) @ v == cross(phi, v)``."""
     x, y, z = np.asarray(phi, dtype=np.float64)
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-def so3_exp(phi: ArrayLike) -> Array:
+def so3_exp(phi: ArrayLike) -> Float64:
     """Rotation matrix (3, 3) of the rotation vector ``phi`` (3,) in radians."""
     return Rotation.from_rotvec(np.asarray(phi, dtype=np.float64)).as_matrix()
 
 
-def so3_log(R: ArrayLike) -> Array:
+def so3_log(R: ArrayLike) -> Float64:
     """Rotation vector (3,) in radians, of angle at most pi, of the rotation matrix ``R`` (3, 3)."""
     return Rotation.from_matrix(np.asarray(R, dtype=np.float64)).as_rotvec()
 
 
-def _left_jacobian(phi: Array) -> Array:
+def _left_jacobian(phi: Float64) -> Float64:
     """V(phi) (3, 3), equation (174): the translation of exp(rho, phi) is V(phi) @ rho."""
     angle = float(np.linalg.norm(phi))
     skew = hat(phi)
@@ -42,7 +42,7 @@ def _left_jacobian(phi: Array) -> Array:
     return np.eye(3) + a * skew + b * skew @ skew
 
 
-def se3_exp(twist: ArrayLike) -> Array:
+def se3_exp(twist: ArrayLike) -> Float64:
     """Rigid motion (4, 4) of the twist (6,) = (rho in metres, phi in radians), equation (172)."""
     xi = np.asarray(twist, dtype=np.float64)
     T = np.eye(4)
@@ -51,7 +51,7 @@ def se3_exp(twist: ArrayLike) -> Array:
     return T
 
 
-def se3_log(T: ArrayLike) -> Array:
+def se3_log(T: ArrayLike) -> Float64:
     """Twist (6,) = (rho in metres, phi in radians) of the rigid motion ``T`` (4, 4), eq. (173)."""
     matrix = np.asarray(T, dtype=np.float64)
     phi = so3_log(matrix[:3, :3])

@@ -7,12 +7,9 @@ camera frame: x right, y down, z forward.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import make_pose, so3_exp
-
-Float64 = NDArray[np.float64]
+from ms_slam_env.geometry import Float64, make_pose, so3_exp
 
 TRANSLATIONS = ("none", "up", "down", "left", "right", "forward", "backward")
 ROTATIONS = (

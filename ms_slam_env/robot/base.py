@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Float64 = NDArray[np.float64]
+from ms_slam_env.geometry import Float64
 
 FRAME_PERIOD_S = 1 / 30
 """Time between frames of a camera whose carrier has no clock of its own."""

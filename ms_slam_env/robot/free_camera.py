@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.errors import UnreachableError
-from ms_slam_env.geometry import invert
+from ms_slam_env.geometry import Float64, invert
 from ms_slam_env.robot.action_primitives import (
     NUM_ROTATIONS,
     NUM_TRANSLATIONS,
@@ -17,8 +17,6 @@ from ms_slam_env.robot.action_primitives import (
 )
 from ms_slam_env.robot.base import Embodiment, MotionResult
 from ms_slam_env.scenes.base import Scene, outside, words
-
-Float64 = NDArray[np.float64]
 
 CAMERA_RADIUS_M = 0.1  # half the width of an ASUS Xtion (18 cm), rounded up
 

@@ -8,9 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env.geometry import Float64
+
 Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
+Rng = np.random.Generator
 
 _FLOOR = "floor"
 _MET_M = 0.02  # closer than this to a surface is on it
@@ -76,7 +78,7 @@ class Scene(ABC):
         """Whether a ball of ``radius_m`` moves from ``start`` (3,) to ``end`` (3,) untouched."""
 
     @abstractmethod
-    def sample_start(self, rng: np.random.Generator) -> Float64:
+    def sample_start(self, rng: Rng) -> Float64:
         """Draw a start pose T_world_camera (4, 4) in free space with furniture in view."""
 
     @abstractmethod

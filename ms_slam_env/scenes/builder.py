@@ -12,9 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from ms_slam_env.scenes.base import Float32, Float64, Int32
-
-UP = np.array([0.0, 0.0, 1.0])
+from ms_slam_env.scenes.base import Float32, Float64, Int32, TexturedMesh
 
 
 @dataclass(frozen=True)
@@ -60,6 +58,19 @@ class Geometry:
     face_label: Int32
     textures: tuple[NDArray[np.uint8], ...]
     labels: tuple[str, ...]
+
+    def lit(self, irradiance: NDArray[np.floating]) -> TexturedMesh:
+        """The mesh under light (F, 3, 3) at the corners of the faces."""
+        return TexturedMesh(
+            vertices=self.vertices.astype(np.float32),
+            faces=self.faces,
+            uv=self.uv,
+            face_texture=self.face_texture,
+            face_label=self.face_label,
+            irradiance=irradiance.astype(np.float32),
+            textures=self.textures,
+            labels=self.labels,
+        )
 
 
 class MeshBuilder:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import MeshBuilder
 from ms_slam_env.scenes.mesh_scene import LargeScene
 from ms_slam_env.scenes.outdoors import houses, street_furniture
@@ -45,17 +46,11 @@ def city_street(seed: int) -> LargeScene:
         with build.frame(plot.origin, plot.yaw):
             _terrace(build, rng, of, plot.width_m, plot.depth_m - 0.5, f"terrace {k}")
     _kerbside(build, rng, plan)
-    places = {
-        name: plan.crossing(column, row)
-        for row, names in enumerate(_PLACES)
-        for column, name in enumerate(names)
-    }
+    places = plan.crossings(_PLACES)
     return daylight_scene(city_street, seed, build, rng, plan, places, _WAYS)
 
 
-def _block(
-    build: MeshBuilder, rng: np.random.Generator, of: houses.TownFinishes, plot: Plot, index: int
-) -> None:
+def _block(build: MeshBuilder, rng: Rng, of: houses.TownFinishes, plot: Plot, index: int) -> None:
     """Terraces back to back along the two long sides, end houses along the short ones."""
     w, d = plot.width_m, plot.depth_m
     deep = 0.32 * min(w, d)
@@ -72,12 +67,7 @@ def _block(
 
 
 def _terrace(
-    build: MeshBuilder,
-    rng: np.random.Generator,
-    of: houses.TownFinishes,
-    length: float,
-    depth: float,
-    name: str,
+    build: MeshBuilder, rng: Rng, of: houses.TownFinishes, length: float, depth: float, name: str
 ) -> None:
     """Houses wall to wall along x."""
     count = max(1, round(length / 7.0))
@@ -116,7 +106,7 @@ def _markings(build: MeshBuilder, plan: StreetPlan) -> None:
                     street_furniture.stripes(build, (x - r, at), (x + r, at + 2.0), False, name)
 
 
-def _kerbside(build: MeshBuilder, rng: np.random.Generator, plan: StreetPlan) -> None:
+def _kerbside(build: MeshBuilder, rng: Rng, plan: StreetPlan) -> None:
     """Parked cars on one side of each street; lamps, trees, signs, benches, bins on pavements."""
     bark = build.material(outdoor.bark(rng), (0.5, 0.5))
     leaves = street_furniture.foliage(build, rng)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ms_slam_env.scenes.base import Float64
+from ms_slam_env.scenes.base import Float64, Rng
 from ms_slam_env.scenes.builder import Material, MeshBuilder
 from ms_slam_env.scenes.furniture import decor, pieces, small_things
-from ms_slam_env.scenes.lighting import Light, Lighting, Panel, auto_exposure, light_mesh
+from ms_slam_env.scenes.lighting import Light, Lighting, Panel, light_and_expose
 from ms_slam_env.scenes.mesh_scene import MeshScene, free_space_around
 from ms_slam_env.scenes.room import Room, floor_material, wall_colour
 from ms_slam_env.scenes.textures import interior
@@ -41,12 +41,11 @@ def corridor(seed: int) -> MeshScene:
         decor.rug(build, rng, rng.uniform(2.0, 3.0), 0.8)
     glow = {f"ceiling lamp {k}": (3.0, 2.9, 2.7) for k in range(len(lamps))}
     lighting = Lighting(tuple(lamps), glow, frozenset(glow))
-    mesh = light_mesh(build.build(), lighting)
     w, d, _ = room.size
     line = np.stack([np.linspace(1, w - 1, 5), np.full(5, d / 2), np.full(5, 1.3)], -1)
-    exposure = auto_exposure(mesh, line, _KEY, frozenset(glow))
+    mesh, exposure = light_and_expose(build, lighting, line, _KEY)
 
-    def start(draw: np.random.Generator) -> tuple[Float64, Float64]:
+    def start(draw: Rng) -> tuple[Float64, Float64]:
         # Oblique views: along its axis most of a corridor is out of the sensor's range.
         eye = np.array([draw.uniform(0.8, w - 0.8), draw.uniform(0.4, d - 0.4), 0.0])
         eye[2] = draw.uniform(1.1, 1.6)
@@ -57,9 +56,7 @@ def corridor(seed: int) -> MeshScene:
     return MeshScene(corridor, seed, mesh, free_space_around(mesh, line), start, exposure)
 
 
-def _walls(
-    build: MeshBuilder, rng: np.random.Generator, room: Room, lower: Material, trim: Material
-) -> None:
+def _walls(build: MeshBuilder, rng: Rng, room: Room, lower: Material, trim: Material) -> None:
     """Doors on both long walls and at one end; pictures, notices and furniture between them."""
     length = room.size[0]
     door_paint = hsv(rng.choice([0.08, 0.1, 0.55]), rng.uniform(0.05, 0.5), rng.uniform(0.5, 0.85))
@@ -104,9 +101,7 @@ def _dado(
             build.box((low, -0.02, 1.0), (high, 0, 1.04), trim, "Y")
 
 
-def _console(
-    build: MeshBuilder, rng: np.random.Generator, room: Room, wall: int, along: float, k: int
-) -> None:
+def _console(build: MeshBuilder, rng: Rng, room: Room, wall: int, along: float, k: int) -> None:
     """Chest of drawers, or a chair, against the wall."""
     with room.at_wall(build, wall, along, gap=0.02):
         if rng.random() < 0.6:
@@ -117,7 +112,7 @@ def _console(
             pieces.chair(build, rng, f"chair {k}")
 
 
-def _lamps(build: MeshBuilder, rng: np.random.Generator, room: Room) -> list[Light]:
+def _lamps(build: MeshBuilder, rng: Rng, room: Room) -> list[Light]:
     """Square lamps along the ceiling, of slightly different strength."""
     w, d, h = room.size
     count = max(2, round(w / _LAMP_SPACING_M))

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ms_slam_env.scenes.base import Float64
+from ms_slam_env.scenes.base import Float64, Rng
 from ms_slam_env.scenes.builder import MeshBuilder
 from ms_slam_env.scenes.furniture import decor, industrial
-from ms_slam_env.scenes.lighting import Light, Lighting, Panel, auto_exposure, light_mesh
+from ms_slam_env.scenes.lighting import Light, Lighting, Panel, light_and_expose
 from ms_slam_env.scenes.mesh_scene import LargeScene
 from ms_slam_env.scenes.room import Room
 from ms_slam_env.scenes.textures import industrial as finish
@@ -59,11 +59,10 @@ def factory_hall(seed: int) -> LargeScene:
     lighting = Lighting(
         tuple(lamps), glow, frozenset(glow), ambient=(0.22, 0.22, 0.22), bounce_rays=16
     )
-    mesh = light_mesh(build.build(), lighting)
     eyes = np.array([0.5 * (places[a] + places[b]) for a, b in _WAYS]) + np.array([0.0, 0.0, 1.5])
-    exposure = auto_exposure(mesh, eyes, _KEY, frozenset(glow))
+    mesh, exposure = light_and_expose(build, lighting, eyes, _KEY)
 
-    def start(draw: np.random.Generator) -> tuple[Float64, Float64]:
+    def start(draw: Rng) -> tuple[Float64, Float64]:
         a, b = _WAYS[int(draw.integers(len(_WAYS)))]
         eye = places[a] + draw.uniform(0.1, 0.9) * (places[b] - places[a])
         eye = eye + np.array([*draw.uniform(-0.5, 0.5, 2), draw.uniform(1.2, 1.7)])
@@ -95,7 +94,7 @@ def _places(room: Room, x0: float, y0: float, length: float, width: float) -> di
     return {name: np.array([x, y, 0.0]) for name, (x, y) in corners.items()}
 
 
-def _around(build: MeshBuilder, rng: np.random.Generator, of: industrial.Stock, room: Room) -> None:
+def _around(build: MeshBuilder, rng: Rng, of: industrial.Stock, room: Room) -> None:
     """Machines, crates, drums, doors, panels and pipes along the walls; columns in the corners."""
     for wall in range(4):
         half = room.length(wall) / 2
@@ -158,7 +157,7 @@ def _markings(build: MeshBuilder, places: dict[str, Float64]) -> None:
                     )
 
 
-def _lamps(build: MeshBuilder, rng: np.random.Generator, room: Room) -> list[Light]:
+def _lamps(build: MeshBuilder, rng: Rng, room: Room) -> list[Light]:
     """Rows of panels under the ceiling, of slightly different strength."""
     w, d, h = room.size
     lights: list[Light] = []

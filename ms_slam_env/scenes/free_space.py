@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +17,9 @@ _GRID_ERROR = 0.4  # of a voxel
 _MAX_CELLS = 6_000_000
 
 
-class ComponentRule(Protocol):
-    """Decides which empty voxels are the free space."""
-
-    def __call__(
-        self, empty: NDArray[np.bool_], origin: Float64, voxel_m: float
-    ) -> NDArray[np.bool_]:
-        """Mask (nx, ny, nz) of the free voxels among the ``empty`` ones."""
+Bool = NDArray[np.bool_]
+ComponentRule = Callable[[Bool, Float64, float], Bool]
+"""Which voxels (nx, ny, nz) are free, of those that are empty, their origin (3,) and edge."""
 
 
 @dataclass(frozen=True)
@@ -32,15 +28,20 @@ class Holding:
 
     inside: Float64
 
-    def __call__(
-        self, empty: NDArray[np.bool_], origin: Float64, voxel_m: float
-    ) -> NDArray[np.bool_]:
+    def __call__(self, empty: Bool, origin: Float64, voxel_m: float) -> Bool:
         """See ``ComponentRule``."""
         component, _ = ndimage.label(empty)
         seeds = np.rint((np.atleast_2d(self.inside) - origin) / voxel_m).astype(int)
         seeds = np.clip(seeds, 0, np.array(empty.shape) - 1)
         wanted = np.unique(component[tuple(seeds.T)])
         return np.isin(component, wanted[wanted > 0])
+
+
+def trilinear(values: NDArray[np.floating], f: Float64) -> Float64:
+    """What lies at places f (N, 3) in [0, 1] between the values (N, 2, 2, 2) at the corners."""
+    along_x = values[:, 0] + (values[:, 1] - values[:, 0]) * f[:, 0, None, None]
+    along_y = along_x[:, 0] + (along_x[:, 1] - along_x[:, 0]) * f[:, 1, None]
+    return along_y[:, 0] + (along_y[:, 1] - along_y[:, 0]) * f[:, 2]
 
 
 class FreeSpace:
@@ -109,10 +110,7 @@ class FreeSpace:
         base = clipped.astype(np.int64)
         f = clipped - base
         values = self._flat[(base @ self._stride)[:, None] + self._corner_offset]  # (N, 8)
-        values = values.reshape(-1, 2, 2, 2)
-        along_x = values[:, 0] + (values[:, 1] - values[:, 0]) * f[:, 0, None, None]
-        along_y = along_x[:, 0] + (along_x[:, 1] - along_x[:, 0]) * f[:, 1, None]
-        result = along_y[:, 0] + (along_y[:, 1] - along_y[:, 0]) * f[:, 2]
+        result = trilinear(values.reshape(-1, 2, 2, 2), f)
         return np.where((position == clipped).all(1), result, 0.0)
 
     def segment_is_free(self, start: Float64, end: Float64, radius_m: float) -> bool:
@@ -151,9 +149,7 @@ class Enclosed:
 
     rays: RayCaster
 
-    def __call__(
-        self, empty: NDArray[np.bool_], origin: Float64, voxel_m: float
-    ) -> NDArray[np.bool_]:
+    def __call__(self, empty: Bool, origin: Float64, voxel_m: float) -> Bool:
         """See ``ComponentRule``."""
         step = max(1, round(_COARSE_M / voxel_m))
         index = np.stack(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ms_slam_env.scenes.base import Float64, TexturedMesh
+from ms_slam_env.scenes.mesh_queries import face_cross
 
 _REACH_M = (
     1.0  # surfaces count with exp(-(distance / reach)^2), or the nearest ones if none is near
@@ -27,7 +28,7 @@ class LightProbe:
         """Sort out the surfaces that tell of the light."""
         step = max(1, len(mesh.faces) // _MOST_FACES)
         corners = mesh.vertices[mesh.faces[::step]].astype(np.float64)
-        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        cross = face_cross(corners)
         area = 0.5 * np.linalg.norm(cross, axis=1)
         light = mesh.irradiance[::step].mean(axis=1).astype(np.float64)  # (F, 3)
         brightness = light.mean(axis=1)

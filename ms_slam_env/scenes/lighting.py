@@ -7,6 +7,7 @@ the physical irradiance divided by pi.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from ms_slam_env.scenes.base import Float32, Float64, TexturedMesh
-from ms_slam_env.scenes.builder import Geometry
-from ms_slam_env.scenes.mesh_queries import RayCaster
+from ms_slam_env.scenes.builder import Geometry, MeshBuilder
+from ms_slam_env.scenes.mesh_queries import RayCaster, face_cross
 
 _FAR_M = 100.0
 _SHADOW_END = 0.999  # a shadow ray stops just before the light, which may be a surface itself
@@ -102,13 +103,9 @@ class Sun(Light):
     def irradiance(self, points: Float64, normals: Float64, rays: RayCaster) -> Float32:
         """See the base class."""
         direction = np.asarray(self.towards_sun) / np.linalg.norm(self.towards_sun)
-        cosine = normals @ direction
         total = np.zeros(len(points), np.float32)
-        lit = np.flatnonzero(cosine > 0)
-        distance, _ = rays.first_hit(
-            points[lit], np.broadcast_to(direction * _FAR_M, (len(lit), 3))
-        )
-        total[lit] = cosine[lit] * (distance > 1.0)
+        lit, value = _from_afar(points, normals, direction, rays)
+        total[lit] = value
         return _tint(total, self.strength)
 
 
@@ -131,11 +128,8 @@ class SkyLight(Light):
         up, angle = k / self.rays, np.pi * (1 + 5**0.5) * k  # even over the upper half sphere
         side = np.sqrt(1 - up * up)
         for direction in np.stack([side * np.cos(angle), side * np.sin(angle), up], -1):
-            cosine = normals @ direction
-            facing = np.flatnonzero(cosine > 0)
-            towards = np.broadcast_to(direction * _FAR_M, (len(facing), 3))
-            distance, _ = rays.first_hit(points[facing], towards)
-            total[facing] += cosine[facing] * (distance > 1.0)
+            lit, value = _from_afar(points, normals, direction, rays)
+            total[lit] += value
         return _tint((total * (2.0 / self.rays)).astype(np.float32), self.radiance)
 
 
@@ -174,16 +168,15 @@ def light_mesh(geometry: Geometry, lighting: Lighting) -> TexturedMesh:
     for name, value in lighting.glow.items():
         if name in g.labels:
             corner[g.face_label == g.labels.index(name)] = value
-    return TexturedMesh(
-        vertices=g.vertices.astype(np.float32),
-        faces=g.faces,
-        uv=g.uv,
-        face_texture=g.face_texture,
-        face_label=g.face_label,
-        irradiance=corner.astype(np.float32),
-        textures=g.textures,
-        labels=g.labels,
-    )
+    return g.lit(corner)
+
+
+def light_and_expose(
+    build: MeshBuilder, lighting: Lighting, focus: Float64, key: float
+) -> tuple[TexturedMesh, float]:
+    """Bake ``lighting`` into what was built; the lit mesh, and the exposure by what glows not."""
+    mesh = light_mesh(build.build(), lighting)
+    return mesh, auto_exposure(mesh, focus, key, frozenset(lighting.glow))
 
 
 def _bounce(g: Geometry, direct: Float32, lighting: Lighting) -> Float32:
@@ -203,14 +196,10 @@ def _bounce(g: Geometry, direct: Float32, lighting: Lighting) -> Float32:
             # The lights already stand for what glows; only its looks are not theirs.
             leaving[of] = 0.0 if name in lighting.clear else 0.2 * albedo[of] * np.array(value)
     leaving = np.concatenate([leaving, np.zeros((1, 3))]).astype(np.float32)  # miss: nothing
-    helper = np.where(np.abs(g.normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
-    tangent = np.cross(helper, g.normals)
-    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
-    bitangent = np.cross(g.normals, tangent)
     gathered = np.zeros((len(g.vertices), 3), np.float32)
     openness = np.zeros(len(g.vertices), np.float32)
-    for x, y, z in cosine_directions(lighting.bounce_rays):
-        distance, face = rays.first_hit(g.light_points, x * tangent + y * bitangent + z * g.normals)
+    for directions in hemispheres(g.normals, lighting.bounce_rays):
+        distance, face = rays.first_hit(g.light_points, directions)
         gathered += leaving[face]
         openness += np.minimum(distance, 0.8) / 0.8
     gathered *= lighting.bounce_gain / lighting.bounce_rays
@@ -234,6 +223,11 @@ def srgb_to_linear(value: Float64) -> Float64:
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
 
+def linear_to_srgb(value: Float64) -> Float64:
+    """Return the sRGB value in [0, 1] of linear intensities in [0, 1] (IEC 61966-2-1)."""
+    return np.where(value <= 0.0031308, value * 12.92, 1.055 * value ** (1 / 2.4) - 0.055)
+
+
 def auto_exposure(mesh: TexturedMesh, points: Float64, key: float, skip: frozenset[str]) -> float:
     """Exposure that maps the median radiance to ``key``.
 
@@ -244,9 +238,7 @@ def auto_exposure(mesh: TexturedMesh, points: Float64, key: float, skip: frozens
         skip: labels to leave out, as panes and lamps.
     """
     corners = mesh.vertices[mesh.faces]
-    area = np.linalg.norm(
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-    )
+    area = np.linalg.norm(face_cross(corners), axis=1)
     centre = corners.mean(1)
     nearest = np.min(np.linalg.norm(centre[:, None] - points[None], axis=2), axis=1)
     weight = area * np.exp(-((nearest / 2.0) ** 2))
@@ -256,6 +248,17 @@ def auto_exposure(mesh: TexturedMesh, points: Float64, key: float, skip: frozens
     order = np.argsort(radiance)
     middle = np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())
     return float(key / radiance[order[middle]])
+
+
+def _from_afar(
+    points: Float64, normals: Float64, direction: Float64, rays: RayCaster
+) -> tuple[NDArray[np.int64], Float64]:
+    """Which points (L,) face a direction (3,), and their cosines to it, 0 in shadow."""
+    cosine = normals @ direction
+    facing = np.flatnonzero(cosine > 0)
+    towards = np.broadcast_to(direction * _FAR_M, (len(facing), 3))
+    distance, _ = rays.first_hit(points[facing], towards)
+    return facing, cosine[facing] * (distance > 1.0)
 
 
 def _point_light(
@@ -291,6 +294,16 @@ def _ball(n: int) -> Float64:
     z, angle = 1 - 2 * k / n, np.pi * (1 + 5**0.5) * k
     r = np.sqrt(1 - z * z)
     return np.stack([r * np.cos(angle), r * np.sin(angle), z], -1)
+
+
+def hemispheres(normals: Float64, n: int) -> Iterator[Float64]:
+    """The ``n`` directions (V, 3) of :func:`cosine_directions` around normals (V, 3)."""
+    helper = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+    tangent = np.cross(helper, normals)
+    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
+    bitangent = np.cross(normals, tangent)
+    for x, y, z in cosine_directions(n):
+        yield x * tangent + y * bitangent + z * normals
 
 
 def cosine_directions(n: int) -> Float64:

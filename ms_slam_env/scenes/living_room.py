@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ms_slam_env.scenes.base import Float64
+from ms_slam_env.scenes.base import Float64, Rng
 from ms_slam_env.scenes.builder import MeshBuilder
 from ms_slam_env.scenes.furniture import decor, pieces, small_things
-from ms_slam_env.scenes.lighting import Lamp, Lighting, Panel, Sun, auto_exposure, light_mesh
+from ms_slam_env.scenes.lighting import Lamp, Lighting, Panel, Sun, light_and_expose
 from ms_slam_env.scenes.mesh_scene import MeshScene, free_space_around
 from ms_slam_env.scenes.room import PANE, Room, Window, floor_material, wall_colour, wall_material
 from ms_slam_env.scenes.textures import interior
@@ -40,7 +40,7 @@ def living_room(seed: int) -> MeshScene:
     return _lit(build, rng, seed, room, window_wall, window, bulb)
 
 
-def _seating_side(build: MeshBuilder, rng: np.random.Generator, room: Room) -> None:
+def _seating_side(build: MeshBuilder, rng: Rng, room: Room) -> None:
     """Sofa at wall 0 with pictures above, rug and coffee table before it, perhaps an armchair."""
     width = rng.uniform(1.8, 2.3)
     along = rng.uniform(-0.3, 0.3)
@@ -76,7 +76,7 @@ def _seating_side(build: MeshBuilder, rng: np.random.Generator, room: Room) -> N
         decor.plant(build, rng, rng.uniform(0.9, 1.3), "plant")
 
 
-def _television_side(build: MeshBuilder, rng: np.random.Generator, room: Room) -> Float64:
+def _television_side(build: MeshBuilder, rng: Rng, room: Room) -> Float64:
     """TV stand at wall 2 between a floor lamp and a door; returns the bulb's place (3,)."""
     side = 1 if rng.random() < 0.5 else -1
     along = 0.35 * side
@@ -98,7 +98,7 @@ def _television_side(build: MeshBuilder, rng: np.random.Generator, room: Room) -
     return room.to_world(2, (*place, bulb))
 
 
-def _shelf_side(build: MeshBuilder, rng: np.random.Generator, room: Room, wall: int) -> None:
+def _shelf_side(build: MeshBuilder, rng: Rng, room: Room, wall: int) -> None:
     """One or two bookshelves and a chest of drawers with things on it and a picture above."""
     side = 1 if rng.random() < 0.5 else -1
     count = int(rng.integers(1, 3))
@@ -117,9 +117,7 @@ def _shelf_side(build: MeshBuilder, rng: np.random.Generator, room: Room, wall: 
         decor.picture_frame(build, rng, 0.55, 0.7, "picture over drawers")
 
 
-def _window_side(
-    build: MeshBuilder, rng: np.random.Generator, room: Room, wall: int, window: Window
-) -> None:
+def _window_side(build: MeshBuilder, rng: Rng, room: Room, wall: int, window: Window) -> None:
     """Curtains beside the window, a plant on the sill, an armchair and a picture nearby."""
     cloth = decor.curtain_cloth(rng)
     top = window.sill + window.height + 0.15
@@ -139,7 +137,7 @@ def _window_side(
 
 def _lit(
     build: MeshBuilder,
-    rng: np.random.Generator,
+    rng: Rng,
     seed: int,
     room: Room,
     window_wall: int,
@@ -179,11 +177,10 @@ def _lit(
         },
         clear=frozenset({PANE, "lamp shade", "ceiling lamp"}),
     )
-    mesh = light_mesh(build.build(), lighting)
     centre = np.array([w / 2, d / 2, 1.2])
-    exposure = auto_exposure(mesh, centre[None], _KEY, frozenset(lighting.glow))
+    mesh, exposure = light_and_expose(build, lighting, centre[None], _KEY)
 
-    def start(draw: np.random.Generator) -> tuple[Float64, Float64]:
+    def start(draw: Rng) -> tuple[Float64, Float64]:
         eye = np.array([*draw.uniform(0.5, [w - 0.5, d - 0.5]), draw.uniform(1.0, 1.6)])
         target = np.array([*draw.uniform(0.2, [w - 0.2, d - 0.2]), draw.uniform(0.5, 1.1)])
         return eye, target

@@ -13,12 +13,12 @@ import trimesh
 from numpy.typing import NDArray
 
 from ms_slam_env.errors import InputError
-from ms_slam_env.scenes.base import Float64
+from ms_slam_env.scenes.base import Float64, Rng
 from ms_slam_env.scenes.builder import Geometry
 from ms_slam_env.scenes.free_space import VOXEL_M, Enclosed, FreeSpace
-from ms_slam_env.scenes.lighting import Lamp, Lighting, auto_exposure, light_mesh
-from ms_slam_env.scenes.mesh_queries import RayCaster, sample_surface
-from ms_slam_env.scenes.mesh_scene import MeshScene
+from ms_slam_env.scenes.lighting import Lamp, Lighting, auto_exposure, light_mesh, linear_to_srgb
+from ms_slam_env.scenes.mesh_queries import RayCaster, face_cross, sample_surface
+from ms_slam_env.scenes.mesh_scene import MeshScene, unit_rows
 
 _GREY = np.array([190, 190, 190], np.uint8)
 _MAX_TRIANGLES = 900_000
@@ -67,9 +67,7 @@ def load_soup(path: Path) -> Soup:
         if not isinstance(part, trimesh.Trimesh) or len(part.faces) == 0:
             continue
         triangles = np.asarray(part.vertices, dtype=np.float64)[part.faces]
-        area = np.linalg.norm(
-            np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1
-        )
+        area = np.linalg.norm(face_cross(triangles), axis=1)
         keep = np.isfinite(triangles).all((1, 2)) & (area > 1e-12)
         uv, image = _appearance(part)
         corners.append(triangles[keep])
@@ -149,9 +147,7 @@ def _material(material: Any) -> tuple[NDArray[np.uint8] | None, Float64]:
         image, factor = material.baseColorTexture, material.baseColorFactor
         if factor is not None:
             linear = np.asarray(factor, dtype=np.float64)[:3] / 255.0
-            factor = 255.0 * np.where(
-                linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055
-            )
+            factor = 255.0 * linear_to_srgb(linear)
     else:
         image = getattr(material, "image", None)
         factor = None if image is not None else getattr(material, "main_color", None)
@@ -236,7 +232,7 @@ def from_file(path: Path, seed: int = 0) -> MeshScene:
     exposure = auto_exposure(mesh, focus, _KEY, frozenset())
     eyes = _eye_cells(free, cells)
 
-    def start(draw: np.random.Generator) -> tuple[Float64, Float64]:
+    def start(draw: Rng) -> tuple[Float64, Float64]:
         eye = eyes[draw.integers(len(eyes))] + draw.uniform(-0.4, 0.4, 3) * free.voxel_m
         angle, drop = draw.uniform(-np.pi, np.pi), draw.uniform(0.0, 0.4)
         return eye, eye + np.array([np.cos(angle), np.sin(angle), -drop])
@@ -248,7 +244,7 @@ def from_file(path: Path, seed: int = 0) -> MeshScene:
 def _turn_to_free_space(soup: Soup, free: FreeSpace) -> Soup:
     """Flip the faces whose back, but not front, opens into the free space."""
     c = soup.corners
-    normal = _unit(np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]))
+    normal = unit_rows(face_cross(c))
     centre = c.mean(1)
     front = free.clearance(centre + _FACING_M * normal) > 0
     back = free.clearance(centre - _FACING_M * normal) > 0
@@ -262,7 +258,7 @@ def _turn_to_free_space(soup: Soup, free: FreeSpace) -> Soup:
 def _geometry(soup: Soup) -> Geometry:
     """Join corners that share place and face direction, so that light is gathered once there."""
     c = soup.corners
-    normal = _unit(np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]))
+    normal = unit_rows(face_cross(c))
     inset = 0.9 * c + 0.1 * c.mean(1, keepdims=True) + 0.006 * normal[:, None]
     normals = np.repeat(normal, 3, 0)
     key = np.concatenate([np.rint(c.reshape(-1, 3) * 2000), np.rint(normals * 8)], 1)
@@ -307,7 +303,3 @@ def _spread(cells: Float64, count: int) -> Float64:
         chosen.append(high[int(np.argmax(distance))])
         distance = np.minimum(distance, np.linalg.norm(high - chosen[-1], axis=1))
     return np.array(chosen)
-
-
-def _unit(v: NDArray[np.float64]) -> Float64:
-    return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
@@ -39,6 +41,11 @@ class RayCaster:
 
 
 _PLASTIC = np.array([0.7548776662466927, 0.5698402909980532])  # R2 low-discrepancy sequence
+
+
+def face_cross(corners: NDArray[np.floating]) -> NDArray[Any]:
+    """Normals (F, 3), twice the area long, of faces with corners (F, 3, 3)."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def sample_surface(

@@ -7,11 +7,11 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from ms_slam_env.geometry import look_at, so3_exp
-from ms_slam_env.scenes.base import Float64, Int32, Scene, TexturedMesh
+from ms_slam_env.scenes.base import Float64, Int32, Rng, Scene, TexturedMesh
 from ms_slam_env.scenes.free_space import VOXEL_M, FreeSpace, Holding
-from ms_slam_env.scenes.mesh_queries import RayCaster, sample_surface
+from ms_slam_env.scenes.mesh_queries import RayCaster, face_cross, sample_surface
 
-StartRule = Callable[[np.random.Generator], tuple[Float64, Float64]]
+StartRule = Callable[[Rng], tuple[Float64, Float64]]
 """Draws a candidate (eye (3,), target (3,)) of a start pose."""
 
 SceneMaker = Callable[[int], Scene]
@@ -72,7 +72,7 @@ class MeshScene(Scene):
         """See the base class."""
         return self.free_space.segment_is_free(start, end, radius_m)
 
-    def sample_start(self, rng: np.random.Generator) -> Float64:
+    def sample_start(self, rng: Rng) -> Float64:
         """See the base class; the best of the candidates tried if none is perfect."""
         best, best_score = np.eye(4), -1.0
         for _ in range(_TRIES):
@@ -108,7 +108,7 @@ class MeshScene(Scene):
         points, face = sample_surface(self.mesh.vertices, self.mesh.faces, spacing_m)
         corners = self.mesh.vertices[self.mesh.faces].astype(np.float64)
         tangent = corners[:, 1] - corners[:, 0]
-        normal = unit_rows(np.cross(tangent, corners[:, 2] - corners[:, 0]))
+        normal = unit_rows(face_cross(corners))
         tangent = unit_rows(tangent)
         bitangent = np.cross(normal, tangent)
         before = points + _FACING_M * normal[face]
@@ -201,7 +201,7 @@ class LargeScene(MeshScene):
         """
         faces = self.mesh.faces[self._solid]
         corners = self.mesh.vertices[faces].astype(np.float64)
-        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        cross = face_cross(corners)
         area = 0.5 * float(np.linalg.norm(cross, axis=1).sum())
         spacing = max(spacing_m, (area / _MOST_POINTS) ** 0.5)
         points, sampled = sample_surface(self.mesh.vertices, faces, spacing)

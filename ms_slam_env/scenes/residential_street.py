@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import Material, MeshBuilder
 from ms_slam_env.scenes.mesh_scene import LargeScene
 from ms_slam_env.scenes.outdoors import houses, street_furniture
 from ms_slam_env.scenes.outdoors.daylight import daylight_scene
-from ms_slam_env.scenes.outdoors.plan import KERB_M, Plot, StreetPlan
+from ms_slam_env.scenes.outdoors.plan import KERB_M, Plot, StreetPlan, sides_of
 from ms_slam_env.scenes.textures import interior, outdoor
 
 _CELL_M = 0.45
@@ -56,11 +57,7 @@ def residential_street(seed: int) -> LargeScene:
     for k, plot in enumerate(plan.surroundings()):
         _row_of_houses(build, rng, plot, k, of)
     _kerbside(build, rng, plan, of)
-    places = {
-        name: plan.crossing(column, row)
-        for row, names in enumerate(_PLACES)
-        for column, name in enumerate(names)
-    }
+    places = plan.crossings(_PLACES)
     return daylight_scene(residential_street, seed, build, rng, plan, places, _ways())
 
 
@@ -70,7 +67,7 @@ def _ways() -> tuple[tuple[str, str], ...]:
     return (*rows, *columns)
 
 
-def _ground(build: MeshBuilder, rng: np.random.Generator, plan: StreetPlan) -> None:
+def _ground(build: MeshBuilder, rng: Rng, plan: StreetPlan) -> None:
     road = build.material(outdoor.asphalt(rng), (6.4, 6.4))
     pavement = build.material(outdoor.paving(rng), (2.2, 2.2))
     kerb = build.material(interior.plaster(rng, (168, 164, 156), 4.0, 256), (0.9, 0.9))
@@ -78,13 +75,7 @@ def _ground(build: MeshBuilder, rng: np.random.Generator, plan: StreetPlan) -> N
     plan.ground(build, road, pavement, kerb, lawn)
 
 
-def _block(
-    build: MeshBuilder,
-    rng: np.random.Generator,
-    plot: Plot,
-    index: int,
-    of: _Kinds,
-) -> None:
+def _block(build: MeshBuilder, rng: Rng, plot: Plot, index: int, of: _Kinds) -> None:
     """One house in its garden, hedges and fences along the pavements, trees and bushes."""
     w, d = plot.width_m, plot.depth_m
     with build.frame(plot.origin, plot.yaw):
@@ -96,13 +87,7 @@ def _block(
             houses.house(
                 build, rng, of.houses, wide, deep, f"house {index}", int(rng.integers(1, 3))
             )
-        sides = (
-            ((0, 0, 0), 0.0, w),
-            ((w, 0, 0), np.pi / 2, d),
-            ((w, d, 0), np.pi, w),
-            ((0, d, 0), -np.pi / 2, d),
-        )
-        for k, (origin, turn, length) in enumerate(sides):
+        for k, (origin, turn, length) in enumerate(sides_of(w, d)):
             with build.frame(origin, turn):
                 _garden_edge(build, rng, length, f"{index}.{k}", of)
         for k, (cx, cy) in enumerate(
@@ -118,9 +103,7 @@ def _block(
                     )
 
 
-def _garden_edge(
-    build: MeshBuilder, rng: np.random.Generator, length: float, name: str, of: _Kinds
-) -> None:
+def _garden_edge(build: MeshBuilder, rng: Rng, length: float, name: str, of: _Kinds) -> None:
     """Hedge, fence, or bushes along a plot's edge, with a gap for a gate."""
     gap = length * rng.uniform(0.35, 0.6)
     for k, (low, high) in enumerate(((0.6, gap - 0.7), (gap + 0.7, length - 0.6))):
@@ -143,13 +126,7 @@ def _garden_edge(
                         street_furniture.bush(build, rng, leaf, size, f"bush {name}.{k}.{n}")
 
 
-def _row_of_houses(
-    build: MeshBuilder,
-    rng: np.random.Generator,
-    plot: Plot,
-    index: int,
-    of: _Kinds,
-) -> None:
+def _row_of_houses(build: MeshBuilder, rng: Rng, plot: Plot, index: int, of: _Kinds) -> None:
     """Houses side by side along an outer street, gardens in front, a tall hedge behind."""
     with build.frame(plot.origin, plot.yaw):
         x, number = 0.3, 0
@@ -178,12 +155,7 @@ def _row_of_houses(
             )
 
 
-def _kerbside(
-    build: MeshBuilder,
-    rng: np.random.Generator,
-    plan: StreetPlan,
-    of: _Kinds,
-) -> None:
+def _kerbside(build: MeshBuilder, rng: Rng, plan: StreetPlan, of: _Kinds) -> None:
     """Parked cars at the kerb, lamp posts, street trees, bins and signs on the pavements."""
     for k, (middle, yaw, length) in enumerate(plan.kerbsides()):
         with build.frame(middle, yaw):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ms_slam_env.scenes.base import Float64
+from ms_slam_env.scenes.base import Float64, Rng
 from ms_slam_env.scenes.builder import Material, MeshBuilder
 from ms_slam_env.scenes.textures import interior
 from ms_slam_env.scenes.textures.noise import hsv
@@ -136,13 +136,13 @@ def add_window(build: MeshBuilder, window: Window) -> None:
         )
 
 
-def floor_material(build: MeshBuilder, rng: np.random.Generator) -> Material:
+def floor_material(build: MeshBuilder, rng: Rng) -> Material:
     """Wooden planks, 2 x 1.2 m of them."""
     tone = interior.TONES[rng.integers(len(interior.TONES))]
     return build.material(interior.planks(rng, tone), (2.0, 1.2))
 
 
-def wall_colour(rng: np.random.Generator) -> Float64:
+def wall_colour(rng: Rng) -> Float64:
     """Return a quiet light paint."""
     return hsv(
         rng.choice([0.09, 0.12, 0.16, 0.3, 0.55, 0.6]),
@@ -151,9 +151,7 @@ def wall_colour(rng: np.random.Generator) -> Float64:
     )
 
 
-def wall_material(
-    build: MeshBuilder, rng: np.random.Generator, colour: Float64, papered: bool
-) -> Material:
+def wall_material(build: MeshBuilder, rng: Rng, colour: Float64, papered: bool) -> Material:
     """Plaster in ``colour``; if ``papered``, wallpaper or brick instead."""
     if not papered:
         return build.material(interior.plaster(rng, colour), (2.0, 2.0))

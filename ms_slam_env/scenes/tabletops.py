@@ -9,15 +9,17 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ms_slam_env.scenes.base import Float64
+from ms_slam_env.scenes.base import Float64, Rng
 from ms_slam_env.scenes.builder import Material, MeshBuilder
 from ms_slam_env.scenes.furniture import decor, pieces, small_things
-from ms_slam_env.scenes.lighting import Light, Lighting, Panel, Sun, auto_exposure, light_mesh
+from ms_slam_env.scenes.lighting import Light, Lighting, Panel, Sun, light_and_expose
 from ms_slam_env.scenes.mesh_scene import MeshScene, SceneMaker, StartRule, free_space_around
 from ms_slam_env.scenes.room import PANE, Room, Window, floor_material, wall_colour
 from ms_slam_env.scenes.textures import fabric, interior
 from ms_slam_env.scenes.textures.noise import hsv
 
+_LAMP_GLOW = {"ceiling lamp": (4.0, 3.8, 3.4)}
+_CLEAR = frozenset({"ceiling lamp", PANE})  # cast no shadow
 CELL_M = 0.07  # finer light than in a room, for the camera is near
 
 
@@ -37,7 +39,7 @@ class Setting:
 
 
 def begin(
-    rng: np.random.Generator,
+    rng: Rng,
     size: tuple[float, float, float],
     floor: Material | None = None,
     windows: dict[int, Window] | None = None,
@@ -55,7 +57,7 @@ def begin(
     return Setting(build, room, colour)
 
 
-def ceiling_light(setting: Setting, rng: np.random.Generator, x: float, y: float) -> Panel:
+def ceiling_light(setting: Setting, rng: Rng, x: float, y: float) -> Panel:
     """Lamp at the ceiling above (x, y), label "ceiling lamp"."""
     h = setting.room.size[2]
     with setting.build.frame((x, y, h)):
@@ -71,26 +73,22 @@ def finish(
     seed: int,
     lights: tuple[Light, ...],
     glow: dict[str, tuple[float, float, float]],
-    clear: frozenset[str],
     target: ArrayLike,
     start: StartRule,
     key: float = 0.2,
     start_objects: int = 2,
 ) -> MeshScene:
     """Bake the light, expose for what lies around ``target`` (3,), and return the scene."""
-    lighting = Lighting(lights, glow, clear)
-    mesh = light_mesh(setting.build.build(), lighting)
     focus = np.asarray(target, dtype=np.float64).reshape(1, 3)
-    exposure = auto_exposure(mesh, focus, key, frozenset(glow))
+    mesh, exposure = light_and_expose(setting.build, Lighting(lights, glow, _CLEAR), focus, key)
     w, d, h = setting.room.size
     inside = np.array([[w / 2, d / 2, 0.75 * h]])
-    free_space = free_space_around(mesh, inside)
-    return MeshScene(maker, seed, mesh, free_space, start, exposure, start_objects)
+    free = free_space_around(mesh, inside)
+    return MeshScene(maker, seed, mesh, free, start, exposure, start_objects)
 
 
 def orbit(
     target: ArrayLike,
-    towards: ArrayLike,
     distance_m: tuple[float, float] = (0.5, 0.9),
     elevation: tuple[float, float] = (0.3, 0.8),
     azimuth: float = 0.6,
@@ -100,18 +98,16 @@ def orbit(
 
     Args:
         target: (3,) middle of the setting.
-        towards: (2,) horizontal direction from the setting to the viewer.
         distance_m: range of the distance to the point looked at.
         elevation: range of the angle above the horizontal, radians.
-        azimuth: greatest turn from ``towards``, radians.
+        azimuth: greatest turn from the direction to the front, -y, radians.
         jitter_m: by which the point looked at moves along each axis.
     """
     middle = np.asarray(target, dtype=np.float64)
-    base = float(np.arctan2(towards[1], towards[0]))  # type: ignore[index]
 
-    def start(draw: np.random.Generator) -> tuple[Float64, Float64]:
+    def start(draw: Rng) -> tuple[Float64, Float64]:
         look = middle + draw.uniform(-jitter_m, jitter_m, 3) * [1, 1, 0.4]
-        angle = base + draw.uniform(-azimuth, azimuth)
+        angle = -np.pi / 2 + draw.uniform(-azimuth, azimuth)
         rise = draw.uniform(*elevation)
         away = np.array([np.cos(angle) * np.cos(rise), np.sin(angle) * np.cos(rise), np.sin(rise)])
         return look + draw.uniform(*distance_m) * away, look
@@ -149,19 +145,9 @@ def carpet(seed: int) -> MeshScene:
     with build.frame(where):
         small_things.lying_book(build, rng, "magazine", 0.01)
     lamp = ceiling_light(setting, rng, w / 2, d / 2)
-    start = orbit(target, (0, -1), (0.6, 0.9), elevation=(0.8, 1.3), azimuth=np.pi, jitter_m=0.3)
-    glow = {"ceiling lamp": (4.0, 3.8, 3.4)}
+    start = orbit(target, (0.6, 0.9), elevation=(0.8, 1.3), azimuth=np.pi, jitter_m=0.3)
     return finish(
-        setting,
-        carpet,
-        seed,
-        (lamp,),
-        glow,
-        frozenset(glow),
-        target,
-        start,
-        key=0.22,
-        start_objects=1,
+        setting, carpet, seed, (lamp,), _LAMP_GLOW, target, start, key=0.22, start_objects=1
     )
 
 
@@ -189,14 +175,13 @@ def table(seed: int) -> MeshScene:
     with build.frame((w / 2 + rng.uniform(-0.3, 0.3), d - gap - depth - 0.2, 0), yaw=np.pi):
         pieces.chair(build, rng)
     lamp = ceiling_light(setting, rng, w / 2 + rng.uniform(-0.4, 0.4), d - gap - 0.5)
-    glow = {"ceiling lamp": (4.0, 3.8, 3.4), "laptop screen": (0.5, 0.5, 0.52)}
+    glow = {**_LAMP_GLOW, "laptop screen": (0.5, 0.5, 0.52)}
     target = (w / 2, d - gap - depth / 2, height)
-    start = orbit(target, (0, -1), elevation=(0.4, 0.9), jitter_m=0.2)
-    clear = frozenset({"ceiling lamp"})
-    return finish(setting, table, seed, (lamp,), glow, clear, target, start)
+    start = orbit(target, elevation=(0.4, 0.9), jitter_m=0.2)
+    return finish(setting, table, seed, (lamp,), glow, target, start)
 
 
-def clutter(build: MeshBuilder, rng: np.random.Generator, width: float, depth: float) -> None:
+def clutter(build: MeshBuilder, rng: Rng, width: float, depth: float) -> None:
     """Put things on the rectangle [-width/2, width/2] x [-depth, 0] at z = 0."""
     with build.frame((rng.uniform(-0.2, 0.2), -0.3 * depth, 0), yaw=rng.uniform(-0.25, 0.25)):
         small_things.laptop(build, rng, "laptop")
@@ -254,25 +239,15 @@ def wall(seed: int) -> MeshScene:
         decor.plant(build, rng, 1.0, "plant")
     lamp = ceiling_light(setting, rng, w / 2 + rng.uniform(-0.8, 0.8), d - 1.3)
     target = (w / 2, d, 1.25)
-    start = orbit(target, (0, -1), (0.55, 0.9), elevation=(-0.15, 0.25), azimuth=0.35, jitter_m=0.4)
+    start = orbit(target, (0.55, 0.9), elevation=(-0.15, 0.25), azimuth=0.35, jitter_m=0.4)
 
-    def on_wall(draw: np.random.Generator) -> tuple[Float64, Float64]:
+    def on_wall(draw: Rng) -> tuple[Float64, Float64]:
         eye, look = start(draw)
         look[1] = d
         return eye, look
 
-    glow = {"ceiling lamp": (4.0, 3.8, 3.4)}
     return finish(
-        setting,
-        wall,
-        seed,
-        (lamp,),
-        glow,
-        frozenset(glow),
-        target,
-        on_wall,
-        key=0.3,
-        start_objects=1,
+        setting, wall, seed, (lamp,), _LAMP_GLOW, target, on_wall, key=0.3, start_objects=1
     )
 
 
@@ -335,7 +310,6 @@ def window(seed: int) -> MeshScene:
         Sun((rng.uniform(-0.5, 0.5), 1.0, rng.uniform(0.9, 1.3)), (4.0, 3.7, 3.1)),
     )
     target = np.array([w / 2 + opening.along, d - 0.4, height + 0.12])
-    start = orbit(target, (0, -1), elevation=(0.05, 0.6), azimuth=0.7, jitter_m=0.2)
+    start = orbit(target, elevation=(0.05, 0.6), azimuth=0.7, jitter_m=0.2)
     glow = {PANE: sky, "laptop screen": (1.0, 1.0, 1.05)}
-    clear = frozenset({PANE})
-    return finish(setting, window, seed, lights, glow, clear, target, start, key=0.2)
+    return finish(setting, window, seed, lights, glow, target, start, key=0.2)

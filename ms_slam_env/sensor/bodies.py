@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env._warp import wp
-from ms_slam_env.geometry import invert
+from ms_slam_env.geometry import Float64, invert
 from ms_slam_env.scenes.base import TexturedMesh
-from ms_slam_env.sensor.casters import Hits, RayCaster
-from ms_slam_env.sensor.rays import Pinhole
+from ms_slam_env.scenes.mesh_queries import face_cross
+from ms_slam_env.sensor.casters import RayCaster
+from ms_slam_env.sensor.rays import Pinhole, make_hits
 from ms_slam_env.sensor.textures import face_planes
-
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -68,7 +67,7 @@ def _shifted(indices: list[NDArray[np.int32]], shifts: NDArray[np.int64]) -> NDA
 def corner_normals(mesh: TexturedMesh) -> NDArray[np.float32]:
     """Smooth unit normals (F, 3, 3) at the corners: the mean over the faces that share a vertex."""
     corners = mesh.vertices[mesh.faces].astype(np.float64)
-    face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    face = face_cross(corners)
     total = np.zeros(mesh.vertices.shape)
     for k in range(3):
         np.add.at(total, mesh.faces[:, k], face)
@@ -95,7 +94,6 @@ class BodyCast:
         caster: RayCaster,
         first_face: int,
         camera: Pinhole,
-        shape: tuple[int, int, int],
         poses: int,
         device: str,
     ) -> None:
@@ -104,9 +102,10 @@ class BodyCast:
         self.faces = slice(first_face, first_face + len(body.mesh.faces))
         self.normals, self.planes = face_planes(body.mesh)
         self.corner_normals = corner_normals(body.mesh)
-        self.hits = Hits(shape, device)
+        shape = 1, int(camera.height), int(camera.width)
+        self.hits = make_hits(shape[1] * shape[2], device)
         self._poses = wp.zeros(poses, dtype=wp.mat44, device=device)
-        self._cast = caster.bind(self._poses, camera, self.hits)
+        self._cast = caster.bind(self._poses, camera, self.hits, shape)
         low, high = body.mesh.vertices.min(0), body.mesh.vertices.max(0)
         self.T_world_body = np.eye(4)
         self._middle = np.array([*(0.5 * (low + high)), 1.0], dtype=np.float64)

@@ -19,40 +19,21 @@ from ms_slam_env.sensor.embree import (
     cast_tiles,
     embree_library,
 )
-from ms_slam_env.sensor.rays import Pinhole, cast_rays, generate_rays
-
-
-class Hits:
-    """First hit of N rays, as Warp arrays on one device, overwritten by the next cast.
-
-    Attributes:
-        shape: (B, H, W) of the images whose rays they are, N = B * H * W.
-        t: (N,) float32 ray parameter, which is the depth; undefined where ``face`` is -1.
-        u: (N,) float32 barycentric weight of the face's second corner.
-        v: (N,) float32 barycentric weight of the face's third corner.
-        face: (N,) int32 index of the face, -1 where the ray meets nothing.
-    """
-
-    def __init__(self, shape: tuple[int, int, int], device: str) -> None:
-        """Allocate room for the rays of images (B, H, W), in that order."""
-        self.shape = shape
-        count = math.prod(shape)
-        self.t = wp.zeros(count, dtype=wp.float32, device=device)
-        self.u = wp.zeros(count, dtype=wp.float32, device=device)
-        self.v = wp.zeros(count, dtype=wp.float32, device=device)
-        self.face = wp.zeros(count, dtype=wp.int32, device=device)
+from ms_slam_env.sensor.rays import Hits, Pinhole, cast_rays, generate_rays
 
 
 class RayCaster(ABC):
     """Finds the first triangle that the ray of each pixel meets."""
 
     @abstractmethod
-    def bind(self, poses: wp.array, camera: Pinhole, hits: Hits) -> Callable[[], None]:
-        """Return a function that casts the rays of poses (B,) mat44 and overwrites ``hits``.
+    def bind(
+        self, poses: wp.array, camera: Pinhole, hits: Hits, shape: tuple[int, int, int]
+    ) -> Callable[[], None]:
+        """Return a function that casts the rays of images (B, H, W) and overwrites ``hits``.
 
-        Where ``camera.rows`` rows share a pose there are as many poses an image as that makes; an
-        even number, because two rows are cast together.
-        It reads the poses anew at each call.
+        There are poses mat44 (B,); where ``camera.rows`` rows share one, as many an image as that
+        makes, of an even number of rows, because two rows are cast together. They are read anew
+        at each call.
         """
 
 
@@ -70,14 +51,16 @@ class EmbreeRayCaster(RayCaster):
             raise OSError("the installed embreex does not give access to Embree 4's ray packets")
         self._scene = PacketScene(library, mesh.vertices, mesh.faces)
 
-    def bind(self, poses: wp.array, camera: Pinhole, hits: Hits) -> Callable[[], None]:
+    def bind(
+        self, poses: wp.array, camera: Pinhole, hits: Hits, shape: tuple[int, int, int]
+    ) -> Callable[[], None]:
         """See the base class; the arrays live on the CPU."""
-        batch, height, width = hits.shape
+        batch, height, width = shape
         command = wp.launch(
             cast_tiles,
             dim=(batch, -(-height // TILE_HEIGHT), -(-width // TILE_WIDTH)),
             inputs=[self._scene.intersect, self._scene.scene, poses, camera],
-            outputs=[hits.t, hits.u, hits.v, hits.face],
+            outputs=[hits],
             device="cpu",
             record_cmd=True,
         )
@@ -93,14 +76,15 @@ class EmbreeSingleRayCaster(RayCaster):
         corners = np.ascontiguousarray(mesh.vertices[mesh.faces], dtype=np.float32)
         self._geometry = TriangleMesh(self._scene, corners)
 
-    def bind(self, poses: wp.array, camera: Pinhole, hits: Hits) -> Callable[[], None]:
+    def bind(
+        self, poses: wp.array, camera: Pinhole, hits: Hits, shape: tuple[int, int, int]
+    ) -> Callable[[], None]:
         """See the base class; the arrays live on the CPU."""
-        count = math.prod(hits.shape)
-        origins = wp.zeros(count, dtype=wp.vec3, device="cpu")
-        directions = wp.zeros(count, dtype=wp.vec3, device="cpu")
+        origins = wp.zeros(math.prod(shape), dtype=wp.vec3, device="cpu")
+        directions = wp.zeros(math.prod(shape), dtype=wp.vec3, device="cpu")
         generate = wp.launch(
             generate_rays,
-            dim=hits.shape,
+            dim=shape,
             inputs=[poses, camera],
             outputs=[origins, directions],
             device="cpu",
@@ -129,13 +113,15 @@ class WarpRayCaster(RayCaster):
             indices=wp.array(mesh.faces.ravel(), dtype=wp.int32, device=device),
         )
 
-    def bind(self, poses: wp.array, camera: Pinhole, hits: Hits) -> Callable[[], None]:
+    def bind(
+        self, poses: wp.array, camera: Pinhole, hits: Hits, shape: tuple[int, int, int]
+    ) -> Callable[[], None]:
         """See the base class; the arrays live on the device of the mesh."""
         command = wp.launch(
             cast_rays,
-            dim=hits.shape,
+            dim=shape,
             inputs=[self._mesh.id, poses, camera],
-            outputs=[hits.t, hits.u, hits.v, hits.face],
+            outputs=[hits],
             device=self._device,
             record_cmd=True,
         )

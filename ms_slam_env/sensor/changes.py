@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env._warp import wp
+from ms_slam_env.geometry import Float64
 from ms_slam_env.scenes.base import TexturedMesh
 from ms_slam_env.sensor.bodies import Body, BodyCast
-from ms_slam_env.sensor.casters import Hits, RayCaster
-from ms_slam_env.sensor.rays import Pinhole, keep_nearer
+from ms_slam_env.sensor.casters import RayCaster
+from ms_slam_env.sensor.rays import Hits, Pinhole, keep_nearer
 from ms_slam_env.sensor.shading import Surfaces
 
-Float64 = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 
 _GATHER = 0.2  # of the way from a corner to the middle of its face: there light is gathered
@@ -65,7 +65,7 @@ class ChangingView:
     ) -> None:
         """Prepare for one image; ``mesh`` is the scene's and the bodies', joined."""
         self._mesh, self._light, self._camera, self._hits = mesh, light, camera, hits
-        self._shape, self._device = hits.shape, device
+        self._device = device
         self._is_cpu = device == "cpu"
         poses = -(-int(camera.height) // int(camera.rows))
         first = len(mesh.faces) - sum(len(body.mesh.faces) for body in bodies)
@@ -73,7 +73,7 @@ class ChangingView:
         self._bodies: list[BodyCast] = []
         at = first
         for body, caster in zip(bodies, casters, strict=True):
-            cast = BodyCast(body, caster, at, camera, hits.shape, poses, device)
+            cast = BodyCast(body, caster, at, camera, poses, device)
             self._bodies.append(cast)
             at += len(body.mesh.faces)
         self.surfaces = _copy(surfaces)
@@ -124,19 +124,11 @@ class ChangingView:
                     _put(self.normal, start, normals[p])
                     _put(self.plane, start, planes[p])
             self._light_body(cast, R[here], middle)
-            found = cast.hits
             wp.launch(
                 keep_nearer,
-                dim=self._shape,
-                inputs=[self._camera, found.t, found.u, found.v, found.face, cast.faces.start],
-                outputs=[
-                    self._moving_faces,
-                    self._hits.t,
-                    self._hits.u,
-                    self._hits.v,
-                    self._hits.face,
-                    self.posed_face,
-                ],
+                dim=(1, int(self._camera.height), int(self._camera.width)),
+                inputs=[self._camera, cast.hits, cast.faces.start, self._moving_faces],
+                outputs=[self._hits, self.posed_face],
                 device=self._device,
             )
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env._warp import wp
 from ms_slam_env.sensor.native import VECTOR_FLAGS
-from ms_slam_env.sensor.rays import Pinhole, pose_of_row
+from ms_slam_env.sensor.rays import Hits, Pinhole, pose_of_row
 
 PACKET_FUNCTION = "rtcIntersect8"
 _VERSION_MAJOR = 4
@@ -151,10 +151,10 @@ reinterpret_cast<void (*)(const int*, void*, RayHit8*, Arguments*)>(intersect)(
     valid, reinterpret_cast<void*>(scene), &r, &arguments);
 for (int k = 0; k < 8; ++k) {
     if (valid[k]) {
-        t.data[pixel[k]] = r.tfar[k];
-        u.data[pixel[k]] = r.u[k];
-        v.data[pixel[k]] = r.v[k];
-        face.data[pixel[k]] = (int)r.primitive[k];
+        hits.t.data[pixel[k]] = r.tfar[k];
+        hits.u.data[pixel[k]] = r.u[k];
+        hits.v.data[pixel[k]] = r.v[k];
+        hits.face.data[pixel[k]] = (int)r.primitive[k];
     }
 }
 """
@@ -169,10 +169,7 @@ def _cast_tile(
     image: int,
     tile_y: int,
     tile_x: int,
-    t: wp.array(dtype=wp.float32),
-    u: wp.array(dtype=wp.float32),
-    v: wp.array(dtype=wp.float32),
-    face: wp.array(dtype=wp.int32),
+    hits: Hits,
 ): ...
 
 
@@ -182,12 +179,9 @@ def cast_tiles(
     scene: wp.uint64,  # address of the RTCScene
     T_world_camera: wp.array(dtype=wp.mat44),  # (B * poses an image,)
     camera: Pinhole,
-    t: wp.array(dtype=wp.float32),  # (B * H * W,)
-    u: wp.array(dtype=wp.float32),
-    v: wp.array(dtype=wp.float32),
-    face: wp.array(dtype=wp.int32),
+    hits: Hits,  # of B * H * W rays
 ):
     """First hit of the ray of each pixel; face -1 where there is none; one thread a tile."""
     b, y, x = wp.tid()
     T = T_world_camera[pose_of_row(camera, b, 2 * y)]  # the rows of a tile share their pose
-    _cast_tile(intersect, scene, T, camera, b, y, x, t, u, v, face)
+    _cast_tile(intersect, scene, T, camera, b, y, x, hits)

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from ms_slam_env._warp import wp
 from ms_slam_env.scenes.base import TexturedMesh
 from ms_slam_env.sensor.bodies import Body
-from ms_slam_env.sensor.casters import Hits, RayCaster
+from ms_slam_env.sensor.casters import RayCaster
 from ms_slam_env.sensor.changes import ChangingLight, ChangingView
 from ms_slam_env.sensor.depth_noise import DepthNoise, measure_depth, projector_shadow
 from ms_slam_env.sensor.native import normal_table, span_of
 from ms_slam_env.sensor.noise import NoiseConfig
-from ms_slam_env.sensor.rays import Pinhole
-from ms_slam_env.sensor.shading import Surfaces, shade, true_geometry
+from ms_slam_env.sensor.rays import Pinhole, make_hits
+from ms_slam_env.sensor.shading import Surfaces, Tables, shade, true_geometry
 from ms_slam_env.sensor.textures import (
     decode_table,
     encode_table,
@@ -46,14 +46,13 @@ def upload_surfaces(mesh: TexturedMesh, device: str) -> Surfaces:
     return surfaces
 
 
-class Tables:
-    """Tables on a device: quantiles of N(0, 1), sRGB to linear, linear to sRGB."""
-
-    def __init__(self, device: str) -> None:
-        """Upload them."""
-        self.normals: wp.array = wp.array(normal_table(), dtype=wp.float32, device=device)
-        self.decode: wp.array = wp.array(decode_table(), dtype=wp.float32, device=device)
-        self.encode: wp.array = wp.array(encode_table(), dtype=wp.float32, device=device)
+def upload_tables(device: str) -> Tables:
+    """The tables of shading and noise, on the device."""
+    tables = Tables()
+    tables.normals = wp.array(normal_table(), dtype=wp.float32, device=device)
+    tables.decode = wp.array(decode_table(), dtype=wp.float32, device=device)
+    tables.encode = wp.array(encode_table(), dtype=wp.float32, device=device)
+    return tables
 
 
 @dataclass(frozen=True)
@@ -102,11 +101,11 @@ class Images:
         poses = batch * -(-height // int(camera.rows))
         self._poses = wp.zeros(poses, dtype=wp.mat44, device=device)
         self._keys = wp.zeros((batch, 2), dtype=wp.uint32, device=device)
-        self._hits = hits = Hits(shape, device)
+        self._hits = hits = make_hits(count, device)
         self._shadow = wp.zeros(count, dtype=wp.uint8, device=device)
         self._color = wp.zeros((count, 3), dtype=wp.uint8, device=device)
         self._depth = wp.zeros(count, dtype=wp.float32, device=device)
-        self._cast = caster.bind(self._poses, camera, hits)
+        self._cast = caster.bind(self._poses, camera, hits, shape)
         self._exposure = exposure
         self._view = None
         posed = [hits.face, surfaces.normal, surfaces.plane]
@@ -125,8 +124,8 @@ class Images:
             posed = [view.posed_face, view.normal, view.plane]
 
         def shading(shot: float, read: float) -> Any:
-            found = [self._poses, camera, span, hits.t, hits.u, hits.v, hits.face, surfaces]
-            lookup = [self._keys, tables.normals, tables.decode, tables.encode]
+            found = [self._poses, camera, span, hits, surfaces]
+            lookup = [self._keys, tables]
             return self._record(
                 shade, parts, [*found, exposure, shot, read, *lookup], [self._color]
             )
@@ -211,7 +210,7 @@ class Images:
         wp.launch(
             true_geometry,
             dim=self._shape,
-            inputs=[self._poses, self._camera, self._hits.t, self._hits.face, self._surfaces],
+            inputs=[self._poses, self._camera, self._hits, self._surfaces],
             outputs=outputs,
             device=self._device,
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ms_slam_env.config import check_range
+from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError, unknown
 
 NATIVE_WIDTH = 640
@@ -12,7 +12,7 @@ NATIVE_WIDTH = 640
 
 
 @dataclass(frozen=True)
-class NoiseConfig:
+class NoiseConfig(Checked):
     """Strengths of the noise; 1 = as published, 0 = off. The defaults are the Kinect's.
 
     An image smaller than 640x480 is a subsample of the native pixels, not their average, so each
@@ -43,35 +43,23 @@ class NoiseConfig:
         InputError: a value outside its range.
     """
 
-    baseline_m: float = 0.075
-    disparity_step_px: float = 0.125
-    axial: float = 1.0
-    lateral: float = 1.0
-    grazing_start_deg: float = 70.0
-    grazing_end_deg: float = 82.0
-    edge_dropout: float = 0.5
-    edge_jump_px: float = 2.0
-    shadow: float = 1.0
-    min_range_m: float = 0.4
-    max_range_m: float = 5.0
-    shot: float = 2e-4
-    read: float = 2e-3
+    baseline_m: float = bounded(0.075, 1e-3, 1.0)
+    disparity_step_px: float = bounded(0.125, 0.0, 8.0)
+    axial: float = bounded(1.0, 0.0, 100.0)
+    lateral: float = bounded(1.0, 0.0, 100.0)
+    grazing_start_deg: float = bounded(70.0, 0.0, 90.0)
+    grazing_end_deg: float = bounded(82.0, 0.0, 90.0)
+    edge_dropout: float = bounded(0.5, 0.0, 1.0)
+    edge_jump_px: float = bounded(2.0, 0.0, 1e6)
+    shadow: float = bounded(1.0, 0.0, 1.0)
+    min_range_m: float = bounded(0.4, 0.0, 100.0)
+    max_range_m: float = bounded(5.0, 0.0, 1e6)
+    shot: float = bounded(2e-4, 0.0, 1.0)
+    read: float = bounded(2e-3, 0.0, 1.0)
 
     def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        check_range(self, "baseline_m", 1e-3, 1.0)
-        check_range(self, "disparity_step_px", 0.0, 8.0)
-        check_range(self, "axial", 0.0, 100.0)
-        check_range(self, "lateral", 0.0, 100.0)
-        check_range(self, "grazing_start_deg", 0.0, 90.0)
-        check_range(self, "grazing_end_deg", 0.0, 90.0)
-        check_range(self, "edge_dropout", 0.0, 1.0)
-        check_range(self, "edge_jump_px", 0.0, 1e6)
-        check_range(self, "shadow", 0.0, 1.0)
-        check_range(self, "min_range_m", 0.0, 100.0)
-        check_range(self, "max_range_m", 0.0, 1e6)
-        check_range(self, "shot", 0.0, 1.0)
-        check_range(self, "read", 0.0, 1.0)
+        """Refuse values out of range, and ends that lie before their starts."""
+        super().__post_init__()
         if self.grazing_end_deg < self.grazing_start_deg:
             raise InputError(
                 f"NoiseConfig.grazing_end_deg = {self.grazing_end_deg} is below "

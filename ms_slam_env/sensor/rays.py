@@ -21,6 +21,24 @@ class Pinhole:
     rows: wp.int32  # that share a pose; ``height`` unless the shutter rolls
 
 
+@wp.struct
+class Hits:
+    """First hit of each of N rays, overwritten by the next cast."""
+
+    t: wp.array(dtype=wp.float32)  # (N,) ray parameter: the depth; undefined where face is -1
+    u: wp.array(dtype=wp.float32)  # (N,) barycentric weight of the face's second corner
+    v: wp.array(dtype=wp.float32)  # (N,) and of its third
+    face: wp.array(dtype=wp.int32)  # (N,) index of the face, -1 where the ray meets nothing
+
+
+def make_hits(count: int, device: str) -> Hits:
+    """Room for the hits of so many rays."""
+    hits = Hits()
+    hits.t, hits.u, hits.v = (wp.zeros(count, dtype=wp.float32, device=device) for _ in range(3))
+    hits.face = wp.zeros(count, dtype=wp.int32, device=device)
+    return hits
+
+
 def make_pinhole(intrinsics: Intrinsics, rows: int | None = None) -> Pinhole:
     """Copy intrinsics into the struct; every ``rows`` rows have a pose, by default all one."""
     pinhole = Pinhole()
@@ -79,10 +97,7 @@ def cast_rays(
     mesh: wp.uint64,
     T_world_camera: wp.array(dtype=wp.mat44),  # (B * poses an image,)
     camera: Pinhole,
-    t: wp.array(dtype=wp.float32),  # (B * H * W,)
-    u: wp.array(dtype=wp.float32),
-    v: wp.array(dtype=wp.float32),
-    face: wp.array(dtype=wp.int32),
+    hits: Hits,  # of B * H * W rays
 ):
     """First hit of the ray of each pixel; face -1 where there is none."""
     b, y, x = wp.tid()
@@ -91,37 +106,31 @@ def cast_rays(
     ray = world_ray(T, camera, float(x), float(y))
     query = wp.mesh_query_ray(mesh, camera_centre(T), ray, 1.0e6)
     if query.result:
-        t[i] = query.t
+        hits.t[i] = query.t
         # Warp's u and v weigh the first and second corner
-        u[i] = query.v
-        v[i] = 1.0 - query.u - query.v
-        face[i] = query.face
+        hits.u[i] = query.v
+        hits.v[i] = 1.0 - query.u - query.v
+        hits.face[i] = query.face
     else:
-        face[i] = -1
+        hits.face[i] = -1
 
 
 @wp.kernel
 def keep_nearer(
     camera: Pinhole,
-    part_t: wp.array(dtype=wp.float32),  # (H * W,)
-    part_u: wp.array(dtype=wp.float32),
-    part_v: wp.array(dtype=wp.float32),
-    part_face: wp.array(dtype=wp.int32),
+    found: Hits,  # of H * W rays, on the body
     first_face: int,
     faces_a_pose: int,
-    t: wp.array(dtype=wp.float32),  # (H * W,)
-    u: wp.array(dtype=wp.float32),
-    v: wp.array(dtype=wp.float32),
-    face: wp.array(dtype=wp.int32),
+    hits: Hits,  # of H * W rays
     posed_face: wp.array(dtype=wp.int32),
 ):
     """Where a body is hit before anything else, its hit takes the place of the other."""
     _, y, x = wp.tid()
     i = y * camera.width + x
-    hit = part_face[i]
-    if hit >= 0 and (face[i] < 0 or part_t[i] < t[i]):
-        t[i] = part_t[i]
-        u[i] = part_u[i]
-        v[i] = part_v[i]
-        face[i] = first_face + hit
+    hit = found.face[i]
+    if hit >= 0 and (hits.face[i] < 0 or found.t[i] < hits.t[i]):
+        hits.t[i] = found.t[i]
+        hits.u[i] = found.u[i]
+        hits.v[i] = found.v[i]
+        hits.face[i] = first_face + hit
         posed_face[i] = first_face + pose_of_row(camera, 0, y) * faces_a_pose + hit

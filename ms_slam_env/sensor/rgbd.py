@@ -18,7 +18,7 @@ from ms_slam_env.sensor.bodies import Body, joined
 from ms_slam_env.sensor.casters import RayCaster, make_caster
 from ms_slam_env.sensor.changes import ChangingLight
 from ms_slam_env.sensor.depth_noise import make_depth_noise
-from ms_slam_env.sensor.images import Changes, Images, Tables, upload_surfaces
+from ms_slam_env.sensor.images import Changes, Images, upload_surfaces, upload_tables
 from ms_slam_env.sensor.native import frame_key
 from ms_slam_env.sensor.noise import NoiseConfig, noise_config
 from ms_slam_env.sensor.rays import make_pinhole
@@ -116,7 +116,7 @@ class RGBDSensor:
         if bodies or light is not None:
             casters = [make_caster(body.mesh, device) for body in bodies]
             self._changes = Changes(mesh, tuple(bodies), casters, light)
-        self._tables = Tables(device)
+        self._tables = upload_tables(device)
         self._of_thread = _OfThread()
 
     def capture(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from ms_slam_env._warp import wp
 from ms_slam_env.sensor.native import PCG, VECTOR_FLAGS, VECTORISE
-from ms_slam_env.sensor.rays import Pinhole, camera_centre, pose_of_row, world_ray
+from ms_slam_env.sensor.rays import Hits, Pinhole, camera_centre, pose_of_row, world_ray
 from ms_slam_env.sensor.textures import ENCODE_STEPS
 
 _MIN_COSINE = 0.1  # beyond 84 degrees the footprint is not stretched further
@@ -32,10 +32,24 @@ class Surfaces:
     sizes: wp.array(dtype=wp.vec3i)  # (T,) width, height, levels
 
 
+@wp.struct
+class Tables:
+    """Functions of one number, tabulated."""
+
+    normals: wp.array(dtype=wp.float32)  # quantiles of N(0, 1)
+    decode: wp.array(dtype=wp.float32)  # sRGB to linear
+    encode: wp.array(dtype=wp.float32)  # linear to sRGB
+
+
 # C++, because Clang turns a loop over a row into vector instructions, provided that no branch
 # depends on the pixel: a fifth of the time of Warp's one call a pixel (shading, 160x120).
 _SHADE_SPAN = """
-const int* face_of = hit_face.data;
+const int* face_of = hits.face.data;
+const float* decode = tables.decode.data;
+const float* encode = tables.encode.data;
+const float* t_of = hits.t.data;
+const float* u_of = hits.u.data;
+const float* v_of = hits.v.data;
 const float* uv = (const float*)surfaces.uv.data;  // 6 a face
 const float* irradiance = (const float*)surfaces.irradiance.data;  // 9 a face
 const float* normal = (const float*)surfaces.normal.data;
@@ -58,14 +72,14 @@ PCG_SOURCEauto log2_of = [](float value) {  // exponent, and the series of atanh
 auto decode_of = [&](float value) {  // linear intensity of an sRGB value in [0, 255]
     const int i = (int)value;
     const float a = value - (float)i;
-    return (1.0f - a) * decode.data[i] + a * decode.data[i + 1];
+    return (1.0f - a) * decode[i] + a * decode[i + 1];
 };
 auto encode_of = [&](float value) {  // 8-bit sRGB value of a linear intensity
     const float below = value < 1.0f ? value : 1.0f;
     const float x = (below > 0.0f ? below : 0.0f) * ENCODE_STEPS;
     const int i = (int)x;
     const float a = x - (float)i;
-    return (unsigned char)(int)((1.0f - a) * encode.data[i] + a * encode.data[i + 1] + 0.5f);
+    return (unsigned char)(int)((1.0f - a) * encode[i] + a * encode[i + 1] + 0.5f);
 };
 
 VECTORISE
@@ -75,8 +89,8 @@ for (int k = 0; k < count; ++k) {
     const int i = first + pixel;
     const bool is_hit = face_of[i] >= 0;
     const int f = is_hit ? face_of[i] : 0;
-    const float u = hit_u.data[i];
-    const float v = hit_v.data[i];
+    const float u = u_of[i];
+    const float v = v_of[i];
     const float w = 1.0f - u - v;
 
     // Mip level: the width of the pixel's footprint on the surface, in texels.
@@ -87,7 +101,7 @@ for (int k = 0; k < count; ++k) {
     const float along = normal[3 * f] * rx + normal[3 * f + 1] * ry + normal[3 * f + 2] * rz;
     const float cosine = fabsf(along) / sqrtf(rx * rx + ry * ry + rz * rz);
     const float facing = cosine > MIN_COSINE ? cosine : MIN_COSINE;
-    const float texel_count = hit_t.data[i] / (camera.fx * facing) * surfaces.density.data[f];
+    const float texel_count = t_of[i] / (camera.fx * facing) * surfaces.density.data[f];
     const float level = log2_of(texel_count > 1.0e-6f ? texel_count : 1.0e-6f);
 
     // Trilinear sRGB value; texel centres lie at half integers, textures repeat.
@@ -146,9 +160,9 @@ for (int k = 0; k < count; ++k) {
     const float b = scale * (decode_of(blue) * (w * e[2] + u * e[5] + v * e[8]));
     const unsigned word = first_word(pixel);
     const unsigned more = pcg(word + 1u);
-    const float r_noise = sqrtf(dark + shot * r) * normals.data[word & 65535u];
-    const float g_noise = sqrtf(dark + shot * g) * normals.data[word >> 16];
-    const float b_noise = sqrtf(dark + shot * b) * normals.data[more & 65535u];
+    const float r_noise = sqrtf(dark + shot * r) * tables.normals.data[word & 65535u];
+    const float g_noise = sqrtf(dark + shot * g) * tables.normals.data[word >> 16];
+    const float b_noise = sqrtf(dark + shot * b) * tables.normals.data[more & 65535u];
     color.data[3 * i] = encode_of(r + r_noise);
     color.data[3 * i + 1] = encode_of(g + g_noise);
     color.data[3 * i + 2] = encode_of(b + b_noise);
@@ -170,19 +184,14 @@ def _shade_span(
     y: int,
     x_first: int,
     count: int,
-    hit_t: wp.array(dtype=wp.float32),
-    hit_u: wp.array(dtype=wp.float32),
-    hit_v: wp.array(dtype=wp.float32),
-    hit_face: wp.array(dtype=wp.int32),
+    hits: Hits,
     surfaces: Surfaces,
     exposure: float,
     shot: float,
     read: float,
     key_0: wp.uint32,
     key_1: wp.uint32,
-    normals: wp.array(dtype=wp.float32),
-    decode: wp.array(dtype=wp.float32),
-    encode: wp.array(dtype=wp.float32),
+    tables: Tables,
     color: wp.array2d(dtype=wp.uint8),
 ): ...
 
@@ -192,18 +201,13 @@ def shade(
     T_world_camera: wp.array(dtype=wp.mat44),  # (B * poses an image,)
     camera: Pinhole,
     span: int,
-    hit_t: wp.array(dtype=wp.float32),  # (B * H * W,)
-    hit_u: wp.array(dtype=wp.float32),
-    hit_v: wp.array(dtype=wp.float32),
-    hit_face: wp.array(dtype=wp.int32),
+    hits: Hits,  # of B * H * W rays
     surfaces: Surfaces,
     exposure: float,
     shot: float,
     read: float,
     keys: wp.array2d(dtype=wp.uint32),  # (B, 2)
-    normals: wp.array(dtype=wp.float32),  # quantiles of N(0, 1)
-    decode: wp.array(dtype=wp.float32),
-    encode: wp.array(dtype=wp.float32),
+    tables: Tables,
     color: wp.array2d(dtype=wp.uint8),  # (B * H * W, 3)
 ):
     """Sensor value = exposure * radiance + noise; one thread for ``span`` pixels of a row."""
@@ -218,19 +222,14 @@ def shade(
         y,
         x,
         count,
-        hit_t,
-        hit_u,
-        hit_v,
-        hit_face,
+        hits,
         surfaces,
         exposure,
         shot,
         read,
         keys[b, 0],
         keys[b, 1],
-        normals,
-        decode,
-        encode,
+        tables,
         color,
     )
 
@@ -239,8 +238,7 @@ def shade(
 def true_geometry(
     T_world_camera: wp.array(dtype=wp.mat44),  # (B * poses an image,)
     camera: Pinhole,
-    hit_t: wp.array(dtype=wp.float32),  # (B * H * W,)
-    hit_face: wp.array(dtype=wp.int32),
+    hits: Hits,  # of B * H * W rays
     surfaces: Surfaces,
     depth: wp.array(dtype=wp.float32),  # (B * H * W,)
     normals: wp.array(dtype=wp.vec3),  # camera frame, towards the camera
@@ -250,7 +248,7 @@ def true_geometry(
     """Write depth, normal, label and point of each hit; 0 and label -1 where there is none."""
     b, y, x = wp.tid()
     i = (b * camera.height + y) * camera.width + x
-    face = hit_face[i]
+    face = hits.face[i]
     depth[i] = 0.0
     labels[i] = -1
     normals[i] = wp.vec3(0.0, 0.0, 0.0)
@@ -261,11 +259,11 @@ def true_geometry(
         normal = surfaces.normal[face]
         if wp.dot(normal, ray) > 0.0:
             normal = -normal
-        depth[i] = hit_t[i]
+        depth[i] = hits.t[i]
         labels[i] = surfaces.label[face]
         normals[i] = wp.vec3(
             T[0, 0] * normal[0] + T[1, 0] * normal[1] + T[2, 0] * normal[2],
             T[0, 1] * normal[0] + T[1, 1] * normal[1] + T[2, 1] * normal[2],
             T[0, 2] * normal[0] + T[1, 2] * normal[1] + T[2, 2] * normal[2],
         )
-        points[i] = camera_centre(T) + hit_t[i] * ray
+        points[i] = camera_centre(T) + hits.t[i] * ray

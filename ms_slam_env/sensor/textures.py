@@ -10,18 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.scenes.base import TexturedMesh
-from ms_slam_env.scenes.lighting import srgb_to_linear
+from ms_slam_env.scenes.lighting import linear_to_srgb, srgb_to_linear
+from ms_slam_env.scenes.mesh_queries import face_cross
 
 Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 ENCODE_STEPS = 4096
 """Intervals of the linear-to-sRGB table."""
-
-
-def linear_to_srgb(value: Float64) -> Float64:
-    """Return the sRGB value in [0, 1] of linear intensities in [0, 1] (IEC 61966-2-1)."""
-    return np.where(value <= 0.0031308, value * 12.92, 1.055 * value ** (1 / 2.4) - 0.055)
 
 
 def decode_table() -> Float32:
@@ -83,7 +78,7 @@ def pack_textures(textures: tuple[NDArray[np.uint8], ...]) -> PackedTextures:
 def face_planes(mesh: TexturedMesh) -> tuple[Float32, Float32]:
     """Unit normal n (F, 3) and offset n . x (F,) of each face's plane, outside = positive."""
     corners = mesh.vertices[mesh.faces].astype(np.float64)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = face_cross(corners)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
     offsets = np.einsum("fd,fd->f", normals, corners[:, 0])
     return normals.astype(np.float32), offsets.astype(np.float32)
@@ -92,9 +87,7 @@ def face_planes(mesh: TexturedMesh) -> tuple[Float32, Float32]:
 def texel_density(mesh: TexturedMesh) -> Float32:
     """Texels of level 0 per metre (F,) on each face: root of the ratio of the two areas."""
     corners = mesh.vertices[mesh.faces].astype(np.float64)
-    area = np.linalg.norm(
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-    )
+    area = np.linalg.norm(face_cross(corners), axis=1)
     sizes = np.array([texture.shape[1::-1] for texture in mesh.textures], dtype=np.float64)
     uv = mesh.uv.astype(np.float64) * sizes[mesh.face_texture][:, None]
     a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]

@@ -250,26 +250,9 @@ def test_distances_are_the_scenes_less_the_slack_where_it_is_flat(seed):
     np.testing.assert_allclose(got[flat], true[flat] - clearance_field.slack_m, atol=1e-5)
 
 
-def test_the_gradient_is_the_slope_of_the_distance(furnished):
-    points = np.random.default_rng(0).uniform(-0.7, 0.7, (200, 3))
-    h = 1e-5
-    steps = h * np.eye(3)
-    numeric = np.stack(
-        [
-            (furnished.distance(points + e) - furnished.distance(points - e)) / (2 * h)
-            for e in steps
-        ],
-        axis=1,
-    )
-    got = furnished.gradient(points)
-    smooth = np.abs(got - numeric).max(axis=1) < 1e-4  # but for kinks at the voxels' borders
-    assert smooth.mean() > 0.98
-
-
 def test_off_the_grid_nothing_is_free(furnished):
     far = np.array([[5.0, 0, 0], [0, 0, -4.0]])
     np.testing.assert_array_equal(furnished.distance(far), 0)
-    np.testing.assert_array_equal(furnished.gradient(far), 0)
 
 
 def test_a_scenes_own_grid_is_used_as_it_is():

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.errors import InputError, UnreachableError
-from ms_slam_env.geometry import invert, make_pose, so3_exp, transform_points
+from ms_slam_env.geometry import Float64, invert, make_pose, so3_exp, transform_points
 from ms_slam_env.robot.action_primitives import decompose
 from ms_slam_env.robot.arm.chain import Chain, with_column
 from ms_slam_env.robot.arm.clearance import ClearanceField
@@ -30,7 +30,6 @@ from ms_slam_env.robot.arm.inverse_kinematics import (
 from ms_slam_env.robot.arm.model import ArmModel
 from ms_slam_env.scenes.base import Scene, enclosed, outside, words
 
-Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 COLUMN_RADIUS_M = 0.08
@@ -45,10 +44,7 @@ _GRID_M = 0.05  # vertical distance of the points of a column that are checked
 
 
 def place_arm(
-    model: ArmModel,
-    scene: Scene,
-    T_world_camera: Float64,
-    config: ArmConfig,
+    model: ArmModel, scene: Scene, T_world_camera: Float64, config: ArmConfig
 ) -> tuple[Float64, Float64]:
     """Find base pose T_world_base (4, 4) and joint angles (n,) that hold the camera at a pose.
 
@@ -78,9 +74,7 @@ def _on_column(model: ArmModel) -> Chain:
 def _planning(config: ArmConfig) -> ArmConfig:
     """What of a configuration the search for postures depends on, so that it is shared."""
     return ArmConfig(
-        speed_m_s=config.speed_m_s,
-        speed_rad_s=config.speed_rad_s,
-        clearance_m=config.clearance_m,
+        speed_m_s=config.speed_m_s, speed_rad_s=config.speed_rad_s, clearance_m=config.clearance_m
     )
 
 

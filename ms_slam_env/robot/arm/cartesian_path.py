@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ms_slam_env.geometry import so3_log
-
-Float64 = NDArray[np.float64]
+from ms_slam_env.geometry import Float64, so3_log
 
 RAMP = 0.2
 """Share of the duration spent speeding up, and again slowing down."""
@@ -21,7 +18,7 @@ _STILL_RAD = 1e-9
 
 
 def progress(share_of_time: Float64) -> Float64:
-    """Share (...,) of the way made after a share (...,) of the duration, both in [0, 1].
+    """Share (...,) of the path made after a share (...,) of the duration, both in [0, 1].
 
     Speed rises linearly during the first ``RAMP`` of the time and falls during the last.
     """
@@ -33,7 +30,7 @@ def progress(share_of_time: Float64) -> Float64:
 
 
 class CartesianPath:
-    """The way of the camera from one pose to another.
+    """A Cartesian path of the camera from one pose to another.
 
     The position moves on a straight line while the orientation turns about one axis, both with
     the speed profile of :func:`progress`.
@@ -50,7 +47,7 @@ class CartesianPath:
         speed_rad_s: float,
         least_duration_s: float = 0.0,
     ) -> None:
-        """Plan the way.
+        """Plan the path.
 
         Args:
             T_start: (4, 4) first pose.
@@ -67,9 +64,9 @@ class CartesianPath:
         fastest = PEAK_SPEED * max(distance / speed_m_s, angle / speed_rad_s)
         self.duration_s = max(fastest, least_duration_s) if moves else 0.0
 
-    def at_share(self, share_of_way: Float64) -> Float64:
-        """Poses (k, 4, 4) after shares (k,) of the way."""
-        share = np.asarray(share_of_way, dtype=np.float64)[:, None]
+    def at_share(self, share_of_path: Float64) -> Float64:
+        """Poses (k, 4, 4) after shares (k,) of the path."""
+        share = np.asarray(share_of_path, dtype=np.float64)[:, None]
         poses = np.tile(np.eye(4), (len(share), 1, 1))
         turned = Rotation.from_rotvec(share * self._turn).as_matrix()
         poses[:, :3, :3] = self._start[:3, :3] @ turned

@@ -9,11 +9,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.geometry import hat
+from ms_slam_env.geometry import Float64, hat
 
-Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
 
+_SHORTEST_PART_M = 0.03  # of a capsule, between two balls that cover it
 _NEIGHBOURS = 2  # links this near touch by construction, or joint limits keep them apart
 
 
@@ -94,6 +94,26 @@ class Chain:
         R, t = poses[..., :3, :3], poses[..., :3, 3]
         return np.einsum("...mij,mkj->...mki", R, self.capsule_ends) + t[..., None, :]
 
+    def pair_gaps(self, q: Float64, pairs: Int32) -> Float64:
+        """Metres (..., p) between the surfaces of pairs (p, 2) of capsules at angles (..., n)."""
+        ends, radius = self.capsules(q), self.capsule_radius
+        first, second = pairs[:, 0], pairs[:, 1]
+        gap = segment_distance(ends[..., first, :, :], ends[..., second, :, :])
+        return gap - radius[first] - radius[second]
+
+    def pair_needs(self, clearance_m: float) -> Float64:
+        """Distances (p,) that the axes of ``self_pairs`` keep: half the gap at home if less."""
+        apart = np.minimum(clearance_m, 0.5 * self.self_gap)
+        return self.capsule_radius[self.self_pairs].sum(axis=1) + apart
+
+    def covering_balls(self) -> tuple[Int32, Float64]:
+        """Parts (m,) that each capsule's axis is cut into, and the radius (m,) of balls around
+        the ends of the parts that hold the whole capsule."""
+        length = np.linalg.norm(self.capsule_ends[:, 1] - self.capsule_ends[:, 0], axis=1)
+        longest = np.maximum(self.capsule_radius, _SHORTEST_PART_M)
+        parts = np.ceil(length / longest - 1e-6).astype(np.int32)
+        return parts, np.hypot(self.capsule_radius, 0.5 * length / np.maximum(parts, 1))
+
     def within_limits(self, q: Float64, margin_rad: float = 0.0) -> NDArray[np.bool_]:
         """(...,) whether joint angles (..., n) keep ``margin_rad`` from every limit."""
         inside = (q >= self.lower + margin_rad) & (q <= self.upper - margin_rad)
@@ -134,13 +154,9 @@ def separate_pairs(chain: Chain, home: Float64) -> Chain:
     m = len(chain.capsule_link)
     first, second = np.triu_indices(m, 1)
     far = np.abs(chain.capsule_link[first] - chain.capsule_link[second]) > _NEIGHBOURS
-    first, second = first[far], second[far]
-    ends = chain.capsules(home)
-    gap = segment_distance(ends[first], ends[second])
-    gap = gap - chain.capsule_radius[first] - chain.capsule_radius[second]
-    free = gap > 0
-    pairs = np.stack([first[free], second[free]], axis=1).astype(np.int32)
-    return dataclasses.replace(chain, self_pairs=pairs, self_gap=gap[free])
+    pairs = np.stack([first[far], second[far]], axis=1).astype(np.int32)
+    gap = chain.pair_gaps(home, pairs)
+    return dataclasses.replace(chain, self_pairs=pairs[gap > 0], self_gap=gap[gap > 0])
 
 
 def with_column(chain: Chain, home: Float64, radius_m: float, height_m: float) -> Chain:

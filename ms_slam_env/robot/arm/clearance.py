@@ -8,12 +8,12 @@ import mink
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.geometry import invert, transform_points
+from ms_slam_env.geometry import Float64, transform_points
 from ms_slam_env.robot.arm.chain import Chain, segment_distance
+from ms_slam_env.scenes.free_space import trilinear
 from ms_slam_env.scenes.mesh_scene import MeshScene
 
 Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 _VOXEL_M = 0.05
 _SLACK = 0.5  # of a voxel
@@ -46,7 +46,6 @@ class ClearanceField:
 
     def __init__(self, scene: HasClearance, T_world_base: Float64, reach_m: float) -> None:
         self.T_world_base = np.array(T_world_base, dtype=np.float64)
-        self._T_base_world = invert(self.T_world_base)
         centre = self.T_world_base[:3, 3]
         if isinstance(scene, MeshScene):
             self.voxel_m = scene.free_space.voxel_m
@@ -59,29 +58,6 @@ class ClearanceField:
 
     def distance(self, points_base: Float64) -> Float64:
         """Distances (N,) of points (N, 3) of the base's frame; 0 inside things or off the grid."""
-        values, f, inside = self._corners(points_base)
-        along_x = values[:, 0] + (values[:, 1] - values[:, 0]) * f[:, 0, None, None]
-        along_y = along_x[:, 0] + (along_x[:, 1] - along_x[:, 0]) * f[:, 1, None]
-        result = along_y[:, 0] + (along_y[:, 1] - along_y[:, 0]) * f[:, 2]
-        return np.where(inside, result, 0.0)
-
-    def gradient(self, points_base: Float64) -> Float64:
-        """Derivative (N, 3) of ``distance`` in the base's frame; 0 off the grid."""
-        values, f, inside = self._corners(points_base)
-        weight = np.stack([1 - f, f], axis=1)  # (N, 2, 3)
-        x, y, z = weight[..., 0], weight[..., 1], weight[..., 2]
-        slope = np.stack(
-            [
-                np.einsum("nyz,ny,nz->n", values[:, 1] - values[:, 0], y, z),
-                np.einsum("nxz,nx,nz->n", values[:, :, 1] - values[:, :, 0], x, z),
-                np.einsum("nxy,nx,ny->n", values[..., 1] - values[..., 0], x, y),
-            ],
-            axis=1,
-        )
-        return np.where(inside[:, None], slope / self.voxel_m @ self.T_world_base[:3, :3], 0.0)
-
-    def _corners(self, points_base: Float64) -> tuple[Float64, Float64, NDArray[np.bool_]]:
-        """Values (N, 2, 2, 2) around points (N, 3), place (N, 3) between, whether on the grid."""
         world = transform_points(self.T_world_base, np.reshape(points_base, (-1, 3)))
         place = (world - self.origin) / self.voxel_m
         limit = np.array(self.grid.shape) - 1
@@ -89,7 +65,8 @@ class ClearanceField:
         base = np.minimum(clipped.astype(np.int64), limit - 1)
         x, y, z = (np.stack([base[:, k], base[:, k] + 1], axis=1) for k in range(3))
         values = self.grid[x[:, :, None, None], y[:, None, :, None], z[:, None, None, :]]
-        return values.astype(np.float64), clipped - base, (place == clipped).all(axis=1)
+        result = trilinear(values.astype(np.float64), clipped - base)
+        return np.where((place == clipped).all(axis=1), result, 0.0)
 
 
 def _part(scene: MeshScene, centre: Float64, reach_m: float) -> tuple[Float64, Float32]:
@@ -117,7 +94,6 @@ def _sampled(scene: HasClearance, centre: Float64, reach_m: float) -> tuple[Floa
     return origin, values.astype(np.float32)
 
 
-_SHORTEST_PART_M = 0.03  # of a capsule, between two balls that cover it
 _NEAR_M = 0.05  # a gap beyond this is not limited
 _STEP_RAD = 1e-5  # of the differences that stand for derivatives
 
@@ -135,17 +111,15 @@ class LinkClearance:
         moving = np.flatnonzero(chain.capsule_link > 0)
         ends, radius = chain.capsule_ends[moving], chain.capsule_radius[moving]
         length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
-        parts = np.ceil(length / np.maximum(radius, _SHORTEST_PART_M) - 1e-6).astype(int)
-        cover = np.hypot(radius, 0.5 * length / np.maximum(parts, 1)) + clearance_m
+        all_parts, all_cover = chain.covering_balls()
+        parts, cover = all_parts[moving], all_cover[moving] + clearance_m
         self._capsule = np.repeat(moving, parts + 1)
         self._share = np.concatenate([np.arange(k + 1) / max(k, 1) for k in parts] or [[]])
         self._cover = np.repeat(cover, parts + 1)
         self._moving = moving
         self._far = 0.5 * length + radius + clearance_m
-        pairs = chain.self_pairs
-        self._pairs = pairs
-        self._apart = chain.capsule_radius[pairs].sum(axis=1)
-        self._apart += np.minimum(clearance_m, 0.5 * chain.self_gap)
+        self._pairs = chain.self_pairs
+        self._apart = chain.pair_needs(clearance_m)
 
     def gaps(self, q: Float64) -> Float64:
         """(k, g) metres to spare of every ball, then of every pair, at joint angles (k, n)."""

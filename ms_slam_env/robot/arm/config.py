@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from ms_slam_env.config import Named, check_range
+from ms_slam_env.config import Checked, Named, bounded
 from ms_slam_env.errors import InputError
+
+_MOST_RAD = math.radians(20)
 
 
 @dataclass(frozen=True)
-class ArmNoise(Named):
+class ArmNoise(Checked, Named):
     """Imperfections of an arm beyond the sag and lag that follow from its physics.
 
     Drawn once an episode: zero offsets of the joint sensors, hand-eye calibration. Drawn all the
@@ -31,28 +33,21 @@ class ArmNoise(Named):
             the joint with the greatest torque; in proportion to torque for the others.
     """
 
-    joint_offset_rad: float = math.radians(0.2)
-    encoder_rad: float = math.radians(0.02)
-    hand_eye_m: float = 0.002
-    hand_eye_rad: float = math.radians(0.3)
-    backlash_rad: float = math.radians(0.1)
-    vibration_nm: float = 1.0
+    joint_offset_rad: float = bounded(math.radians(0.2), 0, _MOST_RAD)
+    encoder_rad: float = bounded(math.radians(0.02), 0, _MOST_RAD)
+    hand_eye_m: float = bounded(0.002, 0, 0.1)
+    hand_eye_rad: float = bounded(math.radians(0.3), 0, _MOST_RAD)
+    backlash_rad: float = bounded(math.radians(0.1), 0, _MOST_RAD)
+    vibration_nm: float = bounded(1.0, 0, 100)
 
     @classmethod
     def named(cls) -> dict[str, ArmNoise]:
         """``none`` and ``default``."""
         return {"none": cls(0.0, 0.0, 0.0, 0.0, 0.0, 0.0), "default": cls()}
 
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        for name in ("joint_offset_rad", "encoder_rad", "hand_eye_rad", "backlash_rad"):
-            check_range(self, name, 0, math.radians(20))
-        check_range(self, "hand_eye_m", 0, 0.1)
-        check_range(self, "vibration_nm", 0, 100)
-
 
 @dataclass(frozen=True)
-class ArmConfig:
+class ArmConfig(Checked):
     """An arm that holds the camera.
 
     Attributes:
@@ -76,25 +71,18 @@ class ArmConfig:
     model: str = "mico"
     camera_site: str = "camera"
     base: tuple[float, float, float, float] | None = None
-    frames_per_action: int | None = None
-    camera_hz: float = 10.0
-    speed_m_s: float = 0.2
-    speed_rad_s: float = math.radians(36)
-    joint_speed_rad_s: float = 1.0
-    control_hz: float = 20.0
-    clearance_m: float = 0.02
+    frames_per_action: int | None = bounded(None, 1, 1000)
+    camera_hz: float = bounded(10.0, 0.1, 30)
+    speed_m_s: float = bounded(0.2, 0.001, 5)
+    speed_rad_s: float = bounded(math.radians(36), 0.001, 20)
+    joint_speed_rad_s: float = bounded(1.0, 0.001, 20)
+    control_hz: float = bounded(20.0, 5, 500)
+    clearance_m: float = bounded(0.02, 0, 0.5)
     noise: ArmNoise = field(default_factory=ArmNoise)
 
     def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        if self.frames_per_action is not None:
-            check_range(self, "frames_per_action", 1, 1000)
-        check_range(self, "camera_hz", 0.1, 30)
-        check_range(self, "speed_m_s", 0.001, 5)
-        check_range(self, "speed_rad_s", 0.001, 20)
-        check_range(self, "joint_speed_rad_s", 0.001, 20)
-        check_range(self, "control_hz", 5, 500)
-        check_range(self, "clearance_m", 0, 0.5)
+        """Refuse values out of range, noise that is none, and a base that is no place."""
+        super().__post_init__()
         if not isinstance(self.noise, ArmNoise):
             raise InputError(f"ArmConfig.noise = {self.noise!r} must be an ArmNoise")
         if self.base is not None:

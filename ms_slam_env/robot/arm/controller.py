@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ms_slam_env.geometry import Float64
 from ms_slam_env.robot.arm.cartesian_path import CartesianPath
 from ms_slam_env.robot.arm.chain import Chain
 from ms_slam_env.robot.arm.clearance import ClearanceField, ClearanceLimit, LinkClearance
@@ -18,10 +19,8 @@ from ms_slam_env.robot.arm.config import ArmConfig
 from ms_slam_env.robot.arm.feasibility import DAMPING, LIMIT_MARGIN_RAD
 from ms_slam_env.robot.arm.model import ArmModel
 
-Float64 = NDArray[np.float64]
-
 REACHED_M, REACHED_RAD = 0.002, np.radians(0.2)
-"""Furthest that commanded poses may be from their way."""
+"""Furthest that commanded poses may be from their path."""
 
 _SOLVED = 1  # exit flag of daqp
 _GAIN = 0.5  # share of a gap to furniture or to another link that one step may use up
@@ -38,7 +37,7 @@ class Plan:
     Attributes:
         q: (k + 1, n) joint angles at the start and at the end of each tick.
         tick_s: seconds a tick.
-        followed: the commanded camera keeps to its way and ends at the target, to 2 mm, 0.2 deg.
+        followed: the commanded camera keeps to its path and ends at the target, to 2 mm, 0.2 deg.
         error_m: distance of the commanded camera to the target at the end.
         error_rad: angle of the same.
     """
@@ -56,7 +55,7 @@ class Plan:
 
 
 class Controller:
-    """Follows the camera's way with the joints, tick by tick, within their limits.
+    """Follows the camera's path with the joints, tick by tick, within their limits.
 
     Each tick solves mink's quadratic programme for the pose at the tick's end: least squares of
     the pose's error subject to range and speed of the joints. If the links then come too close to

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ms_slam_env.geometry import relative_angle, transform_points
+from ms_slam_env.geometry import Float64, relative_angle, transform_points
 from ms_slam_env.robot.arm.arm import ArmEmbodiment, frame_times
 from ms_slam_env.robot.arm.config import ArmConfig
 from ms_slam_env.robot.arm.controller import Controller, Plan, checked_ticks
@@ -18,8 +17,6 @@ from ms_slam_env.robot.base import MotionResult
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.timings import Timings
 
-Float64 = NDArray[np.float64]
-
 _SETTLE_S = 1.0  # before the first frame
 
 
@@ -28,7 +25,7 @@ class Attempt:
     """What came of a motion that was tried whatever the mask says.
 
     Attributes:
-        reached: the command kept to the camera's way and ended at the target, to 2 mm, 0.2 deg,
+        reached: the command kept to the camera's path and ended at the target, to 2 mm, 0.2 deg,
             and nothing stopped the arm.
         stopped: the arm came so close to furniture that it made a protective stop.
         error_m: distance between where the camera ended and where it was commanded to.

@@ -8,13 +8,10 @@ from typing import Any
 import mujoco
 import numpy as np
 from mujoco.batch import Batch
-from numpy.typing import NDArray
 
-from ms_slam_env.geometry import make_pose, so3_exp
+from ms_slam_env.geometry import Float64, make_pose, so3_exp
 from ms_slam_env.robot.arm.config import ArmNoise
 from ms_slam_env.robot.arm.model import ArmModel
-
-Float64 = NDArray[np.float64]
 
 _INPUTS = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 

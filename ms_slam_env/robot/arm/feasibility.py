@@ -1,4 +1,4 @@
-"""Which camera motions an arm can make: straight ways followed in joint space and checked."""
+"""Which motions of its camera an arm can make: Cartesian paths followed in joint space."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ms_slam_env._warp import wp
-from ms_slam_env.geometry import invert
+from ms_slam_env.geometry import Float64, invert
 from ms_slam_env.robot.arm.cartesian_path import PEAK_SPEED, progress
 from ms_slam_env.robot.arm.chain import Chain
 from ms_slam_env.robot.arm.clearance import ClearanceField
@@ -19,22 +19,21 @@ from ms_slam_env.robot.arm.config import ArmConfig
 from ms_slam_env.robot.arm.feasibility_kernels import Grid, follow, start_deficits
 from ms_slam_env.robot.arm.ik_kernels import Arm, Scratch, vec6
 
-Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
 
 REASONS = ("ok", "unreachable", "joint limit", "joint speed", "furniture", "self-collision")
 """Words for ``FeasibilityResult.reason``."""
 
 FEWEST_PARTS = 7
-"""A way is cut into at least so many parts between waypoints."""
+"""A path is cut into at least so many parts between waypoints."""
 
 LONGEST_PART_M = 0.022
 LONGEST_PART_RAD = np.radians(2.2)
-"""Longer ways into more, until the camera moves no more than this in each."""
+"""Longer paths into more, until the camera moves no more than this in each."""
 
 MOST_STRETCH = 4.0
-"""A way on which a joint would take more than this times the camera's duration is refused,
-but for 15 %: what the controller makes good within its tolerance of the way, and in late ticks."""
+"""A path on which a joint would take more than this times the camera's duration is refused,
+but for 15 %: what the controller makes good within its tolerance of the path, and in late ticks."""
 
 LIMIT_MARGIN_RAD = 0.02
 """Distance that planned and commanded joint angles keep from their limits."""
@@ -44,19 +43,18 @@ DAMPING = 1e-5
 controller minimise the same, so that they bend a redundant arm the same way."""
 
 _LEEWAY = 0.15
-_STILL_S = 1e-6  # duration given to a way without motion
-_SHORTEST_PART_M = 0.03  # of a capsule, between two balls that cover it
+_STILL_S = 1e-6  # duration given to a path without motion
 
 
 @dataclass(frozen=True)
 class FeasibilityResult:
-    """What became of ``k`` ways.
+    """What became of ``k`` paths.
 
     Attributes:
         ok: (k,) the arm can make the motion.
         reason: (k,) index into ``REASONS``; 0 where ok.
         q: (k, W, n) joint angles after equal parts of the duration, the first at the start of the
-            way, the last at its end; only the start is sure to be there where the motion is not ok.
+            path, the last at its end; only the start is sure to be there if the motion is not ok.
         duration_s: (k,) of the motion; longer than the camera's own where a joint needs longer;
             0 without motion.
     """
@@ -68,13 +66,13 @@ class FeasibilityResult:
 
 
 class Feasibility:
-    """Follows straight ways of the camera with the joints and says which are possible.
+    """Follows Cartesian paths of the camera with the joints and says which are possible.
 
-    A way is possible if at each of its waypoints inverse kinematics between the joints' limits
+    A path is possible if at each of its waypoints inverse kinematics between the joints' limits
     finds joint angles within 1.8 mm and 0.18 degrees of it (the controller allows itself 2 mm and
     0.2), capsules around the links stay ``clearance_m`` away from furniture (beyond the slack of
     ``ClearanceField``) and from each other, and no joint needs more than ``MOST_STRETCH`` times the
-    duration of the camera's way. Of the joint angles that an arm with spare joints has for a
+    duration of the camera's path. Of the joint angles that an arm with spare joints has for a
     waypoint, those nearest to the waypoint before are taken: spare joints bend around limits as in
     the controller, but not around furniture or other links as there, so that a few motions are
     refused that it could make.
@@ -98,7 +96,7 @@ class Feasibility:
         self._buffers: dict[tuple[int, int], _Buffers] = {}
 
     def probe(self, q: Float64, T_base_targets: Float64) -> FeasibilityResult:
-        """Try the straight ways from joint angles (n,) to camera poses (k, 4, 4)."""
+        """Try the Cartesian paths from joint angles (n,) to camera poses (k, 4, 4)."""
         T_start = self._chain.camera_pose(q)
         targets = np.asarray(T_base_targets, dtype=np.float64)
         step = targets[:, :3, 3] - T_start[:3, 3]
@@ -159,14 +157,14 @@ class Feasibility:
 
 
 def _parts(step: Float64, turn: Float64) -> int:
-    """How many parts the longest of ways with translations and rotations (k, 3) needs."""
+    """How many parts the longest of paths with translations and rotations (k, 3) needs."""
     metres = np.linalg.norm(step, axis=1).max(initial=0.0) / LONGEST_PART_M
     radians = np.linalg.norm(turn, axis=1).max(initial=0.0) / LONGEST_PART_RAD
     return max(FEWEST_PARTS, int(np.ceil(PEAK_SPEED * max(metres, radians) - 1e-6)))
 
 
 class _Buffers:
-    """Device arrays for ``k`` ways of ``w`` waypoints."""
+    """Device arrays for ``k`` paths of ``w`` waypoints."""
 
     def __init__(self, k: int, w: int, chain: Chain, device: str) -> None:
         n, m = chain.num_joints, len(chain.capsule_link)
@@ -196,7 +194,7 @@ class _Buffers:
         self._start = np.zeros((k, w, n), dtype=np.float32)
 
     def fill(self, q: Float64, step: Float64, turn: Float64, duration: Float64) -> None:
-        """Load the ways."""
+        """Load the paths."""
         self._start[:] = q
         self.q.assign(self._start)
         self.step.assign(step.astype(np.float32))
@@ -215,12 +213,7 @@ def _arm(chain: Chain, clearance_m: float, device: str) -> Arm:
     back = invert(np.stack(turns))[chain.capsule_link][:, :3, :3]
     ends = np.einsum("mij,mkj->mki", back, ends)
     radius = chain.capsule_radius
-    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
-    parts = np.ceil(length / np.maximum(radius, _SHORTEST_PART_M) - 1e-6).astype(np.int32)
-    part = length / np.maximum(parts, 1)
-    pairs = chain.self_pairs
-    apart = np.minimum(clearance_m, 0.5 * chain.self_gap)
-
+    parts, cover = chain.covering_balls()
     arm = Arm()
     arm.num_joints = chain.num_joints
     arm.joint_R = _array(joints[:, :3, :3], wp.mat33, device)
@@ -233,10 +226,9 @@ def _arm(chain: Chain, clearance_m: float, device: str) -> Arm:
     arm.capsule_b = _array(ends[:, 1], wp.vec3, device)
     arm.capsule_parts = _array(parts, wp.int32, device)
     arm.capsule_need = _array(radius + clearance_m, wp.float32, device)
-    # balls of this radius around the ends of the parts hold the whole capsule
-    arm.capsule_cover = _array(np.hypot(radius, 0.5 * part) + clearance_m, wp.float32, device)
-    arm.pair = _array(pairs, wp.vec2i, device)
-    arm.pair_need = _array(radius[pairs].sum(axis=1) + apart, wp.float32, device)
+    arm.capsule_cover = _array(cover + clearance_m, wp.float32, device)
+    arm.pair = _array(chain.self_pairs, wp.vec2i, device)
+    arm.pair_need = _array(chain.pair_needs(clearance_m), wp.float32, device)
     return arm
 
 

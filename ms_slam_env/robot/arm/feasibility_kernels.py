@@ -1,6 +1,6 @@
 # ruff: noqa: UP018
 # Warp code: float(0.0) declares a variable that changes.
-"""Warp kernel that follows the camera's straight way to every candidate with the joints.
+"""Warp kernel that follows the camera's Cartesian path to every candidate with the joints.
 
 One thread follows one candidate: inverse kinematics from waypoint to waypoint, then the checks,
 in the order of ``REASONS`` of :mod:`ms_slam_env.robot.arm.feasibility`.
@@ -223,9 +223,9 @@ def follow(
     stretch: wp.array(dtype=float),
     reason: wp.array(dtype=int),
 ):
-    """Follow one candidate's way; ``q`` (k, W, n) holds the start in its first waypoint.
+    """Follow one candidate's path; ``q`` (k, W, n) holds the start in its first waypoint.
 
-    ``share`` (W,) is how much of the way is made at each waypoint.
+    ``share`` (W,) is how much of the path is made at each waypoint.
     """
     k = wp.tid()
     n = arm.num_joints

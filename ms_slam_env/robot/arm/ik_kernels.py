@@ -48,7 +48,7 @@ class Scratch:
     R: wp.array2d(dtype=wp.mat33)  # (k, n + 2) links, then the camera
     t: wp.array2d(dtype=wp.vec3)
     q: wp.array3d(dtype=float)  # (k, 1, n) joint angles between two waypoints
-    low: wp.array2d(dtype=float)  # (k, n) limits of the joint angles on this way
+    low: wp.array2d(dtype=float)  # (k, n) limits of the joint angles on this path
     high: wp.array2d(dtype=float)
     J: wp.array2d(dtype=vec6)  # (k, n) columns of the geometric Jacobian
     step: wp.array2d(dtype=float)  # (k, n) of one iteration
@@ -130,7 +130,7 @@ def bounded_step(
 ):
     """Newton step that stays between ``work.low`` and ``work.high``, in ``work.step``.
 
-    Least squares of the pose's error plus ``damping`` times those of the way from the waypoint
+    Least squares of the pose's error plus ``damping`` times those of the path from the waypoint
     before: the controller's quadratic programme. Joints that would leave their bounds are held
     there, and the others bend around them, until no more leave.
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -9,61 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ms_slam_env.geometry import Float64
 from ms_slam_env.robot.action_primitives import decompose
-from ms_slam_env.robot.arm.chain import Chain, segment_distance
+from ms_slam_env.robot.arm.chain import Chain
 from ms_slam_env.robot.arm.clearance import ClearanceField
 from ms_slam_env.robot.arm.config import ArmConfig
 from ms_slam_env.robot.arm.feasibility import Feasibility
 
-Float64 = NDArray[np.float64]
-
 _DAMPING = 1e-3  # of the pseudo-inverse, metres and radians
 _LARGEST_STEP_RAD = 0.5
-
-
-@dataclass(frozen=True)
-class Solutions:
-    """Joint angles (s, n) and how far the camera is from its target there, (s,) each."""
-
-    q: Float64
-    error_m: Float64
-    error_rad: Float64
-
-    def accurate(self, tolerance_m: float = 1e-6, tolerance_rad: float = 1e-6) -> NDArray[np.bool_]:
-        """(s,) which of them put the camera on the target."""
-        return (self.error_m < tolerance_m) & (self.error_rad < tolerance_rad)
-
-
-def solve_pose(chain: Chain, q: Float64, T_base_camera: Float64, iterations: int = 30) -> Solutions:
-    """Bring the camera to a pose (4, 4) by damped Newton steps from joint angles (s, n).
-
-    Joint limits are not looked at. Wampler, "Manipulator inverse kinematic solutions based on
-    vector formulations and damped least-squares methods" (1986), equation (10).
-    """
-    angles = np.array(q, dtype=np.float64)
-    regularisation = _DAMPING**2 * np.eye(6)
-    for _ in range(iterations):
-        error = _twist(chain.camera_pose(angles), T_base_camera)
-        if (np.abs(error) < 1e-10).all():
-            break
-        J = chain.camera_jacobian(angles)
-        J_transposed = np.swapaxes(J, -1, -2)
-        damped = np.linalg.solve(J @ J_transposed + regularisation, error[..., None])
-        step = (J_transposed @ damped)[..., 0]
-        largest = np.abs(step).max(axis=-1, keepdims=True)
-        angles = angles + step * np.minimum(1.0, _LARGEST_STEP_RAD / np.maximum(largest, 1e-12))
-    error = _twist(chain.camera_pose(angles), T_base_camera)
-    return Solutions(
-        angles, np.linalg.norm(error[..., :3], axis=-1), np.linalg.norm(error[..., 3:], axis=-1)
-    )
-
-
-def _twist(T_now: Float64, T_target: Float64) -> Float64:
-    """(s, 6) translation and rotation vector, in the base frame, from (s, 4, 4) to the target."""
-    turn = T_target[:3, :3] @ np.swapaxes(T_now[..., :3, :3], -1, -2)
-    rotation = Rotation.from_matrix(turn).as_rotvec()
-    return np.concatenate([T_target[:3, 3] - T_now[..., :3, 3], rotation], axis=-1)
-
 
 LIMIT_MARGIN_RAD = 0.15
 """Distance that a posture keeps from joint limits, so that motions are left on both sides."""
@@ -81,6 +36,73 @@ _APART_M = 0.06  # least distance between the bases of two postures of one pitch
 _EFFORT_DAMPING = 0.02
 _TOO_HARD = 4.0
 _AT_ONCE = 256
+
+
+@dataclass(frozen=True)
+class Solutions:
+    """Joint angles (s, n) and how far the camera is from its target there, (s,) each."""
+
+    q: Float64
+    error_m: Float64
+    error_rad: Float64
+
+    def accurate(self, tolerance_m: float = 1e-6, tolerance_rad: float = 1e-6) -> NDArray[np.bool_]:
+        """(s,) which of them put the camera on the target."""
+        return (self.error_m < tolerance_m) & (self.error_rad < tolerance_rad)
+
+
+def solve_pose(chain: Chain, q: Float64, T_base_camera: Float64, iterations: int = 30) -> Solutions:
+    """Bring the camera to a pose (4, 4) from joint angles (s, n), whatever the joint limits."""
+
+    def task(angles: Float64) -> tuple[Float64, Float64]:
+        return _twist(chain.camera_pose(angles), T_base_camera), chain.camera_jacobian(angles)
+
+    def shorten(step: Float64) -> Float64:
+        largest = np.abs(step).max(axis=-1, keepdims=True)
+        return step * np.minimum(1.0, _LARGEST_STEP_RAD / np.maximum(largest, 1e-12))
+
+    angles, error = _damped_newton(task, q, iterations, 1e-10, shorten)
+    return Solutions(
+        angles, np.linalg.norm(error[..., :3], axis=-1), np.linalg.norm(error[..., 3:], axis=-1)
+    )
+
+
+def _damped_newton(
+    task: Callable[[Float64], tuple[Float64, Float64]],
+    q: Float64,
+    iterations: int,
+    tolerance: float,
+    shorten: Callable[[Float64], Float64],
+) -> tuple[Float64, Float64]:
+    """Joint angles (s, n) after damped Newton steps from some, and what is left of the error.
+
+    Wampler, "Manipulator inverse kinematic solutions based on vector formulations and damped
+    least-squares methods" (1986), equation (10).
+
+    Args:
+        task: error (s, e) of joint angles (s, n), and how they lessen it: Jacobian (s, e, n).
+        q: (s, n) where to begin.
+        iterations: steps at most.
+        tolerance: of every number of the error, below which no more are made.
+        shorten: makes steps (s, n) no longer than linearisation allows.
+    """
+    angles = np.array(q, dtype=np.float64)
+    for _ in range(iterations):
+        error, J = task(angles)
+        if (np.abs(error) < tolerance).all():
+            break
+        J_transposed = np.swapaxes(J, -1, -2)
+        regularised = J @ J_transposed + _DAMPING**2 * np.eye(J.shape[-2])
+        damped = np.linalg.solve(regularised, error[..., None])
+        angles = angles + shorten((J_transposed @ damped)[..., 0])
+    return angles, task(angles)[0]
+
+
+def _twist(T_now: Float64, T_target: Float64) -> Float64:
+    """(s, 6) translation and rotation vector, in the base frame, from (s, 4, 4) to the target."""
+    turn = T_target[:3, :3] @ np.swapaxes(T_now[..., :3, :3], -1, -2)
+    rotation = Rotation.from_matrix(turn).as_rotvec()
+    return np.concatenate([T_target[:3, 3] - T_now[..., :3, 3], rotation], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -191,14 +213,14 @@ def _effort(chain: Chain, q: Float64, rates: Float64) -> Float64:
 def _camera_rates(speed_m_s: float, speed_rad_s: float) -> Float64:
     """(6, 49) greatest linear and angular velocity of each motion in the camera's frame."""
     motions = decompose(STEP_M, STEP_RAD)
-    way = np.concatenate(
+    step = np.concatenate(
         [motions[:, :3, 3], Rotation.from_matrix(motions[:, :3, :3]).as_rotvec()], 1
     )
     least_s = np.maximum(
-        np.linalg.norm(way[:, :3], axis=1) / speed_m_s,
-        np.linalg.norm(way[:, 3:], axis=1) / speed_rad_s,
+        np.linalg.norm(step[:, :3], axis=1) / speed_m_s,
+        np.linalg.norm(step[:, 3:], axis=1) / speed_rad_s,
     )
-    return (way / np.maximum(least_s, 1e-9)[:, None]).T
+    return (step / np.maximum(least_s, 1e-9)[:, None]).T
 
 
 def turn_upright(
@@ -209,15 +231,13 @@ def turn_upright(
     Returns:
         Joint angles (s, n), and (s,) whether they do it to 1e-9.
     """
-    angles = np.array(q, dtype=np.float64)
-    for _ in range(iterations):
-        error, J = _uprightness(chain, angles, up)
-        if (np.abs(error) < 1e-12).all():
-            break
-        J_transposed = np.swapaxes(J, -1, -2)
-        damped = np.linalg.solve(J @ J_transposed + 1e-6 * np.eye(3), error[..., None])
-        angles = angles + np.clip((J_transposed @ damped)[..., 0], -0.6, 0.6)
-    error, _ = _uprightness(chain, angles, up)
+    angles, error = _damped_newton(
+        lambda angles: _uprightness(chain, angles, up),
+        q,
+        iterations,
+        1e-12,
+        lambda step: np.clip(step, -0.6, 0.6),
+    )
     return angles, np.linalg.norm(error, axis=-1) < 1e-9
 
 
@@ -236,10 +256,7 @@ def _uprightness(chain: Chain, q: Float64, up: Float64) -> tuple[Float64, Float6
 
 def links_apart(chain: Chain, q: Float64) -> NDArray[np.bool_]:
     """(s,) whether the pairs of links keep half the distance they have at home, at most 2 cm."""
-    ends = chain.capsules(q)
-    first, second = chain.self_pairs[:, 0], chain.self_pairs[:, 1]
-    gap = segment_distance(ends[:, first], ends[:, second])
-    gap = gap - chain.capsule_radius[first] - chain.capsule_radius[second]
+    gap = chain.pair_gaps(q, chain.self_pairs)
     return np.asarray((gap >= np.minimum(0.02, 0.5 * chain.self_gap)).all(axis=-1))
 
 

@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import make_pose
+from ms_slam_env.geometry import Float64, make_pose
 from ms_slam_env.robot.arm.chain import Chain, separate_pairs
 
-Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
 
 ARM_MODELS = {"mico": Path(__file__).with_name("mico.xml")}

@@ -8,12 +8,10 @@ from functools import lru_cache
 import mujoco
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
+from ms_slam_env.geometry import Float64
 from ms_slam_env.robot.arm.base_placement import COLUMN_RADIUS_M
 from ms_slam_env.robot.arm.model import ArmModel
-
-Float64 = NDArray[np.float64]
 
 _COLUMN_RGB = (0.62, 0.63, 0.65)
 _FOOT_HEIGHT_M = 0.02

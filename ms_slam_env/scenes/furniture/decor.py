@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import MeshBuilder
 from ms_slam_env.scenes.furniture.small_things import glaze
 from ms_slam_env.scenes.textures import fabric, interior, outdoor
@@ -11,9 +12,7 @@ from ms_slam_env.scenes.textures.noise import hsv
 from ms_slam_env.scenes.textures.pictures import picture
 
 
-def picture_frame(
-    build: MeshBuilder, rng: np.random.Generator, width_m: float, height_m: float, name: str
-) -> None:
+def picture_frame(build: MeshBuilder, rng: Rng, width_m: float, height_m: float, name: str) -> None:
     """Framed picture hanging with its middle at the origin."""
     size = (256, 384) if width_m > 1.25 * height_m else (256, 256)
     image = build.material(picture(rng, *size))
@@ -37,7 +36,7 @@ def picture_frame(
         build.quad((-w, -0.01, -h), (2 * w, 0, 0), (0, 0, 2 * h), image)
 
 
-def plant(build: MeshBuilder, rng: np.random.Generator, height_m: float, name: str) -> None:
+def plant(build: MeshBuilder, rng: Rng, height_m: float, name: str) -> None:
     """Pot plant of long arching leaves, centred on the origin."""
     pot_h = 0.25 * height_m
     r = 0.16 * height_m
@@ -96,22 +95,7 @@ def floor_lamp(build: MeshBuilder, height_m: float, shade_rgb: tuple[float, ...]
     return height_m - 0.12
 
 
-def table_lamp(build: MeshBuilder, rng: np.random.Generator, shade_rgb: tuple[float, ...]) -> float:
-    """Small lamp with a turned foot; returns the bulb's height."""
-    with build.object("table lamp"):
-        build.lathe(
-            [(0.07, 0), (0.07, 0.015), (0.03, 0.04), (0.05, 0.12), (0.015, 0.2), (0.01, 0.3)],
-            glaze(build, rng),
-            18,
-        )
-    with build.object("lamp shade"):
-        paper = build.plain(shade_rgb)
-        build.lathe([(0.13, 0.24), (0.085, 0.42)], paper, 20)
-        build.lathe([(0.08, 0.42), (0.125, 0.24)], paper, 20)
-    return 0.34
-
-
-def rug(build: MeshBuilder, rng: np.random.Generator, width_m: float, depth_m: float) -> None:
+def rug(build: MeshBuilder, rng: Rng, width_m: float, depth_m: float) -> None:
     """Patterned rug centred on the origin, 1 cm thick."""
     with build.object("rug"):
         design = build.material(fabric.rug(rng))
@@ -122,7 +106,7 @@ def rug(build: MeshBuilder, rng: np.random.Generator, width_m: float, depth_m: f
 
 def curtain(
     build: MeshBuilder,
-    rng: np.random.Generator,
+    rng: Rng,
     width_m: float,
     height_m: float,
     cloth_image: np.ndarray,
@@ -139,7 +123,7 @@ def curtain(
         build.sheet(grid, cloth)
 
 
-def curtain_cloth(rng: np.random.Generator) -> np.ndarray:
+def curtain_cloth(rng: Rng) -> np.ndarray:
     """Plain or striped cloth for a pair of curtains."""
     hue = rng.random()
     light, dark = hsv(hue, rng.uniform(0.1, 0.45), 0.8), hsv(hue + 0.04, 0.5, 0.5)
@@ -148,7 +132,7 @@ def curtain_cloth(rng: np.random.Generator) -> np.ndarray:
     return fabric.pattern(rng, np.array([light, dark, hsv(hue + 0.5, 0.4, 0.6)]))
 
 
-def door(build: MeshBuilder, rng: np.random.Generator, name: str, rgb: np.ndarray) -> None:
+def door(build: MeshBuilder, rng: Rng, name: str, rgb: np.ndarray) -> None:
     """Panelled door, 0.85 x 2.05 m, in its casing, on the wall at y = 0."""
     paint = build.material(interior.plaster(rng, rgb, 0.8, 256), (1.0, 1.0))
     trim = build.plain((228, 224, 214))

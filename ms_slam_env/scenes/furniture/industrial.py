@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import Material, MeshBuilder
 from ms_slam_env.scenes.textures import industrial, interior
 from ms_slam_env.scenes.textures.noise import hsv
@@ -29,7 +30,7 @@ class Stock:
     hazard: Material
 
 
-def stock(build: MeshBuilder, rng: np.random.Generator) -> Stock:
+def stock(build: MeshBuilder, rng: Rng) -> Stock:
     """Draw the materials of a hall."""
     paints = [hsv(rng.random(), rng.uniform(0.2, 0.7), rng.uniform(0.4, 0.8)) for _ in range(4)]
     return Stock(
@@ -48,9 +49,7 @@ def stock(build: MeshBuilder, rng: np.random.Generator) -> Stock:
     )
 
 
-def rack(
-    build: MeshBuilder, rng: np.random.Generator, of: Stock, bays: int, levels: int, name: str
-) -> None:
+def rack(build: MeshBuilder, rng: Rng, of: Stock, bays: int, levels: int, name: str) -> None:
     """Pallet rack along x from the origin, ``RACK_DEPTH_M`` deep in y, goods on every level."""
     step = 1.35
     height = step * levels + 0.3
@@ -77,9 +76,7 @@ def rack(
                 goods(build, rng, of, BAY_M - 0.3, step - 0.3, f"{name} goods {bay}.{level}")
 
 
-def goods(
-    build: MeshBuilder, rng: np.random.Generator, of: Stock, width: float, height: float, name: str
-) -> None:
+def goods(build: MeshBuilder, rng: Rng, of: Stock, width: float, height: float, name: str) -> None:
     """Two pallets side by side with boxes or a crate on them; sometimes one is empty."""
     for side in range(2):
         if rng.random() < 0.12:
@@ -90,9 +87,7 @@ def goods(
                 pallet_load(build, rng, of, width / 2 - 0.1, height)
 
 
-def pallet_load(
-    build: MeshBuilder, rng: np.random.Generator, of: Stock, width: float, height: float
-) -> None:
+def pallet_load(build: MeshBuilder, rng: Rng, of: Stock, width: float, height: float) -> None:
     """A pallet from the origin with a crate, or rows of boxes, ``height`` at most."""
     deep = 0.9
     for y in (0.0, 0.4, 0.8):
@@ -117,7 +112,7 @@ def pallet_load(
             build.box((x, y, z), (x + w - 0.04, deep - 0.06 + y, z + each - 0.01), kind, "z")
 
 
-def machine(build: MeshBuilder, rng: np.random.Generator, of: Stock, name: str) -> None:
+def machine(build: MeshBuilder, rng: Rng, of: Stock, name: str) -> None:
     """Machine tool of about 2.4 x 1.5 x 2 m, front on y = 0 facing -y, from x = 0."""
     w, d, h = rng.uniform(2.0, 2.8), rng.uniform(1.2, 1.6), rng.uniform(1.6, 2.2)
     k = int(rng.integers(len(of.paints)))
@@ -155,7 +150,7 @@ def column(build: MeshBuilder, of: Stock, height_m: float, name: str) -> None:
         build.box((-0.22, -0.22, 0), (0.22, 0.22, 1.1), of.hazard, "z")
 
 
-def drum(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
+def drum(build: MeshBuilder, rng: Rng, name: str) -> None:
     """Steel drum on the origin."""
     paint = hsv(rng.choice([0.0, 0.12, 0.36, 0.6]), 0.7, rng.uniform(0.35, 0.7))
     metal = build.material(industrial.corrugated(rng, paint, 3, 64), (0.9, 0.9))

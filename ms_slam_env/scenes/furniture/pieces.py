@@ -6,19 +6,20 @@ from itertools import pairwise
 
 import numpy as np
 
+from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import Material, MeshBuilder
 from ms_slam_env.scenes.furniture import small_things
 from ms_slam_env.scenes.textures import fabric, interior, pictures
 from ms_slam_env.scenes.textures.noise import hsv
 
 
-def upholstery(build: MeshBuilder, rng: np.random.Generator) -> Material:
+def upholstery(build: MeshBuilder, rng: Rng) -> Material:
     """Woven fabric of a quiet colour."""
     colour = hsv(rng.random(), rng.uniform(0.08, 0.55), rng.uniform(0.3, 0.75))
     return build.material(fabric.weave(rng, colour), (0.25, 0.25))
 
 
-def throw_pillow(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
+def throw_pillow(build: MeshBuilder, rng: Rng, name: str) -> None:
     """Patterned pillow of 40 cm leaning back, standing on its lower edge."""
     hue = rng.random()
     colours = np.array([hsv(hue, 0.25, 0.85), hsv(hue + 0.05, 0.7, 0.5), hsv(hue + 0.5, 0.5, 0.4)])
@@ -27,9 +28,7 @@ def throw_pillow(build: MeshBuilder, rng: np.random.Generator, name: str) -> Non
         build.pillow((-0.21, -0.08, 0.0), (0.21, 0.08, 0.4), cloth, 0.55)
 
 
-def sofa(
-    build: MeshBuilder, rng: np.random.Generator, width_m: float, seats: int, name: str = "sofa"
-) -> None:
+def sofa(build: MeshBuilder, rng: Rng, width_m: float, seats: int, name: str = "sofa") -> None:
     """Upholstered seat with arms, back, loose cushions and a few throw pillows."""
     cloth = upholstery(build, rng)
     leg = build.material(interior.board(rng, size=256), (0.4, 0.4))
@@ -54,7 +53,7 @@ def sofa(
             throw_pillow(build, rng, f"{name} pillow {k}")
 
 
-def chair(build: MeshBuilder, rng: np.random.Generator, name: str = "chair") -> None:
+def chair(build: MeshBuilder, rng: Rng, name: str = "chair") -> None:
     """Wooden chair with a padded seat; stands on its four legs, back at y = 0."""
     frame_wood = build.material(interior.board(rng, size=256), (0.5, 0.5))
     pad = upholstery(build, rng)
@@ -94,7 +93,7 @@ def table(
 
 
 def place(
-    rng: np.random.Generator,
+    rng: Rng,
     low: tuple[float, float],
     high: tuple[float, float],
     radii: list[float],
@@ -118,9 +117,7 @@ def place(
     return result
 
 
-def book_row(
-    build: MeshBuilder, rng: np.random.Generator, length_m: float, height_m: float, name: str
-) -> None:
+def book_row(build: MeshBuilder, rng: Rng, length_m: float, height_m: float, name: str) -> None:
     """Books standing side by side from x = 0 to at most ``length_m``, spines at -y."""
     sheet = pictures.spines(rng)
     pages = build.plain((225, 218, 200))
@@ -145,7 +142,7 @@ def book_row(
 
 def bookshelf(
     build: MeshBuilder,
-    rng: np.random.Generator,
+    rng: Rng,
     width_m: float = 1.0,
     height_m: float = 2.0,
     shelves: int = 5,
@@ -179,7 +176,7 @@ def bookshelf(
                 )
 
 
-def tv_stand(build: MeshBuilder, rng: np.random.Generator, width_m: float) -> float:
+def tv_stand(build: MeshBuilder, rng: Rng, width_m: float) -> float:
     """Low cabinet with two drawers and an open middle; returns the height of its top."""
     material = build.material(interior.board(rng), (0.9, 0.9))
     dark = build.plain((40, 36, 34))
@@ -209,9 +206,7 @@ def tv_stand(build: MeshBuilder, rng: np.random.Generator, width_m: float) -> fl
     return height
 
 
-def drawers(
-    build: MeshBuilder, rng: np.random.Generator, width_m: float, height_m: float, name: str
-) -> None:
+def drawers(build: MeshBuilder, rng: Rng, width_m: float, height_m: float, name: str) -> None:
     """Chest of drawers with knobs."""
     material = build.material(interior.board(rng), (0.8, 0.8))
     knob = build.plain((190, 170, 110))
@@ -236,9 +231,7 @@ def drawers(
                 )
 
 
-def wall_shelf(
-    build: MeshBuilder, rng: np.random.Generator, width_m: float, name: str = "shelf"
-) -> None:
+def wall_shelf(build: MeshBuilder, rng: Rng, width_m: float, name: str = "shelf") -> None:
     """Board on two brackets, top at z = 0, with books and an ornament on it."""
     material = build.material(interior.board(rng, size=256), (0.6, 0.6))
     half = width_m / 2

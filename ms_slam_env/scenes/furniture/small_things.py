@@ -5,13 +5,14 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import Material, MeshBuilder
 from ms_slam_env.scenes.textures import interior, pictures
-from ms_slam_env.scenes.textures.noise import Image, hsv, noise, shade
+from ms_slam_env.scenes.textures.noise import Image, grain, hsv
 from ms_slam_env.scenes.textures.pictures import picture
 
 
-def glaze(build: MeshBuilder, rng: np.random.Generator, banded: bool = True) -> Material:
+def glaze(build: MeshBuilder, rng: Rng, banded: bool = True) -> Material:
     """Ceramic: one colour with painted bands around, and fine speckles."""
     h, w = 128, 256
     base = hsv(rng.random(), rng.uniform(0.05, 0.7), rng.uniform(0.5, 0.95))
@@ -25,10 +26,10 @@ def glaze(build: MeshBuilder, rng: np.random.Generator, banded: bool = True) -> 
             y, step = int(rng.uniform(0.3, 0.6) * h), int(rng.integers(12, 32))
             for x in range(0, w, step):
                 image[y : y + step // 2, x : x + step // 2] = accent
-    return build.material(shade(image, (0.04, noise(rng, (h, w), 0.6))))
+    return build.material(grain(rng, image, (h, w), (0.04, 0.6)))
 
 
-def cup(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
+def cup(build: MeshBuilder, rng: Rng, name: str) -> None:
     """Mug with a handle and coffee, standing at the origin."""
     r, h = rng.uniform(0.035, 0.045), rng.uniform(0.08, 0.11)
     outside = [(0.85 * r, 0), (r, 0.02), (r, 0.6 * h), (r, h), (r, h)]
@@ -48,7 +49,7 @@ def cup(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
         build.patch(tube, material, inset=False)
 
 
-def plate(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
+def plate(build: MeshBuilder, rng: Rng, name: str) -> None:
     """Plate with a decorated rim; sometimes fruit on it."""
     r = rng.uniform(0.1, 0.14)
     with build.object(name):
@@ -58,19 +59,19 @@ def plate(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
         fruit(build, rng, f"{name} fruit", 0.012)
 
 
-def fruit(build: MeshBuilder, rng: np.random.Generator, name: str, z: float) -> None:
+def fruit(build: MeshBuilder, rng: Rng, name: str, z: float) -> None:
     """A few apples or oranges."""
     size = (64, 64)
     with build.object(name):
         for k in range(int(rng.integers(2, 5))):
             colour = hsv(rng.choice([0.0, 0.07, 0.14, 0.25]), rng.uniform(0.65, 0.9), 0.8)
-            skin = build.material(shade(colour, (0.09, noise(rng, size, 1.2))), (0.1, 0.1))
+            skin = build.material(grain(rng, colour, size, (0.09, 1.2)), (0.1, 0.1))
             angle, r = 2.1 * k + rng.uniform(0, 0.3), rng.uniform(0.03, 0.038)
             x, y = 0.045 * np.cos(angle), 0.045 * np.sin(angle)
             build.pillow((x - r, y - r, z), (x + r, y + r, z + 1.9 * r), skin, 1.0)
 
 
-def bowl(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
+def bowl(build: MeshBuilder, rng: Rng, name: str) -> None:
     """Bowl full of fruit."""
     r = rng.uniform(0.11, 0.15)
     outside = [(0.45 * r, 0), (0.8 * r, 0.035), (r, 0.085), (r, 0.085)]
@@ -80,7 +81,7 @@ def bowl(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
     fruit(build, rng, f"{name} fruit", 0.05)
 
 
-def bottle(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
+def bottle(build: MeshBuilder, rng: Rng, name: str) -> None:
     """Wine bottle or jar with a printed label."""
     r, h = rng.uniform(0.033, 0.042), rng.uniform(0.24, 0.31)
     glass = build.plain(hsv(rng.choice([0.3, 0.1, 0.55]), 0.6, rng.uniform(0.15, 0.4)))
@@ -104,7 +105,7 @@ def bottle(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
         build.lathe([(1.02 * r, 0.15 * h), (1.02 * r, 0.45 * h)], printed_label, 18)
 
 
-def vase(build: MeshBuilder, rng: np.random.Generator, height_m: float, name: str) -> None:
+def vase(build: MeshBuilder, rng: Rng, height_m: float, name: str) -> None:
     """Turned vase of random outline."""
     t = np.linspace(0, 1, 9)
     wave = rng.uniform(0.6, 1.0) + 0.35 * np.sin(rng.uniform(2.5, 4.5) * t + rng.uniform(0, 2))
@@ -115,9 +116,7 @@ def vase(build: MeshBuilder, rng: np.random.Generator, height_m: float, name: st
         build.lathe(np.concatenate([outside, inside]), glaze(build, rng), 22)
 
 
-def ornament(
-    build: MeshBuilder, rng: np.random.Generator, height_m: float, half_width_m: float, name: str
-) -> None:
+def ornament(build: MeshBuilder, rng: Rng, height_m: float, half_width_m: float, name: str) -> None:
     """A vase, a framed photograph or a ball, within the given size, in front of y = 0."""
     kind = rng.integers(3)
     size = float(min(height_m, 2.4 * half_width_m))
@@ -141,7 +140,7 @@ def ornament(
             )
 
 
-def lying_book(build: MeshBuilder, rng: np.random.Generator, name: str, thick_m: float) -> None:
+def lying_book(build: MeshBuilder, rng: Rng, name: str, thick_m: float) -> None:
     """Book or magazine lying on its back, cover up, centred on the origin."""
     w, h = rng.uniform(0.13, 0.22), rng.uniform(0.19, 0.29)
     cover = build.material(pictures.cover(rng, 256, 256))
@@ -150,14 +149,14 @@ def lying_book(build: MeshBuilder, rng: np.random.Generator, name: str, thick_m:
         build.box((-w / 2, -h / 2, 0), (w / 2, h / 2, thick_m), pages, "z", top=cover)
 
 
-def paper(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
+def paper(build: MeshBuilder, rng: Rng, name: str) -> None:
     """Printed sheet of paper, centred on the origin."""
     sheet = build.material(pictures.page(rng, 256, 192))
     with build.object(name), build.frame((0, 0, 0.0015), yaw=rng.uniform(-0.5, 0.5)):
         build.quad((-0.105, -0.148, 0), (0.21, 0, 0), (0, 0.297, 0), sheet)
 
 
-def pen_pot(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
+def pen_pot(build: MeshBuilder, rng: Rng, name: str) -> None:
     """Pot with pens and brushes."""
     with build.object(name):
         build.lathe(
@@ -182,7 +181,7 @@ def pen_pot(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
                 build.lathe([(0.004, 0), (0.004, 0.15), (0.0, 0.162)], ink, 6)
 
 
-def television(build: MeshBuilder, rng: np.random.Generator, width_m: float) -> None:
+def television(build: MeshBuilder, rng: Rng, width_m: float) -> None:
     """Flat television on a foot; its picture has the label "TV screen"."""
     black = build.plain((24, 24, 26))
     h, half = 0.57 * width_m, width_m / 2
@@ -195,24 +194,7 @@ def television(build: MeshBuilder, rng: np.random.Generator, width_m: float) -> 
         build.quad((-half + 0.015, -0.192, 0.09), (width_m - 0.03, 0, 0), (0, 0, h - 0.04), film)
 
 
-def monitor(build: MeshBuilder, rng: np.random.Generator, width_m: float, name: str) -> None:
-    """Computer monitor on a foot; its picture has the label "<name> screen"."""
-    black = build.plain((30, 30, 33))
-    h, half = 0.58 * width_m, width_m / 2
-    with build.object(name):
-        build.lathe(
-            [(0.11, 0), (0.11, 0.012), (0.11, 0.012), (0.02, 0.016), (0.02, 0.12)],
-            black,
-            18,
-            (0, -0.1, 0),
-        )
-        build.box((-half, -0.13, 0.1), (half, -0.1, 0.1 + h), black)
-    with build.object(f"{name} screen"):
-        desktop = build.material(pictures.screen(rng))
-        build.quad((-half + 0.01, -0.132, 0.11), (width_m - 0.02, 0, 0), (0, 0, h - 0.02), desktop)
-
-
-def keys(rng: np.random.Generator) -> Image:
+def keys(rng: Rng) -> Image:
     """Seen from above: rows of keys with a letter each."""
     image = np.full((128, 320, 3), 38, np.uint8)
     for row in range(5):
@@ -227,15 +209,7 @@ def keys(rng: np.random.Generator) -> Image:
     return image
 
 
-def keyboard(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
-    """Keyboard of 42 x 14 cm."""
-    with build.object(name):
-        side = build.plain((36, 36, 38))
-        top = build.material(keys(rng))
-        build.box((-0.21, -0.14, 0), (0.21, 0, 0.018), side, "z", top=top)
-
-
-def laptop(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
+def laptop(build: MeshBuilder, rng: Rng, name: str) -> None:
     """Open laptop; its picture has the label "<name> screen"."""
     silver = build.plain((150, 152, 156))
     with build.object(name):

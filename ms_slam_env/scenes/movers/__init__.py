@@ -4,23 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
-
 from ms_slam_env.errors import unknown
+from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.movers.box import box
 from ms_slam_env.scenes.movers.car import car
 from ms_slam_env.scenes.movers.person import person
 from ms_slam_env.scenes.movers.shape import Joint, Part, Shape
 
-MOVERS: dict[str, Callable[[np.random.Generator], Shape]] = {
-    "box": box,
-    "person": person,
-    "car": car,
-}
+MOVERS: dict[str, Callable[[Rng], Shape]] = {"box": box, "person": person, "car": car}
 """Kind to what builds one from random numbers."""
 
 
-def make_mover(kind: str, rng: np.random.Generator) -> Shape:
+def make_mover(kind: str, rng: Rng) -> Shape:
     """Build a thing that moves; the same random numbers give the same thing.
 
     Raises:

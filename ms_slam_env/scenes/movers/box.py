@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
+from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import MeshBuilder
 from ms_slam_env.scenes.movers.shape import Joint, Shape, assemble
 from ms_slam_env.scenes.textures import pictures
-from ms_slam_env.scenes.textures.noise import hsv, noise, shade
+from ms_slam_env.scenes.textures.noise import grain, hsv
 
 _SIZE_M = (0.18, 0.36)  # of a side
 _SIDES = "xXyYzZ"
 
 
-def box(rng: np.random.Generator, size_m: tuple[float, float, float] | None = None) -> Shape:
+def box(rng: Rng, size_m: tuple[float, float, float] | None = None) -> Shape:
     """Cardboard with prints, labels and tape; its origin is its middle.
 
     Args:
@@ -33,7 +34,7 @@ def box(rng: np.random.Generator, size_m: tuple[float, float, float] | None = No
     return Shape("box", parts, float(np.linalg.norm(half)), 2 * x, 2 * y, z, z)
 
 
-def _side(rng: np.random.Generator, paper: np.ndarray, size: int = 256) -> np.ndarray:
+def _side(rng: Rng, paper: np.ndarray, size: int = 256) -> np.ndarray:
     """One side: a print, one or two labels, tape across the middle."""
     image = np.broadcast_to(paper, (size, size, 3)).astype(np.float32).copy()
     for _ in range(int(rng.integers(1, 4))):
@@ -43,6 +44,4 @@ def _side(rng: np.random.Generator, paper: np.ndarray, size: int = 256) -> np.nd
         image[y : y + h, x : x + w] = draw(rng, h, w)
     tape = size // 2
     image[tape - size // 24 : tape + size // 24] = 0.8 * image[tape - size // 24] + 40.0
-    return shade(
-        image, (0.06, noise(rng, (size, size), 0.6)), (0.05, noise(rng, (size, size), 1.3))
-    )
+    return grain(rng, image, (size, size), (0.06, 0.6), (0.05, 1.3))

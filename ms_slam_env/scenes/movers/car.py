@@ -6,15 +6,16 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import Material, MeshBuilder
 from ms_slam_env.scenes.movers.shape import Joint, Piece, Shape, assemble
-from ms_slam_env.scenes.textures.noise import hsv, noise, shade
+from ms_slam_env.scenes.textures.noise import grain, hsv
 
 _LENGTH_M = (3.9, 4.6)
 _WHEEL_M = 0.31  # radius
 
 
-def car(rng: np.random.Generator, length_m: float | None = None) -> Shape:
+def car(rng: Rng, length_m: float | None = None) -> Shape:
     """Painted body, windows, lights, plates and rolling wheels; the origin is on the ground.
 
     Args:
@@ -24,7 +25,7 @@ def car(rng: np.random.Generator, length_m: float | None = None) -> Shape:
     length = float(length_m if length_m is not None else rng.uniform(*_LENGTH_M))
     width, height = rng.uniform(1.68, 1.82), rng.uniform(1.42, 1.55)
     half, axle = 0.5 * length, 0.295 * length
-    paint = shade(_paint(rng), (0.02, noise(rng, (128, 128), 1.2)))
+    paint = grain(rng, _paint(rng), (128, 128), (0.02, 1.2))
     pieces: list[Piece] = [(_body(rng, half, 0.5 * width, height, paint, axle), Joint())]
     for x in (axle, -axle):
         for side in (-1, 1):
@@ -35,7 +36,7 @@ def car(rng: np.random.Generator, length_m: float | None = None) -> Shape:
     return Shape("car", assemble(pieces, cell_m=0.25), radius, length, width, height)
 
 
-def _paint(rng: np.random.Generator) -> np.ndarray:
+def _paint(rng: Rng) -> np.ndarray:
     if rng.random() < 0.4:
         return np.full(3, rng.choice([60.0, 130.0, 185.0, 225.0]))
     return hsv(
@@ -46,12 +47,7 @@ def _paint(rng: np.random.Generator) -> np.ndarray:
 
 
 def _body(
-    rng: np.random.Generator,
-    half: float,
-    side: float,
-    height: float,
-    colours: np.ndarray,
-    axle: float,
+    rng: Rng, half: float, side: float, height: float, colours: np.ndarray, axle: float
 ) -> Callable[[MeshBuilder], None]:
     """Hull, cabin and trim."""
     belt = rng.uniform(0.84, 0.92)
@@ -157,10 +153,10 @@ def _cabin(
             build.patch(np.array(pane) + out, glass)
 
 
-def _glass(rng: np.random.Generator, size: int = 64) -> np.ndarray:
+def _glass(rng: Rng, size: int = 64) -> np.ndarray:
     """A dark pane: paler above, where it mirrors the sky."""
     ramp = np.linspace(95, 25, size)[:, None, None] * np.array([0.85, 0.95, 1.0])
-    return shade(np.broadcast_to(ramp, (size, size, 3)), (0.1, noise(rng, (size, size), 1.5)))
+    return grain(rng, np.broadcast_to(ramp, (size, size, 3)), (size, size), (0.1, 1.5))
 
 
 def _wheel(hub: tuple[float, float, float], side: int) -> Callable[[MeshBuilder], None]:

@@ -7,17 +7,18 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import MeshBuilder
 from ms_slam_env.scenes.movers.shape import Joint, Piece, Shape, assemble
 from ms_slam_env.scenes.textures import fabric
-from ms_slam_env.scenes.textures.noise import hsv, noise, shade
+from ms_slam_env.scenes.textures.noise import grain, hsv
 
 _STATURE_M = (1.6, 1.85)
 _LEG_SWING_RAD = 0.42
 _ARM_SWING_RAD = 0.38
 
 
-def person(rng: np.random.Generator, stature_m: float | None = None) -> Shape:
+def person(rng: Rng, stature_m: float | None = None) -> Shape:
     """Body, head, swinging arms and legs; the origin is between the feet.
 
     Proportions: Drillis and Contini, "Body Segment Parameters", New York University 1966 (hip at
@@ -44,16 +45,16 @@ def person(rng: np.random.Generator, stature_m: float | None = None) -> Shape:
 class _Trunk:
     """Shirt, pelvis, neck, head, hair and face."""
 
-    def __init__(
-        self, rng: np.random.Generator, h: float, trousers: np.ndarray, skin: np.ndarray
-    ) -> None:
+    def __init__(self, rng: Rng, h: float, trousers: np.ndarray, skin: np.ndarray) -> None:
         self.h = h
         self.shirt = _cloth(rng, patterned=True)
         self.trousers = trousers
         self.skin = skin
-        self.hair = shade(
+        self.hair = grain(
+            rng,
             hsv(rng.uniform(0.04, 0.1), rng.uniform(0.3, 0.7), rng.uniform(0.08, 0.55)),
-            (0.25, noise(rng, (64, 64), 0.5)),
+            (64, 64),
+            (0.25, 0.5),
         )
 
     def __call__(self, build: MeshBuilder) -> None:
@@ -121,7 +122,7 @@ def _rings(outline: ArrayLike, sides: int = 16) -> np.ndarray:
     return np.stack([x, y, np.broadcast_to(z[:, None], x.shape)], -1)
 
 
-def _cloth(rng: np.random.Generator, patterned: bool) -> np.ndarray:
+def _cloth(rng: Rng, patterned: bool) -> np.ndarray:
     hue = rng.random()
     if patterned and rng.random() < 0.7:
         colours = [hsv(hue, 0.5, 0.8), hsv(hue + 0.08, 0.7, 0.4), hsv(hue + 0.5, 0.4, 0.6)]
@@ -129,6 +130,6 @@ def _cloth(rng: np.random.Generator, patterned: bool) -> np.ndarray:
     return fabric.weave(rng, hsv(hue, rng.uniform(0.2, 0.7), rng.uniform(0.25, 0.7)))
 
 
-def _skin(rng: np.random.Generator) -> np.ndarray:
+def _skin(rng: Rng) -> np.ndarray:
     colour = hsv(rng.uniform(0.04, 0.08), rng.uniform(0.3, 0.55), rng.uniform(0.45, 0.9))
-    return shade(colour, (0.05, noise(rng, (64, 64), 1.2)))
+    return grain(rng, colour, (64, 64), (0.05, 1.2))

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ms_slam_env.scenes.base import Float32, Float64, TexturedMesh
 from ms_slam_env.scenes.builder import Geometry, MeshBuilder
-from ms_slam_env.scenes.lighting import cosine_directions
+from ms_slam_env.scenes.lighting import hemispheres
 from ms_slam_env.scenes.mesh_queries import RayCaster
 
 _OPENNESS_RAYS = 24
@@ -106,37 +106,20 @@ def assemble(pieces: list[Piece], cell_m: float, ground_z: float | None = 0.0) -
         np.concatenate([g.faces + n for g, n in zip(geometries, counts[:-1], strict=True)]),
     )
     return tuple(
-        Part(_mesh(g, _openness(g, rays, ground_z)), joint)
+        Part(g.lit(_openness(g, rays, ground_z)), joint)
         for g, (_, joint) in zip(geometries, pieces, strict=True)
     )
 
 
 def _openness(g: Geometry, rays: RayCaster, ground_z: float | None) -> Float32:
-    """Share (V,) of the cosine-weighted directions from which light arrives."""
-    helper = np.where(np.abs(g.normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
-    tangent = np.cross(helper, g.normals)
-    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
-    bitangent = np.cross(g.normals, tangent)
+    """Share (F, 3, 3) of the cosine-weighted directions from which light arrives at corners."""
     total = np.zeros(len(g.vertices), np.float32)
-    for x, y, z in cosine_directions(_OPENNESS_RAYS):
-        direction = x * tangent + y * bitangent + z * g.normals
+    for direction in hemispheres(g.normals, _OPENNESS_RAYS):
         distance, _ = rays.first_hit(g.light_points, direction)
         arrives = np.minimum(distance, 1.0)
         if ground_z is not None:  # near the ground less light comes from below
             height = g.light_points[:, 2] - ground_z
             arrives = np.where(direction[:, 2] < 0, arrives * np.clip(height, 0.2, 1.0), arrives)
         total += arrives
-    return (_DARKEST + (1 - _DARKEST) * total / _OPENNESS_RAYS).astype(np.float32)
-
-
-def _mesh(g: Geometry, openness: Float32) -> TexturedMesh:
-    return TexturedMesh(
-        vertices=g.vertices.astype(np.float32),
-        faces=g.faces,
-        uv=g.uv,
-        face_texture=g.face_texture,
-        face_label=g.face_label,
-        irradiance=np.repeat(openness[g.faces][..., None], 3, axis=2).astype(np.float32),
-        textures=g.textures,
-        labels=g.labels,
-    )
+    openness = (_DARKEST + (1 - _DARKEST) * total / _OPENNESS_RAYS).astype(np.float32)
+    return np.repeat(openness[g.faces][..., None], 3, axis=2)

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ms_slam_env.scenes.base import Float64
+from ms_slam_env.scenes.base import Float64, Rng
 from ms_slam_env.scenes.builder import MeshBuilder
-from ms_slam_env.scenes.lighting import Lighting, SkyLight, Sun, auto_exposure, light_mesh
+from ms_slam_env.scenes.lighting import Lighting, SkyLight, Sun, light_and_expose
 from ms_slam_env.scenes.mesh_scene import SKY, LargeScene, SceneMaker
 from ms_slam_env.scenes.outdoors.plan import StreetPlan
 from ms_slam_env.scenes.textures import outdoor
@@ -17,7 +17,7 @@ RADIUS_M = 150.0
 _LOWEST_RAD = np.radians(-12.0)
 
 
-def sky_dome(build: MeshBuilder, rng: np.random.Generator, centre: tuple[float, float]) -> None:
+def sky_dome(build: MeshBuilder, rng: Rng, centre: tuple[float, float]) -> None:
     """Add a dome of ``RADIUS_M`` seen from inside, with clouds, around ``centre`` (x, y)."""
     elevation = np.linspace(_LOWEST_RAD, np.pi / 2, 14)[:, None]
     azimuth = np.linspace(0, 2 * np.pi, 37)[None, :]
@@ -49,7 +49,7 @@ def daylight_scene(
     maker: SceneMaker,
     seed: int,
     build: MeshBuilder,
-    rng: np.random.Generator,
+    rng: Rng,
     plan: StreetPlan,
     places: Mapping[str, Float64],
     ways: tuple[tuple[str, str], ...],
@@ -71,23 +71,19 @@ def daylight_scene(
     sun = (np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height))
     bright = rng.uniform(0.85, 1.15)
     lighting = Lighting(
-        lights=(
-            Sun(sun, tuple(np.array([2.9, 2.7, 2.35]) * bright)),
-            SkyLight((0.62, 0.72, 0.9)),
-        ),
+        lights=(Sun(sun, tuple(np.array([2.9, 2.7, 2.35]) * bright)), SkyLight((0.62, 0.72, 0.9))),
         glow={SKY: (1.25, 1.25, 1.25)},
         clear=frozenset({SKY}),
         ambient=(0.05, 0.05, 0.05),
         bounce_rays=12,
         bounce_gain=1.5,
     )
-    mesh = light_mesh(build.build(), lighting)
     middles = np.array([0.5 * (places[a] + places[b]) for a, b in ways])
     eyes = middles + np.array([0.0, 0.0, 1.6])
     # Between tall houses most is shade; exposed for it alone, what lies in the sun would be white.
-    exposure = min(auto_exposure(mesh, eyes, _KEY, frozenset({SKY})), _MOST_EXPOSED)
+    mesh, exposure = light_and_expose(build, lighting, eyes, _KEY)
 
-    def start(draw: np.random.Generator) -> tuple[Float64, Float64]:
+    def start(draw: Rng) -> tuple[Float64, Float64]:
         a, b = ways[int(draw.integers(len(ways)))]
         if draw.random() < 0.5:
             a, b = b, a
@@ -105,4 +101,5 @@ def daylight_scene(
         target[2] = draw.uniform(0.6, 1.6)
         return eye, target
 
+    exposure = min(exposure, _MOST_EXPOSED)
     return LargeScene(maker, seed, mesh, start, exposure, places, eyes, lanes=plan.lanes())

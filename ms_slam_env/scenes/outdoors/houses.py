@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ms_slam_env.scenes.base import Float64
+from ms_slam_env.scenes.base import Float64, Rng
 from ms_slam_env.scenes.builder import Material, MeshBuilder
+from ms_slam_env.scenes.outdoors.plan import sides_of
 from ms_slam_env.scenes.textures import fabric, interior, outdoor
 from ms_slam_env.scenes.textures.noise import hsv
 from ms_slam_env.scenes.textures.pictures import picture
@@ -31,7 +32,7 @@ class Finishes:
     step: Material
 
 
-def finishes(build: MeshBuilder, rng: np.random.Generator) -> Finishes:
+def finishes(build: MeshBuilder, rng: Rng) -> Finishes:
     """Draw the finishes of a quarter."""
     tones = [
         hsv(rng.choice([0.02, 0.04, 0.6]), rng.uniform(0.1, 0.6), rng.uniform(0.34, 0.6))
@@ -53,7 +54,7 @@ def finishes(build: MeshBuilder, rng: np.random.Generator) -> Finishes:
     )
 
 
-def wall_finish(build: MeshBuilder, rng: np.random.Generator) -> Material:
+def wall_finish(build: MeshBuilder, rng: Rng) -> Material:
     """Render, brick or painted boards."""
     kind = rng.random()
     if kind < 0.4:
@@ -85,7 +86,7 @@ def window(
 
 def house(
     build: MeshBuilder,
-    rng: np.random.Generator,
+    rng: Rng,
     of: Finishes,
     width_m: float,
     depth_m: float,
@@ -112,7 +113,7 @@ def house(
         )
     door_at = width_m * rng.choice([0.25, 0.5, 0.75])
     with build.object(f"{name} windows"):
-        for k, (origin, yaw, length) in enumerate(_sides(width_m, depth_m)):
+        for k, (origin, yaw, length) in enumerate(sides_of(width_m, depth_m)):
             count = max(1, int(length / 2.1))
             for storey in range(storeys):
                 for n in range(count):
@@ -130,19 +131,7 @@ def house(
         build.box((door_at - 0.9, -0.9, 2.55), (door_at + 0.9, 0, 2.68), tiles, "Y")
 
 
-def _sides(
-    width: float, depth: float
-) -> tuple[tuple[tuple[float, float, float], float, float], ...]:
-    """Origin, yaw and length of each wall's frame, seen from outside from left to right."""
-    return (
-        ((0, 0, 0), 0.0, width),
-        ((width, 0, 0), np.pi / 2, depth),
-        ((width, depth, 0), np.pi, width),
-        ((0, depth, 0), -np.pi / 2, depth),
-    )
-
-
-def _pick(rng: np.random.Generator, materials: tuple[Material, ...]) -> Material:
+def _pick(rng: Rng, materials: tuple[Material, ...]) -> Material:
     return materials[int(rng.integers(len(materials)))]
 
 
@@ -185,7 +174,7 @@ class TownFinishes:
     signs: tuple[Material, ...]
 
 
-def town_finishes(build: MeshBuilder, rng: np.random.Generator) -> TownFinishes:
+def town_finishes(build: MeshBuilder, rng: Rng) -> TownFinishes:
     """Draw the finishes of a town."""
     walls = []
     for k in range(8):
@@ -218,7 +207,7 @@ def town_finishes(build: MeshBuilder, rng: np.random.Generator) -> TownFinishes:
 
 def town_house(
     build: MeshBuilder,
-    rng: np.random.Generator,
+    rng: Rng,
     of: TownFinishes,
     width_m: float,
     depth_m: float,
@@ -247,12 +236,7 @@ def town_house(
 
 
 def _shop(
-    build: MeshBuilder,
-    rng: np.random.Generator,
-    of: TownFinishes,
-    width: float,
-    name: str,
-    trim: Material,
+    build: MeshBuilder, rng: Rng, of: TownFinishes, width: float, name: str, trim: Material
 ) -> None:
     """Door, shop windows, perhaps an awning, a sign above."""
     door_at = rng.uniform(1.0, 1.4) if rng.random() < 0.5 else width - rng.uniform(1.0, 1.4)

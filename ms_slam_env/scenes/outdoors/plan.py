@@ -31,6 +31,18 @@ class Plot:
     depth_m: float
 
 
+def sides_of(
+    width: float, depth: float
+) -> tuple[tuple[tuple[float, float, float], float, float], ...]:
+    """Origin, yaw and length of each side of a rectangle, seen from outside from left to right."""
+    return (
+        ((0, 0, 0), 0.0, width),
+        ((width, 0, 0), np.pi / 2, depth),
+        ((width, depth, 0), np.pi, width),
+        ((0, depth, 0), -np.pi / 2, depth),
+    )
+
+
 @dataclass(frozen=True)
 class StreetPlan:
     """Streets along x and y that cross at right angles.
@@ -57,6 +69,14 @@ class StreetPlan:
     def crossing(self, column: int, row: int) -> Float64:
         """Point (3,) where street ``column`` of ``xs`` meets street ``row`` of ``ys``."""
         return np.array([self.xs[column], self.ys[row], 0.0])
+
+    def crossings(self, names: tuple[tuple[str, ...], ...]) -> dict[str, Float64]:
+        """Crossings (3,) by their names, given in rows along x."""
+        return {
+            name: self.crossing(column, row)
+            for row, those in enumerate(names)
+            for column, name in enumerate(those)
+        }
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
@@ -131,14 +151,10 @@ class StreetPlan:
         for plot in self.blocks():
             half_size = np.array([plot.width_m / 2, plot.depth_m / 2, 0.0])
             c = np.array(plot.origin) + half_size
-            for k, (half, length) in enumerate(
-                (
-                    (plot.depth_m / 2, plot.width_m),
-                    (plot.width_m / 2, plot.depth_m),
-                    (plot.depth_m / 2, plot.width_m),
-                    (plot.width_m / 2, plot.depth_m),
-                )
-            ):
+            for k in range(4):
+                half, length = plot.depth_m / 2, plot.width_m
+                if k % 2:
+                    half, length = plot.width_m / 2, plot.depth_m
                 yaw = k * np.pi / 2
                 yield c + half * np.array([np.sin(yaw), -np.cos(yaw), 0.0]), yaw, length
 

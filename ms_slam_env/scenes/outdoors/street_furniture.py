@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ms_slam_env.scenes.base import Float64
+from ms_slam_env.scenes.base import Float64, Rng
 from ms_slam_env.scenes.builder import Material, MeshBuilder
 from ms_slam_env.scenes.textures import interior, outdoor
-from ms_slam_env.scenes.textures.noise import hsv, noise, shade
+from ms_slam_env.scenes.textures.noise import grain, hsv
 
 
 def lamp_post(build: MeshBuilder, height_m: float, name: str) -> None:
@@ -22,14 +22,11 @@ def lamp_post(build: MeshBuilder, height_m: float, name: str) -> None:
         build.box((-0.11, -1.28, height_m - 0.14), (0.11, -0.82, height_m - 0.1), glass, "Z")
 
 
-def car(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
+def car(build: MeshBuilder, rng: Rng, name: str) -> None:
     """Parked car on the origin, 4.1 m long, front at +x."""
     hue, strength = rng.choice([0.0, 0.03, 0.12, 0.38, 0.58, 0.62]), rng.choice([0.04, 0.1, 0.65])
     colour = hsv(hue, strength, rng.uniform(0.3, 0.9))
-    paint = build.material(
-        shade(colour, (0.03, noise(rng, (128, 128), 1.2)), (0.02, noise(rng, (128, 128), 0.3))),
-        (1.5, 1.5),
-    )
+    paint = build.material(grain(rng, colour, (128, 128), (0.03, 1.2), (0.02, 0.3)), (1.5, 1.5))
     glass = build.plain((38, 46, 54))
     dark, light, red = (
         build.plain((24, 24, 26)),
@@ -81,7 +78,7 @@ def _wheel(build: MeshBuilder, centre: ArrayLike, pitch: float, tyre: Material) 
         build.lathe([(0.2, 0.02), (0.0, 0.03)], hub, 14)
 
 
-def sign(build: MeshBuilder, rng: np.random.Generator, text: str, name: str) -> None:
+def sign(build: MeshBuilder, rng: Rng, text: str, name: str) -> None:
     """Street sign on a pole, readable from -y and from +y."""
     metal = build.plain((120, 122, 124))
     colour = hsv(rng.choice([0.0, 0.33, 0.62]), 0.75, rng.uniform(0.35, 0.6))
@@ -93,7 +90,7 @@ def sign(build: MeshBuilder, rng: np.random.Generator, text: str, name: str) -> 
             build.quad((-0.45, 0.02, 2.0), (0.9, 0, 0), (0, 0, 0.45), board)
 
 
-def bin_(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
+def bin_(build: MeshBuilder, rng: Rng, name: str) -> None:
     """Wheeled refuse bin on the origin."""
     colour = hsv(rng.choice([0.1, 0.33, 0.6]), rng.uniform(0.2, 0.7), rng.uniform(0.2, 0.5))
     plastic = build.material(interior.plaster(rng, colour, 3.0, 64), (0.6, 0.6))
@@ -103,7 +100,7 @@ def bin_(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
         build.box((-0.14, -0.305, 0.4), (0.14, -0.3, 0.7), build.plain((225, 222, 214)), "Y")
 
 
-def bench(build: MeshBuilder, rng: np.random.Generator, name: str) -> None:
+def bench(build: MeshBuilder, rng: Rng, name: str) -> None:
     """Slatted bench, seat towards -y."""
     wood = build.material(outdoor.boards(rng, (150, 104, 66), 6), (0.5, 0.5))
     metal = build.plain((48, 50, 52))
@@ -135,12 +132,12 @@ def stripes(
             build.quad(a, (size[0], 0, 0), (0, size[1], 0), paint)
 
 
-def foliage(build: MeshBuilder, rng: np.random.Generator) -> Material:
+def foliage(build: MeshBuilder, rng: Rng) -> Material:
     """Leaves of one kind of plant."""
     return build.material(outdoor.clump(rng, rng.uniform(0.2, 0.31)), (0.9, 0.9))
 
 
-def fence_boards(build: MeshBuilder, rng: np.random.Generator) -> Material:
+def fence_boards(build: MeshBuilder, rng: Rng) -> Material:
     """Painted or grey boards of a fence."""
     tone = hsv(0.08, rng.uniform(0.05, 0.5), rng.uniform(0.5, 0.85))
     return build.material(outdoor.boards(rng, tone), (1.3, 1.0))
@@ -148,7 +145,7 @@ def fence_boards(build: MeshBuilder, rng: np.random.Generator) -> Material:
 
 def lump(
     build: MeshBuilder,
-    rng: np.random.Generator,
+    rng: Rng,
     centre: ArrayLike,
     radii: ArrayLike,
     material: Material,
@@ -176,19 +173,13 @@ def lump(
     tile = material.tile_m or (1.0, 1.0)
     round_ = max(1, round(2 * np.pi * size[:2].mean() / tile[0]))
     uv = np.stack(
-        np.broadcast_arrays(longitude / (2 * np.pi) * round_, -latitude * size[2] / tile[1]),
-        -1,
+        np.broadcast_arrays(longitude / (2 * np.pi) * round_, -latitude * size[2] / tile[1]), -1
     )
     build.patch(grid, material, uv, inset=False)
 
 
 def tree(
-    build: MeshBuilder,
-    rng: np.random.Generator,
-    bark: Material,
-    leaves: Material,
-    height_m: float,
-    name: str,
+    build: MeshBuilder, rng: Rng, bark: Material, leaves: Material, height_m: float, name: str
 ) -> None:
     """Trunk with a crown of lumps, standing on the origin."""
     trunk = 0.42 * height_m
@@ -208,9 +199,7 @@ def tree(
             lump(build, rng, (x, y, z), (radius, radius, high), leaves)
 
 
-def bush(
-    build: MeshBuilder, rng: np.random.Generator, leaves: Material, radius_m: float, name: str
-) -> None:
+def bush(build: MeshBuilder, rng: Rng, leaves: Material, radius_m: float, name: str) -> None:
     """Round bush on the origin."""
     with build.object(name):
         size = (radius_m, radius_m, 0.85 * radius_m)

@@ -7,10 +7,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
+from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.textures.noise import Field, Image, hsv, noise, shade
 
 
-def weave(rng: np.random.Generator, rgb: ArrayLike, threads: int = 64, size: int = 256) -> Image:
+def weave(rng: Rng, rgb: ArrayLike, threads: int = 64, size: int = 256) -> Image:
     """Plain weave of ``threads`` threads in each direction, unevenly dyed and worn."""
     y, x = np.mgrid[:size, :size].astype(np.float32) * (np.pi * threads / size)
     over = np.sin(x) * np.sin(y)
@@ -18,7 +19,7 @@ def weave(rng: np.random.Generator, rgb: ArrayLike, threads: int = 64, size: int
     return shade(rgb, (0.09, over), (0.045, slub), (0.06, noise(rng, (size, size), 1.4)))
 
 
-def pattern(rng: np.random.Generator, colours: NDArray[np.float64], size: int = 256) -> Image:
+def pattern(rng: Rng, colours: NDArray[np.float64], size: int = 256) -> Image:
     """Woven stripes, checks or dots in some ``colours`` (n, 3), for cushions and curtains."""
     kind = rng.integers(3)
     image = np.broadcast_to(colours[0], (size, size, 3)).astype(np.float32).copy()
@@ -43,7 +44,7 @@ def pattern(rng: np.random.Generator, colours: NDArray[np.float64], size: int = 
     return weave_over(rng, image)
 
 
-def weave_over(rng: np.random.Generator, image: NDArray[np.float32]) -> Image:
+def weave_over(rng: Rng, image: NDArray[np.float32]) -> Image:
     """Lay threads and wear over a printed or knotted design (h, w, 3)."""
     h, w = image.shape[:2]
     y, x = np.mgrid[:h, :w].astype(np.float32)
@@ -53,7 +54,7 @@ def weave_over(rng: np.random.Generator, image: NDArray[np.float32]) -> Image:
     )
 
 
-def rug(rng: np.random.Generator, size: int = 512) -> Image:
+def rug(rng: Rng, size: int = 512) -> Image:
     """Oriental or geometric rug: borders, a mirrored field of motifs, a medallion."""
     hue = float(rng.choice([0.0, 0.02, 0.06, 0.1, 0.56, 0.62, 0.45]))
     palette = np.array(
@@ -104,7 +105,7 @@ def rug(rng: np.random.Generator, size: int = 512) -> Image:
     return weave_over(rng, np.concatenate([top, top[::-1]], 0))
 
 
-def _band(rng: np.random.Generator, size: int, cycles: float) -> Field:
+def _band(rng: Rng, size: int, cycles: float) -> Field:
     """Tileable noise around ``cycles`` cycles an image, unit deviation."""
     fy, fx = fft.fftfreq(size)[:, None] * size, fft.rfftfreq(size)[None, :] * size
     spectrum = np.exp(-(((np.hypot(fy, fx) - cycles) / (0.35 * cycles)) ** 2))
@@ -113,7 +114,7 @@ def _band(rng: np.random.Generator, size: int, cycles: float) -> Field:
     return (field / field.std()).astype(np.float32)
 
 
-def carpet_pile(rng: np.random.Generator, rgb: ArrayLike, size: int = 512) -> Image:
+def carpet_pile(rng: Rng, rgb: ArrayLike, size: int = 512) -> Image:
     """Loop pile in rows: tufts of one size and three near tones, the same everywhere."""
     tufts = 64
     y, x = np.mgrid[:size, :size].astype(np.float32) / size

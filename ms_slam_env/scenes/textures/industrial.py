@@ -6,15 +6,14 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ms_slam_env.scenes.textures.noise import Image, hsv, noise, shade
+from ms_slam_env.scenes.base import Rng
+from ms_slam_env.scenes.textures.noise import Image, grain, hsv, noise, shade
 
 
-def concrete(rng: np.random.Generator, rgb: ArrayLike = (150, 149, 145), size: int = 1024) -> Image:
+def concrete(rng: Rng, rgb: ArrayLike = (150, 149, 145), size: int = 1024) -> Image:
     """Power-floated slab: clouds, tyre marks, pits and expansion joints along the edges."""
     shape = (size, size)
-    image = shade(rgb, (0.09, noise(rng, shape, 1.5)), (0.04, noise(rng, shape, 0.3))).astype(
-        np.float32
-    )
+    image = grain(rng, rgb, shape, (0.09, 1.5), (0.04, 0.3)).astype(np.float32)
     for _ in range(7):  # tyre marks
         at, to = rng.uniform(0, size, 2), rng.uniform(0, size, 2)
         mark = np.zeros(shape, np.uint8)
@@ -28,17 +27,17 @@ def concrete(rng: np.random.Generator, rgb: ArrayLike = (150, 149, 145), size: i
     return np.clip(image, 0, 255).astype(np.uint8)
 
 
-def corrugated(rng: np.random.Generator, rgb: ArrayLike, count: int = 10, size: int = 512) -> Image:
+def corrugated(rng: Rng, rgb: ArrayLike, count: int = 10, size: int = 512) -> Image:
     """Painted trapezoidal sheet, ribs along the rows' direction y, streaks of rust."""
     x = np.arange(size) * count / size % 1.0
     rib = 0.86 + 0.22 * np.clip(3.0 * np.sin(2 * np.pi * x), -1, 1)
     rust = np.clip(noise(rng, (size, size), 1.2, 8.0).T - 1.0, 0, 1)[..., None]
     colour = np.asarray(rgb, float) * rib[None, :, None] * np.ones((size, 1, 1))
     colour = (1 - 0.6 * rust) * colour + 0.6 * rust * np.array([122.0, 78, 48])
-    return shade(colour, (0.05, noise(rng, (size, size), 1.3)))
+    return grain(rng, colour, (size, size), (0.05, 1.3))
 
 
-def cardboard(rng: np.random.Generator, size: int = 192) -> Image:
+def cardboard(rng: Rng, size: int = 192) -> Image:
     """Side of a box: tape, a label with a bar code, arrows and letters."""
     tone = hsv(0.085, rng.uniform(0.32, 0.5), rng.uniform(0.55, 0.78))
     image = np.full((size, size, 3), tone, np.float32)
@@ -57,12 +56,10 @@ def cardboard(rng: np.random.Generator, size: int = 192) -> Image:
     place = (int(0.1 * size), int(0.92 * size))
     cv2.putText(mask, letters[::-1], place, cv2.FONT_HERSHEY_DUPLEX, 1.1, 255, 2)
     image[mask > 96] = 35
-    return shade(
-        image, (0.05, noise(rng, (size, size), 0.9)), (0.04, noise(rng, (size, size), 1.5))
-    )
+    return grain(rng, image, (size, size), (0.05, 0.9), (0.04, 1.5))
 
 
-def crate(rng: np.random.Generator, size: int = 256) -> Image:
+def crate(rng: Rng, size: int = 256) -> Image:
     """Wooden crate: planks in a frame with a brace, nails and a stencil."""
     tone = hsv(0.09, rng.uniform(0.4, 0.55), rng.uniform(0.5, 0.72))
     rows = 5
@@ -90,7 +87,7 @@ def hazard(size: int = 128) -> Image:
     return np.where(stripe[..., None], (226, 184, 34), (38, 36, 34)).astype(np.uint8)
 
 
-def control_panel(rng: np.random.Generator, rgb: ArrayLike, size: int = 256) -> Image:
+def control_panel(rng: Rng, rgb: ArrayLike, size: int = 256) -> Image:
     """Front of a machine: grilles, lamps, buttons, gauges, a display and a plate."""
     image = np.full((size, size, 3), np.asarray(rgb, float), np.float32)
     cv2.rectangle(image, (8, 8), (size - 8, size - 8), (np.asarray(rgb) * 0.7).tolist(), 3)
@@ -109,6 +106,4 @@ def control_panel(rng: np.random.Generator, rgb: ArrayLike, size: int = 256) -> 
     for k in range(9):  # grille
         y = int((0.74 + 0.022 * k) * size)
         cv2.line(image, (size // 8, y), (int(0.86 * size), y), (40, 40, 42), 2)
-    return shade(
-        image, (0.04, noise(rng, (size, size), 0.8)), (0.05, noise(rng, (size, size), 1.4))
-    )
+    return grain(rng, image, (size, size), (0.04, 0.8), (0.05, 1.4))

@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ms_slam_env.scenes.textures.noise import Field, Image, noise, shade
+from ms_slam_env.scenes.base import Rng
+from ms_slam_env.scenes.textures.noise import Field, Image, grain, noise, shade
 
 TONES = np.array(
     [[176, 128, 82], [140, 94, 58], [205, 168, 122], [104, 68, 44], [190, 148, 96], [158, 118, 84]]
@@ -14,7 +15,7 @@ TONES = np.array(
 """SRGB colours of oak, walnut, birch, mahogany, pine and teak."""
 
 
-def _grain(rng: np.random.Generator, shape: tuple[int, int]) -> Field:
+def _grain(rng: Rng, shape: tuple[int, int]) -> Field:
     """Fibres and growth rings along x, unit deviation or so."""
     h = shape[0]
     warp = noise(rng, shape, 1.8, 6.0)
@@ -24,14 +25,14 @@ def _grain(rng: np.random.Generator, shape: tuple[int, int]) -> Field:
     return (0.45 * rings + 0.8 * fibres + 0.5 * warp).astype(np.float32)
 
 
-def board(rng: np.random.Generator, tone: ArrayLike | None = None, size: int = 512) -> Image:
+def board(rng: Rng, tone: ArrayLike | None = None, size: int = 512) -> Image:
     """Return a tileable board (size, size, 3), grain along x."""
     colour = TONES[rng.integers(len(TONES))] if tone is None else tone
     grain = _grain(rng, (size, size))
     return shade(colour, (0.085, grain), (0.03, noise(rng, (size, size), 0.4)))
 
 
-def planks(rng: np.random.Generator, tone: ArrayLike, rows: int = 8, size: int = 1024) -> Image:
+def planks(rng: Rng, tone: ArrayLike, rows: int = 8, size: int = 1024) -> Image:
     """Tileable floor of planks along x, each with its own grain and tone."""
     grain = _grain(rng, (size, size))
     row = np.arange(size) * rows // size
@@ -54,18 +55,14 @@ def planks(rng: np.random.Generator, tone: ArrayLike, rows: int = 8, size: int =
     return shade(colour, (0.075, own_grain), (0.04, noise(rng, (size, size), 1.2)))
 
 
-def plaster(
-    rng: np.random.Generator, rgb: ArrayLike, contrast: float = 1.0, size: int = 512
-) -> Image:
+def plaster(rng: Rng, rgb: ArrayLike, contrast: float = 1.0, size: int = 512) -> Image:
     """Painted plaster: faint clouds and roller stipple; ``contrast`` 0 is a perfect wall."""
     shape = (size, size)
     clouds, stipple = noise(rng, shape, 1.6), noise(rng, shape, 0.5)
     return shade(rgb, (0.022 * contrast, clouds), (0.014 * contrast, stipple))
 
 
-def wallpaper(
-    rng: np.random.Generator, rgb: ArrayLike, accent: ArrayLike, size: int = 512
-) -> Image:
+def wallpaper(rng: Rng, rgb: ArrayLike, accent: ArrayLike, size: int = 512) -> Image:
     """Stripes or a repeated ornament of colour ``accent`` on ``rgb``."""
     mask = np.zeros((size, size), np.uint8)
     if rng.random() < 0.5:
@@ -95,11 +92,11 @@ def wallpaper(
     alpha = (0.65 * mask.astype(np.float32) / 255)[..., None]
     colour = (1 - alpha) * np.asarray(rgb, np.float32) + alpha * np.asarray(accent, np.float32)
     shape = (size, size)
-    return shade(colour, (0.02, noise(rng, shape, 1.4)), (0.015, noise(rng, shape, 0.4)))
+    return grain(rng, colour, shape, (0.02, 1.4), (0.015, 0.4))
 
 
 def _courses(
-    rng: np.random.Generator, rows: int, columns: int, joint: float, bond: float, size: int
+    rng: Rng, rows: int, columns: int, joint: float, bond: float, size: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Block index (size, size) and joint mask of a wall of ``rows`` x ``columns`` blocks."""
     y, x = np.mgrid[:size, :size] / size
@@ -113,17 +110,17 @@ def _courses(
     return row * columns + shifted.astype(int), is_joint
 
 
-def brick(rng: np.random.Generator, rgb: ArrayLike, size: int = 512) -> Image:
+def brick(rng: Rng, rgb: ArrayLike, size: int = 512) -> Image:
     """Running bond, 8 courses of 3 bricks, pale mortar."""
     block, joint = _courses(rng, 8, 3, 0.07, 0.5, size)
     tone = (1.0 + 0.14 * rng.standard_normal(24).clip(-2, 2))[block % 24]
     colour = np.asarray(rgb, np.float32) * tone[..., None]
     colour = np.where(joint[..., None], np.array([178, 170, 158], np.float32), colour)
     shape = (size, size)
-    return shade(colour, (0.07, noise(rng, shape, 0.8)), (0.05, noise(rng, shape, 1.5)))
+    return grain(rng, colour, shape, (0.07, 0.8), (0.05, 1.5))
 
 
-def tiles(rng: np.random.Generator, rgb: ArrayLike, count: int = 4, size: int = 512) -> Image:
+def tiles(rng: Rng, rgb: ArrayLike, count: int = 4, size: int = 512) -> Image:
     """Square tiles of slightly different tone with grey grout and faint marbling."""
     block, joint = _courses(rng, count, count, 0.016, 0.0, size)
     tone = (1.0 + 0.045 * rng.standard_normal(count * count))[block % (count * count)]

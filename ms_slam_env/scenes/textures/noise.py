@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
+from ms_slam_env.scenes.base import Rng
+
 Field = NDArray[np.float32]
 Image = NDArray[np.uint8]
 
@@ -36,12 +38,7 @@ def _base_field(height: int, width: int, exponent: float, stretch: float, index:
     return field
 
 
-def noise(
-    rng: np.random.Generator,
-    shape: tuple[int, int],
-    exponent: float = 1.0,
-    stretch: float = 1.0,
-) -> Field:
+def noise(rng: Rng, shape: tuple[int, int], exponent: float = 1.0, stretch: float = 1.0) -> Field:
     """Tileable noise (h, w) of unit deviation with amplitude spectrum 1 / f^exponent.
 
     ``stretch`` > 1 makes features that many times longer along the columns' direction x.
@@ -59,6 +56,13 @@ def shade(rgb: ArrayLike, *variations: tuple[float, Field]) -> Image:
         factor = factor + np.float32(amount) * field
     image = np.asarray(rgb, dtype=np.float32) * np.asarray(factor)[..., None]
     return np.clip(image, 0, 255).astype(np.uint8)
+
+
+def grain(
+    rng: Rng, rgb: ArrayLike, shape: tuple[int, int], *variations: tuple[float, ...]
+) -> Image:
+    """:func:`shade` by fields (h, w) of noise: the amount, exponent and stretch of each."""
+    return shade(rgb, *((amount, noise(rng, shape, *how)) for amount, *how in variations))
 
 
 def hsv(hue: float, saturation: float, value: float) -> NDArray[np.float64]:

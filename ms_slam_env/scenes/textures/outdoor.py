@@ -6,10 +6,11 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ms_slam_env.scenes.textures.noise import Image, hsv, noise, shade
+from ms_slam_env.scenes.base import Rng
+from ms_slam_env.scenes.textures.noise import Image, grain, hsv, noise, shade
 
 
-def asphalt(rng: np.random.Generator, size: int = 1024) -> Image:
+def asphalt(rng: Rng, size: int = 1024) -> Image:
     """Grey tar with chippings, stains, cracks, mended patches and a few covers."""
     shape = (size, size)
     colour = np.full((*shape, 3), (112.0, 110, 110), np.float32)
@@ -30,7 +31,7 @@ def asphalt(rng: np.random.Generator, size: int = 1024) -> Image:
     )
 
 
-def paving(rng: np.random.Generator, count: int = 4, size: int = 512) -> Image:
+def paving(rng: Rng, count: int = 4, size: int = 512) -> Image:
     """Concrete slabs, ``count`` to a side, each of its own tone, with dark joints."""
     y, x = np.mgrid[:size, :size] * count / size
     row = y.astype(int)
@@ -41,10 +42,10 @@ def paving(rng: np.random.Generator, count: int = 4, size: int = 512) -> Image:
     colour = np.array([172.0, 166, 156]) * tone[row, shifted.astype(int)][..., None]
     colour = np.where(joint[..., None], np.array([92.0, 88, 82]), colour)
     shape = (size, size)
-    return shade(colour, (0.05, noise(rng, shape, 0.4)), (0.06, noise(rng, shape, 1.4)))
+    return grain(rng, colour, shape, (0.05, 0.4), (0.06, 1.4))
 
 
-def grass(rng: np.random.Generator, size: int = 512) -> Image:
+def grass(rng: Rng, size: int = 512) -> Image:
     """Lawn with bare patches and clover."""
     shape = (size, size)
     blades, patches = noise(rng, shape, 0.5, 0.5), noise(rng, shape, 1.3)
@@ -53,7 +54,7 @@ def grass(rng: np.random.Generator, size: int = 512) -> Image:
     return shade(colour, (0.26, blades), (0.10, noise(rng, shape, 1.0)))
 
 
-def clump(rng: np.random.Generator, hue: float = 0.27, size: int = 256) -> Image:
+def clump(rng: Rng, hue: float = 0.27, size: int = 256) -> Image:
     """Leaves over one another, light ones above dark ones; tiles."""
     image = np.full((size, size, 3), hsv(hue, 0.6, 0.16), np.float32)
     count = 900
@@ -68,16 +69,16 @@ def clump(rng: np.random.Generator, hue: float = 0.27, size: int = 256) -> Image
                 at = (int(x + dx), int(y + dy))
                 if -12 < at[0] < size + 12 and -12 < at[1] < size + 12:
                     cv2.ellipse(image, at, axes, angle, 0, 360, colour.tolist(), -1)
-    return shade(image, (0.06, noise(rng, (size, size), 0.8)))
+    return grain(rng, image, (size, size), (0.06, 0.8))
 
 
-def bark(rng: np.random.Generator, size: int = 256) -> Image:
+def bark(rng: Rng, size: int = 256) -> Image:
     """Grey-brown bark with furrows along the rows' direction y."""
     furrows = noise(rng, (size, size), 0.9, 6.0).T
     return shade((104, 84, 66), (0.28, furrows), (0.08, noise(rng, (size, size), 0.5)))
 
 
-def roof_tiles(rng: np.random.Generator, rgb: ArrayLike, size: int = 512) -> Image:
+def roof_tiles(rng: Rng, rgb: ArrayLike, size: int = 512) -> Image:
     """Overlapping courses of clay tiles, 12 to a side."""
     count = 12
     y, x = np.mgrid[:size, :size] * count / size
@@ -89,20 +90,20 @@ def roof_tiles(rng: np.random.Generator, rgb: ArrayLike, size: int = 512) -> Ima
         1.0 - 0.5 * np.exp(-((1.0 - fy) / 0.12)) - 0.35 * np.exp(-np.minimum(fx, 1 - fx) / 0.06)
     )
     colour = np.asarray(rgb, float) * (tone[row, shifted.astype(int)] * shadow)[..., None]
-    return shade(colour, (0.06, noise(rng, (size, size), 0.8)))
+    return grain(rng, colour, (size, size), (0.06, 0.8))
 
 
-def siding(rng: np.random.Generator, rgb: ArrayLike, rows: int = 8, size: int = 512) -> Image:
+def siding(rng: Rng, rgb: ArrayLike, rows: int = 8, size: int = 512) -> Image:
     """Painted boards lying over one another, with knots and worn paint."""
     y = np.arange(size) * rows / size
     shadow = 1.0 - 0.4 * np.exp(-(1.0 - y % 1.0) / 0.05)
     tone = (1.0 + 0.04 * rng.standard_normal(rows))[y.astype(int)]
     shape = (size, size)
     colour = np.asarray(rgb, float) * (shadow * tone)[:, None, None] * np.ones((1, size, 1))
-    return shade(colour, (0.05, noise(rng, shape, 0.8, 12.0)), (0.05, noise(rng, shape, 1.4)))
+    return grain(rng, colour, shape, (0.05, 0.8, 12.0), (0.05, 1.4))
 
 
-def pane(rng: np.random.Generator, frame_rgb: ArrayLike, bars: int = 1, size: int = 128) -> Image:
+def pane(rng: Rng, frame_rgb: ArrayLike, bars: int = 1, size: int = 128) -> Image:
     """A window seen from the street: frame, bars, curtains, and the sky mirrored in the glass."""
     h = w = size
     top, low = hsv(0.58, 0.3, rng.uniform(0.55, 0.85)), hsv(0.6, 0.3, rng.uniform(0.14, 0.3))
@@ -128,7 +129,7 @@ def pane(rng: np.random.Generator, frame_rgb: ArrayLike, bars: int = 1, size: in
     return np.clip(image, 0, 255).astype(np.uint8)
 
 
-def panelled_door(rng: np.random.Generator, rgb: ArrayLike, size: int = 128) -> Image:
+def panelled_door(rng: Rng, rgb: ArrayLike, size: int = 128) -> Image:
     """Front door with panels, a light on top and a handle."""
     image = np.full((2 * size, size, 3), np.asarray(rgb, float), np.float32)
     for top, low in ((0.08, 0.24), (0.3, 0.58), (0.64, 0.93)):
@@ -139,10 +140,10 @@ def panelled_door(rng: np.random.Generator, rgb: ArrayLike, size: int = 128) -> 
             image[a:b, c:d] = np.asarray(rgb, float) * 1.25
             image[a + 3 : b, c + 3 : d] = colour
     cv2.circle(image, (int(0.88 * size), int(1.1 * size)), 5, (205, 190, 130), -1)
-    return shade(image, (0.05, noise(rng, (2 * size, size), 0.9)))
+    return grain(rng, image, (2 * size, size), (0.05, 0.9))
 
 
-def sky(rng: np.random.Generator, h: int = 512, w: int = 1024) -> Image:
+def sky(rng: Rng, h: int = 512, w: int = 1024) -> Image:
     """Sky (rows: zenith to horizon, columns all around) with fair-weather clouds."""
     up = np.linspace(1.0, 0.0, h)[:, None, None]
     zenith, horizon = np.array([92.0, 142, 208]), np.array([206.0, 222, 236])
@@ -154,7 +155,7 @@ def sky(rng: np.random.Generator, h: int = 512, w: int = 1024) -> Image:
     return np.clip(image, 0, 255).astype(np.uint8)
 
 
-def boards(rng: np.random.Generator, rgb: ArrayLike, count: int = 12, size: int = 256) -> Image:
+def boards(rng: Rng, rgb: ArrayLike, count: int = 12, size: int = 256) -> Image:
     """Upright fence boards with dark gaps."""
     x = np.arange(size) * count / size
     gap = (x % 1.0) < 0.09
@@ -164,7 +165,7 @@ def boards(rng: np.random.Generator, rgb: ArrayLike, count: int = 12, size: int 
     return shade(np.asarray(rgb, float) * row, (0.12, grain), (0.05, noise(rng, (size, size), 1.3)))
 
 
-def road_sign(rng: np.random.Generator, text: str, rgb: ArrayLike, size: int = 128) -> Image:
+def road_sign(rng: Rng, text: str, rgb: ArrayLike, size: int = 128) -> Image:
     """A white-rimmed sign with some letters."""
     image = np.full((size // 2, size, 3), 240, np.float32)
     image[4:-4, 4:-4] = np.asarray(rgb, float)
@@ -181,21 +182,21 @@ def road_sign(rng: np.random.Generator, text: str, rgb: ArrayLike, size: int = 1
         cv2.LINE_AA,
     )
     image[mask > 96] = 245
-    return shade(image, (0.03, noise(rng, image.shape[:2], 0.9)))
+    return grain(rng, image, image.shape[:2], (0.03, 0.9))
 
 
-def leaf(rng: np.random.Generator, size: int = 128) -> Image:
+def leaf(rng: Rng, size: int = 128) -> Image:
     """A leaf's surface, midrib along the rows in the middle column, side veins off it."""
     colour = hsv(rng.uniform(0.24, 0.36), rng.uniform(0.5, 0.75), rng.uniform(0.35, 0.55))
     y, x = np.mgrid[:size, :size].astype(np.float32) / size
     off = np.abs(x - 0.5)
     rib = np.exp(-((off / 0.02) ** 2))
     veins = np.exp(-(((((y + 0.8 * off) * 9.0) % 1.0 - 0.5) / 0.09) ** 2)) * (off < 0.46)
-    image = shade(colour, (0.10, noise(rng, (size, size), 1.2)))
+    image = grain(rng, colour, (size, size), (0.10, 1.2))
     light = (0.5 * rib + 0.22 * veins)[..., None]
     return np.clip(image + light * (np.array([205, 220, 150]) - image), 0, 255).astype(np.uint8)
 
 
-def soil(rng: np.random.Generator, size: int = 128) -> Image:
+def soil(rng: Rng, size: int = 128) -> Image:
     """Dark crumbly earth."""
-    return shade((72, 52, 38), (0.3, noise(rng, (size, size), 0.5)))
+    return grain(rng, (72, 52, 38), (size, size), (0.3, 0.5))

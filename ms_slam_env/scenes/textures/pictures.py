@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.scenes.textures.noise import Image, hsv, noise, shade
+from ms_slam_env.scenes.base import Rng
+from ms_slam_env.scenes.textures.noise import Image, grain, hsv, noise
 
 _Canvas = NDArray[np.float32]
 
@@ -18,7 +19,7 @@ def _gradient(h: int, w: int, top: NDArray[np.float64], bottom: NDArray[np.float
     )
 
 
-def _landscape(rng: np.random.Generator, h: int, w: int) -> _Canvas:
+def _landscape(rng: Rng, h: int, w: int) -> _Canvas:
     """Sky, sun, receding ridges, water or fields, trees."""
     sky = rng.uniform(0.52, 0.64) if rng.random() < 0.6 else rng.uniform(0.02, 0.1)
     image = _gradient(h, w, hsv(sky, 0.6, 0.75), hsv(rng.uniform(0.05, 0.13), 0.25, 0.98))
@@ -52,7 +53,7 @@ def _landscape(rng: np.random.Generator, h: int, w: int) -> _Canvas:
     return image
 
 
-def _abstract(rng: np.random.Generator, h: int, w: int) -> _Canvas:
+def _abstract(rng: Rng, h: int, w: int) -> _Canvas:
     """Overlapping discs, bars and triangles of a small palette."""
     hues = rng.random() + np.array([0.0, rng.uniform(0.06, 0.15), rng.uniform(0.4, 0.6), 0.75])
     palette = [hsv(u, rng.uniform(0.3, 0.95), rng.uniform(0.3, 0.95)) for u in hues]
@@ -78,7 +79,7 @@ def _abstract(rng: np.random.Generator, h: int, w: int) -> _Canvas:
     return image.astype(np.float32)
 
 
-def _portrait(rng: np.random.Generator, h: int, w: int) -> _Canvas:
+def _portrait(rng: Rng, h: int, w: int) -> _Canvas:
     """A head and shoulders before a dark ground."""
     ground = hsv(rng.random(), 0.35, rng.uniform(0.25, 0.6))
     image = _gradient(h, w, ground * 1.2, ground * 0.6)
@@ -110,7 +111,7 @@ def _portrait(rng: np.random.Generator, h: int, w: int) -> _Canvas:
     return image
 
 
-def _flowers(rng: np.random.Generator, h: int, w: int) -> _Canvas:
+def _flowers(rng: Rng, h: int, w: int) -> _Canvas:
     """A bunch of flowers in a vase."""
     hue = rng.random()
     image = _gradient(h, w, hsv(hue, 0.15, 0.9), hsv(hue + 0.1, 0.3, 0.65))
@@ -143,10 +144,10 @@ def _flowers(rng: np.random.Generator, h: int, w: int) -> _Canvas:
 _KINDS = (_landscape, _abstract, _portrait, _flowers)
 
 
-def picture(rng: np.random.Generator, h: int = 256, w: int = 256) -> Image:
+def picture(rng: Rng, h: int = 256, w: int = 256) -> Image:
     """Return a picture (h, w, 3) of a random kind, with the texture of paint or print."""
     image = _KINDS[rng.choice(4, p=[0.4, 0.3, 0.12, 0.18])](rng, h, w)
-    return shade(image, (0.035, noise(rng, (h, w), 0.5)), (0.03, noise(rng, (h, w), 1.2)))
+    return grain(rng, image, (h, w), (0.035, 0.5), (0.03, 1.2))
 
 
 _LETTERS = "ABCDEFGHIKLMNOPRSTUVWY"
@@ -156,7 +157,7 @@ SPINE_SLOTS = 16
 """Spines side by side in one image of ``spines``."""
 
 
-def _word(rng: np.random.Generator, low: int = 3, high: int = 10) -> str:
+def _word(rng: Rng, low: int = 3, high: int = 10) -> str:
     return "".join(_LETTERS[k] for k in rng.integers(0, len(_LETTERS), rng.integers(low, high)))
 
 
@@ -174,7 +175,7 @@ def _text(
     image[mask > 96] = colour
 
 
-def book_colour(rng: np.random.Generator) -> NDArray[np.float64]:
+def book_colour(rng: Rng) -> NDArray[np.float64]:
     """Return the colour of a binding: many muted, some bright, some near black or white."""
     kind = rng.random()
     if kind < 0.2:
@@ -185,7 +186,7 @@ def book_colour(rng: np.random.Generator) -> NDArray[np.float64]:
     return hsv(hue + rng.uniform(-0.02, 0.02), rng.uniform(0.3, 0.85), rng.uniform(0.25, 0.8))
 
 
-def spines(rng: np.random.Generator, size: tuple[int, int] = (256, 512)) -> Image:
+def spines(rng: Rng, size: tuple[int, int] = (256, 512)) -> Image:
     """Return ``SPINE_SLOTS`` book spines side by side (h, w, 3): title, bands, publisher's mark."""
     h, w = size
     slot = w // SPINE_SLOTS
@@ -212,10 +213,10 @@ def spines(rng: np.random.Generator, size: tuple[int, int] = (256, 512)) -> Imag
         cv2.circle(spine, (int(0.93 * h), slot // 2), slot // 5, ink.tolist(), -1, cv2.LINE_AA)
         rounded = 1.0 - 0.35 * np.abs(np.linspace(-1, 1, slot, dtype=np.float32)) ** 3
         sheet[:, k * slot : (k + 1) * slot] = np.rot90(spine * rounded[:, None, None], -1)
-    return shade(sheet, (0.04, noise(rng, (h, w), 0.8)))
+    return grain(rng, sheet, (h, w), (0.04, 0.8))
 
 
-def cover(rng: np.random.Generator, h: int = 256, w: int = 256) -> Image:
+def cover(rng: Rng, h: int = 256, w: int = 256) -> Image:
     """Front of a book or magazine: a picture under a title."""
     image = picture(rng, h, w).astype(np.float32)
     band = int(rng.uniform(0.12, 0.25) * h)
@@ -229,7 +230,7 @@ def cover(rng: np.random.Generator, h: int = 256, w: int = 256) -> Image:
     return np.clip(image, 0, 255).astype(np.uint8)
 
 
-def page(rng: np.random.Generator, h: int = 256, w: int = 256) -> Image:
+def page(rng: Rng, h: int = 256, w: int = 256) -> Image:
     """Paper with a heading, lines of text and a figure."""
     image = np.full((h, w, 3), (238, 235, 226), np.float32)
     _text(image, _word(rng, 6, 10), (w // 10, h // 8), h // 14, np.array([30.0, 30, 35]), _FONTS[1])
@@ -251,7 +252,7 @@ def page(rng: np.random.Generator, h: int = 256, w: int = 256) -> Image:
     return np.clip(image, 0, 255).astype(np.uint8)
 
 
-def screen(rng: np.random.Generator, h: int = 256, w: int = 512) -> Image:
+def screen(rng: Rng, h: int = 256, w: int = 512) -> Image:
     """A desktop: wallpaper picture, windows with text and plots."""
     image = picture(rng, h, w)
     for _ in range(int(rng.integers(1, 4))):
@@ -275,7 +276,7 @@ def screen(rng: np.random.Generator, h: int = 256, w: int = 512) -> Image:
     return image
 
 
-def television(rng: np.random.Generator) -> Image:
+def television(rng: Rng) -> Image:
     """A frame of some film: a picture with letter-box bars."""
     image = picture(rng, 256, 512)
     image[:18], image[-18:] = 4, 4
