@@ -64,11 +64,11 @@ class CameraFeed(ABC):
     def get_state(self) -> dict[str, Any]:
         """Everything needed to go on bit-exactly."""
 
-    @abstractmethod
     def set_state(
         self, state: dict[str, Any], scene: Scene, sensor: RGBDSensor, start: Float64
     ) -> None:
         """Go on from a state that ``get_state`` returned in an episode that began at ``start``."""
+        self.begin(scene, sensor, start, state["noise_seed"])
 
 
 class SensorFeed(CameraFeed):
@@ -94,12 +94,6 @@ class SensorFeed(CameraFeed):
     def get_state(self) -> dict[str, Any]:
         """See the base class."""
         return {"noise_seed": self._seed}
-
-    def set_state(
-        self, state: dict[str, Any], scene: Scene, sensor: RGBDSensor, start: Float64
-    ) -> None:
-        """See the base class."""
-        self.begin(scene, sensor, start, state["noise_seed"])
 
 
 class PerturbedFeed(CameraFeed):
@@ -130,21 +124,21 @@ class PerturbedFeed(CameraFeed):
     def begin(
         self, scene: Scene, sensor: RGBDSensor, T_world_camera: Float64, noise_seed: int
     ) -> None:
-        """See the base class."""
-        self._enter(scene, sensor, T_world_camera, noise_seed)
+        """See the base class; camera and moving things may be in the scene already."""
+        self._path = PoseInterpolation([0.0], T_world_camera[None])
+        began = (scene.name, scene.seed, noise_seed, T_world_camera.tobytes())
+        if began != self._began:
+            self._began = ()
+            self._enter(scene, sensor, noise_seed)
+            self._began = began
         self._brightness = []
         for mover in self._movers:
             mover.set_state([])
 
-    def _enter(self, scene: Scene, sensor: RGBDSensor, start: Float64, noise_seed: int) -> None:
-        """Put camera and moving things into the scene, unless they are there already."""
-        self._path = path = PoseInterpolation([0.0], start[None])
-        began = (scene.name, scene.seed, noise_seed, start.tobytes())
-        if began == self._began:
-            return
-        self._began = ()
+    def _enter(self, scene: Scene, sensor: RGBDSensor, noise_seed: int) -> None:
+        """Put camera and moving things into the scene."""
         self._seed = noise_seed
-        given = (scene, path, sensor.intrinsics, noise_seed)
+        given = (scene, self._path, sensor.intrinsics, noise_seed)
         self._movers = self._imperfections.movers(*given)
         light = self._imperfections.changing_light(*given)
         self._camera = PerturbedCamera(
@@ -157,7 +151,6 @@ class PerturbedFeed(CameraFeed):
             sensor,
             sensor.caster,
         )
-        self._began = began
 
     def set_trajectory(self, times_s: Float64, poses: Float64) -> None:
         """See the base class; what would come too near to the camera waits.
@@ -237,7 +230,7 @@ class PerturbedFeed(CameraFeed):
         self, state: dict[str, Any], scene: Scene, sensor: RGBDSensor, start: Float64
     ) -> None:
         """See the base class."""
-        self._enter(scene, sensor, start, state["noise_seed"])
+        super().set_state(state, scene, sensor, start)
         self._brightness = list(state["brightness"])
         for mover, waits in zip(self._movers, state["waits"], strict=True):
             mover.set_state(waits)

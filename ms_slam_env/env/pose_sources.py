@@ -36,9 +36,9 @@ class FrameObservation:
 class PoseSource(ABC):
     """Says where a frame was taken and has it fused into the map."""
 
-    @abstractmethod
     def locate(self, slam: SlamBackend, seen: FrameObservation) -> TrackResult:
-        """Estimate the pose of a frame that is not the first."""
+        """Fuse a frame that is not the first at the pose of :meth:`predict`."""
+        return slam.fuse(seen.frame, self.predict(seen))
 
     @abstractmethod
     def predict(self, seen: FrameObservation) -> Float64:
@@ -79,10 +79,6 @@ class GuessedSlamPose(PoseSource):
 class KinematicPose(PoseSource):
     """Forward kinematics alone, with their noise and bias; SLAM only maps."""
 
-    def locate(self, slam: SlamBackend, seen: FrameObservation) -> TrackResult:
-        """Fuse at the kinematic pose."""
-        return slam.fuse(seen.frame, self.predict(seen))
-
     def predict(self, seen: FrameObservation) -> Float64:
         """The kinematic pose."""
         return seen.T_world_camera_kinematic
@@ -90,10 +86,6 @@ class KinematicPose(PoseSource):
 
 class TruePose(PoseSource):
     """The true pose: what a perfect tracker would leave to mapping."""
-
-    def locate(self, slam: SlamBackend, seen: FrameObservation) -> TrackResult:
-        """Fuse at the true pose."""
-        return slam.fuse(seen.frame, self.predict(seen))
 
     def predict(self, seen: FrameObservation) -> Float64:
         """The true pose."""
