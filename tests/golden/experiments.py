@@ -173,7 +173,7 @@ def _is_close(value: Any, truth: Any, relative: float, absolute: float) -> bool:
 
 
 def _episode(planner: str, env_id: str = FREE, steps: int = 3, **fields: Any) -> Any:
-    from ms_slam_env.benchmark.episode import EpisodeSpec, run_episode
+    from ms_slam_env.experiments.harness.episodes import EpisodeSpec, run_episode
 
     return run_episode(EpisodeSpec(planner, "carpet", 1000, env_id, steps, **fields))
 
@@ -293,7 +293,7 @@ def kidnapping(_: Path) -> Any:
 
 @experiment("loop_closure", CHAOTIC)
 def loop_closure(_: Path) -> Any:
-    from ms_slam_env.benchmark.loop_closure_run import LoopSpec, run_loop
+    from ms_slam_env.experiments.loop_closure import LoopSpec, run_loop
 
     recording = ("living_room", 1002, "around", 0.06, 5.0, "kinect", "80x60")
     return run_loop(LoopSpec(*recording, closure="deformation"))
