@@ -9,8 +9,8 @@ from surfel_scenes import SMALL, device_poses, fuse, live_frame
 
 from ms_slam_env.geometry import invert, make_pose, so3_exp, transform_points
 from ms_slam_env.slam.surfel.config import SurfelConfig
-from ms_slam_env.slam.surfel.frustum_culling import BLOCK_SIZE
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
+from ms_slam_env.slam.surfel.surfels import BLOCK_SIZE
 
 CONFIG = SurfelConfig(max_surfels=3000, compaction_interval=2, unstable_window=3)
 MAPS = SurfelMap(2, SMALL, CONFIG)
@@ -64,8 +64,8 @@ def visible(poses: np.ndarray, first_env: int, margin_px: float) -> list[dict[st
 
 def look_everywhere() -> None:
     """Boxes without end: every surfel is looked at."""
-    MAPS._blocks.low.fill_((-1e6, -1e6, -1e6))
-    MAPS._blocks.high.fill_((1e6, 1e6, 1e6))
+    MAPS._buffers.blocks.low.fill_((-1e6, -1e6, -1e6))
+    MAPS._buffers.blocks.high.fill_((1e6, 1e6, 1e6))
 
 
 @settings(max_examples=60, deadline=None)
@@ -79,7 +79,7 @@ def test_the_visible_surfels_are_those_of_the_loop_over_all(seed, margin_px, ext
     MAPS.active.seen_to.fill_(int(window[1]))
     poses = np.stack([random_pose(rng, extent_m) for _ in range(2)])
     fast = visible(poses, 0, margin_px)
-    looked_at = MAPS._blocks.num_listed.numpy() * BLOCK_SIZE
+    looked_at = MAPS._buffers.blocks.num_listed.numpy() * BLOCK_SIZE
     look_everywhere()
     slow = visible(poses, 0, margin_px)
     for env in range(2):
@@ -137,7 +137,7 @@ def test_one_env_of_several_is_culled_by_its_own_boxes():
 
 def assert_boxes_hold(surfel_map: SurfelMap) -> None:
     """Every living surfel lies in its block's box; no unstable one is due before its block."""
-    blocks, surfels = surfel_map._blocks, surfel_map.surfels
+    blocks, surfels = surfel_map._buffers.blocks, surfel_map.surfels
     low, high, expiry = blocks.low.numpy(), blocks.high.numpy(), blocks.expiry.numpy()
     counts = surfels.count.numpy()
     np.testing.assert_array_equal(blocks.bounded.numpy(), counts)
@@ -193,7 +193,7 @@ def test_far_blocks_are_not_looked_at():
     set_surfels([{name: np.concatenate([far[name], near[name]]) for name in near}] * 2)
     poses = np.tile(make_pose(np.eye(3), [0, 0, -3]), (2, 1, 1))
     visible(poses, 0, 1.0)
-    assert (MAPS._blocks.num_listed.numpy() <= 500 / BLOCK_SIZE + 2).all()
+    assert (MAPS._buffers.blocks.num_listed.numpy() <= 500 / BLOCK_SIZE + 2).all()
 
 
 def test_unstable_surfels_expire_at_the_interval_and_gaps_close_when_many():
@@ -220,7 +220,7 @@ def test_unstable_surfels_expire_at_the_interval_and_gaps_close_when_many():
             expected &= ~old_and_unstable
             used = -(-int(surfel_map.surfels.count.numpy()[0]) // BLOCK_SIZE)
             # No block is looked at again for what is gone already.
-            assert (surfel_map._blocks.expiry.numpy()[0, :used] >= time - 6).all()
+            assert (surfel_map._buffers.blocks.expiry.numpy()[0, :used] >= time - 6).all()
         state = surfel_map.get_state()
         for name, values in surfels.items():
             found = surfel_map.attribute(name, stable=False)

@@ -13,7 +13,11 @@ from __future__ import annotations
 from typing import Any
 
 from ms_slam_env._warp import wp
+from ms_slam_env.slam.surfel.device import record_launch
 from ms_slam_env.slam.surfel.surfels import (
+    BLOCK_SIZE,
+    CullingBlocks,
+    MapBuffers,
     SeenWindow,
     SplatCamera,
     Surfels,
@@ -23,48 +27,10 @@ from ms_slam_env.slam.surfel.surfels import (
     translation_of,
 )
 
-BLOCK_SIZE = wp.constant(128)
-"""Surfels of a block."""
-
-
-@wp.struct
-class CullingBlocks:
-    """Blocks of B maps: arrays (B, capacity / BLOCK_SIZE, rounded up).
-
-    Attributes:
-        low: lower corner of the bounding box, world frame.
-        high: upper corner.
-        expiry: frame that saw the block's longest unseen unstable surfel; the largest number if all
-            are stable or dead.
-        listed: blocks that a camera may see.
-        num_listed: (B,) how many those are.
-        bounded: (B,) slots whose blocks have a box that holds.
-    """
-
-    low: wp.array2d(dtype=wp.vec3)
-    high: wp.array2d(dtype=wp.vec3)
-    expiry: wp.array2d(dtype=wp.int32)
-    listed: wp.array2d(dtype=wp.int32)
-    num_listed: wp.array(dtype=wp.int32)
-    bounded: wp.array(dtype=wp.int32)
-
-
-def allocate_culling_blocks(batch: int, capacity: int, device: str) -> CullingBlocks:
-    """CullingBlocks of empty maps."""
-    blocks = CullingBlocks()
-    shape = (batch, -(-capacity // BLOCK_SIZE))
-    blocks.low = wp.zeros(shape, dtype=wp.vec3, device=device)
-    blocks.high = wp.zeros(shape, dtype=wp.vec3, device=device)
-    blocks.expiry = wp.zeros(shape, dtype=wp.int32, device=device)
-    blocks.listed = wp.zeros(shape, dtype=wp.int32, device=device)
-    blocks.num_listed = wp.zeros(batch, dtype=wp.int32, device=device)
-    blocks.bounded = wp.zeros(batch, dtype=wp.int32, device=device)
-    return blocks
-
 
 @wp.func
 def num_blocks(count: int):
-    """CullingBlocks that ``count`` slots fill or begin."""
+    """Blocks that ``count`` slots fill or begin."""
     return (count + BLOCK_SIZE - 1) / BLOCK_SIZE
 
 
@@ -376,34 +342,25 @@ class FrustumCuller:
     """
 
     def __init__(
-        self,
-        surfels: Surfels,
-        blocks: CullingBlocks,
-        visible: VisibleList,
-        envs: int,
-        camera: SplatCamera,
-        workers: int,
-        device: str,
-        window: SeenWindow | None = None,
+        self, buffers: MapBuffers, envs: int, camera: SplatCamera, window: SeenWindow | None = None
     ) -> None:
-        self._blocks = blocks
-        self._visible = visible
-        window = window or any_time(surfels.count.shape[0], device)
-        self._arguments: tuple[Any, ...] = (0, wp.zeros(envs, dtype=wp.mat44, device=device), 0.0)
+        self._buffers = buffers
+        window = window or any_time(buffers.batch, buffers.device)
+        none = wp.zeros(envs, dtype=wp.mat44, device=buffers.device)
+        self._arguments: tuple[Any, ...] = (0, none, 0.0)
         first_env, poses, margin_px = self._arguments
-        shared = [surfels, blocks, first_env, poses, camera, margin_px, workers]
+        shared = [buffers.surfels, buffers.blocks, first_env, poses, camera, margin_px]
+        shared.append(buffers.workers)
+        dim, device = (envs, buffers.workers), buffers.device
         self._launches = [
-            wp.launch(kernel, (envs, workers), inputs, device=device, record_cmd=True)
-            for kernel, inputs in (
-                (list_visible_blocks, shared),
-                (cull, [*shared, window, visible]),
-            )
+            record_launch(list_visible_blocks, dim, shared, device),
+            record_launch(cull, dim, [*shared, window, buffers.visible], device),
         ]
 
     def __call__(self, poses: wp.array, first_env: int = 0, margin_px: float = 0.0) -> None:
         """Fill the list for ``poses`` (envs,) T_world_camera of the envs from ``first_env`` on."""
-        self._blocks.num_listed.zero_()
-        self._visible.count.zero_()
+        self._buffers.blocks.num_listed.zero_()
+        self._buffers.visible.count.zero_()
         changing = (first_env, poses, margin_px)
         for index, new, old in zip((2, 3, 5), changing, self._arguments, strict=True):
             if new is not old:

@@ -7,9 +7,9 @@ from typing import Any
 
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.slam.surfel.frustum_culling import CullingBlocks, FrustumCuller
+from ms_slam_env.slam.surfel.device import record_launch
+from ms_slam_env.slam.surfel.frustum_culling import FrustumCuller
 from ms_slam_env.slam.surfel.splatting import (
-    SplatFootprints,
     Sums,
     list_hidden,
     project_footprints,
@@ -17,7 +17,7 @@ from ms_slam_env.slam.surfel.splatting import (
     splat_attributes,
     splat_depth,
 )
-from ms_slam_env.slam.surfel.surfels import SeenWindow, SplatCamera, Surfels, VisibleList
+from ms_slam_env.slam.surfel.surfels import MapBuffers, SeenWindow, SplatCamera, VisibleList
 
 
 @dataclass(frozen=True)
@@ -65,20 +65,15 @@ def splat_camera(intrinsics: Intrinsics, parameters: SplatParameters) -> SplatCa
 
 
 class SplatRenderer:
-    """Renders ``envs`` of the maps in ``surfels``, one pose each, at one image size.
+    """Renders ``envs`` of the maps in ``buffers``, one pose each, at one image size.
 
     The launches are recorded once: a recorded one costs a fifth of packing its arguments anew.
 
     Args:
-        surfels: the maps.
-        blocks: their blocks.
-        visible: working list of the surfels in view, shared by all renderers of a map.
-        discs: working memory for such a list, shared likewise.
+        buffers: the maps, and working memory shared by all renderers of them.
         envs: number of images rendered at once.
         intrinsics: of the images.
         parameters: how discs are drawn.
-        workers: threads per env; 1 on the CPU, where they would run one after the other.
-        device: Warp device.
         window: draw the surfels last seen within it; None: all.
 
     Attributes:
@@ -88,74 +83,37 @@ class SplatRenderer:
 
     def __init__(
         self,
-        surfels: Surfels,
-        blocks: CullingBlocks,
-        visible: VisibleList,
-        discs: SplatFootprints,
+        buffers: MapBuffers,
         envs: int,
         intrinsics: Intrinsics,
         parameters: SplatParameters,
-        workers: int,
-        device: str,
         window: SeenWindow | None = None,
     ) -> None:
         self.envs = envs
         self.intrinsics = intrinsics
-        self.device = device
-        self.workers = workers
+        self.device = buffers.device
         self.camera = splat_camera(intrinsics, parameters)
-        self.view = self._new_view()
-        self.visible = visible
-        self._discs = discs
+        self.view = view = self._new_view()
+        self.visible = buffers.visible
+        self._buffers = buffers
         pixels = envs * intrinsics.width * intrinsics.height
-        self._z_buffer = wp.zeros(pixels, dtype=wp.float32, device=device)
-        self._sums = wp.zeros(pixels, dtype=Sums, device=device)
-        self._culler = FrustumCuller(
-            surfels, blocks, visible, envs, self.camera, workers, device, window
-        )
-        self._splats = {id(visible): self._record_splats(surfels, visible)}
-        self._first_env = {id(visible): 0}
-        self._surfels = surfels
-        self._resolve = wp.launch(
+        self._z_buffer = wp.zeros(pixels, dtype=wp.float32, device=self.device)
+        self._sums = wp.zeros(pixels, dtype=Sums, device=self.device)
+        self._culler = FrustumCuller(buffers, envs, self.camera, window)
+        self._splats: dict[tuple[int, int], list[wp.Launch]] = {}
+        images = [a.flatten() for a in (view.vertices, view.normals, view.intensity, view.color)]
+        self._resolve = record_launch(
             resolve,
-            dim=(envs, intrinsics.height),
-            inputs=[
-                self._sums,
-                self.camera,
-                self.view.vertices.flatten(),
-                self.view.normals.flatten(),
-                self.view.intensity.flatten(),
-                self.view.color.flatten(),
-            ],
-            device=device,
-            record_cmd=True,
+            (envs, intrinsics.height),
+            [self._sums, self.camera, *images],
+            self.device,
         )
 
     def _new_view(self) -> ModelView:
-        shape = (self.envs, *self.intrinsics.shape)
-        return ModelView(
-            vertices=wp.zeros(shape, dtype=wp.vec3, device=self.device),
-            normals=wp.zeros(shape, dtype=wp.vec3, device=self.device),
-            intensity=wp.zeros(shape, dtype=wp.float32, device=self.device),
-            color=wp.zeros(shape, dtype=wp.vec3, device=self.device),
-        )
+        def image(dtype: Any) -> wp.array:
+            return wp.zeros((self.envs, *self.intrinsics.shape), dtype=dtype, device=self.device)
 
-    def _record_splats(
-        self, surfels: Surfels, listed: VisibleList
-    ) -> tuple[wp.Launch, wp.Launch, wp.Launch]:
-        """The three passes over the surfels of a list."""
-        camera, workers, discs, z_buffer = self.camera, self.workers, self._discs, self._z_buffer
-
-        def record(kernel: Any, inputs: list[Any]) -> wp.Launch:
-            dim = (self.envs, workers)
-            return wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, record_cmd=True)
-
-        shared = [surfels, listed, 0, camera, workers, discs]
-        return (
-            record(project_footprints, [listed, camera, workers, discs]),
-            record(splat_depth, [listed, camera, workers, discs, z_buffer]),
-            record(splat_attributes, [*shared, z_buffer, self._sums]),
-        )
+        return ModelView(image(wp.vec3), image(wp.vec3), image(wp.float32), image(wp.vec3))
 
     def cull(self, poses: wp.array, first_env: int = 0, margin_px: float = 1.0) -> None:
         """List the surfels that the cameras at ``poses`` (envs,) T_world_camera can see."""
@@ -164,28 +122,32 @@ class SplatRenderer:
     def splat(self, first_env: int = 0, listed: VisibleList | None = None) -> ModelView:
         """Draw the surfels that ``cull`` listed, or those of another list."""
         listed = self.visible if listed is None else listed
-        if id(listed) not in self._splats:
-            self._splats[id(listed)] = self._record_splats(self._surfels, listed)
-            self._first_env[id(listed)] = 0
         self._z_buffer.zero_()
         self._sums.zero_()
-        self._discs.num_drawn.zero_()
-        project, depth, attributes = self._splats[id(listed)]
-        if first_env != self._first_env[id(listed)]:
-            attributes.set_param_at_index(2, first_env)
-            self._first_env[id(listed)] = first_env
-        project.launch()
-        depth.launch()
-        attributes.launch()
-        self._resolve.launch()
+        self._buffers.footprints.num_drawn.zero_()
+        key = (id(listed), first_env)
+        if key not in self._splats:
+            self._splats[key] = self._record_splats(listed, first_env)
+        for launch in (*self._splats[key], self._resolve):
+            launch.launch()
         return self.view
+
+    def _record_splats(self, listed: VisibleList, first_env: int) -> list[wp.Launch]:
+        """The three passes over the surfels of a list."""
+        surfels, workers = self._buffers.surfels, self._buffers.workers
+        shared = [listed, self.camera, workers, self._buffers.footprints]
+        listed_in = [surfels, listed, first_env, *shared[1:]]
+        passes = (
+            (project_footprints, shared),
+            (splat_depth, [*shared, self._z_buffer]),
+            (splat_attributes, [*listed_in, self._z_buffer, self._sums]),
+        )
+        dim = (self.envs, workers)
+        return [record_launch(kernel, dim, inputs, self.device) for kernel, inputs in passes]
 
     def list_hidden(self, hidden: VisibleList) -> None:
         """List the culled surfels that lie well behind the surface that ``splat`` just drew."""
         hidden.count.zero_()
-        wp.launch(
-            list_hidden,
-            dim=(self.envs, self.workers),
-            inputs=[self.visible, self.camera, self.workers, self._z_buffer, hidden],
-            device=self.device,
-        )
+        workers = self._buffers.workers
+        inputs = [self.visible, self.camera, workers, self._z_buffer, hidden]
+        wp.launch(list_hidden, (self.envs, workers), inputs, device=self.device)

@@ -19,55 +19,12 @@ from ms_slam_env._warp import wp
 from ms_slam_env.slam.surfel.device import fetch, put, raise_to
 from ms_slam_env.slam.surfel.surfels import (
     SplatCamera,
+    SplatFootprints,
     Surfels,
     VisibleList,
     depth_tolerance,
     floor_int,
 )
-
-
-@wp.struct
-class SplatFootprints:
-    """The surfels of a list in the image, arrays (B, capacity), and those that meet a pixel.
-
-    Attributes:
-        u: column of the centre.
-        v: row of the centre.
-        inverse: inverse depth of the centre.
-        slope_u: change of inverse depth per column.
-        slope_v: change of inverse depth per row.
-        rim: squared radius, square metres.
-        left: first column that the disc may cover; ``right``, ``top`` and ``bottom`` likewise.
-        right: last column.
-        top: first row.
-        bottom: last row.
-        drawn: places in the list of the discs that may cover a pixel.
-        num_drawn: (B,) how many those are.
-    """
-
-    u: wp.array2d(dtype=wp.float32)
-    v: wp.array2d(dtype=wp.float32)
-    inverse: wp.array2d(dtype=wp.float32)
-    slope_u: wp.array2d(dtype=wp.float32)
-    slope_v: wp.array2d(dtype=wp.float32)
-    rim: wp.array2d(dtype=wp.float32)
-    left: wp.array2d(dtype=wp.int32)
-    right: wp.array2d(dtype=wp.int32)
-    top: wp.array2d(dtype=wp.int32)
-    bottom: wp.array2d(dtype=wp.int32)
-    drawn: wp.array2d(dtype=wp.int32)
-    num_drawn: wp.array(dtype=wp.int32)
-
-
-def allocate_footprints(batch: int, capacity: int, device: str) -> SplatFootprints:
-    """Working memory for lists of up to ``capacity`` surfels."""
-    discs = SplatFootprints()
-    for name in ("u", "v", "inverse", "slope_u", "slope_v", "rim"):
-        setattr(discs, name, wp.zeros((batch, capacity), dtype=wp.float32, device=device))
-    for name in ("left", "right", "top", "bottom", "drawn"):
-        setattr(discs, name, wp.zeros((batch, capacity), dtype=wp.int32, device=device))
-    discs.num_drawn = wp.zeros(batch, dtype=wp.int32, device=device)
-    return discs
 
 
 @wp.func
@@ -93,7 +50,7 @@ def drawn_radius(radius: float, z: float, camera: SplatCamera):
 
 @wp.kernel
 def project_footprints(
-    visible: VisibleList, camera: SplatCamera, workers: int, discs: SplatFootprints
+    visible: VisibleList, camera: SplatCamera, workers: int, footprints: SplatFootprints
 ) -> None:
     """Footprints of the listed surfels.
 
@@ -112,23 +69,23 @@ def project_footprints(
     while j < end:
         p = fetch(visible.position, k, j)
         inverse = 1.0 / p[2]
-        put(discs.inverse, k, j, inverse)
-        put(discs.u, k, j, fx * p[0] * inverse + cx)
-        put(discs.v, k, j, fy * p[1] * inverse + cy)
+        put(footprints.inverse, k, j, inverse)
+        put(footprints.u, k, j, fx * p[0] * inverse + cx)
+        put(footprints.v, k, j, fy * p[1] * inverse + cy)
         j += 1
     j = int(start)
     while j < end:
         n = fetch(visible.normal, k, j)
         # n . ray = (n . p) / z for rays with z = 1: inverse depth is (n / (n . p)) . ray.
         plane = 1.0 / wp.min(wp.dot(n, fetch(visible.position, k, j)), -1.0e-6)
-        put(discs.slope_u, k, j, n[0] * plane / fx)
-        put(discs.slope_v, k, j, n[1] * plane / fy)
+        put(footprints.slope_u, k, j, n[0] * plane / fx)
+        put(footprints.slope_v, k, j, n[1] * plane / fy)
         j += 1
     j = int(start)
     while j < end:
         z = fetch(visible.position, k, j)[2]
         radius = drawn_radius(fetch(visible.radius, k, j), z, camera)
-        put(discs.rim, k, j, radius * radius)
+        put(footprints.rim, k, j, radius * radius)
         j += 1
     j = int(start)
     while j < end:
@@ -137,8 +94,8 @@ def project_footprints(
         radius = drawn_radius(fetch(visible.radius, k, j), p[2], camera)
         reach = half_extent(p, n, p[0], n[0], radius, fx)
         u = fx * p[0] / p[2] + cx
-        put(discs.left, k, j, wp.max(floor_int(u - reach) + 1, 0))
-        put(discs.right, k, j, wp.min(floor_int(u + reach), camera.width - 1))
+        put(footprints.left, k, j, wp.max(floor_int(u - reach) + 1, 0))
+        put(footprints.right, k, j, wp.min(floor_int(u + reach), camera.width - 1))
         j += 1
     j = int(start)
     while j < end:
@@ -147,8 +104,8 @@ def project_footprints(
         radius = drawn_radius(fetch(visible.radius, k, j), p[2], camera)
         reach = half_extent(p, n, p[1], n[1], radius, fy)
         v = fy * p[1] / p[2] + cy
-        put(discs.top, k, j, wp.max(floor_int(v - reach) + 1, 0))
-        put(discs.bottom, k, j, wp.min(floor_int(v + reach), camera.height - 1))
+        put(footprints.top, k, j, wp.max(floor_int(v - reach) + 1, 0))
+        put(footprints.bottom, k, j, wp.min(floor_int(v + reach), camera.height - 1))
         j += 1
 
 
@@ -172,7 +129,7 @@ def splat_depth(
     visible: VisibleList,
     camera: SplatCamera,
     workers: int,
-    discs: SplatFootprints,
+    footprints: SplatFootprints,
     z_buffer: wp.array(dtype=wp.float32),
 ) -> None:
     """Inverse depth (E * H * W) of the nearest disc at every pixel; list the discs on a pixel."""
@@ -182,17 +139,17 @@ def splat_depth(
     count = visible.count[k]
     j = int(worker)
     while j < count:
-        left = fetch(discs.left, k, j)
-        right = fetch(discs.right, k, j)
-        row = fetch(discs.top, k, j)
-        bottom = fetch(discs.bottom, k, j)
+        left = fetch(footprints.left, k, j)
+        right = fetch(footprints.right, k, j)
+        row = fetch(footprints.top, k, j)
+        bottom = fetch(footprints.bottom, k, j)
         if left <= right and row <= bottom:
-            centre_u = fetch(discs.u, k, j)
-            centre_v = fetch(discs.v, k, j)
-            centre_inverse = fetch(discs.inverse, k, j)
-            slope_u = fetch(discs.slope_u, k, j)
-            slope_v = fetch(discs.slope_v, k, j)
-            rim = fetch(discs.rim, k, j)
+            centre_u = fetch(footprints.u, k, j)
+            centre_v = fetch(footprints.v, k, j)
+            centre_inverse = fetch(footprints.inverse, k, j)
+            slope_u = fetch(footprints.slope_u, k, j)
+            slope_v = fetch(footprints.slope_v, k, j)
+            rim = fetch(footprints.rim, k, j)
             nearly_rim = rim * 1.00001  # ``splat_attributes`` rounds otherwise
             hits = int(0)
             z = 1.0 / centre_inverse
@@ -211,7 +168,7 @@ def splat_depth(
                     u += 1
                 row += 1
             if hits > 0:
-                put(discs.drawn, k, wp.atomic_add(discs.num_drawn, k, 1), j)
+                put(footprints.drawn, k, wp.atomic_add(footprints.num_drawn, k, 1), j)
         j += workers
 
 
@@ -222,7 +179,7 @@ def splat_attributes(
     first_env: int,
     camera: SplatCamera,
     workers: int,
-    discs: SplatFootprints,
+    footprints: SplatFootprints,
     z_buffer: wp.array(dtype=wp.float32),
     sums: wp.array(dtype=Sums),
 ) -> None:
@@ -234,20 +191,20 @@ def splat_attributes(
     b = first_env + k
     width = camera.width
     image = k * camera.height * width
-    count = discs.num_drawn[k]
+    count = footprints.num_drawn[k]
     d = int(worker)
     while d < count:
-        j = fetch(discs.drawn, k, d)
-        left = fetch(discs.left, k, j)
-        right = fetch(discs.right, k, j)
-        row = fetch(discs.top, k, j)
-        bottom = fetch(discs.bottom, k, j)
-        centre_u = fetch(discs.u, k, j)
-        centre_v = fetch(discs.v, k, j)
-        centre_inverse = fetch(discs.inverse, k, j)
-        slope_u = fetch(discs.slope_u, k, j)
-        slope_v = fetch(discs.slope_v, k, j)
-        per_rim = 1.0 / fetch(discs.rim, k, j)
+        j = fetch(footprints.drawn, k, d)
+        left = fetch(footprints.left, k, j)
+        right = fetch(footprints.right, k, j)
+        row = fetch(footprints.top, k, j)
+        bottom = fetch(footprints.bottom, k, j)
+        centre_u = fetch(footprints.u, k, j)
+        centre_v = fetch(footprints.v, k, j)
+        centre_inverse = fetch(footprints.inverse, k, j)
+        slope_u = fetch(footprints.slope_u, k, j)
+        slope_v = fetch(footprints.slope_v, k, j)
+        per_rim = 1.0 / fetch(footprints.rim, k, j)
         n = fetch(visible.normal, k, j)
         i = fetch(visible.index, k, j)
         color = fetch(surfels.color, b, i)

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from ms_slam_env._warp import wp
 from ms_slam_env.slam.surfel.device import fetch, put
-from ms_slam_env.slam.surfel.frustum_culling import BLOCK_SIZE, CullingBlocks, num_blocks
-from ms_slam_env.slam.surfel.surfels import Surfels
+from ms_slam_env.slam.surfel.frustum_culling import num_blocks
+from ms_slam_env.slam.surfel.surfels import BLOCK_SIZE, Compaction, CullingBlocks, Surfels
 
 NEVER = wp.constant(2**31 - 1)
 
 
 @wp.struct
-class SurfelCulling:
+class CullingRule:
     """When surfels go.
 
     Attributes:
@@ -41,11 +41,11 @@ def is_crowded(slots: int, capacity: int):
 def cull_unstable(
     surfels: Surfels,
     blocks: CullingBlocks,
-    removal: SurfelCulling,
+    rule: CullingRule,
     mask: wp.array(dtype=wp.int32),
     time: wp.array(dtype=wp.int32),
     workers: int,
-    expired: wp.array(dtype=wp.int32),
+    compaction: Compaction,
 ) -> None:
     """Let the unstable surfels die that were not seen for long, every ``interval`` frames.
 
@@ -53,11 +53,11 @@ def cull_unstable(
     those that are not in view. Only the blocks are looked at that hold such surfels.
     """
     b, worker = wp.tid()
-    count = wp.min(surfels.count[b], removal.capacity)
-    crowded = is_crowded(count - surfels.dead[b], removal.capacity)
-    if mask[b] == 0 or (time[b] % removal.interval != 0 and not crowded):
+    count = wp.min(surfels.count[b], rule.capacity)
+    crowded = is_crowded(count - surfels.dead[b], rule.capacity)
+    if mask[b] == 0 or (time[b] % rule.interval != 0 and not crowded):
         return
-    oldest = time[b] - wp.where(crowded, 0, removal.window)
+    oldest = time[b] - wp.where(crowded, 0, rule.window)
     block = int(worker)
     while block < num_blocks(count):
         if blocks.expiry[b, block] < oldest:
@@ -67,10 +67,10 @@ def cull_unstable(
             while i < end:
                 confidence = fetch(surfels.confidence, b, i)
                 seen = fetch(surfels.seen, b, i)
-                if confidence > 0.0 and confidence < removal.confidence_threshold:
+                if confidence > 0.0 and confidence < rule.confidence_threshold:
                     if seen < oldest:
                         put(surfels.confidence, b, i, 0.0)
-                        wp.atomic_add(expired, b, 1)
+                        wp.atomic_add(compaction.expired, b, 1)
                     else:
                         expiry = wp.min(expiry, seen)
                 i += 1
@@ -81,13 +81,11 @@ def cull_unstable(
 @wp.kernel
 def list_survivors(
     surfels: Surfels,
-    removal: SurfelCulling,
+    rule: CullingRule,
     mask: wp.array(dtype=wp.int32),
     time: wp.array(dtype=wp.int32),
     workers: int,
-    expired: wp.array(dtype=wp.int32),
-    survivors: wp.array2d(dtype=wp.int32),
-    kept: wp.array(dtype=wp.int32),
+    compaction: Compaction,
 ) -> None:
     """List the slots to keep of every env whose compaction is due; ``kept`` -1: not due.
 
@@ -95,18 +93,18 @@ def list_survivors(
     in a crowded map a sixty-fourth and as many as are free.
     """
     b, worker = wp.tid()
-    count = wp.min(surfels.count[b], removal.capacity)
-    dead = surfels.dead[b] + expired[b]
-    many = 8 * dead > count and time[b] % removal.interval == 0
-    crowded = is_crowded(count, removal.capacity)
-    needed = crowded and 64 * dead > count and dead > removal.capacity - count
+    count = wp.min(surfels.count[b], rule.capacity)
+    dead = surfels.dead[b] + compaction.expired[b]
+    many = 8 * dead > count and time[b] % rule.interval == 0
+    crowded = is_crowded(count, rule.capacity)
+    needed = crowded and 64 * dead > count and dead > rule.capacity - count
     if mask[b] == 0 or not (many or needed):
-        kept[b] = -1
+        compaction.kept[b] = -1
         return
     i = int(worker)
     while i < count:
         if fetch(surfels.confidence, b, i) > 0.0:
-            put(survivors, b, wp.atomic_add(kept, b, 1), i)
+            put(compaction.survivors, b, wp.atomic_add(compaction.kept, b, 1), i)
         i += workers
 
 
@@ -126,16 +124,15 @@ def copy_surfel(source: Surfels, target: Surfels, b: int, i: int, j: int):
 def gather(
     source: Surfels,
     target: Surfels,
-    survivors: wp.array2d(dtype=wp.int32),
-    kept: wp.array(dtype=wp.int32),
+    compaction: Compaction,
     workers: int,
 ) -> None:
     """Copy the survivors that must move to their new slots in ``target``."""
     b, worker = wp.tid()
-    count = kept[b]
+    count = compaction.kept[b]
     j = int(worker)
     while j < count:
-        i = fetch(survivors, b, j)
+        i = fetch(compaction.survivors, b, j)
         if i != j:
             copy_surfel(source, target, b, i, j)
         j += workers
@@ -146,23 +143,21 @@ def put_back(
     source: Surfels,
     target: Surfels,
     blocks: CullingBlocks,
-    survivors: wp.array2d(dtype=wp.int32),
-    expired: wp.array(dtype=wp.int32),
-    kept: wp.array(dtype=wp.int32),
+    compaction: Compaction,
     capacity: int,
     workers: int,
 ) -> None:
     """Copy the gathered survivors back and set the counters."""
     b, worker = wp.tid()
-    count = kept[b]
+    count = compaction.kept[b]
     j = int(worker)
     while j < count:
-        if fetch(survivors, b, j) != j:
+        if fetch(compaction.survivors, b, j) != j:
             copy_surfel(source, target, b, j, j)
         j += workers
     if worker == 0:
         target.count[b] = wp.min(target.count[b], capacity)
-        target.dead[b] = target.dead[b] + expired[b]
+        target.dead[b] = target.dead[b] + compaction.expired[b]
         if count >= 0:
             target.count[b] = count
             target.dead[b] = 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,12 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.slam.base import Views
+from ms_slam_env.slam.base import Float64, Views
 from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.device import record_launch
 from ms_slam_env.slam.surfel.frustum_culling import (
-    CullingBlocks,
     FrustumCuller,
-    allocate_culling_blocks,
     bound_blocks,
     set_bounded,
 )
@@ -33,9 +32,8 @@ from ms_slam_env.slam.surfel.rendering import (
     SplatRenderer,
     splat_camera,
 )
-from ms_slam_env.slam.surfel.splatting import SplatFootprints, allocate_footprints
 from ms_slam_env.slam.surfel.surfel_culling import (
-    SurfelCulling,
+    CullingRule,
     cull_unstable,
     gather,
     list_survivors,
@@ -44,107 +42,100 @@ from ms_slam_env.slam.surfel.surfel_culling import (
 from ms_slam_env.slam.surfel.surfels import (
     ATTRIBUTES,
     COUNTERS,
+    MapBuffers,
     SeenWindow,
-    Surfels,
-    VisibleList,
-    allocate_surfels,
-    allocate_visible,
-    any_time,
+    allocate_map,
 )
 from ms_slam_env.slam.surfel.view_prediction import DeviceViews, ViewPredictor
 
 _CHANGING = ("poses", "mask", "time", "weight", "live_depth", "live_normals", "live_color")
 
 
-@dataclass(frozen=True)
-class MapBuffers:
-    """Device arrays of B maps, shared by all of its kernels.
+class MapKernels:
+    """Recorded launches for frames of one size under one configuration.
 
-    Attributes:
-        batch: number of maps B.
-        capacity: slots of each.
-        workers: threads that share one map.
-        device: of all arrays.
-        surfels: the maps.
-        spare: room for compaction.
-        blocks: of the surfels.
-        visible: working list.
-        discs: working memory of the list.
-        survivors: (B, capacity) working list of compaction.
-        kept: (B,) surfels that a compaction keeps.
-        expired: (B,) surfels that a removal takes.
-        active: what ``fuse`` and ``render_model`` work on.
+    One map may have several: a running SLAM that changes its parameters or the size of its images
+    works on the same surfels with other kernels.
     """
 
-    batch: int
-    capacity: int
-    workers: int
-    device: str
-    surfels: Surfels
-    spare: Surfels
-    blocks: CullingBlocks
-    visible: VisibleList
-    discs: SplatFootprints
-    survivors: wp.array
-    kept: wp.array
-    expired: wp.array
-    active: SeenWindow
-
-
-class MapKernels:
-    """Recorded launches for frames of one size under one configuration."""
-
     def __init__(
-        self, arrays: MapBuffers, intrinsics: Intrinsics, config: SurfelConfig, model_stride: int
+        self, buffers: MapBuffers, intrinsics: Intrinsics, config: SurfelConfig, model_stride: int
     ) -> None:
         """Prepare for frames of ``intrinsics``; see ``SurfelMap``."""
         self.config = config
-        self._arrays = arrays
-        self._intrinsics = intrinsics
-        self._covered = wp.zeros(
-            arrays.batch * intrinsics.width * intrinsics.height,
-            dtype=wp.int32,
-            device=arrays.device,
-        )
-        self._fusion = FusionParameters()
-        self._fusion.distance_m = config.fusion_distance_m
-        self._fusion.min_cosine = math.cos(math.radians(config.fusion_angle_deg))
-        self._fusion.coverage_px = config.coverage_px
-        self._fusion.radius_px = config.surfel_radius_px
-        self._fusion.max_confidence = config.max_confidence
         self.splat_parameters = SplatParameters(tolerance_m=config.fusion_distance_m)
+        self._buffers = buffers
+        self._intrinsics = intrinsics
         self._camera = splat_camera(intrinsics, self.splat_parameters)
-        self._cull = FrustumCuller(
-            arrays.surfels,
-            arrays.blocks,
-            arrays.visible,
-            arrays.batch,
-            self._camera,
-            arrays.workers,
-            arrays.device,
-            arrays.active,
-        )
-        self._model_renderer = self.model_renderer(model_stride, arrays.active)
+        self._cull = FrustumCuller(buffers, buffers.batch, self._camera, buffers.active)
+        self._model_renderer = self.model_renderer(model_stride, buffers.active)
         self._arguments: tuple[Any, ...] = (None,) * 5
-        self._record_launches()
+        self._covered = self._pixels(wp.int32)
+        self._fusion = self._record_fusion()
+        self._culling = self._record_culling()
+        inputs = [buffers.surfels, buffers.blocks, buffers.capacity]
+        threshold = config.confidence_threshold
+        self._bound = [
+            self._record(bound_blocks, [*inputs, threshold, buffers.workers]),
+            record_launch(set_bounded, buffers.batch, inputs, buffers.device),
+        ]
+
+    def _pixels(self, dtype: Any) -> wp.array:
+        """Zeros for all pixels of all envs, flat."""
+        count = math.prod((self._buffers.batch, *self._intrinsics.shape))
+        return wp.zeros(count, dtype=dtype, device=self._buffers.device)
+
+    def _record(self, kernel: Any, inputs: list[Any]) -> wp.Launch:
+        dim = (self._buffers.batch, self._buffers.workers)
+        return record_launch(kernel, dim, inputs, self._buffers.device)
+
+    def _per_env(self, dtype: Any) -> wp.array:
+        """A place holder for one number per env, which is set with the frame."""
+        return wp.zeros(self._buffers.batch, dtype=dtype, device=self._buffers.device)
+
+    def _record_fusion(self) -> list[wp.Launch]:
+        """Launches that update and add surfels; what changes with the frame is set there."""
+        config, buffers = self.config, self._buffers
+        rule = FusionParameters()
+        rule.distance_m = config.fusion_distance_m
+        rule.min_cosine = math.cos(math.radians(config.fusion_angle_deg))
+        rule.coverage_px = config.coverage_px
+        rule.radius_px = config.surfel_radius_px
+        rule.max_confidence = config.max_confidence
+        radial = radial_weights(*self._intrinsics.shape).ravel()
+        integers, image = self._per_env(wp.int32), self._pixels(wp.vec3)
+        frame = [self._per_env(wp.mat44), self._camera, integers, integers]
+        frame += [self._per_env(wp.float32), rule, buffers.workers, self._pixels(wp.float32)]
+        frame += [image, image, wp.array(radial, device=buffers.device), self._covered]
+        return [
+            self._record(update_surfels, [buffers.surfels, buffers.visible, *frame]),
+            self._record(add_surfels, [buffers.surfels, buffers.capacity, *frame]),
+        ]
+
+    def _record_culling(self) -> list[wp.Launch]:
+        """Launches that remove surfels; the first two depend on the frame."""
+        config, buffers = self.config, self._buffers
+        rule = CullingRule()
+        rule.capacity = buffers.capacity
+        rule.interval = config.compaction_interval
+        rule.window = config.unstable_window
+        rule.confidence_threshold = config.confidence_threshold
+        surfels, spare, blocks = buffers.surfels, buffers.spare, buffers.blocks
+        integers, workers, compaction = self._per_env(wp.int32), buffers.workers, buffers.compaction
+        due = [rule, integers, integers, workers, compaction]
+        return [
+            self._record(cull_unstable, [surfels, blocks, *due]),
+            self._record(list_survivors, [surfels, *due]),
+            self._record(gather, [surfels, spare, compaction, workers]),
+            self._record(put_back, [spare, surfels, blocks, compaction, rule.capacity, workers]),
+        ]
 
     def model_renderer(self, stride: int, window: SeenWindow) -> SplatRenderer:
         """Renders every ``stride``-th row and column of what was last seen within ``window``."""
-        arrays, parameters = self._arrays, self.splat_parameters
-        return SplatRenderer(
-            arrays.surfels,
-            arrays.blocks,
-            arrays.visible,
-            arrays.discs,
-            arrays.batch,
-            self._intrinsics.every_nth(stride),
-            replace(
-                parameters, min_px=parameters.min_px / stride, max_px=parameters.max_px / stride
-            ),
-            arrays.workers,
-            arrays.device,
-            window,
-        )
+        drawn = self.splat_parameters
+        drawn = replace(drawn, min_px=drawn.min_px / stride, max_px=drawn.max_px / stride)
+        intrinsics = self._intrinsics.every_nth(stride)
+        return SplatRenderer(self._buffers, self._buffers.batch, intrinsics, drawn, window)
 
     def render_model(self, poses: wp.array) -> ModelView:
         """Render every env's map from its pose; see ``SurfelMap.render_model``."""
@@ -157,12 +148,10 @@ class MapKernels:
         """Fuse one frame per env; see ``SurfelMap.fuse``."""
         self._cull(poses)
         self._covered.zero_()
-        self._arrays.kept.zero_()
-        self._arrays.expired.zero_()
+        self._buffers.compaction.kept.zero_()
+        self._buffers.compaction.expired.zero_()
         self._bind(live, poses, time, weight, mask)
-        self._update.launch()
-        self._add.launch()
-        for launch in (*self._removal, *self._bound):
+        for launch in (*self._fusion, *self._culling, *self._bound):
             launch.launch()
 
     def bound_blocks(self) -> None:
@@ -179,60 +168,12 @@ class MapKernels:
             return
         self._arguments = arguments
         images = (live.depth.flatten(), live.normals.flatten(), live.color.flatten())
-        for command in (self._update, self._add):
+        for command in self._fusion:
             for name, value in zip(_CHANGING, (poses, mask, time, weight, *images), strict=True):
                 command.set_param_by_name(name, value)
-        for command in self._removal[:2]:
+        for command in self._culling[:2]:
             command.set_param_by_name("mask", mask)
             command.set_param_by_name("time", time)
-
-    def _record_launches(self) -> None:
-        """Record the launches of ``fuse``; what changes with the frame is set there."""
-        config, arrays = self.config, self._arrays
-        batch, workers, capacity = arrays.batch, arrays.workers, arrays.capacity
-        device = arrays.device
-        dim = (batch, workers)
-        poses = wp.zeros(batch, dtype=wp.mat44, device=device)
-        integers = wp.zeros(batch, dtype=wp.int32, device=device)
-        floats = wp.zeros(batch, dtype=wp.float32, device=device)
-        pixels = math.prod((batch, *self._intrinsics.shape))
-        depth = wp.zeros(pixels, dtype=wp.float32, device=device)
-        image = wp.zeros(pixels, dtype=wp.vec3, device=device)
-        radial = radial_weights(*self._intrinsics.shape).ravel()
-        frame = [poses, self._camera, integers, integers, floats, self._fusion, workers]
-        frame += [depth, image, image, wp.array(radial, device=device), self._covered]
-
-        def record(kernel: Any, inputs: list[Any]) -> Any:
-            return wp.launch(kernel, dim=dim, inputs=inputs, device=device, record_cmd=True)
-
-        self._update = record(update_surfels, [arrays.surfels, arrays.visible, *frame])
-        self._add = record(add_surfels, [arrays.surfels, capacity, *frame])
-        removal = SurfelCulling()
-        removal.capacity = capacity
-        removal.interval = config.compaction_interval
-        removal.window = config.unstable_window
-        removal.confidence_threshold = config.confidence_threshold
-        surfels, spare, blocks = arrays.surfels, arrays.spare, arrays.blocks
-        survivors, kept, expired = arrays.survivors, arrays.kept, arrays.expired
-        due = [removal, integers, integers, workers, expired]
-        self._removal = [
-            record(cull_unstable, [surfels, blocks, *due]),
-            record(list_survivors, [surfels, *due, survivors, kept]),
-            record(gather, [surfels, spare, survivors, kept, workers]),
-            record(put_back, [spare, surfels, blocks, survivors, expired, kept, capacity, workers]),
-        ]
-        threshold = config.confidence_threshold
-        self._bound = [
-            record(bound_blocks, [surfels, blocks, capacity, threshold, workers]),
-            wp.launch(
-                set_bounded, batch, [surfels, blocks, capacity], device=device, record_cmd=True
-            ),
-        ]
-
-
-Float64 = NDArray[np.float64]
-GPU_THREADS = 1 << 20  # of a launch, about
-GPU_WORKERS = (256, 8192)  # fewest and most that share one env's surfels
 
 
 class SurfelMap:
@@ -266,38 +207,12 @@ class SurfelMap:
         self.batch = batch
         self.intrinsics = intrinsics
         self.device = device
-        self._workers = default_workers(batch, device) if workers is None else workers
         capacity = config.capacity(intrinsics.width)
-        self.surfels = allocate_surfels(batch, capacity, device)
-        self._blocks = allocate_culling_blocks(batch, capacity, device)
-        self._discs = allocate_footprints(batch, capacity, device)
-        self.active = any_time(batch, device)
-        self._arrays = MapBuffers(
-            batch=batch,
-            capacity=capacity,
-            workers=self._workers,
-            device=device,
-            surfels=self.surfels,
-            spare=allocate_surfels(batch, capacity, device),
-            blocks=self._blocks,
-            visible=allocate_visible(batch, capacity, device),
-            discs=self._discs,
-            survivors=wp.zeros((batch, capacity), dtype=wp.int32, device=device),
-            kept=wp.zeros(batch, dtype=wp.int32, device=device),
-            expired=wp.zeros(batch, dtype=wp.int32, device=device),
-            active=self.active,
-        )
+        self._buffers = allocate_map(batch, capacity, device, workers)
+        self.surfels, self.active = self._buffers.surfels, self._buffers.active
         self.kernels = self.make_kernels(intrinsics, config, model_stride)
-        self._predictor = ViewPredictor(
-            self.surfels,
-            self._blocks,
-            self._arrays.visible,
-            self._discs,
-            intrinsics,
-            self.kernels.splat_parameters,
-            self._workers,
-            device,
-        )
+        drawn = self.kernels.splat_parameters
+        self._predictor = ViewPredictor(self._buffers, intrinsics, drawn)
 
     @property
     def config(self) -> SurfelConfig:
@@ -307,11 +222,11 @@ class SurfelMap:
     def make_kernels(
         self, intrinsics: Intrinsics, config: SurfelConfig, model_stride: int
     ) -> MapKernels:
-        """Passes for frames of another size or with other parameters; ``use`` puts them in force.
+        """Kernels for frames of another size or with other parameters; ``use`` puts them in force.
 
         The capacity of the map stays what it is.
         """
-        return MapKernels(self._arrays, intrinsics, config, model_stride)
+        return MapKernels(self._buffers, intrinsics, config, model_stride)
 
     def use(self, kernels: MapKernels) -> None:
         """Go on with other kernels; views are predicted at the sizes of before."""
@@ -327,7 +242,7 @@ class SurfelMap:
     def clear(self, env: int | None = None) -> None:
         """Forget the map of one env, or of all."""
         counters = [getattr(self.surfels, name) for name in COUNTERS]
-        for counter in (*counters, self._blocks.bounded):
+        for counter in (*counters, self._buffers.blocks.bounded):
             if env is None:
                 counter.zero_()
             else:
@@ -354,8 +269,8 @@ class SurfelMap:
 
     def surfels_moved(self) -> None:
         """Look at all surfels anew: something else than ``fuse`` has changed them."""
-        self._blocks.bounded.zero_()
-        self._blocks.num_listed.zero_()
+        self._buffers.blocks.bounded.zero_()
+        self._buffers.blocks.num_listed.zero_()
         self.kernels.bound_blocks()
 
     def render_model(self, poses: wp.array) -> ModelView:
@@ -442,11 +357,3 @@ class SurfelMap:
                 if used:
                     getattr(self.surfels, name)[env, :used].assign(arrays[name])
         self.surfels_moved()
-
-
-def default_workers(batch: int, device: str) -> int:
-    """Threads that share one env's surfels."""
-    if wp.get_device(device).is_cpu:
-        return 1
-    fewest, most = GPU_WORKERS
-    return min(most, max(fewest, GPU_THREADS // batch))

@@ -1,26 +1,24 @@
-"""The surfels of B maps as structure of arrays, and the small functions that kernels share."""
+"""The surfels of B maps and what is kept about them, as structures of device arrays."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 from ms_slam_env._warp import wp
 
-ATTRIBUTES = {
-    "position": wp.vec3,
-    "normal": wp.vec3,
-    "color": wp.vec3,
-    "radius": wp.float32,
-    "confidence": wp.float32,
-    "created": wp.int32,
-    "seen": wp.int32,
-}
-"""Arrays (B, capacity) of ``Surfels`` and their types."""
-COUNTERS = ("count", "dead", "dropped")
-"""Arrays (B,) int32 of ``Surfels``."""
+BLOCK_SIZE = wp.constant(128)
+"""Surfels of a culling block."""
+EARLIEST = -(2**31)
+LATEST = 2**31 - 1
+"""Bounds of a ``SeenWindow`` that leaves out nothing."""
+GPU_THREADS = 1 << 20  # of a launch, about
+GPU_WORKERS = (256, 8192)  # fewest and most that share one env's surfels
 
 
 @wp.struct
 class Surfels:
-    """SplatFootprints in the world frame; slots ``count[b]`` and later of env b are free.
+    """Discs in the world frame; slots ``count[b]`` and later of env b are free.
 
     A surfel with confidence 0 is dead: it keeps its slot until the next compaction.
     """
@@ -37,6 +35,12 @@ class Surfels:
     dropped: wp.array(dtype=wp.int32)
 
 
+COUNTERS = ("count", "dead", "dropped")
+"""Arrays (B,) of ``Surfels``."""
+ATTRIBUTES = ("position", "normal", "color", "radius", "confidence", "created", "seen")
+"""Arrays (B, capacity) of ``Surfels``."""
+
+
 @wp.struct
 class VisibleList:
     """Surfels inside the frustum of one camera per env, with their camera-frame geometry."""
@@ -46,6 +50,76 @@ class VisibleList:
     normal: wp.array2d(dtype=wp.vec3)
     radius: wp.array2d(dtype=wp.float32)
     count: wp.array(dtype=wp.int32)
+
+
+@wp.struct
+class CullingBlocks:
+    """Blocks of B maps: arrays (B, capacity / BLOCK_SIZE, rounded up).
+
+    Attributes:
+        low: lower corner of the bounding box, world frame.
+        high: upper corner.
+        expiry: frame that saw the block's longest unseen unstable surfel; the largest number if all
+            are stable or dead.
+        listed: blocks that a camera may see.
+        num_listed: (B,) how many those are.
+        bounded: (B,) slots whose blocks have a box that holds.
+    """
+
+    low: wp.array2d(dtype=wp.vec3)
+    high: wp.array2d(dtype=wp.vec3)
+    expiry: wp.array2d(dtype=wp.int32)
+    listed: wp.array2d(dtype=wp.int32)
+    num_listed: wp.array(dtype=wp.int32)
+    bounded: wp.array(dtype=wp.int32)
+
+
+@wp.struct
+class SplatFootprints:
+    """The surfels of a list in the image, arrays (B, capacity), and those that meet a pixel.
+
+    Attributes:
+        u: column of the centre.
+        v: row of the centre.
+        inverse: inverse depth of the centre.
+        slope_u: change of inverse depth per column.
+        slope_v: change of inverse depth per row.
+        rim: squared radius, square metres.
+        left: first column that the disc may cover; ``right``, ``top`` and ``bottom`` likewise.
+        right: last column.
+        top: first row.
+        bottom: last row.
+        drawn: places in the list of the discs that may cover a pixel.
+        num_drawn: (B,) how many those are.
+    """
+
+    u: wp.array2d(dtype=wp.float32)
+    v: wp.array2d(dtype=wp.float32)
+    inverse: wp.array2d(dtype=wp.float32)
+    slope_u: wp.array2d(dtype=wp.float32)
+    slope_v: wp.array2d(dtype=wp.float32)
+    rim: wp.array2d(dtype=wp.float32)
+    left: wp.array2d(dtype=wp.int32)
+    right: wp.array2d(dtype=wp.int32)
+    top: wp.array2d(dtype=wp.int32)
+    bottom: wp.array2d(dtype=wp.int32)
+    drawn: wp.array2d(dtype=wp.int32)
+    num_drawn: wp.array(dtype=wp.int32)
+
+
+@wp.struct
+class Compaction:
+    """Working memory of ``surfel_culling``.
+
+    Attributes:
+        survivors: (B, capacity) slots to keep.
+        kept: (B,) how many those are, -1 where no compaction is due.
+        expired: (B,) surfels that died just now.
+    """
+
+    survivors: wp.array2d(dtype=wp.int32)
+    kept: wp.array(dtype=wp.int32)
+    expired: wp.array(dtype=wp.int32)
 
 
 @wp.struct
@@ -61,11 +135,6 @@ class SeenWindow:
     seen_to: wp.array(dtype=wp.int32)
 
 
-EARLIEST = -(2**31)
-LATEST = 2**31 - 1
-"""Bounds of a ``SeenWindow`` that leaves out nothing."""
-
-
 def any_time(batch: int, device: str) -> SeenWindow:
     """Window that leaves out no surfel of ``batch`` maps."""
     window = SeenWindow()
@@ -74,25 +143,73 @@ def any_time(batch: int, device: str) -> SeenWindow:
     return window
 
 
-def allocate_surfels(batch: int, capacity: int, device: str) -> Surfels:
+def allocate(struct: Any, batch: int, size: int, device: str) -> Any:
+    """Zeros for all arrays of a struct: (B, size), or (B,) where they have one dimension."""
+    arrays = struct()
+    for name, member in struct.vars.items():
+        shape = (batch, size)[: member.type.ndim]
+        setattr(arrays, name, wp.zeros(shape, dtype=member.type.dtype, device=device))
+    return arrays
+
+
+@dataclass(frozen=True)
+class MapBuffers:
+    """Device arrays of B maps, which all that works on these maps shares.
+
+    Attributes:
+        batch: number of maps B.
+        capacity: slots of each.
+        workers: threads that share one map.
+        device: of all arrays.
+        surfels: the maps.
+        spare: room for compaction.
+        blocks: of the surfels.
+        visible: working list of the surfels in view.
+        footprints: of such a list.
+        compaction: working memory.
+        active: what frames are tracked against and fused into; all unless its times are set.
+    """
+
+    batch: int
+    capacity: int
+    workers: int
+    device: str
+    surfels: Surfels
+    spare: Surfels
+    blocks: CullingBlocks
+    visible: VisibleList
+    footprints: SplatFootprints
+    compaction: Compaction
+    active: SeenWindow
+
+
+def allocate_map(batch: int, capacity: int, device: str, workers: int | None = None) -> MapBuffers:
     """Empty maps of ``batch`` envs with ``capacity`` slots each."""
-    surfels = Surfels()
-    for name, dtype in ATTRIBUTES.items():
-        setattr(surfels, name, wp.zeros((batch, capacity), dtype=dtype, device=device))
-    for name in COUNTERS:
-        setattr(surfels, name, wp.zeros(batch, dtype=wp.int32, device=device))
-    return surfels
+    structs = (Surfels, VisibleList, SplatFootprints, Compaction)
+    surfels, visible, footprints, compaction = (
+        allocate(struct, batch, capacity, device) for struct in structs
+    )
+    return MapBuffers(
+        batch=batch,
+        capacity=capacity,
+        workers=default_workers(batch, device) if workers is None else workers,
+        device=device,
+        surfels=surfels,
+        spare=allocate(Surfels, batch, capacity, device),
+        blocks=allocate(CullingBlocks, batch, -(-capacity // BLOCK_SIZE), device),
+        visible=visible,
+        footprints=footprints,
+        compaction=compaction,
+        active=any_time(batch, device),
+    )
 
 
-def allocate_visible(batch: int, capacity: int, device: str) -> VisibleList:
-    """Empty list of visible surfels."""
-    visible = VisibleList()
-    visible.index = wp.zeros((batch, capacity), dtype=wp.int32, device=device)
-    visible.position = wp.zeros((batch, capacity), dtype=wp.vec3, device=device)
-    visible.normal = wp.zeros((batch, capacity), dtype=wp.vec3, device=device)
-    visible.radius = wp.zeros((batch, capacity), dtype=wp.float32, device=device)
-    visible.count = wp.zeros(batch, dtype=wp.int32, device=device)
-    return visible
+def default_workers(batch: int, device: str) -> int:
+    """Threads that share one env's surfels: 1 on the CPU, which runs one after the other."""
+    if wp.get_device(device).is_cpu:
+        return 1
+    fewest, most = GPU_WORKERS
+    return min(most, max(fewest, GPU_THREADS // batch))
 
 
 @wp.func

@@ -6,21 +6,19 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert
-from ms_slam_env.slam.surfel.frustum_culling import CullingBlocks
+from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.surfel.rendering import (
     ModelView,
     SplatParameters,
     SplatRenderer,
     splat_camera,
 )
-from ms_slam_env.slam.surfel.splatting import SplatFootprints
-from ms_slam_env.slam.surfel.surfels import Surfels, VisibleList, allocate_visible
+from ms_slam_env.slam.surfel.surfels import MapBuffers, VisibleList, allocate
 from ms_slam_env.slam.surfel.view_warping import (
     EMPTY,
     PointCloud,
@@ -30,7 +28,6 @@ from ms_slam_env.slam.surfel.view_warping import (
     scatter_points,
 )
 
-Float64 = NDArray[np.float64]
 MAX_MARGIN = 1.0  # a reference view wider than the views by more than their own size is refused
 NEAREST_M = 0.5  # surfaces closer than this may leave the reference view's margin
 SIZE_STEP_PX = 8  # reference views come in such steps, so that few sets of buffers are needed
@@ -102,12 +99,7 @@ class _Reference:
         self.hidden = hidden
         envs, capacity = renderer.envs, 2 * renderer.intrinsics.width * renderer.intrinsics.height
         device = renderer.device
-        self.points = PointCloud()
-        self.points.position = wp.zeros((envs, capacity), dtype=wp.vec3, device=device)
-        self.points.normal = wp.zeros((envs, capacity), dtype=wp.vec3, device=device)
-        self.points.intensity = wp.zeros((envs, capacity), dtype=wp.float32, device=device)
-        self.points.count = wp.zeros(envs, dtype=wp.int32, device=device)
-        self.points.front_count = wp.zeros(envs, dtype=wp.int32, device=device)
+        self.points = allocate(PointCloud, envs, capacity, device)
 
     def render(self, poses: wp.array, first_env: int) -> None:
         """Fill ``points`` from the front surface and the one behind it."""
@@ -131,37 +123,20 @@ class ViewPredictor:
     """Predicts views near each other by warping one reference view; far ones one by one.
 
     Args:
-        surfels: the maps.
-        blocks: their blocks.
-        visible: working list shared with the map's other renderers.
-        discs: working memory shared likewise.
+        buffers: the maps, and working memory shared with their other renderers.
         intrinsics: of the live camera.
         parameters: how discs are drawn.
-        workers: threads per env or view.
-        device: Warp device.
     """
 
     def __init__(
-        self,
-        surfels: Surfels,
-        blocks: CullingBlocks,
-        visible: VisibleList,
-        discs: SplatFootprints,
-        intrinsics: Intrinsics,
-        parameters: SplatParameters,
-        workers: int,
-        device: str,
+        self, buffers: MapBuffers, intrinsics: Intrinsics, parameters: SplatParameters
     ) -> None:
-        self.surfels = surfels
-        self.blocks = blocks
-        self.visible = visible
-        self.discs = discs
         self.intrinsics = intrinsics
         self.parameters = parameters
-        self.workers = workers
-        self.device = device
-        batch, capacity = visible.index.shape
-        self._hidden = allocate_visible(batch, capacity, device)
+        self.device = buffers.device
+        self.workers = buffers.workers
+        self._map = buffers
+        self._hidden = allocate(VisibleList, buffers.batch, buffers.capacity, self.device)
         self._references: dict[tuple[int, Intrinsics], _Reference] = {}
         self._single: dict[tuple[int, Intrinsics], SplatRenderer] = {}
         self._outputs: dict[tuple[int, Intrinsics], tuple[wp.array, DeviceViews]] = {}
@@ -253,17 +228,7 @@ class ViewPredictor:
         return wp.array(flat, dtype=wp.mat44, device=self.device)
 
     def _renderer(self, envs: int, intrinsics: Intrinsics) -> SplatRenderer:
-        return SplatRenderer(
-            self.surfels,
-            self.blocks,
-            self.visible,
-            self.discs,
-            envs,
-            intrinsics,
-            self.parameters,
-            self.workers,
-            self.device,
-        )
+        return SplatRenderer(self._map, envs, intrinsics, self.parameters)
 
     def _reference(self, envs: int, intrinsics: Intrinsics) -> _Reference:
         key = (envs, intrinsics)
