@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from ms_slam_env.config import check_choice, check_range
+from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.errors import InputError
 
 
 @dataclass(frozen=True)
-class LoopConfig:
+class LoopConfig(Checked):
     """When loops are looked for, when they are believed, and how the map is bent.
 
     ElasticFusion's published values are for 640x480 at 30 Hz and minutes of recording; these are
@@ -42,43 +42,23 @@ class LoopConfig:
         InputError: a value outside its range.
     """
 
-    window: int = 50
-    interval: int = 5
-    coverage: float = 0.25
-    sigma: float = 0.01
-    inliers: float = 0.7
-    largest_m: float = 0.3
-    largest_deg: float = 20.0
-    smallest_m: float = 0.008
-    agreement_m: float = 0.01
-    global_interval: int = 20
-    dissimilarity: float = 0.3
-    drift_share: float = 0.15
-    surfels_per_node: int = 400
-    max_nodes: int = 100
-    constraint_columns: int = 16
-    error_m: float = 0.01
-    error_share: float = 0.3
-
-    def __post_init__(self) -> None:
-        """Refuse values outside the ranges."""
-        check_range(self, "window", 1, 1_000_000)
-        check_range(self, "interval", 1, 10_000)
-        check_range(self, "coverage", 0.01, 1.0)
-        check_range(self, "sigma", 1e-6, 1.0)
-        check_range(self, "inliers", 0.0, 1.0)
-        check_range(self, "largest_m", 0.0, 100.0)
-        check_range(self, "largest_deg", 0.0, 180.0)
-        check_range(self, "smallest_m", 0.0, 1.0)
-        check_range(self, "agreement_m", 0.0, 1.0)
-        check_range(self, "global_interval", 1, 10_000)
-        check_range(self, "dissimilarity", 0.0, 1.0)
-        check_range(self, "drift_share", 0.0, 10.0)
-        check_range(self, "surfels_per_node", 10, 1_000_000)
-        check_range(self, "max_nodes", 10, 10_000)
-        check_range(self, "constraint_columns", 2, 100)
-        check_range(self, "error_m", 0.0, 1.0)
-        check_range(self, "error_share", 0.0, 1.0)
+    window: int = bounded(50, 1, 1_000_000)
+    interval: int = bounded(5, 1, 10_000)
+    coverage: float = bounded(0.25, 0.01, 1.0)
+    sigma: float = bounded(0.01, 1e-6, 1.0)
+    inliers: float = bounded(0.7, 0.0, 1.0)
+    largest_m: float = bounded(0.3, 0.0, 100.0)
+    largest_deg: float = bounded(20.0, 0.0, 180.0)
+    smallest_m: float = bounded(0.008, 0.0, 1.0)
+    agreement_m: float = bounded(0.01, 0.0, 1.0)
+    global_interval: int = bounded(20, 1, 10_000)
+    dissimilarity: float = bounded(0.3, 0.0, 1.0)
+    drift_share: float = bounded(0.15, 0.0, 10.0)
+    surfels_per_node: int = bounded(400, 10, 1_000_000)
+    max_nodes: int = bounded(100, 10, 10_000)
+    constraint_columns: int = bounded(16, 2, 100)
+    error_m: float = bounded(0.01, 0.0, 1.0)
+    error_share: float = bounded(0.3, 0.0, 1.0)
 
 
 RELOCALISATIONS = ("ferns", "local")
@@ -86,7 +66,7 @@ LOOP_CLOSURES = ("none", "deformation")
 
 
 @dataclass(frozen=True)
-class SurfelConfig:
+class SurfelConfig(Checked):
     """Parameters of tracking, fusion and prediction.
 
     Attributes:
@@ -135,41 +115,38 @@ class SurfelConfig:
         InputError: a value outside its range.
     """
 
-    depth_cutoff_m: float = 4.0
-    icp_rgb_weight: float = 0.1
-    confidence_threshold: float = 10.0
+    depth_cutoff_m: float = bounded(4.0, 0.0, 10.0)
+    icp_rgb_weight: float = bounded(0.1, 0.0, 1.0)
+    confidence_threshold: float = bounded(10.0, 0.0, 12.0)
     iterations: tuple[int, ...] = (4, 5, 10)
-    max_surfels: int | None = None
-    coverage_px: float = 0.85
-    surfel_radius_px: float = 0.9
-    max_confidence: float = 50.0
-    compaction_interval: int = 10
-    unstable_window: int = 200
-    fusion_distance_m: float = 0.02
-    fusion_angle_deg: float = 45.0
-    bilateral_sigma_px: float = 1.5
-    bilateral_sigma_m: float = 0.01
-    bilateral_radius_px: int = 2
-    normal_edge_per_m: float = 0.03
-    icp_distance_m: float = 0.10
-    icp_angle_deg: float = 40.0
-    depth_noise_m: float = 0.003
-    cauchy_icp: float = 2.0
-    cauchy_rgb: float = 1.0
-    intensity_noise: float = 0.5
-    lateral_noise_px: float = 0.3
-    points_per_level: int = 5000
+    max_surfels: int | None = bounded(None, 1000, 50_000_000)
+    coverage_px: float = bounded(0.85, 0.5, 1.0)
+    surfel_radius_px: float = bounded(0.9, 0.5, 3.0)
+    max_confidence: float = bounded(50.0, 1.0, 10_000.0)
+    compaction_interval: int = bounded(10, 1, 10_000)
+    unstable_window: int = bounded(200, 1, 100_000)
+    fusion_distance_m: float = bounded(0.02, 0.0001, 1.0)
+    fusion_angle_deg: float = bounded(45.0, 1.0, 90.0)
+    bilateral_sigma_px: float = bounded(1.5, 0.1, 20.0)
+    bilateral_sigma_m: float = bounded(0.01, 0.0001, 1.0)
+    bilateral_radius_px: int = bounded(2, 0, 10)
+    normal_edge_per_m: float = bounded(0.03, 0.001, 10.0)
+    icp_distance_m: float = bounded(0.10, 0.001, 1.0)
+    icp_angle_deg: float = bounded(40.0, 1.0, 90.0)
+    depth_noise_m: float = bounded(0.003, 0.00001, 1.0)
+    cauchy_icp: float = bounded(2.0, 0.01, 1000.0)
+    cauchy_rgb: float = bounded(1.0, 0.01, 1000.0)
+    intensity_noise: float = bounded(0.5, 0.01, 255.0)
+    lateral_noise_px: float = bounded(0.3, 0.0, 100.0)
+    points_per_level: int = bounded(5000, 100, 10_000_000)
     refuse_bad_fits: bool = True
-    relocalisation: str = "ferns"
-    loop_closure: str = "none"
+    relocalisation: str = chosen("ferns", *RELOCALISATIONS)
+    loop_closure: str = chosen("none", *LOOP_CLOSURES)
     loops: LoopConfig = field(default_factory=LoopConfig)
 
     def __post_init__(self) -> None:
         """Refuse values outside the ranges."""
-        check_range(self, "depth_cutoff_m", 0.0, 10.0)
-        check_choice(self, "relocalisation", RELOCALISATIONS)
-        check_range(self, "icp_rgb_weight", 0.0, 1.0)
-        check_range(self, "confidence_threshold", 0.0, 12.0)
+        super().__post_init__()
         are_counts = isinstance(self.iterations, (tuple, list)) and all(
             isinstance(count, int) and 0 <= count <= 100 for count in self.iterations
         )
@@ -178,32 +155,10 @@ class SurfelConfig:
                 f"SurfelConfig.iterations = {self.iterations!r} must be 1 to 5 integers in [0, 100]"
             )
         object.__setattr__(self, "iterations", tuple(self.iterations))  # lists come from YAML
-        if self.max_surfels is not None:
-            check_range(self, "max_surfels", 1000, 50_000_000)
-        check_range(self, "coverage_px", 0.5, 1.0)
-        check_range(self, "surfel_radius_px", 0.5, 3.0)
-        check_range(self, "max_confidence", 1.0, 10_000.0)
-        check_range(self, "compaction_interval", 1, 10_000)
-        check_range(self, "unstable_window", 1, 100_000)
-        check_range(self, "fusion_distance_m", 0.0001, 1.0)
-        check_range(self, "fusion_angle_deg", 1.0, 90.0)
-        check_range(self, "bilateral_sigma_px", 0.1, 20.0)
-        check_range(self, "bilateral_sigma_m", 0.0001, 1.0)
-        check_range(self, "bilateral_radius_px", 0, 10)
-        check_range(self, "normal_edge_per_m", 0.001, 10.0)
-        check_range(self, "icp_distance_m", 0.001, 1.0)
-        check_range(self, "icp_angle_deg", 1.0, 90.0)
-        check_range(self, "depth_noise_m", 0.00001, 1.0)
-        check_range(self, "cauchy_icp", 0.01, 1000.0)
-        check_range(self, "cauchy_rgb", 0.01, 1000.0)
-        check_range(self, "intensity_noise", 0.01, 255.0)
-        check_range(self, "lateral_noise_px", 0.0, 100.0)
-        check_range(self, "points_per_level", 100, 10_000_000)
         if not isinstance(self.refuse_bad_fits, bool):
             raise InputError(
                 f"SurfelConfig.refuse_bad_fits = {self.refuse_bad_fits!r} must be true or false"
             )
-        check_choice(self, "loop_closure", LOOP_CLOSURES)
 
     def capacity(self, columns: int) -> int:
         """Surfels that the map of a camera with images of so many columns has room for."""

@@ -18,16 +18,14 @@ A closed loop makes the estimated pose jump by the drift that it takes back.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env._warp import wp
-from ms_slam_env.geometry import invert, relative_angle
+from ms_slam_env.geometry import invert
+from ms_slam_env.slam.alignment_check import TrackingStatus
 from ms_slam_env.slam.ferns import Candidate
 from ms_slam_env.slam.surfel.acceptance import Alignment, acceptance_thresholds
 from ms_slam_env.slam.surfel.config import SurfelConfig
@@ -35,6 +33,7 @@ from ms_slam_env.slam.surfel.device import HostDeviceBuffer
 from ms_slam_env.slam.surfel.map_deformation import MapDeformer
 from ms_slam_env.slam.surfel.pose_hypotheses import (
     NUM_HYPOTHESES,
+    is_within,
     relocalization_hypotheses,
     tracking_hypotheses,
 )
@@ -61,14 +60,20 @@ class SimilarViews(Protocol):
         """Those of one env that were taken before a frame, the most similar first."""
 
 
-class LoopClosure(ABC):
-    """Recognises places seen before and bends the maps of B envs so that they meet again."""
+class LoopClosure:
+    """Recognises places seen before and deforms the maps of B envs so that they meet again.
 
-    @abstractmethod
+    This is the variant "none": frames are tracked against everything in the map, old and new
+    alike; nothing is deformed, and poses are final when they are returned.
+    """
+
+    def __init__(self, batch: int) -> None:
+        """For ``batch`` envs."""
+        self.batch = batch
+
     def reset(self, env: int) -> None:
         """Forget one env."""
 
-    @abstractmethod
     def select(self, lost: Int32) -> bool:
         """Choose the surfels that the next frames are tracked against and fused into.
 
@@ -78,8 +83,8 @@ class LoopClosure(ABC):
         Returns:
             Whether the choice changed.
         """
+        return False
 
-    @abstractmethod
     def record(self, poses: Float64, time: Int32, fused: Bool) -> None:
         """Take note of frames.
 
@@ -89,7 +94,6 @@ class LoopClosure(ABC):
             fused: (B,) whether the frame was fused.
         """
 
-    @abstractmethod
     def close(
         self, live: LiveFrame, poses: Float64, time: Int32, tracked: Bool, similar: SimilarViews
     ) -> Bool:
@@ -105,84 +109,24 @@ class LoopClosure(ABC):
         Returns:
             (B,) which envs closed a loop.
         """
+        return np.zeros(self.batch, dtype=bool)
 
-    @abstractmethod
     def trajectory(self, env: int) -> tuple[Int32, Float64]:
-        """Frames (N,) and poses (N, 4, 4) of the past as the closures since have bent them.
+        """Fused frames (N,) and their poses (N, 4, 4) as the closures since have moved them.
 
         Empty where no trajectory is kept.
         """
+        return np.zeros(0, dtype=np.int32), np.zeros((0, 4, 4))
 
-    @abstractmethod
     def get_state(self) -> dict[str, Any]:
-        """Everything needed to go on bit-exactly."""
+        """Everything needed to go on bit-exactly, as NumPy arrays."""
+        return {}
 
-    @abstractmethod
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state that ``get_state`` returned."""
 
 
-class NoLoopClosure(LoopClosure):
-    """Frames are tracked against everything in the map, old and new alike; nothing is bent."""
-
-    def __init__(self, batch: int) -> None:
-        """For ``batch`` envs."""
-        self._never = np.zeros(batch, dtype=bool)
-
-    def reset(self, env: int) -> None:
-        """There is nothing to forget."""
-
-    def select(self, lost: Int32) -> bool:
-        """All surfels, always."""
-        return False
-
-    def record(self, poses: Float64, time: Int32, fused: Bool) -> None:
-        """Nothing is kept."""
-
-    def close(
-        self, live: LiveFrame, poses: Float64, time: Int32, tracked: Bool, similar: SimilarViews
-    ) -> Bool:
-        """Never."""
-        return self._never
-
-    def trajectory(self, env: int) -> tuple[Int32, Float64]:
-        """Nothing is kept: poses are final when they are returned."""
-        return np.zeros(0, dtype=np.int32), np.zeros((0, 4, 4))
-
-    def get_state(self) -> dict[str, Any]:
-        """Nothing."""
-        return {}
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Nothing."""
-
-
-SETTLED_M, SETTLED_DEG = 0.02, 2.0  # largest motion of a repeated registration
-
-
-@dataclass(frozen=True)
-class Placement:
-    """Where frames lie in the inactive part.
-
-    Attributes:
-        found: (B,) whether the registration succeeded.
-        T_world_live: (B, 4, 4) pose.
-        sigma: (B,) standard deviation of its worst direction, metres and radians.
-    """
-
-    found: Bool
-    T_world_live: Float64
-    sigma: Float64
-
-
-def _placement(found: Bool, alignment: Alignment) -> Placement:
-    return Placement(found, alignment.T_world_live, alignment.statistics["sigma_m"])
-
-
-def _nowhere(batch: int) -> Placement:
-    return Placement(
-        np.zeros(batch, dtype=bool), np.tile(np.eye(4), (batch, 1, 1)), np.zeros(batch)
-    )
+SETTLED = 0.02, np.radians(2.0)  # largest motion of a repeated registration
 
 
 class InactiveRegistration:
@@ -220,56 +164,45 @@ class InactiveRegistration:
         shares = (view.vertices.numpy()[..., 2] > 0).mean(axis=(1, 2))
         return due & (shares >= self.config.coverage)
 
-    def near(self, poses: Float64) -> Placement:
+    def near(self, poses: Float64) -> Alignment:
         """Register with the view that ``covered`` rendered from ``poses``."""
-        found = self._align(
-            poses, tracking_hypotheses(np.eye(4)), self._limits(self.config.largest_m)
-        )
-        return _placement(found.tracked, found)
+        return self._align(poses, tracking_hypotheses(np.eye(4)), self.config.largest_m)
 
-    def from_keyframes(self, starts: Float64) -> Placement:
+    def from_keyframes(self, starts: Float64) -> Alignment | None:
         """Register from poses (B, 4, 4) that are rough and may be wrong, NaN for an env without.
 
-        What is found must be found again from there.
+        What is found must be found again from there; None if nothing was.
         """
         given = np.isfinite(starts[:, 0, 0])
         origins = np.where(given[:, None, None], starts, np.eye(4))
-        limits = self._limits(0.6)
         given &= self.covered(origins, given)
         if not given.any():
-            return _nowhere(self.batch)
-        first = self._align(origins, relocalization_hypotheses(0), limits)
+            return None
+        first = self._align(origins, relocalization_hypotheses(0), 0.6)
         good = given & first.tracked
         origins = np.where(good[:, None, None], first.T_world_live, np.eye(4))
         good &= self.covered(origins, good)
         if not good.any():
-            return _nowhere(self.batch)
-        again = self._align(origins, tracking_hypotheses(np.eye(4)), self._limits(0.1))
-        good &= again.tracked
-        for env in np.flatnonzero(good):
-            good[env] = _is_settled(origins[env], again.T_world_live[env])
-        return _placement(good, again)
+            return None
+        again = self._align(origins, tracking_hypotheses(np.eye(4)), 0.1)
+        settled = [
+            is_within(*pair, *SETTLED) for pair in zip(origins, again.T_world_live, strict=True)
+        ]
+        return again.with_status(~good | ~np.array(settled), TrackingStatus.IMPLAUSIBLE_MOTION)
 
-    def _align(self, origins: Float64, hypotheses: Float64, limits: NDArray[Any]) -> Alignment:
+    def _align(self, origins: Float64, hypotheses: Float64, largest_m: float) -> Alignment:
         stack = np.tile(hypotheses, (self.batch, 1, 1, 1))
-        return self._tracker.align(self._inactive.view, origins, stack, limits)
-
-    def _limits(self, motion_m: float) -> NDArray[Any]:
-        limits = acceptance_thresholds(np.ones(self.batch, bool), np.zeros(self.batch, np.int32))
-        limits["sigma_m"] = self.config.sigma
-        limits["inlier_ratio"] = self.config.inliers
-        limits["motion_m"] = motion_m
-        limits["rotation_cos"] = np.cos(np.radians(self.config.largest_deg))
-        return limits
-
-
-def _is_settled(a: Float64, b: Float64) -> bool:
-    near = np.linalg.norm(a[:3, 3] - b[:3, 3]) <= SETTLED_M
-    return bool(near and relative_angle(a[:3, :3], b[:3, :3]) <= np.radians(SETTLED_DEG))
+        strict, lost = np.ones(self.batch, dtype=bool), np.zeros(self.batch, dtype=np.int32)
+        thresholds = acceptance_thresholds(strict, lost)
+        thresholds["sigma_m"] = self.config.sigma
+        thresholds["inlier_ratio"] = self.config.inliers
+        thresholds["motion_m"] = largest_m
+        thresholds["rotation_cos"] = np.cos(np.radians(self.config.largest_deg))
+        return self._tracker.align(self._inactive.view, origins, stack, thresholds)
 
 
 SIGNIFICANT = 3.0  # drift, in standard deviations of the registration, that is worth bending for
-VIEW_APART_M, VIEW_APART_DEG = 1.0, 60.0  # views of one place differ by less
+VIEW_APART_M, VIEW_APART_RAD = 1.0, np.radians(60.0)  # views of one place differ by less
 
 
 class DeformationLoopClosure(LoopClosure):
@@ -321,7 +254,7 @@ class DeformationLoopClosure(LoopClosure):
         near = self._registration.covered(poses, due)
         if near.any():
             there = self._registration.near(poses)
-            for env in np.flatnonzero(near & there.found):
+            for env in np.flatnonzero(near & there.tracked):
                 closed[env] = self._close(int(env), poses, there)
                 due[env] = False
         due &= time % self.config.global_interval == 0
@@ -336,24 +269,27 @@ class DeformationLoopClosure(LoopClosure):
             if candidate.dissimilarity > self.config.dissimilarity:
                 break
             allowed_m = self.config.drift_share * history.path_m(candidate.time)
-            if not _may_be_the_same(poses[env], candidate.T_world_camera, allowed_m):
+            apart = VIEW_APART_M + allowed_m, VIEW_APART_RAD
+            if not is_within(poses[env], candidate.T_world_camera, *apart):
                 continue
             starts = np.full((self.batch, 4, 4), np.nan)
             starts[env] = candidate.T_world_camera
             there = self._registration.from_keyframes(starts)
+            if there is None:
+                continue
             drift = np.linalg.norm(there.T_world_live[env, :3, 3] - poses[env, :3, 3])
-            if there.found[env] and drift <= allowed_m:
+            if there.tracked[env] and drift <= allowed_m:
                 return self._close(env, poses, there)
         return False
 
-    def _close(self, env: int, poses: Float64, there: Placement) -> bool:
+    def _close(self, env: int, poses: Float64, there: Alignment) -> bool:
         """Bend map, pose and past of one env; returns whether that was believed and done."""
         history, corrected = self._histories[env], there.T_world_live[env]
         drift = motion_size(invert(poses[env]) @ corrected)
         if drift < self.config.smallest_m:
             self._deformer.join_parts(env, poses[env], history.last)
             return False
-        if drift < SIGNIFICANT * there.sigma[env] or not history.confirms(
+        if drift < SIGNIFICANT * there.statistics["sigma_m"][env] or not history.confirms(
             poses[env], corrected, self.config.agreement_m, 2 * self.config.global_interval
         ):
             return False
@@ -379,19 +315,8 @@ class DeformationLoopClosure(LoopClosure):
         self._histories = [history_from_state(history) for history in state["past"]]
 
 
-def _may_be_the_same(pose: Float64, keyframe: Float64, drift_m: float) -> bool:
-    """Whether a keyframe may show what is in view from ``pose``, which has drifted."""
-    apart = np.linalg.norm(pose[:3, 3] - keyframe[:3, 3])
-    angle = relative_angle(pose[:3, :3], keyframe[:3, :3])
-    return bool(apart <= VIEW_APART_M + drift_m and angle <= np.radians(VIEW_APART_DEG))
-
-
-_MAKERS: dict[str, Callable[[SurfelMap, SurfelConfig, str], LoopClosure]] = {
-    "none": lambda surfel_map, config, device: NoLoopClosure(surfel_map.batch),
-    "deformation": DeformationLoopClosure,
-}
-
-
 def make_loop_closure(surfel_map: SurfelMap, config: SurfelConfig, device: str) -> LoopClosure:
     """The loop closure ``config.loop_closure`` for the maps in ``surfel_map``."""
-    return _MAKERS[config.loop_closure](surfel_map, config, device)
+    if config.loop_closure == "none":
+        return LoopClosure(surfel_map.batch)
+    return DeformationLoopClosure(surfel_map, config, device)

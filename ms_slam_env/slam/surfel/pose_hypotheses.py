@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env._warp import wp
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import check_pose, make_pose, se3_exp, se3_log, so3_exp
+from ms_slam_env.geometry import check_pose, make_pose, relative_angle, se3_exp, se3_log, so3_exp
 from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.surfel.normal_equations import OFF, RUNNING, Photometry, Sum
 
@@ -94,6 +94,12 @@ def motion_weight(motions: Float64) -> NDArray[np.float32]:
     cosine = (np.trace(motions[:, :3, :3], axis1=1, axis2=2) - 1) / 2
     size = np.maximum(distance, np.arccos(np.clip(cosine, -1, 1)))
     return np.maximum(0.5, 1 - size / 0.2).astype(np.float32)
+
+
+def is_within(a: Float64, b: Float64, distance_m: float, angle_rad: float) -> bool:
+    """Whether two poses (4, 4) differ by at most so much."""
+    near = np.linalg.norm(a[:3, 3] - b[:3, 3]) <= distance_m
+    return bool(near and relative_angle(a[:3, :3], b[:3, :3]) <= angle_rad)
 
 
 def check_poses(poses: Float64, batch: int) -> Float64:

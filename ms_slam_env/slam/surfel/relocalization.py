@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.geometry import relative_angle
 from ms_slam_env.slam.alignment_check import (
     is_photometrically_consistent,
     measure_photometric_consistency,
@@ -22,6 +21,7 @@ from ms_slam_env.slam.surfel.pose_hypotheses import (
     AT_REST,
     KEYFRAME_HYPOTHESES,
     NUM_HYPOTHESES,
+    is_within,
     tracking_hypotheses,
 )
 from ms_slam_env.slam.surfel.rendering import ModelView
@@ -110,7 +110,7 @@ HOPELESS_COST = 2.45  # an alignment with a keyframe's view that costs more is n
 GOOD_COST = 1.6  # with one that costs less the other keyframes are left untried
 _LOOKED_AT = 40  # keyframes among which those tried are chosen
 _STEP_M, _STEP_RAD = 0.03, np.radians(3.0)  # frames between such steps are no new keyframes
-_APART_M, _APART_RAD = 0.10, np.radians(10.0)  # two of them differ by at least so much
+_APART = 0.10, np.radians(10.0)  # two of them differ by at least so much
 _STRICT = acceptance_thresholds(np.ones(1, dtype=bool), np.zeros(1, dtype=np.int32))
 
 
@@ -306,14 +306,11 @@ def _spread(candidates: list[Candidate], count: int) -> list[Candidate]:
     for one in candidates:
         if len(chosen) == count:
             break
-        if not any(_is_close(one.T_world_camera, other.T_world_camera) for other in chosen):
+        if not any(
+            is_within(one.T_world_camera, other.T_world_camera, *_APART) for other in chosen
+        ):
             chosen.append(one)
     return chosen
-
-
-def _is_close(a: Float64, b: Float64) -> bool:
-    near = np.linalg.norm(a[:3, 3] - b[:3, 3]) <= _APART_M
-    return bool(near and relative_angle(a[:3, :3], b[:3, :3]) <= _APART_RAD)
 
 
 def make_relocalization(batch: int, intrinsics: Intrinsics, config: SurfelConfig) -> Relocalization:
