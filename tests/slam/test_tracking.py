@@ -67,11 +67,11 @@ def _synthetic(seed: int = 0) -> dict[str, np.ndarray]:
 
 def _device_sums(data, T, weights, stride=1, columns=1 << 20, light=LIGHT):
     kinds = [wp.vec3, wp.vec3, wp.float32, wp.vec3, wp.vec3, wp.vec3]
-    images = [
-        wp.array(a.astype(np.float32), dtype=k).flatten()
-        for a, k in zip(data.values(), kinds, strict=True)
-    ]
-    size = wp.vec2i(SMALL.width, SMALL.height)
+    images = ne.AlignedImages()
+    for (name, values), kind in zip(data.items(), kinds, strict=True):
+        setattr(images, name, wp.array(values.astype(np.float32), dtype=kind).flatten())
+    images.model_size = images.live_size = wp.vec2i(SMALL.width, SMALL.height)
+    images.focal, images.centre = wp.vec2(SMALL.fx, SMALL.fy), wp.vec2(SMALL.cx, SMALL.cy)
     columns = min(columns, SMALL.width)
     rows, pieces = -(-SMALL.height // stride), -(-SMALL.width // columns)
     partial = wp.zeros((1, 1, rows * pieces, ne.NUM_SUMS), dtype=wp.float32)
@@ -81,8 +81,7 @@ def _device_sums(data, T, weights, stride=1, columns=1 << 20, light=LIGHT):
         ne.accumulate_normal_equations,
         dim=(1, 1, rows, pieces),
         inputs=[
-            *images, size, size, wp.vec2(SMALL.fx, SMALL.fy), wp.vec2(SMALL.cx, SMALL.cy), weights,
-            stride, columns, wp.array(T[None, None], dtype=wp.mat44d),
+            images, weights, stride, columns, wp.array(T[None, None], dtype=wp.mat44d),
             wp.array(light[:, None], dtype=ne.Photometry), active,
         ],
         outputs=[partial],

@@ -53,12 +53,44 @@ class FusionParameters:
     max_confidence: float
 
 
-_UPDATE = """
+@wp.struct
+class FusedFrame:
+    """The frames that are fused, images flat; poses, time, weight and mask are (B,).
+
+    Attributes:
+        poses: T_world_camera.
+        mask: 0 leaves an env's map as it is.
+        time: number of the frame in its episode.
+        weight: in (0, 1], lower for a fast camera.
+        depth: (B * H * W) metres.
+        normals: camera frame.
+        color: RGB.
+        radial: (H * W) weights of the pixels.
+        covered: 1 where a surfel of the map covers the pixel.
+    """
+
+    poses: wp.array(dtype=wp.mat44)
+    mask: wp.array(dtype=wp.int32)
+    time: wp.array(dtype=wp.int32)
+    weight: wp.array(dtype=wp.float32)
+    depth: wp.array(dtype=wp.float32)
+    normals: wp.array(dtype=wp.vec3)
+    color: wp.array(dtype=wp.vec3)
+    radial: wp.array(dtype=wp.float32)
+    covered: wp.array(dtype=wp.int32)
+
+
+@wp.func_native(
+    f"constexpr float STEEPEST = {STEEPEST}f, COARSER = {COARSER}f;"
+    + """
 #if defined(__CUDA_ARCH__)
 constexpr int LANES = 1;  // surfels at a time
 #else
 constexpr int LANES = 64;
 #endif
+const wp::mat44 T = frame.poses.data[b];
+const int now = frame.time.data[b];
+const float gain = frame.weight.data[b];
 const int n = end - first < LANES ? end - first : LANES;
 const int width = camera.width, height = camera.height;
 const float fx = camera.focal[0], fy = camera.focal[1];
@@ -99,7 +131,7 @@ for (int k = 0; k < n; ++k) {
 // The four readings around; those of the surfel's surface get their bilinear weight, others 0.
 float w00[LANES], w01[LANES], w10[LANES], w11[LANES];
 for (int k = 0; k < n; ++k) {
-    const float* z = live_depth.data + image + pixel[k];
+    const float* z = frame.depth.data + image + pixel[k];
     w00[k] = z[0];
     w01[k] = z[1];
     w10[k] = z[width];
@@ -138,7 +170,7 @@ for (int k = 0; k < n; ++k) {
     c11[k] = (w11[k] > 0.0f) & (l2 + u2 < covers);
 }
 for (int k = 0; k < n; ++k) {
-    int* at = covered.data + image + pixel[k];
+    int* at = frame.covered.data + image + pixel[k];
 #if defined(__CUDA_ARCH__)
     if (c00[k]) at[0] = 1;
     if (c01[k]) at[1] = 1;
@@ -158,11 +190,11 @@ float lx[LANES], ly[LANES], lz[LANES], red[LANES], green[LANES], blue[LANES];
 float old_red[LANES], old_green[LANES], old_blue[LANES];
 for (int k = 0; k < n; ++k) {
     const int nearest = pixel[k] + (right[k] >= 0.5f ? 1 : 0) + (down[k] >= 0.5f ? width : 0);
-    const float* normal = (const float*)live_normals.data + 3 * size_t(image + nearest);
+    const float* normal = (const float*)frame.normals.data + 3 * size_t(image + nearest);
     lx[k] = normal[0];
     ly[k] = normal[1];
     lz[k] = normal[2];
-    alpha[k] = gain * radial.data[nearest];
+    alpha[k] = gain * frame.radial.data[nearest];
 }
 for (int k = 0; k < n; ++k) {
     const size_t i = map + index[k];
@@ -174,7 +206,7 @@ for (int k = 0; k < n; ++k) {
     old_blue[k] = color[2];
 }
 for (int k = 0; k < n; ++k) {
-    const float* color = (const float*)live_color.data + 3 * size_t(image + pixel[k]);
+    const float* color = (const float*)frame.color.data + 3 * size_t(image + pixel[k]);
     const float* below = color + 3 * width;
     red[k] = w00[k] * color[0] + w01[k] * color[3] + w10[k] * below[0] + w11[k] * below[3];
     green[k] = w00[k] * color[1] + w01[k] * color[4] + w10[k] * below[1] + w11[k] * below[4];
@@ -187,13 +219,13 @@ int matched[LANES], refined[LANES];
 for (int k = 0; k < n; ++k) {
     const float x = P[3 * k], y = P[3 * k + 1], z = P[3 * k + 2];
     const float cosine = -(lx[k] * x + ly[k] * y + lz[k] * z) / sqrtf(x * x + y * y + z * z);
-    const float steep = cosine > steepest ? cosine : steepest;
+    const float steep = cosine > STEEPEST ? cosine : STEEPEST;
     const float live_radius = parameters.radius_px * z / (fx * steep);
     const float agreement = lx[k] * N[3 * k] + ly[k] * N[3 * k + 1] + lz[k] * N[3 * k + 2];
     const float squared = lx[k] * lx[k] + ly[k] * ly[k] + lz[k] * lz[k];
     const bool hit = total[k] > 0.25f, agrees = agreement > parameters.min_cosine;
     matched[k] = hit;
-    refined[k] = hit & agrees & (live_radius < coarser * radius[k]);
+    refined[k] = hit & agrees & (live_radius < COARSER * radius[k]);
     const float per_total = 1.0f / total[k];
     const float keep = confidence[k] / (confidence[k] + alpha[k]);
     const float take = 1.0f - keep;
@@ -245,27 +277,16 @@ for (int k = 0; k < n; ++k) {
 if (dead) wp::atomic_add(surfels.dead.data + b, dead);
 return n;
 """
-
-
-@wp.func_native(_UPDATE)
+)
 def update_some(
     surfels: Surfels,
     visible: VisibleList,
     b: int,
     first: int,
     end: int,
-    T: wp.mat44,
     camera: SplatCamera,
-    now: int,
-    gain: float,
     parameters: FusionParameters,
-    steepest: float,
-    coarser: float,
-    live_depth: wp.array(dtype=wp.float32),
-    live_normals: wp.array(dtype=wp.vec3),
-    live_color: wp.array(dtype=wp.vec3),
-    radial: wp.array(dtype=wp.float32),
-    covered: wp.array(dtype=wp.int32),
+    frame: FusedFrame,
 ) -> int:
     """Update the listed surfels from ``first`` on, at most to ``end``; how many those were."""
 
@@ -274,49 +295,24 @@ def update_some(
 def update_surfels(
     surfels: Surfels,
     visible: VisibleList,
-    poses: wp.array(dtype=wp.mat44),
     camera: SplatCamera,
-    mask: wp.array(dtype=wp.int32),
-    time: wp.array(dtype=wp.int32),
-    weight: wp.array(dtype=wp.float32),
     parameters: FusionParameters,
+    frame: FusedFrame,
     workers: int,
-    live_depth: wp.array(dtype=wp.float32),
-    live_normals: wp.array(dtype=wp.vec3),
-    live_color: wp.array(dtype=wp.vec3),
-    radial: wp.array(dtype=wp.float32),
-    covered: wp.array(dtype=wp.int32),
 ) -> None:
     """Average each visible surfel with the readings about its projection; mark covered pixels.
 
     A surfel in front of all four readings contradicts free space; one whose normal disagrees
-    contradicts the surface: both lose confidence and die at zero. Images are flat.
+    contradicts the surface: both lose confidence and die at zero.
     """
     b, worker = wp.tid()
-    if mask[b] == 0:
+    if frame.mask[b] == 0:
         return
     count = visible.count[b]
     j = int(worker)
     while j < count:
-        updated = update_some(
-            surfels,
-            visible,
-            b,
-            j,
-            wp.where(workers == 1, count, j + 1),
-            poses[b],
-            camera,
-            time[b],
-            weight[b],
-            parameters,
-            STEEPEST,
-            COARSER,
-            live_depth,
-            live_normals,
-            live_color,
-            radial,
-            covered,
-        )
+        end = wp.where(workers == 1, count, j + 1)
+        updated = update_some(surfels, visible, b, j, end, camera, parameters, frame)
         j += wp.where(workers == 1, updated, workers)
 
 
@@ -341,36 +337,28 @@ def radial_weights(height: int, width: int) -> NDArray[np.float32]:
 def add_surfels(
     surfels: Surfels,
     capacity: int,
-    poses: wp.array(dtype=wp.mat44),
     camera: SplatCamera,
-    mask: wp.array(dtype=wp.int32),
-    time: wp.array(dtype=wp.int32),
-    weight: wp.array(dtype=wp.float32),
     parameters: FusionParameters,
+    frame: FusedFrame,
     workers: int,
-    live_depth: wp.array(dtype=wp.float32),
-    live_normals: wp.array(dtype=wp.vec3),
-    live_color: wp.array(dtype=wp.vec3),
-    radial: wp.array(dtype=wp.float32),
-    covered: wp.array(dtype=wp.int32),
 ) -> None:
     """Start a surfel at every uncovered reading with a normal; a full map drops it.
 
     ``count`` runs past the capacity when surfels are dropped; ``put_back`` sets it right.
     """
     b, worker = wp.tid()
-    if mask[b] == 0:
+    if frame.mask[b] == 0:
         return
     height = camera.height
     width = camera.width
     image = b * height * width
-    T = poses[b]
+    T = frame.poses[b]
     R = rotation_of(T)
     t = translation_of(T)
     pixel = int(worker)
     while pixel < height * width:
-        z = fetch(live_depth, image + pixel)
-        if fetch(covered, image + pixel) == 0 and z > 0.0:
+        z = fetch(frame.depth, image + pixel)
+        if fetch(frame.covered, image + pixel) == 0 and z > 0.0:
             v = pixel / width
             u = pixel - v * width
             p = wp.vec3(
@@ -378,18 +366,18 @@ def add_surfels(
                 z * (float(v) - camera.centre[1]) / camera.focal[1],
                 z,
             )
-            n = fetch(live_normals, image + pixel)
+            n = fetch(frame.normals, image + pixel)
             if wp.dot(n, p) < 0.0:
                 slot = wp.atomic_add(surfels.count, b, 1)
                 if slot < capacity:
                     put(surfels.position, b, slot, R * p + t)
                     put(surfels.normal, b, slot, R * n)
-                    put(surfels.color, b, slot, fetch(live_color, image + pixel))
+                    put(surfels.color, b, slot, fetch(frame.color, image + pixel))
                     radius = reading_radius(z, n, p, camera.focal[0], parameters.radius_px)
                     put(surfels.radius, b, slot, radius)
-                    put(surfels.confidence, b, slot, weight[b] * fetch(radial, pixel))
-                    put(surfels.created, b, slot, time[b])
-                    put(surfels.seen, b, slot, time[b])
+                    put(surfels.confidence, b, slot, frame.weight[b] * fetch(frame.radial, pixel))
+                    put(surfels.created, b, slot, frame.time[b])
+                    put(surfels.seen, b, slot, frame.time[b])
                 else:
                     wp.atomic_add(surfels.dropped, b, 1)
         pixel += workers

@@ -114,6 +114,29 @@ class Photometry:
     trust: float  # weight of the photometric term, [0, 1]
 
 
+@wp.struct
+class AlignedImages:
+    """Images of B envs at one pyramid level, flat, and the camera of the live ones.
+
+    Attributes:
+        model_size: (width, height); ``live_size`` likewise.
+        live_gradient: (I, dI/du, dI/dv).
+        focal: (fx, fy).
+        centre: (cx, cy).
+    """
+
+    model_vertices: wp.array(dtype=wp.vec3)
+    model_normals: wp.array(dtype=wp.vec3)
+    model_intensity: wp.array(dtype=wp.float32)
+    live_vertices: wp.array(dtype=wp.vec3)
+    live_normals: wp.array(dtype=wp.vec3)
+    live_gradient: wp.array(dtype=wp.vec3)
+    model_size: wp.vec2i
+    live_size: wp.vec2i
+    focal: wp.vec2
+    centre: wp.vec2
+
+
 @wp.func_native(
     _PLACES
     + """
@@ -123,14 +146,15 @@ constexpr int LANES = 1;  // points at a time
 constexpr int LANES = 64;
 typedef float eight __attribute__((vector_size(32), aligned(4)));
 #endif
-const float fx = focal[0], fy = focal[1], cx = centre[0], cy = centre[1];
-const int live_width = live_size[0];
-const float u_limit = (float)(live_width - 1), v_limit = (float)(live_size[1] - 1);
-const float* models = (const float*)model_vertices.data;
-const float* model_n = (const float*)model_normals.data;
-const float* lives = (const float*)live_vertices.data + 3 * size_t(live_image);
-const float* live_n = (const float*)live_normals.data + 3 * size_t(live_image);
-const float* gradients = (const float*)live_gradient.data + 3 * size_t(live_image);
+const float fx = images.focal[0], fy = images.focal[1];
+const float cx = images.centre[0], cy = images.centre[1];
+const int live_width = images.live_size[0];
+const float u_limit = (float)(live_width - 1), v_limit = (float)(images.live_size[1] - 1);
+const float* models = (const float*)images.model_vertices.data;
+const float* model_n = (const float*)images.model_normals.data;
+const float* lives = (const float*)images.live_vertices.data + 3 * size_t(live_image);
+const float* live_n = (const float*)images.live_normals.data + 3 * size_t(live_image);
+const float* gradients = (const float*)images.live_gradient.data + 3 * size_t(live_image);
 const float per_scale = 1.0f / wp::max(photometry.scale, weights.least_scale);
 const float narrowing = weights.least_scale * per_scale;
 const float rgb = weights.rgb * photometry.trust * narrowing * narrowing;
@@ -194,7 +218,7 @@ for (int first = start; first < end; first += LANES * stride) {
         nx[m] = model_n[3 * i];
         ny[m] = model_n[3 * i + 1];
         nz[m] = model_n[3 * i + 2];
-        grey[m] = model_intensity.data[i];
+        grey[m] = images.model_intensity.data[i];
         const int column = (int)u[k], row = (int)v[k];
         right[m] = u[k] - (float)column;
         down[m] = v[k] - (float)row;
@@ -347,19 +371,11 @@ out[SUM_EXPOSURE_WRR] = sum_wrr;
 """
 )
 def accumulate_points(
-    model_vertices: wp.array(dtype=wp.vec3),
-    model_normals: wp.array(dtype=wp.vec3),
-    model_intensity: wp.array(dtype=wp.float32),
-    live_vertices: wp.array(dtype=wp.vec3),
-    live_normals: wp.array(dtype=wp.vec3),
-    live_gradient: wp.array(dtype=wp.vec3),
+    images: AlignedImages,
     start: int,
     end: int,
     stride: int,
     live_image: int,
-    live_size: wp.vec2i,
-    focal: wp.vec2,
-    centre: wp.vec2,
     R: wp.mat33,
     t: wp.vec3,
     weights: Weights,
@@ -375,16 +391,7 @@ def accumulate_points(
 
 @wp.kernel
 def accumulate_normal_equations(
-    model_vertices: wp.array(dtype=wp.vec3),
-    model_normals: wp.array(dtype=wp.vec3),
-    model_intensity: wp.array(dtype=wp.float32),
-    live_vertices: wp.array(dtype=wp.vec3),
-    live_normals: wp.array(dtype=wp.vec3),
-    live_gradient: wp.array(dtype=wp.vec3),
-    model_size: wp.vec2i,  # (width, height) of the model images
-    live_size: wp.vec2i,
-    focal: wp.vec2,
-    centre: wp.vec2,
+    images: AlignedImages,
     weights: Weights,
     stride: wp.int32,
     columns: wp.int32,  # of the image, per thread
@@ -397,7 +404,7 @@ def accumulate_normal_equations(
     b, k, row_index, piece = wp.tid()
     if active[b, k] != RUNNING:
         return
-    width = model_size[0]
+    width = images.model_size[0]
     T = pose[b, k]
     R_inverse = wp.mat33(
         float(T[0, 0]), float(T[1, 0]), float(T[2, 0]),
@@ -407,22 +414,14 @@ def accumulate_normal_equations(
     t_inverse = -(R_inverse * wp.vec3(float(T[0, 3]), float(T[1, 3]), float(T[2, 3])))
     # Neighbouring rows sample different columns, like a chessboard.
     start = piece * columns + (row_index % 2) * (stride // 2)
-    model_row = (b * model_size[1] + row_index * stride) * width
+    model_row = (b * images.model_size[1] + row_index * stride) * width
     pieces = (width + columns - 1) // columns
     accumulate_points(
-        model_vertices,
-        model_normals,
-        model_intensity,
-        live_vertices,
-        live_normals,
-        live_gradient,
+        images,
         model_row + start,
         model_row + wp.min((piece + 1) * columns, width),
         stride,
-        b * live_size[0] * live_size[1],
-        live_size,
-        focal,
-        centre,
+        b * images.live_size[0] * images.live_size[1],
         R_inverse,
         t_inverse,
         weights,

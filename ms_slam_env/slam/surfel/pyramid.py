@@ -118,12 +118,12 @@ def _intensity_gradient(
 
 @dataclass(frozen=True)
 class Level:
-    """One pyramid level; arrays (B, h, w). ``gradient`` holds (I, dI/du, dI/dv)."""
+    """One pyramid level; arrays (B, h, w). ``gradient`` holds (I, dI/du, dI/dv), or nothing."""
 
     vertices: wp.array
     normals: wp.array
     intensity: wp.array
-    gradient: wp.array | None
+    gradient: wp.array
 
 
 class Pyramid:
@@ -143,27 +143,29 @@ class Pyramid:
         self._launches: list[wp.Launch] = []
         self._levels: list[Level] = []
 
+        self._with_gradient = with_gradient
+
         def image(dtype: Any) -> wp.array:
             return wp.zeros(size, dtype=dtype, device=device)
 
+        def gradient() -> wp.array:
+            return image(wp.vec3) if with_gradient else wp.empty(0, dtype=wp.vec3, device=device)
+
         size = (batch, *shape)
-        self._gradient = image(wp.vec3) if with_gradient else None
+        self._gradient = gradient()
         self._coarse: list[Level] = []
         for _ in range(1, num_levels):
             size = (batch, size[1] // 2, size[2] // 2)
-            gradient = image(wp.vec3) if with_gradient else None
-            self._coarse.append(Level(image(wp.vec3), image(wp.vec3), image(wp.float32), gradient))
+            images = image(wp.vec3), image(wp.vec3), image(wp.float32)
+            self._coarse.append(Level(*images, gradient()))
 
     def build(self, vertices: wp.array, normals: wp.array, intensity: wp.array) -> list[Level]:
         """All levels, finest first, of images (B, H, W); the coarse ones overwrite the last."""
         if not self._levels or self._levels[0].vertices is not vertices:
             self._levels = [Level(vertices, normals, intensity, self._gradient), *self._coarse]
             self._launches = [self._downsampling(*pair) for pair in pairwise(self._levels)]
-            self._launches += [
-                self._differentiation(level.intensity, level.gradient)
-                for level in self._levels
-                if level.gradient is not None
-            ]
+            if self._with_gradient:
+                self._launches += [self._differentiation(level) for level in self._levels]
         for launch in self._launches:
             launch.launch()
         return self._levels
@@ -175,9 +177,10 @@ class Pyramid:
         inputs = [*source, *size, EDGE_FRACTION, self._columns, *target]
         return record_launch(_downsample, self._dim(coarse.intensity), inputs, self._device)
 
-    def _differentiation(self, intensity: wp.array, gradient: wp.array) -> wp.Launch:
-        inputs = [intensity.flatten(), *intensity.shape[1:], self._columns, gradient.flatten()]
-        return record_launch(_intensity_gradient, self._dim(intensity), inputs, self._device)
+    def _differentiation(self, level: Level) -> wp.Launch:
+        size, image = level.intensity.shape[1:], level.intensity
+        inputs = [image.flatten(), *size, self._columns, level.gradient.flatten()]
+        return record_launch(_intensity_gradient, self._dim(image), inputs, self._device)
 
     def _dim(self, image: wp.array) -> tuple[int, int]:
         """Threads of a kernel that writes ``image`` (B, h, w): a piece of a row each."""

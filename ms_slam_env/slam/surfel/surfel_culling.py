@@ -9,6 +9,7 @@ from __future__ import annotations
 from ms_slam_env._warp import wp
 from ms_slam_env.slam.surfel.device import fetch, put
 from ms_slam_env.slam.surfel.frustum_culling import num_blocks
+from ms_slam_env.slam.surfel.fusion import FusedFrame
 from ms_slam_env.slam.surfel.surfels import BLOCK_SIZE, Compaction, CullingBlocks, Surfels
 
 NEVER = wp.constant(2**31 - 1)
@@ -42,8 +43,7 @@ def cull_unstable(
     surfels: Surfels,
     blocks: CullingBlocks,
     rule: CullingRule,
-    mask: wp.array(dtype=wp.int32),
-    time: wp.array(dtype=wp.int32),
+    frame: FusedFrame,
     workers: int,
     compaction: Compaction,
 ) -> None:
@@ -55,9 +55,9 @@ def cull_unstable(
     b, worker = wp.tid()
     count = wp.min(surfels.count[b], rule.capacity)
     crowded = is_crowded(count - surfels.dead[b], rule.capacity)
-    if mask[b] == 0 or (time[b] % rule.interval != 0 and not crowded):
+    if frame.mask[b] == 0 or (frame.time[b] % rule.interval != 0 and not crowded):
         return
-    oldest = time[b] - wp.where(crowded, 0, rule.window)
+    oldest = frame.time[b] - wp.where(crowded, 0, rule.window)
     block = int(worker)
     while block < num_blocks(count):
         if blocks.expiry[b, block] < oldest:
@@ -82,8 +82,7 @@ def cull_unstable(
 def list_survivors(
     surfels: Surfels,
     rule: CullingRule,
-    mask: wp.array(dtype=wp.int32),
-    time: wp.array(dtype=wp.int32),
+    frame: FusedFrame,
     workers: int,
     compaction: Compaction,
 ) -> None:
@@ -95,10 +94,10 @@ def list_survivors(
     b, worker = wp.tid()
     count = wp.min(surfels.count[b], rule.capacity)
     dead = surfels.dead[b] + compaction.expired[b]
-    many = 8 * dead > count and time[b] % rule.interval == 0
+    many = 8 * dead > count and frame.time[b] % rule.interval == 0
     crowded = is_crowded(count, rule.capacity)
     needed = crowded and 64 * dead > count and dead > rule.capacity - count
-    if mask[b] == 0 or not (many or needed):
+    if frame.mask[b] == 0 or not (many or needed):
         compaction.kept[b] = -1
         return
     i = int(worker)

@@ -20,6 +20,7 @@ from ms_slam_env.slam.surfel.frustum_culling import (
     set_bounded,
 )
 from ms_slam_env.slam.surfel.fusion import (
+    FusedFrame,
     FusionParameters,
     add_surfels,
     radial_weights,
@@ -48,8 +49,6 @@ from ms_slam_env.slam.surfel.surfels import (
 )
 from ms_slam_env.slam.surfel.view_prediction import DeviceViews, ViewPredictor
 
-_CHANGING = ("poses", "mask", "time", "weight", "live_depth", "live_normals", "live_color")
-
 
 class MapKernels:
     """Recorded launches for frames of one size under one configuration.
@@ -70,7 +69,12 @@ class MapKernels:
         self._cull = FrustumCuller(buffers, buffers.batch, self._camera, buffers.active)
         self._model_renderer = self.model_renderer(model_stride, buffers.active)
         self._arguments: tuple[Any, ...] = (None,) * 5
-        self._covered = self._pixels(wp.int32)
+        self._frame = FusedFrame()
+        self._frame.covered = wp.zeros(
+            math.prod((buffers.batch, *intrinsics.shape)), dtype=wp.int32, device=buffers.device
+        )
+        radial = radial_weights(*intrinsics.shape).ravel()
+        self._frame.radial = wp.array(radial, device=buffers.device)
         self._fusion = self._record_fusion()
         self._culling = self._record_culling()
         inputs = [buffers.surfels, buffers.blocks, buffers.capacity]
@@ -80,21 +84,11 @@ class MapKernels:
             record_launch(set_bounded, buffers.batch, inputs, buffers.device),
         ]
 
-    def _pixels(self, dtype: Any) -> wp.array:
-        """Zeros for all pixels of all envs, flat."""
-        count = math.prod((self._buffers.batch, *self._intrinsics.shape))
-        return wp.zeros(count, dtype=dtype, device=self._buffers.device)
-
     def _record(self, kernel: Any, inputs: list[Any]) -> wp.Launch:
         dim = (self._buffers.batch, self._buffers.workers)
         return record_launch(kernel, dim, inputs, self._buffers.device)
 
-    def _per_env(self, dtype: Any) -> wp.array:
-        """A place holder for one number per env, which is set with the frame."""
-        return wp.zeros(self._buffers.batch, dtype=dtype, device=self._buffers.device)
-
     def _record_fusion(self) -> list[wp.Launch]:
-        """Launches that update and add surfels; what changes with the frame is set there."""
         config, buffers = self.config, self._buffers
         rule = FusionParameters()
         rule.distance_m = config.fusion_distance_m
@@ -102,18 +96,13 @@ class MapKernels:
         rule.coverage_px = config.coverage_px
         rule.radius_px = config.surfel_radius_px
         rule.max_confidence = config.max_confidence
-        radial = radial_weights(*self._intrinsics.shape).ravel()
-        integers, image = self._per_env(wp.int32), self._pixels(wp.vec3)
-        frame = [self._per_env(wp.mat44), self._camera, integers, integers]
-        frame += [self._per_env(wp.float32), rule, buffers.workers, self._pixels(wp.float32)]
-        frame += [image, image, wp.array(radial, device=buffers.device), self._covered]
+        shared = [self._camera, rule, self._frame, buffers.workers]
         return [
-            self._record(update_surfels, [buffers.surfels, buffers.visible, *frame]),
-            self._record(add_surfels, [buffers.surfels, buffers.capacity, *frame]),
+            self._record(update_surfels, [buffers.surfels, buffers.visible, *shared]),
+            self._record(add_surfels, [buffers.surfels, buffers.capacity, *shared]),
         ]
 
     def _record_culling(self) -> list[wp.Launch]:
-        """Launches that remove surfels; the first two depend on the frame."""
         config, buffers = self.config, self._buffers
         rule = CullingRule()
         rule.capacity = buffers.capacity
@@ -121,8 +110,8 @@ class MapKernels:
         rule.window = config.unstable_window
         rule.confidence_threshold = config.confidence_threshold
         surfels, spare, blocks = buffers.surfels, buffers.spare, buffers.blocks
-        integers, workers, compaction = self._per_env(wp.int32), buffers.workers, buffers.compaction
-        due = [rule, integers, integers, workers, compaction]
+        workers, compaction = buffers.workers, buffers.compaction
+        due = [rule, self._frame, workers, compaction]
         return [
             self._record(cull_unstable, [surfels, blocks, *due]),
             self._record(list_survivors, [surfels, *due]),
@@ -147,7 +136,7 @@ class MapKernels:
     ) -> None:
         """Fuse one frame per env; see ``SurfelMap.fuse``."""
         self._cull(poses)
-        self._covered.zero_()
+        self._frame.covered.zero_()
         self._buffers.compaction.kept.zero_()
         self._buffers.compaction.expired.zero_()
         self._bind(live, poses, time, weight, mask)
@@ -166,14 +155,12 @@ class MapKernels:
         arguments = (live, poses, time, weight, mask)
         if all(new is old for new, old in zip(arguments, self._arguments, strict=True)):
             return
-        self._arguments = arguments
-        images = (live.depth.flatten(), live.normals.flatten(), live.color.flatten())
-        for command in self._fusion:
-            for name, value in zip(_CHANGING, (poses, mask, time, weight, *images), strict=True):
-                command.set_param_by_name(name, value)
-        for command in self._culling[:2]:
-            command.set_param_by_name("mask", mask)
-            command.set_param_by_name("time", time)
+        self._arguments, frame = arguments, self._frame
+        frame.poses, frame.time, frame.weight, frame.mask = poses, time, weight, mask
+        frame.depth, frame.normals = live.depth.flatten(), live.normals.flatten()
+        frame.color = live.color.flatten()
+        for launch in (*self._fusion, *self._culling[:2]):
+            launch.set_param_by_name("frame", frame)
 
 
 class SurfelMap:

@@ -28,6 +28,7 @@ from ms_slam_env.slam.surfel.normal_equations import (
     NUM_SUMS,
     OFF,
     RUNNING,
+    AlignedImages,
     Photometry,
     Weights,
     accumulate_normal_equations,
@@ -298,21 +299,18 @@ class Tracker:
         camera, model, live = self._cameras[level], self._model_levels[level], self._live_levels
         height, width = self._model_shapes[level]
         rows = -(-height // stride)
-        inputs = [
-            *_flat(model.vertices, model.normals, model.intensity),
-            *_flat(live[level].vertices, live[level].normals, live[level].gradient),
-            wp.vec2i(width, height),
-            wp.vec2i(camera.width, camera.height),
-            wp.vec2(camera.fx, camera.fy),
-            wp.vec2(camera.cx, camera.cy),
-            self._weights[level],
-            stride,
-            min(self._columns, width),
-            state.pose,
-            state.photometry,
-            state.active,
-            state.partial,
-        ]
+        images = AlignedImages()
+        images.model_vertices = model.vertices.flatten()
+        images.model_normals = model.normals.flatten()
+        images.model_intensity = model.intensity.flatten()
+        images.live_vertices = live[level].vertices.flatten()
+        images.live_normals = live[level].normals.flatten()
+        images.live_gradient = live[level].gradient.flatten()
+        images.model_size = wp.vec2i(width, height)
+        images.live_size = wp.vec2i(camera.width, camera.height)
+        images.focal, images.centre = wp.vec2(camera.fx, camera.fy), wp.vec2(camera.cx, camera.cy)
+        inputs = [images, self._weights[level], stride, min(self._columns, width)]
+        inputs += [state.pose, state.photometry, state.active, state.partial]
         return (*state.pose.shape, rows, self._slots(level, stride) // rows), inputs
 
     def _step(self, level: int, state: _Hypotheses, last: bool) -> None:
@@ -327,11 +325,6 @@ class Tracker:
                 [state.sums, *rule, state.pose, state.photometry, state.active],
             ),
         )
-
-
-def _flat(*images: Any) -> list[Any]:
-    """One-dimensional views of device arrays."""
-    return [image.flatten() for image in images]
 
 
 def _weights(config: SurfelConfig, level: int) -> Weights:
