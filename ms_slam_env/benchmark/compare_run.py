@@ -128,13 +128,14 @@ def run_here(spec: CompareSpec) -> dict[str, Any]:
 
 def _map_quality(points: np.ndarray, surface: np.ndarray) -> dict[str, Any]:
     """Errors of the map where its estimated poses placed it; None for an empty map."""
+    from ms_slam_env.geometry.point_clouds import voxel_downsample
     from ms_slam_env.metrics import reconstruction
 
     names = [f"{kind}_{round(100 * t)}cm" for t in THRESHOLDS_M for kind in ("precision", "f")]
     if len(points) == 0:
         return {"points": 0, "map_error_mm": None, **dict.fromkeys(names)}
     found = reconstruction.map_metrics(points, surface, THRESHOLDS_M, registration="none")
-    distances = reconstruction.nearest_distances(reconstruction.voxel_thin(points, 0.01), surface)
+    distances = reconstruction.nearest_distances(voxel_downsample(points, 0.01), surface)
     values = [of[t] for t in THRESHOLDS_M for of in (found.precision, found.f_score)]
     return {
         "points": len(points),

@@ -195,5 +195,5 @@ def _map_error_mm(points: np.ndarray, surface: np.ndarray) -> float | None:
 
     if len(points) == 0:
         return None
-    distances = reconstruction.nearest_distances(reconstruction.voxel_thin(points, 0.01), surface)
+    distances = reconstruction.nearest_distances(metrics.voxel_downsample(points, 0.01), surface)
     return 1e3 * float(np.median(distances))

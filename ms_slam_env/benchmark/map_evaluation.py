@@ -15,8 +15,8 @@ from ms_slam_env.benchmark.surface_files import read_surface
 from ms_slam_env.config import check_choice, check_range
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import transform_points
+from ms_slam_env.geometry.cloud_registration import CUTOFF_M, REGISTRATIONS
 from ms_slam_env.metrics.accuracy import SAMPLES
-from ms_slam_env.metrics.cloud_registration import CUTOFF_M, REGISTRATIONS
 
 Float64 = NDArray[np.float64]
 
@@ -141,4 +141,4 @@ def evaluate_maps(
 
 
 def _thin(points: Float64, voxel_m: float) -> Float64:
-    return metrics.voxel_thin(points, voxel_m) if voxel_m > 0 else points
+    return metrics.voxel_downsample(points, voxel_m) if voxel_m > 0 else points

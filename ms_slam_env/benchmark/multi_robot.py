@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 from ms_slam_env.benchmark import multi_robot_report as report
-from ms_slam_env.benchmark.map_merging import MergeConfig
 from ms_slam_env.benchmark.multi_robot_run import (
     SHARED,
     MultiRobotSpec,
@@ -35,6 +34,7 @@ from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import write_json
 from ms_slam_env.scenes.registry import check_name
 from ms_slam_env.sensor.noise import noise_config
+from ms_slam_env.slam.map_merging import MergeConfig
 
 PROGRAM = "python -m ms_slam_env.benchmark.multi_robot"
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.camera import xtion
 from ms_slam_env.errors import InputError
-from ms_slam_env.metrics import voxel_thin
+from ms_slam_env.geometry.point_clouds import voxel_downsample
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sequences import HandheldPath
@@ -40,7 +40,7 @@ class Views:
             view = self._sensor.ground_truth(pose)
             near = (view.depth > 0) & (view.depth <= _REACH_M)
             seen.append(view.points[near].astype(np.float64))
-        return voxel_thin(np.concatenate(seen), voxel_m)
+        return voxel_downsample(np.concatenate(seen), voxel_m)
 
 
 def overlap(a: set[tuple[int, ...]], b: set[tuple[int, ...]]) -> float:

@@ -14,7 +14,7 @@ from ms_slam_env.benchmark.figures import caption, colour, new_figure, save
 from ms_slam_env.benchmark.map_consistency_picture import CAMERA, overview_pose, render_points
 from ms_slam_env.benchmark.multi_robot_run import Team
 from ms_slam_env.geometry import transform_points
-from ms_slam_env.metrics.reconstruction import voxel_firsts
+from ms_slam_env.geometry.point_clouds import voxel_firsts
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import format_number, markdown_table
 

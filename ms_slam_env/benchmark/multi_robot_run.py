@@ -11,8 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import metrics, scenes, slam
-from ms_slam_env.benchmark.map_hypotheses import RobotRun, pose_difference
-from ms_slam_env.benchmark.map_merging import Merge, MergeConfig, decide, find_hypotheses
 from ms_slam_env.benchmark.multi_robot_paths import Views, team_paths
 from ms_slam_env.camera import xtion
 from ms_slam_env.config import check_choice, check_range
@@ -20,6 +18,14 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.map_quality import judge_map
 from ms_slam_env.geometry import invert, transform_points
 from ms_slam_env.sequences import HandheldPath, render_sequence
+from ms_slam_env.slam.map_hypotheses import RobotRun
+from ms_slam_env.slam.map_merging import (
+    Merge,
+    MergeConfig,
+    decide,
+    find_hypotheses,
+    pose_difference,
+)
 
 Float64 = NDArray[np.float64]
 

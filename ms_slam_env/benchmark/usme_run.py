@@ -185,8 +185,10 @@ def _seen_surface(scene: Scene, poses: Float64, options: dict[str, Any]) -> Floa
     for index in np.unique(picked):
         view = sensor.ground_truth(poses[index])
         near = (view.depth > 0) & (view.depth <= reach)
-        clouds.append(metrics.voxel_thin(view.points[near].astype(np.float64), voxel_m(scene.name)))
-    return metrics.voxel_thin(np.concatenate(clouds), voxel_m(scene.name))
+        clouds.append(
+            metrics.voxel_downsample(view.points[near].astype(np.float64), voxel_m(scene.name))
+        )
+    return metrics.voxel_downsample(np.concatenate(clouds), voxel_m(scene.name))
 
 
 def voxel_m(scene: str) -> float:
@@ -206,7 +208,7 @@ def map_measures(points: Float64, surface: Float64, scene: str) -> dict[str, Any
         ("c2c_mean_m", "c2c_std_m", "hausdorff_m", "completion", "noise_ratio", "spacing_m")
     )
     result: dict[str, Any] = {"points": len(points), "near_m": near, **nothing}
-    cloud = metrics.voxel_thin(points, voxel_m(scene)) if len(points) else points
+    cloud = metrics.voxel_downsample(points, voxel_m(scene)) if len(points) else points
     if len(cloud) < 100:
         return result
     if len(cloud) > _MOST_POINTS:

@@ -17,7 +17,7 @@ def judge_map(points: Float64, surface: Float64, reference: Float64) -> dict[str
     """Map metrics from points (N, 3) of the map, of the true surface and of the reference."""
     result: dict[str, float] = {}
     if len(points):
-        cloud = metrics.voxel_thin(points, MAP_VOXEL_M)
+        cloud = metrics.voxel_downsample(points, MAP_VOXEL_M)
         to_surface = metrics.nearest_distances(cloud, surface)
         to_map = metrics.nearest_distances(reference, cloud)
         rer = metrics.rer(cloud, surface)

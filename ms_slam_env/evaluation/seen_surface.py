@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.metrics.reconstruction import voxel_thin
+from ms_slam_env.geometry.point_clouds import voxel_downsample
 from ms_slam_env.sequences import Sequence
 
 Float64 = NDArray[np.float64]
@@ -34,7 +34,7 @@ def seen_surface(sequence: Sequence, cutoff_m: float = CUTOFF_M) -> Float64:
         )
         for k in picked
     ]
-    return voxel_thin(np.concatenate(clouds), SURFACE_SPACING_M)
+    return voxel_downsample(np.concatenate(clouds), SURFACE_SPACING_M)
 
 
 def back_projected(

@@ -21,8 +21,9 @@ from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.experiments.harness.experiment import Experiment
 from ms_slam_env.experiments.pictures.loop_maps import MapView, save_picture
 from ms_slam_env.geometry import invert, relative_angle
+from ms_slam_env.geometry.point_clouds import voxel_downsample
 from ms_slam_env.metrics import ate_rmse, path_length
-from ms_slam_env.metrics.reconstruction import nearest_distances, voxel_thin
+from ms_slam_env.metrics.reconstruction import nearest_distances
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished, make_table
@@ -281,8 +282,8 @@ def run_loop(spec: LoopSpec) -> dict[str, Any]:
     frames, bent = system.loops.trajectory(0)
     final = estimate.copy()
     final[frames] = bent
-    surface = voxel_thin(scene.surface_points(0.01)[0], 0.01)
-    errors = nearest_distances(voxel_thin(system.map.points(stable=False), 0.01), surface)
+    surface = voxel_downsample(scene.surface_points(0.01)[0], 0.01)
+    errors = nearest_distances(voxel_downsample(system.map.points(stable=False), 0.01), surface)
     error_m = np.linalg.norm(estimate[:, :3, 3] - truth[:, :3, 3], axis=1)
     return {
         "frames": len(truth),

@@ -1,5 +1,7 @@
 """Errors of trajectories and maps; costs of SLAM."""
 
+from ms_slam_env.geometry.cloud_registration import CloudRegistration, register_clouds
+from ms_slam_env.geometry.point_clouds import umeyama, voxel_downsample
 from ms_slam_env.metrics.absolute import (
     Alignment,
     absolute_errors,
@@ -8,7 +10,6 @@ from ms_slam_env.metrics.absolute import (
     find_alignment,
 )
 from ms_slam_env.metrics.accuracy import Completion, completion
-from ms_slam_env.metrics.alignment import umeyama
 from ms_slam_env.metrics.cloud import (
     CloudDistance,
     cloud_distance,
@@ -17,7 +18,6 @@ from ms_slam_env.metrics.cloud import (
     point_spacing,
     statistical_inliers,
 )
-from ms_slam_env.metrics.cloud_registration import CloudRegistration, register_clouds
 from ms_slam_env.metrics.consistency import (
     ConsistencyRule,
     MapConsistency,
@@ -38,7 +38,6 @@ from ms_slam_env.metrics.reconstruction import (
     rcm,
     recall,
     rer,
-    voxel_thin,
 )
 from ms_slam_env.metrics.relative import (
     pose_pairs,
@@ -123,5 +122,5 @@ __all__ = [
     "tracked_segments",
     "tracking_robustness",
     "umeyama",
-    "voxel_thin",
+    "voxel_downsample",
 ]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.metrics.alignment import umeyama
+from ms_slam_env.geometry.point_clouds import umeyama
 from ms_slam_env.metrics.trajectory import (
     ErrorStatistics,
     check_kind,

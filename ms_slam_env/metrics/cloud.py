@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from ms_slam_env.errors import InputError
-from ms_slam_env.metrics.points import check_points
+from ms_slam_env.geometry.point_clouds import check_points
 from ms_slam_env.metrics.reconstruction import nearest_distances
 
 Float64 = NDArray[np.float64]

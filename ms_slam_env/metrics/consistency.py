@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from ms_slam_env.config import check_range
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose, transform_points
-from ms_slam_env.metrics.points import check_points
+from ms_slam_env.geometry.point_clouds import check_points
 
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]

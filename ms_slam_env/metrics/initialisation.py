@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.errors import InputError
-from ms_slam_env.metrics.alignment import umeyama
+from ms_slam_env.geometry.point_clouds import umeyama
 from ms_slam_env.metrics.trajectory import check_lengths, check_positions
 
 Float64 = NDArray[np.float64]

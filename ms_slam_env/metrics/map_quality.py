@@ -52,7 +52,8 @@ def map_quality(
 ) -> MapQuality:
     """Judge ``points`` (N, 3) of a map against points (M, 3) of the true surface, metres.
 
-    Every point counts alike: thin both clouds first (`voxel_thin`) for a surface to count by area.
+    Every point counts alike: thin both clouds first (`voxel_downsample`) for a surface to count by
+    area.
 
     Raises:
         InputError: bad points, no threshold, or one that is not finite and positive.

@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import transform_points
-from ms_slam_env.metrics.cloud_registration import CUTOFF_M, register_clouds
-from ms_slam_env.metrics.points import check_points
+from ms_slam_env.geometry.cloud_registration import CUTOFF_M, register_clouds
+from ms_slam_env.geometry.point_clouds import check_points, voxel_downsample
 
 Float64 = NDArray[np.float64]
 
@@ -36,33 +36,6 @@ class MapMetrics:
     f_score: dict[float, float]
     rer_m: float
     rcm: float
-
-
-def voxel_thin(points: ArrayLike, voxel_m: float) -> Float64:
-    """One point per occupied voxel of side ``voxel_m``: the first one, in the given order.
-
-    Raises:
-        InputError: bad points, or a voxel size that is not positive.
-    """
-    values = check_points(points, "points")
-    return values[voxel_firsts(values, voxel_m)]
-
-
-def voxel_firsts(points: ArrayLike, voxel_m: float) -> NDArray[np.int64]:
-    """Indices (K,), ascending, of the first point in each occupied voxel of side ``voxel_m``.
-
-    Raises:
-        InputError: bad points, or a voxel size that is not positive.
-    """
-    values = check_points(points, "points")
-    if not voxel_m > 0:
-        raise InputError(f"voxel_m must be > 0, got {voxel_m}")
-    index = np.floor(values / voxel_m).astype(np.int64)
-    index -= index.min(axis=0)
-    size = index.max(axis=0) + 1
-    key = (index[:, 0] * size[1] + index[:, 1]) * size[2] + index[:, 2]
-    _, first = np.unique(key, return_index=True)
-    return np.sort(first)
 
 
 def nearest_distances(points: ArrayLike, truth: ArrayLike) -> Float64:
@@ -130,8 +103,8 @@ def map_metrics(
     """
     for threshold in (*thresholds_m, rcm_threshold_m):
         _check_threshold(threshold)
-    cloud = voxel_thin(check_points(points, "points"), voxel_m)
-    true_cloud = voxel_thin(check_points(truth, "truth"), voxel_m)
+    cloud = voxel_downsample(check_points(points, "points"), voxel_m)
+    true_cloud = voxel_downsample(check_points(truth, "truth"), voxel_m)
     # Distances matter only up to the largest threshold: a bounded search is much faster, and the
     # points beyond it stay at infinity.
     reach = max(*thresholds_m, rcm_threshold_m)

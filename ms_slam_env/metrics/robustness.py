@@ -16,7 +16,7 @@ from scipy.linalg import logm
 
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.geometry import check_pose
-from ms_slam_env.metrics.alignment import umeyama
+from ms_slam_env.geometry.point_clouds import umeyama
 
 Float64 = NDArray[np.float64]
 

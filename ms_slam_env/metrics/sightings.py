@@ -12,7 +12,7 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.config import check_range
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, transform_points
-from ms_slam_env.metrics.points import check_points
+from ms_slam_env.geometry.point_clouds import check_points
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]

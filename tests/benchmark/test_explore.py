@@ -20,9 +20,9 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.seen_surface import seen_surface
 from ms_slam_env.exploration import ExplorationSettings, make_space
 from ms_slam_env.geometry import look_at
+from ms_slam_env.geometry.point_clouds import voxel_downsample
 from ms_slam_env.metrics import ate_rmse
 from ms_slam_env.metrics.cost import energy_counters
-from ms_slam_env.metrics.reconstruction import voxel_thin
 from ms_slam_env.sequences import open_sequence, render_sequence
 from ms_slam_env.sequences.writing import write_sequence
 from ms_slam_env.slam.configuration import SlamConfiguration, read_configuration
@@ -67,7 +67,7 @@ def test_measures_what_a_run_by_hand_gives(evaluator, sequences):
     assert (row["M_I"], row["M_D"]) == tuple(pytest.approx(m) for m in divergences.max(axis=0))
     assert row["load_ms"] == pytest.approx(row["ext_ms"] / 2)
     surface = seen_surface(sequence)
-    distances, _ = cKDTree(surface).query(voxel_thin(system.surface_points(), 0.01))
+    distances, _ = cKDTree(surface).query(voxel_downsample(system.surface_points(), 0.01))
     assert row["map_error_mm"] == pytest.approx(1e3 * np.median(distances))
     assert row["mem_mb"] is None or row["mem_mb"] > 0
     assert "failure" not in row

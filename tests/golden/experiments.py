@@ -301,8 +301,8 @@ def loop_closure(_: Path) -> Any:
 
 @experiment("multi_robot", CHAOTIC)
 def multi_robot(_: Path) -> Any:
-    from ms_slam_env.benchmark.map_merging import MergeConfig
     from ms_slam_env.benchmark.multi_robot_run import MultiRobotSpec, run_team
+    from ms_slam_env.slam.map_merging import MergeConfig
 
     merge = MergeConfig(queries=6, lost_queries=1, patience=2)
     spec = MultiRobotSpec(

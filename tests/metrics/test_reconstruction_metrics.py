@@ -16,7 +16,7 @@ from ms_slam_env.metrics import (
     rcm,
     recall,
     rer,
-    voxel_thin,
+    voxel_downsample,
 )
 
 
@@ -80,7 +80,7 @@ def test_icp_undoes_a_small_motion():
 
 def test_map_metrics_equal_the_single_measures():
     points, truth = box(0) + np.array([0.0, 0.0, 0.01]), box(1)
-    thinned, thinned_truth = voxel_thin(points, 0.02), voxel_thin(truth, 0.02)
+    thinned, thinned_truth = voxel_downsample(points, 0.02), voxel_downsample(truth, 0.02)
     for registration in ("none", "icp"):
         found = map_metrics(points, truth, (0.02, 0.05), 0.04, registration, voxel_m=0.02)
         for threshold in (0.02, 0.05):
@@ -96,7 +96,7 @@ def test_map_metrics_equal_the_single_measures():
 @given(st.integers(0, 100), st.floats(0.02, 0.5))
 def test_thinning_leaves_one_point_of_the_input_in_each_voxel(seed, voxel_m):
     points = box(seed, 300) - 0.7
-    thinned = voxel_thin(points, voxel_m)
+    thinned = voxel_downsample(points, voxel_m)
     cells = {tuple(cell) for cell in np.floor(points / voxel_m).astype(int)}
     assert len(thinned) == len(cells)
     assert {tuple(cell) for cell in np.floor(thinned / voxel_m).astype(int)} == cells
@@ -141,4 +141,4 @@ def test_bad_options_are_refused():
         with pytest.raises(InputError, match="threshold"):
             map_metrics(GOOD, GOOD, (threshold,))
     with pytest.raises(InputError, match="voxel_m"):
-        voxel_thin(GOOD, 0.0)
+        voxel_downsample(GOOD, 0.0)

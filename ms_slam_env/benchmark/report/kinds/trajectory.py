@@ -18,7 +18,7 @@ from ms_slam_env.benchmark.report.flatten import Record, flatten
 from ms_slam_env.benchmark.report.glossary import Meanings
 from ms_slam_env.benchmark.report.kinds.base import Kind
 from ms_slam_env.errors import InputError
-from ms_slam_env.metrics import umeyama
+from ms_slam_env.geometry.point_clouds import umeyama
 from ms_slam_env.sequences import associate, read_trajectory
 
 Float64 = NDArray[np.float64]

@@ -14,23 +14,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.benchmark.map_hypotheses import (
+from ms_slam_env.config import Checked, bounded
+from ms_slam_env.errors import unknown
+from ms_slam_env.geometry import invert, relative_angle, se3_exp, se3_log, transform_points
+from ms_slam_env.geometry.cloud_registration import register_clouds
+from ms_slam_env.geometry.point_clouds import voxel_downsample
+from ms_slam_env.slam.alignment_check import measure_photometric_consistency
+from ms_slam_env.slam.map_hypotheses import (
     SOURCES,
     Hypothesis,
     RobotRun,
-    consensus,
-    mean_pose,
-    pose_difference,
+    hypotheses_from_features,
+    hypotheses_from_relocalisation,
     query_frames,
-    recognised,
-    relocalised,
 )
-from ms_slam_env.config import check_range
-from ms_slam_env.errors import unknown
-from ms_slam_env.geometry import invert, transform_points
-from ms_slam_env.metrics import voxel_thin
-from ms_slam_env.metrics.cloud_registration import register_clouds
-from ms_slam_env.slam.alignment_check import measure_photometric_consistency
 
 Float64 = NDArray[np.float64]
 
@@ -40,7 +37,7 @@ _FAR_M = 10.0
 
 
 @dataclass(frozen=True)
-class MergeConfig:
+class MergeConfig(Checked):
     """When two maps are taken to show the same place.
 
     Attributes:
@@ -65,38 +62,26 @@ class MergeConfig:
     """
 
     sources: tuple[str, ...] = SOURCES
-    queries: int = 24
-    lost_queries: int = 8
-    patience: int = 4
-    agree_m: float = 0.10
-    agree_deg: float = 5.0
-    least_agreeing: int = 3
-    least_share: float = 0.6
-    tolerance_m: float = 0.05
-    least_overlap: float = 0.05
-    least_consistent: float = 0.85
-    least_alike: float = 0.5
-    voxel_m: float = 0.02
-    cutoff_m: float = 0.10
+    queries: int = bounded(24, 1, 10_000)
+    lost_queries: int = bounded(8, 1, 10_000)
+    patience: int = bounded(4, 2, 1000)
+    agree_m: float = bounded(0.10, 1e-4, 10.0)
+    agree_deg: float = bounded(5.0, 1e-2, 180.0)
+    least_agreeing: int = bounded(3, 1, 10_000)
+    least_share: float = bounded(0.6, 0.0, 1.0)
+    tolerance_m: float = bounded(0.05, 1e-4, 1.0)
+    least_overlap: float = bounded(0.05, 0.0, 1.0)
+    least_consistent: float = bounded(0.85, 0.0, 1.0)
+    least_alike: float = bounded(0.5, -1.0, 1.0)
+    voxel_m: float = bounded(0.02, 1e-3, 1.0)
+    cutoff_m: float = bounded(0.10, 1e-3, 10.0)
 
     def __post_init__(self) -> None:
-        """Refuse values out of range."""
+        """Refuse values out of range and unknown sources."""
+        super().__post_init__()
         for source in self.sources:
             if source not in SOURCES:
                 raise unknown("source of guesses", source, SOURCES)
-        check_range(self, "queries", 1, 10_000)
-        check_range(self, "lost_queries", 1, 10_000)
-        check_range(self, "patience", 2, 1000)
-        check_range(self, "agree_m", 1e-4, 10.0)
-        check_range(self, "agree_deg", 1e-2, 180.0)
-        check_range(self, "least_agreeing", 1, 10_000)
-        check_range(self, "least_share", 0.0, 1.0)
-        check_range(self, "tolerance_m", 1e-4, 1.0)
-        check_range(self, "least_overlap", 0.0, 1.0)
-        check_range(self, "least_consistent", 0.0, 1.0)
-        check_range(self, "least_alike", -1.0, 1.0)
-        check_range(self, "voxel_m", 1e-3, 1.0)
-        check_range(self, "cutoff_m", 1e-3, 10.0)
 
 
 @dataclass(frozen=True)
@@ -145,12 +130,12 @@ def find_hypotheses(a: RobotRun, b: RobotRun, config: MergeConfig) -> list[Hypot
     """Guesses of T_a_b, from the frames of both robots."""
     found: list[Hypothesis] = []
     if SOURCES[0] in config.sources:
-        found += recognised(a, b, config.queries)
+        found += hypotheses_from_features(a, b, config.queries)
     if SOURCES[1] in config.sources:
-        found += relocalised(a, b, config.lost_queries, config.patience)
+        found += hypotheses_from_relocalisation(a, b, config.lost_queries, config.patience)
         found += [
             Hypothesis(invert(back.T_a_b), back.weight, back.source)
-            for back in relocalised(b, a, config.lost_queries, config.patience)
+            for back in hypotheses_from_relocalisation(b, a, config.lost_queries, config.patience)
         ]
     return found
 
@@ -169,11 +154,11 @@ def decide(
     if len(agreeing) < config.least_share * len(hypotheses):
         return Merge(None, "the frames contradict each other", *counts)
     T_a_b, refined_m = mean_pose(agreeing, centre), 0.0
-    fit = judge(a, b, T_a_b, config)
+    fit = measure_fit(a, b, T_a_b, config)
     refined = refine(a, b, T_a_b, config)
     moved_m, moved_deg = pose_difference(refined, T_a_b, centre)
     if moved_m < config.agree_m and moved_deg < config.agree_deg:
-        again = judge(a, b, refined, config)
+        again = measure_fit(a, b, refined, config)
         if again.overlap >= fit.overlap - _SLACK and again.consistent >= fit.consistent - _SLACK:
             T_a_b, fit, refined_m = refined, again, moved_m
     if fit.overlap < config.least_overlap:
@@ -185,7 +170,7 @@ def decide(
     return Merge(T_a_b, "", *counts, fit, refined_m)
 
 
-def judge(a: RobotRun, b: RobotRun, T_a_b: Float64, config: MergeConfig) -> Fit:
+def measure_fit(a: RobotRun, b: RobotRun, T_a_b: Float64, config: MergeConfig) -> Fit:
     """Lay both robots' frames upon the view that the other's map predicts there.
 
     A surface of the map behind the reading may be one that only the map's robot saw, and says
@@ -221,7 +206,43 @@ def judge(a: RobotRun, b: RobotRun, T_a_b: Float64, config: MergeConfig) -> Fit:
 
 def refine(a: RobotRun, b: RobotRun, T_a_b: Float64, config: MergeConfig) -> Float64:
     """T_a_b (4, 4) after registration of the maps from that start."""
-    target = voxel_thin(a.backend.surface_points(), config.voxel_m)
-    source = voxel_thin(b.backend.surface_points(), config.voxel_m)
+    target = voxel_downsample(a.backend.surface_points(), config.voxel_m)
+    source = voxel_downsample(b.backend.surface_points(), config.voxel_m)
     moved = transform_points(T_a_b, source)
     return register_clouds(moved, target, "gicp", config.cutoff_m).T_target_source @ T_a_b
+
+
+def consensus(
+    hypotheses: Sequence[Hypothesis], centre: Float64, agree_m: float, agree_deg: float
+) -> list[Hypothesis]:
+    """The hypotheses that agree with the one that most agree with, by their number.
+
+    Two agree if they put the point ``centre`` (3,) of map b at about the same place and turn alike.
+    """
+    best: list[Hypothesis] = []
+    for one in hypotheses:
+        agreeing = []
+        for other in hypotheses:
+            distance, angle = pose_difference(one.T_a_b, other.T_a_b, centre)
+            if distance <= agree_m and angle <= agree_deg:
+                agreeing.append(other)
+        if len(agreeing) > len(best):
+            best = agreeing
+    return best
+
+
+def pose_difference(T: Float64, T_other: Float64, point: Float64) -> tuple[float, float]:
+    """Distance in metres between where two poses put a point (3,), and their angle in degrees."""
+    moved = transform_points(T, point[None]) - transform_points(T_other, point[None])
+    angle = relative_angle(T[:3, :3], T_other[:3, :3])
+    return float(np.linalg.norm(moved)), float(np.degrees(angle))
+
+
+def mean_pose(hypotheses: Sequence[Hypothesis], centre: Float64) -> Float64:
+    """Weighted mean (4, 4) of hypotheses that lie close together, taken about a point of map b."""
+    T_b_centre = np.eye(4)
+    T_b_centre[:3, 3] = centre
+    poses = [hypothesis.T_a_b @ T_b_centre for hypothesis in hypotheses]
+    twists = [se3_log(invert(poses[0]) @ pose) for pose in poses]
+    weights = [hypothesis.weight for hypothesis in hypotheses]
+    return poses[0] @ se3_exp(np.average(twists, axis=0, weights=weights)) @ invert(T_b_centre)

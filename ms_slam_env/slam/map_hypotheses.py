@@ -1,7 +1,7 @@
-"""Relative poses of two robots' maps from points that look alike in their frames.
+"""Hypotheses of where two robots' maps lie relative to each other.
 
 Relocalisation finds a frame in a map that was seen from about the same place. Two robots rather see
-the same things from different places, so points are matched by their looks (SIFT, Lowe, IJCV
+the same things from different places, so points are matched by their looks too (SIFT, Lowe, IJCV
 2004), and three matches give a relative pose (RANSAC, Fischler and Bolles, 1981), since depth puts
 every point into space.
 """
@@ -16,17 +16,119 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
-from ms_slam_env.geometry import make_pose, transform_points
-from ms_slam_env.metrics import umeyama
+from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import invert, make_pose, transform_points
+from ms_slam_env.geometry.point_clouds import umeyama
+from ms_slam_env.slam.base import SlamBackend
 from ms_slam_env.slam.sparse.features import InverseDepth
 
 Float64 = NDArray[np.float64]
 
+FEATURES, RELOCALISATION = "features", "relocalisation"
+SOURCES = (FEATURES, RELOCALISATION)
+
+_LEAST_MATCHES = 8
+_MATCH_TOLERANCE_M = 0.02  # at 1 m
 _MAGNIFY_TO = 640  # columns of the image in which corners are sought
 _MOST_FEATURES = 400
 _RATIO = 0.8  # the best match must be this much better than the second best
 _TRIALS = 300  # of three matches
 _REFITS = 3
+_RELOCALISED_WEIGHT = 30.0  # of a relocalised frame, in matches of features
+
+
+@dataclass(frozen=True)
+class RobotRun:
+    """A robot that has finished its path.
+
+    Attributes:
+        backend: its SLAM, with the map.
+        frames: N, what it saw.
+        estimates: (N, 4, 4) T_map_camera, in the frame of its own map.
+        tracked: (N,) bool.
+
+    Raises:
+        InputError: no frame, or another number of poses or flags than of frames.
+    """
+
+    backend: SlamBackend
+    frames: Sequence[RGBDFrame]
+    estimates: Float64
+    tracked: NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        """Refuse what does not belong together."""
+        count = len(self.frames)
+        if count == 0:
+            raise InputError("a robot without frames has no map to merge")
+        if self.estimates.shape != (count, 4, 4) or self.tracked.shape != (count,):
+            raise InputError(
+                f"{count} frames but poses of shape {self.estimates.shape} and flags of shape "
+                f"{self.tracked.shape}"
+            )
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A guess from one frame.
+
+    Attributes:
+        T_a_b: (4, 4) maps points of map b into map a.
+        weight: matches behind it.
+        source: one of ``SOURCES``.
+    """
+
+    T_a_b: Float64
+    weight: float
+    source: str
+
+
+def hypotheses_from_features(a: RobotRun, b: RobotRun, queries: int) -> list[Hypothesis]:
+    """From points that look alike in a frame of robot b and in frames of robot a."""
+    K = a.backend.intrinsics
+    known = [landmarks(a.frames[k], a.estimates[k], K) for k in query_frames(a, queries)]
+    rng = np.random.default_rng(0)  # fixed: the same maps merge in the same way
+    found = []
+    for index in query_frames(b, queries):
+        seen = landmarks(b.frames[index], b.estimates[index], K)
+        match = match_landmarks(known, seen, _LEAST_MATCHES, _MATCH_TOLERANCE_M, rng)
+        if match is not None:
+            found.append(Hypothesis(match[0], float(match[1]), FEATURES))
+    return found
+
+
+def hypotheses_from_relocalisation(
+    a: RobotRun, b: RobotRun, queries: int, patience: int
+) -> list[Hypothesis]:
+    """From frames of robot b that the SLAM of robot a finds in its map; that is left as it was.
+
+    SLAM is told nothing: it sees a black frame, is lost, and then sees up to ``patience``
+    consecutive frames of robot b, as after a kidnapping.
+    """
+    state = a.backend.get_state()
+    height, width = b.frames[0].depth.shape
+    black = RGBDFrame(np.zeros((height, width, 3), np.uint8), np.zeros((height, width), np.float32))
+    found = []
+    for first in query_frames(b, queries):
+        a.backend.track(black)
+        for index in range(first, min(first + patience, len(b.frames))):
+            result = a.backend.track(b.frames[index])
+            if result.tracking_ok:
+                if b.tracked[index]:
+                    T_a_b = result.T_world_camera @ invert(b.estimates[index])
+                    found.append(Hypothesis(T_a_b, _RELOCALISED_WEIGHT, RELOCALISATION))
+                break
+        a.backend.set_state(state)
+    return found
+
+
+def query_frames(robot: RobotRun, count: int) -> list[int]:
+    """Indices of at most ``count`` tracked frames, evenly spread over the path."""
+    tracked = np.flatnonzero(robot.tracked)
+    if len(tracked) == 0:
+        return []
+    picked = np.linspace(0, len(tracked) - 1, min(count, len(tracked))).round().astype(int)
+    return tracked[picked].tolist()
 
 
 @dataclass(frozen=True)

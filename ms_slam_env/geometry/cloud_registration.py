@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.geometry import se3_exp, transform_points
-from ms_slam_env.metrics.points import check_points
+from ms_slam_env.geometry.point_clouds import check_points
 
 Float64 = NDArray[np.float64]
 

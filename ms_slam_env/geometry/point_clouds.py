@@ -1,0 +1,85 @@
+"""Point clouds: checks, voxel downsampling, alignment of points that correspond."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ms_slam_env.errors import InputError
+
+Float64 = NDArray[np.float64]
+
+
+def check_points(points: ArrayLike, name: str) -> Float64:
+    """Return points (N, 3) as float64.
+
+    Raises:
+        InputError: wrong shape, no points, values that are not finite or not numbers.
+    """
+    try:
+        values = np.asarray(points, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} is not an array of numbers") from None
+    if values.ndim != 2 or values.shape[1] != 3:
+        raise InputError(f"{name} must be (N, 3), got {values.shape}")
+    if len(values) == 0:
+        raise InputError(f"{name} is empty")
+    if not np.isfinite(values).all():
+        raise InputError(f"{name} holds values that are not finite")
+    return values
+
+
+def voxel_downsample(points: ArrayLike, voxel_m: float) -> Float64:
+    """One point per occupied voxel of side ``voxel_m``: the first one, in the given order.
+
+    Raises:
+        InputError: bad points, or a voxel size that is not positive.
+    """
+    values = check_points(points, "points")
+    return values[voxel_firsts(values, voxel_m)]
+
+
+def voxel_firsts(points: ArrayLike, voxel_m: float) -> NDArray[np.int64]:
+    """Indices (K,), ascending, of the first point in each occupied voxel of side ``voxel_m``.
+
+    Raises:
+        InputError: bad points, or a voxel size that is not positive.
+    """
+    values = check_points(points, "points")
+    if not voxel_m > 0:
+        raise InputError(f"voxel_m must be > 0, got {voxel_m}")
+    index = np.floor(values / voxel_m).astype(np.int64)
+    index -= index.min(axis=0)
+    size = index.max(axis=0) + 1
+    key = (index[:, 0] * size[1] + index[:, 1]) * size[2] + index[:, 2]
+    _, first = np.unique(key, return_index=True)
+    return np.sort(first)
+
+
+def umeyama(
+    source: Float64, target: Float64, with_scale: bool = False
+) -> tuple[Float64, Float64, float]:
+    """Rotation R (3, 3), translation t (3,) and scale s minimising |s R source + t - target|^2.
+
+    Source: Umeyama, "Least-squares estimation of transformation parameters between two point
+    patterns", PAMI 1991, equations (38) to (43). Points (N, 3) of each set correspond by row.
+    On degenerate sets (fewer than 3 points, or all on a line) the answer is one of several best.
+
+    Raises:
+        InputError: a scale is asked for and all source points coincide.
+    """
+    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
+    source_centred, target_centred = source - source_mean, target - target_mean
+    covariance = target_centred.T @ source_centred / len(source)  # (38)
+    U, singular, Vt = np.linalg.svd(covariance)
+    S = np.eye(3)
+    if np.linalg.det(U) * np.linalg.det(Vt) < 0:
+        S[2, 2] = -1.0  # (43): the best proper rotation, not a reflection
+    R = U @ S @ Vt  # (40)
+    scale = 1.0
+    if with_scale:
+        variance = (source_centred**2).sum() / len(source)
+        if variance < 1e-18:
+            raise InputError("an alignment with scale needs an estimate that moves")
+        scale = float((singular * np.diag(S)).sum() / variance)  # (42)
+    return R, target_mean - scale * R @ source_mean, scale  # (41)
