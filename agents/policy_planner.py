@@ -9,7 +9,7 @@ import numpy as np
 from ms_slam_agents import artefact
 from ms_slam_agents.evaluation import most_probable, sample
 
-from ms_slam_env.env.planner import Planner
+from ms_slam_env.env import Planner
 from ms_slam_env.errors import InputError
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env.env import Planner
 from ms_slam_env.env.config import TargetConfig
-from ms_slam_env.env.planner import Planner
 
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ms_slam_env.env.planner import Planner
+from ms_slam_env.env import Planner
 
 
 class RandomWalk(Planner):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ms_slam_env.env.planner import Planner
+from ms_slam_env.env import Planner
 
 
 class Stationary(Planner):

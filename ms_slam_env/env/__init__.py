@@ -3,7 +3,7 @@
 from ms_slam_env.env.active_slam import ActiveSlamEnv
 from ms_slam_env.env.config import EnvConfig, LookaheadConfig, RewardConfig, TargetConfig
 from ms_slam_env.env.episode import Episode
-from ms_slam_env.env.planner import Planner
+from ms_slam_env.env.planners import Planner
 
 __all__ = [
     "ActiveSlamEnv",

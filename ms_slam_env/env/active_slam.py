@@ -256,16 +256,14 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
             else:
                 result = self.slam.track(frame)
         with self.timings.stage("divergence"):
-            before, episode.histograms = episode.histograms, self._histograms(frame)
+            grey = intensity_image(frame.color)[None].astype(np.float32)
+            now = self._divergence.histograms(grey, frame.depth[None])
+            before, episode.histograms = episode.histograms, now
             divergence = self._divergence_from(before)
         with self.timings.stage("coverage"):
             new_surface = self._cover(frame, T_true, result)
         episode.record(seen, result, divergence)
         return new_surface
-
-    def _histograms(self, frame: RGBDFrame) -> Histograms:
-        grey = intensity_image(frame.color)[None].astype(np.float32)
-        return self._divergence.histograms(grey, frame.depth[None])
 
     def _divergence_from(self, before: Histograms | None) -> Float64:
         """(2,) divergence of the last frame from an earlier one; zero from none."""

@@ -1,21 +1,56 @@
-"""Planners by name: entry points of group ``ms_slam_env.planners``, or ``module:Class``."""
+"""Planners: their interface, and how they are found by name.
+
+A name is an entry point of the group ``ms_slam_env.planners``, or ``module:Class``.
+"""
 
 from __future__ import annotations
 
 import inspect
 import os
 import sys
+from abc import ABC, abstractmethod
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from ms_slam_env.config import parse_named
-from ms_slam_env.env.planner import Planner
 from ms_slam_env.errors import InputError, unknown
+
+if TYPE_CHECKING:
+    from ms_slam_env.env.active_slam import ActiveSlamEnv
 
 GROUP = "ms_slam_env.planners"
 
 _TRAINING = ("torch", "stable_baselines3", "sb3_contrib")  # packages of the extra "train"
+
+
+class Planner(ABC):
+    """Chooses actions for one environment.
+
+    A planner may use what a robot has: the observation, ``info["action_mask"]`` and the
+    environment's predictions from the map (``lookahead``, ``predict_candidates``,
+    ``candidate_poses``). Ground truth in ``info`` is for evaluation.
+
+    Args:
+        env: the unwrapped environment.
+        seed: of the planner's own random choices.
+    """
+
+    observation: str = "features"
+    """The observation variant that ``act`` expects."""
+
+    def __init__(self, env: ActiveSlamEnv, seed: int = 0) -> None:
+        self.env = env
+        self.rng = np.random.default_rng(seed)
+
+    def reset(self) -> None:  # noqa: B027 -- most planners keep nothing between episodes
+        """Prepare for a new episode; called after the environment's reset."""
+
+    @abstractmethod
+    def act(self, observation: Any, info: dict[str, Any]) -> int:
+        """Return the next action, given what ``reset`` or ``step`` last returned."""
 
 
 def planner_names() -> tuple[str, ...]:
