@@ -42,10 +42,19 @@ class RGBDFrame:
             )
         if not np.issubdtype(self.depth.dtype, np.floating):
             raise InputError(f"depth must be float metres, got {self.depth.dtype}")
-        if not np.isfinite(self.depth).all():
-            raise InputError("depth holds NaN or infinite values; 0 means no reading")
-        if (self.depth < 0).any():
-            raise InputError("depth holds negative values; 0 means no reading")
+        check_readings(self.depth)
+
+
+def check_readings(depth: NDArray[np.floating]) -> None:
+    """Refuse depth that would poison what follows.
+
+    Raises:
+        InputError: NaN, infinite or negative depth.
+    """
+    if not np.isfinite(depth).all():
+        raise InputError("depth holds NaN or infinite values; 0 means no reading")
+    if (depth < 0).any():
+        raise InputError("depth holds negative values; 0 means no reading")
 
 
 def intensity_image(image: ArrayLike) -> NDArray[np.uint8]:

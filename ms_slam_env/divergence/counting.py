@@ -75,10 +75,12 @@ def normalise(counts: Float64, pseudo_count: float) -> Float64:
 class HistogramCounter:
     """Counts the pixels of batches of frames on one device."""
 
-    def __init__(self, config: DivergenceConfig, intrinsics: Intrinsics, device: str) -> None:
+    def __init__(
+        self, config: DivergenceConfig, intrinsics: Intrinsics, device: str = "cpu"
+    ) -> None:
         """Prepare for frames of ``intrinsics`` on ``device`` (``cpu`` or ``cuda``)."""
-        self._config = config
-        self._intrinsics = intrinsics
+        self.config = config
+        self.intrinsics = intrinsics
         self._device = device
         rows, columns = config.windows if config.measure == "windowed-kl" else (1, 1)
         self._windows = rows * columns
@@ -100,7 +102,7 @@ class HistogramCounter:
         self._buffers: dict[int, tuple[Any, Any, Any]] = {}  # by batch size
 
     def histograms(self, intensity: Any, depth: Any, normals: Any | None = None) -> Histograms:
-        """Histograms of B frames.
+        """Histograms of B frames, all counted in one pass.
 
         Args:
             intensity: (B, h, w) float32 in [0, 255], NumPy or Warp.
@@ -129,7 +131,7 @@ class HistogramCounter:
         return self._normalised(*counts)
 
     def normals(self, depth: Any) -> NDArray[np.float32]:
-        """Unit normals (B, h, w, 3) towards the camera of depth (B, h, w), 0 where none."""
+        """Unit normals (B, h, w, 3) towards the camera from depth (B, h, w); 0 where none."""
         depth_wp = self._upload(depth, wp.float32, "depth")
         inverse = self._inverse(depth_wp, wp.empty_like(depth_wp))
         result = wp.empty(depth_wp.shape, dtype=wp.vec3, device=self._device)
@@ -146,16 +148,16 @@ class HistogramCounter:
             if type_is_vector and array.shape[3] != 3:
                 raise InputError(f"{name} must be (B, h, w, 3), got {array.shape}")
             array = wp.array(array, dtype=dtype, device=self._device, copy=False)
-        if array.shape[1:] != self._intrinsics.shape:
+        if array.shape[1:] != self.intrinsics.shape:
             raise InputError(
                 f"{name} is {array.shape[2]}x{array.shape[1]} but the intrinsics say "
-                f"{self._intrinsics.width}x{self._intrinsics.height}"
+                f"{self.intrinsics.width}x{self.intrinsics.height}"
             )
         return array
 
     def _camera(self) -> list[Any]:
         """Kernel arguments from focal length to edge threshold."""
-        camera, config = self._intrinsics, self._config
+        camera, config = self.intrinsics, self.config
         return [
             wp.vec2(camera.fx, camera.fy),
             wp.vec2(camera.cx, camera.cy),
@@ -168,7 +170,7 @@ class HistogramCounter:
         if batch not in self._buffers:
             levels_shape = (batch, self._windows * 256)
             cells_shape = (batch, self._windows * TABLE_SIZE**2)
-            images_shape = (batch, *self._intrinsics.shape)
+            images_shape = (batch, *self.intrinsics.shape)
             self._buffers[batch] = (
                 wp.zeros(levels_shape, dtype=wp.int32, device=self._device),
                 wp.zeros(cells_shape, dtype=wp.int32, device=self._device),
@@ -192,7 +194,7 @@ class HistogramCounter:
         """Counts (B, W, 256) of grey levels and (B, W, TABLE_SIZE ** 2) of directions."""
         batch = intensity.shape[0]
         levels, cells, inverse = self._buffer(batch)
-        only_with_depth = int(self._config.intensity_pixels == "with-depth")
+        only_with_depth = int(self.config.intensity_pixels == "with-depth")
         self._launch(
             kernels.count_intensity, [intensity, depth, only_with_depth, *self._grid, levels]
         )
@@ -209,7 +211,7 @@ class HistogramCounter:
 
     def _normalised(self, levels: Int32, cells: Int32) -> Histograms:
         """Histograms of raw counts, the sums of equation (9) by one matrix product."""
-        pseudo_count = self._config.pseudo_count
+        pseudo_count = self.config.pseudo_count
         batch, windows = levels.shape[:2]
         sums = cells.reshape(batch * windows, -1).astype(np.float32) @ self._cell_weights
         normals = sums.reshape(batch, windows, -1).astype(np.float64)

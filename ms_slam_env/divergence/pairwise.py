@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
+from ms_slam_env.camera.frame import check_readings
 from ms_slam_env.divergence.config import DivergenceConfig
 from ms_slam_env.divergence.counting import HistogramCounter, grouping_matrix, normalise
 from ms_slam_env.divergence.measures import kl_divergence
@@ -104,7 +105,7 @@ def ms_parameters(divergences: ArrayLike) -> tuple[float, float]:
 
 @lru_cache(maxsize=16)
 def _counter(config: DivergenceConfig, intrinsics: Intrinsics) -> HistogramCounter:
-    return HistogramCounter(config, intrinsics, "cpu")
+    return HistogramCounter(config, intrinsics)
 
 
 def _intensity_distribution(
@@ -126,8 +127,5 @@ def _depth_image(image: ArrayLike | RGBDFrame, intrinsics: Intrinsics) -> NDArra
     if depth.ndim != 2 or not np.issubdtype(depth.dtype, np.floating):
         raise InputError(f"depth must be (H, W) float metres, got {depth.shape} {depth.dtype}")
     intrinsics.check_image(depth, "depth")
-    if not np.isfinite(depth).all():
-        raise InputError("depth holds NaN or infinite values; 0 means no reading")
-    if (depth < 0).any():
-        raise InputError("depth holds negative values; 0 means no reading")
+    check_readings(depth)
     return depth.astype(np.float32)

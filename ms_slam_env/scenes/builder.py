@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from ms_slam_env.scenes.base import Float32, Float64, Int32, TexturedMesh
+from ms_slam_env.scenes.base import Float32, Float64, Int32, Rng, TexturedMesh
 
 
 @dataclass(frozen=True)
@@ -71,6 +71,11 @@ class Geometry:
             textures=self.textures,
             labels=self.labels,
         )
+
+
+def pick(rng: Rng, materials: Sequence[Material]) -> Material:
+    """One of some materials."""
+    return materials[int(rng.integers(len(materials)))]
 
 
 class MeshBuilder:

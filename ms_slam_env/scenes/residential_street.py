@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ms_slam_env.scenes.base import Rng
-from ms_slam_env.scenes.builder import Material, MeshBuilder
+from ms_slam_env.scenes.builder import Material, MeshBuilder, pick
 from ms_slam_env.scenes.mesh_scene import LargeScene
 from ms_slam_env.scenes.outdoors import houses, street_furniture
 from ms_slam_env.scenes.outdoors.daylight import daylight_scene
@@ -97,7 +97,7 @@ def _block(build: MeshBuilder, rng: Rng, plot: Plot, index: int, of: _Kinds) -> 
             if not taken and rng.random() < 0.75:
                 with build.frame((cx, cy, 0.0), rng.uniform(0, 6)):
                     tree_height = rng.uniform(3.6, 5.2)
-                    kind = of.leaves[int(rng.integers(3))]
+                    kind = pick(rng, of.leaves)
                     street_furniture.tree(
                         build, rng, of.bark, kind, tree_height, f"garden tree {index}.{k}"
                     )
@@ -112,17 +112,17 @@ def _garden_edge(build: MeshBuilder, rng: Rng, length: float, name: str, of: _Ki
         kind = rng.random()
         with build.frame((low, 0.12, 0.0)):
             if kind < 0.42:
-                leaf = of.leaves[int(rng.integers(3))]
+                leaf = pick(rng, of.leaves)
                 street_furniture.hedge(
                     build, leaf, high - low, rng.uniform(0.8, 1.25), f"hedge {name}.{k}"
                 )
             elif kind < 0.78:
-                boards, tall = of.boards[int(rng.integers(4))], rng.uniform(0.8, 1.3)
+                boards, tall = pick(rng, of.boards), rng.uniform(0.8, 1.3)
                 street_furniture.fence(build, boards, high - low, tall, f"fence {name}.{k}")
             else:
                 for n, at in enumerate(np.arange(0.4, high - low - 0.2, 1.1)):
                     with build.frame((at, 0.35, 0.0), rng.uniform(0, 6)):
-                        leaf, size = of.leaves[int(rng.integers(3))], rng.uniform(0.35, 0.6)
+                        leaf, size = pick(rng, of.leaves), rng.uniform(0.35, 0.6)
                         street_furniture.bush(build, rng, leaf, size, f"bush {name}.{k}.{n}")
 
 
@@ -142,7 +142,7 @@ def _row_of_houses(build: MeshBuilder, rng: Rng, plot: Plot, index: int, of: _Ki
             gap = rng.uniform(1.4, 2.6)
             if rng.random() < 0.6:
                 with build.frame((x + wide + gap / 2, rng.uniform(0.8, 2.0), 0.0)):
-                    kind = of.leaves[int(rng.integers(3))]
+                    kind = pick(rng, of.leaves)
                     high = rng.uniform(3.6, 5.5)
                     street_furniture.tree(
                         build, rng, of.bark, kind, high, f"row {index} tree {number}"
@@ -166,7 +166,7 @@ def _kerbside(build: MeshBuilder, rng: Rng, plan: StreetPlan, of: _Kinds) -> Non
             with build.frame((-0.32 * length, -0.85 * plan.pavement_m, 0.0)):
                 street_furniture.lamp_post(build, rng.uniform(3.6, 4.4), f"lamp post {k}")
             with build.frame((0.36 * length, -0.8 * plan.pavement_m, 0.0)):
-                kind, high = of.leaves[int(rng.integers(3))], rng.uniform(3.4, 4.4)
+                kind, high = pick(rng, of.leaves), rng.uniform(3.4, 4.4)
                 if rng.random() < 0.7:
                     street_furniture.tree(build, rng, of.bark, kind, high, f"street tree {k}")
             with build.frame((rng.uniform(-0.2, 0.2) * length, -0.32, 0.0), rng.uniform(-0.3, 0.3)):

@@ -175,8 +175,6 @@ def _put(array: wp.array, start: int, values: NDArray[np.floating]) -> None:
 
 def _copy(surfaces: Surfaces) -> Surfaces:
     copied = Surfaces()
-    for name in ("uv", "irradiance", "normal", "plane", "density", "texture", "label"):
-        setattr(copied, name, getattr(surfaces, name))
-    for name in ("texels", "offsets", "sizes"):
+    for name in Surfaces.vars:  # type: ignore[attr-defined]
         setattr(copied, name, getattr(surfaces, name))
     return copied

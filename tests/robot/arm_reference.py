@@ -15,6 +15,19 @@ from ms_slam_env.robot.arm.config import ArmConfig
 from ms_slam_env.robot.arm.feasibility import DAMPING, LIMIT_MARGIN_RAD, MOST_STRETCH
 
 
+class Balls:
+    """Balls in empty space."""
+
+    def __init__(self, *balls):
+        self.balls = balls
+
+    def clearance(self, points):
+        distance = np.full(len(points), 9.0)
+        for centre, radius in self.balls:
+            distance = np.minimum(distance, np.linalg.norm(points - centre, axis=1) - radius)
+        return np.maximum(distance, 0)
+
+
 @dataclass(frozen=True)
 class SlowWay:
     """Joint angles along a way, and by how much each requirement is kept (< 0: broken)."""

@@ -3,6 +3,7 @@
 import mink
 import numpy as np
 import pytest
+from arm_reference import Balls
 from numpy.testing import assert_allclose
 from test_arm_model import ARMS
 
@@ -16,19 +17,6 @@ from ms_slam_env.robot.arm.controller import LIMIT_MARGIN_RAD, Controller
 
 MOTIONS = decompose(0.08, np.radians(10))
 CONFIG = ArmConfig(clearance_m=0.02)
-
-
-class Balls:
-    """Balls in empty space."""
-
-    def __init__(self, *balls):
-        self.balls = balls
-
-    def clearance(self, points):
-        distance = np.full(len(points), 9.0)
-        for centre, radius in self.balls:
-            distance = np.minimum(distance, np.linalg.norm(points - centre, axis=1) - radius)
-        return np.maximum(distance, 0)
 
 
 @pytest.fixture(params=ARMS, scope="module")

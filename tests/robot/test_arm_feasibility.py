@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from arm_reference import follow
+from arm_reference import Balls, follow
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -29,7 +29,7 @@ def furnished(arm):
     """A post beside the camera at home, in the way of some motions."""
     camera = transform_points(BASE, arm.chain.camera_pose(arm.home)[:3, 3])
     post = camera + transform_points(BASE, [[-0.2, 0.1, 0.05]])[0] - BASE[:3, 3]
-    return ClearanceField(_Ball(post, 0.08), BASE, 1.4)
+    return ClearanceField(Balls((post, 0.08)), BASE, 1.4)
 
 
 def postures(arm, clearance_field, count, seed=0):
@@ -52,12 +52,12 @@ def postures(arm, clearance_field, count, seed=0):
 
 
 def test_it_agrees_with_the_slow_version(arm, furnished):
-    reach = Feasibility(arm.chain, furnished, CONFIG)
+    feasibility = Feasibility(arm.chain, furnished, CONFIG)
     rng = np.random.default_rng(1)
     reasons = set()
     for q in postures(arm, furnished, 8):
         targets = arm.chain.camera_pose(q) @ MOTIONS
-        result = reach.probe(q, targets)
+        result = feasibility.probe(q, targets)
         refused = rng.permutation(np.flatnonzero(~result.ok))[:2]
         made = rng.permutation(np.flatnonzero(result.ok)[1:])[:2]
         for k in (*refused, *made):
@@ -103,14 +103,14 @@ def test_standing_still_is_possible_and_takes_no_time(arm, furnished):
 def test_one_and_many_agree_bit_for_bit_and_so_does_a_second_time(arm, furnished):
     q = postures(arm, furnished, 1, seed=5)[0]
     targets = arm.chain.camera_pose(q) @ MOTIONS
-    reach = Feasibility(arm.chain, furnished, CONFIG)
-    all_at_once = reach.probe(q, targets)
-    reach.probe(q + 0.01, targets)
+    feasibility = Feasibility(arm.chain, furnished, CONFIG)
+    all_at_once = feasibility.probe(q, targets)
+    feasibility.probe(q + 0.01, targets)
     again = Feasibility(arm.chain, furnished, CONFIG).probe(q, targets)
     np.testing.assert_array_equal(all_at_once.q[all_at_once.ok], again.q[again.ok])
     np.testing.assert_array_equal(all_at_once.reason, again.reason)
     for k in range(49):
-        alone = reach.probe(q, targets[k : k + 1])
+        alone = feasibility.probe(q, targets[k : k + 1])
         assert alone.reason[0] == all_at_once.reason[k]
         if alone.ok[0]:
             np.testing.assert_array_equal(alone.q[0], all_at_once.q[k])
@@ -119,21 +119,21 @@ def test_one_and_many_agree_bit_for_bit_and_so_does_a_second_time(arm, furnished
 
 def test_results_are_not_overwritten_by_the_next_probe(arm, furnished):
     first, second = postures(arm, furnished, 2)
-    reach = Feasibility(arm.chain, furnished, CONFIG)
-    kept = reach.probe(first, arm.chain.camera_pose(first) @ MOTIONS)
+    feasibility = Feasibility(arm.chain, furnished, CONFIG)
+    kept = feasibility.probe(first, arm.chain.camera_pose(first) @ MOTIONS)
     before = kept.q.copy(), kept.reason.copy(), kept.duration_s.copy()
-    reach.probe(second, arm.chain.camera_pose(second) @ MOTIONS)
+    feasibility.probe(second, arm.chain.camera_pose(second) @ MOTIONS)
     for old, now in zip(before, (kept.q, kept.reason, kept.duration_s), strict=True):
         np.testing.assert_array_equal(old, now)
 
 
 def test_the_reason_is_given(arm):
-    open_space = ClearanceField(_Nothing(), np.eye(4), 1.3)
+    open_space = ClearanceField(Balls(), np.eye(4), 1.3)
     q = arm.home
 
     def why(target, config=CONFIG, clearance_field=open_space, start=q):
-        reach = Feasibility(arm.chain, clearance_field, config)
-        return REASONS[reach.probe(start, target[None]).reason[0]]
+        feasibility = Feasibility(arm.chain, clearance_field, config)
+        return REASONS[feasibility.probe(start, target[None]).reason[0]]
 
     T = arm.chain.camera_pose(q)
     hurried = ArmConfig(speed_m_s=5, speed_rad_s=20)
@@ -150,15 +150,15 @@ def test_the_reason_is_given(arm):
 
 
 def test_folding_the_arm_onto_itself_is_refused(arm):
-    open_space = ClearanceField(_Nothing(), np.eye(4), 1.3)
-    reach = Feasibility(arm.chain, open_space, CONFIG)
+    open_space = ClearanceField(Balls(), np.eye(4), 1.3)
+    feasibility = Feasibility(arm.chain, open_space, CONFIG)
     rng = np.random.default_rng(0)
     seen = 0
     for _ in range(200):
         q = arm.home + rng.uniform(-1.5, 1.5, 6)
         if not arm.chain.within_limits(q, 0.1):
             continue
-        result = reach.probe(q, arm.chain.camera_pose(q) @ MOTIONS)
+        result = feasibility.probe(q, arm.chain.camera_pose(q) @ MOTIONS)
         seen += int((result.reason == REASONS.index("self-collision")).sum())
         if seen > 50:
             break
@@ -170,27 +170,27 @@ def test_an_arm_that_is_too_close_may_leave_but_not_come_closer(arm):
     T = arm.chain.camera_pose(q)
     lowest = _lowest(arm, q)
     floor = ClearanceField(_Below(lowest - 0.01), np.eye(4), 1.3)  # 1 cm instead of 2
-    reach = Feasibility(arm.chain, floor, CONFIG)
+    feasibility = Feasibility(arm.chain, floor, CONFIG)
     up, down = T.copy(), T.copy()
     up[2, 3] += 0.05
     down[2, 3] -= 0.05
-    result = reach.probe(q, np.stack([up, down]))
+    result = feasibility.probe(q, np.stack([up, down]))
     assert result.ok[0]
     assert REASONS[result.reason[1]] == "furniture"
 
 
 def test_long_ways_are_cut_finer(arm):
-    open_space = ClearanceField(_Nothing(), np.eye(4), 1.3)
-    reach = Feasibility(arm.chain, open_space, CONFIG)
+    open_space = ClearanceField(Balls(), np.eye(4), 1.3)
+    feasibility = Feasibility(arm.chain, open_space, CONFIG)
     T = arm.chain.camera_pose(arm.home)
-    far = reach.probe(arm.home, (T @ make_pose(np.eye(3), [0, 0, -0.4]))[None])
-    turned = reach.probe(arm.home, (T @ make_pose(so3_exp([0, 0, 1.0]), [0, 0, 0]))[None])
+    far = feasibility.probe(arm.home, (T @ make_pose(np.eye(3), [0, 0, -0.4]))[None])
+    turned = feasibility.probe(arm.home, (T @ make_pose(so3_exp([0, 0, 1.0]), [0, 0, 0]))[None])
     assert far.q.shape[1] == 24
     assert turned.q.shape[1] == 34
 
 
 def test_a_slow_joint_stretches_the_motion_up_to_a_limit(arm):
-    open_space = ClearanceField(_Nothing(), np.eye(4), 1.3)
+    open_space = ClearanceField(Balls(), np.eye(4), 1.3)
     targets = arm.chain.camera_pose(arm.home) @ MOTIONS
     easy = Feasibility(arm.chain, open_space, ArmConfig(speed_m_s=0.01, speed_rad_s=0.03))
     hard = Feasibility(arm.chain, open_space, ArmConfig(speed_m_s=0.2, speed_rad_s=0.6))
@@ -228,8 +228,8 @@ def test_one_joint_along_the_view_can_only_roll(tmp_path):
     path = tmp_path / "roll.xml"
     path.write_text(ROLLING)
     chain = load_arm(str(path)).chain
-    reach = Feasibility(chain, ClearanceField(_Nothing(), np.eye(4), 1.0), CONFIG)
-    result = reach.probe(np.zeros(1), chain.camera_pose(np.zeros(1)) @ MOTIONS)
+    feasibility = Feasibility(chain, ClearanceField(Balls(), np.eye(4), 1.0), CONFIG)
+    result = feasibility.probe(np.zeros(1), chain.camera_pose(np.zeros(1)) @ MOTIONS)
     np.testing.assert_array_equal(np.flatnonzero(result.ok), [0, 1, 2])  # none, right, left
     assert {REASONS[r] for r in result.reason[3:]} == {"unreachable"}
     np.testing.assert_allclose(np.abs(result.q[1:3, -1, 0]), np.radians(12), atol=2e-3)
@@ -291,19 +291,6 @@ def test_inverse_kinematics_says_where_it_fails(arm):
     found = solve_pose(arm.chain, arm.home[None], far)
     assert not found.accurate().any()
     assert found.error_m[0] > 1.5
-
-
-class _Nothing:
-    def clearance(self, points):
-        return np.full(len(points), 100.0)
-
-
-class _Ball:
-    def __init__(self, centre, radius):
-        self.centre, self.radius = centre, radius
-
-    def clearance(self, points):
-        return np.maximum(np.linalg.norm(points - self.centre, axis=1) - self.radius, 0)
 
 
 class _Below:

@@ -33,8 +33,8 @@ def rng():
 
 def possible(arm, scene, config, T_world_base, q):
     chain = standing_chain(arm, config)
-    reach = Feasibility(chain, ClearanceField(scene, T_world_base, reach_m(chain)), config)
-    return int(reach.probe(q, chain.camera_pose(q) @ MOTIONS).ok.sum())
+    feasibility = Feasibility(chain, ClearanceField(scene, T_world_base, reach_m(chain)), config)
+    return int(feasibility.probe(q, chain.camera_pose(q) @ MOTIONS).ok.sum())
 
 
 @settings(max_examples=25, deadline=None)

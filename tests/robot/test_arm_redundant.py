@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from arm_reference import follow
+from arm_reference import Balls, follow
 
 from ms_slam_env.robot.action_primitives import decompose
 from ms_slam_env.robot.arm import ArmConfig, load_arm
@@ -14,11 +14,6 @@ from ms_slam_env.robot.arm.feasibility import LIMIT_MARGIN_RAD, MOST_STRETCH, Fe
 
 MOTIONS = decompose(0.12, np.radians(12))
 CONFIG = ArmConfig()
-
-
-class _Nothing:
-    def clearance(self, points):
-        return np.full(len(points), 100.0)
 
 
 @pytest.fixture(scope="module")
@@ -38,14 +33,14 @@ def near_a_limit(second, count, seed=0):
 
 
 def test_a_redundant_arm_bends_around_its_limits_as_the_slow_version_does(second):
-    open_space = ClearanceField(_Nothing(), np.eye(4), 2.0)
-    reach = Feasibility(second.chain, open_space, CONFIG)
+    open_space = ClearanceField(Balls(), np.eye(4), 2.0)
+    feasibility = Feasibility(second.chain, open_space, CONFIG)
     rng = np.random.default_rng(0)
     low, high = second.chain.lower + LIMIT_MARGIN_RAD, second.chain.upper - LIMIT_MARGIN_RAD
     bent = 0
     for q in near_a_limit(second, 12):
         targets = second.chain.camera_pose(q) @ MOTIONS
-        result = reach.probe(q, targets)
+        result = feasibility.probe(q, targets)
         at_limit = ((result.q < low + 1e-5) | (result.q > high - 1e-5)).any(axis=(1, 2))
         bending, others = np.flatnonzero(result.ok & at_limit), np.flatnonzero(result.ok)[1:]
         bent += len(bending[:3])
@@ -57,14 +52,14 @@ def test_a_redundant_arm_bends_around_its_limits_as_the_slow_version_does(second
 
 
 def test_mask_and_controller_agree_on_a_redundant_arm(second):
-    open_space = ClearanceField(_Nothing(), np.eye(4), 2.0)
-    reach = Feasibility(second.chain, open_space, CONFIG)
+    open_space = ClearanceField(Balls(), np.eye(4), 2.0)
+    feasibility = Feasibility(second.chain, open_space, CONFIG)
     controller = Controller(second, second.chain, open_space, CONFIG)
     rng = np.random.default_rng(0)
     agrees, apart = [], []
     for q in near_a_limit(second, 12, seed=1):
         targets = second.chain.camera_pose(q) @ MOTIONS
-        result = reach.probe(q, targets)
+        result = feasibility.probe(q, targets)
         for k in rng.choice(np.arange(1, 49), 5, replace=False):
             stretch = 1.0 if result.ok[k] else MOST_STRETCH
             plan = controller.plan(q, targets[k], stretch * result.duration_s[k])
@@ -79,10 +74,10 @@ def test_mask_and_controller_agree_on_a_redundant_arm(second):
 
 def test_a_redundant_arm_keeps_its_limits_and_speeds(second):
     chain = second.chain
-    reach = Feasibility(chain, ClearanceField(_Nothing(), np.eye(4), 2.0), CONFIG)
+    feasibility = Feasibility(chain, ClearanceField(Balls(), np.eye(4), 2.0), CONFIG)
     for q in (second.home, *near_a_limit(second, 6)):
         targets = chain.camera_pose(q) @ MOTIONS
-        result = reach.probe(q, targets)
+        result = feasibility.probe(q, targets)
         assert result.ok.sum() > 5
         ends = chain.camera_pose(result.q[result.ok, -1])
         np.testing.assert_allclose(ends, targets[result.ok], atol=1.8e-3)

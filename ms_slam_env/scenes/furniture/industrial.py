@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ms_slam_env.scenes.base import Rng
-from ms_slam_env.scenes.builder import Material, MeshBuilder
+from ms_slam_env.scenes.builder import Material, MeshBuilder, pick
 from ms_slam_env.scenes.textures import industrial, interior
 from ms_slam_env.scenes.textures.noise import hsv
 
@@ -94,14 +94,14 @@ def pallet_load(build: MeshBuilder, rng: Rng, of: Stock, width: float, height: f
         build.box((0, y, 0), (width, y + 0.1, 0.1), of.pallet, "z")
     build.box((0, 0, 0.1), (width, deep, 0.13), of.pallet)
     if rng.random() < 0.3:
-        crate = of.crates[int(rng.integers(len(of.crates)))]
+        crate = pick(rng, of.crates)
         high = height * rng.uniform(0.7, 0.95)
         build.box((0.03, 0.04, 0.13), (width - 0.03, deep - 0.04, high), crate, "z")
         return
     layers = int(rng.integers(1, 3))
     each = (height * rng.uniform(0.7, 0.98) - 0.13) / layers
     columns = int(rng.integers(1, 3))
-    kind = of.boxes[int(rng.integers(len(of.boxes)))]
+    kind = pick(rng, of.boxes)
     for layer in range(layers):
         for column in range(columns):
             if layer == layers - 1 and columns > 1 and rng.random() < 0.2:
@@ -116,7 +116,7 @@ def machine(build: MeshBuilder, rng: Rng, of: Stock, name: str) -> None:
     """Machine tool of about 2.4 x 1.5 x 2 m, front on y = 0 facing -y, from x = 0."""
     w, d, h = rng.uniform(2.0, 2.8), rng.uniform(1.2, 1.6), rng.uniform(1.6, 2.2)
     k = int(rng.integers(len(of.paints)))
-    paint, panel = of.paints[k], of.panels[int(rng.integers(len(of.panels)))]
+    paint, panel = of.paints[k], pick(rng, of.panels)
     dark, glass = build.plain((44, 46, 50)), build.plain((70, 92, 104))
     with build.object(name):
         build.box((0, 0, 0.12), (w, d, h), paint, "z")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ms_slam_env.scenes.base import Float64, Rng
-from ms_slam_env.scenes.builder import Material, MeshBuilder
+from ms_slam_env.scenes.builder import Material, MeshBuilder, pick
 from ms_slam_env.scenes.outdoors.plan import sides_of
 from ms_slam_env.scenes.textures import fabric, interior, outdoor
 from ms_slam_env.scenes.textures.noise import hsv
@@ -94,9 +94,9 @@ def house(
     storeys: int = 2,
 ) -> None:
     """House with its front on y = 0 facing -y, from x = 0 to ``width_m``, and a gable roof."""
-    wall, tiles = _pick(rng, of.walls), _pick(rng, of.roofs)
-    trim, door = _pick(rng, of.trims), _pick(rng, of.doors)
-    panes = [_pick(rng, of.panes) for _ in range(3)]
+    wall, tiles = pick(rng, of.walls), pick(rng, of.roofs)
+    trim, door = pick(rng, of.trims), pick(rng, of.doors)
+    panes = [pick(rng, of.panes) for _ in range(3)]
     eaves = STOREY_M * storeys
     along_x = bool(rng.random() < 0.6)
     with build.object(name):
@@ -123,16 +123,12 @@ def house(
                     at = (x, STOREY_M * storey + 1.55)
                     size = (rng.uniform(0.95, 1.25), rng.uniform(1.15, 1.4))
                     with build.frame(origin, yaw):
-                        window(build, panes[int(rng.integers(3))], trim, at, size)
+                        window(build, pick(rng, panes), trim, at, size)
     with build.object(f"{name} door"):
         build.box((door_at - 0.5, -0.08, 0.3), (door_at + 0.5, 0, 2.4), trim, "Yz", front=door)
         build.box((door_at - 0.8, -0.9, 0), (door_at + 0.8, 0, 0.16), of.step, "zY")
         build.box((door_at - 0.7, -0.5, 0.16), (door_at + 0.7, 0, 0.3), of.step, "zY")
         build.box((door_at - 0.9, -0.9, 2.55), (door_at + 0.9, 0, 2.68), tiles, "Y")
-
-
-def _pick(rng: Rng, materials: tuple[Material, ...]) -> Material:
-    return materials[int(rng.integers(len(materials)))]
 
 
 def _gable_roof(
@@ -215,7 +211,7 @@ def town_house(
     name: str,
 ) -> None:
     """House with its front on y = 0 facing -y from x = 0; its sides and back are bare walls."""
-    wall, stone, trim = _pick(rng, of.walls), _pick(rng, of.stones), _pick(rng, of.trims)
+    wall, stone, trim = pick(rng, of.walls), pick(rng, of.stones), pick(rng, of.trims)
     top = SHOP_M + TOWN_STOREY_M * storeys
     with build.object(name):
         build.box((0, 0, SHOP_M), (width_m, depth_m, top), wall, "z", top=stone)
@@ -224,14 +220,14 @@ def town_house(
         build.box((-0.1, -0.4, top - 0.4), (width_m + 0.1, 0.0, top), trim, "Y")
         for x in (0.0, width_m - 0.35):
             build.box((x, -0.12, 0), (x + 0.35, 0, SHOP_M - 0.15), trim, "zY")
-    panes = [_pick(rng, of.panes) for _ in range(3)]
+    panes = [pick(rng, of.panes) for _ in range(3)]
     count = max(2, int(width_m / 1.75))
     size = (rng.uniform(0.95, 1.15), rng.uniform(1.5, 1.85))
     with build.object(f"{name} windows"):
         for storey in range(storeys):
             for n in range(count):
                 at = ((n + 0.5) * width_m / count, SHOP_M + TOWN_STOREY_M * storey + 1.6)
-                window(build, panes[int(rng.integers(3))], trim, at, size)
+                window(build, pick(rng, panes), trim, at, size)
     _shop(build, rng, of, width_m, name, trim)
 
 
@@ -241,7 +237,7 @@ def _shop(
     """Door, shop windows, perhaps an awning, a sign above."""
     door_at = rng.uniform(1.0, 1.4) if rng.random() < 0.5 else width - rng.uniform(1.0, 1.4)
     with build.object(f"{name} door"):
-        door = _pick(rng, of.doors)
+        door = pick(rng, of.doors)
         build.box((door_at - 0.55, -0.07, 0), (door_at + 0.55, 0, 2.5), trim, "Yz", front=door)
     low, high = (0.55, door_at - 0.8) if door_at > width / 2 else (door_at + 0.8, width - 0.55)
     count = max(1, round((high - low) / 2.2))
@@ -249,15 +245,15 @@ def _shop(
     with build.object(f"{name} shop windows"):
         for k in range(count):
             x = low + k * each
-            view = _pick(rng, of.displays)
+            view = pick(rng, of.displays)
             build.box((x + 0.06, -0.08, 0.5), (x + each - 0.06, 0, 2.55), trim, "Y", front=view)
             build.box((x + 0.04, -0.16, 0.35), (x + each - 0.04, 0, 0.5), trim, "Y")
     with build.object(f"{name} sign"):
         middle = (low + high) / 2
-        board = _pick(rng, of.signs)
+        board = pick(rng, of.signs)
         build.box((middle - 1.1, -0.14, 2.75), (middle + 1.1, 0, 3.35), trim, "Y", front=board)
     if rng.random() < 0.5:
-        cloth = _pick(rng, of.cloths)
+        cloth = pick(rng, of.cloths)
         with build.object(f"{name} awning"):
             xs = np.linspace(low, high, max(2, int((high - low) / 0.4)))
             out = np.array([1.1, 0.0])
