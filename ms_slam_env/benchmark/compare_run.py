@@ -128,19 +128,17 @@ def run_here(spec: CompareSpec) -> dict[str, Any]:
 
 def _map_quality(points: np.ndarray, surface: np.ndarray) -> dict[str, Any]:
     """Errors of the map where its estimated poses placed it; None for an empty map."""
-    from ms_slam_env.geometry.point_clouds import voxel_downsample
-    from ms_slam_env.metrics import reconstruction
+    from ms_slam_env.evaluation.map_quality import map_quality, share_keys
 
-    names = [f"{kind}_{round(100 * t)}cm" for t in THRESHOLDS_M for kind in ("precision", "f")]
+    keys = share_keys(THRESHOLDS_M, ("precision", "f_score"))
     if len(points) == 0:
+        names = [key.replace("f_score", "f") for key in keys]
         return {"points": 0, "map_error_mm": None, **dict.fromkeys(names)}
-    found = reconstruction.map_metrics(points, surface, THRESHOLDS_M, registration="none")
-    distances = reconstruction.nearest_distances(voxel_downsample(points, 0.01), surface)
-    values = [of[t] for t in THRESHOLDS_M for of in (found.precision, found.f_score)]
+    found = map_quality(points, surface, (*keys, "map_error_median_m"))
     return {
         "points": len(points),
-        "map_error_mm": 1e3 * float(np.median(distances)),
-        **dict(zip(names, values, strict=True)),
+        "map_error_mm": 1e3 * found["map_error_median_m"],
+        **{key.replace("f_score", "f"): found[key] for key in keys},
     }
 
 

@@ -18,6 +18,7 @@ from ms_slam_env.camera import XTION_SIZES
 from ms_slam_env.config import check_choice, check_range
 from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.evaluation.map_quality import map_quality
 from ms_slam_env.evaluation.run_sequence import run_sequence
 from ms_slam_env.exploration.objectives import FAILURE
 from ms_slam_env.metrics.cost import CostMeter
@@ -191,9 +192,5 @@ def _warm_up(backend: str, size: str, device: str, given: Input) -> None:
 
 def _map_error_mm(points: np.ndarray, surface: np.ndarray) -> float | None:
     """Median distance of a map point to the true surface, millimetres; None for an empty map."""
-    from ms_slam_env.metrics import reconstruction
-
-    if len(points) == 0:
-        return None
-    distances = reconstruction.nearest_distances(metrics.voxel_downsample(points, 0.01), surface)
-    return 1e3 * float(np.median(distances))
+    found = map_quality(points, surface, ("map_error_median_m",))["map_error_median_m"]
+    return None if math.isnan(found) else 1e3 * found

@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
-
-import numpy as np
 
 from ms_slam_env import metrics, slam
 from ms_slam_env.benchmark.compare_inputs import Input, load
 from ms_slam_env.benchmark.options import parse_frame_management
+from ms_slam_env.evaluation.map_quality import map_quality
 from ms_slam_env.evaluation.run_sequence import run_sequence
 from ms_slam_env.experiments.harness.episodes import LOST_ERROR_M
-from ms_slam_env.metrics import reconstruction
 from ms_slam_env.parallel import limit_threads
 from ms_slam_env.sequences import UnevenPath
 from ms_slam_env.slam.frame_selection import FrameSelectionConfig, RegularConfig
-
-THRESHOLDS_M = (0.02, 0.05)
 
 
 @dataclass(frozen=True)
@@ -77,6 +72,7 @@ def run_one(config: FrameSelectionConfig, backend: str, given: Input) -> dict[st
     system = config.manage(slam.make(backend, given.intrinsics))
     run = run_sequence(system, given)
     estimate, kept = run.estimates, run.processed
+    quality = map_quality(system.surface_points(), given.surface, ("f_score_2cm", "f_score_5cm"))
     errors = metrics.absolute_errors(estimate[kept], given.poses[kept], align="none")
     return {
         "frames": len(run),
@@ -86,19 +82,11 @@ def run_one(config: FrameSelectionConfig, backend: str, given: Input) -> dict[st
         "ate_processed_m": metrics.ate_rmse(estimate[kept], given.poses[kept]),
         "largest_error_m": float(errors.max()),
         "failed": bool(errors.max() > LOST_ERROR_M),
-        **_map_quality(system.surface_points(), given.surface),
+        "f_2cm": quality["f_score_2cm"],
+        "f_5cm": quality["f_score_5cm"],
         "cpu_ms": float(run.cpu_ms.mean()),
         "filter_ms": _filter_ms(config, given),
     }
-
-
-def _map_quality(points: np.ndarray, surface: np.ndarray) -> Mapping[str, float]:
-    """F-scores of the map; 0 of an empty one."""
-    names = [f"f_{round(100 * t)}cm" for t in THRESHOLDS_M]
-    if len(points) == 0:
-        return dict.fromkeys(names, 0.0)
-    found = reconstruction.map_metrics(points, surface, THRESHOLDS_M, registration="none")
-    return dict(zip(names, (found.f_score[t] for t in THRESHOLDS_M), strict=True))
 
 
 def _filter_ms(config: FrameSelectionConfig, given: Input) -> float:

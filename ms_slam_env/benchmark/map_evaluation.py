@@ -14,11 +14,17 @@ from ms_slam_env import metrics
 from ms_slam_env.benchmark.surface_files import read_surface
 from ms_slam_env.config import check_choice, check_range
 from ms_slam_env.errors import InputError
+from ms_slam_env.evaluation.map_quality import ComparedMap, share_keys
 from ms_slam_env.geometry import transform_points
 from ms_slam_env.geometry.cloud_registration import CUTOFF_M, REGISTRATIONS
 from ms_slam_env.metrics.accuracy import SAMPLES
 
 Float64 = NDArray[np.float64]
+
+MEASURES = (
+    *("accuracy_cm", "completion_cm", "completion_ratio", "rer_m", "rcm"),
+    *("c2c_mean_m", "c2c_std_m", "c2c_rms_m", "hausdorff_directed_m", "hausdorff_m"),
+)
 
 
 @dataclass(frozen=True)
@@ -65,24 +71,9 @@ class MapOptions:
                 raise InputError(f"MapOptions.thresholds_m = {threshold} is outside (0, 1e+06]")
 
 
-@dataclass(frozen=True)
-class ComparedMaps:
-    """What a figure needs.
-
-    Attributes:
-        points: (N, 3) of the map, where it was judged.
-        truth: (M, 3).
-        quality: of the map.
-    """
-
-    points: Float64
-    truth: Float64
-    quality: metrics.MapQuality
-
-
 def evaluate_maps(
     estimate: Path, truth: Path, options: MapOptions | None = None
-) -> tuple[dict[str, Any], ComparedMaps]:
+) -> tuple[dict[str, Any], ComparedMap]:
     """Compare the map in file ``estimate`` with the true surface in file ``truth``.
 
     Returns:
@@ -102,14 +93,8 @@ def evaluate_maps(
     points, surface = (_thin(cloud, options.voxel_m) for cloud in (kept, true.points))
     found = metrics.register_clouds(points, surface, options.register, options.cutoff_m)
     points = transform_points(found.T_target_source, points)
-    quality = metrics.map_quality(points, surface, options.thresholds_m)
     unregistered = options.register == "none"
-    by_threshold = {}
-    for threshold in options.thresholds_m:
-        name = f"{100 * threshold:g}cm"
-        by_threshold[f"precision_{name}"] = quality.precision[threshold]
-        by_threshold[f"recall_{name}"] = quality.recall[threshold]
-        by_threshold[f"f_{name}"] = quality.f_score[threshold]
+    compared = ComparedMap(points, surface, voxel_m=0, registered=not unregistered)
     result = {
         "map": str(estimate),
         "true_map": str(truth),
@@ -122,22 +107,12 @@ def evaluate_maps(
         "compared_true_points": len(surface),
         "noise_ratio": 1.0 - float(inliers.mean()),
         "spacing_m": metrics.point_spacing(read.points),
-        **by_threshold,
-        "accuracy_cm": quality.completion.accuracy_cm,
-        "completion_cm": quality.completion.completion_cm,
-        "completion_ratio": quality.completion.completion_ratio,
-        "rcm": quality.completion.completion_ratio,
-        "rer_m": metrics.rer(points, surface) if unregistered else quality.distance.rms,
-        "c2c_mean_m": quality.distance.mean,
-        "c2c_std_m": quality.distance.std,
-        "c2c_rms_m": quality.distance.rms,
-        "hausdorff_directed_m": quality.distance.max,
-        "hausdorff_m": quality.hausdorff_m,
+        **compared.measure((*share_keys(options.thresholds_m), *MEASURES)),
         "registration_converged": None if unregistered else found.converged,
         "registration_share": None if unregistered else found.share,
         "T_true_map": found.T_target_source.tolist(),
     }
-    return result, ComparedMaps(points, surface, quality)
+    return result, compared
 
 
 def _thin(points: Float64, voxel_m: float) -> Float64:

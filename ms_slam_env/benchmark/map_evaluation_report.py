@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.benchmark import figures
-from ms_slam_env.benchmark.map_evaluation import ComparedMaps
+from ms_slam_env.evaluation.map_quality import ComparedMap
 from ms_slam_env.report.tables import format_number, markdown_table
 
 _FIXED = (
@@ -35,7 +35,11 @@ def measures(result: dict[str, Any]) -> list[tuple[str, str]]:
     rows = []
     for threshold in result["thresholds_m"]:
         name = f"{100 * threshold:g}cm"
-        for kind, heading in (("precision", "precision"), ("recall", "recall"), ("f", "F-score")):
+        for kind, heading in (
+            ("precision", "precision"),
+            ("recall", "recall"),
+            ("f_score", "F-score"),
+        ):
             value = 100 * result[f"{kind}_{name}"]
             rows.append((f"{heading}, {100 * threshold:g} cm [%]", format_number(value, 4)))
     rows += [(text, format_number(scale * result[key], 4)) for key, text, scale in _FIXED]
@@ -56,16 +60,16 @@ def tables(result: dict[str, Any]) -> str:
     return f"{_heading(result)}\n\n{markdown_table(['measure', 'value'], measures(result))}"
 
 
-def save_figure(compared: ComparedMaps, path: Path) -> Path:
+def save_figure(compared: ComparedMap, path: Path) -> Path:
     """The map from above, coloured by its error; shares of points within a distance."""
     figure = figures.new_figure(2, 4.6, 4.2)
     top, curve = figure.subplots(1, 2)
-    errors_cm = 100 * compared.quality.to_truth
+    errors_cm = 100 * compared.to_surface
     picked = np.unique(np.linspace(0, len(errors_cm) - 1, _MAX_DOTS).astype(int))
     order = picked[np.argsort(errors_cm[picked])]  # the worst lie on top, so that they are seen
     dots = top.scatter(
-        compared.points[order, 0],
-        compared.points[order, 1],
+        compared.cloud[order, 0],
+        compared.cloud[order, 1],
         c=errors_cm[order],
         s=1,
         linewidths=0,
@@ -78,7 +82,7 @@ def save_figure(compared: ComparedMaps, path: Path) -> Path:
     top.set(xlabel="x [m]", ylabel="y [m]")
     top.set_aspect("equal", adjustable="datalim")
     for index, (distances, label) in enumerate(
-        ((compared.quality.to_truth, "precision"), (compared.quality.to_map, "recall"))
+        ((compared.to_surface, "precision"), (compared.to_map, "recall"))
     ):
         limits = np.linspace(0, _SHOWN_CM, 201)
         curve.plot(limits, _shares(distances, limits), color=figures.colour(index), label=label)

@@ -15,7 +15,7 @@ from ms_slam_env.benchmark.multi_robot_paths import Views, team_paths
 from ms_slam_env.camera import xtion
 from ms_slam_env.config import check_choice, check_range
 from ms_slam_env.errors import InputError
-from ms_slam_env.evaluation.map_quality import judge_map
+from ms_slam_env.evaluation.map_quality import map_quality
 from ms_slam_env.geometry import invert, transform_points
 from ms_slam_env.sequences import HandheldPath, render_sequence
 from ms_slam_env.slam.map_hypotheses import RobotRun
@@ -230,7 +230,7 @@ def judge_team(
         truths.append(team.truths[k])
         points.append(transform_points(T, team.robots[k].backend.surface_points()))
     ate = metrics.team_ate(estimates, truths)
-    merged_map = judge_map(np.concatenate(points), team.surface, team.seen)
+    merged_map = map_quality(np.concatenate(points), team.surface, reference=team.seen)
     return {
         "pairs": pairs,
         "path_overlaps": team.overlaps,
@@ -279,5 +279,8 @@ def _alone(team: Team, k: int) -> dict[str, Any]:
         "rpe_m": metrics.rpe_rmse(robot.estimates, truth),
         "lost_share": 1.0 - float(robot.tracked.mean()),
         "path_m": metrics.path_length(truth),
-        **{f"map_{n}": v for n, v in judge_map(points, team.surface, team.seen).items()},
+        **{
+            f"map_{name}": value
+            for name, value in map_quality(points, team.surface, reference=team.seen).items()
+        },
     }

@@ -201,6 +201,7 @@ def voxel_m(scene: str) -> float:
 def map_measures(points: Float64, surface: Float64, scene: str) -> dict[str, Any]:
     """Measures of the map (N, 3) against the true surface (M, 3); see ``run_here``."""
     from ms_slam_env import metrics
+    from ms_slam_env.evaluation.map_quality import ComparedMap
     from ms_slam_env.geometry import transform_points
 
     near = 5 * voxel_m(scene)
@@ -218,13 +219,12 @@ def map_measures(points: Float64, surface: Float64, scene: str) -> dict[str, Any
     result["spacing_m"] = metrics.point_spacing(cloud)
     kept = cloud[inliers]
     found = metrics.register_clouds(kept, surface, "icp", cutoff_m=10 * near)
-    quality = metrics.map_quality(transform_points(found.T_target_source, kept), surface, (near,))
+    placed = ComparedMap(transform_points(found.T_target_source, kept), surface, voxel_m=0)
     return {
         **result,
-        "c2c_mean_m": quality.distance.mean,
-        "c2c_std_m": quality.distance.std,
-        "hausdorff_m": quality.distance.max,
-        "completion": quality.recall[near],
+        **placed.measure(("c2c_mean_m", "c2c_std_m")),
+        "hausdorff_m": float(placed.to_surface.max()),
+        "completion": placed.recall(near),
     }
 
 

@@ -1,34 +1,178 @@
-"""How good a map is: its points against the true surface."""
+"""How good a map is: its points against the true surface.
+
+Every measure of a map goes through `map_quality`, which searches only for what is asked::
+
+    map_quality(slam.surface_points(), surface)                            # the planners' measures
+    map_quality(slam.surface_points(), surface, ("map_error_median_m",))   # one search, no ICP
+
+Sources: Saeedi et al., ICRA 2017, section II-A (RER, RCM); Knapitsch et al., "Tanks and Temples",
+2017 (F-score); Qu et al., "USME", 2021, section 1.2 and equation (7); Sucar et al., "iMAP", 2021.
+"""
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cached_property
 
-from ms_slam_env import metrics
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.geometry.point_clouds import voxel_downsample
+from ms_slam_env.metrics.accuracy import RATIO_THRESHOLD_M
+from ms_slam_env.metrics.reconstruction import harmonic_mean, nearest_distances, rer
 
 Float64 = NDArray[np.float64]
 
 THRESHOLDS_M = (0.02, 0.05)
 MAP_VOXEL_M = 0.01  # a surface counts by its area, not by how often it was seen
+CAP_M = 0.1  # of one distance in the capped RMS, by which a few strays do not decide
+
+_SHARE = re.compile(r"(precision|recall|f_score)_(\d+(?:\.\d+)?)cm")
 
 
-def judge_map(points: Float64, surface: Float64, reference: Float64) -> dict[str, float]:
-    """Map metrics from points (N, 3) of the map, of the true surface and of the reference."""
-    result: dict[str, float] = {}
-    if len(points):
-        cloud = metrics.voxel_downsample(points, MAP_VOXEL_M)
-        to_surface = metrics.nearest_distances(cloud, surface)
-        to_map = metrics.nearest_distances(reference, cloud)
-        rer = metrics.rer(cloud, surface)
-    else:
-        to_surface, to_map, rer = np.array([np.inf]), np.array([np.inf]), float("nan")
-    for threshold in THRESHOLDS_M:
-        name = f"{round(100 * threshold)}cm"
-        precision = float((to_surface < threshold).mean())
-        recall = float((to_map < threshold).mean())
-        both = precision + recall
-        result[f"precision_{name}"] = precision
-        result[f"recall_{name}"] = recall
-        result[f"f_score_{name}"] = 2 * precision * recall / both if both else 0.0
-    return {**result, "rcm": result["recall_5cm"], "rer_m": rer, "map_points": len(points)}
+def share_keys(
+    thresholds_m: Sequence[float],
+    kinds: Iterable[str] = ("precision", "recall", "f_score"),
+) -> tuple[str, ...]:
+    """Keys such as ``precision_2cm`` for each threshold in metres.
+
+    Raises:
+        InputError: no threshold, or one that is not finite and positive.
+    """
+    if len(thresholds_m) == 0 or not all(np.isfinite(t) and t > 0 for t in thresholds_m):
+        raise InputError(f"thresholds must be finite and > 0 m, got {tuple(thresholds_m)}")
+    names = list(kinds)
+    return tuple(f"{name}_{100 * t:g}cm" for t in thresholds_m for name in names)
+
+
+STANDARD = (*share_keys(THRESHOLDS_M), "rcm", "rer_m", "map_points")
+"""What planners are judged by."""
+
+
+class ComparedMap:
+    """A map beside the true surface; distances are searched for when they are first asked for.
+
+    The map is judged where its estimated poses placed it; only RER registers it first.
+
+    Args:
+        points: (N, 3) of the map, metres; none is a map that has nothing.
+        surface: (M, 3) of the true surface.
+        reference: (K, 3) true points that the map should have; ``surface`` by default.
+        voxel_m: the map keeps one point a voxel of this side; 0 keeps all.
+        registered: whether the map has been registered to the surface already; RER is then taken
+            where it lies.
+    """
+
+    def __init__(
+        self,
+        points: ArrayLike,
+        surface: ArrayLike,
+        reference: ArrayLike | None = None,
+        voxel_m: float = MAP_VOXEL_M,
+        registered: bool = False,
+    ) -> None:
+        given = np.asarray(points)
+        self.map_points = len(given)
+        self.cloud = voxel_downsample(given, voxel_m) if voxel_m > 0 and len(given) else given
+        self.surface = surface
+        self.reference = surface if reference is None else reference
+        self.registered = registered
+
+    @cached_property
+    def to_surface(self) -> Float64:
+        """(N,) distance of each map point to the true surface; of an empty map one NaN."""
+        return self._search(self.cloud, self.surface)
+
+    @cached_property
+    def to_map(self) -> Float64:
+        """(K,) distance of each point of the reference to the map; of an empty map one NaN."""
+        return self._search(self.reference, self.cloud)
+
+    def _search(self, points: ArrayLike, target: ArrayLike) -> Float64:
+        return nearest_distances(points, target) if self.map_points else np.array([np.nan])
+
+    def precision(self, threshold_m: float) -> float:
+        """Share of map points nearer to the true surface; 0 of an empty map."""
+        return float((self.to_surface < threshold_m).mean())
+
+    def recall(self, threshold_m: float) -> float:
+        """Share of the reference nearer to the map; 0 of an empty map."""
+        return float((self.to_map < threshold_m).mean())
+
+    def f_score(self, threshold_m: float) -> float:
+        """Harmonic mean of precision and recall."""
+        return harmonic_mean(self.precision(threshold_m), self.recall(threshold_m))
+
+    def rer(self) -> float:
+        """RMS distance of map points to the true surface, after ICP; NaN of an empty map."""
+        if not self.map_points:
+            return float("nan")
+        return _rms(self.to_surface) if self.registered else rer(self.cloud, self.surface)
+
+    def measure(self, keys: Iterable[str] = STANDARD) -> dict[str, float]:
+        """The measures of the given keys, lengths in metres; distances NaN of an empty map.
+
+        Raises:
+            InputError: an unknown key.
+        """
+        return {key: self._value(key) for key in keys}
+
+    def _value(self, key: str) -> float:
+        share = _SHARE.fullmatch(key)
+        if share is not None:
+            kind, centimetres = share.groups()
+            value: float = getattr(self, kind)(float(centimetres) / 100)
+            return value
+        if key not in _MEASURES:
+            raise unknown("measure of a map", key, [*share_keys(THRESHOLDS_M), *_MEASURES])
+        return _MEASURES[key](self)
+
+
+_MEASURES: Mapping[str, Callable[[ComparedMap], float]] = {
+    "map_points": lambda of: of.map_points,
+    "rcm": lambda of: of.recall(RATIO_THRESHOLD_M),
+    "rer_m": ComparedMap.rer,
+    "map_error_median_m": lambda of: float(np.median(of.to_surface)),
+    "map_error_capped_rms_m": lambda of: _rms(np.minimum(of.to_surface, CAP_M)),
+    "accuracy_cm": lambda of: 100 * float(of.to_surface.mean()),
+    "completion_cm": lambda of: 100 * float(of.to_map.mean()),
+    "completion_ratio": lambda of: of.recall(RATIO_THRESHOLD_M),
+    "c2c_mean_m": lambda of: float(of.to_surface.mean()),
+    "c2c_std_m": lambda of: float(of.to_surface.std()),
+    "c2c_rms_m": lambda of: _rms(of.to_surface),
+    "hausdorff_directed_m": lambda of: float(of.to_surface.max()),
+    "hausdorff_m": lambda of: float(max(of.to_surface.max(), of.to_map.max())),
+}
+
+
+def map_quality(
+    points: ArrayLike,
+    surface: ArrayLike,
+    keys: Iterable[str] = STANDARD,
+    reference: ArrayLike | None = None,
+    voxel_m: float = MAP_VOXEL_M,
+) -> dict[str, float]:
+    """Judge ``points`` (N, 3) of a map against points (M, 3) of the true surface, metres.
+
+    Args:
+        points: of the map, where its estimated poses placed it.
+        surface: that map points should lie on.
+        keys: of the registry: ``precision_2cm``, ``recall_5cm``, ``f_score_10cm`` and so on,
+            ``rcm``, ``rer_m``, ``map_error_median_m``, ``map_error_capped_rms_m``, ...
+        reference: (K, 3) true points that the map should have; ``surface`` by default.
+        voxel_m: the map keeps one point a voxel of this side; 0 keeps all.
+
+    Returns:
+        the measures by key, in the order of ``keys``; of an empty map shares are 0 and distances
+        NaN.
+
+    Raises:
+        InputError: an unknown key, or bad points.
+    """
+    return ComparedMap(points, surface, reference, voxel_m).measure(keys)
+
+
+def _rms(distances: Float64) -> float:
+    return float(np.sqrt(np.mean(distances**2)))

@@ -18,12 +18,12 @@ from ms_slam_env import scenes
 from ms_slam_env.camera import xtion
 from ms_slam_env.config import from_dict, nested_options
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.evaluation.map_quality import map_quality
 from ms_slam_env.experiments.harness.experiment import Experiment
 from ms_slam_env.experiments.pictures.loop_maps import MapView, save_picture
 from ms_slam_env.geometry import invert, relative_angle
 from ms_slam_env.geometry.point_clouds import voxel_downsample
 from ms_slam_env.metrics import ate_rmse, path_length
-from ms_slam_env.metrics.reconstruction import nearest_distances
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished, make_table
@@ -283,7 +283,7 @@ def run_loop(spec: LoopSpec) -> dict[str, Any]:
     final = estimate.copy()
     final[frames] = bent
     surface = voxel_downsample(scene.surface_points(0.01)[0], 0.01)
-    errors = nearest_distances(voxel_downsample(system.map.points(stable=False), 0.01), surface)
+    points = system.map.points(stable=False)
     error_m = np.linalg.norm(estimate[:, :3, 3] - truth[:, :3, 3], axis=1)
     return {
         "frames": len(truth),
@@ -294,7 +294,7 @@ def run_loop(spec: LoopSpec) -> dict[str, Any]:
         "final_ate_m": ate_rmse(final, truth),
         "end_error_m": float(error_m[-1]),
         "largest_error_m": float(error_m.max()),
-        "map_error_capped_rms_m": float(np.sqrt(np.mean(np.minimum(errors, 0.1) ** 2))),
+        **map_quality(points, surface, ("map_error_capped_rms_m",)),
         "lost_frames": lost,
         "closed_loops": len(closures),
         "closures": [asdict(closure) for closure in closures],

@@ -26,13 +26,10 @@ from ms_slam_env.metrics.consistency import (
 )
 from ms_slam_env.metrics.cost import CostMeter, EnergyCounter, FrameCost, energy_counters
 from ms_slam_env.metrics.initialisation import Initialisation, initialisation, local_scales
-from ms_slam_env.metrics.map_quality import MapQuality, map_quality
 from ms_slam_env.metrics.multi_robot import mean_path_length, task_time, team_ate, team_rpe
 from ms_slam_env.metrics.reconstruction import (
-    MapMetrics,
     f_score,
     icp,
-    map_metrics,
     nearest_distances,
     precision,
     rcm,
@@ -74,8 +71,6 @@ __all__ = [
     "Initialisation",
     "LabelledView",
     "MapConsistency",
-    "MapMetrics",
-    "MapQuality",
     "ObjectConsistency",
     "SightingRule",
     "TrackingRobustness",
@@ -96,8 +91,6 @@ __all__ = [
     "initialisation",
     "judge_consistency",
     "local_scales",
-    "map_metrics",
-    "map_quality",
     "mean_path_length",
     "mean_relocalisation_time",
     "nearest_distances",

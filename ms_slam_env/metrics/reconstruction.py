@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
@@ -12,30 +9,11 @@ from scipy.spatial import cKDTree
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import transform_points
 from ms_slam_env.geometry.cloud_registration import CUTOFF_M, register_clouds
-from ms_slam_env.geometry.point_clouds import check_points, voxel_downsample
+from ms_slam_env.geometry.point_clouds import check_points
 
 Float64 = NDArray[np.float64]
 
 ICP_POINTS = 5000  # of a map, evenly picked, are enough to place it
-
-
-@dataclass(frozen=True)
-class MapMetrics:
-    """Quality of an estimated map against the true surface.
-
-    Attributes:
-        precision: threshold in metres -> share of map points that near the true surface.
-        recall: threshold -> share of true points that near the map (RCM at that threshold).
-        f_score: threshold -> harmonic mean of precision and recall.
-        rer_m: RMS distance of map points to the true surface, after the registration asked for.
-        rcm: recall at ``rcm_threshold_m``.
-    """
-
-    precision: dict[float, float]
-    recall: dict[float, float]
-    f_score: dict[float, float]
-    rer_m: float
-    rcm: float
 
 
 def nearest_distances(points: ArrayLike, truth: ArrayLike) -> Float64:
@@ -82,45 +60,6 @@ def rer(points: ArrayLike, truth: ArrayLike, registration: str = "icp") -> float
     """
     cloud, true_cloud = check_points(points, "points"), check_points(truth, "truth")
     return _rms(_registered_distances(cloud, cKDTree(true_cloud), registration))
-
-
-def map_metrics(
-    points: ArrayLike,
-    truth: ArrayLike,
-    thresholds_m: Sequence[float] = (0.02, 0.05),
-    rcm_threshold_m: float = 0.05,
-    registration: str = "icp",
-    voxel_m: float = 0.01,
-) -> MapMetrics:
-    """All measures of a map at once, from two k-d trees.
-
-    Precision, recall and F-score judge the map where its estimated poses placed it; only RER
-    registers it first. Both clouds are thinned to one point per voxel, so that a surface counts
-    by its area and not by how often it was seen.
-
-    Raises:
-        InputError: bad points, thresholds, voxel size or registration.
-    """
-    for threshold in (*thresholds_m, rcm_threshold_m):
-        _check_threshold(threshold)
-    cloud = voxel_downsample(check_points(points, "points"), voxel_m)
-    true_cloud = voxel_downsample(check_points(truth, "truth"), voxel_m)
-    # Distances matter only up to the largest threshold: a bounded search is much faster, and the
-    # points beyond it stay at infinity.
-    reach = max(*thresholds_m, rcm_threshold_m)
-    true_tree = cKDTree(true_cloud, balanced_tree=False, compact_nodes=False)
-    tree = cKDTree(cloud, balanced_tree=False, compact_nodes=False)
-    to_truth = true_tree.query(cloud, distance_upper_bound=reach)[0]
-    to_map = tree.query(true_cloud, distance_upper_bound=reach)[0]
-    precisions = {t: float((to_truth < t).mean()) for t in thresholds_m}
-    recalls = {t: float((to_map < t).mean()) for t in thresholds_m}
-    return MapMetrics(
-        precision=precisions,
-        recall=recalls,
-        f_score={t: harmonic_mean(precisions[t], recalls[t]) for t in thresholds_m},
-        rer_m=_rms(_registered_distances(cloud, true_tree, registration)),
-        rcm=float((to_map < rcm_threshold_m).mean()),
-    )
 
 
 def icp(source: ArrayLike, target: ArrayLike, cutoff_m: float = CUTOFF_M) -> Float64:

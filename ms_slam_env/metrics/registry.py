@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from importlib import resources
 from typing import Any
@@ -128,12 +129,24 @@ def metric(key: str) -> Metric:
     Raises:
         InputError: an unknown key; the message names similar ones.
     """
-    found = registry().get(key)
+    found = registry().get(key) or _of_a_threshold(key)
     if found is None:
         similar = difflib.get_close_matches(key, registry(), n=3)
         hint = f"; similar: {', '.join(similar)}" if similar else ""
         raise InputError(f"unknown metric {key!r}: not in metrics/registry.yaml{hint}")
     return found
+
+
+def _of_a_threshold(key: str) -> Metric | None:
+    """The metric of a key such as ``recall_3cm``, whose entry ``recall_{}cm`` has any number."""
+    number = re.search(r"_(\d+(?:\.\d+)?)cm$", key)
+    if number is None:
+        return None
+    found = registry().get(f"{key[: number.start(1)]}{{}}{key[number.end(1) :]}")
+    if found is None:
+        return None
+    texts = {name: getattr(found, name).format(number[1]) for name in ("heading", "definition")}
+    return replace(found, key=key, **texts)
 
 
 def check_keys(result: Any) -> None:

@@ -134,12 +134,12 @@ def test_the_command_reports_teams(robots, tmp_path, monkeypatch, capsys) -> Non
             rows.append({"spec": dataclasses.asdict(spec), "result": run(spec), "error": None})
         return rows
 
-    def judged(points, *_):
+    def judged(points, *_, **__):
         return {"f_score_2cm": 0.5, "f_score_5cm": 1.0, "map_points": len(points)}
 
     floor = np.zeros((1, 3))
     team = Team(robots, list(TRUTHS), [np.arange(10) / 30] * 2, floor, floor, [0.5])
-    monkeypatch.setattr(multi_robot_run, "judge_map", judged)  # takes seconds, and is tested above
+    monkeypatch.setattr(multi_robot_run, "map_quality", judged)  # takes seconds
     monkeypatch.setattr(multi_robot, "run_all", here)
     monkeypatch.setattr(multi_robot, "make_team", lambda _: team)
     monkeypatch.setattr(multi_robot_run, "make_team", lambda _: team)

@@ -300,7 +300,7 @@ def test_maps_by_their_measures(maps: list[str], tmp_path: Path) -> None:
     expected = {
         "precision_1cm": metrics.precision(points, surface, 0.01),
         "recall_2.5cm": metrics.recall(points, surface, 0.025),
-        "f_2.5cm": metrics.f_score(points, surface, 0.025),
+        "f_score_2.5cm": metrics.f_score(points, surface, 0.025),
         "rer_m": metrics.rer(points, surface),
         "rcm": metrics.rcm(points, surface),
         "accuracy_cm": metrics.completion(points, surface).accuracy_cm,

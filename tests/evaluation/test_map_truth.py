@@ -7,7 +7,7 @@ import pytest
 from box_scene import BOXES, ROOM_HIGH, ROOM_LOW, BoxScene
 
 from ms_slam_env.evaluation import map_truth
-from ms_slam_env.evaluation.map_quality import judge_map
+from ms_slam_env.evaluation.map_quality import map_quality
 
 START = np.array([-1.0, -1.0, 1.2])
 
@@ -59,21 +59,21 @@ def test_reference_is_the_same_every_time(scene: BoxScene, reference: np.ndarray
 
 def test_perfect_map_scores_one_and_half_a_map_loses_recall_only(reference: np.ndarray) -> None:
     surface = np.concatenate([reference, ROOM_HIGH[None]])
-    whole = judge_map(reference, surface, reference)
+    whole = map_quality(reference, surface, reference=reference)
     assert whole["f_score_2cm"] == whole["f_score_5cm"] == whole["rcm"] == 1
-    half = judge_map(reference[reference[:, 0] < START[0]], surface, reference)
+    half = map_quality(reference[reference[:, 0] < START[0]], surface, reference=reference)
     assert half["precision_2cm"] == 1
     assert half["recall_5cm"] < 0.8
     assert half["f_score_5cm"] == pytest.approx(2 * half["recall_5cm"] / (1 + half["recall_5cm"]))
 
 
 def test_shifted_map_loses_both_but_not_rer(reference: np.ndarray) -> None:
-    shifted = judge_map(reference + 0.1, reference, reference)
+    shifted = map_quality(reference + 0.1, reference, reference=reference)
     assert shifted["f_score_5cm"] < 0.3
     assert shifted["rer_m"] < 0.03  # registered first
 
 
 def test_empty_map_scores_zero(reference: np.ndarray) -> None:
-    empty = judge_map(np.empty((0, 3)), reference, reference)
+    empty = map_quality(np.empty((0, 3)), reference, reference=reference)
     assert empty["f_score_5cm"] == empty["rcm"] == empty["map_points"] == 0
     assert np.isnan(empty["rer_m"])

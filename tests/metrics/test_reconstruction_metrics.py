@@ -10,7 +10,6 @@ from ms_slam_env.geometry import se3_exp, transform_points
 from ms_slam_env.metrics import (
     f_score,
     icp,
-    map_metrics,
     nearest_distances,
     precision,
     rcm,
@@ -78,20 +77,6 @@ def test_icp_undoes_a_small_motion():
     assert rer(moved, truth, "icp") < 0.2 * rer(moved, truth, "none")
 
 
-def test_map_metrics_equal_the_single_measures():
-    points, truth = box(0) + np.array([0.0, 0.0, 0.01]), box(1)
-    thinned, thinned_truth = voxel_downsample(points, 0.02), voxel_downsample(truth, 0.02)
-    for registration in ("none", "icp"):
-        found = map_metrics(points, truth, (0.02, 0.05), 0.04, registration, voxel_m=0.02)
-        for threshold in (0.02, 0.05):
-            pair = thinned, thinned_truth, threshold
-            assert found.precision[threshold] == precision(*pair)
-            assert found.recall[threshold] == recall(*pair)
-            assert found.f_score[threshold] == f_score(*pair)
-        assert found.rcm == rcm(thinned, thinned_truth, 0.04)
-        assert found.rer_m == pytest.approx(rer(thinned, thinned_truth, registration), abs=1e-6)
-
-
 @settings(max_examples=20)
 @given(st.integers(0, 100), st.floats(0.02, 0.5))
 def test_thinning_leaves_one_point_of_the_input_in_each_voxel(seed, voxel_m):
@@ -101,13 +86,6 @@ def test_thinning_leaves_one_point_of_the_input_in_each_voxel(seed, voxel_m):
     assert len(thinned) == len(cells)
     assert {tuple(cell) for cell in np.floor(thinned / voxel_m).astype(int)} == cells
     assert {tuple(p) for p in thinned} <= {tuple(p) for p in points}
-
-
-def test_a_map_equal_to_the_truth_is_perfect():
-    truth = box(0)
-    found = map_metrics(truth, truth)
-    assert (found.f_score, found.rcm) == ({0.02: 1.0, 0.05: 1.0}, 1.0)
-    assert found.rer_m == pytest.approx(0, abs=1e-9)
 
 
 GOOD = box(0, 50)
@@ -125,8 +103,6 @@ GOOD = box(0, 50)
 def test_bad_points_are_refused(bad, match):
     for pair in ((bad, GOOD), (GOOD, bad)):
         with pytest.raises(InputError, match=match):
-            map_metrics(*pair)
-        with pytest.raises(InputError, match=match):
             nearest_distances(*pair)
         with pytest.raises(InputError, match=match):
             rer(*pair)
@@ -138,7 +114,5 @@ def test_bad_options_are_refused():
     for threshold in (0.0, -1.0, np.nan):
         with pytest.raises(InputError, match="threshold"):
             f_score(GOOD, GOOD, threshold)
-        with pytest.raises(InputError, match="threshold"):
-            map_metrics(GOOD, GOOD, (threshold,))
     with pytest.raises(InputError, match="voxel_m"):
         voxel_downsample(GOOD, 0.0)

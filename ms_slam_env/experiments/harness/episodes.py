@@ -22,7 +22,7 @@ from ms_slam_env.env.config import make_config
 from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.env.planners import check_planner, make_planner, planner_class
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.evaluation.map_quality import judge_map
+from ms_slam_env.evaluation.map_quality import map_quality
 from ms_slam_env.evaluation.map_truth import reference_of, true_surface
 from ms_slam_env.registration import ADAPTIVE_ID
 from ms_slam_env.scenes import SCENES, SEED_SPLITS
@@ -221,7 +221,7 @@ def measure_map(world: ActiveSlamEnv, spec: EpisodeSpec) -> dict[str, float]:
     surface = true_surface(spec.scene, spec.seed)
     reference = reference_of(spec.scene, spec.seed, (x, y, z))
     area = {"mapped_area_m2": world.coverage.mapped_area}
-    return {**judge_map(world.slam.map_points(), surface, reference), **area}
+    return {**map_quality(world.slam.map_points(), surface, reference=reference), **area}
 
 
 def parse_options(texts: Sequence[str]) -> dict[str, Any]:
