@@ -17,6 +17,7 @@ from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.normal_equations import (
     NUM_SUMS,
     RUNNING,
+    Hypotheses,
     Photometry,
     Sum,
 )
@@ -47,18 +48,13 @@ def _regress(model, live, weight, light, textured_robust=None):
     if textured_robust is not None:
         sums[Sum.TEXTURED] = len(textured_robust)
         sums[Sum.ROUGH] = (1 - textured_robust).sum()
-    lights = wp.array(light[:, None], dtype=Photometry)
-    wp.launch(
-        gauss_newton_step,
-        dim=(1, 1),
-        inputs=[wp.array(sums[None, None], dtype=wp.float64), 1e-6, 1e-3, 0, 1.0],
-        outputs=[
-            wp.array(np.eye(4)[None, None], dtype=wp.mat44d),
-            lights,
-            wp.array([[RUNNING]], dtype=wp.int32),
-        ],
-    )
-    return lights.numpy()[:, 0]
+    one = Hypotheses()
+    one.pose = wp.array(np.eye(4)[None, None], dtype=wp.mat44d)
+    one.state = wp.array([[RUNNING]], dtype=wp.int32)
+    one.photometry = wp.array(light[:, None], dtype=Photometry)
+    one.sums = wp.array(sums[None, None], dtype=wp.float64)
+    wp.launch(gauss_newton_step, dim=(1, 1), inputs=[one, 1e-6, 1e-3, 0, 1.0])
+    return one.photometry.numpy()[:, 0]
 
 
 @given(seed=st.integers(0, 1000), gain=st.floats(0.5, 1.6), bias=st.floats(-20, 20))

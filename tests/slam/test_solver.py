@@ -13,6 +13,7 @@ from ms_slam_env.slam.surfel.normal_equations import (
     OFF,
     RESTING,
     RUNNING,
+    Hypotheses,
     Photometry,
     Sum,
 )
@@ -29,19 +30,14 @@ def _sums(H: np.ndarray, g: np.ndarray) -> np.ndarray:
     return sums
 
 
-def _lights() -> wp.array:
-    return wp.array(same_exposure(1)[:, None], dtype=Photometry)
-
-
 def _step(H, g, T, state=RUNNING, last=0, smallest=1e-9, damping=0.0):
-    pose = wp.array(T[None, None], dtype=wp.mat44d)
-    active = wp.array([[state]], dtype=wp.int32)
-    sums = wp.array(_sums(H, g)[None, None], dtype=wp.float64)
-    wp.launch(
-        gauss_newton_step, dim=(1, 1), inputs=[sums, damping, smallest, last, 1.0],
-        outputs=[pose, _lights(), active],
-    )  # fmt: skip
-    return pose.numpy()[0, 0], int(active.numpy()[0, 0])
+    one = Hypotheses()
+    one.pose = wp.array(T[None, None], dtype=wp.mat44d)
+    one.state = wp.array([[state]], dtype=wp.int32)
+    one.photometry = wp.array(same_exposure(1)[:, None], dtype=Photometry)
+    one.sums = wp.array(_sums(H, g)[None, None], dtype=wp.float64)
+    wp.launch(gauss_newton_step, dim=(1, 1), inputs=[one, damping, smallest, last, 1.0])
+    return one.pose.numpy()[0, 0], int(one.state.numpy()[0, 0])
 
 
 @given(seed=st.integers(0, 10_000), size=st.sampled_from([1e-9, 1e-5, 1e-2, 0.5]))
@@ -87,9 +83,10 @@ def test_reduction_adds_the_slots_of_running_hypotheses():
     rng = np.random.default_rng(0)
     partial = rng.normal(size=(2, 3, 7, NUM_SUMS)).astype(np.float32)
     states = np.array([[RUNNING, OFF, RUNNING], [RESTING, RUNNING, RUNNING]])
-    sums = wp.zeros((2, 3, NUM_SUMS), dtype=wp.float64)
-    active = wp.array(states, dtype=wp.int32)
-    inputs = [wp.array(partial, dtype=wp.float32), 5, active]
-    wp.launch(reduce_sums, dim=sums.shape, inputs=inputs, outputs=[sums])
+    hypotheses = Hypotheses()
+    hypotheses.sums = wp.zeros((2, 3, NUM_SUMS), dtype=wp.float64)
+    hypotheses.state = wp.array(states, dtype=wp.int32)
+    hypotheses.partial = wp.array(partial, dtype=wp.float32)
+    wp.launch(reduce_sums, dim=(2, 3, NUM_SUMS), inputs=[hypotheses, 5])
     expected = partial[:, :, :5].astype(np.float64).sum(2) * (states == RUNNING)[..., None]
-    np.testing.assert_allclose(sums.numpy(), expected, atol=1e-12)
+    np.testing.assert_allclose(hypotheses.sums.numpy(), expected, atol=1e-12)

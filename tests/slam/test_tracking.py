@@ -74,21 +74,16 @@ def _device_sums(data, T, weights, stride=1, columns=1 << 20, light=LIGHT):
     images.focal, images.centre = wp.vec2(SMALL.fx, SMALL.fy), wp.vec2(SMALL.cx, SMALL.cy)
     columns = min(columns, SMALL.width)
     rows, pieces = -(-SMALL.height // stride), -(-SMALL.width // columns)
-    partial = wp.zeros((1, 1, rows * pieces, ne.NUM_SUMS), dtype=wp.float32)
-    sums = wp.zeros((1, 1, ne.NUM_SUMS), dtype=wp.float64)
-    active = wp.array([[ne.RUNNING]], dtype=wp.int32)
-    wp.launch(
-        ne.accumulate_normal_equations,
-        dim=(1, 1, rows, pieces),
-        inputs=[
-            images, weights, stride, columns, wp.array(T[None, None], dtype=wp.mat44d),
-            wp.array(light[:, None], dtype=ne.Photometry), active,
-        ],
-        outputs=[partial],
-    )  # fmt: skip
-    inputs = [partial, rows * pieces, active]
-    wp.launch(reduce_sums, dim=sums.shape, inputs=inputs, outputs=[sums])
-    return sums.numpy()[0, 0]
+    one = ne.Hypotheses()
+    one.pose = wp.array(T[None, None], dtype=wp.mat44d)
+    one.state = wp.array([[ne.RUNNING]], dtype=wp.int32)
+    one.photometry = wp.array(light[:, None], dtype=ne.Photometry)
+    one.partial = wp.zeros((1, 1, rows * pieces, ne.NUM_SUMS), dtype=wp.float32)
+    one.sums = wp.zeros((1, 1, ne.NUM_SUMS), dtype=wp.float64)
+    inputs = [images, weights, stride, columns, one]
+    wp.launch(ne.accumulate_normal_equations, dim=(1, 1, rows, pieces), inputs=inputs)
+    wp.launch(reduce_sums, dim=one.sums.shape, inputs=[one, rows * pieces])
+    return one.sums.numpy()[0, 0]
 
 
 def _bilinear(image, x, y):

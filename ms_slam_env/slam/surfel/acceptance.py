@@ -26,7 +26,7 @@ from ms_slam_env.slam.surfel.degeneracy import (
     pose_covariance,
     vec6d,
 )
-from ms_slam_env.slam.surfel.normal_equations import Sum
+from ms_slam_env.slam.surfel.normal_equations import Hypotheses, Sum
 from ms_slam_env.slam.surfel.solver import (
     cholesky,
     cholesky_solve,
@@ -105,8 +105,7 @@ def _without_open_directions(
 
 @wp.kernel
 def assess_alignment(
-    sums: wp.array3d(dtype=wp.float64),
-    T_model_live: wp.array2d(dtype=wp.mat44d),  # in, and out where it is degenerate
+    hypotheses: Hypotheses,  # (B, 1); out: the pose where it is degenerate
     predicted: wp.array(dtype=wp.mat44d),  # (B,) T_model_live
     thresholds: wp.array(dtype=DeviceThresholds),  # (B,)
     T_world_model: wp.array(dtype=wp.mat44d),  # in: pose of the model view
@@ -121,6 +120,7 @@ def assess_alignment(
     """
     b = wp.tid()
     one = wp.float64(1.0)
+    sums = hypotheses.sums
     matched = sums[b, 0, Sum.MATCHED]
     tilted = sums[b, 0, Sum.TILTED]
     found = DeviceStatistics()
@@ -144,10 +144,10 @@ def assess_alignment(
     found.term_conflict = _conflict(A, B, g_a, g_b)
     covariance[b] = pose_covariance(E, A, B, tilted, matched, length)
 
-    T = T_model_live[b, 0]
+    T = hypotheses.pose[b, 0]
     if found.degenerate_directions > wp.float64(0.0):
         T = _without_open_directions(T, predicted[b], E, A, tilted, matched, length)
-        T_model_live[b, 0] = T
+        hypotheses.pose[b, 0] = T
     found.motion_m = wp.sqrt(T[0, 3] * T[0, 3] + T[1, 3] * T[1, 3] + T[2, 3] * T[2, 3])
     found.rotation_cos = wp.float64(0.5) * (T[0, 0] + T[1, 1] + T[2, 2] - one)
 

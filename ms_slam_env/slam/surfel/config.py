@@ -10,7 +10,7 @@ from ms_slam_env.errors import InputError
 
 @dataclass(frozen=True)
 class LoopConfig(Checked):
-    """When loops are looked for, when they are believed, and how the map is bent.
+    """When loops are looked for, when they are believed, and how the map is deformed.
 
     ElasticFusion's published values are for 640x480 at 30 Hz and minutes of recording; these are
     shares of the image and of the map where they can be, and frames elsewhere.
@@ -24,7 +24,7 @@ class LoopConfig(Checked):
         inliers: least share of matched points that the registration explains.
         largest_m: largest correction of the camera's position that is believed.
         largest_deg: largest correction of its rotation.
-        smallest_m: a correction that moves a point at 1 m less than this bends nothing: the
+        smallest_m: a correction that moves a point at 1 m less than this deforms nothing: the
             inactive surfels are taken back as they are.
         agreement_m: a loop is closed when two looks agree so far on the correction, at 1 m.
         global_interval: frames between two looks at keyframes; a multiple of ``interval``.
@@ -106,7 +106,7 @@ class SurfelConfig(Checked):
             map. If not, every frame is fused at the pose that alignment found, as in ElasticFusion
             without relocalisation, and a map may show things twice.
         loop_closure: "none": frames are aligned with all of the map, however old; "deformation":
-            with its recent part, and where that meets the old part again the map is bent to fit.
+            with its recent part; where that meets the old part again the map is deformed to fit.
         loops: parameters of the latter.
         relocalisation: where a lost frame is searched besides around the last good pose: "ferns",
             at keyframes that resemble it, or "local", nowhere.

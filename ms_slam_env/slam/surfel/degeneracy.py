@@ -172,10 +172,5 @@ def pose_covariance(
                 else:
                     inverse[i, j] += along / E[6, k]
     C += inverse * (GEOMETRIC_NOISE * A + PHOTOMETRIC_NOISE * B) * inverse
-    for i in range(6):
-        for j in range(6):
-            if i >= 3:
-                C[i, j] = C[i, j] / length
-            if j >= 3:
-                C[i, j] = C[i, j] / length
+    C = in_metres(C, length)
     return wp.float64(0.5) * (C + wp.transpose(C))

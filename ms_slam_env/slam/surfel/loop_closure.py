@@ -1,4 +1,4 @@
-"""Loop closure by deformation: the map is bent where its present part meets an older one again.
+"""Loop closure by deformation: the map is deformed where its present part meets an older one again.
 
 ElasticFusion (Whelan et al., RSS 2015, sections IV to VI). Surfels not seen for ``window`` frames
 are inactive: frames are neither tracked against them nor fused into them. Every few frames
@@ -201,7 +201,7 @@ class InactiveRegistration:
         return self._tracker.align(self._inactive.view, origins, stack, thresholds)
 
 
-SIGNIFICANT = 3.0  # drift, in standard deviations of the registration, that is worth bending for
+SIGNIFICANT = 3.0  # drift, in standard deviations of the registration, that is worth deforming for
 VIEW_APART_M, VIEW_APART_RAD = 1.0, np.radians(60.0)  # views of one place differ by less
 
 
@@ -283,7 +283,7 @@ class DeformationLoopClosure(LoopClosure):
         return False
 
     def _close(self, env: int, poses: Float64, there: Alignment) -> bool:
-        """Bend map, pose and past of one env; returns whether that was believed and done."""
+        """Deform map, pose and history of one env; returns whether that was accepted and done."""
         history, corrected = self._histories[env], there.T_world_live[env]
         drift = motion_size(invert(poses[env]) @ corrected)
         if drift < self.config.smallest_m:
@@ -303,7 +303,7 @@ class DeformationLoopClosure(LoopClosure):
         return True
 
     def trajectory(self, env: int) -> tuple[Int32, Float64]:
-        """Tracked frames (N,) and their poses (N, 4, 4), bent by the closures since."""
+        """Tracked frames (N,) and their poses (N, 4, 4), moved by the closures since."""
         return self._histories[env].trajectory()
 
     def get_state(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Bends the map of one env so that its present part meets the inactive one, and joins them."""
+"""Deforms the map of one env so that its present part meets the inactive one; joins them."""
 
 from __future__ import annotations
 
@@ -35,6 +35,9 @@ from ms_slam_env.slam.surfel.surfels import (
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
+
+FEWEST_CONSTRAINTS = 12
+NEAREST = wp.constant(5)  # of deformation_graph: NEIGHBOURS that move a point, and the next one
 
 
 @dataclass(frozen=True)
@@ -108,15 +111,10 @@ def surface_constraints(
     active: VisiblePoints, inactive: VisiblePoints, correction: Float64
 ) -> Constraints:
     """Move points of the active part by ``correction`` (4, 4), hold those of the inactive part."""
-    count, pins = len(active.world), len(inactive.world)
-    moves = Constraints(
-        active.world,
-        active.times,
-        transform_points(correction, active.world),
-        np.full(count, np.nan),
-    )
-    holds = Constraints(inactive.world, inactive.times, inactive.world, np.full(pins, np.nan))
-    return join([moves, holds])
+    targets = transform_points(correction, active.world)
+    moves = Constraints(active.world, active.times, targets, np.full(len(targets), np.nan))
+    pins = np.full(len(inactive.world), np.nan)
+    return join([moves, Constraints(inactive.world, inactive.times, inactive.world, pins)])
 
 
 def relative_to(
@@ -130,9 +128,6 @@ def relative_to(
     targets = constraints.targets[:count]
     _, nearest = cKDTree(inactive.world).query(targets)
     return Constraints(active.world, active.times, targets, inactive.times[nearest])
-
-
-NEAREST = wp.constant(5)  # of deformation_graph: NEIGHBOURS that move a point, and the next one
 
 
 @wp.struct
@@ -241,11 +236,8 @@ def merge(
             wp.atomic_add(surfels.dead, b, 1)
 
 
-FEWEST_CONSTRAINTS = 12
-
-
 class MapDeformer:
-    """Bends the maps of B envs, one at a time.
+    """Deforms the maps of B envs, one at a time.
 
     Args:
         surfel_map: the maps.
@@ -276,7 +268,7 @@ class MapDeformer:
     def deform(
         self, env: int, pose: Float64, corrected: Float64, earlier: Constraints
     ) -> tuple[Deformation, Constraints] | None:
-        """Take what is seen from ``pose`` to where it is seen from ``corrected``, if believable.
+        """Take what is seen from ``pose`` to where it is seen from ``corrected``, if acceptable.
 
         Args:
             env: whose map.
@@ -306,12 +298,12 @@ class MapDeformer:
         count = min(self.config.max_nodes, used // self.config.surfels_per_node)
         graph = sample_graph(positions[order], ordered_times, count)
         deformation = optimise(graph, constraints)
-        if not self._is_believable(constraints, deformation):
+        if not self._is_acceptable(constraints, deformation):
             return None
         self._move_surfels(env, deformation, times)
         return deformation, relative_to(surface, new, old).moved_by(deformation)
 
-    def _is_believable(self, constraints: Constraints, deformation: Deformation) -> bool:
+    def _is_acceptable(self, constraints: Constraints, deformation: Deformation) -> bool:
         """Whether the graph could do what the constraints ask."""
         before = _rms(constraints.errors(identity(deformation.graph)))
         after = _rms(constraints.errors(deformation))
@@ -350,14 +342,14 @@ class MapDeformer:
         nodes.R = wp.array(deformation.R, dtype=wp.mat33, device=self.device)
         nodes.t = wp.array(deformation.t, dtype=wp.vec3, device=self.device)
         first = graph.first_candidates(times).astype(np.int32)
-        first_device: Any = wp.array(first, dtype=wp.int32, device=self.device)
-        wp.launch(
-            deform_surfels,
-            dim=len(times),
-            inputs=[self.map.surfels, env, nodes, first_device, graph.window],
-            device=self.device,
-        )
+        candidates: Any = wp.array(first, dtype=wp.int32, device=self.device)
+        self._launch(deform_surfels, len(times), env, [nodes, candidates, graph.window])
         self.map.surfels_moved()
+
+    def _launch(self, kernel: Any, count: int, env: int, inputs: list[Any]) -> None:
+        """Run a kernel on ``count`` surfels of one env."""
+        inputs = [self.map.surfels, env, *inputs]
+        wp.launch(kernel, dim=count, inputs=inputs, device=self.device)
 
     def join_parts(self, env: int, pose: Float64, now: int) -> None:
         """Make one surface of both parts in view from ``pose`` (4, 4), and the old one active.
@@ -372,29 +364,13 @@ class MapDeformer:
         seen = self.map.surfels.seen[env].numpy()[listed]
         self._cull(self._active, pose)
         active = self._active.visible
-        wp.launch(
-            merge,
-            dim=int(active.count.numpy()[env]),
-            inputs=[
-                self.map.surfels,
-                env,
-                active,
-                self._inactive.camera,
-                view.vertices,
-                view.normals,
-                self._min_cosine,
-                self._stable,
-            ],
-            device=self.device,
-        )
+        shown = [active, self._inactive.camera, view.vertices, view.normals]
+        rule = [self._min_cosine, self._stable]
+        self._launch(merge, int(active.count.numpy()[env]), env, [*shown, *rule])
         reach = self.config.window // 2
         first, last = (int(np.quantile(seen, q)) for q in (0.1, 0.9))
-        wp.launch(
-            reactivate,
-            dim=int(self.map.surfels.count.numpy()[env]),
-            inputs=[self.map.surfels, env, first - reach, last + reach, now],
-            device=self.device,
-        )
+        count = int(self.map.surfels.count.numpy()[env])
+        self._launch(reactivate, count, env, [first - reach, last + reach, now])
         self.map.surfels_moved()
 
 

@@ -115,6 +115,25 @@ class Photometry:
 
 
 @wp.struct
+class Hypotheses:
+    """K pose hypotheses of B envs.
+
+    Attributes:
+        pose: (B, K) T_model_live.
+        photometry: (B, K).
+        state: (B, K) OFF, RUNNING or RESTING.
+        partial: (B, K, rows * pieces, NUM_SUMS) of the parts of a pass.
+        sums: (B, K, NUM_SUMS) of the last pass, see ``Sum``.
+    """
+
+    pose: wp.array2d(dtype=wp.mat44d)
+    photometry: wp.array2d(dtype=Photometry)
+    state: wp.array2d(dtype=wp.int32)
+    partial: wp.array4d(dtype=wp.float32)
+    sums: wp.array3d(dtype=wp.float64)
+
+
+@wp.struct
 class AlignedImages:
     """Images of B envs at one pyramid level, flat, and the camera of the live ones.
 
@@ -395,17 +414,14 @@ def accumulate_normal_equations(
     weights: Weights,
     stride: wp.int32,
     columns: wp.int32,  # of the image, per thread
-    pose: wp.array2d(dtype=wp.mat44d),  # T_model_live (B, K)
-    photometry: wp.array2d(dtype=Photometry),
-    active: wp.array2d(dtype=wp.int32),
-    partial: wp.array4d(dtype=wp.float32),  # (B, K, rows * pieces, NUM_SUMS)
+    hypotheses: Hypotheses,
 ):
     """Sum the terms of one piece of a row of model points, for every active hypothesis."""
     b, k, row_index, piece = wp.tid()
-    if active[b, k] != RUNNING:
+    if hypotheses.state[b, k] != RUNNING:
         return
     width = images.model_size[0]
-    T = pose[b, k]
+    T = hypotheses.pose[b, k]
     R_inverse = wp.mat33(
         float(T[0, 0]), float(T[1, 0]), float(T[2, 0]),
         float(T[0, 1]), float(T[1, 1]), float(T[2, 1]),
@@ -416,6 +432,8 @@ def accumulate_normal_equations(
     start = piece * columns + (row_index % 2) * (stride // 2)
     model_row = (b * images.model_size[1] + row_index * stride) * width
     pieces = (width + columns - 1) // columns
+    slots = hypotheses.partial.shape[2]
+    row = (b * hypotheses.partial.shape[1] + k) * slots + row_index * pieces + piece
     accumulate_points(
         images,
         model_row + start,
@@ -425,7 +443,7 @@ def accumulate_normal_equations(
         R_inverse,
         t_inverse,
         weights,
-        photometry[b, k],
-        partial,
-        (b * partial.shape[1] + k) * partial.shape[2] + row_index * pieces + piece,
+        hypotheses.photometry[b, k],
+        hypotheses.partial,
+        row,
     )

@@ -25,6 +25,8 @@ from ms_slam_env.slam.surfel.device import (
 from ms_slam_env.slam.surfel.normal_equations import Photometry
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
 
+Bool = NDArray[np.bool_]
+
 DTYPE: np.dtype[Any] = Photometry.numpy_dtype()  # type: ignore[attr-defined]
 SMALL_GAIN = 0.04  # a gain and a bias this near to none are left alone: a systematic error of
 SMALL_BIAS = 4.0  # theirs, applied frame after frame, would bleach or darken the map
@@ -35,19 +37,23 @@ TRUST_GROWS = 1.15
 LEAST_TRUST = 1.0e-4
 USUAL_SCALE = 1.4  # a frame's residuals may have 1.4 times the scale estimated for the last ones
 SCALE_FALLS = 0.1  # share of the way to a smaller scale, a frame
+_EVERY = 4  # rows and columns that are looked at
+_CONSTANT = 0.5  # largest standard deviation of an image that no sensor took, grey levels
+_DARK, _BRIGHT = 16.0, 240.0  # means below and above which an image
+_FAINT = 4.0  # of at most this standard deviation is black or glare
 
 
 def same_exposure(batch: int) -> NDArray[Any]:
     """Photometry (B,) of images exposed like the map, full trust."""
-    lights = np.zeros(batch, dtype=DTYPE)
+    photometry = np.zeros(batch, dtype=DTYPE)
     for name in ("gain", "scale", "reference", "trust"):
-        lights[name] = 1.0
-    return lights
+        photometry[name] = 1.0
+    return photometry
 
 
-def geometry_only(lights: NDArray[Any]) -> NDArray[Any]:
+def geometry_only(photometry: NDArray[Any]) -> NDArray[Any]:
     """The same (B,) for an alignment by geometry alone."""
-    blind = lights.copy()
+    blind = photometry.copy()
     blind["trust"] = 0.0
     return blind
 
@@ -73,10 +79,10 @@ def next_photometry(
     return after
 
 
-def correction(lights: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def correction(photometry: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Gain (B,) and bias (B,) that colours are freed from; exactly 1 and 0 if they are small."""
-    gain = np.exp(_shrink(np.log(lights["gain"].astype(np.float64)), SMALL_GAIN))
-    shift = lights["bias"] + MIDDLE_GREY * (lights["gain"].astype(np.float64) - 1.0)
+    gain = np.exp(_shrink(np.log(photometry["gain"].astype(np.float64)), SMALL_GAIN))
+    shift = photometry["bias"] + MIDDLE_GREY * (photometry["gain"].astype(np.float64) - 1.0)
     return gain, _shrink(shift, SMALL_BIAS) - MIDDLE_GREY * (gain - 1.0)
 
 
@@ -122,9 +128,9 @@ class ExposureCorrection:
         self._bias = HostDeviceBuffer(batch, wp.float32, device)
         self._launches = KernelLaunchCache(device)
 
-    def __call__(self, live: LiveFrame, lights: NDArray[Any]) -> None:
-        """Change ``live.color`` in place where ``lights`` (B,) differ from the map's exposure."""
-        gain, bias = correction(lights)
+    def __call__(self, live: LiveFrame, photometry: NDArray[Any]) -> None:
+        """Change ``live.color`` in place where ``photometry`` (B,) differs from the map."""
+        gain, bias = correction(photometry)
         if (gain == 1.0).all() and (bias == 0.0).all():
             return
         self._per_gain.write(1.0 / gain)
@@ -132,13 +138,6 @@ class ExposureCorrection:
         inputs = [self._per_gain.array, self._bias.array, *self._size, self._columns]
         color = live.color
         self._launches.launch("correct", _correct, lambda: (self._dim, [*inputs, color.flatten()]))
-
-
-Bool = NDArray[np.bool_]
-_EVERY = 4  # rows and columns that are looked at
-_CONSTANT = 0.5  # largest standard deviation of an image that no sensor took, grey levels
-_DARK, _BRIGHT = 16.0, 240.0  # means below and above which an image
-_FAINT = 4.0  # of at most this standard deviation is black or glare
 
 
 def is_invalid_frame(color: NDArray[np.uint8]) -> Bool:

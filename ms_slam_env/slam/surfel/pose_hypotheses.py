@@ -14,9 +14,14 @@ from ms_slam_env._warp import wp
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose, make_pose, relative_angle, se3_exp, se3_log, so3_exp
 from ms_slam_env.slam.base import Float64
-from ms_slam_env.slam.surfel.normal_equations import OFF, RUNNING, Photometry, Sum
+from ms_slam_env.slam.surfel.normal_equations import OFF, RUNNING, Hypotheses, Sum
 
 NUM_HYPOTHESES = 8
+AT_REST, CONSTANT_VELOCITY, INITIAL_GUESS = (wp.constant(i) for i in range(3))
+"""Places of the first hypotheses; the guess, if any, is the last of them."""
+CLEARLY_BETTER = wp.constant(wp.float64(0.97))  # ratios of scores
+CLEARLY_WORSE = wp.constant(wp.float64(1.03))
+DECAY = 0.9  # from frame to frame, of a motion that is predicted only
 NUM_FIRST = 2  # tried first, with the guess if any: at rest and at constant velocity
 PAN_RAD = np.radians(8.0)
 ROLL_RAD = np.radians(8.0)
@@ -76,8 +81,7 @@ KEYFRAME_HYPOTHESES = np.stack(
     [[_HERE, _HERE, *(_turn(*turn) for turn in turns)] for turns in _TURNS_DEG]
 )
 """Starts (3, 8, 4, 4) relative to a keyframe, in turns; a turn stands for a sideways step too."""
-AT_REST = np.tile(_HERE, (NUM_HYPOTHESES, 1, 1))
-DECAY = 0.9  # from frame to frame, of a motion that is predicted only
+UNMOVED = np.tile(_HERE, (NUM_HYPOTHESES, 1, 1))
 
 
 def damped(motion: Float64) -> Float64:
@@ -125,13 +129,6 @@ def check_guesses(guesses: Sequence[ArrayLike | None] | None, batch: int) -> Flo
     )
 
 
-INITIAL_GUESS = wp.constant(
-    2
-)  # index of the guess among the first hypotheses, after rest and constant velocity
-CLEARLY_BETTER = wp.constant(wp.float64(0.97))  # ratios of scores
-CLEARLY_WORSE = wp.constant(wp.float64(1.03))
-
-
 @wp.func
 def _score(sums: wp.array3d(dtype=wp.float64), b: int, k: int):
     """Mean truncated cost per model point; a point out of view costs a fixed share."""
@@ -143,62 +140,43 @@ def _score(sums: wp.array3d(dtype=wp.float64), b: int, k: int):
 
 
 @wp.kernel
-def expand_hypotheses(
-    first_active: wp.array2d(dtype=wp.int32),
-    good_score: wp.float64,
-    first_sums: wp.array3d(dtype=wp.float64),
-    more_sums: wp.array3d(dtype=wp.float64),
-    more_active: wp.array2d(dtype=wp.int32),
-):
+def expand_hypotheses(first: Hypotheses, more: Hypotheses, good_score: wp.float64):
     """Switch on the further hypotheses (B, K2) unless one of the first (B, K1) fits well."""
     b = wp.tid()
     best = wp.float64(1.0e9)
-    for k in range(first_sums.shape[1]):
-        if first_active[b, k] == OFF:
-            first_sums[b, k, Sum.POINTS] = wp.float64(0.0)  # no points: the worst score
-        best = wp.min(best, _score(first_sums, b, k))
-    for k in range(more_active.shape[1]):
+    for k in range(first.sums.shape[1]):
+        if first.state[b, k] == OFF:
+            first.sums[b, k, Sum.POINTS] = wp.float64(0.0)  # no points: the worst score
+        best = wp.min(best, _score(first.sums, b, k))
+    for k in range(more.state.shape[1]):
         if best > good_score:
-            more_active[b, k] = RUNNING
+            more.state[b, k] = RUNNING
         else:
-            more_active[b, k] = OFF
-            more_sums[b, k, Sum.POINTS] = wp.float64(0.0)  # no points: the worst score
+            more.state[b, k] = OFF
+            more.sums[b, k, Sum.POINTS] = wp.float64(0.0)  # no points: the worst score
 
 
 @wp.kernel
-def select_hypothesis(
-    first_sums: wp.array3d(dtype=wp.float64),
-    first_pose: wp.array2d(dtype=wp.mat44d),
-    first_photometry: wp.array2d(dtype=Photometry),
-    more_sums: wp.array3d(dtype=wp.float64),
-    more_pose: wp.array2d(dtype=wp.mat44d),
-    more_photometry: wp.array2d(dtype=Photometry),
-    pose: wp.array2d(dtype=wp.mat44d),  # (B, 1)
-    photometry: wp.array2d(dtype=Photometry),  # (B, 1)
-    active: wp.array2d(dtype=wp.int32),  # (B, 1)
-):
-    """Go on with the seed whose points fit best; it becomes the one hypothesis.
-
-    The first hypotheses are at rest, at constant velocity, and the guess.
-    """
+def select_hypothesis(first: Hypotheses, more: Hypotheses, one: Hypotheses):
+    """Go on with the hypothesis whose points fit best; it becomes the only one, (B, 1)."""
     b = wp.tid()
     # Where the view leaves directions open all starts fit alike: prefer what is predicted.
-    best = first_pose[b, 1]
-    best_photometry = first_photometry[b, 1]
-    best_score = _score(first_sums, b, 1)
-    for n in range(1, first_pose.shape[1]):
-        k = wp.where(n == 1, 0, n)
-        score = _score(first_sums, b, k)
+    best = first.pose[b, CONSTANT_VELOCITY]
+    photometry = first.photometry[b, CONSTANT_VELOCITY]
+    best_score = _score(first.sums, b, CONSTANT_VELOCITY)
+    for n in range(1, first.pose.shape[1]):
+        k = wp.where(n == CONSTANT_VELOCITY, AT_REST, n)
+        score = _score(first.sums, b, k)
         if score < best_score * wp.where(k == INITIAL_GUESS, CLEARLY_WORSE, CLEARLY_BETTER):
             best_score = score
-            best = first_pose[b, k]
-            best_photometry = first_photometry[b, k]
-    for k in range(more_pose.shape[1]):
-        score = _score(more_sums, b, k)
+            best = first.pose[b, k]
+            photometry = first.photometry[b, k]
+    for k in range(more.pose.shape[1]):
+        score = _score(more.sums, b, k)
         if score < best_score * CLEARLY_BETTER:
             best_score = score
-            best = more_pose[b, k]
-            best_photometry = more_photometry[b, k]
-    pose[b, 0] = best
-    photometry[b, 0] = best_photometry
-    active[b, 0] = RUNNING
+            best = more.pose[b, k]
+            photometry = more.photometry[b, k]
+    one.pose[b, 0] = best
+    one.photometry[b, 0] = photometry
+    one.state[b, 0] = RUNNING

@@ -18,9 +18,9 @@ from ms_slam_env.slam.ferns import Candidate, FernConfig, FernDatabase
 from ms_slam_env.slam.surfel.acceptance import Alignment, acceptance_thresholds
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.pose_hypotheses import (
-    AT_REST,
     KEYFRAME_HYPOTHESES,
     NUM_HYPOTHESES,
+    UNMOVED,
     is_within,
     tracking_hypotheses,
 )
@@ -115,7 +115,7 @@ _STRICT = acceptance_thresholds(np.ones(1, dtype=bool), np.zeros(1, dtype=np.int
 
 
 def _lax_thresholds() -> NDArray[Any]:
-    """Thresholds of an alignment that is repeated and checked before it is believed.
+    """Thresholds of an alignment that is repeated and checked before it is accepted.
 
     A keyframe's view hides what the camera sees from elsewhere, so that even a perfect alignment
     with it leaves much unexplained.
@@ -133,7 +133,7 @@ _LAX = _lax_thresholds()
 class FernRelocalization(Relocalization):
     """Searches from the keyframes that resemble the lost frame (Glocker et al., TVCG 2015).
 
-    The best of a few alignments is refined, and believed if the map's view from there is like the
+    The best of a few alignments is refined, and accepted if the map's view from there is like the
     frame (``is_photometrically_consistent``) and the next frame is found close by. Only then is
     anything fused.
     """
@@ -163,13 +163,13 @@ class FernRelocalization(Relocalization):
             return found
         view = aligner.render(np.where(found[:, None, None], poses, np.eye(4)))
         intensity, depth = view.intensity.numpy(), view.vertices.numpy()[..., 2]
-        believed = found.copy()
+        verified = found.copy()
         for env in np.flatnonzero(found):
             found_there = measure_photometric_consistency(
                 frames.color[env], frames.depth[env], intensity[env], depth[env], self._cutoff_m
             )
-            believed[env] = is_photometrically_consistent(found_there)
-        return believed
+            verified[env] = is_photometrically_consistent(found_there)
+        return verified
 
     def relocalize(
         self, frames: Images, lost: Bool, aligner: FrameAligner
@@ -212,11 +212,11 @@ class FernRelocalization(Relocalization):
             wanted = _has_pose(poses)
             if not wanted.any():
                 return
-            again = _align(aligner, poses, AT_REST, _LAX)
+            again = _align(aligner, poses, UNMOVED, _LAX)
             wanted &= again.tracked
-            believed = self.verify(frames, again.T_world_live, wanted, aligner)
-            self._tentative[believed] = again.T_world_live[believed]
-            going_on = wanted & ~believed
+            verified = self.verify(frames, again.T_world_live, wanted, aligner)
+            self._tentative[verified] = again.T_world_live[verified]
+            going_on = wanted & ~verified
             poses = np.where(going_on[:, None, None], again.T_world_live, np.nan)
 
     def _keyframes_to_try(self, frames: Images, lost: Bool) -> Float64:
@@ -291,13 +291,13 @@ def _has_moved(before: Float64, now: Float64) -> Bool:
 
 
 def _align(
-    aligner: FrameAligner, starts: Float64, hypotheses: Float64, limits: NDArray[Any]
+    aligner: FrameAligner, starts: Float64, hypotheses: Float64, thresholds: NDArray[Any]
 ) -> Alignment:
     """Align from ``starts`` (B, 4, 4); what comes out where those are NaN means nothing."""
     batch = len(starts)
     origins = np.where(np.isfinite(starts), starts, np.eye(4))
     hypotheses = np.broadcast_to(hypotheses, (batch, NUM_HYPOTHESES, 4, 4))
-    return aligner.align_from(origins, hypotheses, np.repeat(limits, batch))
+    return aligner.align_from(origins, hypotheses, np.repeat(thresholds, batch))
 
 
 def _spread(candidates: list[Candidate], count: int) -> list[Candidate]:

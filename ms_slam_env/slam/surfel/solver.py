@@ -15,24 +15,19 @@ from ms_slam_env.slam.surfel.degeneracy import (
     turning_length,
     vec6d,
 )
-from ms_slam_env.slam.surfel.normal_equations import RESTING, RUNNING, Photometry, Sum
+from ms_slam_env.slam.surfel.normal_equations import RESTING, RUNNING, Hypotheses, Photometry, Sum
 
 
 @wp.kernel
-def reduce_sums(
-    partial: wp.array4d(dtype=wp.float32),
-    slots: wp.int32,
-    active: wp.array2d(dtype=wp.int32),
-    sums: wp.array3d(dtype=wp.float64),  # (B, K, NUM_SUMS)
-):
+def reduce_sums(hypotheses: Hypotheses, slots: wp.int32):
     """Add up the partial sums of every active hypothesis, always in the same order."""
     b, k, i = wp.tid()
-    if active[b, k] != RUNNING:
+    if hypotheses.state[b, k] != RUNNING:
         return
     total = wp.float64(0.0)
     for slot in range(slots):
-        total += wp.float64(partial[b, k, slot, i])
-    sums[b, k, i] = total
+        total += wp.float64(hypotheses.partial[b, k, slot, i])
+    hypotheses.sums[b, k, i] = total
 
 
 @wp.func
@@ -235,31 +230,28 @@ def update_photometry(
 
 @wp.kernel
 def gauss_newton_step(
-    sums: wp.array3d(dtype=wp.float64),
+    hypotheses: Hypotheses,
     damping: wp.float64,
     smallest_step: wp.float64,  # metres and radians; below it the level has converged
     last: wp.int32,  # 1: last iteration of its level, so the next level may go on
     least_scale: wp.float32,
-    pose: wp.array2d(dtype=wp.mat44d),
-    photometry: wp.array2d(dtype=Photometry),
-    active: wp.array2d(dtype=wp.int32),
 ):
     """Move every active hypothesis where the data constrain it; stop those that converged."""
     b, k = wp.tid()
-    if active[b, k] == RUNNING:
-        before = photometry[b, k]
-        photometry[b, k] = update_photometry(sums, b, k, before, least_scale)
+    sums = hypotheses.sums
+    if hypotheses.state[b, k] == RUNNING:
+        before = hypotheses.photometry[b, k]
+        hypotheses.photometry[b, k] = update_photometry(sums, b, k, before, least_scale)
         A, B, g_a, g_b, length = load_terms(sums, b, k)
-        xi = remapped_step(
-            A, B, g_a + g_b, sums[b, k, Sum.TILTED], sums[b, k, Sum.MATCHED], damping
-        )
+        tilted, matched = sums[b, k, Sum.TILTED], sums[b, k, Sum.MATCHED]
+        xi = remapped_step(A, B, g_a + g_b, tilted, matched, damping)
         for i in range(3, 6):
             xi[i] = xi[i] / length
         size = wp.float64(0.0)
         for i in range(6):
             size = wp.max(size, wp.abs(xi[i]))
-        pose[b, k] = orthonormalise(pose[b, k] * se3_exp(xi))
+        hypotheses.pose[b, k] = orthonormalise(hypotheses.pose[b, k] * se3_exp(xi))
         if size < smallest_step:
-            active[b, k] = RESTING
-    if last != 0 and active[b, k] == RESTING:
-        active[b, k] = RUNNING
+            hypotheses.state[b, k] = RESTING
+    if last != 0 and hypotheses.state[b, k] == RESTING:
+        hypotheses.state[b, k] = RUNNING

@@ -29,6 +29,7 @@ from ms_slam_env.slam.surfel.normal_equations import (
     OFF,
     RUNNING,
     AlignedImages,
+    Hypotheses,
     Photometry,
     Weights,
     accumulate_normal_equations,
@@ -65,23 +66,25 @@ def _point_stride(shape: tuple[int, int], points: float) -> int:
     return max(1, round((shape[0] * shape[1] / points) ** 0.5))
 
 
-class _Hypotheses:
-    """Device buffers of K hypotheses per env: poses, states, photometry and sums."""
+class _HypothesisBuffers:
+    """Host-device buffers of K hypotheses per env."""
 
     def __init__(self, batch: int, k: int, slots: int, device: str) -> None:
         self.poses = HostDeviceBuffer((batch, k), wp.mat44d, device)
         self.states = HostDeviceBuffer((batch, k), wp.int32, device)
-        self.photometries = HostDeviceBuffer((batch, k), Photometry, device)
-        self.pose, self.active = self.poses.array, self.states.array
-        self.photometry = self.photometries.array
-        self.sums = wp.zeros((batch, k, NUM_SUMS), dtype=wp.float64, device=device)
-        self.partial = wp.zeros((batch, k, slots, NUM_SUMS), dtype=wp.float32, device=device)
+        self.photometry = HostDeviceBuffer((batch, k), Photometry, device)
+        arrays = Hypotheses()
+        arrays.pose, arrays.state = self.poses.array, self.states.array
+        arrays.photometry = self.photometry.array
+        arrays.partial = wp.zeros((batch, k, slots, NUM_SUMS), dtype=wp.float32, device=device)
+        arrays.sums = wp.zeros((batch, k, NUM_SUMS), dtype=wp.float64, device=device)
+        self.arrays, self.shape = arrays, (batch, k)
         is_cpu = wp.get_device(device).is_cpu
-        self._active_on_host = self.active.numpy() if is_cpu else None  # shares the memory
+        self._state_on_host = arrays.state.numpy() if is_cpu else None  # shares the memory
 
     def running(self) -> bool:
         """Whether a hypothesis may still move; on a GPU always True: asking would mean waiting."""
-        return self._active_on_host is None or bool((self._active_on_host == RUNNING).any())
+        return self._state_on_host is None or bool((self._state_on_host == RUNNING).any())
 
 
 class Tracker:
@@ -120,9 +123,10 @@ class Tracker:
         slots = max(self._slots(level, self._stride(level)) for level in range(num_levels))
         slots = max(slots, self._slots(num_levels - 1, self._search_stride()))
 
-        self._first = _Hypotheses(batch, NUM_FIRST + 1, slots, device)  # the last is the guess
-        self._more = _Hypotheses(batch, num_hypotheses - NUM_FIRST, slots, device)
-        self._one = _Hypotheses(batch, 1, slots, device)
+        # The last of the first is the guess.
+        self._first = _HypothesisBuffers(batch, NUM_FIRST + 1, slots, device)
+        self._more = _HypothesisBuffers(batch, num_hypotheses - NUM_FIRST, slots, device)
+        self._one = _HypothesisBuffers(batch, 1, slots, device)
         self._launches = KernelLaunchCache(device)
         self._seen: tuple[LiveFrame | None, ModelView | None] = (None, None)
         self.good_score = GOOD_SCORE
@@ -180,7 +184,7 @@ class Tracker:
         self._thresholds.write(thresholds)
         photometry = same_exposure(self.batch) if photometry is None else photometry
         for state in (self._first, self._more):
-            state.photometries.write(photometry[:, None])
+            state.photometry.write(photometry[:, None])
         self._search()
         self._refine()
         self._evaluate()
@@ -189,7 +193,7 @@ class Tracker:
             T_model_live=self._one.poses.read()[:, 0],
             status=self._status.read(),
             statistics=self._statistics.read(),
-            photometry=self._one.photometries.read()[:, 0],
+            photometry=self._one.photometry.read()[:, 0],
             covariance=self._covariance.read(),
         )
 
@@ -228,21 +232,17 @@ class Tracker:
         self._launches.launch(
             "expand",
             expand_hypotheses,
-            lambda: (
-                self.batch,
-                [first.active, self.good_score, first.sums, more.sums, more.active],
-            ),
+            lambda: (self.batch, [first.arrays, more.arrays, self.good_score]),
         )
         if more.running():
             self._settle(more)
-        found = [(state.sums, state.pose, state.photometry) for state in (first, more)]
         self._launches.launch(
             "select",
             select_hypothesis,
-            lambda: (self.batch, [*found[0], *found[1], one.pose, one.photometry, one.active]),
+            lambda: (self.batch, [first.arrays, more.arrays, one.arrays]),
         )
 
-    def _settle(self, state: _Hypotheses) -> None:
+    def _settle(self, state: _HypothesisBuffers) -> None:
         """A few steps for every active hypothesis, and the sums at the pose they lead to."""
         coarsest, stride = len(self._model_levels) - 1, self._search_stride()
         self._iterate(coarsest, stride, state, SEARCH_ITERATIONS)
@@ -264,10 +264,10 @@ class Tracker:
         found = (self._T_world_live, self._status, self._statistics, self._covariance)
         arrays = [buffer.array for buffer in (*given, *found)]
         self._launches.launch(
-            "assess", assess_alignment, lambda: (self.batch, [one.sums, one.pose, *arrays])
+            "assess", assess_alignment, lambda: (self.batch, [one.arrays, *arrays])
         )
 
-    def _iterate(self, level: int, stride: int, state: _Hypotheses, count: int) -> None:
+    def _iterate(self, level: int, stride: int, state: _HypothesisBuffers, count: int) -> None:
         """At most ``count`` Gauss-Newton iterations at one level; all resting ones wake after."""
         for iteration in range(count):
             running = state.running()
@@ -277,7 +277,7 @@ class Tracker:
             if not running:
                 break
 
-    def _accumulate(self, level: int, stride: int, state: _Hypotheses) -> None:
+    def _accumulate(self, level: int, stride: int, state: _HypothesisBuffers) -> None:
         """Accumulate and reduce the sums of every active hypothesis at one level."""
         key = (level, stride, id(state))
         slots = self._slots(level, stride)
@@ -289,11 +289,11 @@ class Tracker:
         self._launches.launch(
             ("reduce", *key),
             reduce_sums,
-            lambda: (state.sums.shape, [state.partial, slots, state.active, state.sums]),
+            lambda: ((*state.shape, NUM_SUMS), [state.arrays, slots]),
         )
 
     def _accumulation(
-        self, level: int, stride: int, state: _Hypotheses
+        self, level: int, stride: int, state: _HypothesisBuffers
     ) -> tuple[tuple[int, ...], list[Any]]:
         """Threads and arguments of ``accumulate_normal_equations``."""
         camera, model, live = self._cameras[level], self._model_levels[level], self._live_levels
@@ -309,21 +309,17 @@ class Tracker:
         images.model_size = wp.vec2i(width, height)
         images.live_size = wp.vec2i(camera.width, camera.height)
         images.focal, images.centre = wp.vec2(camera.fx, camera.fy), wp.vec2(camera.cx, camera.cy)
-        inputs = [images, self._weights[level], stride, min(self._columns, width)]
-        inputs += [state.pose, state.photometry, state.active, state.partial]
-        return (*state.pose.shape, rows, self._slots(level, stride) // rows), inputs
+        inputs = [images, self._weights[level], stride, min(self._columns, width), state.arrays]
+        return (*state.shape, rows, self._slots(level, stride) // rows), inputs
 
-    def _step(self, level: int, state: _Hypotheses, last: bool) -> None:
+    def _step(self, level: int, state: _HypothesisBuffers, last: bool) -> None:
         """Move every active hypothesis by one Gauss-Newton step."""
         smallest = SMALLEST_STEP[min(level, len(SMALLEST_STEP) - 1)]
         rule = [DAMPING, smallest, int(last), self._weights[level].least_scale]
         self._launches.launch(
             ("step", level, last, id(state)),
             gauss_newton_step,
-            lambda: (
-                state.pose.shape,
-                [state.sums, *rule, state.pose, state.photometry, state.active],
-            ),
+            lambda: (state.shape, [state.arrays, *rule]),
         )
 
 

@@ -110,7 +110,7 @@ def motion_size(T: Float64) -> float:
 
 
 def history_from_state(state: dict[str, Any]) -> TrajectoryHistory:
-    """The past that gave this state."""
+    """The history that gave this state."""
     return TrajectoryHistory(
         [int(frame) for frame in state["frames"]],
         list(state["poses"].copy()),

@@ -71,16 +71,10 @@ def scatter_points(
     width = camera.width
     image = view * height * width
     K = wp.mat33(
-        camera.focal[0],
-        0.0,
-        camera.centre[0],
-        0.0,
-        camera.focal[1],
-        camera.centre[1],
-        0.0,
-        0.0,
-        1.0,
-    )
+        camera.focal[0], 0.0, camera.centre[0],
+        0.0, camera.focal[1], camera.centre[1],
+        0.0, 0.0, 1.0,
+    )  # fmt: skip
     R = K * rotation_of(motions[view])
     t = K * translation_of(motions[view])
     right = float(width)
