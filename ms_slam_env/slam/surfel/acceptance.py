@@ -156,6 +156,9 @@ def assess_alignment(
     statistics[b] = found
 
 
+_ORDINARY = AcceptanceThresholds(matches=100.0, sigma_m=0.04).repeated(1)
+
+
 def acceptance_thresholds(strict: NDArray[np.bool_], lost: NDArray[np.int32]) -> NDArray[Any]:
     """Thresholds (B,) of ordinary tracking, or ``strict`` ones where a wide search found the pose.
 
@@ -168,7 +171,7 @@ def acceptance_thresholds(strict: NDArray[np.bool_], lost: NDArray[np.int32]) ->
     frames of five scenes, hand-held with 4 cm and 2 degrees a frame, whose colour was not
     registered with depth, half of them with exposure jumps, rolling shutter and holes besides.
     """
-    thresholds = AcceptanceThresholds(matches=100.0, sigma_m=0.04).repeated(len(strict))
+    thresholds = np.repeat(_ORDINARY, len(strict))
     thresholds["overlap"] = np.where(strict, 0.4, 0.3)
     thresholds["inlier_ratio"] = np.where(strict, 0.7, 0.65)
     thresholds["photometric_inlier_ratio"] = np.where(strict, 0.75, 0.7)
