@@ -148,3 +148,32 @@ class SlamBackend(ABC):
     @abstractmethod
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state that ``get_state`` returned."""
+
+
+class BorrowedMap(SlamBackend):
+    """A backend whose surface is that of another backend."""
+
+    @property
+    @abstractmethod
+    def _mapper(self) -> SlamBackend:
+        """The backend with the surface, up to date."""
+
+    def predict(self, poses: ArrayLike, scale: float = 1.0) -> Views:
+        """Render the surface from ``poses`` (N, 4, 4) T_world_camera at ``scale`` times the size.
+
+        Raises:
+            InputError: poses of another shape, or a scale outside (0, 1].
+        """
+        return self._mapper.predict(poses, scale)
+
+    def surface_points(self) -> Float64:
+        """Points (M, 3) of the surface in the world frame, metres."""
+        return self._mapper.surface_points()
+
+    def surface_colors(self) -> NDArray[np.uint8]:
+        """Colours (M, 3) RGB of ``surface_points``."""
+        return self._mapper.surface_colors()
+
+    def map_attributes(self) -> dict[str, NDArray[Any]]:
+        """What is known of each of ``surface_points``."""
+        return self._mapper.map_attributes()

@@ -13,7 +13,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.config import Checked, bounded
@@ -28,7 +27,7 @@ from ms_slam_env.slam.alignment_check import (
     evaluate_alignment,
     measure_alignment,
 )
-from ms_slam_env.slam.base import Float64, Views
+from ms_slam_env.slam.base import BorrowedMap, Float64
 from ms_slam_env.slam.pose_hypotheses import motion_hypotheses
 from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
 from ms_slam_env.slam.tracking_template import Attempt, FrameByFrameSlam
@@ -128,7 +127,7 @@ class _Placed:
     prepared: PreparedImage
 
 
-class OdometrySlam(FrameByFrameSlam[DepthImage, _Placed]):
+class OdometrySlam(BorrowedMap, FrameByFrameSlam[DepthImage, _Placed]):
     """Keyframe odometry through OpenCV, its keyframes fused into a surfel map."""
 
     def __init__(self, intrinsics: Intrinsics, config: OdometryConfig | None = None) -> None:
@@ -240,25 +239,9 @@ class OdometrySlam(FrameByFrameSlam[DepthImage, _Placed]):
         if self.config.stock:
             self._start_from(frame, prepared)
 
-    def predict(self, poses: ArrayLike, scale: float = 1.0) -> Views:
-        """Render the map from ``poses`` (N, 4, 4) T_world_camera at ``scale`` times the size.
-
-        Raises:
-            InputError: poses of another shape, or a scale outside (0, 1].
-        """
-        return self._map.predict(poses, scale)
-
-    def surface_points(self) -> Float64:
-        """The keyframes' readings (M, 3), merged where they meet, world frame."""
-        return self._map.surface_points()
-
-    def surface_colors(self) -> NDArray[np.uint8]:
-        """Colours (M, 3) RGB of ``surface_points``."""
-        return self._map.surface_colors()
-
-    def map_attributes(self) -> dict[str, NDArray[Any]]:
-        """Colour, normal, radius and confidence of ``surface_points``."""
-        return self._map.map_attributes()
+    @property
+    def _mapper(self) -> SurfelSlam:
+        return self._map
 
     def _map_state(self) -> dict[str, Any]:
         return {

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.geometry import check_pose, invert, se3_exp, se3_log
-from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult, Views
+from ms_slam_env.slam.base import BorrowedMap, Float64, SlamBackend, TrackResult
 
 
 class FrameFilter(ABC):
@@ -104,7 +104,7 @@ class PosePrediction:
         self._frames = state["frames"]
 
 
-class SelectiveSlam(SlamBackend):
+class SelectiveSlam(BorrowedMap):
     """A backend behind a filter: active frame management (Saeedi et al., ICRA 2017, section V-A).
 
     A dropped frame is not shown to the backend; its result has ``processed`` False and a predicted
@@ -224,25 +224,13 @@ class SelectiveSlam(SlamBackend):
             processed=False,
         )
 
-    def predict(self, poses: ArrayLike, scale: float = 1.0) -> Views:
-        """Render the backend's map; see ``SlamBackend``."""
-        return self.backend.predict(poses, scale)
-
-    def surface_points(self) -> Float64:
-        """Points (M, 3) of the backend's surface in the world frame, metres."""
-        return self.backend.surface_points()
-
-    def surface_colors(self) -> NDArray[np.uint8]:
-        """Colours (M, 3) RGB of ``surface_points``."""
-        return self.backend.surface_colors()
+    @property
+    def _mapper(self) -> SlamBackend:
+        return self.backend
 
     def map_points(self) -> Float64:
         """Every point (M, 3) of the backend's map, metres."""
         return self.backend.map_points()
-
-    def map_attributes(self) -> dict[str, NDArray[Any]]:
-        """What the backend knows of each of ``surface_points``."""
-        return self.backend.map_attributes()
 
     def corrected_trajectory(self) -> tuple[NDArray[np.int32], Float64]:
         """Frames (N,), counted since ``reset`` with the dropped ones, and their poses (N, 4, 4).

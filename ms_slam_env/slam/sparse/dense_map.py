@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.geometry import relative_angle
-from ms_slam_env.slam.base import Float64, Views
+from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.sparse.config import SparseConfig
 from ms_slam_env.slam.sparse.sparse_map import Keyframe
 from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
@@ -51,13 +50,14 @@ class DenseMap:
         for keyframe in keyframes[len(self._poses) :]:
             self._poses.append(keyframe.T_world_camera.copy())
 
-    def update(self, keyframes: Sequence[Keyframe]) -> None:
-        """Fuse the keyframes that were placed; to be called before the map is looked at."""
+    def updated(self, keyframes: Sequence[Keyframe]) -> SurfelSlam:
+        """The surfels, once the keyframes that were placed are fused."""
         for keyframe, pose in zip(
             keyframes[self._fused :], self._poses[self._fused :], strict=True
         ):
             self._surfels.fuse(RGBDFrame(keyframe.color, keyframe.depth), pose)
             self._fused += 1
+        return self._surfels
 
     def _has_moved(self, placed: Float64, keyframe: Keyframe) -> bool:
         pose = keyframe.T_world_camera
@@ -66,22 +66,6 @@ class DenseMap:
         moved_m = float(np.linalg.norm(placed[:3, 3] - pose[:3, 3]))
         turned = np.degrees(relative_angle(placed[:3, :3], pose[:3, :3]))
         return moved_m > self._config.remap_m or turned > self._config.remap_deg
-
-    def predict(self, poses: ArrayLike, scale: float) -> Views:
-        """Render from ``poses`` (N, 4, 4); see ``SlamBackend``."""
-        return self._surfels.predict(poses, scale)
-
-    def points(self) -> Float64:
-        """Points (M, 3) of the surface, world frame."""
-        return self._surfels.surface_points()
-
-    def colors(self) -> NDArray[np.uint8]:
-        """Colours (M, 3) RGB of ``points``."""
-        return self._surfels.surface_colors()
-
-    def attributes(self) -> dict[str, NDArray[Any]]:
-        """Colour, normal, radius and confidence of ``points``."""
-        return self._surfels.map_attributes()
 
     def get_state(self) -> dict[str, Any]:
         """The surfels, and where the keyframes are."""

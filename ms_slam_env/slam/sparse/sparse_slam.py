@@ -11,13 +11,12 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.geometry import relative_angle
 from ms_slam_env.slam.alignment_check import DepthImage
-from ms_slam_env.slam.base import Float64, Views
+from ms_slam_env.slam.base import BorrowedMap, Float64
 from ms_slam_env.slam.sparse.config import SparseConfig
 from ms_slam_env.slam.sparse.dense_map import DenseMap
 from ms_slam_env.slam.sparse.features import FeatureExtractor, InverseDepth
@@ -31,6 +30,7 @@ from ms_slam_env.slam.sparse.localization import (
 from ms_slam_env.slam.sparse.loop_closure import LoopCloser
 from ms_slam_env.slam.sparse.matching import most_alike, thumbnail
 from ms_slam_env.slam.sparse.sparse_map import SparseMap, make_keyframe
+from ms_slam_env.slam.surfel import SurfelSlam
 from ms_slam_env.slam.tracking_template import Attempt, FrameByFrameSlam
 
 _LOOKALIKES = 4  # keyframes in which a lost camera is sought
@@ -38,7 +38,7 @@ _SOONER = 0.25  # share of a keyframe's distance that is enough where matches ar
 _BESIDE = 2  # keyframes beside the guess in which it is sought
 
 
-class SparseSlam(FrameByFrameSlam[LiveFrame, Fix]):
+class SparseSlam(BorrowedMap, FrameByFrameSlam[LiveFrame, Fix]):
     """The sparse SLAM of one camera."""
 
     def __init__(self, intrinsics: Intrinsics, config: SparseConfig | None = None) -> None:
@@ -175,29 +175,9 @@ class SparseSlam(FrameByFrameSlam[LiveFrame, Fix]):
         self._pose = keyframe.T_world_camera.copy()
         self._dense.place(self._map.keyframes)
 
-    def predict(self, poses: ArrayLike, scale: float = 1.0) -> Views:
-        """Render the keyframes' depth from ``poses`` (N, 4, 4) at ``scale`` times the size.
-
-        Raises:
-            InputError: poses of another shape, or a scale outside (0, 1].
-        """
-        return self._surface().predict(poses, scale)
-
-    def surface_points(self) -> Float64:
-        """The keyframes' readings (M, 3), merged where they meet, world frame."""
-        return self._surface().points()
-
-    def surface_colors(self) -> NDArray[np.uint8]:
-        """Colours (M, 3) RGB of ``surface_points``."""
-        return self._surface().colors()
-
-    def map_attributes(self) -> dict[str, NDArray[Any]]:
-        """Colour, normal, radius and confidence of ``surface_points``."""
-        return self._surface().attributes()
-
-    def _surface(self) -> DenseMap:
-        self._dense.update(self._map.keyframes)
-        return self._dense
+    @property
+    def _mapper(self) -> SurfelSlam:
+        return self._dense.updated(self._map.keyframes)
 
     def _map_state(self) -> dict[str, Any]:
         return {
