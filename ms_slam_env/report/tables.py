@@ -105,11 +105,16 @@ def table_from_json(content: Mapping[str, Any]) -> Table:
         KeyError, TypeError: content of another form.
     """
     rows = [
-        {n: Interval(**v) if isinstance(v, dict) else v for n, v in row.items()}
+        {name: _interval(v) if isinstance(v, dict) else v for name, v in row.items()}
         for row in content["rows"]
     ]
     columns = [Column(**column) for column in content["columns"]]
     return make_table(columns, rows, content.get("title", ""), content.get("note", ""))
+
+
+def _interval(parts: Mapping[str, float | None]) -> Interval:
+    """The interval that was written; JSON has null for NaN."""
+    return Interval(**{name: math.nan if v is None else v for name, v in parts.items()})
 
 
 @dataclass(frozen=True)
@@ -192,8 +197,8 @@ def format_value(value: Value, key: str) -> str:
         return format_interval(value, of.scale, of.digits)
     if isinstance(value, bool):
         return "yes" if value else "no"
-    if isinstance(value, int) and of.scale == 1:
-        return str(value)
+    if of.scale == 1 and float(value).is_integer() and (isinstance(value, int) or of.digits > 8):
+        return str(int(value))
     return format_number(value * of.scale, of.digits)
 
 

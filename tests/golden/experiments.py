@@ -283,20 +283,21 @@ def frame_skipping(_: Path) -> Any:
     }
 
 
-@experiment("kidnapping", CHAOTIC)
-def kidnapping(_: Path) -> Any:
-    from ms_slam_env.benchmark.kidnapping import KidnappingSpec, run_map
+@experiment("relocalization", CHAOTIC)
+def relocalization(_: Path) -> Any:
+    from ms_slam_env.experiments.relocalization import Relocalization, RelocalizationSpec
 
     settings, variants = ("near", "black", "foreign"), ("ferns", "local")
-    return run_map(KidnappingSpec("table", 1001, "80x60", settings, variants, 1, 50, 3))
+    spec = RelocalizationSpec("table", 1001, "80x60", settings, variants, 1, 50, 3)
+    return Relocalization.run(spec)
 
 
 @experiment("loop_closure", CHAOTIC)
 def loop_closure(_: Path) -> Any:
-    from ms_slam_env.experiments.loop_closure import LoopSpec, run_loop
+    from ms_slam_env.experiments.loop_closure import LoopClosure, LoopSpec
 
     recording = ("living_room", 1002, "around", 0.06, 5.0, "kinect", "80x60")
-    return run_loop(LoopSpec(*recording, closure="deformation"))
+    return LoopClosure.run(LoopSpec(*recording, closure="deformation"))
 
 
 @experiment("multi_robot", CHAOTIC)

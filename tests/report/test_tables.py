@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import pytest
 
 from ms_slam_env.errors import InputError
+from ms_slam_env.report.records import to_plain
 from ms_slam_env.report.statistics import Interval
 from ms_slam_env.report.tables import (
     Column,
@@ -51,6 +53,13 @@ def test_a_table_survives_json() -> None:
     assert table_from_json(table.as_json()) == table
     assert "| planner | table [mm] |" in table.as_markdown()
     assert "| greedy | 1.00 [0.500, 2.00] |" in table.as_markdown()
+
+
+def test_an_interval_of_nothing_survives_json() -> None:
+    empty = Interval(math.nan, math.nan, math.nan)
+    table = make_table(["planner", "ate_m"], [{"planner": "greedy", "ate_m": empty}])
+    again = table_from_json(json.loads(json.dumps(to_plain(table.as_json()))))
+    assert "| greedy | - |" in again.as_markdown()
 
 
 def test_an_unknown_key_is_refused_with_similar_ones() -> None:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from ms_slam_env.config import from_dict
 from ms_slam_env.experiments.harness.experiment import Experiment
 from ms_slam_env.metrics.registry import metric
-from ms_slam_env.report.records import from_plain, to_plain
+from ms_slam_env.report.records import Row, from_plain, to_plain
 from ms_slam_env.report.results import Results
 from ms_slam_env.report.tables import finished
 
@@ -21,16 +21,22 @@ _SMALLEST = 1e-4
 
 
 def check_results(cls: type[Experiment], committed: Results) -> list[str]:
-    """Run the cheapest committed rows again; one line for each metric that differs.
+    """Run some committed rows again; one line for each value that differs.
 
-    Only metrics that the registry calls repeatable are compared.
+    The cheapest row is taken for each value of the first field of the specifications (planners,
+    say). Only metrics that the registry calls repeatable are compared.
 
     Raises:
         InputError: rows that the experiment has no specification for.
     """
     rows = sorted(finished(committed.rows), key=lambda row: row["elapsed_s"])
+    different: dict[str, Any] = {}
+    for row in rows:
+        different.setdefault(str(next(iter(row["spec"].values()))), row)
+    chosen = list(different.values())
+    chosen += [row for row in rows if row not in chosen]
     differences = []
-    for row in rows[: cls.check_rows]:
+    for row in chosen[: cls.check_rows]:
         spec = from_dict(spec_type(cls), row["spec"])
         again = from_plain(to_plain(cls.run(spec)))
         name = ", ".join(f"{key} {value}" for key, value in row["spec"].items())
@@ -44,32 +50,26 @@ def spec_type(cls: type[Experiment]) -> type[Any]:
     return hint
 
 
-def compare(before: Mapping[str, Any], after: Mapping[str, Any], path: str = "") -> list[str]:
-    """What differs between two results beyond ``TOLERANCE``, one line a metric."""
-    differences = []
-    for key, old in before.items():
-        if not metric(key).repeatable:
-            continue
-        where = f"{path}{key}"
-        if key not in after:
-            differences.append(f"{where} is missing")
-        elif not _alike(old, after[key]):
-            differences.append(f"{where} was {old!r}, is {after[key]!r}")
-    return differences
+def compare(before: Any, after: Any, where: str = "") -> list[str]:
+    """What differs between two results beyond ``TOLERANCE``, at any depth, one line a value."""
+    if isinstance(before, Mapping) and isinstance(after, Mapping):
+        kept = {key: old for key, old in before.items() if metric(key).repeatable}
+        missing = [f"{where}{key} is missing" for key in kept if key not in after]
+        pairs = [(f"{where}{key}.", old, after[key]) for key, old in kept.items() if key in after]
+    elif isinstance(before, list) and isinstance(after, list):
+        missing = []
+        if len(before) != len(after):
+            return [f"{where[:-1]} had {len(before)} values, has {len(after)}"]
+        pairs = [(f"{where}{i}.", *pair) for i, pair in enumerate(zip(before, after, strict=True))]
+    else:
+        return [] if _alike(before, after) else [f"{where[:-1]} was {before!r}, is {after!r}"]
+    return missing + [text for name, old, new in pairs for text in compare(old, new, name)]
 
 
 def _alike(old: Any, new: Any) -> bool:
-    if isinstance(old, Mapping) and isinstance(new, Mapping):
-        return not compare(old, new)
-    if isinstance(old, Sequence) and not isinstance(old, str):
-        return (
-            isinstance(new, Sequence)
-            and len(old) == len(new)
-            and all(map(_alike, old, new))
-        )  # fmt: skip
     if isinstance(old, float) and isinstance(new, (int, float)):
         return math.isclose(old, new, rel_tol=TOLERANCE, abs_tol=_SMALLEST)
-    return old == new
+    return bool(old == new)
 
 
 def committed_results(name: str) -> Path:

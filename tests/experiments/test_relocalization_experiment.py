@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
-import json
+import math
 
 import numpy as np
 import pytest
 from box_scene import BoxScene
 
-from ms_slam_env.benchmark.kidnapping import Arguments, KidnappingSpec, interrupt, run_map
-from ms_slam_env.benchmark.kidnapping_report import about_the_maps, as_table, summarise
-from ms_slam_env.benchmark.kidnapping_scenarios import (
+from ms_slam_env.camera import RGBDFrame
+from ms_slam_env.errors import InputError
+from ms_slam_env.experiments.harness.interruptions import (
     SETTINGS,
     Interruption,
     MappedSpace,
     draw_interruption,
+    interrupt,
     map_path,
 )
-from ms_slam_env.camera import RGBDFrame
-from ms_slam_env.errors import InputError
+from ms_slam_env.experiments.relocalization import (
+    Relocalization,
+    RelocalizationSpec,
+    about_the_maps,
+)
 from ms_slam_env.geometry import look_at, make_pose, relative_angle
+from ms_slam_env.report.records import from_plain, to_plain
 from ms_slam_env.slam import TrackResult
 
 AFTER = 5
@@ -100,58 +105,58 @@ def _outcome(results, expected=True, black=0):
 
 def test_finding_is_judged_by_the_error():
     good = _outcome([None, None, _at(0.04), _at(0.0)], black=3)
-    assert (good["found"], good["wrong"], good["first"]) == (True, False, 2)
+    assert (good["found"], good["wrong"], good["frames_to_pose"]) == (True, False, 2)
     assert good["relocalisation_s"] == pytest.approx(2 / 30)
     assert good["first_error_m"] == pytest.approx(0.04)
-    assert (good["black"], good["black_tracked"]) == (3, 0)
+    assert (good["black_frames"], good["black_tracked"]) == (3, 0)
     vague = _outcome([_at(0.08)])
     assert (vague["found"], vague["wrong"], vague["relocalisation_s"]) == (False, False, 0)
     mixed = _outcome([_at(0.5), _at(0.0)])
     assert (mixed["found"], mixed["wrong"]) == (True, True)
     never = _outcome([None, None])
-    assert (never["found"], never["wrong"], never["first"]) == (False, False, None)
-    assert never["relocalisation_s"] is None
+    assert (never["found"], never["wrong"], never["frames_to_pose"]) == (False, False, math.inf)
+    assert never["relocalisation_s"] == math.inf
     assert _outcome([None, _at(0.0)], expected=False)["wrong"]
     assert not _outcome([None, None], expected=False)["wrong"]
 
 
 def test_shares_and_times_of_known_attempts():
     def attempt(found, wrong, first):
-        seconds = None if first is None else first / 30
         return {
             "variant": "ferns",
             "setting": "near",
             "found": found,
             "wrong": wrong,
-            "first": first,
-            "relocalisation_s": seconds,
-            "lost_frame_ms": 20.0,
+            "frames_to_pose": first,
+            "relocalisation_s": first / 30,
+            "lost_frame_cpu_ms": 20.0,
             "black_tracked": 1,
         }
 
-    attempts = [attempt(True, False, 3), attempt(True, False, 6), attempt(False, False, None)]
-    maps = {"ferns": {"ate_m": 0.002, "lost_frames": 0}, "local": {"ate_m": 1.0, "lost_frames": 2}}
+    attempts = [attempt(True, False, 3), attempt(True, False, 6), attempt(False, False, math.inf)]
+    maps = [{"ate_unaligned_m": 0.002, "lost_frames": 0}, {"ate_unaligned_m": 1, "lost_frames": 2}]
     row = {"error": None, "spec": {"size": "160x120"}}
     rows = [
         {**row, "result": {"attempts": attempts, "maps": maps}},
-        {**row, "result": {"attempts": [attempt(False, True, 0)], "maps": {}}},
+        {**row, "result": {"attempts": [attempt(False, True, 0)], "maps": []}},
     ]
-    (cell,) = summarise(rows)
-    assert (cell.attempts, cell.found.value, cell.wrong.value) == (4, 0.5, 0.25)
-    assert cell.found.low < 0.5 < cell.found.high
-    assert cell.first.value == 3
-    assert cell.relocalisation_s == pytest.approx(0.1)
-    assert cell.black_tracked == 4
-    assert as_table([cell]).splitlines()[2].startswith("| 160x120 near ferns | 4 | 50.0 [")
+    experiment = Relocalization()
+    (line,) = experiment.tables(rows)[0].rows
+    assert (line["attempts_count"], line["found"].value, line["wrong"].value) == (4, 0.5, 0.25)
+    assert line["found"].low < 0.5 < line["found"].high
+    assert line["frames_to_pose"].value == 3
+    assert line["relocalisation_s"] == pytest.approx(0.1)
+    assert line["black_tracked"] == 4
     assert about_the_maps(rows).startswith("1 of 2 maps were used")
     rows[1]["result"]["attempts"][0]["setting"] = "foreign"
-    near, foreign, every = summarise(rows)
-    assert [(c.setting, c.attempts) for c in (near, foreign, every)] == [
+    near, foreign, every = experiment.tables(rows)[0].rows
+    assert [(c["setting"], c["attempts_count"]) for c in (near, foreign, every)] == [
         ("near", 3),
         ("foreign", 1),
         ("all", 4),
     ]
-    assert every.wrong == cell.wrong
+    assert every["wrong"] == line["wrong"]
+    assert experiment.charts(rows)[0].panels[0].series[0].x == ["near", "all"]
 
 
 @pytest.mark.parametrize(
@@ -168,11 +173,11 @@ def test_shares_and_times_of_known_attempts():
 )
 def test_bad_arguments_are_refused(fields, reason):
     with pytest.raises(InputError, match=reason):
-        Arguments(**fields)
+        Relocalization(**fields).specs()
 
 
 def test_maps_take_the_scenes_in_turns():
-    specs = Arguments(scenes=("table", "wall"), sizes=("160x120", "320x240"), maps=3).specs()
+    specs = Relocalization(scenes=("table", "wall"), sizes=("160x120", "320x240"), maps=3).specs()
     assert [(s.size[:3], s.scene, s.seed) for s in specs[:4]] == [
         ("160", "table", 1000),
         ("160", "wall", 1001),
@@ -184,8 +189,10 @@ def test_maps_take_the_scenes_in_turns():
 @pytest.mark.slow
 def test_one_map_is_interrupted():
     settings = ("near", "foreign")
-    result = run_map(KidnappingSpec("carpet", 1001, "80x60", settings, ("ferns",), 1, 60, 3))
+    result = Relocalization.run(
+        RelocalizationSpec("carpet", 1001, "80x60", settings, ("ferns",), 1, 60, 3)
+    )
     assert {attempt["setting"] for attempt in result["attempts"]} == set(settings)
     assert not any(attempt["wrong"] for attempt in result["attempts"])
-    assert result["maps"]["ferns"]["ate_m"] < 0.03
-    assert json.loads(json.dumps(result)) == result
+    assert result["maps"][0]["ate_unaligned_m"] < 0.03
+    assert from_plain(to_plain(result)) == result

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.camera import Intrinsics, xtion
+from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
+from ms_slam_env.evaluation.run_sequence import run_sequence
 from ms_slam_env.geometry import invert, make_pose, relative_angle, so3_exp, transform_points
+from ms_slam_env.metrics import relocalisation_times
 from ms_slam_env.scenes import Scene
-from ms_slam_env.sensor import RGBDSensor
+from ms_slam_env.sensor import FRAME_RATE_HZ, RGBDSensor
 from ms_slam_env.sequences import handheld_trajectory
+from ms_slam_env.slam import SlamBackend
 
 Float64 = NDArray[np.float64]
 
 DEPTH_LIMIT_M = 3.0  # readings beyond count neither as mapped nor as not
+FOUND_M, FOUND_DEG = 0.05, 5.0
+WRONG_M, WRONG_DEG = 0.10, 10.0
 _CLEARANCE_M = 0.1
 _AWAY_M, _AWAY_DEG = 0.3, 30.0  # a kidnapping ends at least so far from where it began
 _DRAWS = 300
@@ -160,3 +167,55 @@ def _random_motion(setting: Setting, rng: np.random.Generator) -> Float64:
 def _is_away(a: Float64, b: Float64) -> bool:
     moved = np.linalg.norm(a[:3, 3] - b[:3, 3]) >= _AWAY_M
     return bool(moved or relative_angle(a[:3, :3], b[:3, :3]) >= np.radians(_AWAY_DEG))
+
+
+def interrupt(
+    backend: SlamBackend, one: Interruption, frames: list[RGBDFrame], expected: Float64 | None
+) -> dict[str, Any]:
+    """Put a SLAM that has mapped a path through an interruption.
+
+    Args:
+        backend: the SLAM.
+        one: the interruption.
+        frames: N, taken after it.
+        expected: (N, 4, 4) their poses in the map; None if they show nothing that it holds.
+
+    Returns:
+        ``found``: a pose within 5 cm and 5 degrees of the expected one was given; ``wrong``: one
+        farther than 10 cm or 10 degrees off was, or any where none is expected; the others as the
+        registry defines them.
+    """
+    height, width = frames[0].depth.shape
+    nothing = RGBDFrame(
+        np.zeros((height, width, 3), np.uint8), np.zeros((height, width), np.float32)
+    )
+    dark = run_sequence(backend, [nothing] * one.black, reset=False)
+    run = run_sequence(backend, frames, reset=False)
+    tracked = run.tracking_ok
+    errors = []
+    if expected is not None:
+        errors = [_error(run.estimates[i], expected[i]) for i in np.flatnonzero(tracked)]
+    seconds = np.arange(len(frames) + 1) / FRAME_RATE_HZ
+    interrupted = [True] + [False] * len(frames)
+    first = int(tracked.argmax()) if tracked.any() else None
+    far = [m > WRONG_M or deg > WRONG_DEG for m, deg in errors]
+    return {
+        "found": any(m < FOUND_M and deg < FOUND_DEG for m, deg in errors),
+        "wrong": any(far) or (expected is None and bool(tracked.any())),
+        "frames_to_pose": math.inf if first is None else first,
+        "relocalisation_s": float(
+            relocalisation_times(seconds, interrupted, [False, *tracked.tolist()])[0]
+        ),
+        "first_error_m": errors[0][0] if errors else None,
+        "first_error_deg": errors[0][1] if errors else None,
+        "lost_frame_cpu_ms": float(np.mean(run.cpu_ms[: None if first is None else first + 1])),
+        "black_frames": one.black,
+        "black_tracked": len(dark) - dark.lost_frames,
+        "mapped_share": one.mapped,
+    }
+
+
+def _error(estimate: Float64, truth: Float64) -> tuple[float, float]:
+    """Distance in metres and angle in degrees between two poses (4, 4)."""
+    distance = float(np.linalg.norm(estimate[:3, 3] - truth[:3, 3]))
+    return distance, float(np.degrees(relative_angle(estimate[:3, :3], truth[:3, :3])))
