@@ -11,7 +11,7 @@ from typing import Any
 from ms_slam_env.config import from_dict
 from ms_slam_env.experiments.harness.experiment import Experiment
 from ms_slam_env.metrics.registry import metric
-from ms_slam_env.report.records import Row, from_plain, to_plain
+from ms_slam_env.report.records import from_plain, to_plain
 from ms_slam_env.report.results import Results
 from ms_slam_env.report.tables import finished
 
