@@ -20,14 +20,19 @@ from numpy.typing import NDArray
 
 from ms_slam_env import scenes as scene_library
 from ms_slam_env.benchmark.arm_masks_report import as_markdown, summarise
-from ms_slam_env.benchmark.arm_mesh import floor_below
-from ms_slam_env.benchmark.arm_truth import ArmTruth, Cloud, column_cloud, furniture_cloud
 from ms_slam_env.benchmark.planner_report import finished
 from ms_slam_env.camera import xtion
 from ms_slam_env.command_line import exit_code, parse, report_failures
 from ms_slam_env.config import check_range, from_dict
 from ms_slam_env.env import EnvConfig
 from ms_slam_env.errors import InputError, UnreachableError, unknown
+from ms_slam_env.experiments.harness.arm_truth import (
+    ArmTruth,
+    Cloud,
+    column_cloud,
+    floor_below,
+    furniture_cloud,
+)
 from ms_slam_env.experiments.harness.episodes import (
     DEFAULT_STEP_DEG,
     DEFAULT_STEP_M,

@@ -20,7 +20,6 @@ from ms_slam_env.benchmark.frame_management_report import (
     table,
 )
 from ms_slam_env.benchmark.frame_management_run import FilterSpec, run_filters
-from ms_slam_env.benchmark.options import parse_frame_management
 from ms_slam_env.camera import XTION_SIZES
 from ms_slam_env.command_line import exit_code, parse, report_failures
 from ms_slam_env.config import check_range
@@ -29,6 +28,7 @@ from ms_slam_env.experiments.harness.rows import check_any_finished, failures, r
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import write_json
 from ms_slam_env.sequences import check_sequence
+from ms_slam_env.slam.frame_selection import parse_frame_selection
 
 PROGRAM = "python -m ms_slam_env.benchmark.frame_management"
 
@@ -74,7 +74,7 @@ class Arguments:
         for text in self.sequences:
             check_sequence(text)
         for text in self.managements:
-            if parse_frame_management(text).uses_clock:
+            if parse_frame_selection(text).uses_clock:
                 raise InputError(f"{text!r} measures time: no two runs are alike")
         if self.backend not in slam.BACKENDS:
             raise unknown("SLAM backend", self.backend, slam.BACKENDS)

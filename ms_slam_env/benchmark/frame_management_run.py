@@ -8,13 +8,16 @@ from typing import Any
 
 from ms_slam_env import metrics, slam
 from ms_slam_env.benchmark.compare_inputs import Input, load
-from ms_slam_env.benchmark.options import parse_frame_management
 from ms_slam_env.evaluation.map_quality import map_quality
 from ms_slam_env.evaluation.run_sequence import run_sequence
 from ms_slam_env.experiments.harness.episodes import LOST_ERROR_M
 from ms_slam_env.parallel import limit_threads
 from ms_slam_env.sequences import UnevenPath
-from ms_slam_env.slam.frame_selection import FrameSelectionConfig, RegularConfig
+from ms_slam_env.slam.frame_selection import (
+    FrameSelectionConfig,
+    RegularConfig,
+    parse_frame_selection,
+)
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,7 @@ def run_filters(spec: FilterSpec) -> dict[str, Any]:
     given = load(spec.sequence, spec.image_size, UnevenPath(spec.frames))
     runs = []
     for text in spec.managements:
-        config = parse_frame_management(text)
+        config = parse_frame_selection(text)
         run: dict[str, Any] = {"management": text, **run_one(config, spec.backend, given)}
         run["regular"] = None
         if config.name not in ("none", "regular"):

@@ -19,13 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import slam as slam_backends
-from ms_slam_env.benchmark.map_consistency import JudgedMap, judge_map, labelled_view
-from ms_slam_env.benchmark.map_consistency_picture import save_map_picture
 from ms_slam_env.benchmark.planner_report import finished
 from ms_slam_env.command_line import exit_code, parse, report_failures
 from ms_slam_env.errors import InputError
+from ms_slam_env.evaluation.duplicate_objects import JudgedMap, judge_map, labelled_view
 from ms_slam_env.experiments.harness.episodes import check_names, seed_list
 from ms_slam_env.experiments.harness.rows import check_any_finished, failures, run_all
+from ms_slam_env.experiments.pictures.judged_map import save_map_picture
 from ms_slam_env.geometry import invert, se3_exp, se3_log
 from ms_slam_env.metrics.consistency import ConsistencyRule
 from ms_slam_env.report import statistics

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.benchmark.figures import caption, colour, new_figure, save
-from ms_slam_env.benchmark.map_consistency_picture import CAMERA, overview_pose, render_points
 from ms_slam_env.benchmark.multi_robot_run import Team
+from ms_slam_env.experiments.pictures.judged_map import overview, overview_pose
 from ms_slam_env.geometry import transform_points
 from ms_slam_env.geometry.point_clouds import voxel_firsts
 from ms_slam_env.report.records import Row
@@ -145,7 +145,7 @@ def save_picture(
     panels = {"the merged map": shades, "coloured by robot": tints}
     for ax, (name, colors) in zip(figure.subplots(1, 2), panels.items(), strict=True):
         values = np.concatenate(colors).clip(0, 255).astype(np.uint8)
-        ax.imshow(render_points(everything, values, pose, CAMERA))
+        ax.imshow(overview(everything, values, pose))
         ax.set_title(name, fontsize="small")
         ax.axis("off")
     alone = float(np.mean([robot["map_f_score_5cm"] for robot in found["robots"]]))

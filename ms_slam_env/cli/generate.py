@@ -136,10 +136,13 @@ def _motion(args: Arguments, recorded: Any, scene: Any) -> tuple[Any, Any, dict[
 
 def _planned(args: Arguments, planner: str) -> tuple[Any, Any, dict[str, Any]]:
     """The same of a planner's episode."""
-    from ms_slam_env.benchmark.planned_motion import planned_motion
-    from ms_slam_env.experiments.harness.episodes import EpisodeSpec, parse_options
+    from ms_slam_env.experiments.harness.episodes import (
+        EpisodeSpec,
+        parse_options,
+        planned_motion,
+    )
 
-    motion = planned_motion(
+    return planned_motion(
         EpisodeSpec(
             planner,
             args.scene,
@@ -151,4 +154,3 @@ def _planned(args: Arguments, planner: str) -> tuple[Any, Any, dict[str, Any]]:
             parse_options(args.episode.options),
         )
     )
-    return motion.times_s, motion.poses, motion.about()

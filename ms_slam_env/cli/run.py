@@ -58,15 +58,15 @@ class Arguments:
 def main(arguments: Sequence[str]) -> int:
     """Run, write, and print what was measured."""
     args = parse(Arguments, arguments, "ms-slam run")
-    from ms_slam_env.benchmark.options import parse_frame_management
     from ms_slam_env.benchmark.sequence_run import run_to_folder
     from ms_slam_env.config import nested_options
     from ms_slam_env.parallel import limit_threads
     from ms_slam_env.sequences import open_sequence
     from ms_slam_env.sequences.recording import parse_calibration
     from ms_slam_env.slam.configuration import SlamConfiguration, merged, read_configuration
+    from ms_slam_env.slam.frame_selection import parse_frame_selection
 
-    management = parse_frame_management(args.frame_management)
+    management = parse_frame_selection(args.frame_management)
     slam = SlamConfiguration(slam=args.backend or "surfel")
     if args.config is not None:
         slam = read_configuration(args.config)

@@ -9,8 +9,8 @@ from ms_slam_env import scenes
 from ms_slam_env.benchmark import arm_masks
 from ms_slam_env.benchmark.arm_masks import Arguments, WalkSpec, main, run_walk
 from ms_slam_env.benchmark.arm_masks_report import as_markdown, summarise
-from ms_slam_env.benchmark.arm_truth import furniture_cloud
 from ms_slam_env.errors import InputError
+from ms_slam_env.experiments.harness.arm_truth import furniture_cloud
 
 # reason, reached, stopped, gap_m, touches_itself: right where allowed and possible agree
 CASES = [

@@ -212,7 +212,7 @@ def arm_experiment(_: Path) -> Any:
 @experiment("arm_masks")
 def arm_mask_walk(_: Path) -> Any:
     from ms_slam_env.benchmark import arm_masks
-    from ms_slam_env.benchmark.arm_truth import furniture_cloud
+    from ms_slam_env.experiments.harness.arm_truth import furniture_cloud
 
     coarse = furniture_cloud(_scene("carpet", 1000), spacing_m=0.04)  # quick to prepare
     with patch.object(arm_masks, "furniture_of", lambda *_: coarse):
@@ -389,8 +389,8 @@ def _glide(frames: int, offset_m: float) -> tuple[Any, list[Any], Any]:
     From half way on, the poses are off by ``offset_m`` to the left.
     """
     from ms_slam_env import scenes, slam
-    from ms_slam_env.benchmark.map_consistency import labelled_view
     from ms_slam_env.camera import xtion
+    from ms_slam_env.evaluation.duplicate_objects import labelled_view
     from ms_slam_env.geometry import make_pose
     from ms_slam_env.sensor import RGBDSensor
 
@@ -408,7 +408,7 @@ def _glide(frames: int, offset_m: float) -> tuple[Any, list[Any], Any]:
 
 @experiment("map_consistency")
 def map_consistency(_: Path) -> Any:
-    from ms_slam_env.benchmark.map_consistency import judge_map
+    from ms_slam_env.evaluation.duplicate_objects import judge_map
 
     sensor, views, system = _glide(8, 0.15)
     judged = judge_map(system.surface_points(), system.surface_colors(), views, sensor)
@@ -544,10 +544,10 @@ def _recorded(folder: Path, frames: int) -> Any:
 
 @experiment("sequence_run")
 def sequence_run(folder: Path) -> Any:
-    from ms_slam_env.benchmark.options import parse_frame_management
     from ms_slam_env.benchmark.sequence_run import run_to_folder
+    from ms_slam_env.slam.frame_selection import parse_frame_selection
 
-    recording, every_other = _recorded(folder, 12), parse_frame_management("regular,every=2")
+    recording, every_other = _recorded(folder, 12), parse_frame_selection("regular,every=2")
     loops = {"loop_closure": "deformation"}
     found = {
         "all": run_to_folder(recording, "surfel", loops, folder / "all"),

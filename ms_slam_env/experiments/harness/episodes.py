@@ -109,6 +109,28 @@ def run_episode(spec: EpisodeSpec) -> dict[str, Any]:
         env.close()
 
 
+def planned_motion(spec: EpisodeSpec) -> tuple[Float64, Float64, dict[str, Any]]:
+    """Where a planner moves the camera in an episode, to be rendered again as a sequence.
+
+    Returns:
+        simulated seconds (N,) of each frame from the episode's start, true poses (N, 4, 4) of every
+        frame, those within a step among them, and what to note of the episode beside the sequence.
+
+    Raises:
+        InputError: an unknown planner, scene or option, or no start pose.
+    """
+    check_planner(spec.planner)
+    env = make_env(spec)
+    try:
+        world = cast(ActiveSlamEnv, env.unwrapped)
+        progress = play(env, make_planner(spec.planner, world, spec.seed), spec.seed)
+        lost = int((~world.episode.tracked).sum())
+        about = {"episode_steps": progress["steps"], "episode_lost_frames": lost}
+        return world.episode.timestamps, world.episode.trajectory_truth, about
+    finally:
+        env.close()
+
+
 def check_episodes(specs: Sequence[EpisodeSpec]) -> None:
     """Refuse now what would make episodes fail at their start, by starting one of each planner.
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ms_slam_env.config import from_dict
+from ms_slam_env.config import from_dict, nested_options
 from ms_slam_env.slam.frame_selection.budget import BudgetConfig
 from ms_slam_env.slam.frame_selection.config import (
     EveryFrameConfig,
@@ -32,6 +32,16 @@ def make_config(name: str, **options: Any) -> FrameSelectionConfig:
     return from_dict(family, {"name": name, **options}, "frame_management")
 
 
+def parse_frame_selection(text: str) -> FrameSelectionConfig:
+    """The configuration ``NAME,option=value,...``; nested options as in ``change.width=40``.
+
+    Raises:
+        InputError: an unknown name or option (the message lists the valid ones), or a bad value.
+    """
+    name, *parts = text.split(",")
+    return make_config(name, **nested_options(parts))
+
+
 __all__ = [
     "BudgetConfig",
     "ChangeConfig",
@@ -42,4 +52,5 @@ __all__ = [
     "RegularConfig",
     "SelectiveSlam",
     "make_config",
+    "parse_frame_selection",
 ]

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from ms_slam_env.benchmark.arm_figure import main
-from ms_slam_env.benchmark.arm_mesh import LABEL, floor_below, scene_with
 from ms_slam_env.camera import Intrinsics
+from ms_slam_env.experiments.harness.arm_truth import floor_below
+from ms_slam_env.experiments.pictures.arm import LABEL, Options, arm_sheet, scene_with
+from ms_slam_env.experiments.pictures.drawing import run_script
 from ms_slam_env.geometry import look_at, make_pose, so3_exp
 from ms_slam_env.robot.arm import load_arm
 from ms_slam_env.robot.arm.shape import arm_parts, column_parts
@@ -82,7 +83,8 @@ def test_column_stands_between_floor_and_base(box_scene):
 
 def test_command_writes_the_picture(tmp_path):
     path = tmp_path / "deep" / "arm.png"
-    assert main(["--out", str(path), "--scenes", "carpet", "--width", "32", "--moves", "1"]) == 0
+    words = ["--out", str(path), "--scenes", "carpet", "--width", "32", "--moves", "1"]
+    assert run_script(Options, arm_sheet, words) == 0
     image = cv2.imread(str(path))
     assert image.shape == (18 + 24 + 4, 3 * 36, 3)
     assert image[18:].std() > 5

@@ -1,4 +1,4 @@
-"""The verdict on the map of an episode: does it show an object twice?"""
+"""The duplicate-object check: does a map of a rendered scene show an object twice?"""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.evaluation.map_truth import SURFACE_SPACING_M
 from ms_slam_env.geometry.point_clouds import voxel_firsts
 from ms_slam_env.metrics.consistency import (
@@ -25,7 +24,6 @@ from ms_slam_env.sensor.scene_cache import get_scene
 Float64 = NDArray[np.float64]
 
 MAP_VOXEL_M = 0.01
-MOST_VIEWS = 200  # of an episode's frames, evenly picked: the verdict costs some 3 s
 
 
 @dataclass(frozen=True)
@@ -47,20 +45,6 @@ class JudgedMap:
     def name(self, item: ObjectConsistency) -> str:
         """Name of an object."""
         return self.labels[item.label]
-
-
-def judge_episode(world: ActiveSlamEnv, rule: ConsistencyRule | None = None) -> JudgedMap:
-    """Judge the map of the episode just played.
-
-    The frames are rendered again without noise from their true poses, with the objects' labels.
-    """
-    frames = np.flatnonzero(world.episode.tracked & world.episode.processed)
-    picked = frames[np.unique(np.linspace(0, len(frames) - 1, MOST_VIEWS).astype(int))]
-    truth, estimate = world.episode.trajectory_truth, world.episode.trajectory_estimate
-    views = [labelled_view(world.sensor, truth[k], estimate[k]) for k in picked]
-    return judge_map(
-        world.slam.surface_points(), world.slam.surface_colors(), views, world.sensor, rule
-    )
 
 
 def labelled_view(

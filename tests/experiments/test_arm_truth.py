@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from ms_slam_env.benchmark.arm_truth import (
+from ms_slam_env.experiments.harness.arm_truth import (
     ArmTruth,
     Cloud,
     column_cloud,

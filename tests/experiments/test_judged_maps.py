@@ -9,18 +9,16 @@ import numpy as np
 import pytest
 
 from ms_slam_env import slam as slam_backends
-from ms_slam_env.benchmark.map_consistency import (
+from ms_slam_env.evaluation.duplicate_objects import (
     JudgedMap,
     judge_map,
     labelled_surface,
     labelled_view,
 )
-from ms_slam_env.benchmark.map_consistency_picture import (
-    CAMERA,
+from ms_slam_env.experiments.pictures.judged_map import (
     RED,
     describe,
     overview_pose,
-    render_points,
     save_map_picture,
 )
 from ms_slam_env.geometry import invert, make_pose, transform_points
@@ -77,27 +75,6 @@ def test_the_whole_surface_counts_as_true() -> None:
         np.cross(*np.moveaxis(np.diff(mesh.vertices[mesh.faces], axis=1), 1, 0)), axis=1
     )
     assert len(points) == pytest.approx(area.sum() / 0.01**2, rel=1e-3)
-
-
-def test_rendered_points_hide_those_behind() -> None:
-    near, far = [0.0, 0.0, 1.0], [0.0, 0.0, 2.0]
-    for points, colours in (
-        ([near, far], [[255, 0, 0], [0, 0, 255]]),
-        ([far, near], [[0, 0, 255], [255, 0, 0]]),
-    ):
-        image = render_points(np.array(points), colours, np.eye(4), CAMERA)
-        assert image[240, 320].tolist() == [255, 0, 0]
-        assert image[10, 10].tolist() == [255, 255, 255]
-
-
-def test_rendered_points_lie_where_the_camera_projects_them() -> None:
-    rng = np.random.default_rng(0)
-    pose = overview_pose(rng.normal(0, 0.3, (50, 3)), np.array([[1.0, 2.0, 0.5]]))
-    point = np.array([[0.1, -0.2, 0.05]])
-    image = render_points(point, [[1, 2, 3]], pose, CAMERA)
-    rows, columns = np.nonzero((image == [1, 2, 3]).all(axis=2))
-    expected = CAMERA.project(transform_points(invert(pose), point))[0]
-    assert np.allclose([columns.mean(), rows.mean()], expected, atol=0.51)
 
 
 def test_the_overview_looks_from_behind_and_above() -> None:

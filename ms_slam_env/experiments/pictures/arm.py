@@ -1,4 +1,4 @@
-"""The picture of the arm: `python -m ms_slam_env.benchmark.arm_figure --out FILE.png`.
+"""The picture of the arm: `python -m ms_slam_env.experiments.pictures.arm`.
 
 The arm where an episode put it in several scenes, seen from outside by the project's own renderer,
 and what its camera sees. No OpenGL is needed.
@@ -6,34 +6,30 @@ and what its camera sees. No OpenGL is needed.
 
 from __future__ import annotations
 
+import copy
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import scenes
-from ms_slam_env.benchmark.arm_mesh import LABEL, floor_below, scene_with
 from ms_slam_env.camera import Intrinsics, xtion
-from ms_slam_env.command_line import exit_code, parse
-from ms_slam_env.config import check_range
+from ms_slam_env.config import Checked, bounded
 from ms_slam_env.env.config import EnvConfig
 from ms_slam_env.errors import InputError, UnreachableError
+from ms_slam_env.experiments.harness.arm_truth import floor_below
+from ms_slam_env.experiments.pictures.drawing import Image, run_script, shrunk, titled_row
 from ms_slam_env.geometry import invert, look_at, transform_points
 from ms_slam_env.robot.arm import ArmConfig
 from ms_slam_env.robot.arm.arm import KinematicArm
-from ms_slam_env.robot.arm.shape import arm_parts, column_parts
-from ms_slam_env.scenes import Scene
+from ms_slam_env.robot.arm.shape import Part, arm_parts, column_parts
+from ms_slam_env.scenes import Scene, TexturedMesh
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.timings import Timings
 
-PROGRAM = "python -m ms_slam_env.benchmark.arm_figure"
-
-Image = NDArray[np.uint8]
 Float64 = NDArray[np.float64]
 
 _FILL = 1.25  # distance of the near view in diagonals of the box around the arm
@@ -46,33 +42,30 @@ _SEEDS = {"table": 1003, "wall": 1002, "carpet": 1004}  # elsewhere the camera s
 _GAZE_M = 1.0  # the far view shows what the camera looks at, up to there
 _HIDDEN_M = 0.1  # nearer than this to what hides it, a point is still called seen
 _START_TRIES = 20
-_TITLE = 18
-_BORDER = 4
+
+LABEL = "arm"
+_AMBIENT, _DIRECT, _SECOND = 0.35, 0.65, 0.25
+_TO_LIGHT = np.array([0.35, -0.3, 0.89])  # a ceiling lamp somewhat to the side
+_TO_SECOND = np.array([-0.8, 0.55, 0.25])  # and light from the walls
+_BRIGHTNESS = 0.9  # a white surface that faces the light, in units of the sensor's white
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(Checked):
     """Draw the arm in scenes, and what its camera sees."""
 
     scenes: tuple[str, ...] = ("table", "wall", "carpet", "living_room")
     """One row a scene."""
-    seed: int | None = None
+    seed: int | None = bounded(None, 0, 2**31)
     """Of scene, start pose and motions; None for one of which each scene shows what it is about."""
-    moves: int = 3
+    moves: int = bounded(3, 0, 1000)
     """Random motions between start and picture."""
-    width: int = 320
+    width: int = bounded(320, 16, 4096)
     """Of one image, pixels."""
     arm: ArmConfig = field(default_factory=ArmConfig)
     """The arm."""
     out: Path = Path("docs/pictures/arm.png")
     """The PNG file to write."""
-
-    def __post_init__(self) -> None:
-        """Refuse numbers out of range."""
-        if self.seed is not None:
-            check_range(self, "seed", 0, 2**31)
-        check_range(self, "moves", 0, 1000)
-        check_range(self, "width", 16, 4096)
 
 
 def arm_in(scene: Scene, config: ArmConfig, moves: int, seed: int) -> KinematicArm:
@@ -109,7 +102,7 @@ def pictures(scene: Scene, arm: KinematicArm, width: int) -> tuple[Image, Image,
     return (
         _view(scene, shown, afar, near + _FARTHER_M, width, gaze),
         _view(scene, shown, middle, near, width, None),
-        _shrunk(camera.color, width),
+        shrunk(camera.color, width),
     )
 
 
@@ -135,7 +128,7 @@ def _view(
 
     best = max(poses, key=shows)
     large = RGBDSensor(shown, _outside_camera(_SMOOTH * width), noise="none").ground_truth(best)
-    return _shrunk(large.color, width)
+    return shrunk(large.color, width)
 
 
 def _is_seen(point: Float64, pose: Float64, camera: Intrinsics, depth: NDArray[Any]) -> bool:
@@ -149,44 +142,62 @@ def _is_seen(point: Float64, pose: Float64, camera: Intrinsics, depth: NDArray[A
     return bool(inside and depth[v, u] > local[0, 2] - _HIDDEN_M)
 
 
-def _shrunk(image: Image, width: int) -> Image:
-    size = (width, 3 * width // 4)
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-
-
 def _outside_camera(width: int) -> Intrinsics:
     height = 3 * width // 4
     return Intrinsics(width, width, (width - 1) / 2, (height - 1) / 2, width, height)
 
 
-def contact_sheet(options: Options) -> Image:
-    """Return the whole sheet, an RGB image, one row a scene."""
+def scene_with(scene: Scene, parts: list[Part]) -> Scene:
+    """A copy of ``scene`` that shows ``parts`` too; they cast no shadow.
+
+    The light on them is made up: a lamp above, light from the side, and a share from everywhere.
+    """
+    corners = np.concatenate([part.corners for part in parts])
+    normals = np.concatenate([part.normals for part in parts])
+    counts = [len(part.corners) for part in parts]
+    light = _AMBIENT + sum(
+        strength * np.clip(normals @ (to / np.linalg.norm(to)), 0, None)
+        for strength, to in ((_DIRECT, _TO_LIGHT), (_SECOND, _TO_SECOND))
+    )
+    mesh = scene.mesh
+    count = len(corners)
+    faces = np.arange(3 * count, dtype=np.int32).reshape(count, 3) + len(mesh.vertices)
+    light = np.repeat(np.asarray(light)[..., None], 3, axis=2) * _BRIGHTNESS / scene.exposure
+    textures = [
+        np.full((4, 4, 3), np.rint(255 * np.array(part.rgb)), dtype=np.uint8) for part in parts
+    ]
+    seen = copy.copy(scene)
+    seen.mesh = TexturedMesh(
+        vertices=np.concatenate([mesh.vertices, corners.reshape(-1, 3).astype(np.float32)]),
+        faces=np.concatenate([mesh.faces, faces]),
+        uv=np.concatenate([mesh.uv, np.full((count, 3, 2), 0.5, np.float32)]),
+        face_texture=np.concatenate(
+            [
+                mesh.face_texture,
+                np.repeat(len(mesh.textures) + np.arange(len(parts)), counts).astype(np.int32),
+            ]
+        ),
+        face_label=np.concatenate(
+            [mesh.face_label, np.full(count, len(mesh.labels), dtype=np.int32)]
+        ),
+        irradiance=np.concatenate([mesh.irradiance, light.astype(np.float32)]),
+        textures=(*mesh.textures, *textures),
+        labels=(*mesh.labels, LABEL),
+    )
+    return seen
+
+
+def arm_sheet(options: Options) -> Image:
+    """The whole sheet, an RGB image, one row a scene."""
     rows = []
     for name in options.scenes:
         seed = _SEEDS.get(name, _SEED) if options.seed is None else options.seed
         scene = scenes.make(name, seed)
-        arm = arm_in(scene, options.arm, options.moves, seed)
-        framed = [
-            cv2.copyMakeBorder(i, 0, _BORDER, 0, _BORDER, cv2.BORDER_CONSTANT, value=(255,) * 3)
-            for i in pictures(scene, arm, options.width)
-        ]
-        strip = np.concatenate(framed, 1)
-        title = np.full((_TITLE, strip.shape[1], 3), 255, np.uint8)
-        text = f"{name}, seed {seed}: from afar, from near, what the arm's camera sees"
-        at = (2, _TITLE - 5)
-        cv2.putText(title, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.42, (30, 30, 30), 1, cv2.LINE_AA)
-        rows += [title, strip]
+        images = pictures(scene, arm_in(scene, options.arm, options.moves, seed), options.width)
+        title = f"{name}, seed {seed}: from afar, from near, what the arm's camera sees"
+        rows.append(titled_row(images, title))
     return np.concatenate(rows, 0)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Write the sheet; return the exit code."""
-    options = parse(Options, arguments, PROGRAM)
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    sheet = contact_sheet(options)
-    cv2.imwrite(str(options.out), sheet[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(exit_code(main, PROGRAM))
+    sys.exit(run_script(Options, arm_sheet))

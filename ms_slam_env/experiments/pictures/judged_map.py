@@ -8,17 +8,17 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
-from ms_slam_env.benchmark.figures import caption, new_figure, save
-from ms_slam_env.benchmark.map_consistency import JudgedMap
 from ms_slam_env.camera import Intrinsics
+from ms_slam_env.env.point_renderer import render_points
+from ms_slam_env.evaluation.duplicate_objects import JudgedMap
+from ms_slam_env.experiments.pictures.drawing import Image
 from ms_slam_env.geometry import invert, look_at, transform_points
+from ms_slam_env.report.figures import caption, new_figure, save
 
 Float64 = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 CAMERA = Intrinsics(fx=460.0, fy=460.0, cx=319.5, cy=239.5, width=640, height=480)
 RED = (225, 30, 30)
-_BACKGROUND = 255
 _NEAREST_M = 0.35  # what hangs in front of the eye would hide the rest
 _DOT_M = 0.014  # the points are a centimetre apart
 
@@ -35,7 +35,7 @@ def save_map_picture(judged: JudgedMap, cameras: ArrayLike, path: Path, title: s
     pose = overview_pose(judged.points, np.asarray(cameras))
     figure: Figure = new_figure(2, width=5.0, height=4.3)
     panels = {
-        "the map": render_points(judged.points, judged.colors, pose, CAMERA),
+        "the map": overview(judged.points, judged.colors, pose),
         "second copies in red, seen through the rest": _marked(judged, pose),
     }
     for ax, (name, image) in zip(figure.subplots(1, 2), panels.items(), strict=True):
@@ -49,9 +49,9 @@ def save_map_picture(judged: JudgedMap, cameras: ArrayLike, path: Path, title: s
 def _marked(judged: JudgedMap, pose: Float64) -> Image:
     """The map, faded, with the second copies drawn over what hides them."""
     faded = (0.35 * judged.colors + 0.65 * 235).astype(np.uint8)
-    image = render_points(judged.points, faded, pose, CAMERA)
+    image = overview(judged.points, faded, pose)
     copies = judged.points[judged.consistency.apart]
-    over = render_points(copies, np.tile(RED, (len(copies), 1)), pose, CAMERA)
+    over = overview(copies, np.tile(RED, (len(copies), 1)), pose)
     return np.where((over == RED).all(axis=2, keepdims=True), over, image)
 
 
@@ -74,29 +74,8 @@ def overview_pose(points: Float64, cameras: Float64) -> Float64:
     return look_at(eye + 0.7 * back + np.array([0.0, 0.0, 0.5]), target)
 
 
-def render_points(
-    points: Float64, colors: ArrayLike, T_world_camera: Float64, intrinsics: Intrinsics
-) -> Image:
-    """Points (N, 3) with colours (N, 3) uint8 as dots that hide what is behind, (H, W, 3) uint8."""
-    camera = transform_points(invert(T_world_camera), points)
-    ahead = camera[:, 2] > _NEAREST_M
-    camera, shades = camera[ahead], np.asarray(colors, dtype=np.uint8)[ahead]
-    order = np.argsort(-camera[:, 2], kind="stable")  # far ones first, near ones over them
-    camera, shades = camera[order], shades[order]
-    column, row = np.rint(intrinsics.project(camera)).astype(np.int64).T
-    radius = np.ceil(0.5 * _DOT_M * intrinsics.fx / camera[:, 2]).astype(np.int64)
-    reach = int(radius.max(initial=0))
-    image = np.full((*intrinsics.shape, 3), _BACKGROUND, np.uint8)
-    depth = np.full(intrinsics.shape, np.inf)
-    for dy in range(-reach, reach + 1):
-        for dx in range(-reach, reach + 1):
-            x, y = column + dx, row + dy
-            drawn = (radius >= max(abs(dx), abs(dy))) & (x >= 0) & (x < intrinsics.width)
-            drawn &= (y >= 0) & (y < intrinsics.height)
-            layer = np.full(intrinsics.shape, np.inf)
-            layer[y[drawn], x[drawn]] = camera[drawn, 2]  # of several, the last is the nearest
-            shade = np.zeros_like(image)
-            shade[y[drawn], x[drawn]] = shades[drawn]
-            nearer = layer < depth
-            image[nearer], depth[nearer] = shade[nearer], layer[nearer]
-    return image
+def overview(points: Float64, colors: ArrayLike, T_world_camera: Float64) -> Image:
+    """Points (N, 3) with colours (N, 3) uint8 as `CAMERA` sees them, without those near its eye."""
+    ahead = transform_points(invert(T_world_camera), points)[:, 2] > _NEAREST_M
+    points, shades = points[ahead], np.asarray(colors, dtype=np.uint8)[ahead]
+    return render_points(CAMERA, T_world_camera, points, shades, np.full(len(points), _DOT_M))

@@ -1,4 +1,4 @@
-"""``python -m ms_slam_env.benchmark.lookahead_figure``: the paper's Fig. 7.
+"""``python -m ms_slam_env.experiments.pictures.lookahead``: Fig. 7 of Saeedi et al., ICRA 2017.
 
 The 49 predicted images of one moment with their divergences from the reference.
 """
@@ -11,21 +11,18 @@ from pathlib import Path
 
 import gymnasium
 import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from ms_slam_env.command_line import exit_code, parse
+from ms_slam_env.experiments.pictures.drawing import run_script
 from ms_slam_env.robot import NUM_ROTATIONS, NUM_TRANSLATIONS, ROTATIONS, TRANSLATIONS
-
-PROGRAM = "python -m ms_slam_env.benchmark.lookahead_figure"
 
 
 @dataclass(frozen=True)
-class Args:
+class Options:
     """Draw the 49 predicted images of one moment with their divergences."""
 
     out: Path = Path("docs/pictures/lookahead.png")
@@ -35,22 +32,24 @@ class Args:
     steps_before: int = 20
 
 
-def main() -> int:
-    """Move at random for a while, predict the 49 candidates and draw them; return the exit code."""
-    args = parse(Args, None, PROGRAM)
-    env = gymnasium.make("MSActiveSLAM-FreeCamera-v0", scene=args.scene, scene_seed=args.scene_seed)
-    _, info = env.reset(seed=args.seed)
-    rng = np.random.default_rng(args.seed)
-    for _ in range(args.steps_before):
+def save_lookahead(options: Options) -> str:
+    """Move at random for a while, predict the 49 candidates and draw them."""
+    env = gymnasium.make(
+        "MSActiveSLAM-FreeCamera-v0", scene=options.scene, scene_seed=options.scene_seed
+    )
+    _, info = env.reset(seed=options.seed)
+    rng = np.random.default_rng(options.seed)
+    for _ in range(options.steps_before):
         _, _, _, _, info = env.step(rng.choice(np.flatnonzero(info["action_mask"])))
     active = env.unwrapped
     views, divergences = active.predict_candidates(), active.lookahead()  # type: ignore[attr-defined]
-    figure, axes = plt.subplots(NUM_TRANSLATIONS, NUM_ROTATIONS, figsize=(14, 11.5))
-    scale = Normalize(0, divergences[:, 0].max())
+    figure = Figure(figsize=(14, 11.5))
+    axes = figure.subplots(NUM_TRANSLATIONS, NUM_ROTATIONS)
+    scale, colours = Normalize(0, divergences[:, 0].max()), matplotlib.colormaps["plasma"]
+    corner = (0, 0), views.intrinsics.width * 0.16, views.intrinsics.height * 0.2
     for action, axis in enumerate(axes.ravel()):
         axis.imshow(views.intensity[action], cmap="gray", vmin=0, vmax=255)
-        corner = (0, 0), views.intrinsics.width * 0.16, views.intrinsics.height * 0.2
-        axis.add_patch(Rectangle(*corner, color=plt.cm.plasma(scale(divergences[action, 0]))))
+        axis.add_patch(Rectangle(*corner, color=colours(scale(divergences[action, 0]))))
         axis.set_title("I {:.4f}  D {:.4f}".format(*divergences[action]), fontsize=7, pad=2)
         axis.set_xticks([])
         axis.set_yticks([])
@@ -61,14 +60,10 @@ def main() -> int:
             axis.set_xlabel(ROTATIONS[rotation])
     figure.tight_layout(rect=(0, 0, 0.92, 1), pad=0.4)
     bar = figure.add_axes((0.93, 0.1, 0.015, 0.8))
-    figure.colorbar(
-        plt.cm.ScalarMappable(scale, "plasma"), bar, label="intensity divergence (nats)"
-    )
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(args.out, dpi=80)
-    print(f"{args.out}: {args.scene} seed {args.scene_seed} after {args.steps_before} steps")
-    return 0
+    figure.colorbar(ScalarMappable(scale, "plasma"), bar, label="intensity divergence (nats)")
+    figure.savefig(options.out, dpi=80)
+    return f"{options.scene} seed {options.scene_seed} after {options.steps_before} steps"
 
 
 if __name__ == "__main__":
-    sys.exit(exit_code(main, PROGRAM))
+    sys.exit(run_script(Options, save_lookahead))

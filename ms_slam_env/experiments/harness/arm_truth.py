@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ms_slam_env.geometry import invert, transform_points
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.geometry import invert, make_pose, transform_points
 from ms_slam_env.robot.arm import ArmModel
 from ms_slam_env.scenes import Scene
+from ms_slam_env.sensor import RGBDSensor
 
 Float64 = NDArray[np.float64]
 
@@ -49,6 +51,15 @@ class Cloud:
 def furniture_cloud(scene: Scene, spacing_m: float = _SPACING_M) -> Cloud:
     """The true surface of a scene."""
     return Cloud(scene.surface_points(spacing_m)[0])
+
+
+def floor_below(scene: Scene, point: Float64) -> float:
+    """Height of the surface under a point (3,); the point's own where there is none."""
+    camera = Intrinsics(fx=1, fy=1, cx=0, cy=0, width=1, height=1)
+    start = point + np.array([0, 0, 0.01])
+    down = make_pose(np.diag([1.0, -1.0, -1.0]), start)
+    depth = float(RGBDSensor(scene, camera, noise="none").ground_truth(down).depth[0, 0])
+    return float(start[2] - depth) if depth > 0 else float(point[2])
 
 
 def column_cloud(radius: float, depth: float) -> Cloud:
