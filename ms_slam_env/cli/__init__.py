@@ -10,6 +10,7 @@ COMMANDS = {
     "benchmark": "run planners on scenes with SLAM in the loop and compare them",
     "compare": "run SLAM backends over the same sequences and compare them",
     "divergence": "measure how hard recorded sequences are, from frame to frame",
+    "docs": "write the tables of Markdown pages from committed results",
     "evaluate": "compare an estimated trajectory (TUM file) or map (PLY) with the truth",
     "experiment": "run one of the project's experiments, or list them",
     "explore": "search the parameters of a SLAM backend for the best compromises",

@@ -15,9 +15,8 @@ from ms_slam_env.command_line import parse
 class Arguments:
     """Turn a folder of results into one HTML page with interactive figures and sortable tables.
 
-    Takes what benchmark, compare, divergence, evaluate, explore, run, usme and the benchmarks of
-    this package write; a folder of such folders gives one page with a table of contents. The page
-    needs no network and no other file.
+    Takes what the other commands write with --out; a folder of such folders gives one page with a
+    table of contents. The page needs no network and no other file.
     """
 
     folder: tyro.conf.Positional[Path]
@@ -29,7 +28,7 @@ class Arguments:
 def main(arguments: Sequence[str]) -> int:
     """Write the page and print where it is."""
     args = parse(Arguments, arguments, "ms-slam report")
-    from ms_slam_env.benchmark.report import write_report
+    from ms_slam_env.report.page import write_report
 
     path = write_report(args.folder, args.out)
     print(f"{path} ({path.stat().st_size / 1e6:.1f} MB)")

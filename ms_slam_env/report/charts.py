@@ -8,9 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.metrics.registry import metric
+from ms_slam_env.report.records import build
 from ms_slam_env.report.statistics import Interval
 from ms_slam_env.report.tables import Row, finished, grouped, summary
+
+MODES = ("lines", "lines+markers", "markers", "dots", "bars")
 
 Point = float | int | str | None
 
@@ -37,6 +41,20 @@ class Series:
     mode: str = "lines+markers"
     text: Sequence[str] = ()
 
+    def __post_init__(self) -> None:
+        """Refuse unknown modes and columns of different length.
+
+        Raises:
+            InputError: naming the series.
+        """
+        if self.mode not in MODES:
+            raise unknown("mode of a series", self.mode, MODES)
+        others = (self.y, self.low, self.high, self.text)
+        if any(len(part) not in (len(self.x), 0) for part in others) or (
+            (len(self.y), len(self.high)) != (len(self.x), len(self.low))
+        ):
+            raise InputError(f"series {self.name!r}: not as many values in each of its columns")
+
 
 @dataclass(frozen=True)
 class Guide:
@@ -51,6 +69,15 @@ class Guide:
     value: float
     axis: str = "y"
     name: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse unknown axes.
+
+        Raises:
+            InputError: listing the axes.
+        """
+        if self.axis not in ("x", "y"):
+            raise unknown("axis of a guide", self.axis, ("x", "y"))
 
 
 @dataclass(frozen=True)
@@ -114,16 +141,17 @@ def chart_from_json(content: Mapping[str, Any]) -> Chart:
         KeyError, TypeError: content of another form.
     """
     panels = [
-        Panel(
-            **{
+        build(
+            Panel,
+            {
                 **panel,
-                "series": [Series(**series) for series in panel["series"]],
-                "guides": [Guide(**guide) for guide in panel.get("guides", ())],
-            }
+                "series": [build(Series, series) for series in panel["series"]],
+                "guides": [build(Guide, guide) for guide in panel.get("guides", ())],
+            },
         )
         for panel in content["panels"]
     ]
-    return Chart(**{**content, "panels": panels})
+    return build(Chart, {**content, "panels": panels})
 
 
 def interval_series(

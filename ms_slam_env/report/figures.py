@@ -112,7 +112,7 @@ def _scale(key: str) -> float:
 
 def _scaled(values: Sequence[Any], key: str) -> list[Any]:
     """Values in the shown unit; names of categories as text."""
-    if not key:
+    if not key or any(isinstance(value, str) for value in values):
         return [str(value) for value in values]
     return [np.nan if value is None else value * _scale(key) for value in values]
 

@@ -7,14 +7,17 @@ import hashlib
 import json
 import math
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from types import NoneType
+from typing import Any, TypeVar
 
 import numpy as np
 
 from ms_slam_env.errors import InputError
 
 Row = dict[str, Any]
+T = TypeVar("T")
 
 _INFINITE = {math.inf: "Infinity", -math.inf: "-Infinity"}
 _FROM_TEXT = {text: number for number, text in _INFINITE.items()}
@@ -78,13 +81,15 @@ class RecordFile:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write ``content``; an interrupt leaves the old file or the new one, never half of one.
+    """Write ``content``, whole or not at all; see :func:`to_plain` for what JSON does not have."""
+    write_text(path, json.dumps(to_plain(content), indent=1, allow_nan=False) + "\n")
 
-    See :func:`to_plain` for numbers that JSON does not have.
-    """
+
+def write_text(path: Path, text: str) -> None:
+    """Write ``text``; an interrupt leaves the old file or the new one, never half of one."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
-    partial.write_text(json.dumps(to_plain(content), indent=1, allow_nan=False) + "\n")
+    partial.write_bytes(text.encode("utf-8", errors="replace"))
     os.replace(partial, path)
 
 
@@ -108,3 +113,48 @@ def from_plain(content: Any) -> Any:
     if isinstance(content, list):
         return [from_plain(value) for value in content]
     return _FROM_TEXT.get(content, content) if isinstance(content, str) else content
+
+
+_PLAIN: Mapping[str, tuple[type, ...]] = {
+    "str": (str,),
+    "bool": (bool,),
+    "float": (int, float),
+    "Sequence[Point]": (str, int, float, NoneType),
+    "Sequence[float | None]": (int, float, NoneType),
+    "Sequence[str]": (str,),
+}  # annotation to what JSON may have there
+
+
+def build(cls: type[T], values: Mapping[str, Any]) -> T:
+    """Dataclass ``cls`` from JSON that a stranger may have written.
+
+    Raises:
+        TypeError: a missing or unknown field, or a value of another type than its field says.
+        OverflowError: an integer that no float can hold.
+    """
+    made = cls(**values)
+    for field in dataclasses.fields(made):  # type: ignore[arg-type]
+        value = getattr(made, field.name)
+        of_many = str(field.type).startswith("Sequence")
+        if of_many and not isinstance(value, (list, tuple)):
+            raise TypeError(f"{field.name} is no list")
+        kinds = _PLAIN.get(str(field.type))
+        if kinds is not None:
+            for part in value if of_many else (value,):
+                check_plain(field.name, part, kinds)
+    return made
+
+
+def check_plain(
+    name: str, value: Any, kinds: tuple[type, ...] = (str, int, float, NoneType)
+) -> None:
+    """Refuse a value of JSON of another kind.
+
+    Raises:
+        TypeError: not one of ``kinds``.
+        OverflowError: an integer that no float can hold.
+    """
+    if not isinstance(value, kinds):
+        raise TypeError(f"{name} is {type(value).__name__}")
+    if isinstance(value, int):
+        float(value)

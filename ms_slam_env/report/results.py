@@ -15,13 +15,14 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.metrics.registry import RESULTS_VERSION, RESULTS_VERSIONS, check_keys
 from ms_slam_env.report.charts import Chart, chart_from_json
 from ms_slam_env.report.provenance import provenance
-from ms_slam_env.report.records import from_plain, write_json
+from ms_slam_env.report.records import check_plain, from_plain, write_json
 from ms_slam_env.report.tables import Table, table_from_json
 
 RESULTS = "results.json"
@@ -146,22 +147,47 @@ def read_results(path: Path) -> Results:
         raise InputError(f"{path} is not a result of ms-slam: it has no kind and tables")
     try:
         rows_key = content.pop("rows_key", "rows")
+        check_plain("rows_key", rows_key, (str,))
         return Results(
             kind=str(content.pop("kind")),
             title=str(content.pop("title", "")),
             about=str(content.pop("about", "")),
             tables=[table_from_json(table) for table in content.pop("tables")],
             charts=[chart_from_json(chart) for chart in content.pop("charts", [])],
-            rows=content.pop(rows_key, []),
+            rows=_checked_rows(content.pop(rows_key, [])),
             rows_key=rows_key,
-            version=int(content.pop("results_version", 1)),
-            provenance=content.pop("provenance", {}),
+            version=_checked_version(content.pop("results_version", 1)),
+            provenance=_checked_provenance(content.pop("provenance", {})),
             content=content,
         )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         if isinstance(error, InputError):
             raise InputError(f"{path}: {error}") from None
         raise InputError(f"{path} is not a result of ms-slam: {error!r}") from None
+
+
+def _checked_rows(rows: Any) -> list[Mapping[str, Any]]:
+    """Rows of a file, as far as tables and pages read them."""
+    for row in rows:
+        for key in ("commit", "error"):
+            check_plain(key, row.get(key), (str, NoneType))
+        for key in ("spec", "result"):
+            check_plain(key, row.get(key), (dict, NoneType))
+            for number in (v for v in (row.get(key) or {}).values() if isinstance(v, int)):
+                check_plain(key, number)
+    return list(rows)
+
+
+def _checked_version(version: Any) -> int:
+    check_plain("results_version", version, (int,))
+    return max(1, int(version))
+
+
+def _checked_provenance(given: Any) -> dict[str, Any]:
+    check_plain("provenance", given, (dict,))
+    check_plain("commit", given.get("commit"), (str, NoneType))
+    check_plain("versions", given.get("versions", {}), (dict,))
+    return dict(given)
 
 
 def is_result(content: Any) -> bool:

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from ms_slam_env.metrics.registry import metric
+from ms_slam_env.report.records import build, check_plain
 from ms_slam_env.report.statistics import Interval, median_interval, share_interval
 
 Value = str | float | int | bool | None | Interval
@@ -104,17 +105,17 @@ def table_from_json(content: Mapping[str, Any]) -> Table:
         InputError: a key that the registry does not know.
         KeyError, TypeError: content of another form.
     """
-    rows = [
-        {name: _interval(v) if isinstance(v, dict) else v for name, v in row.items()}
-        for row in content["rows"]
-    ]
-    columns = [Column(**column) for column in content["columns"]]
-    return make_table(columns, rows, content.get("title", ""), content.get("note", ""))
+    rows = [{n: _value_from_json(v) for n, v in row.items()} for row in content["rows"]]
+    columns = [build(Column, column) for column in content["columns"]]
+    return make_table(columns, rows, str(content.get("title", "")), str(content.get("note", "")))
 
 
-def _interval(parts: Mapping[str, float | None]) -> Interval:
-    """The interval that was written; JSON has null for NaN."""
-    return Interval(**{name: math.nan if v is None else v for name, v in parts.items()})
+def _value_from_json(value: Any) -> Value:
+    """The value that was written; JSON has null for NaN."""
+    if isinstance(value, dict):
+        return Interval(**{n: math.nan if v is None else float(v) for n, v in value.items()})
+    check_plain("a cell", value)
+    return value
 
 
 @dataclass(frozen=True)
@@ -192,7 +193,7 @@ def format_value(value: Value, key: str) -> str:
     if value is None:
         return "-"
     if isinstance(value, str):
-        return value.replace("|", "\\|")
+        return value
     if isinstance(value, Interval):
         return format_interval(value, of.scale, of.digits)
     if isinstance(value, bool):
@@ -228,4 +229,4 @@ def format_number(value: float, digits: int = 2) -> str:
 
 
 def _line(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
+    return "| " + " | ".join(" ".join(c.split()).replace("|", "\\|") for c in cells) + " |"

@@ -67,7 +67,7 @@
       dragmode: touch.matches ? false : "zoom",
       ...layout,
       font: { color: text, size: small ? 12 : 13, family: getComputedStyle(document.body).fontFamily },
-      hoverlabel: { bgcolor: css("--page"), bordercolor: line, font: { color: text } },
+      hoverlabel: { bgcolor: css("--page"), bordercolor: line, font: { color: text }, namelength: -1 },
       legend: {
         orientation: "h", x: 0, y: 1, xanchor: "left", yanchor: "bottom",
         bgcolor: "rgba(0,0,0,0)", ...layout.legend,

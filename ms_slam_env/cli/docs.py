@@ -1,0 +1,56 @@
+"""``ms-slam docs``."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from ms_slam_env.command_line import parse
+from ms_slam_env.errors import InputError
+
+_PAGES = ("README.md", "BENCHMARK.md")
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Write the tables of a clone's Markdown pages from its committed results.
+
+    A table stands between <!-- results: FOLDER table=0 columns=planner,ate_m --> and
+    <!-- end -->; FOLDER is one of docs/results.
+    """
+
+    pages: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Pages; by default README.md, BENCHMARK.md and those in docs."""
+    root: Path = Path()
+    """Root of the clone."""
+    check: bool = False
+    """Change nothing; exit with 1 if a page is out of date."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Write the tables, or check them, and print the pages that were out of date."""
+    args = parse(Arguments, arguments, "ms-slam docs")
+    from ms_slam_env.report.markdown_pages import update_pages
+
+    pages = args.pages or pages_of(args.root)
+    if not pages:
+        raise InputError(f"{args.root} holds no pages: neither {' nor '.join(_PAGES)}")
+    changed = update_pages(pages, args.root / "docs" / "results", write=not args.check)
+    for page in changed:
+        print(f"{page}: {'out of date' if args.check else 'written'}")
+    if args.check and changed:
+        print("ms-slam: error: run ms-slam docs", file=sys.stderr)
+        return 1
+    return 0
+
+
+def pages_of(root: Path) -> tuple[Path, ...]:
+    """The pages of a clone; the Markdown beside results is no page."""
+    results = root / "docs" / "results"
+    found = [root / name for name in _PAGES if (root / name).is_file()]
+    found += [p for p in sorted((root / "docs").rglob("*.md")) if not p.is_relative_to(results)]
+    return tuple(found)

@@ -1,0 +1,121 @@
+"""Results in a folder and below, each with the pictures and texts that lie beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ms_slam_env.errors import InputError
+from ms_slam_env.report.results import Results, read_results
+
+PICTURES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".gif": "image/gif"}
+_TEXTS = (".yaml", ".yml", ".md", ".txt", ".csv")
+_MAX_RESULT_BYTES = 200_000_000
+_MAX_PICTURE_BYTES = 4_000_000
+_MAX_TEXT_BYTES = 100_000
+
+
+@dataclass(frozen=True)
+class FoundResult:
+    """A result file and its neighbours.
+
+    Attributes:
+        path: of the file.
+        title: its folder from the top one on, with the file where the folder has several.
+        results: what it holds.
+        pictures: picture files that belong to it, without those drawn from its charts.
+        texts: text files that belong to it, without its tables in Markdown.
+    """
+
+    path: Path
+    title: str
+    results: Results
+    pictures: Sequence[Path]
+    texts: Sequence[Path]
+
+
+@dataclass(frozen=True)
+class NotShown:
+    """A file that is not shown, by its name from the top folder on, and why."""
+
+    name: str
+    reason: str
+
+
+def find_results(folder: Path) -> tuple[list[FoundResult], list[NotShown]]:
+    """The results, by path, and the files that are no results or too large.
+
+    Hidden files and links that lead out of the folder are passed over.
+
+    Raises:
+        InputError: no such folder, no result in it.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder")
+    top = folder.resolve()
+    found: list[FoundResult] = []
+    absent: list[NotShown] = []
+    by_folder: dict[Path, list[Path]] = {}
+    for path in sorted(folder.rglob("*")):
+        is_hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
+        if not is_hidden and path.is_file() and path.resolve().is_relative_to(top):
+            by_folder.setdefault(path.parent, []).append(path)
+    for parent, paths in by_folder.items():
+        own: dict[Path, Results] = {}
+        for path in (path for path in paths if path.suffix == ".json"):
+            try:
+                own[path] = _read(path)
+            except InputError as error:
+                reason = str(error).removeprefix(str(path)).lstrip(": ")
+                absent.append(NotShown(path.relative_to(folder).as_posix(), reason))
+        beside = _neighbours(own, paths) if own else {}
+        for path, results in own.items():
+            title = top.name if parent == folder else parent.relative_to(folder).as_posix()
+            title = f"{title}: {path.stem}" if len(own) > 1 else title
+            pictures, texts, too_large = beside[path]
+            found.append(FoundResult(path, title, results, pictures, texts))
+            absent += [
+                NotShown(large.relative_to(folder).as_posix(), "is too large")
+                for large in too_large
+            ]
+    if not found:
+        seen = "".join(f"; {missing.name} {missing.reason}" for missing in absent[:3])
+        raise InputError(f"{folder} holds no results{seen}")
+    return found, absent
+
+
+def _read(path: Path) -> Results:
+    """The result in a file.
+
+    Raises:
+        InputError: too large, or not a result.
+    """
+    if path.stat().st_size > _MAX_RESULT_BYTES:
+        raise InputError(f"{path} has more than {_MAX_RESULT_BYTES / 1e6:.0f} MB")
+    return read_results(path)
+
+
+def _neighbours(
+    results: Mapping[Path, Results], paths: Sequence[Path]
+) -> dict[Path, tuple[list[Path], list[Path], list[Path]]]:
+    """Pictures, texts, and those too large, of each result: those whose names are most alike."""
+    found: dict[Path, tuple[list[Path], list[Path], list[Path]]]
+    found = {path: ([], [], []) for path in results}
+    drawn = {chart.name for result in results.values() for chart in result.charts}
+    for path in paths:
+        suffix = path.suffix.lower()
+        is_table = suffix == ".md" and path.stem.startswith("table")
+        is_picture = suffix in PICTURES and path.stem not in drawn
+        if not is_picture and (suffix not in _TEXTS or is_table):
+            continue
+        most = _MAX_PICTURE_BYTES if is_picture else _MAX_TEXT_BYTES
+        kind = 2 if path.stat().st_size > most else 0 if is_picture else 1
+        owner = max(results, key=lambda result: _likeness(result.stem, path.stem))
+        found[owner][kind].append(path)
+    return found
+
+
+def _likeness(result: str, other: str) -> int:
+    """How many words, parted by underscores, the two names have in common."""
+    return len(set(result.split("_")) & set(other.split("_")))

@@ -1,0 +1,125 @@
+"""Tables of Markdown pages, written from committed results so that no page says something else.
+
+Between two comments, each on a line of its own, stands what a result says::
+
+    <!-- results: planners table=0 columns=planner,ate_m,f_score_5cm -->
+    <!-- end -->
+
+The first word is a folder of results, whose ``results.json`` is read, or a JSON file in one. The
+options: ``table``, number or title of a table (by default the first); ``columns``, their names (by
+default all); ``rows``, at most so many of the first; ``made_by=yes``, the command in a line below.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import shlex
+from collections.abc import Iterable
+from pathlib import Path
+
+from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.report.records import write_text
+from ms_slam_env.report.results import RESULTS, Results, made_by, read_results
+from ms_slam_env.report.tables import Table
+
+_START = re.compile(r"^<!-- results: (?P<what>.*) -->$")
+_END = "<!-- end -->"
+_OPTIONS = ("table", "columns", "rows", "made_by")
+
+
+def update_pages(pages: Iterable[Path], results: Path, write: bool = True) -> list[Path]:
+    """Write the tables of Markdown pages; return the pages that were out of date.
+
+    Args:
+        pages: Markdown files.
+        results: folder of the folders of results.
+        write: whether to change the pages.
+
+    Raises:
+        InputError: a comment that names no table, or is not closed; the message says where.
+    """
+    changed = []
+    for page in pages:
+        try:
+            before = page.read_text(encoding="utf-8")
+        except OSError as error:
+            raise InputError(f"cannot read page {page}: {error.strerror}") from None
+        after = with_tables(before, results, str(page))
+        if after != before:
+            changed.append(page)
+            if write:
+                write_text(page, after)
+    return changed
+
+
+def with_tables(text: str, results: Path, name: str = "page") -> str:
+    """``text`` with its tables as the results have them.
+
+    Raises:
+        InputError: see :func:`update_pages`.
+    """
+    lines: list[str] = []
+    opened = 0  # line number of the comment that a table stands below
+    for number, line in enumerate(text.split("\n"), start=1):
+        start = _START.match(line)
+        if opened and start:
+            raise InputError(f"{name}, line {opened}: no {_END} before line {number}")
+        if line == _END and not opened:
+            raise InputError(f"{name}, line {number}: {_END} without a start")
+        if start:
+            opened = number
+            try:
+                lines += [line, "", *_inserted(start["what"], results).split("\n"), ""]
+            except InputError as error:
+                raise InputError(f"{name}, line {number}: {error}") from None
+        elif line == _END:
+            opened = 0
+        if not opened:
+            lines.append(line)
+    if opened:
+        raise InputError(f"{name}, line {opened}: no {_END}")
+    return "\n".join(lines)
+
+
+def _inserted(what: str, folder: Path) -> str:
+    """What stands below a comment: a warning where the result is out of date, note and table."""
+    try:
+        place, *words = shlex.split(what)
+    except ValueError as error:
+        raise InputError(f"{what!r}: {str(error).lower()}") from None
+    options = dict(word.partition("=")[::2] for word in words)
+    for option in options:
+        if option not in _OPTIONS:
+            raise unknown("option", option, _OPTIONS)
+    path = folder / place
+    results = read_results(path if path.suffix == ".json" else path / RESULTS)
+    table = _cut(_chosen(results, options.get("table", "0")), options)
+    parts = [f"*{results.stale}*\n"] if results.stale else []
+    parts.append(table.as_markdown())
+    if options.get("made_by") == "yes":
+        parts.append(made_by(results.provenance, results.rows))
+    return "\n".join(parts).rstrip("\n")
+
+
+def _chosen(results: Results, which: str) -> Table:
+    """The table of a number or title."""
+    tables = {str(n): table for n, table in enumerate(results.tables)}
+    tables |= {table.title: table for table in results.tables if table.title}
+    if which not in tables:
+        raise unknown("table", which, tables)
+    return tables[which]
+
+
+def _cut(table: Table, options: dict[str, str]) -> Table:
+    """The columns and rows that are asked for, without title: the page has its own headings."""
+    columns = {column.name: column for column in table.columns}
+    names = options["columns"].split(",") if "columns" in options else list(columns)
+    for name in names:
+        if name not in columns:
+            raise unknown("column", name, columns)
+    count = options.get("rows", str(len(table.rows)))
+    if not count.isdecimal():
+        raise InputError(f"rows = {count!r} is no number")
+    chosen = tuple(columns[name] for name in names)
+    return dataclasses.replace(table, title="", columns=chosen, rows=table.rows[: int(count)])
