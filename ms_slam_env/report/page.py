@@ -14,7 +14,7 @@ from typing import Any
 
 from ms_slam_env import __version__
 from ms_slam_env.errors import InputError
-from ms_slam_env.metrics.registry import metric, registry
+from ms_slam_env.metrics.registry import metric
 from ms_slam_env.report.charts import Chart
 from ms_slam_env.report.discovery import PICTURES, FoundResult, NotShown, find_results
 from ms_slam_env.report.plotly_charts import plots_of
@@ -261,9 +261,16 @@ def _rows(results: Results, anchor: str) -> str:
     same = [name for name in shown if len(lines) > 1 and _never_changes(lines, name)]
     shown = [name for name in shown if name not in same]
     note = ", ".join(f"{key} {lines[0][part, key]}" for part, key in same if part == "spec")
+    known = {key for _, key in shown if _is_metric(key)}
     table = _sortable(
-        [_heading(key) for _, key in shown],
-        [[_raw_cell(line.get(name), name[1]) for name in shown] for line in lines],
+        [metric(key).label if key in known else key for _, key in shown],
+        [
+            [
+                _cell(line.get(name), name[1]) if name[1] in known else _raw_cell(line.get(name))
+                for name in shown
+            ]
+            for line in lines
+        ],
         results.rows_key,
         anchor,
         f"The same in every row: {note}." if note else "",
@@ -280,14 +287,16 @@ def _never_changes(lines: Sequence[Mapping[Any, Any]], name: tuple[str, str]) ->
     return len({repr(line.get(name)) for line in lines}) == 1
 
 
-def _heading(key: str) -> str:
-    """Of a metric with its unit; a setting that is no metric is called as in the file."""
-    return metric(key).label if key in registry() else key
+def _is_metric(key: str) -> bool:
+    """Whether the registry explains ``key``; a setting that is no metric is called as it is."""
+    try:
+        metric(key)
+    except InputError:
+        return False
+    return True
 
 
-def _raw_cell(value: Any, key: str) -> str:
-    if key in registry():
-        return _cell(value, key)
+def _raw_cell(value: Any) -> str:
     is_number = isinstance(value, (int, float)) and math.isfinite(value)
     mark = f' class="n" data-n="{float(value)!r}"' if is_number else ""
     return f"<td{mark}>{'-' if value is None else escape(str(value))}</td>"

@@ -1,0 +1,80 @@
+"""Tables of Markdown pages come from results, and the repository's pages are up to date."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from ms_slam_env.cli import main
+from ms_slam_env.errors import InputError
+from ms_slam_env.report.markdown_pages import with_tables
+from ms_slam_env.report.results import write_results
+from ms_slam_env.report.tables import make_table
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = "# Title\n\n<!-- results: {} -->\n{}<!-- end -->\n\nText.\n"
+
+
+@pytest.fixture
+def clone(tmp_path: Path) -> Path:
+    """The root of a clone with one result and no page."""
+    lines = [{"planner": name, "ate_m": k / 1000, "frames": k} for k, name in enumerate("abc", 1)]
+    columns = ["planner", "ate_m", "frames"]
+    tables = [make_table(columns, lines, note="A note."), make_table(["planner"], [], "Empty one")]
+    write_results(tmp_path / "docs/results/x/results.json", "x", "X", "About.", tables)
+    return tmp_path
+
+
+def test_a_table_is_written_between_its_comments(clone: Path) -> None:
+    (clone / "README.md").write_text(PAGE.format("x columns=ate_m,planner rows=2", "old\n"))
+    arguments = ["docs", "--root", str(clone)]
+    assert main([*arguments, "--check"]) == 1
+    assert "old" in (clone / "README.md").read_text()
+    assert main(arguments) == 0
+    table = "\nA note.\n\n| ATE [mm] | planner |\n| --- | ---: |\n| 1.00 | a |\n| 2.00 | b |\n\n"
+    expected = PAGE.format("x columns=ate_m,planner rows=2", table)
+    assert (clone / "README.md").read_text() == expected
+    assert main([*arguments, "--check"]) == 0
+
+
+def test_age_and_command_stand_with_the_table(clone: Path) -> None:
+    path = clone / "docs/results/x/results.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"results_version": 1}))
+    what = 'x/results.json table="Empty one" made_by=yes'
+    text = with_tables(PAGE.format(what, ""), clone / "docs/results")
+    assert "*These figures are older than the code" in text
+    assert "Made by `" in text
+
+
+@pytest.mark.parametrize(
+    ("page", "message"),
+    [
+        (PAGE.format("x table=7", ""), "line 3: unknown table '7'; valid choices: 0, 1, Empty one"),
+        (PAGE.format("x columns=ate", ""), "line 3: unknown column 'ate'"),
+        (PAGE.format("x colums=ate_m", ""), "line 3: unknown option 'colums'"),
+        (PAGE.format("x rows=many", ""), "line 3: rows = 'many' is no number"),
+        (PAGE.format("x 'y", ""), "line 3: .*no closing quotation"),
+        (PAGE.format("y", ""), "line 3: cannot read result"),
+        ("<!-- results: x -->\n", "line 1: no <!-- end -->"),
+        (PAGE.format("x", "<!-- results: x -->\n"), "line 3: no <!-- end --> before line 4"),
+        ("\n<!-- end -->\n", "line 2: <!-- end --> without a start"),
+    ],
+)
+def test_a_comment_that_says_nothing_useful_is_refused(
+    clone: Path, page: str, message: str
+) -> None:
+    with pytest.raises(InputError, match=f"page, {message}"):
+        with_tables(page, clone / "docs/results")
+
+
+def test_a_folder_without_pages_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["docs", "--root", str(tmp_path)]) == 2
+    assert "holds no pages" in capsys.readouterr().err
+
+
+def test_pages_of_the_repository_are_up_to_date() -> None:
+    assert main(["docs", "--check", "--root", str(ROOT)]) == 0
