@@ -37,7 +37,7 @@ def run(cls: type[Experiment], arguments: Sequence[str], program: str, out: Path
     if args.check:
         return check(cls, args.against)
     own = {field.name: getattr(args, field.name) for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
-    outcome = run_experiment(cls(**own), args.out, args.workers)
+    outcome = run_experiment(cls(**own), args.out, args.workers, args.ray)
     print(outcome.results.as_markdown())
     print(f"written: {args.out}/{RESULTS}, table.md and figures", file=sys.stderr)
     return report_failures(outcome.failures)
@@ -59,6 +59,7 @@ def with_run_options(cls: type[Experiment], out: Path) -> type[Any]:
     options: list[tuple[str, Any, str, Any]] = [
         ("workers", int | None, "Parallel processes (default: the experiment's own).", None),
         ("out", Path, "Folder of the results; what it holds already is not run again.", out),
+        ("ray", str | None, "Address of a Ray cluster whose workers run the rows, or local.", None),
         ("check", bool, "Run some committed rows again and compare.", False),
         ("against", Path, "Folder of the committed results.", committed_results(name)),
     ]

@@ -158,7 +158,7 @@ def failed() -> dict[str, Any]:
 def made_up_rows(first: dict[str, Any], last: dict[str, Any]) -> Callable[..., list[Row]]:
     """A ``run_all`` that runs nothing."""
 
-    def run_all(specs: list[Any], *_: object) -> list[Row]:
+    def run_all(specs: list[Any], *_: object, **__: object) -> list[Row]:
         outcomes = [*[first] * (len(specs) - 1), last]
         return [
             {"key": f"k{i}", "spec": vars(spec), "commit": "c", **outcome}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ import pytest
 from ms_slam_env.cli import main
 from ms_slam_env.cli.experiment import run
 from ms_slam_env.errors import InputError
-from ms_slam_env.experiments.harness import Experiment, experiment_class, experiment_names
+from ms_slam_env.experiments.harness import Experiment, experiment_class, experiment_names, rows
 from ms_slam_env.experiments.harness.checking import check_results, compare, spec_type
 from ms_slam_env.experiments.harness.running import run_experiment
 from ms_slam_env.metrics.registry import RESULTS_VERSION, check_keys, registry
@@ -73,6 +74,23 @@ def test_rows_are_kept_and_only_failed_ones_run_again(tmp_path: Path) -> None:
     assert content["about"] == "A constant by seed."
     assert [row["result"]["ate_m"] for row in content["rows"]] == [0.01, 0.02, 0.01, 0.02]
     assert "| table | 2 | 15.0 [10.0, 20.0] | 0 [0, 66] |" in (tmp_path / "table.md").read_text()
+
+
+def test_the_harness_hands_its_options_to_the_pool(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: dict[str, Any] = {}
+
+    def open_pool(run: object, workers: int, ray: str | None, **options: Any) -> Any:
+        given.update(workers=workers, ray=ray, **options)
+        return real_pool(run, workers)
+
+    real_pool = rows.open_pool
+    monkeypatch.setattr(rows, "open_pool", open_pool)
+    monkeypatch.setattr(Wobbles, "fresh_process", True)
+    run_experiment(Wobbles(), tmp_path, workers=1, ray="a:1")
+    assert (given["workers"], given["ray"], given["fresh"]) == (1, "a:1", True)
+    assert "OMP_NUM_THREADS" in {*given["environment"], *os.environ}
 
 
 def test_the_command_line_is_made_of_the_fields(

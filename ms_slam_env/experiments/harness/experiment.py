@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
+from ms_slam_env.parallel import one_thread_unless_set
 from ms_slam_env.report.charts import Chart
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table
@@ -69,6 +70,10 @@ class Experiment(ABC):
         Raises:
             InputError: what is wrong.
         """
+
+    def environment(self) -> Mapping[str, str]:
+        """Variables of the processes that run the rows: one thread each, unless set already."""
+        return one_thread_unless_set()
 
     @classmethod
     def title(cls) -> str:

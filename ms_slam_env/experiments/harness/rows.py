@@ -25,6 +25,10 @@ def run_all(
     out: Path,
     workers: int | None = None,
     description: str = "episodes",
+    *,
+    ray: str | None = None,
+    fresh: bool = False,
+    environment: Mapping[str, str] | None = None,
 ) -> list[Row]:
     """Run every spec once, in parallel, and return one row for each, in the order of ``specs``.
 
@@ -39,10 +43,13 @@ def run_all(
         out: folder of the results.
         workers: processes, each of one thread; None for one a core.
         description: shown at the progress bar.
+        ray: address of a Ray cluster whose workers run the specs; None: processes of this machine.
+        fresh: whether each spec has a process of its own.
+        environment: variables of the processes; None: one thread each, unless set already.
 
     Raises:
-        InputError: fewer than one worker, a folder that cannot be made, or a file of results
-            that cannot be read.
+        InputError: fewer than one worker, no Ray or no cluster at the address, a folder that cannot
+            be made, or a file of results that cannot be read.
     """
     if workers is not None and workers < 1:
         raise InputError(f"workers = {workers} must be at least 1")
@@ -73,7 +80,8 @@ def run_all(
                     name = name_of[row["key"]]
                     bar.write(f"failed: {name}: {row['error']}", file=sys.stderr)
 
-            with open_pool(run, workers, environment=one_thread_unless_set()) as pool:
+            variables = one_thread_unless_set() if environment is None else environment
+            with open_pool(run, workers, ray, environment=variables, fresh=fresh) as pool:
                 for outcome in run_each(pool, todo):
                     finish(_row(outcome, todo[outcome.key]))
     return [rows[key] for key in keys]

@@ -27,16 +27,19 @@ class Outcome:
     failures: Sequence[str]
 
 
-def run_experiment(experiment: Experiment, out: Path, workers: int | None = None) -> Outcome:
+def run_experiment(
+    experiment: Experiment, out: Path, workers: int | None = None, ray: str | None = None
+) -> Outcome:
     """Run the rows that ``out`` does not hold yet; write ``results.json``, ``table.md``, figures.
 
     Args:
         experiment: with its options.
         out: folder of the results; finished rows stand there at once, in ``rows.jsonl``.
         workers: processes; None for the experiment's own default.
+        ray: address of a Ray cluster whose workers run the rows; None: processes of this machine.
 
     Raises:
-        InputError: options that no row could be run with.
+        InputError: options that no row could be run with, or no cluster at the address.
         RuntimeError: every row failed; the files of an earlier run are left as they are.
     """
     specs = experiment.specs()
@@ -47,6 +50,9 @@ def run_experiment(experiment: Experiment, out: Path, workers: int | None = None
         out,
         experiment.workers if workers is None else workers,
         experiment.unit,
+        ray=ray,
+        fresh=experiment.fresh_process,
+        environment=experiment.environment(),
     )
     check_any_finished(rows)
     return Outcome(write_all(experiment, rows, out), failures(rows))
