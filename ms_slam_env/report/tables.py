@@ -167,6 +167,23 @@ def grouped(rows: Iterable[Row], by: Sequence[str]) -> dict[tuple[Any, ...], lis
     return groups
 
 
+def complete_cases(rows: Iterable[Row], case: Sequence[str], compared: str) -> list[Row]:
+    """Finished rows of the cases that everything compared has finished.
+
+    Args:
+        rows: of an experiment.
+        case: fields of the specification that make a case, as scene and seed.
+        compared: field whose values are compared in each case.
+    """
+    done = finished(rows)
+    found: dict[tuple[Any, ...], set[Any]] = {}
+    for row in done:
+        case_of = tuple(row["spec"][name] for name in case)
+        found.setdefault(case_of, set()).add(row["spec"][compared])
+    every = set().union(*found.values())
+    return [row for row in done if found[tuple(row["spec"][name] for name in case)] == every]
+
+
 def summary(results: Iterable[Row], key: str) -> Interval:
     """Median, of flags the share, of a metric with its 95 % interval; NaN without values."""
     values = [result[key] for result in results if result.get(key) is not None]

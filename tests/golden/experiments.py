@@ -183,8 +183,8 @@ def planner_benchmark(_: Path) -> Any:
     return {planner: _episode(planner) for planner in ("random", "greedy", "max-information")}
 
 
-@experiment("table_two")
-def table_two(_: Path) -> Any:
+@experiment("paper_table2")
+def paper_table2(_: Path) -> Any:
     return {planner: _episode(planner, FIXED_TRANSLATION) for planner in ("random", "greedy")}
 
 

@@ -1,0 +1,157 @@
+"""What SLAM's pose costs against the arm's kinematics and against the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from ms_slam_env.env.pose_sources import POSE_SOURCES
+from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.experiments.harness.episodes import (
+    DEFAULT_STEP_DEG,
+    DEFAULT_STEP_M,
+    EpisodeSpec,
+    check_episodes,
+    check_names,
+    parse_options,
+    run_episode,
+    seed_list,
+)
+from ms_slam_env.experiments.harness.experiment import Experiment
+from ms_slam_env.report.charts import Chart, by_group
+from ms_slam_env.report.records import Row
+from ms_slam_env.report.statistics import Interval, relative_cut
+from ms_slam_env.report.tables import Grouping, Table, complete_cases, grouped, make_table
+
+REFERENCE = "slam"
+"""The source that the others are compared with, episode by episode."""
+METRICS = ("ate_m", "ate_unaligned_m", "rpe_m", "f_score_2cm", "f_score_5cm", "rcm", "lost")
+EVERYWHERE = "all"
+_DIGITS = 9  # nanometres: what is left of zero after an alignment
+
+
+@dataclass(frozen=True)
+class PoseSourceExperiment(Experiment):
+    """The same episodes with the pose from SLAM, kinematics, both, and the truth
+
+    What the estimate of the pose costs the map, and the planner that looks at it.
+    """
+
+    sources: tuple[str, ...] = tuple(POSE_SOURCES)
+    """Sources of the pose."""
+    planners: tuple[str, ...] = ("random", "greedy")
+    """Planners, options appended as in greedy,rho_I=0.3."""
+    scenes: tuple[str, ...] = ("living_room", "table", "wall", "carpet")
+    """Names of scenes, or mesh files."""
+    episodes: int = 5
+    """Seeds for each scene."""
+    steps: int = 60
+    """Length of an episode."""
+    step_m: float = DEFAULT_STEP_M
+    """Translation of a motion, metres."""
+    step_deg: float = DEFAULT_STEP_DEG
+    """Rotation of a motion, degrees."""
+    env_id: str = "MSActiveSLAM-v0"
+    """The environment."""
+    seeds: str = "test"
+    """Split that the seeds come from."""
+    options: tuple[str, ...] = ()
+    """Options of the environment, as in arm.frames_per_action=1."""
+
+    unit = rows_key = "episodes"
+    run = staticmethod(run_episode)
+
+    def __post_init__(self) -> None:
+        """Refuse unknown or repeated sources."""
+        if not self.sources or len(set(self.sources)) < len(self.sources):
+            raise InputError(f"sources {', '.join(self.sources)!r} must be different, at least one")
+        for source in self.sources:
+            if source not in POSE_SOURCES:
+                raise unknown("source of the pose", source, POSE_SOURCES)
+
+    def specs(self) -> list[EpisodeSpec]:
+        """Every episode; those of one scene and seed are neighbours and share its geometry."""
+        check_names(self.planners, self.scenes)
+        options = parse_options(self.options)
+        if "pose" in options:
+            raise InputError("option 'pose' is not free: the benchmark sets it")
+        return [
+            EpisodeSpec(
+                planner,
+                scene,
+                seed,
+                self.env_id,
+                steps=self.steps,
+                step_m=self.step_m,
+                step_deg=self.step_deg,
+                options={**options, "pose": source},
+            )
+            for scene in self.scenes
+            for seed in seed_list(self.seeds, self.episodes)
+            for planner in self.planners
+            for source in self.sources
+        ]
+
+    def prepare(self) -> None:
+        """Start one episode of each planner and source."""
+        check_episodes(self.specs())
+
+    def tables(self, rows: Sequence[Row]) -> list[Table]:
+        """One line a scene (last all together), planner and source."""
+        common = compared(rows)
+        everywhere = [{**r, "spec": {**r["spec"], "scene": EVERYWHERE}} for r in common]
+        by_scene = sorted(common, key=lambda row: self.scenes.index(row["spec"]["scene"]))
+        every = by_scene + everywhere
+        fields = ("scene", "planner", "pose_source")
+        medians = Grouping(fields, METRICS, count="episodes").table(every)
+        results = grouped(every, fields)
+        lines: list[dict[str, Any]] = []
+        for line in medians.rows:
+            scene, planner, source = (line[name] for name in fields)
+            episodes = results[scene, planner, source]
+            reference = results.get((scene, planner, REFERENCE), [])
+            lines.append({**line, "ate_ratio": _ratio(episodes, reference)})
+        note = (
+            "Medians (of losses: the share) with 95 % intervals, over the episodes that every "
+            f"source finished; pose source {REFERENCE} is the unit of the ATE ratio."
+        )
+        return [make_table([*medians.columns, "ate_ratio"], lines, note=note)]
+
+    def charts(self, rows: Sequence[Row]) -> list[Chart]:
+        """Errors and the map's F-score of every episode, by source."""
+        panels = by_group(
+            compared(rows), "pose_source", ("ate_unaligned_m", "rpe_m", "f_score_2cm")
+        )
+        caption = "Small dots: episodes. Large mark and bar: median and its 95 % interval."
+        return [Chart("pose_sources", "Measures by source of the pose", caption, panels)]
+
+
+def compared(rows: Sequence[Row]) -> list[Row]:
+    """Rows of the episodes that every source finished, the source as ``pose_source`` in the spec.
+
+    Numbers of single episodes are rounded to nanometres, so that none is a rounding error.
+    """
+    named = [
+        {**row, "spec": {**row["spec"], "pose_source": row["spec"]["options"]["pose"]}}
+        for row in rows
+    ]
+    common = complete_cases(named, ("planner", "scene", "seed"), "pose_source")
+    return [
+        {**row, "result": {key: _rounded(row["result"][key]) for key in METRICS}}
+        for row in sorted(common, key=lambda row: (row["spec"]["scene"], row["spec"]["seed"]))
+    ]
+
+
+def _rounded(value: float | bool) -> float | bool:
+    return value if isinstance(value, bool) else round(value, _DIGITS)
+
+
+def _ratio(
+    episodes: Sequence[Mapping[str, Any]], reference: Sequence[Mapping[str, Any]]
+) -> Interval | None:
+    """Median ATE in units of the reference's, of the same episodes."""
+    if not reference:
+        return None
+    cut = relative_cut([e["ate_m"] for e in episodes], [e["ate_m"] for e in reference])
+    return Interval(1 - cut.value, 1 - cut.high, 1 - cut.low)
