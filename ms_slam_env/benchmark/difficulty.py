@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 from ms_slam_env.benchmark import difficulty_report as report
 from ms_slam_env.benchmark.difficulty_report import RECORDING
 from ms_slam_env.benchmark.image_motion import MOTIONS, contrast, frame_motion
-from ms_slam_env.benchmark.sequence_divergence import consecutive_divergences
 from ms_slam_env.camera import XTION_SIZES, Intrinsics, RGBDFrame
 from ms_slam_env.command_line import exit_code, parse, report_failures
 from ms_slam_env.config import check_range
 from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.evaluation.sequence_divergence import consecutive_divergences
 from ms_slam_env.experiments.harness.rows import check_any_finished, failures, run_all
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import write_json

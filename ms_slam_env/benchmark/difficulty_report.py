@@ -13,7 +13,7 @@ from scipy.stats import spearmanr
 
 from ms_slam_env.benchmark import figures
 from ms_slam_env.benchmark.image_motion import MOTIONS
-from ms_slam_env.benchmark.sequence_divergence import KINDS, statistics_of
+from ms_slam_env.evaluation.sequence_divergence import KINDS, statistics_of
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import format_number, markdown_table
 

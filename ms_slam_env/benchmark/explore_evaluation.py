@@ -13,13 +13,13 @@ import numpy as np
 from ms_slam_env import metrics, slam
 from ms_slam_env.benchmark import compare_inputs
 from ms_slam_env.benchmark.compare_inputs import Input
-from ms_slam_env.benchmark.sequence_divergence import consecutive_divergences
 from ms_slam_env.camera import XTION_SIZES
 from ms_slam_env.config import check_choice, check_range
 from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.evaluation.map_quality import map_quality
 from ms_slam_env.evaluation.run_sequence import run_sequence
+from ms_slam_env.evaluation.sequence_divergence import consecutive_divergences
 from ms_slam_env.exploration.objectives import FAILURE
 from ms_slam_env.metrics.cost import CostMeter
 from ms_slam_env.parallel import limited_threads

@@ -36,24 +36,17 @@ class Arguments:
 def main(arguments: Sequence[str]) -> int:
     """Measure, write and print the table."""
     args = parse(Arguments, arguments, "ms-slam divergence")
-    from ms_slam_env.benchmark import sequence_divergence as measure
     from ms_slam_env.divergence import DivergenceConfig
     from ms_slam_env.errors import InputError
-    from ms_slam_env.report.provenance import provenance
-    from ms_slam_env.report.records import write_json
+    from ms_slam_env.evaluation.sequence_divergence import sequence_divergence, write_divergences
     from ms_slam_env.sequences import open_sequence
 
     if not args.sequences:
         raise InputError("no sequence given")
     config = DivergenceConfig.paper() if args.paper else DivergenceConfig()
     opened = [open_sequence(name, args.image_size, layout=args.layout) for name in args.sequences]
-    measured = [measure.sequence_divergence(one, config, args.every) for one in opened]
+    measured = [sequence_divergence(one, config, args.every) for one in opened]
     settings = {"divergence": asdict(config), "image_size": args.image_size, "every": args.every}
-    sequences = measure.content(measured)
-    write_json(args.out / "divergence.json", {**provenance(), **settings, "sequences": sequences})
-    text = measure.table(measured)
-    (args.out / "table.md").write_text(text, encoding="utf-8")
-    measure.save_figure(measured, args.out / "divergence.png")
-    print(text)
+    print(write_divergences(measured, settings, args.out).as_markdown())
     print(f"written: {args.out}/divergence.json, table.md, divergence.png", file=sys.stderr)
     return 0

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from ms_slam_env.command_line import parse
 from ms_slam_env.errors import InputError
+
+if TYPE_CHECKING:
+    from ms_slam_env.evaluation.map_files import MapOptions
+    from ms_slam_env.evaluation.trajectory_files import TrajectoryOptions
 
 
 @dataclass(frozen=True)
@@ -19,7 +23,7 @@ class Arguments:
 
     Trajectories are TUM files: timestamp tx ty tz qx qy qz qw, camera to world. Maps are PLY files
     (or what else trimesh reads): clouds as they are, meshes sampled. With --out, writes
-    evaluation.json, table.md, trajectory.png and map.png, and the poses that correspond, aligned,
+    evaluation.json, table.md and figures, and the poses that correspond, aligned,
     as evaluation.estimate.txt and evaluation.truth.txt.
     """
 
@@ -86,40 +90,26 @@ def main(arguments: Sequence[str]) -> int:
         raise InputError(
             "Missing files: ESTIMATE GROUNDTRUTH, or --map ESTIMATE --true-map GROUNDTRUTH"
         )
-    from ms_slam_env.report.provenance import provenance
-    from ms_slam_env.report.records import write_json
+    from ms_slam_env.evaluation import evaluation_report as report
 
-    result: dict[str, Any] = {}
-    parts: list[str] = []
     # Nothing is written before everything has been measured: bad input leaves no half of a result.
-    writers = []
-    if args.estimate is not None:
-        writers.append(_trajectories(args, result, parts))
-    if args.map is not None:
-        writers.append(_maps(args, result, parts))
+    parts = []
+    if args.estimate is not None and args.groundtruth is not None:
+        options = _trajectory_options(args)
+        parts.append(report.evaluate_trajectories(args.estimate, args.groundtruth, options))
+        print(parts[-1].summary)
+    if args.map is not None and args.true_map is not None:
+        parts.append(report.evaluate_map_files(args.map, args.true_map, _map_options(args)))
+        print(parts[-1].summary)
     if args.out is not None:
-        for write in writers:
-            write(args.out)
-        write_json(args.out / "evaluation.json", {**result, "provenance": provenance()})
-        (args.out / "table.md").write_text("\n".join(parts), encoding="utf-8")
+        report.write_evaluation(parts, args.out)
     return 0
 
 
-def _trajectories(
-    args: Arguments, result: dict[str, Any], parts: list[str]
-) -> Callable[[Path], object]:
-    """Measure and print; return what writes figure and poses into a folder."""
-    from ms_slam_env.benchmark import trajectory_evaluation_report as report
-    from ms_slam_env.benchmark.trajectory_evaluation import (
-        TrajectoryOptions,
-        match_files,
-        measure_matched,
-    )
-    from ms_slam_env.sequences import write_trajectory
+def _trajectory_options(args: Arguments) -> TrajectoryOptions:
+    from ms_slam_env.evaluation.trajectory_files import TrajectoryOptions
 
-    assert args.estimate is not None
-    assert args.groundtruth is not None
-    options = TrajectoryOptions(
+    return TrajectoryOptions(
         align=args.align,
         delta=args.delta,
         delta_unit=args.delta_unit,
@@ -131,28 +121,12 @@ def _trajectories(
         gap_s=args.gap_s,
         frames=None if args.frames is None else str(args.frames),
     )
-    matched = match_files(args.estimate, args.groundtruth, options)
-    result.update(measure_matched(args.estimate, args.groundtruth, matched, options))
-    parts.append(report.tables(result))
-    print(report.summary(result))
-
-    def write(out: Path) -> None:
-        report.save_figure(matched, out / "trajectory.png")
-        for name, poses in (("estimate", matched.estimate), ("truth", matched.truth)):
-            # A name of its own: the folder may be that of the files that are compared.
-            write_trajectory(out / f"evaluation.{name}.txt", matched.times, poses)
-
-    return write
 
 
-def _maps(args: Arguments, result: dict[str, Any], parts: list[str]) -> Callable[[Path], object]:
-    """Measure and print; return what writes the figure into a folder."""
-    from ms_slam_env.benchmark import map_evaluation_report as report
-    from ms_slam_env.benchmark.map_evaluation import MapOptions, evaluate_maps
+def _map_options(args: Arguments) -> MapOptions:
+    from ms_slam_env.evaluation.map_files import MapOptions
 
-    assert args.map is not None
-    assert args.true_map is not None
-    options = MapOptions(
+    return MapOptions(
         register=args.register,
         cutoff_m=args.cutoff_m,
         remove_outliers=args.remove_outliers,
@@ -162,8 +136,3 @@ def _maps(args: Arguments, result: dict[str, Any], parts: list[str]) -> Callable
         voxel_m=args.voxel_m,
         samples=args.samples,
     )
-    found, compared = evaluate_maps(args.map, args.true_map, options)
-    result.update(found)
-    parts.append(report.tables(found))
-    print(report.summary(found))
-    return lambda out: report.save_figure(compared, out / "map.png")

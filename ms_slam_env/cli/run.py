@@ -58,8 +58,8 @@ class Arguments:
 def main(arguments: Sequence[str]) -> int:
     """Run, write, and print what was measured."""
     args = parse(Arguments, arguments, "ms-slam run")
-    from ms_slam_env.benchmark.sequence_run import run_to_folder
     from ms_slam_env.config import nested_options
+    from ms_slam_env.evaluation.run_to_folder import run_to_folder
     from ms_slam_env.parallel import limit_threads
     from ms_slam_env.sequences import open_sequence
     from ms_slam_env.sequences.recording import parse_calibration

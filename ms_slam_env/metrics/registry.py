@@ -29,6 +29,22 @@ A new one is added whenever a change of algorithms changes the numbers of an exp
 """
 RESULTS_VERSION = max(RESULTS_VERSIONS)
 
+STATISTICS = {
+    "mean": "mean",
+    "median": "median",
+    "std": "standard deviation",
+    "variance": "variance",
+    "min": "smallest",
+    "max": "largest",
+}
+"""What stands for ``{statistic}`` in a key, and in the texts of its metric."""
+
+_FAMILIES = {
+    "{number}": r"(?<=_)\d+(?:\.\d+)?(?=cm$)",
+    "{statistic}": rf"(?<=_)({'|'.join(STATISTICS)})(?=_|$)",
+}
+"""Blank in a key of the registry to what may stand there."""
+
 _SCALES = {
     ("m", "mm"): 1e3,
     ("m", "cm"): 1e2,
@@ -129,7 +145,7 @@ def metric(key: str) -> Metric:
     Raises:
         InputError: an unknown key; the message names similar ones.
     """
-    found = registry().get(key) or _of_a_threshold(key)
+    found = registry().get(key) or _of_a_family(key)
     if found is None:
         similar = difflib.get_close_matches(key, registry(), n=3)
         hint = f"; similar: {', '.join(similar)}" if similar else ""
@@ -137,16 +153,21 @@ def metric(key: str) -> Metric:
     return found
 
 
-def _of_a_threshold(key: str) -> Metric | None:
-    """The metric of a key such as ``recall_3cm``, whose entry ``recall_{}cm`` has any number."""
-    number = re.search(r"_(\d+(?:\.\d+)?)cm$", key)
-    if number is None:
-        return None
-    found = registry().get(f"{key[: number.start(1)]}{{}}{key[number.end(1) :]}")
-    if found is None:
-        return None
-    texts = {name: getattr(found, name).format(number[1]) for name in ("heading", "definition")}
-    return replace(found, key=key, **texts)
+def _of_a_family(key: str) -> Metric | None:
+    """The metric of a key such as ``recall_3cm`` or ``rpe_mean_m``.
+
+    The entries ``recall_{number}cm`` and ``rpe_{statistic}_m`` stand for all of theirs.
+    """
+    for blank, pattern in _FAMILIES.items():
+        for part in re.finditer(pattern, key):
+            found = registry().get(f"{key[: part.start()]}{blank}{key[part.end() :]}")
+            if found is not None:
+                word = STATISTICS.get(part[0], part[0])
+                heading, definition = (
+                    text.replace(blank, word) for text in (found.heading, found.definition)
+                )
+                return replace(found, key=key, heading=heading, definition=definition)
+    return None
 
 
 def check_keys(result: Any) -> None:

@@ -13,8 +13,8 @@ from ms_slam_env.benchmark import difficulty
 from ms_slam_env.benchmark.difficulty import RECORDING, main
 from ms_slam_env.benchmark.difficulty_report import EASY, HARD, order, statistics
 from ms_slam_env.benchmark.image_motion import MOTIONS, contrast, frame_motion
-from ms_slam_env.benchmark.sequence_divergence import statistics_of
 from ms_slam_env.camera import RGBDFrame, xtion
+from ms_slam_env.evaluation.sequence_divergence import statistics_of
 from ms_slam_env.geometry import make_pose, so3_exp
 from ms_slam_env.sequences import write_trajectory
 

@@ -13,11 +13,11 @@ from ms_slam_env.benchmark.explore_divergence import main as divergence_main
 from ms_slam_env.benchmark.explore_evaluation import SlamEvaluator, summarise
 from ms_slam_env.benchmark.explore_grid import Grid
 from ms_slam_env.benchmark.explore_judge import judge
-from ms_slam_env.benchmark.sequence_divergence import sequence_divergence
 from ms_slam_env.camera import xtion
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.seen_surface import seen_surface
+from ms_slam_env.evaluation.sequence_divergence import sequence_divergence
 from ms_slam_env.exploration import ExplorationSettings, make_space
 from ms_slam_env.geometry import look_at
 from ms_slam_env.geometry.point_clouds import voxel_downsample

@@ -12,6 +12,7 @@ from ms_slam_env.camera import xtion
 from ms_slam_env.cli import main
 from ms_slam_env.geometry import look_at
 from ms_slam_env.metrics import ate_rmse
+from ms_slam_env.metrics.registry import RESULTS_VERSION
 from ms_slam_env.sequences import read_trajectory, render_sequence, write_trajectory
 from ms_slam_env.sequences.recording import Recording
 
@@ -60,6 +61,9 @@ def test_writes_trajectory_map_and_metrics(sequence, tmp_path, capsys):
     _, truth = read_trajectory(sequence / "groundtruth.txt")
     written = json.loads((out / "metrics.json").read_text())
     assert written["complete"]
+    assert (written["kind"], written["results_version"]) == ("run", RESULTS_VERSION)
+    assert [chart["name"] for chart in written["charts"]] == ["path", "error", "cost"]
+    assert [table["title"] for table in written["tables"]] == ["Frames and trajectory", "Cost"]
     assert (written["frames"], written["lost_frames"], len(times)) == (FRAMES, 0, FRAMES)
     assert written["ate_m"] == pytest.approx(ate_rmse(poses, truth), abs=1e-6)
     assert written["ate_m"] < 0.01
@@ -88,7 +92,7 @@ def test_a_backend_that_closes_loops_writes_the_final_poses_too(sequence, tmp_pa
     np.testing.assert_array_equal(times, first_times)
     np.testing.assert_allclose(final, first, atol=1e-6)  # no loop in eight frames
     written = json.loads((out / "metrics.json").read_text())
-    assert written["ate_m_corrected"] == pytest.approx(written["ate_m"], abs=1e-9)
+    assert written["final_ate_m"] == pytest.approx(written["ate_m"], abs=1e-9)
 
 
 def test_a_configuration_file_says_how_to_run(sequence, tmp_path):

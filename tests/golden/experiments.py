@@ -426,8 +426,8 @@ def map_consistency_check(_: Path) -> Any:
 
 @experiment("map_evaluation", EXACT)
 def map_evaluation(folder: Path) -> Any:
-    from ms_slam_env.benchmark.map_evaluation import MapOptions, evaluate_maps
-    from ms_slam_env.benchmark.point_cloud import write_ply
+    from ms_slam_env.evaluation.map_files import MapOptions, evaluate_maps
+    from ms_slam_env.evaluation.run_to_folder import write_ply
 
     rng = np.random.default_rng(0)
     truth = rng.uniform(0, 1, (4000, 3)) * (1, 1, 0.3)
@@ -544,7 +544,7 @@ def _recorded(folder: Path, frames: int) -> Any:
 
 @experiment("sequence_run")
 def sequence_run(folder: Path) -> Any:
-    from ms_slam_env.benchmark.sequence_run import run_to_folder
+    from ms_slam_env.evaluation.run_to_folder import run_to_folder
     from ms_slam_env.slam.frame_selection import parse_frame_selection
 
     recording, every_other = _recorded(folder, 12), parse_frame_selection("regular,every=2")
@@ -563,10 +563,10 @@ def sequence_run(folder: Path) -> Any:
 
 @experiment("sequence_divergence", DIVERGENCE)
 def sequence_divergence(folder: Path) -> Any:
-    from ms_slam_env.benchmark.sequence_divergence import content, sequence_divergence
+    from ms_slam_env.evaluation.sequence_divergence import as_metrics, sequence_divergence
 
     recording = _recorded(folder, 9)
-    return content([sequence_divergence(recording, every=every) for every in (1, 2)])
+    return as_metrics([sequence_divergence(recording, every=every) for every in (1, 2)])
 
 
 @experiment("difficulty", DIVERGENCE)
@@ -600,7 +600,7 @@ def difficulty(folder: Path) -> Any:
 
 @experiment("trajectory_evaluation", EXACT)
 def trajectory_evaluation(folder: Path) -> Any:
-    from ms_slam_env.benchmark.trajectory_evaluation import TrajectoryOptions, evaluate_files
+    from ms_slam_env.evaluation.trajectory_files import TrajectoryOptions, evaluate_files
     from ms_slam_env.geometry import se3_exp
     from ms_slam_env.sequences import write_trajectory
 

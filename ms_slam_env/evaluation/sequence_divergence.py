@@ -6,7 +6,7 @@ divergence, such as mean and variance, to the sequence"; "evaluated per unit of 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,16 +15,24 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from ms_slam_env.benchmark import figures
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.divergence import DivergenceConfig, make_divergence
 from ms_slam_env.errors import InputError
-from ms_slam_env.report.tables import format_number, markdown_table
+from ms_slam_env.evaluation.trajectory_charts import thinned
+from ms_slam_env.report.charts import Chart, Panel, Series
+from ms_slam_env.report.figures import save_charts
+from ms_slam_env.report.results import TABLE, Results, write_results
+from ms_slam_env.report.tables import Table, make_table
 from ms_slam_env.sequences import Sequence as RGBDSequence
 
 Float64 = NDArray[np.float64]
 
 KINDS = ("intensity", "depth")
+
+_ABOUT = (
+    "How far each frame's histogram of intensity, and of depth, diverges from that of the frame "
+    "before: a sequence of large divergence is hard to track (ICRA 2017, Table I)."
+)
 
 
 @dataclass(frozen=True)
@@ -116,60 +124,74 @@ def sequence_divergence(
     return SequenceDivergence(sequence.name, times[1:] - times[0], values, np.diff(times))
 
 
-_SHOWN = {
-    "max": "max",
-    "mean": "mean",
-    "variance": "variance",
-    "std": "std",
-    "max_per_s": "max / s",
-    "mean_per_s": "mean / s",
-    "variance_per_s": "variance / s²",
-    "std_per_s": "std / s",
-}
+# -- Results -----------------------------------------------------------------------------------
 
 
-def table(measured: Sequence[SequenceDivergence]) -> str:
-    """Markdown: one line a sequence and kind, Table I's statistics and those per second."""
-    header = ["sequence", "divergence", *_SHOWN.values(), "frames"]
-    body = []
-    for sequence in measured:
-        for kind, numbers in sequence.statistics().items():
-            cells = (numbers[name] for name in _SHOWN)
-            shown = ["-" if v is None else format_number(v, 3) for v in cells]
-            body.append([sequence.name, kind, *shown, str(len(sequence.times) + 1)])
-    return markdown_table(header, body)
-
-
-def content(measured: Sequence[SequenceDivergence]) -> list[dict[str, Any]]:
-    """Statistics and values of all sequences, for a JSON file."""
+def as_metrics(measured: Sequence[SequenceDivergence]) -> list[dict[str, Any]]:
+    """Statistics and values of all sequences, by keys of the registry."""
     return [
         {
             "sequence": sequence.name,
-            "statistics": sequence.statistics(),
-            "times_s": sequence.times.tolist(),
-            **{kind: sequence.divergences[:, k].tolist() for k, kind in enumerate(KINDS)},
+            "frames": len(sequence.times) + 1,
+            "statistics": _lines(sequence),
+            "since_start_s": sequence.times.tolist(),
+            **{f"{kind}_divergence": sequence.divergences[:, k].tolist()
+               for k, kind in enumerate(KINDS)},
         }
         for sequence in measured
+    ]  # fmt: skip
+
+
+def table(measured: Sequence[SequenceDivergence]) -> Table:
+    """One line a sequence and kind, Table I's statistics and those per second."""
+    lines = [
+        {"sequence": sequence.name, **line, "frames": len(sequence.times) + 1}
+        for sequence in measured
+        for line in _lines(sequence)
     ]
+    keys = [key for key in lines[0] if key not in ("sequence", "divergence", "frames")]
+    return make_table(("sequence", "divergence", *keys, "frames"), lines)
 
 
-def save_figure(measured: Sequence[SequenceDivergence], path: Path) -> Path:
+def chart(measured: Sequence[SequenceDivergence]) -> Chart:
     """The divergences over time, a line for each sequence; none of intensity without colour."""
-    known = [
-        k for k in range(len(KINDS)) if any(~np.isnan(m.divergences[:, k]).all() for m in measured)
+    panels = []
+    for k, kind in enumerate(KINDS):
+        series = []
+        for sequence in measured:
+            values = sequence.divergences[:, k]
+            if not np.isnan(values).all():
+                picked = thinned(len(values))
+                series.append(Series(sequence.name, sequence.times[picked].tolist(),
+                                     values[picked].tolist(), mode="lines"))  # fmt: skip
+        if series:
+            panels.append(Panel("since_start_s", f"{kind}_divergence", series))
+    return Chart("divergence", "Divergence over time", "From frame to frame.", panels)
+
+
+def _lines(sequence: SequenceDivergence) -> list[dict[str, Any]]:
+    """The statistics of each kind, by keys of the registry."""
+    return [
+        {"divergence": kind, **{f"divergence_{name}": value for name, value in numbers.items()}}
+        for kind, numbers in sequence.statistics().items()
     ]
-    figure = figures.new_figure(len(known), 4.6)
-    axes = figure.subplots(1, len(known), squeeze=False)[0]
-    for column, ax in zip(known, axes, strict=True):
-        for index, sequence in enumerate(measured):
-            ax.plot(
-                sequence.times,
-                sequence.divergences[:, column],
-                color=figures.colour(index),
-                linewidth=0.8,
-                label=sequence.name,
-            )
-        ax.set(xlabel="time [s]", ylabel=f"{KINDS[column]} divergence [nats]")
-        ax.grid(alpha=0.3)
-    figures.legend_beside(figure, axes[0])
-    return figures.save(figure, path)
+
+
+def write_divergences(
+    measured: Sequence[SequenceDivergence], settings: Mapping[str, Any], out: Path
+) -> Results:
+    """Write ``divergence.json``, ``table.md`` and ``divergence.png`` into folder ``out``."""
+    shown = chart(measured)
+    results = write_results(
+        out / "divergence.json",
+        kind="divergence",
+        title="How hard sequences are",
+        about=_ABOUT,
+        tables=[table(measured)],
+        charts=[shown],
+        content=settings,
+        metrics={"sequences": as_metrics(measured)},
+    )
+    (out / TABLE).write_text(results.as_markdown(), encoding="utf-8")
+    save_charts([shown], out)
+    return results

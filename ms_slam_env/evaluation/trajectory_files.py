@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+import csv
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import metrics
-from ms_slam_env.benchmark.frame_records import lost_times
-from ms_slam_env.config import check_choice, check_range
+from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.errors import InputError
 from ms_slam_env.metrics.absolute import ALIGNMENTS
 from ms_slam_env.metrics.relative import DELTA_UNITS, PAIRINGS, TOLERANCE
@@ -21,10 +22,13 @@ from ms_slam_env.sequences import associate, read_trajectory
 Float64 = NDArray[np.float64]
 
 _GAP_INTERVALS = 3.0
+_FRAME_COLUMNS = ("timestamp", "tracking_ok")
+_ALIGNED = {"se3": "ate", "sim3": "ate_sim3", "none": "ate_unaligned"}
+"""Metric of the absolute error by alignment."""
 
 
 @dataclass(frozen=True)
-class TrajectoryOptions:
+class TrajectoryOptions(Checked):
     """How two trajectories are compared.
 
     Attributes:
@@ -43,27 +47,20 @@ class TrajectoryOptions:
             it writes too, are left out, and there is a gap wherever one was.
     """
 
-    align: str = "se3"
+    align: str = chosen("se3", *ALIGNMENTS)
     delta: float = 1
-    delta_unit: str = "frames"
-    pairs: str = "all"
-    tolerance: float = TOLERANCE
-    segments: int = 1
+    delta_unit: str = chosen("frames", *DELTA_UNITS)
+    pairs: str = chosen("all", *PAIRINGS)
+    tolerance: float = bounded(TOLERANCE, 0.0, 1.0)
+    segments: int = bounded(1, 1, 1_000_000)
     segment_lengths_m: Sequence[float] | None = None
-    max_difference_s: float = 0.02
-    gap_s: float | None = None
+    max_difference_s: float = bounded(0.02, 0.0, 1e9)
+    gap_s: float | None = bounded(None, 0.0, 1e9)
     frames: str | None = None
 
     def __post_init__(self) -> None:
         """Refuse what cannot be."""
-        check_choice(self, "align", ALIGNMENTS)
-        check_choice(self, "delta_unit", DELTA_UNITS)
-        check_choice(self, "pairs", PAIRINGS)
-        check_range(self, "tolerance", 0.0, 1.0)
-        check_range(self, "segments", 1, 1_000_000)
-        check_range(self, "max_difference_s", 0.0, 1e9)
-        if self.gap_s is not None:
-            check_range(self, "gap_s", 0.0, 1e9)
+        super().__post_init__()
         if self.delta_unit == "frames" and float(self.delta).is_integer():
             object.__setattr__(self, "delta", int(self.delta))
 
@@ -152,69 +149,94 @@ def _tracked(
     return times[kept], poses[kept], np.diff(index, prepend=index[0] - 1) > 1
 
 
+def lost_times(path: Path) -> Float64:
+    """Timestamps (K,) of the frames that were not tracked, from ``frames.csv`` of ``ms-slam run``.
+
+    Raises:
+        InputError: a file that cannot be read, or of another form; the message names file and line.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read frames {path}: {error}") from None
+    reader = csv.DictReader(text.splitlines())
+    if not set(_FRAME_COLUMNS) <= set(reader.fieldnames or ()):
+        raise InputError(f"{path}, line 1: expected columns {', '.join(_FRAME_COLUMNS)}")
+    lost = []
+    for row in reader:
+        try:
+            timestamp, ok = float(row["timestamp"]), {"0": False, "1": True}[row["tracking_ok"]]
+        except (TypeError, ValueError, KeyError):
+            raise InputError(
+                f"{path}, line {reader.line_num}: expected a timestamp and tracking_ok 0 or 1"
+            ) from None
+        if not ok:
+            lost.append(timestamp)
+    return np.array(lost)
+
+
 def evaluate_files(
     estimate: Path, truth: Path, options: TrajectoryOptions | None = None
 ) -> dict[str, Any]:
     """Compare TUM file ``estimate`` with TUM file ``truth``, both T_world_camera.
 
     Returns:
-        the options, the number of ``poses`` that correspond and of ``unmatched_poses`` of the
-        estimate, and as statistics (rmse, mean, median, std, min, max) ``ate_m``, ``ate_rad`` (None
-        where the path is a line), ``rpe_m`` and ``rpe_rad``; ``scale`` of the alignment,
-        ``path_m``, ``duration_s``, ``segments`` (the same statistics by piece), ``drift`` (by
-        length of path), ``robustness`` (USME equations 9 and 10 over gaps in time) and
-        ``initialisation`` (12 and 13).
+        the metrics of `measure_matched`.
 
     Raises:
         InputError: as `match_files`; no two poses ``delta`` apart; more segments than poses.
     """
     options = options or TrajectoryOptions()
-    return measure_matched(estimate, truth, match_files(estimate, truth, options), options)
+    return measure_matched(match_files(estimate, truth, options), options)
 
 
-def measure_matched(
-    estimate: Path, truth: Path, matched: Matched, options: TrajectoryOptions
-) -> dict[str, Any]:
-    """`evaluate_files` of poses that are already matched."""
-    ate_m, ate_rad = absolute(matched)
+def measure_matched(matched: Matched, options: TrajectoryOptions) -> dict[str, Any]:
+    """The measures of poses that correspond, by keys of the registry.
+
+    Returns:
+        ``poses`` and ``unmatched_poses`` of the estimate; ``ate_m`` (RMSE),
+        ``ate_mean_m``, ``ate_median_m``, ``ate_std_m``, ``ate_min_m``, ``ate_max_m``, and the same
+        of ``ate_rad`` (None where the path is a line), ``rpe_m`` and ``rpe_rad``; with another
+        alignment than SE(3) ``ate_sim3_m`` or ``ate_unaligned_m`` in the place of ``ate_m``;
+        ``scale`` of the alignment, ``path_m``, ``duration_s``, ``pieces`` (the same statistics by
+        piece), ``drift_by_length`` (of sub-trajectories), robustness (USME equations 9 and 10 over
+        gaps in time) and initialisation (12 and 13).
+
+    Raises:
+        InputError: no two poses ``delta`` apart; more segments than poses.
+    """
     count = len(matched.times)
-    result = {
-        "estimate": str(estimate),
-        "truth": str(truth),
-        **asdict(options),
+    return {
         "poses": count,
         "unmatched_poses": matched.unmatched,
         "scale": matched.alignment.scale,
         "path_m": metrics.path_length(matched.truth),
         "estimate_path_m": metrics.path_length(matched.raw),
         "duration_s": float(matched.times[-1] - matched.times[0]),
-        "ate_m": _statistics(ate_m),
-        "ate_rad": None if ate_rad is None else _statistics(ate_rad),
+        **_absolute_statistics(matched, slice(None), options),
         **_relative(matched, slice(None), options),
+        "pieces": [
+            {
+                "start_s": float(matched.times[first] - matched.times[0]),
+                "end_s": float(matched.times[end - 1] - matched.times[0]),
+                "poses": int(end - first),
+                **_absolute_statistics(matched, slice(first, end), options),
+                **_relative_or_none(matched, slice(first, end), options),
+            }
+            for first, end in metrics.equal_pieces(count, options.segments)
+        ],
+        "drift_by_length": [
+            {
+                "length_m": drift.length_m,
+                "sub_trajectories": drift.segments,
+                **_named("drift_translation", drift.translation),
+                **_named("drift_rotation_deg_m", drift.rotation_rad_m, np.degrees),
+            }
+            for drift in metrics.drifts(matched.estimate, matched.truth, options.segment_lengths_m)
+        ],
+        **_robustness(matched, options),
+        **_initialisation(matched, options),
     }
-    result["segments"] = [
-        {
-            "start_s": float(matched.times[first] - matched.times[0]),
-            "end_s": float(matched.times[end - 1] - matched.times[0]),
-            "poses": int(end - first),
-            "ate_m": _statistics(ate_m[first:end]),
-            "ate_rad": None if ate_rad is None else _statistics(ate_rad[first:end]),
-            **_relative_or_none(matched, slice(first, end), options),
-        }
-        for first, end in metrics.equal_pieces(count, options.segments)
-    ]
-    result["drift"] = [
-        {
-            "length_m": drift.length_m,
-            "segments": drift.segments,
-            "translation_percent": {k: 100 * v for k, v in asdict(drift.translation).items()},
-            "rotation_deg_m": {k: np.degrees(v) for k, v in asdict(drift.rotation_rad_m).items()},
-        }
-        for drift in metrics.drifts(matched.estimate, matched.truth, options.segment_lengths_m)
-    ]
-    result["robustness"] = _robustness(matched, options)
-    result["initialisation"] = _initialisation(matched, options)
-    return result
 
 
 def absolute(matched: Matched) -> tuple[Float64, Float64 | None]:
@@ -225,12 +247,49 @@ def absolute(matched: Matched) -> tuple[Float64, Float64 | None]:
     return ate_m, metrics.absolute_errors(matched.estimate, matched.truth, "none", "rotation")
 
 
+def statistic_keys(key: str) -> tuple[str, ...]:
+    """Keys of the statistics of an error in the order of `ErrorStatistics`.
+
+    ``ate_m`` itself is the root mean square, ``ate_mean_m`` the mean, and so on.
+    """
+    name, unit = re.fullmatch(r"(.*?)((?:_m|_rad|_deg_m)?)", key).groups()  # type: ignore[union-attr]
+    others = (field.name for field in fields(metrics.ErrorStatistics) if field.name != "rmse")
+    return (key, *(f"{name}_{statistic}{unit}" for statistic in others))
+
+
+def _named(
+    key: str, statistics: metrics.ErrorStatistics, convert: Callable[[float], float] = float
+) -> dict[str, float]:
+    """Statistics by key."""
+    values = asdict(statistics).values()
+    return {of: float(convert(v)) for of, v in zip(statistic_keys(key), values, strict=True)}
+
+
+def absolute_key(align: str, unit: str) -> str:
+    """Key of the absolute error: ``ate_m``, ``ate_sim3_m`` or ``ate_unaligned_m``; ``unit`` m, rad.
+
+    One key means one alignment.
+    """
+    return f"{_ALIGNED[align]}_{unit}"
+
+
+def _absolute_statistics(
+    matched: Matched, part: slice, options: TrajectoryOptions
+) -> dict[str, float | None]:
+    found: dict[str, float | None] = {}
+    for unit, errors in zip(("m", "rad"), absolute(matched), strict=True):
+        key = absolute_key(options.align, unit)
+        found |= {key: None} if errors is None else _named(key, metrics.statistics_of(errors[part]))
+    return found
+
+
 def _relative(matched: Matched, part: slice, options: TrajectoryOptions) -> dict[str, Any]:
     P, Q, times = matched.estimate[part], matched.truth[part], matched.times[part]
-    return {
-        name: _statistics(metrics.relative_errors(P, Q, kind=kind, times=times, **options.relative))
-        for name, kind in (("rpe_m", "translation"), ("rpe_rad", "rotation"))
-    }
+    found: dict[str, Any] = {}
+    for key, kind in (("rpe_m", "translation"), ("rpe_rad", "rotation")):
+        errors = metrics.relative_errors(P, Q, kind=kind, times=times, **options.relative)
+        found |= _named(key, metrics.statistics_of(errors))
+    return found
 
 
 def _relative_or_none(matched: Matched, part: slice, options: TrajectoryOptions) -> dict[str, Any]:
@@ -249,36 +308,33 @@ def _robustness(matched: Matched, options: TrajectoryOptions) -> dict[str, Any]:
     # A gap stands as one untracked frame between the pieces.
     rows = np.insert(np.arange(len(matched.piece)), breaks, -1)
     align = "sim3" if options.align == "sim3" else "se3"
+    gaps = {
+        "gaps": len(matched.gaps),
+        "lost_s": lost_s,
+        "lost_time_share": lost_s / duration if duration > 0 else 0.0,
+    }
     try:
         found = metrics.tracking_robustness(
             matched.raw[rows], matched.truth[rows], rows >= 0, align
         )
-        parts = {
-            "error": found.error,
-            "translation_m": found.translation_m,
-            "rotation_rad": found.rotation_rad,
-            "log_scale": found.log_scale,
-            "pieces": len(found.segments),
-            "reason": "",
-        }
     except InputError as error:
-        names = ("error", "translation_m", "rotation_rad", "log_scale")
-        parts = {**dict.fromkeys(names), "pieces": 0, "reason": str(error)}
+        return {"robustness": None, "robustness_reason": str(error), "tracked_pieces": 0, **gaps}
     return {
-        **parts,
-        "gaps": len(matched.gaps),
-        "lost_s": lost_s,
-        "lost_share": lost_s / duration if duration > 0 else 0.0,
+        "robustness": found.error,
+        "robustness_translation_m": found.translation_m,
+        "robustness_rotation_rad": found.rotation_rad,
+        "robustness_log_scale": found.log_scale,
+        "tracked_pieces": len(found.segments),
+        **gaps,
     }
 
 
 def _initialisation(matched: Matched, options: TrajectoryOptions) -> dict[str, Any]:
     """When the scale has settled, and how right it is, USME equations (12) and (13)."""
     known = None if options.align == "sim3" else 1.0
-    return asdict(
-        metrics.initialisation(matched.times, matched.raw, matched.truth, global_scale=known)
-    )
-
-
-def _statistics(errors: Float64) -> dict[str, float]:
-    return asdict(metrics.statistics_of(errors))
+    found = metrics.initialisation(matched.times, matched.raw, matched.truth, global_scale=known)
+    return {
+        "initialisation_s": found.time_s,
+        "initialisation_scale": found.scale,
+        "scale_error": found.scale_error,
+    }

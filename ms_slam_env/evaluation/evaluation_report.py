@@ -1,0 +1,291 @@
+"""``ms-slam evaluate``: trajectories and maps compared, as text, JSON, tables and figures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.evaluation.map_files import MEASURES, MapOptions, evaluate_maps
+from ms_slam_env.evaluation.map_quality import ComparedMap, share_keys
+from ms_slam_env.evaluation.trajectory_charts import error_panel, path_panel
+from ms_slam_env.evaluation.trajectory_files import (
+    Matched,
+    TrajectoryOptions,
+    absolute,
+    absolute_key,
+    match_files,
+    measure_matched,
+    statistic_keys,
+)
+from ms_slam_env.metrics.registry import metric
+from ms_slam_env.report import figures
+from ms_slam_env.report.charts import Chart, Panel, Series
+from ms_slam_env.report.results import TABLE, write_results
+from ms_slam_env.report.tables import Column, Table, format_value, make_table
+from ms_slam_env.sequences import write_trajectory
+
+Float64 = NDArray[np.float64]
+Found = Mapping[str, Any]
+
+EVALUATION = "evaluation.json"
+_ABOUT = (
+    "Trajectories: absolute error (ATE) after alignment and relative error (RPE) of the motion "
+    "between two poses. Maps: distances between points of the map and of the true surface."
+)
+_ROBUSTNESS = (
+    *("gaps", "lost_s", "lost_time_share", "tracked_pieces", "robustness"),
+    *("robustness_translation_m", "robustness_rotation_rad", "robustness_log_scale"),
+    *("initialisation_s", "initialisation_scale", "scale_error"),
+)
+_STATISTICS = ("rmse", "mean", "median", "std", "min", "max")
+_SHOWN_M = 0.1  # the farthest threshold of the curves of precision and recall
+_MAX_DOTS = 40_000
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A comparison with the truth.
+
+    Attributes:
+        found: metrics by key.
+        config: the files and the options.
+        summary: lines for a terminal.
+        tables: of the metrics.
+        charts: the same.
+        write: writes what else belongs into a folder.
+    """
+
+    found: Found
+    config: Mapping[str, Any]
+    summary: str
+    tables: Sequence[Table]
+    charts: Sequence[Chart]
+    write: Callable[[Path], object]
+
+
+def write_evaluation(parts: Sequence[Evaluation], out: Path) -> None:
+    """Write ``evaluation.json``, ``table.md``, figures and files of all parts into ``out``."""
+    charts = [chart for part in parts for chart in part.charts]
+    results = write_results(
+        out / EVALUATION,
+        kind="evaluation",
+        title="Estimate against the truth",
+        about=_ABOUT,
+        tables=[table for part in parts for table in part.tables],
+        charts=charts,
+        content={"config": {key: value for part in parts for key, value in part.config.items()}},
+        metrics={key: value for part in parts for key, value in part.found.items()},
+    )
+    (out / TABLE).write_text(results.as_markdown(), encoding="utf-8")
+    figures.save_charts(charts, out)
+    for part in parts:
+        part.write(out)
+
+
+# -- Trajectories ------------------------------------------------------------------------------
+
+
+def evaluate_trajectories(estimate: Path, truth: Path, options: TrajectoryOptions) -> Evaluation:
+    """Compare two TUM files; errors are those of `match_files` and `measure_matched`."""
+    matched = match_files(estimate, truth, options)
+    found = measure_matched(matched, options)
+
+    def write(out: Path) -> None:
+        for name, poses in (("estimate", matched.estimate), ("truth", matched.truth)):
+            # A name of its own: the folder may be that of the files that are compared.
+            write_trajectory(out / f"evaluation.{name}.txt", matched.times, poses)
+
+    return Evaluation(
+        found,
+        {"estimate": str(estimate), "truth": str(truth), **asdict(options)},
+        trajectory_summary(found, options),
+        trajectory_tables(found, options),
+        trajectory_charts(matched, options),
+        write,
+    )
+
+
+def trajectory_summary(found: Found, options: TrajectoryOptions) -> str:
+    """Lines for a terminal."""
+    unit = "" if options.delta_unit == "frames" else f" {options.delta_unit}"
+    lines = [
+        f"{found['poses']} poses, alignment {options.align}, delta {options.delta}{unit}"
+        + (f", scale {found['scale']:.6f}" if options.align == "sim3" else "")
+    ]
+    for key in _errors(options):
+        if found[key] is not None:
+            values = zip(_STATISTICS, statistic_keys(key), strict=True)
+            shown = "  ".join(f"{name} {found[of]:.6f}" for name, of in values)
+            lines.append(f"{key.split('_')[0].upper()} [{key.split('_')[-1]}]  {shown}")
+    if found["gaps"]:
+        reason = found.get("robustness_reason") or f"{found['robustness']:.6f}"
+        lines.append(f"lost in {_gaps(found)}; robustness error {reason}")
+    return "\n".join(lines)
+
+
+def trajectory_tables(found: Found, options: TrajectoryOptions) -> list[Table]:
+    """Everything that was measured."""
+    errors = _errors(options)
+    note = (
+        f"{found['poses']} poses over {found['duration_s']:.3f} s and "
+        f"{found['path_m']:.3f} m, timestamps at most {options.max_difference_s:g} s apart "
+        f"({found['unmatched_poses']} poses of the estimate have no true one); alignment "
+        f"{options.align} (scale {found['scale']:.6f}); relative errors over {options.delta} "
+        f"{options.delta_unit} ({options.pairs} pairs)."
+    )
+    statistics = [
+        {"statistic": name, **{key: found.get(statistic_keys(key)[k]) for key in errors}}
+        for k, name in enumerate(_STATISTICS)
+    ]
+    tables = [make_table(("statistic", *errors), statistics, "Errors", note)]
+    if len(found["pieces"]) > 1:
+        piece_keys = ("start_s", "end_s", "poses", *errors)
+        tables.append(make_table(piece_keys, found["pieces"], "RMSE of equal pieces"))
+    if found["drift_by_length"]:
+        drifts = [
+            Column(of, heading=f"{metric(key).heading} ({name})")
+            for key in ("drift_translation", "drift_rotation_deg_m")
+            for name, of in zip(_STATISTICS, statistic_keys(key), strict=True)
+            if name in ("mean", "median", "max")
+        ]
+        title = "Drift over lengths of the true path"
+        keys: list[Column | str] = ["length_m", "sub_trajectories", *drifts]
+        tables.append(make_table(keys, found["drift_by_length"], title))
+    shown = [key for key in _ROBUSTNESS if found.get(key) is not None]
+    note = f"{_gaps(found)}."
+    if found.get("robustness_reason"):
+        note += f" Robustness of tracking is not available: {found['robustness_reason']}."
+    if found["initialisation_s"] is None:
+        note += " The scale does not settle."
+    return [*tables, make_table(shown, [found], "Robustness and initialisation", note)]
+
+
+def trajectory_charts(matched: Matched, options: TrajectoryOptions) -> list[Chart]:
+    """Both paths, and the absolute errors over time."""
+    ate_m, ate_rad = absolute(matched)
+    paths = {
+        "truth": matched.true_path,
+        "estimate": _broken(matched.estimate[:, :3, 3], matched.piece),
+    }
+    panels = [path_panel(paths)]
+    times = matched.times - matched.times[0]
+    for key, errors in (("position_error_m", ate_m), ("orientation_error_rad", ate_rad)):
+        if errors is not None:
+            line = _broken(np.stack([times, errors], axis=1), matched.piece)
+            panels.append(error_panel(key, line[:, 0], {"estimate": line[:, 1]}))
+    caption = f"After alignment ({options.align}); lines are broken where the estimate was lost."
+    return [Chart("trajectory", "Path and error", caption, panels)]
+
+
+def _errors(options: TrajectoryOptions) -> tuple[str, ...]:
+    return (
+        *(absolute_key(options.align, unit) for unit in ("m", "rad")),
+        *("rpe_m", "rpe_rad"),
+    )
+
+
+def _broken(line: Float64, piece: NDArray[np.int64]) -> Float64:
+    """The points (N, k) of a line with NaN between pieces, so that no stroke joins them."""
+    return np.insert(line, np.flatnonzero(np.diff(piece)) + 1, np.nan, axis=0)
+
+
+def _gaps(found: Found) -> str:
+    plural = "" if found["gaps"] == 1 else "s"
+    return f"{found['gaps']} gap{plural}, {found['lost_s']:.3f} s together"
+
+
+# -- Maps --------------------------------------------------------------------------------------
+
+
+def evaluate_map_files(estimate: Path, truth: Path, options: MapOptions) -> Evaluation:
+    """Compare two maps; errors are those of `evaluate_maps`."""
+    found, compared = evaluate_maps(estimate, truth, options)
+    return Evaluation(
+        found,
+        {"map": str(estimate), "true_map": str(truth), **asdict(options)},
+        map_summary(found, options),
+        map_tables(found, options),
+        map_charts(compared),
+        lambda out: save_map_picture(compared, out / "map.png"),
+    )
+
+
+def map_summary(found: Found, options: MapOptions) -> str:
+    """Lines for a terminal."""
+    lines = [map_heading(found, options)]
+    for key in _map_keys(options):
+        lines.append(f"{metric(key).label:<32} {format_value(found[key], key)}")
+    if found["registration_share"] == 0:
+        lines.append("registration found no pairs: the map was judged where it lies")
+    return "\n".join(lines)
+
+
+def map_tables(found: Found, options: MapOptions) -> list[Table]:
+    """Shares by threshold, then all distances."""
+    shares = share_keys(options.thresholds_m)
+    others = [key for key in _map_keys(options) if key not in shares]
+    return [
+        make_table(shares, [found], "Map", map_heading(found, options)),
+        make_table(others, [found], "Distances of the map"),
+    ]
+
+
+def map_heading(found: Found, options: MapOptions) -> str:
+    """What was compared."""
+    removed = ", outliers removed" if options.remove_outliers else ""
+    return (
+        f"{found['compared_points']} map points ({found['map_kind']}) against "
+        f"{found['compared_true_points']} true points ({found['true_map_kind']}), one a voxel of "
+        f"{1e3 * options.voxel_m:g} mm; registration {options.register}{removed}"
+    )
+
+
+def map_charts(compared: ComparedMap) -> list[Chart]:
+    """Shares of points within a distance."""
+    limits = np.linspace(0, _SHOWN_M, 101)
+    series = [
+        Series(name, limits.tolist(), _shares(distances, limits).tolist(), mode="lines")
+        for name, distances in (("precision", compared.to_surface), ("recall", compared.to_map))
+    ]
+    caption = "Precision: of the map's points; recall: of the true surface's."
+    panel = Panel("threshold_m", "share_within", series)
+    return [Chart("map_shares", "Share of points within a distance", caption, [panel])]
+
+
+def save_map_picture(compared: ComparedMap, path: Path) -> Path:
+    """Draw the map from above, coloured by its error."""
+    figure = figures.new_figure(1, 4.6, 4.2)
+    ax = figure.subplots()
+    errors_cm = 100 * compared.to_surface
+    picked = np.unique(np.linspace(0, len(errors_cm) - 1, _MAX_DOTS).astype(int))
+    order = picked[np.argsort(errors_cm[picked])]  # the worst lie on top, so that they are seen
+    dots = ax.scatter(
+        compared.cloud[order, 0],
+        compared.cloud[order, 1],
+        c=errors_cm[order],
+        s=1,
+        linewidths=0,
+        vmin=0,
+        vmax=min(100 * _SHOWN_M, max(float(errors_cm.max()), 1e-6)),
+        cmap="viridis",
+        rasterized=True,
+    )
+    figure.colorbar(dots, ax=ax, label="distance to the truth [cm]")
+    ax.set(xlabel="x [m]", ylabel="y [m]")
+    ax.set_aspect("equal", adjustable="datalim")
+    figures.caption(figure, "Map where it was judged, along z.")
+    return figures.save(figure, path)
+
+
+def _map_keys(options: MapOptions) -> tuple[str, ...]:
+    return (*share_keys(options.thresholds_m), *MEASURES, "noise_ratio", "spacing_m")
+
+
+def _shares(distances: Float64, limits: Float64) -> Float64:
+    """Share (K,) of the distances below each limit (K,)."""
+    return np.searchsorted(np.sort(distances), limits, "left") / len(distances)

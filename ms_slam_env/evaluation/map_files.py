@@ -1,0 +1,187 @@
+"""Two map files compared: a reconstruction against the true surface.
+
+Clouds are taken as they are, meshes are sampled, the depth of a sequence is placed by its true
+poses.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env import metrics
+from ms_slam_env.config import Checked, bounded, chosen
+from ms_slam_env.errors import InputError
+from ms_slam_env.evaluation.map_quality import ComparedMap, share_keys
+from ms_slam_env.evaluation.seen_surface import seen_surface
+from ms_slam_env.geometry import transform_points
+from ms_slam_env.geometry.cloud_registration import CUTOFF_M, REGISTRATIONS
+from ms_slam_env.metrics.accuracy import SAMPLES
+from ms_slam_env.sequences.recording import Recording, open_recording, recorded_sequence
+
+Float64 = NDArray[np.float64]
+
+MEASURES = (
+    *("accuracy_cm", "completion_cm", "completion_ratio", "rer_m", "rcm"),
+    *("c2c_mean_m", "c2c_std_m", "c2c_rms_m", "hausdorff_directed_m", "hausdorff_m"),
+)
+
+
+@dataclass(frozen=True)
+class MapOptions(Checked):
+    """How two maps are compared.
+
+    Attributes:
+        register: how the map is first brought onto the truth: ``none``, ``icp``, ``plane-icp`` or
+            ``gicp``.
+        cutoff_m: pairs of points farther apart do not count in that.
+        remove_outliers: statistically, before everything else, as USME does.
+        neighbours: of a point in the statistics of outliers.
+        std_ratio: standard deviations above the mean that make an outlier.
+        thresholds_m: for precision, recall and F-score.
+        voxel_m: both clouds keep one point a voxel of this side, so that a surface counts by its
+            area; 0 keeps all.
+        samples: points taken from a mesh.
+        seed: of that choice.
+    """
+
+    register: str = chosen("none", *REGISTRATIONS)
+    cutoff_m: float = bounded(CUTOFF_M, 1e-6, 1e6)
+    remove_outliers: bool = False
+    neighbours: int = bounded(20, 2, 10_000)
+    std_ratio: float = bounded(2.0, 1e-6, 1e6)
+    thresholds_m: Sequence[float] = (0.02, 0.05)
+    voxel_m: float = bounded(0.01, 0.0, 1e3)
+    samples: int = bounded(SAMPLES, 1, 100_000_000)
+    seed: int = bounded(0, 0, 2**32 - 1)
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be."""
+        super().__post_init__()
+        if len(self.thresholds_m) == 0:
+            raise InputError("MapOptions.thresholds_m is empty")
+        for threshold in self.thresholds_m:
+            if not 0 < threshold <= 1e6:
+                raise InputError(f"MapOptions.thresholds_m = {threshold} is outside (0, 1e+06]")
+
+
+def evaluate_maps(
+    estimate: Path, truth: Path, options: MapOptions | None = None
+) -> tuple[dict[str, Any], ComparedMap]:
+    """Compare the map in file ``estimate`` with the true surface in file ``truth``.
+
+    Returns:
+        The measures by keys of the registry, and the clouds that they are of.
+        ``rer_m`` is taken after point-to-point ICP if nothing else was asked for.
+
+    Raises:
+        InputError: a file that cannot be read, too few points for the statistics of outliers.
+    """
+    options = options or MapOptions()
+    read = read_surface(estimate, options.samples, options.seed)
+    true = read_surface(truth, options.samples, options.seed)
+    inliers = metrics.statistical_inliers(read.points, options.neighbours, options.std_ratio)
+    kept = read.points[inliers] if options.remove_outliers else read.points
+    if len(kept) == 0:
+        raise InputError(f"statistical outlier removal leaves nothing of {estimate}")
+    points, surface = (_thin(cloud, options.voxel_m) for cloud in (kept, true.points))
+    found = metrics.register_clouds(points, surface, options.register, options.cutoff_m)
+    points = transform_points(found.T_target_source, points)
+    unregistered = options.register == "none"
+    compared = ComparedMap(points, surface, voxel_m=0, registered=not unregistered)
+    result = {
+        "map_kind": read.kind,
+        "true_map_kind": true.kind,
+        "map_points": len(read.points),
+        "true_points": len(true.points),
+        "compared_points": len(points),
+        "compared_true_points": len(surface),
+        "noise_ratio": 1.0 - float(inliers.mean()),
+        "spacing_m": metrics.point_spacing(read.points),
+        **compared.measure((*share_keys(options.thresholds_m), *MEASURES)),
+        "registration_converged": None if unregistered else found.converged,
+        "registration_share": None if unregistered else found.share,
+        "T_true_map": found.T_target_source.tolist(),
+    }
+    return result, compared
+
+
+def _thin(points: Float64, voxel_m: float) -> Float64:
+    return metrics.voxel_downsample(points, voxel_m) if voxel_m > 0 else points
+
+
+@dataclass(frozen=True)
+class SurfaceFile:
+    """What a file holds.
+
+    Attributes:
+        points: (N, 3) metres.
+        kind: ``cloud``, ``mesh``, ``true depth`` or ``recorded depth``.
+    """
+
+    points: Float64
+    kind: str
+
+
+def read_surface(path: Path, samples: int, seed: int = 0) -> SurfaceFile:
+    """Read a cloud or a mesh (PLY, or what else trimesh reads).
+
+    Args:
+        path: of the file; or of a sequence's folder, for the surface that its depth images show
+            from its true poses, up to 4 m away. Those of ``depth_true`` are taken if
+            ``ms-slam generate --truth`` wrote them, else the recorded ones with their noise.
+        samples: points taken evenly from the surface of a mesh.
+        seed: of that choice.
+
+    Raises:
+        InputError: no such file, one that cannot be read, no points in it, or points that are not
+            finite.
+    """
+    import trimesh
+
+    if path.is_dir():
+        return _sequence_surface(open_recording(path), path / "depth_true")
+    if not path.is_file():
+        raise InputError(f"map file {str(path)!r} does not exist")
+    try:
+        loaded = trimesh.load(path, process=False)
+        if isinstance(loaded, trimesh.Scene):
+            loaded = loaded.to_geometry()
+    except Exception as error:  # trimesh raises whatever its many readers raise
+        raise InputError(f"map file {str(path)!r} cannot be read: {error}") from None
+    vertices = np.asarray(getattr(loaded, "vertices", np.empty((0, 3))), dtype=np.float64)
+    if vertices.ndim != 2 or len(vertices) == 0:
+        raise InputError(f"map file {str(path)!r} holds no points")
+    if not np.isfinite(vertices).all():
+        raise InputError(f"map file {str(path)!r} holds points that are not finite")
+    if not isinstance(loaded, trimesh.Trimesh) or len(loaded.faces) == 0:
+        return SurfaceFile(vertices, "cloud")
+    if not loaded.area > 0:
+        raise InputError(f"map file {str(path)!r} holds a mesh without area")
+    points, _ = trimesh.sample.sample_surface(loaded, samples, seed=seed)
+    return SurfaceFile(np.asarray(points, dtype=np.float64), "mesh")
+
+
+def _sequence_surface(recording: Recording, true_depth: Path) -> SurfaceFile:
+    """What the frames of a sequence with a true trajectory saw."""
+    if recording.truth is None or recording.truth_times is None:
+        raise InputError(f"sequence {recording.name} has no true trajectory to place its depth by")
+    kind = "recorded depth"
+    if true_depth.is_dir():
+        kind = "true depth"
+        entries = tuple(
+            dataclasses.replace(entry, depth=true_depth / entry.depth.name)
+            for entry in recording.entries
+        )
+        recording = dataclasses.replace(recording, entries=entries)
+    sequence = recorded_sequence(recording)
+    if not sequence.known.any():
+        raise InputError(f"sequence {recording.name}: no frame has a true pose")
+    placed = sequence.picked(np.flatnonzero(sequence.known))
+    return SurfaceFile(seen_surface(placed), kind)

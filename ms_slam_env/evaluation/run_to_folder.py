@@ -1,0 +1,310 @@
+"""A SLAM backend over a sequence: trajectory, map, cost of every frame and metrics in a folder."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env import metrics, slam
+from ms_slam_env.evaluation.run_sequence import SequenceRun
+from ms_slam_env.evaluation.trajectory_charts import error_panel, path_panel, thinned
+from ms_slam_env.geometry import invert
+from ms_slam_env.report.charts import Chart, Panel, Series
+from ms_slam_env.report.results import write_results
+from ms_slam_env.report.tables import Table, make_table
+from ms_slam_env.sequences import Sequence, associate
+from ms_slam_env.sequences.recording import Recording
+from ms_slam_env.sequences.trajectory import (
+    MAX_DIFFERENCE_S,
+    TRAJECTORY_HEADER,
+    trajectory_line,
+    write_trajectory,
+)
+from ms_slam_env.slam.frame_selection import EveryFrameConfig, FrameSelectionConfig
+
+Float64 = NDArray[np.float64]
+
+TRAJECTORY, UNFINISHED = "trajectory.txt", "trajectory.incomplete.txt"
+CORRECTED, TRUTH = "trajectory.corrected.txt", "groundtruth.txt"
+MAP, FRAMES, METRICS = "map.ply", "frames.csv", "metrics.json"
+
+_ABOUT = "A SLAM backend over a sequence: its path, its error, what each frame cost."
+_TABLES = {
+    "Frames and trajectory": (
+        *("frames", "processed_frames", "lost_frames", "path_m", "ate_m", "ate_max_m", "ate_rad"),
+        *("ate_unaligned_m", "rpe_m", "rpe_rad", "final_ate_m", "final_rpe_m"),
+    ),
+    "Cost": (
+        *("cpu_ms_median", "cpu_ms_p95", "cpu_ms_max", "ext_ms", "ext_ms_p95", "ext_ms_max"),
+        *("mem_mb", "mem_peak_mb", "ene_j", "ene_frame_j", "ene_source"),
+    ),
+}
+_COSTS = ("frame_cpu_ms", "frame_ext_ms", "frame_mem_mb", "frame_ene_j")
+"""Metrics of one frame, as `frame_costs` gives them."""
+
+
+def run_to_folder(
+    sequence: Sequence,
+    backend: str,
+    params: dict[str, Any],
+    out: Path,
+    fed: Mapping[str, Any] | None = None,
+    selection: FrameSelectionConfig | None = None,
+) -> dict[str, Any]:
+    """Track every frame of ``sequence`` and write what came of it to ``out``.
+
+    Those that ``selection`` drops are not processed; their poses are predicted.
+    SLAM starts at the true pose of the first frame where that is known, else at the identity.
+    While it runs, the trajectory so far stands in ``trajectory.incomplete.txt``; at the end it is
+    renamed to ``trajectory.txt``, beside ``map.ply`` and ``metrics.json``. Where the backend closes
+    loops, ``trajectory.corrected.txt`` holds the poses as the finished map has them; where the true
+    poses are known, ``groundtruth.txt`` holds those; what every frame cost stands in
+    ``frames.csv``. A run that fails or is interrupted leaves the unfinished file and a
+    ``metrics.json`` that says so, and says how the frames were ``fed`` to the backend.
+
+    Returns:
+        the metrics in ``metrics.json``.
+
+    Raises:
+        InputError: a bad option, or an image that cannot be read.
+    """
+    costs = metrics.CostMeter(str(params.get("device", "cpu")))
+    selection = selection or EveryFrameConfig()
+    system = selection.manage(slam.make(backend, sequence.intrinsics, **params))
+    run = SequenceRun(system, sequence, meter=costs, progress=sequence.name)
+    out.mkdir(parents=True, exist_ok=True)
+    for old in (TRAJECTORY, CORRECTED, TRUTH, MAP, METRICS, FRAMES):
+        (out / old).unlink(missing_ok=True)
+    content = {"complete": False, **_about(sequence, backend, params, fed or {}, selection)}
+    final: dict[str, Any] = {}
+    try:
+        with (out / UNFINISHED).open("w", encoding="utf-8") as file:
+            file.write(TRAJECTORY_HEADER + "\n")
+            for step in run:
+                pose = step.result.T_world_camera
+                file.write(trajectory_line(step.frame.timestamp, pose) + "\n")
+                file.flush()
+        write_ply(out / MAP, system.surface_points(), system.map_attributes())
+        corrected = run.corrected()
+        if corrected is not None:
+            write_trajectory(out / CORRECTED, run.timestamps, corrected)
+            errors = trajectory_errors(run, corrected, sequence)
+            final = {f"final_{key}": errors[key] for key in ("ate_m", "rpe_m") if key in errors}
+        truth = sequence.true_trajectory()
+        if truth is not None:
+            write_trajectory(out / TRUTH, *truth)
+        os.replace(out / UNFINISHED, out / TRAJECTORY)
+        content["complete"] = True
+    except BaseException as error:
+        content["error"] = str(error) or type(error).__name__
+        raise
+    finally:
+        result = {**final, **measure(run, sequence)}
+        write_frames(out / FRAMES, run)
+        write_results(
+            out / METRICS,
+            kind="run",
+            title=f"{backend} over {sequence.name}",
+            about=_ABOUT,
+            tables=_tables(result),
+            charts=_charts(run, sequence),
+            content=content,
+            metrics=result,
+        )
+    return result
+
+
+def _about(
+    sequence: Sequence,
+    backend: str,
+    params: dict[str, Any],
+    fed: Mapping[str, Any],
+    selection: FrameSelectionConfig,
+) -> dict[str, Any]:
+    """What was run."""
+    recording = sequence.frames if isinstance(sequence.frames, Recording) else None
+    registration = None if recording is None else recording.registration
+    return {
+        "sequence": sequence.name,
+        "layout": "rendered" if recording is None else recording.layout,
+        "backend": backend,
+        "params": params,
+        **fed,
+        "frame_management": asdict(selection),
+        "registration": None if registration is None else str(registration),
+        "image_size": f"{sequence.intrinsics.width}x{sequence.intrinsics.height}",
+    }
+
+
+# -- Metrics -----------------------------------------------------------------------------------
+
+
+def measure(run: SequenceRun, sequence: Sequence) -> dict[str, Any]:
+    """Metrics of a run, finished or not; those against the truth only where there is one.
+
+    ``frames``, ``lost_frames``, ``processed_frames``, ``path_m`` of the estimate; what
+    `trajectory_errors` gives; the costs by the names of ``CostMeter.summary``.
+    """
+    if not len(run) or run.meter is None:
+        return {"frames": 0}
+    return {
+        "frames": len(run),
+        "lost_frames": run.lost_frames,
+        "processed_frames": int(run.processed.sum()),
+        "path_m": metrics.path_length(run.estimates),
+        **run.meter.summary(),
+        **trajectory_errors(run, run.estimates, sequence),
+    }
+
+
+def trajectory_errors(run: SequenceRun, poses: Float64, sequence: Sequence) -> dict[str, Any]:
+    """Errors of poses (N, 4, 4) against the true ones; empty with fewer than two of these.
+
+    ``poses``; ``ate_m`` (RMSE after SE(3) alignment), ``ate_max_m``, ``ate_rad`` (RMSE of
+    the orientation after it, None where the path is a line), ``ate_unaligned_m``, ``rpe_m``,
+    ``rpe_rad``.
+    """
+    _, P, Q = _pairs(run, poses, sequence)
+    if len(P) < 2:
+        return {}
+    ate = metrics.ate_statistics(P, Q)
+    return {
+        "poses": len(P),
+        "ate_m": ate.rmse,
+        "ate_max_m": ate.max,
+        "ate_rad": _orientation_error(P, Q),
+        "ate_unaligned_m": metrics.ate_rmse(Q[0] @ invert(P[0]) @ P, Q, align="none"),
+        "rpe_m": metrics.rpe_rmse(P, Q),
+        "rpe_rad": metrics.rpe_rmse(P, Q, kind="rotation"),
+    }
+
+
+def _pairs(run: SequenceRun, poses: Float64, sequence: Sequence) -> tuple[Float64, ...]:
+    """Times (M,), poses (M, 4, 4) and the true ones (M, 4, 4) of frames that have a true one."""
+    truth = sequence.true_trajectory()
+    times = np.array(run.timestamps)
+    if truth is None:
+        return times[:0], poses[:0], poses[:0]
+    own, true = associate(times, truth[0], MAX_DIFFERENCE_S)
+    return times[own], poses[own], truth[1][true]
+
+
+def _orientation_error(P: Float64, Q: Float64) -> float | None:
+    """RMS angle in radians between aligned and true poses; None if positions leave it open."""
+    unique = metrics.find_alignment(P, Q).unique
+    return metrics.ate_rmse(P, Q, kind="rotation") if unique else None
+
+
+# -- Tables and charts -------------------------------------------------------------------------
+
+
+def _tables(result: Mapping[str, Any]) -> list[Table]:
+    tables = []
+    for title, keys in _TABLES.items():
+        known = [key for key in keys if result.get(key) is not None]
+        if known:
+            tables.append(make_table(known, [{key: result[key] for key in known}], title))
+    return tables
+
+
+def _charts(run: SequenceRun, sequence: Sequence) -> list[Chart]:
+    """Path from above, error over time, cost of every frame."""
+    if len(run) < 2:
+        return []
+    times, P, Q = _pairs(run, run.estimates, sequence)
+    corrected = run.corrected()
+    paths = {"truth": Q[:, :3, 3]} if len(Q) else {}
+    paths["estimate"] = run.estimates[:, :3, 3]
+    if corrected is not None:
+        paths["estimate, loops closed"] = corrected[:, :3, 3]
+    found = [Chart("path", "Path", "The two directions in which it extends most.",
+                   [path_panel(paths)])]  # fmt: skip
+    if len(P) > 1:
+        aligned = metrics.find_alignment(P, Q).poses(P)
+        distance = np.linalg.norm(aligned[:, :3, 3] - Q[:, :3, 3], axis=1)
+        caption = "Distance from the true position after SE(3) alignment."
+        panel = error_panel("position_error_m", times - run.timestamps[0], {"estimate": distance})
+        found.append(Chart("error", "Error over time", caption, [panel]))
+    caption = "The frames for which SLAM had no pose are marked."
+    return [*found, Chart("cost", "Cost of every frame", caption, _cost_panels(run))]
+
+
+def _cost_panels(run: SequenceRun) -> list[Panel]:
+    costs, lost = frame_costs(run), np.flatnonzero(~run.tracking_ok)
+    picked = thinned(len(run))
+    panels = []
+    for key in _COSTS:
+        values = costs[key]
+        if not np.isfinite(values).any():
+            continue
+        series = [Series("all", picked.tolist(), values[picked].tolist(), mode="lines")]
+        if len(lost):
+            shown = lost[thinned(len(lost))]
+            series.append(Series("lost", shown.tolist(), values[shown].tolist(), mode="markers"))
+        panels.append(Panel("frame", key, series))
+    return panels
+
+
+# -- Files -------------------------------------------------------------------------------------
+
+
+def frame_costs(run: SequenceRun) -> dict[str, Float64]:
+    """What each frame (N,) cost, by key; NaN where it cannot be had.
+
+    The cost of a frame that was interrupted before it was recorded is left out.
+    """
+    costs = run.costs[: len(run)]
+    values = [(1e3 * cost.cpu_s, 1e3 * cost.ext_s, cost.mem_mb, cost.joules) for cost in costs]
+    return dict(zip(_COSTS, np.array(values, dtype=np.float64).reshape(-1, 4).T, strict=True))
+
+
+def write_frames(path: Path, run: SequenceRun) -> None:
+    """Write what every frame cost and whether it was tracked as CSV; what is unknown is empty."""
+    costs = frame_costs(run)
+    columns = [costs[f"frame_{name}"] for name in ("ext_ms", "cpu_ms", "mem_mb", "ene_j")]
+    lines = ["timestamp,tracking_ok,ext_ms,cpu_ms,mem_mb,ene_j"]
+    for timestamp, ok, *values in zip(run.timestamps, run.tracking_ok, *columns, strict=True):
+        words = ["" if math.isnan(value) else f"{value:.3f}" for value in values]
+        lines.append(",".join([f"{timestamp:.6f}", str(int(ok)), *words]))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+_PLY_NAMES = {
+    "color": ("red", "green", "blue"),
+    "normal": ("nx", "ny", "nz"),
+}
+_PLY_TYPES = {"u1": "uchar", "f4": "float"}
+
+
+def write_ply(
+    path: Path, points: NDArray[np.float64], attributes: dict[str, NDArray[np.generic]]
+) -> None:
+    """Write points (M, 3) and what is known of each, by name: (M,) or (M, 3) arrays, binary PLY.
+
+    ``color`` is uint8, everything else 32-bit floats. An interrupt leaves no half file.
+    """
+    columns = {name: np.asarray(points[:, k], "<f4") for k, name in enumerate("xyz")}
+    for name, values in attributes.items():
+        kind = "u1" if name == "color" else "<f4"
+        for k, column in enumerate(np.atleast_2d(values.T)):
+            columns[_PLY_NAMES.get(name, (name,))[k]] = column.astype(kind)
+    table = np.empty(len(points), dtype=[(name, c.dtype) for name, c in columns.items()])
+    for name, column in columns.items():
+        table[name] = column
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(points)}",
+        *(f"property {_PLY_TYPES[c.dtype.str[1:]]} {name}" for name, c in columns.items()),
+        "end_header",
+    ]
+    partial = path.with_name(path.name + ".partial")
+    partial.write_bytes("\n".join(lines).encode() + b"\n" + table.tobytes())
+    os.replace(partial, path)

@@ -1,0 +1,42 @@
+"""Paths and errors of trajectories as panels of charts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.report.charts import Panel, Series
+
+Float64 = NDArray[np.float64]
+
+MOST_POINTS = 1000
+"""Of a line: more are not told apart on a screen."""
+
+
+def thinned(count: int) -> NDArray[np.int64]:
+    """At most ``MOST_POINTS`` indices of ``count``, evenly spread."""
+    return np.arange(0, count, max(1, -(-count // MOST_POINTS)))
+
+
+def path_panel(paths: Mapping[str, Float64]) -> Panel:
+    """Positions (N, 3) by name along the two axes along which they extend most, at one scale.
+
+    A line is broken where a row is NaN.
+    """
+    everything = np.concatenate(list(paths.values()))
+    extent = np.nanmax(everything, axis=0) - np.nanmin(everything, axis=0)
+    a, b = sorted(np.argsort(extent)[-2:].tolist())
+    series = [_line(name, points[:, a], points[:, b]) for name, points in paths.items()]
+    return Panel(f"position_{'xyz'[a]}_m", f"position_{'xyz'[b]}_m", series, equal=True)
+
+
+def error_panel(key: str, times: Float64, errors: Mapping[str, Float64]) -> Panel:
+    """Errors (N,) of metric ``key`` by name over times (N,) in seconds since the start."""
+    return Panel("since_start_s", key, [_line(name, times, e) for name, e in errors.items()])
+
+
+def _line(name: str, x: Float64, y: Float64) -> Series:
+    picked = thinned(len(x))
+    return Series(name, x[picked].tolist(), y[picked].tolist(), mode="lines")
