@@ -37,7 +37,7 @@ def test_generate_then_run(tmp_path, capsys) -> None:
     assert main(["run", str(out), "--out", str(tmp_path / "run")]) == 0
     metrics = json.loads((tmp_path / "run/metrics.json").read_text())
     assert metrics["complete"]
-    assert (metrics["compared"], metrics["registration"]) == (6, None)
+    assert (metrics["poses"], metrics["registration"]) == (6, None)
     assert metrics["ate_m"] < 0.02
 
 
