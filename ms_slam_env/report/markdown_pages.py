@@ -8,6 +8,7 @@ Between two comments, each on a line of its own, stands what a result says::
 The first word is a folder of results, whose ``results.json`` is read, or a JSON file in one. The
 options: ``table``, number or title of a table (by default the first); ``columns``, their names (by
 default all); ``rows``, at most so many of the first; ``made_by=yes``, the command in a line below.
+Where the result is older than the code, the first of its tables on the page says so above.
 """
 
 from __future__ import annotations
@@ -60,6 +61,7 @@ def with_tables(text: str, results: Path, name: str = "page") -> str:
         InputError: see :func:`update_pages`.
     """
     lines: list[str] = []
+    warned: set[Path] = set()  # a page says once that a result is out of date
     opened = 0  # line number of the comment that a table stands below
     for number, line in enumerate(text.split("\n"), start=1):
         start = _START.match(line)
@@ -70,7 +72,7 @@ def with_tables(text: str, results: Path, name: str = "page") -> str:
         if start:
             opened = number
             try:
-                lines += [line, "", *_inserted(start["what"], results).split("\n"), ""]
+                lines += [line, "", *_inserted(start["what"], results, warned).split("\n"), ""]
             except InputError as error:
                 raise InputError(f"{name}, line {number}: {error}") from None
         elif line == _END:
@@ -82,8 +84,11 @@ def with_tables(text: str, results: Path, name: str = "page") -> str:
     return "\n".join(lines)
 
 
-def _inserted(what: str, folder: Path) -> str:
-    """What stands below a comment: a warning where the result is out of date, note and table."""
+def _inserted(what: str, folder: Path, warned: set[Path]) -> str:
+    """What stands below a comment: a warning where the result is out of date, note and table.
+
+    Results in ``warned`` have their warning further up; this one's is added.
+    """
     try:
         place, *words = shlex.split(what)
     except ValueError as error:
@@ -93,9 +98,11 @@ def _inserted(what: str, folder: Path) -> str:
         if option not in _OPTIONS:
             raise unknown("option", option, _OPTIONS)
     path = folder / place
-    results = read_results(path if path.suffix == ".json" else path / RESULTS)
+    path = path if path.suffix == ".json" else path / RESULTS
+    results = read_results(path)
     table = _cut(_chosen(results, options.get("table", "0")), options)
-    parts = [f"*{results.stale}*\n"] if results.stale else []
+    parts = [f"*{results.stale}*\n"] if results.stale and path not in warned else []
+    warned.add(path)
     parts.append(table.as_markdown())
     if options.get("made_by") == "yes":
         parts.append(made_by(results.provenance, results.rows))

@@ -146,7 +146,7 @@ def _section(found: FoundResult, anchor: str, is_alone: bool) -> str:
     parts += [f"<p>{escape(results.about)}</p>"] if results.about else []
     parts += [f'<p class="stale">{escape(results.stale)}</p>'] if results.stale else []
     charts = [chart for chart in results.charts if chart.panels]
-    parts += [_chart(chart, f"{anchor}-c{n}") for n, chart in enumerate(charts)]
+    parts += [_chart(chart, charts, f"{anchor}-c{n}") for n, chart in enumerate(charts)]
     parts += [_table(table, f"{anchor}-t{n}") for n, table in enumerate(results.tables)]
     parts += [_pictures(found.pictures)] if found.pictures else []
     parts += [_rows(results, f"{anchor}-rows")] if results.rows else []
@@ -161,8 +161,8 @@ def _section(found: FoundResult, anchor: str, is_alone: bool) -> str:
     return f'<section id="{anchor}" aria-labelledby="{anchor}-title">\n{inner}\n</section>'
 
 
-def _chart(chart: Chart, anchor: str) -> str:
-    plots = plots_of(chart)
+def _chart(chart: Chart, beside: Sequence[Chart], anchor: str) -> str:
+    plots = plots_of(chart, beside)
     data = [{"data": plot.data, "layout": plot.layout} for plot in plots]
     content = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     choice = ""

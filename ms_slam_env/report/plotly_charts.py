@@ -47,13 +47,21 @@ class Plot:
     height_px: int
 
 
-def plots_of(chart: Chart) -> list[Plot]:
-    """The panels of a chart; series of one name look alike in all of them."""
-    names = list(dict.fromkeys(s.name for panel in chart.panels for s in panel.series))
+def plots_of(chart: Chart, beside: Sequence[Chart] = ()) -> list[Plot]:
+    """The panels of a chart; series of one name look alike in all of them.
+
+    Also in those of the charts ``beside`` it, unless that takes more names than there are colours.
+    """
+    names = _names(beside or [chart])
+    names = names if len(names) <= len(PALETTE) else _names([chart])
     labels = [panel.title or _measure(panel) for panel in chart.panels]
     if len(set(labels)) < len(labels):
         labels = [f"{panel.title}: {_measure(panel)}".strip(": ") for panel in chart.panels]
     return [_plot(panel, names, label) for panel, label in zip(chart.panels, labels, strict=True)]
+
+
+def _names(charts: Sequence[Chart]) -> list[str]:
+    return list(dict.fromkeys(s.name for c in charts for panel in c.panels for s in panel.series))
 
 
 def short(value: Any) -> str:
