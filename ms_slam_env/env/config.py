@@ -45,7 +45,7 @@ class TargetConfig(Checked):
     """Motion-and-structure parameters and thresholds of the paper's Algorithm 1, line 9.
 
     M_I and M_D are the maxima of hand-held sequences of which every fourth frame was kept, the
-    sparsest that SLAM tracked without a loss (``python -m ms_slam_env.benchmark.frame_skipping``).
+    sparsest that SLAM tracked without a loss (``ms-slam experiment frame-skipping``).
     The thresholds and lambda were chosen on validation seeds: with larger ones the greedy planner
     loses track as random walk does, with smaller ones it maps little (BENCHMARK.md).
 

@@ -87,6 +87,13 @@ def share_interval(flags: ArrayLike) -> Interval:
     return Interval(float(array.mean()), float(interval.low), float(interval.high))
 
 
+def rank_correlation(a: ArrayLike, b: ArrayLike) -> float:
+    """Spearman's correlation of (n,) and (n,) values; NaN where one of them does not vary."""
+    if np.ptp(a) == 0 or np.ptp(b) == 0:
+        return float("nan")
+    return float(stats.spearmanr(a, b).statistic)
+
+
 def has_rliable() -> bool:
     """Whether the extra ``statistics`` is installed."""
     return importlib.util.find_spec("rliable") is not None

@@ -10,12 +10,6 @@ import numpy as np
 import pytest
 
 from ms_slam_env.benchmark import planner_report
-from ms_slam_env.benchmark.frame_skipping import (
-    Arguments,
-    SkippingSpec,
-    run_sequence,
-    suggest_targets,
-)
 from ms_slam_env.config import parse_named
 from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.env.planners import (
@@ -30,7 +24,6 @@ from ms_slam_env.experiments.harness.episodes import (
     parse_options,
     run_episode,
 )
-from ms_slam_env.report.statistics import Interval
 
 SPEC = EpisodeSpec("random", "table", seed=2000, steps=4)
 CLOCKS = ("decision_ms",)
@@ -102,36 +95,6 @@ def test_planner_by_module_and_class_takes_options() -> None:
         "path": "runs/a.zip",
         "deterministic": True,
     }
-
-
-def test_skipping_frames_raises_divergence() -> None:
-    every = run_sequence(SkippingSpec("table", 1000, 1, 9, "80x60"))
-    third = run_sequence(SkippingSpec("table", 1000, 3, 9, "80x60"))
-    assert (every["kept_frames"], third["kept_frames"]) == (9, 3)
-    assert third["mean_D"] > every["mean_D"]
-    assert 0 < every["ate_m"] < 0.05
-
-
-def cell(ate_m: float, lost: float, M: float) -> dict[str, Interval]:
-    values = {"ate_m": ate_m, "lost": lost, "M_I": M, "M_D": 2 * M, "mean_I": M / 2, "mean_D": M}
-    return {name: Interval(value, value, value) for name, value in values.items()}
-
-
-def test_targets_are_read_at_the_last_interval_that_suffices() -> None:
-    summary = {1: cell(0.002, 0, 0.01), 2: cell(0.008, 0, 0.02), 4: cell(0.003, 0.1, 0.04)}
-    summary[8] = cell(0.001, 0, 0.08)  # luck beyond the first failure does not count
-    targets = suggest_targets(summary, 0.01)
-    assert targets is not None
-    assert (targets["interval"], targets["M_I"], targets["M_D"]) == (2, 0.02, 0.04)
-    assert suggest_targets(summary, 0.001) is None
-
-
-@pytest.mark.parametrize(
-    "options", [{"intervals": (0,)}, {"intervals": (81,)}, {"desired_ate_m": 0}]
-)
-def test_bad_skipping_options_are_refused(options: dict[str, Any]) -> None:
-    with pytest.raises(InputError):
-        Arguments(**options)
 
 
 def test_an_episode_moves_as_the_environment_does_by_default() -> None:

@@ -275,10 +275,10 @@ def frame_management(_: Path) -> Any:
 
 @experiment("frame_skipping")
 def frame_skipping(_: Path) -> Any:
-    from ms_slam_env.benchmark.frame_skipping import SkippingSpec, run_sequence
+    from ms_slam_env.experiments.frame_skipping import FrameSkipping, SkippingSpec
 
     return {
-        f"every {interval}": run_sequence(SkippingSpec("table", 1000, interval, 18, "80x60"))
+        f"every {interval}": FrameSkipping.run(SkippingSpec("table", 1000, interval, 18, "80x60"))
         for interval in (1, 3)
     }
 

@@ -1,0 +1,50 @@
+"""Motions and recorded depth of ICL-NUIM's living room, from a folder that holds them.
+
+Handa et al., ICRA 2014: ``icl_nuim/trajectories/lr_kt0.tum.txt`` and so on, and
+``icl_nuim/lr_kt3_depth``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.camera import XTION_SIZES, Intrinsics
+from ms_slam_env.errors import InputError
+from ms_slam_env.sequences.recording import Recording, open_recording
+from ms_slam_env.sequences.trajectory import read_trajectory
+
+Float64 = NDArray[np.float64]
+
+INTRINSICS = Intrinsics(fx=481.2, fy=480.0, cx=319.5, cy=239.5, width=640, height=480)
+RECORDED = "lr_kt3"
+"""The motion whose depth was recorded."""
+
+
+@lru_cache(maxsize=8)
+def read_motion(data: str, name: str) -> tuple[Float64, Float64]:
+    """Times (N,) and poses (N, 4, 4) of a motion such as ``lr_kt0``."""
+    return read_trajectory(Path(data) / f"icl_nuim/trajectories/{name}.tum.txt")
+
+
+def read_motions(data: str, names: Sequence[str]) -> tuple[list[Float64], Float64]:
+    """Times (N_i,) of each motion, and the poses (sum N_i, 4, 4) of all of them.
+
+    Raises:
+        InputError: no name, or a trajectory that cannot be read.
+    """
+    if not names:
+        raise InputError("no motion given")
+    pairs = [read_motion(data, name) for name in names]
+    return [times for times, _ in pairs], np.concatenate([poses for _, poses in pairs])
+
+
+def recorded_depth(data: str, image_size: str, every: int) -> Recording:
+    """Every so many frames of the recorded depth, at most as large as ``image_size``."""
+    recording = open_recording(Path(data) / f"icl_nuim/{RECORDED}_depth").every(every)
+    is_larger = XTION_SIZES[image_size][0] < recording.source.width
+    return recording.at_size(image_size) if is_larger else recording
