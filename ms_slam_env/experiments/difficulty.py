@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ms_slam_env.camera import XTION_SIZES, Intrinsics, RGBDFrame
 from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.divergence import DivergenceConfig
-from ms_slam_env.evaluation.image_motion import MOTIONS, by_second, watch_frames
+from ms_slam_env.evaluation.image_motion import MOTIONS, WatchedSequence, by_second, watch_frames
 from ms_slam_env.evaluation.sequence_divergence import KINDS, statistics_of
 from ms_slam_env.experiments.harness.experiment import Experiment
 from ms_slam_env.metrics.registry import metric
@@ -152,14 +152,14 @@ class Difficulty(Checked, Experiment):
     @staticmethod
     def run(spec: DifficultySpec) -> dict[str, Any]:
         """Statistics of the divergence, how camera and image move, and what they see."""
-        watched = watch_frames(*_open(spec), HISTOGRAMS)
+        watched = watch(spec)
         lines, curves = [], []
         for (name, values), (column, kind) in product(
             watched.divergences.items(), enumerate(KINDS)
         ):
             own = values[:, column]
-            if spec.scene == RECORDING and kind == "intensity":
-                continue  # it has no colour
+            if np.isnan(own).all():
+                continue
             label = {"histograms": name, "divergence": kind}
             numbers = statistics_of(own, watched.gaps_s)
             lines.append({
@@ -184,7 +184,7 @@ class Difficulty(Checked, Experiment):
         lines = statistics(rows)
         which = ("scene", "noise", "motion")
         once = {tuple(map(line.get, which)): line for line in lines}
-        paper = [
+        paper: list[Line] = [
             {"motion": motion, **dict(zip(("max", "mean", "variance"), numbers, strict=True))}
             for motion, numbers in PAPER.items()
         ]
@@ -227,6 +227,14 @@ class Difficulty(Checked, Experiment):
                    for kind, series in kinds.items()])
             for which, kinds in found.items()
         ]  # fmt: skip
+
+
+def watch(spec: DifficultySpec) -> WatchedSequence:
+    """Render or read the frames, and measure each against the one before."""
+    watched = watch_frames(*_open(spec), HISTOGRAMS)
+    for values in watched.divergences.values() if spec.scene == RECORDING else ():
+        values[:, 0] = np.nan  # it has no colour
+    return watched
 
 
 def _open(spec: DifficultySpec) -> tuple[Iterable[RGBDFrame], Float64, Float64, Intrinsics]:

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from ms_slam_env import metrics, slam
-from ms_slam_env.benchmark.sequence_divergence import consecutive_divergences
 from ms_slam_env.camera import xtion
 from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.run_sequence import run_sequence
+from ms_slam_env.evaluation.sequence_divergence import consecutive_divergences
 from ms_slam_env.experiments.harness.episodes import LOST_ERROR_M, check_names, seed_list
 from ms_slam_env.experiments.harness.experiment import Experiment
 from ms_slam_env.report.charts import Chart, scatter

@@ -573,7 +573,7 @@ def sequence_divergence(folder: Path) -> Any:
 def difficulty(folder: Path) -> Any:
     from PIL import Image
 
-    from ms_slam_env.benchmark.difficulty import RECORDING, DifficultySpec, measure
+    from ms_slam_env.experiments.difficulty import RECORDING, DifficultySpec, watch
     from ms_slam_env.sequences import write_trajectory
 
     data = folder / "icl_nuim"
@@ -591,7 +591,7 @@ def difficulty(folder: Path) -> Any:
     (data / "lr_kt3_depth/depth.txt").write_text(lines)
     (data / "lr_kt3_depth/intrinsics.txt").write_text("60 60 39.5 29.5 80 60")
     return {
-        scene: measure(
+        scene: watch(
             DifficultySpec(scene, "lr_kt3", motions, str(folder), 0, 1.0, "80x60", "kinect", 1)
         )
         for scene in (RECORDING, "table")
