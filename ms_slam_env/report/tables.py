@@ -93,9 +93,14 @@ def make_table(
     title: str = "",
     note: str = "",
 ) -> Table:
-    """A table whose columns are given by name where the metric's own heading will do."""
+    """A table whose columns are given by name where the metric's own heading will do.
+
+    Cells of no column are dropped.
+    """
     full = tuple(Column(column) if isinstance(column, str) else column for column in columns)
-    return Table(full, tuple(rows), title, note)
+    names = [column.name for column in full]
+    cells = tuple({name: row[name] for name in names if name in row} for row in rows)
+    return Table(full, cells, title, note)
 
 
 def table_from_json(content: Mapping[str, Any]) -> Table:
@@ -105,8 +110,12 @@ def table_from_json(content: Mapping[str, Any]) -> Table:
         InputError: a key that the registry does not know.
         KeyError, TypeError: content of another form.
     """
-    rows = [{n: _value_from_json(v) for n, v in row.items()} for row in content["rows"]]
     columns = [build(Column, column) for column in content["columns"]]
+    names = {column.name for column in columns}
+    rows = [
+        {name: _value_from_json(value) for name, value in row.items() if name in names}
+        for row in content["rows"]
+    ]
     return make_table(columns, rows, str(content.get("title", "")), str(content.get("note", "")))
 
 

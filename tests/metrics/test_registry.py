@@ -13,28 +13,22 @@ from ms_slam_env.report.statistics import Interval
 from ms_slam_env.report.tables import format_value
 
 METRICS = list(registry().values())
-UNITS = {
-    *("", "text", "flag", "share", "count", "1000"),
-    *("m", "cm", "mm", "m²", "rad", "deg", "mrad", "s", "ms", "min", "J", "W", "MB"),
+BASE_UNITS = {
+    *("", "text", "flag", "share", "%", "count", "1000", "MB", "nats"),
+    *("m", "cm", "mm", "rad", "deg", "mrad", "s", "ms", "min", "J", "W", "Hz"),
 }
+"""Units that others are made of, as in ``deg/m`` or ``m²``."""
 SUFFIXES = {
+    **{"deg_m": "deg/m", "deg_s": "deg/s", "m_s": "m/s"},
     **{"m": "m", "cm": "cm", "m2": "m²", "rad": "rad", "deg": "deg", "s": "s", "ms": "ms"},
-    **{"j": "J", "w": "W", "mb": "MB", "share": "share", "count": "count"},
+    **{"j": "J", "w": "W", "mb": "MB", "share": "share"},
 }
-"""Last part of a key to the unit that its values are then stored in."""
-OTHERWISE = {
-    "step_deg": "centimetres and degrees at once",
-    **dict.fromkeys(("f_score_{}cm", "precision_{}cm", "recall_{}cm"), "a threshold"),
-    **dict.fromkeys(("f_score_2cm", "precision_2cm", "recall_2cm"), "a threshold"),
-    **dict.fromkeys(("f_score_5cm", "precision_5cm", "recall_5cm"), "a threshold"),
-}
-"""Keys whose last part is no unit, and what it is."""
-ALIKE = {
-    frozenset(("path_m", "path_length_m")),
-    frozenset(("attempts", "attempts_count")),
-}
-"""Keys that share a heading on purpose: a length and the same where truth may lack, a list and its
-length."""
+"""End of a key to the unit that its values are then stored in; the first that fits counts."""
+NO_UNIT = re.compile(r"step_deg|.*(\d|\})cm")
+"""Keys that end in a threshold, and a step of centimetres and degrees at once."""
+ALIKE = {frozenset(("path_m", "path_length_m")), frozenset(("attempts", "attempts_count"))}
+"""Keys that share a heading on purpose: the true length and the same where truth may lack, a list
+and its length."""
 
 
 def of_all(metrics: list[Metric]) -> pytest.MarkDecorator:
@@ -46,7 +40,8 @@ def test_an_entry_says_what_it_is_in_words_and_known_units(entry: Metric) -> Non
     assert entry.heading == entry.heading.strip() != ""
     assert entry.definition.endswith(".")
     assert "mean" not in entry.definition.lower() or "median" not in entry.heading.lower()
-    assert {entry.unit, entry.shown} <= UNITS
+    parts = {part.strip("²") for unit in (entry.unit, entry.shown) for part in unit.split("/")}
+    assert parts <= BASE_UNITS
     assert math.isfinite(entry.scale)
     assert entry.better in ("", "lower", "higher")
     assert entry.alignment in ("", "none", "SE(3)", "Sim(3)", "ICP")
@@ -55,10 +50,11 @@ def test_an_entry_says_what_it_is_in_words_and_known_units(entry: Metric) -> Non
 
 @of_all(METRICS)
 def test_a_key_is_lower_case_and_ends_in_its_unit(entry: Metric) -> None:
-    assert re.fullmatch(r"M_[ID]|[a-z][a-z0-9_]*(\{\}[a-z0-9_]+)?", entry.key)
-    last = entry.key.rpartition("_")[2]
-    if last in SUFFIXES and entry.key not in OTHERWISE:
-        assert entry.unit == SUFFIXES[last]
+    assert re.fullmatch(r"M_[ID]|T_[a-z_]+|[a-z]([a-z0-9_]|\{[a-z]+\})*", entry.key)
+    if NO_UNIT.fullmatch(entry.key) or "_per_" in entry.key:
+        return
+    unit = next((u for end, u in SUFFIXES.items() if entry.key.endswith(f"_{end}")), entry.unit)
+    assert entry.unit == unit
 
 
 @of_all([entry for entry in METRICS if entry.unit not in ("text",)])
@@ -69,7 +65,14 @@ def test_numbers_of_a_metric_can_be_shown(entry: Metric) -> None:
     assert entry.explanation.startswith(entry.definition)
 
 
-@of_all([entry for entry in METRICS if re.match(r"(ate|rpe|rer|lost|ext|cpu|mem|ene)_", entry.key)])
+@of_all(
+    [
+        entry
+        for entry in METRICS
+        if re.match(r"(ate|rpe|rer|lost|ext|cpu|mem|ene)_", entry.key)
+        and not re.search(r"_(cut|gain)$", entry.key)
+    ]
+)
 def test_errors_and_costs_are_better_when_lower(entry: Metric) -> None:
     assert entry.better == "lower" or entry.unit == "text"
 

@@ -51,7 +51,10 @@ def test_values_are_shown_in_the_unit_of_their_metric() -> None:
 def test_a_table_survives_json() -> None:
     table = make_table(
         ["planner", Column("ate_table", "ate_m", "table")],
-        [{"planner": "greedy", "ate_table": Interval(0.001, 0.0005, 0.002)}, {"planner": "x"}],
+        [
+            {"planner": "greedy", "ate_table": Interval(0.001, 0.0005, 0.002), "of no column": []},
+            {"planner": "x"},
+        ],
         "Title",
         "Note.",
     )
