@@ -22,6 +22,7 @@ _LOOKS: dict[str, dict[str, Any]] = {
     "markers": {"linestyle": "", "marker": "o"},
     "dots": {"linestyle": "", "marker": ".", "markersize": 5, "alpha": 0.35},
 }
+_LONG_NAME = 30  # letters; legends of longer ones would leave the panels no room beside them
 
 
 def save_charts(charts: Iterable[Chart], out: Path) -> list[Path]:
@@ -47,9 +48,11 @@ def draw(chart: Chart) -> Figure:
         }
     named = {name: line for name, line in handles.items() if name not in categories}
     if len(named) > 1:
-        figure.legend(
-            list(named.values()), list(named), loc="outside right upper", fontsize="small"
-        )
+        is_long = max(map(len, named)) > _LONG_NAME
+        place: Any = "outside lower left" if is_long else "outside right upper"
+        figure.legend(list(named.values()), list(named), loc=place, fontsize="small")
+        if is_long:
+            figure.set_size_inches(max(figure.get_figwidth(), 6.0), 3.2 + 0.2 * len(named))
     caption(figure, chart.caption)
     return figure
 

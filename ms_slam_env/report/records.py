@@ -94,13 +94,20 @@ def write_text(path: Path, text: str) -> None:
 
 
 def to_plain(content: Any) -> Any:
-    """``content`` in JSON's types: NaN (not known) becomes null, infinity (never) a text."""
+    """``content`` in JSON's types: NaN (not known) becomes null, infinity (never) a text.
+
+    Paths become texts, dataclasses mappings.
+    """
     if isinstance(content, dict):
         return {key: to_plain(value) for key, value in content.items()}
     if isinstance(content, (list, tuple)):
         return [to_plain(value) for value in content]
     if isinstance(content, np.generic):
         return to_plain(content.item())
+    if isinstance(content, Path):
+        return str(content)
+    if dataclasses.is_dataclass(content) and not isinstance(content, type):
+        return to_plain(dataclasses.asdict(content))
     if isinstance(content, float) and not math.isfinite(content):
         return None if math.isnan(content) else _INFINITE[content]
     return content

@@ -193,6 +193,23 @@ def complete_cases(rows: Iterable[Row], case: Sequence[str], compared: str) -> l
     return [row for row in done if found[tuple(row["spec"][name] for name in case)] == every]
 
 
+def flattened(rows: Iterable[Row], key: str) -> list[dict[str, Any]]:
+    """A row for each mapping in the list ``key`` of each finished row's result.
+
+    What labels it, texts and flags among its values, joins the specification, so that rows can be
+    grouped by it.
+    """
+    return [
+        {
+            "spec": {**row["spec"], **{k: v for k, v in one.items() if isinstance(v, (str, bool))}},
+            "result": one,
+            "error": None,
+        }
+        for row in finished(rows)
+        for one in row["result"][key]
+    ]
+
+
 def summary(results: Iterable[Row], key: str) -> Interval:
     """Median, of flags the share, of a metric with its 95 % interval; NaN without values."""
     values = [result[key] for result in results if result.get(key) is not None]

@@ -255,22 +255,21 @@ def usme(folder: Path) -> Any:
 
 @experiment("adaptation", CHAOTIC)
 def adaptation(_: Path) -> Any:
-    from ms_slam_env.benchmark.adaptation import AdaptationSpec, run_competitors
+    from ms_slam_env.experiments.adaptation import Adaptation, AdaptationSpec
     from ms_slam_env.sequences import MotionSegments
     from ms_slam_env.slam.adaptation import DivergenceAdaptationConfig
 
     stretches = MotionSegments(frames=12, quiet=5, violent=5)
-    return run_competitors(
-        AdaptationSpec("table", 1000, stretches, "80x60", DivergenceAdaptationConfig())
-    )
+    adaptation = DivergenceAdaptationConfig()
+    return Adaptation.run(AdaptationSpec("table", 1000, stretches, "80x60", adaptation))
 
 
-@experiment("frame_management")
-def frame_management(_: Path) -> Any:
-    from ms_slam_env.benchmark.frame_management_run import FilterSpec, run_filters
+@experiment("frame_selection")
+def frame_selection(_: Path) -> Any:
+    from ms_slam_env.experiments.frame_selection import FilterSpec, FrameSelection
 
     filters = ("none", "regular,every=2", "divergence,threshold=0.02")
-    return run_filters(FilterSpec("table:1000", filters, image_size="80x60", frames=30))
+    return FrameSelection.run(FilterSpec("table:1000", filters, image_size="80x60", frames=30))
 
 
 @experiment("frame_skipping")

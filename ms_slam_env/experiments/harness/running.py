@@ -83,8 +83,5 @@ def write_all(experiment: Experiment, rows: Sequence[Row], out: Path) -> Results
 
 def as_config(experiment: Any) -> dict[str, Any]:
     """The options of an experiment as JSON's types."""
-    return {
-        field.name: str(value) if isinstance(value := getattr(experiment, field.name), Path)
-        else value
-        for field in dataclasses.fields(experiment)
-    }  # fmt: skip
+    names = [field.name for field in dataclasses.fields(experiment)]
+    return {name: to_plain(getattr(experiment, name)) for name in names}

@@ -146,7 +146,7 @@ def default_configurations(intrinsics: Intrinsics) -> tuple[SlamConfiguration, .
 
     Images are halved where the camera's are large enough: that is faster and, because every level
     of the pyramid is coarser, copes with larger motions. Chosen on validation seeds
-    (``python -m ms_slam_env.benchmark.adaptation``). ``about.cost`` is the processor time of
+    (``ms-slam experiment adaptation``). ``about.cost`` is the processor time of
     a processed frame at 160x120, relative to the last: 6.1, 6.9 and 9.5 ms were measured on one
     core of a busy machine.
     """

@@ -1,0 +1,283 @@
+"""Run-time adaptation against fixed configurations (Saeedi et al., ICRA 2017, section V-B)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env import metrics, slam
+from ms_slam_env.camera import XTION_SIZES, Intrinsics, RGBDFrame, xtion
+from ms_slam_env.config import Checked, bounded
+from ms_slam_env.evaluation.run_sequence import Step, run_sequence
+from ms_slam_env.experiments.harness.episodes import check_names, seed_list
+from ms_slam_env.experiments.harness.experiment import Experiment
+from ms_slam_env.report.charts import Chart, Guide, Panel, Series
+from ms_slam_env.report.records import Row
+from ms_slam_env.report.statistics import relative_cut
+from ms_slam_env.report.tables import (
+    Grouping,
+    Table,
+    finished,
+    flattened,
+    grouped,
+    make_table,
+    summary,
+)
+from ms_slam_env.sequences import MotionSegments, open_sequence
+from ms_slam_env.sequences.trajectory import PoseInterpolation
+from ms_slam_env.slam.adaptation import AdaptiveSlam, AgentConfig, DivergenceAdaptationConfig
+from ms_slam_env.slam.adaptation.controllers import DivergenceController
+from ms_slam_env.slam.base import SlamBackend
+from ms_slam_env.slam.configuration import SlamConfiguration
+
+ADAPTIVE = "adaptive"
+ALSO = (
+    SlamConfiguration(image_size="160x120", keep_every=3),
+    SlamConfiguration(image_size="160x120"),
+    SlamConfiguration(),
+)
+"""Fixed configurations that run too: what others may pick as the best one."""
+METRICS = (
+    *("cpu_ms_mean", "ate_interpolated_m", "ate_m", "processed_share", "lost_share"),
+    *("cpu_quiet_ms", "cpu_violent_ms"),
+)
+_SMALLEST_CHANGE = 1e-4  # nats; what is below is drawn there
+
+Float64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class AdaptationSpec:
+    """One sequence, run by every competitor.
+
+    Attributes:
+        scene: a scene's name or a mesh file.
+        seed: of the scene, the path and the sensor noise.
+        stretches: how the camera is carried.
+        image_size: of the camera, width x height.
+        adaptation: what is compared with each of its configurations.
+    """
+
+    scene: str
+    seed: int
+    stretches: MotionSegments
+    image_size: str
+    adaptation: DivergenceAdaptationConfig
+
+
+@dataclass(frozen=True)
+class Adaptation(Experiment, Checked):
+    """Adaptation by divergence against each of its configurations and the full image size
+
+    Sequences are quiet and violent by turns; every SLAM is shown the same frames. Times are true
+    with one worker on a quiet machine.
+    """
+
+    scenes: tuple[str, ...] = ("living_room", "corridor", "table")
+    """Names of scenes, or mesh files."""
+    sequences: int = bounded(4, 1, 1000)
+    """Sequences for each scene."""
+    seeds: str = "validation"
+    """Split that the seeds come from."""
+    image_size: str = "320x240"
+    """Of the camera."""
+    stretches: MotionSegments = field(default_factory=MotionSegments)
+    """How the camera is carried."""
+    configurations: tuple[Path, ...] = ()
+    """YAML files, from fast to robust; none for the default three."""
+    thresholds: tuple[float, ...] = DivergenceAdaptationConfig.thresholds
+    """Of the change between frames, nats, one between any two configurations."""
+    release_share: float = DivergenceAdaptationConfig.release_share
+    """Of the thresholds, below which the way down is open."""
+    dwell_frames: int = DivergenceAdaptationConfig.dwell_frames
+    """Frames below before the way down is taken."""
+
+    unit = "sequences"
+    workers = 1
+
+    def adaptation(self) -> DivergenceAdaptationConfig:
+        """What is to be judged."""
+        return DivergenceAdaptationConfig(
+            configurations=self.configurations or None,
+            thresholds=self.thresholds,
+            release_share=self.release_share,
+            dwell_frames=self.dwell_frames,
+        )
+
+    def specs(self) -> list[AdaptationSpec]:
+        """Every sequence."""
+        xtion(self.image_size)
+        check_names(("random",), self.scenes)
+        adaptation = self.adaptation()
+        return [
+            AdaptationSpec(scene, seed, self.stretches, self.image_size, adaptation)
+            for scene in self.scenes
+            for seed in seed_list(self.seeds, self.sequences)
+        ]
+
+    @staticmethod
+    def run(spec: AdaptationSpec) -> dict[str, Any]:
+        """Every competitor, the adaptive one last; change and level are its own, frame by frame."""
+        sequence = open_sequence(f"{spec.scene}:{spec.seed}", spec.image_size, path=spec.stretches)
+        frames = list(sequence.frames)
+        violent = spec.stretches.is_violent()
+        runs = []
+        levels: list[int] = []
+        changes: list[float] = []
+        for name, backend in competitors(spec.adaptation, sequence.intrinsics).items():
+            figures, levels, changes = judge(backend, frames, sequence.poses, violent)
+            runs.append({"configuration": name, **figures})
+        change = [round(value, 6) for value in changes]
+        return {"runs": runs, "change": change, "level": levels}
+
+    def tables(self, rows: Sequence[Row]) -> list[Table]:
+        """Every competitor's figures, then what adaptation cuts of them."""
+        runs = flattened(rows, "runs")
+        note = f"Medians of {len(finished(rows))} sequences with 95 % intervals."
+        return [Grouping(("configuration",), METRICS).table(runs, note=note), comparison(runs)]
+
+    def charts(self, rows: Sequence[Row]) -> list[Chart]:
+        """Error against time, and the first sequence along time."""
+        series = []
+        for (name,), runs in grouped(flattened(rows, "runs"), ("configuration",)).items():
+            ms, ate = ([run[key] for run in runs] for key in ("cpu_ms_mean", "ate_interpolated_m"))
+            series.append(Series(name, ms, ate, mode="dots"))
+            x, y = (summary(runs, key).value for key in ("cpu_ms_mean", "ate_interpolated_m"))
+            series.append(Series(name, [x], [y], mode="markers"))
+        against = Panel("cpu_ms_mean", "ate_interpolated_m", series, "y")
+        caption = "Small dots: sequences; large marks: medians."
+        charts = [Chart("error_time", "Error against time", caption, [against])]
+        return charts + [_time_line(row) for row in finished(rows)[:1]]
+
+    def content(self, rows: Sequence[Row]) -> Mapping[str, Any]:
+        """The configurations that adaptation switches among, from fast to robust."""
+        resolved = self.adaptation().resolved(xtion(self.image_size))
+        return {"configurations": [asdict(configuration) for configuration in resolved]}
+
+
+def competitors(
+    adaptation: DivergenceAdaptationConfig, intrinsics: Intrinsics
+) -> dict[str, SlamBackend]:
+    """Each configuration alone, the default ones with every frame, and the adaptation, last."""
+    given = adaptation.resolved(intrinsics)
+    also = [one for one in ALSO if _width(one) <= intrinsics.width]
+    fixed = {describe(one): one for one in (*given, *also)}
+    alone = {
+        name: AgentConfig(configurations=(one, one), start=0).adapt(slam.make("surfel", intrinsics))
+        for name, one in fixed.items()
+    }
+    # The same without the first change of configuration, which is from the default to the first.
+    adaptive = replace(adaptation, configurations=given).adapt(slam.make("surfel", intrinsics))
+    return {**alone, ADAPTIVE: adaptive}
+
+
+def _width(configuration: SlamConfiguration) -> int:
+    """Columns that frames are reduced to; 0 for as they come."""
+    size = configuration.image_size
+    return 0 if size is None else XTION_SIZES[size][0]
+
+
+def describe(configuration: SlamConfiguration) -> str:
+    """A configuration in a few words: image size, iterations and the like, share of frames."""
+    parts = [configuration.image_size or "full size"]
+    for key, value in configuration.slam_config.items():
+        is_list = isinstance(value, (tuple, list))
+        text = "-".join(map(str, value)) if is_list else str(value)
+        parts.append(f"{text} {key.replace('_', ' ').replace(' per level', '')}")
+    every = configuration.keep_every
+    return ", ".join([*parts, "every frame" if every == 1 else f"one frame in {every}"])
+
+
+def judge(
+    backend: SlamBackend, frames: Sequence[RGBDFrame], truth: Float64, violent: NDArray[np.bool_]
+) -> tuple[dict[str, float], list[int], list[float]]:
+    """Run a SLAM over N frames with true poses (N, 4, 4); ``violent`` (N,) says which are.
+
+    Returns:
+        figures; level and change of every frame.
+    """
+    levels: list[int] = []
+    changes: list[float] = []
+
+    def note(step: Step) -> None:
+        assert isinstance(backend, AdaptiveSlam)
+        levels.append(backend.level)
+        controller = backend.controller
+        changes.append(controller.change if isinstance(controller, DivergenceController) else 0.0)
+
+    run = run_sequence(backend, frames, start=truth[0], on_step=note)
+    online, processed, ms = run.estimates, run.processed, run.cpu_ms
+    kept = np.flatnonzero(processed)
+    filled = PoseInterpolation(kept.astype(np.float64), online[kept])(np.arange(len(frames)))
+    ate = metrics.ate_statistics(filled, truth)
+    figures = {
+        "cpu_ms_mean": float(ms.mean()),
+        "cpu_quiet_ms": float(ms[~violent].mean()),
+        "cpu_violent_ms": float(ms[violent].mean()) if violent.any() else float("nan"),
+        "ate_interpolated_m": ate.rmse,
+        "ate_interpolated_max_m": ate.max,
+        "ate_m": metrics.ate_rmse(online, truth),
+        "processed_share": float(processed.mean()),
+        "lost_share": float(np.mean(~run.tracking_ok)),
+    }
+    return figures, levels, changes
+
+
+def comparison(runs: Sequence[Row]) -> Table:
+    """What adaptation cuts of each fixed configuration's median time and error, paired."""
+    columns = ("configuration", "cpu_cut", "ate_cut", "better_share")
+    by_name = {name: results for (name,), results in grouped(runs, ("configuration",)).items()}
+    own = by_name.pop(ADAPTIVE, [])
+    lines = []
+    for name, other in by_name.items():
+        pairs = {
+            key: ([run[key] for run in own], [run[key] for run in other])
+            for key in ("cpu_ms_mean", "ate_interpolated_m")
+        }
+        (own_ate, other_ate) = pairs["ate_interpolated_m"]
+        line: dict[str, Any] = {
+            "configuration": name,
+            "cpu_cut": relative_cut(*pairs["cpu_ms_mean"]),
+            "ate_cut": relative_cut(own_ate, other_ate),
+            "better_share": float(np.mean(np.less(own_ate, other_ate))),
+        }
+        lines.append(line)
+    note = "Of the ATE with dropped frames interpolated. A negative cut is a rise; better: lower."
+    return make_table(columns, lines, "What adaptation cuts of each configuration", note)
+
+
+def _time_line(row: Mapping[str, Any]) -> Chart:
+    """Change between frames with its thresholds, and the configuration in force."""
+    spec, result = row["spec"], row["result"]
+    violent = MotionSegments(**spec["stretches"]).is_violent()
+    frames = list(range(len(violent)))
+    change = np.maximum(result["change"], _SMALLEST_CHANGE).tolist()
+    parts = {"quiet motion": ~violent, "violent motion": violent}
+    panels = [
+        Panel(
+            "frame",
+            key,
+            [
+                Series(name, frames, _where(part, values), mode="lines")
+                for name, part in parts.items()
+            ],
+            log,
+            guides,
+        )
+        for key, values, log, guides in (
+            ("change", change, "y", [Guide(t) for t in spec["adaptation"]["thresholds"]]),
+            ("level", result["level"], "", []),
+        )
+    ]
+    about = f"{spec['scene']}, seed {spec['seed']}: 0 is the fast configuration; dashed: thresholds"
+    return Chart("time_line", "One sequence", about, panels)
+
+
+def _where(part: NDArray[np.bool_], values: Sequence[float]) -> list[float | None]:
+    """The values where ``part``, None elsewhere."""
+    return [value if here else None for here, value in zip(part, values, strict=True)]
