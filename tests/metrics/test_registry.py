@@ -50,7 +50,7 @@ def test_an_entry_says_what_it_is_in_words_and_known_units(entry: Metric) -> Non
 
 @of_all(METRICS)
 def test_a_key_is_lower_case_and_ends_in_its_unit(entry: Metric) -> None:
-    assert re.fullmatch(r"M_[ID]|T_[a-z_]+|[a-z]([a-z0-9_]|\{[a-z]+\})*", entry.key)
+    assert re.fullmatch(r"(M|mean)_[ID]|T_[a-z_]+|[a-z]([a-z0-9_]|\{[a-z]+\})*", entry.key)
     if NO_UNIT.fullmatch(entry.key) or "_per_" in entry.key:
         return
     unit = next((u for end, u in SUFFIXES.items() if entry.key.endswith(f"_{end}")), entry.unit)
