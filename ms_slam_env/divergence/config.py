@@ -15,7 +15,7 @@ class DivergenceConfig(Checked):
     """How the histograms of a frame are made and compared.
 
     The defaults are those under which the divergence predicted from the map follows the one that
-    is met (``python -m ms_slam_env.benchmark.fidelity``).
+    is met (``ms-slam experiment lookahead_ranking``).
 
     Attributes:
         measure: ``kl`` (equations (5) and (10) of Saeedi et al., ICRA 2017), ``windowed-kl`` (its

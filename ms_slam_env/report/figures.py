@@ -34,7 +34,12 @@ def draw(chart: Chart) -> Figure:
     """The chart with its panels side by side and one legend."""
     names = list(dict.fromkeys(s.name for panel in chart.panels for s in panel.series))
     categories = {str(y) for p in chart.panels if not p.y for s in p.series for y in s.y}
-    figure = new_figure(len(chart.panels), height=max(3.2, 1.2 + 0.4 * len(categories)))
+    longest = max(map(len, categories), default=0)
+    figure = new_figure(
+        len(chart.panels),
+        3.4 + max(0.0, 0.08 * longest - 1.0) / len(chart.panels),
+        max(3.2, 1.2 + 0.4 * len(categories)),
+    )
     axes = figure.subplots(1, len(chart.panels), squeeze=False)[0]
     for ax, panel in zip(axes, chart.panels, strict=True):
         _draw_panel(ax, panel, names)

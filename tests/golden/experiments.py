@@ -221,11 +221,21 @@ def arm_mask_walk(_: Path) -> Any:
     return {**found, "reasons": dict(sorted(reasons.items()))}
 
 
-@experiment("fidelity")
-def fidelity(_: Path) -> Any:
-    from ms_slam_env.benchmark.fidelity import FidelitySpec, run_path
+@experiment("lookahead_ranking")
+def lookahead_ranking(_: Path) -> Any:
+    from ms_slam_env.experiments.lookahead_ranking import (
+        JUDGED,
+        KINDS,
+        LookaheadRanking,
+        RankingSpec,
+    )
 
-    return run_path(FidelitySpec("carpet", 1000, 1, 0.06, 6.0, "80x60"))
+    found = LookaheadRanking.run(RankingSpec("carpet", 1000, 1, 0.06, 6.0, "80x60"))
+    pairs = {
+        state["variant"]: {name: [state[f"{name}_{kind}"] for kind in KINDS] for name in JUDGED}
+        for state in found.pop("predictions")
+    }
+    return {**found, "variants": pairs}
 
 
 # --- SLAM on sequences ----------------------------------------------------------------------------

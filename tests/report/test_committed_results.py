@@ -26,7 +26,6 @@ NOT_CONVERTED = {
     "explore_divergence",
     "explore_fresh",
     "explore_samplers",
-    "fidelity",
     "frame_management",
     "frame_management_steady",
     "multi_robot/foreign",
