@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 
 from ms_slam_env import metrics, slam
-from ms_slam_env.benchmark import compare_inputs
-from ms_slam_env.benchmark.compare_inputs import Input
 from ms_slam_env.camera import XTION_SIZES
 from ms_slam_env.config import check_choice, check_range
 from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.evaluation.map_quality import map_quality
 from ms_slam_env.evaluation.run_sequence import run_sequence
+from ms_slam_env.evaluation.seen_surface import SequenceWithSurface, open_with_surface
 from ms_slam_env.evaluation.sequence_divergence import consecutive_divergences
 from ms_slam_env.exploration.objectives import FAILURE
 from ms_slam_env.metrics.cost import CostMeter
@@ -116,7 +115,7 @@ class SlamEvaluator:
         except (RuntimeError, ArithmeticError, ValueError, MemoryError) as error:
             return {**row, "lost": 1.0, FAILURE: f"{text}: {error or type(error).__name__}"}
 
-    def _run(self, configuration: SlamConfiguration, given: Input) -> Row:
+    def _run(self, configuration: SlamConfiguration, given: SequenceWithSurface) -> Row:
         device = str(configuration.slam_config.get("device", "cpu"))
         meter = CostMeter(device)
         system = slam.make(configuration.slam, given.intrinsics, **configuration.slam_config)
@@ -162,8 +161,8 @@ def summarise(rows: Sequence[Row]) -> Row:
 
 
 @lru_cache(maxsize=64)
-def _load(text: str, size: str, path: HandheldPath) -> Input:
-    return compare_inputs.load(text, size, path)
+def _load(text: str, size: str, path: HandheldPath) -> SequenceWithSurface:
+    return open_with_surface(text, size, path)
 
 
 @lru_cache(maxsize=1024)
@@ -180,7 +179,7 @@ def _divergences(text: str, size: str, path: HandheldPath, every: int) -> tuple[
 _WARM: set[tuple[str, str, str]] = set()
 
 
-def _warm_up(backend: str, size: str, device: str, given: Input) -> None:
+def _warm_up(backend: str, size: str, device: str, given: SequenceWithSurface) -> None:
     """Run the backend once in this process before any run is timed: kernels are loaded."""
     if (backend, size, device) not in _WARM:
         _WARM.add((backend, size, device))

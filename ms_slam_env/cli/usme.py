@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
-import tyro
-
-from ms_slam_env.benchmark.usme import UsmeOptions, make_suite, run_suite
-from ms_slam_env.command_line import parse, report_failures
+from ms_slam_env.cli.experiment import run
+from ms_slam_env.command_line import parse
+from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import unknown
-
-_Options = tyro.conf.OmitArgPrefixes[UsmeOptions]
+from ms_slam_env.experiments.pictures.usme import save_usme_picture
+from ms_slam_env.experiments.usme import Usme, check_suite
+from ms_slam_env.sequences.usme_suite import NAMES, make_suite
 
 
 @dataclass(frozen=True)
-class Make:
+class Make(Checked):
     """Render the eight sequences into folders, in the TUM layout that ms-slam run reads.
 
     An interrupted call goes on from where it was when the same command is given again.
@@ -27,27 +27,20 @@ class Make:
     """Folder that gets one folder a sequence."""
     truth: bool = False
     """Also write true depth and object labels."""
-    options: _Options = field(default_factory=UsmeOptions)
-    """Of the suite."""
+    sequences: tuple[str, ...] = NAMES
+    """Their names."""
+    image_size: str = "160x120"
+    """Such as 160x120."""
+    seed: int = bounded(2000, 0, 2**32 - 1)
+    """Of scenes, paths, noise and perturbations."""
+    frames_scale: float = bounded(1.0, 0.002, 10.0)
+    """Share of the frames that the same paths take: 0.5 halves the work and doubles the camera's
+    speed."""
 
-
-@dataclass(frozen=True)
-class Run:
-    """Run SLAM backends over the eight sequences and print the USME tables.
-
-    Every run has a process of its own. Runs that are in --out already are not repeated.
-    """
-
-    folder: tyro.conf.Positional[Path | None] = None
-    """Folder that ms-slam usme make wrote; without it every frame is rendered when it is needed."""
-    backends: tuple[str, ...] = ("surfel", "odometry")
-    """NAME, parameters appended as in surfel,loop_closure=deformation."""
-    workers: int = 1
-    """Runs at the same time; more than one disturbs the time by the clock."""
-    out: Path = Path("results/usme_run")
-    """Folder of the results."""
-    options: _Options = field(default_factory=UsmeOptions)
-    """Of the suite."""
+    def __post_init__(self) -> None:
+        """Refuse what cannot be rendered."""
+        super().__post_init__()
+        check_suite(self.sequences, self.image_size)
 
 
 @dataclass(frozen=True)
@@ -60,7 +53,7 @@ class Picture:
     """Of scenes, ways, noise and perturbations."""
 
 
-COMMANDS: dict[str, type[Make | Run | Picture]] = {"make": Make, "run": Run, "picture": Picture}
+COMMANDS: dict[str, type[Make | Usme | Picture]] = {"make": Make, "run": Usme, "picture": Picture}
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -71,22 +64,22 @@ def main(arguments: Sequence[str]) -> int:
     name, *rest = arguments
     if name not in COMMANDS:
         raise unknown("command of ms-slam usme", name, COMMANDS)
+    if name == "run":
+        return run(Usme, rest, "ms-slam usme run", Path("results/usme_run"))
     command = parse(COMMANDS[name], rest, f"ms-slam usme {name}")
     if isinstance(command, Make):
-        folders = make_suite(command.options, command.out, command.truth)
+        folders = make_suite(
+            command.out,
+            command.sequences,
+            command.image_size,
+            command.seed,
+            command.frames_scale,
+            command.truth,
+        )
         print(f"{len(folders)} sequences in {command.out}")
-        return 0
     if isinstance(command, Picture):
-        from ms_slam_env.benchmark.usme_report import save_contact_sheet
-
-        print(f"written: {save_contact_sheet(command.out, command.seed)}")
-        return 0
-    text, failed = run_suite(
-        command.options, command.backends, command.out, command.folder, command.workers
-    )
-    print(text)
-    print(f"written: {command.out}/usme.json, table.md, usme.png", file=sys.stderr)
-    return report_failures(failed)
+        print(f"written: {save_usme_picture(command.out, command.seed)}")
+    return 0
 
 
 def _usage() -> str:

@@ -87,6 +87,10 @@ def write_evaluation(parts: Sequence[Evaluation], out: Path) -> None:
         part.write(out)
 
 
+def _one_line(keys: Sequence[str], found: Found, title: str, note: str = "") -> Table:
+    return make_table(keys, [{key: found[key] for key in keys}], title, note)
+
+
 # -- Trajectories ------------------------------------------------------------------------------
 
 
@@ -162,7 +166,7 @@ def trajectory_tables(found: Found, options: TrajectoryOptions) -> list[Table]:
         note += f" Robustness of tracking is not available: {found['robustness_reason']}."
     if found["initialisation_s"] is None:
         note += " The scale does not settle."
-    return [*tables, make_table(shown, [found], "Robustness and initialisation", note)]
+    return [*tables, _one_line(shown, found, "Robustness and initialisation", note)]
 
 
 def trajectory_charts(matched: Matched, options: TrajectoryOptions) -> list[Chart]:
@@ -230,8 +234,8 @@ def map_tables(found: Found, options: MapOptions) -> list[Table]:
     shares = share_keys(options.thresholds_m)
     others = [key for key in _map_keys(options) if key not in shares]
     return [
-        make_table(shares, [found], "Map", map_heading(found, options)),
-        make_table(others, [found], "Distances of the map"),
+        _one_line(shares, found, "Map", map_heading(found, options)),
+        _one_line(others, found, "Distances of the map"),
     ]
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry.point_clouds import voxel_downsample
-from ms_slam_env.sequences import Sequence
+from ms_slam_env.sequences import CameraPath, Sequence, open_sequence
 
 Float64 = NDArray[np.float64]
 
@@ -45,3 +47,26 @@ def back_projected(
     return (intrinsics.rays()[valid] * depth[valid, None]) @ T_world_camera[
         :3, :3
     ].T + T_world_camera[:3, 3]
+
+
+@dataclass(frozen=True)
+class SequenceWithSurface(Sequence):
+    """A sequence with its truth, its frames in memory.
+
+    Attributes:
+        surface: (M, 3) true surface that the frames saw, about 1 cm apart, world frame.
+    """
+
+    surface: Float64
+
+
+def open_with_surface(text: str, image_size: str, path: CameraPath) -> SequenceWithSurface:
+    """The sequence that ``text`` names, at ``image_size``; ``path`` is that of rendered ones.
+
+    Raises:
+        InputError: a sequence that cannot be made or read, or a recording without truth.
+    """
+    sequence = open_sequence(text, image_size, path=path, with_truth=True)
+    surface = seen_surface(sequence)
+    frames = tuple(sequence.frames)
+    return SequenceWithSurface(frames, sequence.poses, sequence.intrinsics, sequence.name, surface)

@@ -243,24 +243,23 @@ def lookahead_ranking(_: Path) -> Any:
 
 @experiment("compare")
 def compare(_: Path) -> Any:
-    from ms_slam_env.benchmark.compare_run import CompareSpec, run_here
+    from ms_slam_env.experiments.compare import Compare, CompareSpec
 
+    text = "table:1000:kinect+exposure-ramp"
     return {
-        backend: run_here(
-            CompareSpec("table:1000:kinect+exposure-ramp", backend, "80x60", frames=12)
-        )
+        backend: Compare.run(CompareSpec(text, backend, "80x60", frames=12))
         for backend in ("surfel", "odometry")
     }
 
 
 @experiment("usme", CHAOTIC)
 def usme(folder: Path) -> Any:
-    from ms_slam_env.benchmark.usme import UsmeOptions, make_suite
-    from ms_slam_env.benchmark.usme_run import UsmeSpec, run_here
+    from ms_slam_env.experiments.usme import UsmeSpec, run_usme
+    from ms_slam_env.sequences.usme_suite import make_suite
 
     name, size, seed, scale = "room-fast-black", "80x60", 2000, 0.3
-    (made,) = make_suite(UsmeOptions((name,), size, seed, scale), folder)
-    return run_here(UsmeSpec(name, "surfel", size, seed, frames_scale=scale, folder=str(made)))
+    (made,) = make_suite(folder, (name,), size, seed, scale)
+    return run_usme(UsmeSpec(name, "surfel", size, seed, scale, str(made)))
 
 
 @experiment("adaptation", CHAOTIC)
@@ -338,24 +337,6 @@ def slam_batch(_: Path) -> Any:
         scene="table", seed=1000, size="80x60", frames=6, warm_up=1, sequences=2, max_surfels=8000
     )
     return measure(config, 3, *render(config))
-
-
-@experiment("slam_peers", CHAOTIC)
-def slam_peers(_: Path) -> Any:
-    """Open3D is left out: it adds up in another order each time."""
-    from ms_slam_env import scenes
-    from ms_slam_env.benchmark.slam_peers import OurSlam, map_growth, run_peer
-    from ms_slam_env.benchmark.slam_peers_opencv import OpenCVOdometry
-    from ms_slam_env.camera import xtion
-    from ms_slam_env.sequences import render_sequence, repeated_trajectory
-
-    K, scene = xtion("80x60"), scenes.make("table", 1000)
-    sequence = render_sequence(scene, repeated_trajectory(scene, 8, 1000, 2), K, "kinect", 1000)
-    return {
-        "surfel": run_peer(OurSlam("surfel", K), sequence, "80x60"),
-        "opencv": run_peer(OpenCVOdometry(K), sequence, "80x60"),
-        "growth": map_growth(OurSlam("surfel", K), sequence, 8),
-    }
 
 
 @experiment("slam_speed")

@@ -19,8 +19,6 @@ NOT_CONVERTED = {
     "arm_fuse_all",
     "arm_masks",
     "arm_stop_and_look",
-    "compare160",
-    "compare320",
     "env_speed",
     "explore",
     "explore_divergence",
@@ -32,11 +30,9 @@ NOT_CONVERTED = {
     "multi_robot/three_robots",
     "multi_robot/two_robots",
     "pose_covariance",
-    "slam_peers",
     "slam_speed",
     "speed",
     "train",
-    "usme",
 }
 """Folders with files of an older form; a folder that is converted is taken out."""
 

@@ -13,16 +13,20 @@ those of a game engine, its depth is exact; ours are procedural and smaller, the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+import json
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env import __version__, scenes
 from ms_slam_env.camera import xtion
 from ms_slam_env.config import parse_named
-from ms_slam_env.errors import unknown
-from ms_slam_env.scenes import LARGE_SCENES, Scene
+from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.scenes import Scene
 from ms_slam_env.sequences import (
     HandheldPath,
     Perturbation,
@@ -31,6 +35,7 @@ from ms_slam_env.sequences import (
     make_perturbation,
     render_sequence,
 )
+from ms_slam_env.sequences.writing import DESCRIPTION, write_sequence
 
 Float64 = NDArray[np.float64]
 
@@ -52,8 +57,7 @@ class UsmeSequence:
         path: the camera's way.
         noise: of the sensor.
         perturbations: ``NAME,option=value,...``.
-        loops: how often the way comes back to where it was (``usme_loops.count_loops``); None
-            where it just wanders.
+        loops: how often the path comes back to where it was; None where it just wanders.
         about: in words.
     """
 
@@ -178,39 +182,7 @@ SUITE: tuple[UsmeSequence, ...] = (
 """In the order of the paper's section 3."""
 
 
-@dataclass(frozen=True)
-class SlamOptions:
-    """Options that a backend needs in a scene, beside what the user asks for.
-
-    The defaults of the backends are for a Kinect in a room; streets and halls need a farther
-    cut-off, and the surfel SLAM widths of its filters that fit the noise of the camera there:
-    with its own it was lost 66 frames into a city street (seed 1000, 160x120), with these never.
-    """
-
-    surfel: dict[str, Any] = field(
-        default_factory=lambda: {
-            "depth_cutoff_m": 10.0,
-            "bilateral_sigma_m": 0.003,
-            "fusion_distance_m": 0.01,
-            "depth_noise_m": 0.001,
-            "max_surfels": 2_000_000,
-        }
-    )
-    odometry: dict[str, Any] = field(
-        default_factory=lambda: {"depth_cutoff_m": 10.0, "max_surfels": 2_000_000}
-    )
-    volumetric: dict[str, Any] = field(
-        default_factory=lambda: {"depth_cutoff_m": 10.0, "voxel_m": 0.06}
-    )
-    sparse: dict[str, Any] = field(default_factory=lambda: {"depth_cutoff_m": 10.0})
-
-
-LARGE_OPTIONS = SlamOptions()
-
-
-def slam_options(scene: str, backend: str) -> dict[str, Any]:
-    """Options of ``backend`` in ``scene``; none in rooms."""
-    return dict(getattr(LARGE_OPTIONS, backend, {})) if scene in LARGE_SCENES else {}
+NAMES = tuple(entry.name for entry in SUITE)
 
 
 def find(name: str) -> UsmeSequence:
@@ -251,3 +223,64 @@ def render(
         perturbations=entry.made_perturbations(frames_scale),
         timestamps=times,
     )
+
+
+def describe(
+    name: str, image_size: str = "160x120", seed: int = 2000, frames_scale: float = 1.0
+) -> dict[str, Any]:
+    """What makes a sequence, for its folder."""
+    return {
+        "version": __version__,
+        "suite": "usme",
+        "sequence": asdict(find(name)),
+        "image_size": image_size,
+        "seed": seed,
+        "frames_scale": frames_scale,
+    }
+
+
+def make_suite(
+    out: Path,
+    names: Iterable[str] = NAMES,
+    image_size: str = "160x120",
+    seed: int = 2000,
+    frames_scale: float = 1.0,
+    with_truth: bool = False,
+) -> list[Path]:
+    """Write sequences into folders of ``out``; go on where an interrupted call stopped.
+
+    Raises:
+        InputError: an unknown name or size, or a folder that holds something else.
+    """
+    made: dict[str, Scene] = {}
+    folders = []
+    for name in names:
+        entry = find(name)
+        if entry.scene not in made:
+            made = {entry.scene: scenes.make(entry.scene, seed)}  # one is large enough
+        sequence = render(entry, made[entry.scene], image_size, frames_scale)
+        about = describe(name, image_size, seed, frames_scale)
+        write_sequence(sequence, out / name, about, with_truth)
+        folders.append(out / name)
+    return folders
+
+
+def check_folder(folder: Path, image_size: str, seed: int, frames_scale: float) -> None:
+    """Refuse a folder that is not the sequence of these options.
+
+    Raises:
+        InputError: it holds none, or another one.
+    """
+    wanted = json.loads(json.dumps(describe(folder.name, image_size, seed, frames_scale)))
+    file = folder / DESCRIPTION
+    if not file.is_file():
+        raise InputError(f"{folder} holds no finished sequence; ms-slam usme make writes it")
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise InputError(f"cannot read {file}: {error}") from None
+    for name, value in wanted.items():
+        if found.get(name) != value:
+            raise InputError(
+                f"{folder} was made with another {name.replace('_', ' ')}, see its {DESCRIPTION}"
+            )

@@ -1,0 +1,45 @@
+"""The picture of the USME suite: two frames of each of its eight sequences."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env import scenes
+from ms_slam_env.sequences.usme_suite import SUITE, render
+
+Image = NDArray[np.uint8]
+
+_BORDER, _TITLE, _COLUMNS = 4, 20, 4
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+
+
+def save_usme_picture(path: Path, seed: int) -> Path:
+    """Draw two frames of each sequence, one above the other."""
+    made: dict[str, scenes.Scene] = {}
+    tiles = []
+    for entry in SUITE:
+        if entry.scene not in made:
+            made[entry.scene] = scenes.make(entry.scene, seed)
+        sequence = render(entry, made[entry.scene], "320x240")
+        count = len(sequence)
+        shown = [sequence.frames[k].color for k in (count // 3, int(0.52 * count))]
+        tiles.append(_tile(entry.name, shown))
+    rows = [np.concatenate(tiles[k : k + _COLUMNS], 1) for k in range(0, len(tiles), _COLUMNS)]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), np.concatenate(rows, 0))
+    return path
+
+
+def _tile(name: str, images: Sequence[Image]) -> Image:
+    h, w = images[0].shape[:2]
+    tile = np.full((_TITLE + len(images) * (h + _BORDER), w + _BORDER, 3), 255, np.uint8)
+    cv2.putText(tile, name, (4, 14), _FONT, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
+    for k, image in enumerate(images):
+        top = _TITLE + k * (h + _BORDER)
+        tile[top : top + h, :w] = image[:, :, ::-1]
+    return tile

@@ -1,0 +1,122 @@
+"""``ms-slam usme``: measures, tables, folders, bad input."""
+
+import json
+from functools import cache
+
+import numpy as np
+import pytest
+from large_scenes import SEED
+
+from ms_slam_env import scenes, slam
+from ms_slam_env.cli import main
+from ms_slam_env.errors import InputError
+from ms_slam_env.experiments import usme
+from ms_slam_env.experiments.harness import running
+
+make_scene = cache(scenes.make)
+
+
+@pytest.fixture
+def cheap(monkeypatch):
+    """Scenes are built once, the true surface is seen in small images."""
+    monkeypatch.setattr(scenes, "make", make_scene)
+    monkeypatch.setattr(usme, "_VIEW_SIZE", "80x60")
+
+
+def test_options_of_a_backend_are_those_of_the_scene():
+    assert usme.slam_options("living_room", "surfel") == {}
+    for backend in slam.BACKENDS:
+        options = usme.slam_options("city_street", backend)
+        assert options["depth_cutoff_m"] == 10.0
+
+
+@pytest.mark.usefixtures("cheap")
+def test_one_run_has_every_measure():
+    spec = usme.UsmeSpec("room-fast-black", "surfel", "80x60", SEED, frames_scale=0.12)
+    result = usme.run_usme(spec)
+    assert result["frames"] > 30
+    assert 0.0 <= result["lost_share"] <= 1.0
+    assert not np.isnan(result["relocalisation_s"])
+    assert result["ate_m"] <= result["ate_max_m"]
+    assert result["end_error_share"] == pytest.approx(result["end_error_m"] / result["path_m"])
+    assert 0.0 <= result["noise_ratio"] < 1.0
+    assert result["hausdorff_directed_m"] >= result["c2c_mean_m"] > 0.0
+    assert result["ene_source"]
+    row = {"spec": {"sequence": "room-fast-black", "backend": "surfel"}}
+    failed = {**row, "result": None, "error": "InputError: no"}
+    tables = usme.Usme().tables([{**row, "result": result, "error": None}, failed])
+    assert [table.title for table in tables] == ["Sequences", *usme.TABLES]
+    assert [len(table.rows) for table in tables] == [1] * 5
+    assert tables[0].rows[0]["about"] == "the same with a run of black frames"
+
+
+def test_a_map_against_itself_is_without_error():
+    rng = np.random.default_rng(0)
+    plane = np.column_stack([rng.uniform(0, 2, (20_000, 2)), 0.003 * rng.standard_normal(20_000)])
+    found = usme.map_measures(plane, plane, "living_room")
+    assert found["c2c_mean_m"] < 1e-3
+    assert found["recall_near"] > 0.99
+    empty = usme.map_measures(np.zeros((0, 3)), plane, "living_room")
+    assert (empty["map_points"], empty["c2c_mean_m"]) == (0, None)
+
+
+def run_here(specs, run, *_, **__):
+    """In this process, in which the scenes are."""
+    return [
+        {"key": spec.backend, "spec": spec.__dict__, "result": run(spec), "error": None}
+        for spec in specs
+    ]
+
+
+@pytest.mark.usefixtures("cheap")
+def test_make_writes_what_run_reads(tmp_path, capsys, monkeypatch):
+    few = [
+        "--seed",
+        str(SEED),
+        "--sequences",
+        "room-fast",
+        "--frames-scale",
+        "0.02",
+        "--image-size",
+        "80x60",
+    ]
+    assert main(["usme", "make", *few, "--out", str(tmp_path / "made")]) == 0
+    assert (tmp_path / "made/room-fast/groundtruth.txt").is_file()
+    assert main(["usme", "make", *few, "--out", str(tmp_path / "made")]) == 0
+    monkeypatch.setattr(usme, "limit_threads", lambda _: None)
+    monkeypatch.setattr(running, "run_all", run_here)
+    ran = ["usme", "run", str(tmp_path / "made"), *few, "--backends", "odometry"]
+    assert main([*ran, "--out", str(tmp_path / "out")]) == 0
+    text = capsys.readouterr().out
+    assert "| room-fast | odometry |" in text
+    content = json.loads((tmp_path / "out/results.json").read_text())
+    assert content["rows"][0]["result"]["frames"] >= 5
+    assert (tmp_path / "out/usme.png").stat().st_size > 1000
+    other = [*ran, "--seed", "7", "--out", str(tmp_path / "other")]
+    assert main(other) == 2
+    assert "another seed" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["fly"], "make, run, picture"),
+        (["run", "--backends", "magic"], "unknown SLAM backend 'magic'"),
+        (["run", "--backends", "odometry,magic=1"], "slam_config.magic"),
+        (["make", "--sequences", "x"], "unknown USME sequence 'x'"),
+        (["make", "--image-size", "1x1"], "unknown image size"),
+        (["run", "/nowhere"], "holds no finished sequence"),
+    ],
+)
+def test_bad_input_is_one_line(arguments, message, capsys):
+    assert main(["usme", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert len(error.strip().splitlines()) == 1
+
+
+def test_options_out_of_range_are_refused():
+    with pytest.raises(InputError, match="frames_scale"):
+        usme.Usme(frames_scale=0.0)
+    with pytest.raises(InputError, match="empty"):
+        usme.Usme(sequences=())
