@@ -1,15 +1,15 @@
-# make install | test | benchmark: each does all its own set-up in .venv; running again is instant.
+# make install | test | benchmark | docs: each does all its own set-up in .venv; running again is instant.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 WORKERS ?= 2
 BIN := .venv/bin
 STAMP := .venv/.installed
-EXTRAS := open3d,gtsam,train,statistics,explore,ray,report,energy,dev
+EXTRAS := open3d,gtsam,train,statistics,explore,ray,report,energy,docs,dev
 SYSTEM_LIBRARIES := libusb-1.0-0 libgl1
 # One thread per process: the tests and the benchmark run in parallel processes.
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: install test benchmark lint types clean
+.PHONY: install test benchmark docs lint types clean
 
 install: $(STAMP)
 
@@ -44,5 +44,11 @@ benchmark: $(STAMP)
 	$(BIN)/ms-slam benchmark --scenes living_room table --episodes 3 --steps 60 \
 	    --workers $(WORKERS) --out results/benchmark
 
+# The tables of the Markdown pages from docs/results, then the site into site/.
+docs: $(STAMP)
+	$(BIN)/ms-slam docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "site/index.html"
+
 clean:
-	rm -rf .venv build dist *.egg-info results
+	rm -rf .venv build dist *.egg-info results site

@@ -1,0 +1,258 @@
+"""Pages of the site that are made, not written: gallery, API, results, metrics; and their links.
+
+MkDocs calls the functions ``on_...`` while it builds (``make docs``).
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).resolve().parents[2]
+RESULTS = ROOT / "docs" / "results"
+
+API = {
+    "ms_slam_env": "registration of the environments",
+    "ms_slam_env.env": "environment, configuration, planners' interface",
+    "ms_slam_env.env.wrappers": "wrappers",
+    "ms_slam_env.camera": "intrinsics, frames, images",
+    "ms_slam_env.geometry": "rigid motions",
+    "ms_slam_env.divergence": "information divergence",
+    "ms_slam_env.scenes": "scenes",
+    "ms_slam_env.sensor": "RGB-D sensor",
+    "ms_slam_env.robot": "motions and embodiments",
+    "ms_slam_env.robot.arm": "the arm",
+    "ms_slam_env.slam": "backends",
+    "ms_slam_env.slam.surfel": "surfel SLAM",
+    "ms_slam_env.sequences": "sequences",
+    "ms_slam_env.sequences.perturbations": "perturbations",
+    "ms_slam_env.metrics": "metrics",
+    "ms_slam_env.metrics.registry": "what a key of a result means",
+    "ms_slam_env.evaluation.run_sequence": "run a sequence",
+    "ms_slam_env.evaluation.map_quality": "judge a map",
+    "ms_slam_env.exploration": "design-space exploration",
+    "ms_slam_env.experiments.harness": "experiments",
+    "ms_slam_env.report.results": "result files",
+    "ms_slam_env.report.tables": "tables",
+    "ms_slam_env.report.charts": "charts",
+    "ms_slam_baselines": "baseline planners",
+}
+"""Modules with public names, and what is in them."""
+
+
+def on_config(config: Any) -> Any:
+    """Put the made pages into the places that the navigation keeps for them."""
+    made = {"Gallery": _gallery(), "API": _api(), "Results": _results()}
+    for group in (config.nav, *(next(iter(entry.values())) for entry in config.nav)):
+        for entry in group if isinstance(group, list) else ():
+            for title in made.keys() & entry.keys():
+                pages = sorted(name for name, _ in made[title])
+                pages.sort(key=lambda name: name.count("/index.md") == 0 or name.count("/") > 1)
+                entry[title] = pages
+    return config
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add the pages that are made, the pages of the root and the notebooks."""
+    pages = dict(_root_pages()) | dict(_api()) | dict(_results()) | dict(_gallery())
+    pages["metrics.md"] = _metrics()
+    for name, text in pages.items():
+        files.append(File.generated(config, name, content=text))
+    for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        files.append(File.generated(config, f"notebooks/{path.name}", abs_src_path=str(path)))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Lead links that hold in a clone to the pages of the site."""
+    up = "../" * page.file.src_uri.count("/")
+    for here, there in (
+        (r"\(\.\./BENCHMARK\.md", f"({up}benchmark.md"),
+        (r"\(\.\./CHANGELOG\.md", f"({up}changelog.md"),
+        (r"\(\.\./README\.md", f"({up}index.md"),
+        (r"\(\.\./notebooks/", f"({up}notebooks/"),
+        (r"(\(results/[^)]*/)table\.md", r"\1index.md"),
+    ):
+        markdown = re.sub(here, there, markdown)
+    return markdown
+
+
+def on_page_content(html: str, **_: Any) -> str:
+    """Show the roles of docstrings (:class:`x`) as code alone."""
+    return re.sub(r":(?:class|func|meth|mod|attr|data):(<code)", r"\1", html)
+
+
+def _root_pages() -> Iterator[tuple[str, str]]:
+    """BENCHMARK.md and CHANGELOG.md as pages beside those of docs/."""
+    for name in ("BENCHMARK", "CHANGELOG"):
+        text = (ROOT / f"{name}.md").read_text(encoding="utf-8")
+        text = re.sub(r"\(docs/", "(", text).replace("(README.md", "(index.md")
+        yield f"{name.lower()}.md", re.sub(r"\(CHANGELOG\.md", "(changelog.md", text)
+
+
+def _table(headings: list[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    lines = [headings, ["---"] * len(headings), *rows]
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+
+
+def _api() -> Iterator[tuple[str, str]]:
+    """A page for each module with public names, and one that lists them."""
+    rows = [(f"[`{module}`]({module}.md)", what) for module, what in API.items()]
+    listing = _table(["module", "what is in it"], rows)
+    yield "api/index.md", f"# API\n\nEvery public name, by module.\n\n{listing}"
+    for module in API:
+        yield f"api/{module}.md", f"# `{module}`\n\n::: {module}\n"
+
+
+def _results() -> Iterator[tuple[str, str]]:
+    """A page for each folder of committed results, and one that lists them."""
+    from ms_slam_env.metrics.registry import RESULTS_VERSION
+
+    rows = []
+    for table in sorted(RESULTS.rglob("table.md")):
+        name = table.parent.relative_to(RESULTS).as_posix()
+        content = _content(table.parent)
+        title, about = content.get("title", name), content.get("about", "")
+        figures = "".join(f"![{p.stem}]({p.name})\n\n" for p in sorted(table.parent.glob("*.png")))
+        text = table.read_text(encoding="utf-8")
+        yield f"results/{name}/index.md", f"# {title}\n\n{about}\n\n{text}\n\n{figures}"
+        version = content.get("results_version", 1)
+        age = "today" if version == RESULTS_VERSION else f"version {version} of {RESULTS_VERSION}"
+        rows.append((f"[{name}]({name}/index.md)", title, age))
+    listing = _table(["results", "what they show", "made by the algorithms of"], rows)
+    about = "What the experiments wrote, as it is committed in `docs/results`."
+    yield "results/index.md", f"# Results\n\n{about}\n\n{listing}"
+
+
+def _content(folder: Path) -> dict[str, Any]:
+    """The result file of a folder; empty where there is none."""
+    for path in sorted(folder.glob("*.json")):
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if isinstance(content, dict) and "kind" in content:
+            return content
+    return {}
+
+
+def _metrics() -> str:
+    """The registry of metrics as one table."""
+    from ms_slam_env.metrics.registry import registry
+
+    rows = [(f"`{key}`", m.label, m.explanation) for key, m in registry().items()]
+    about = "What every key of a result means: one heading, unit and definition."
+    return f"# Metrics\n\n{about}\n\n{_table(['key', 'heading', 'meaning'], rows)}"
+
+
+NUM_CONFIGURATIONS = 3  # of the default ladder of MSActiveSLAM-Adaptive-v0
+
+HOLDERS = {
+    "MSActiveSLAM-v0": "A simulated 6-DOF arm (Kinova Mico, MuJoCo) holds the camera; motions that "
+    "it cannot make are masked. See [the arm](../arm.md).",
+    "MSActiveSLAM-FreeCamera-v0": "The camera flies; motions into furniture are masked.",
+    "MSActiveSLAM-FixedTranslation-v0": "The camera moves on a straight line by itself; the agent "
+    "chooses the rotation, as in the paper's second experiment.",
+    "MSActiveSLAM-Adaptive-v0": "The arm holds the camera; with each motion the agent also chooses "
+    "which SLAM configuration, from fast to robust, its frames are processed under.",
+}
+
+ENVIRONMENT = """# {env_id}
+
+{holder}
+
+![A moment of an episode](../pictures/environments/{env_id}.png)
+
+```python
+import gymnasium as gym
+import ms_slam_env
+
+env = gym.make("{env_id}", scene="living_room")
+observation, info = env.reset(seed=0)
+```
+
+## Actions
+
+{space}: {what}
+
+{actions}
+Axes are those of the current camera frame. `info["action_mask"]` says what is possible; a masked
+action does nothing.
+
+## Observations
+
+{observations}
+At the default image size of 160x120. What the numbers are, the reward, `info` and all options:
+[environments](../environments.md).
+"""
+
+
+def _gallery() -> Iterator[tuple[str, str]]:
+    """A page for each id, with picture, spaces and an example, and one that shows them all."""
+    from ms_slam_env import ENV_IDS, PERTURBED_ENV_IDS
+
+    rows = []
+    for env_id in ENV_IDS:
+        picture = f"![{env_id}](../pictures/environments/{env_id}.png)"
+        yield f"gallery/{env_id}.md", _environment(env_id)
+        rows.append((picture, f"[`{env_id}`]({env_id}.md)", _space(env_id)))
+    free = [name for name in PERTURBED_ENV_IDS if "-FreeCamera-" in name]
+    pairs = [(name.replace("FreeCamera-", ""), name) for name in free]
+    held = [f"`{arm}`" if arm in PERTURBED_ENV_IDS else "" for arm, _ in pairs]
+    perturbed = [(arm, f"`{name}`") for arm, (_, name) in zip(held, pairs, strict=True)]
+    yield (
+        "gallery/index.md",
+        "# Environments\n\n"
+        + _table(["", "id", "actions"], rows)
+        + "\nWith an imperfect camera; `perturbation={...}` sets its strength:\n\n"
+        + _table(["arm", "free camera"], perturbed),
+    )
+
+
+def _space(env_id: str) -> str:
+    if "Adaptive" in env_id:
+        return f"`MultiDiscrete([49, {NUM_CONFIGURATIONS}])`"
+    return "`Discrete(7)`" if "FixedTranslation" in env_id else "`Discrete(49)`"
+
+
+def _environment(env_id: str) -> str:
+    """The page of an id."""
+    from ms_slam_env.robot.action_primitives import ROTATIONS, TRANSLATIONS
+
+    what, motions, configurations = "`7 * translation + rotation`.", 49, 1
+    headings, columns = ["number", "translation", "rotation"], [TRANSLATIONS, ROTATIONS]
+    if "FixedTranslation" in env_id:
+        what, motions = "the rotation.", 7
+        headings, columns = ["number", "rotation"], [ROTATIONS]
+    if "Adaptive" in env_id:
+        what += " The second part is the number of the SLAM configuration, 0 the fastest."
+        configurations = NUM_CONFIGURATIONS
+    rows = [(str(k), *words) for k, words in enumerate(zip(*columns, strict=True))]
+    return ENVIRONMENT.format(
+        env_id=env_id,
+        holder=HOLDERS[env_id],
+        space=_space(env_id),
+        what=what,
+        actions=_table(headings, rows),
+        observations=_observations(motions, configurations),
+    )
+
+
+def _observations(num_motions: int, num_configurations: int) -> str:
+    """The observation spaces by option."""
+    from gymnasium.spaces import Dict
+
+    from ms_slam_env.camera import xtion
+    from ms_slam_env.env.observations import OBSERVATIONS, make_observation
+
+    rows = []
+    for name in OBSERVATIONS:
+        space = make_observation(name, xtion("160x120"), num_motions, num_configurations).space
+        parts = space.spaces if isinstance(space, Dict) else {"": space}
+        for part, box in parts.items():
+            shown = f"`{part}`" if part else "the vector"
+            rows.append((f"`{name}`", shown, str(tuple(box.shape)), str(box.dtype)))
+    return _table(["`observation=`", "part", "shape", "type"], rows)

@@ -1,0 +1,82 @@
+"""The pages name files, commands and anchors that exist; the site builds without a warning."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ms_slam_env.cli import COMMANDS
+from ms_slam_env.experiments.harness import experiment_names
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [ROOT / "README.md", ROOT / "BENCHMARK.md", *sorted((ROOT / "docs").glob("*.md"))]
+FILE = re.compile(r"`((?:ms_slam_env|baselines|agents|tests|docs|notebooks)/[\w./-]*)`")
+LINK = re.compile(r"\]\((?!https?:)([^)#\s]*)(?:#([^)\s]*))?\)")
+
+
+def text_of(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
+
+
+def anchors(page: Path) -> set[str]:
+    """Of the headings, as GitHub and MkDocs name them."""
+    headings = re.findall(r"^#+ (.*)$", text_of(page), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", h.lower()).strip().replace(" ", "-") for h in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_files_and_links_of_a_page_exist(page: Path) -> None:
+    text = text_of(page)
+    missing = [name for name in FILE.findall(text) if not (ROOT / name).exists()]
+    for target, anchor in LINK.findall(text):
+        path = page.parent / target if target else page
+        if not path.exists() or (anchor and anchor not in anchors(path)):
+            missing.append(f"{target}#{anchor}")
+    assert missing == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_commands_of_a_page_exist(page: Path) -> None:
+    text = text_of(page)
+    used = set(re.findall(r"\bms-slam ([a-z]+)\b", text))
+    assert used <= set(COMMANDS)
+    experiments = {name.replace("-", "_") for name in re.findall(r"ms-slam experiment (\w+)", text)}
+    assert experiments <= {*experiment_names(), "list", "NAME"}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_python_of_a_page_is_python(page: Path) -> None:
+    for source in re.findall(r"^```python\n(.*?)^```", text_of(page), re.MULTILINE | re.DOTALL):
+        ast.parse(source)
+
+
+def test_readme_is_short() -> None:
+    assert len(text_of(ROOT / "README.md").splitlines()) <= 200
+
+
+def test_the_drawing_shows_the_rooms() -> None:
+    spec = importlib.util.spec_from_file_location("rooms", ROOT / "docs" / "site" / "rooms.py")
+    assert spec is not None
+    assert spec.loader is not None
+    rooms = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(rooms)
+    shown = re.findall(r'class="name">(\w+)<', text_of(rooms.OUT))
+    assert set(shown) == set(rooms.uses()), "run python docs/site/rooms.py"
+
+
+@pytest.mark.slow
+def test_the_site_builds_and_loads_nothing_from_the_network(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    loads = re.compile(r"<(?:script|img|link|iframe)\b[^>]*(?:src|href)=\"?(https?:[^\" >]*)")
+    pages = list(tmp_path.rglob("*.html"))
+    assert len(pages) > 50
+    for page in pages:
+        assert [url for url in loads.findall(text_of(page)) if "canonical" not in url] == []
