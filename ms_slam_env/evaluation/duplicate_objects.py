@@ -12,11 +12,13 @@ from ms_slam_env.evaluation.map_truth import SURFACE_SPACING_M
 from ms_slam_env.geometry.point_clouds import voxel_firsts
 from ms_slam_env.metrics.consistency import (
     ConsistencyRule,
+    LabelledView,
     MapConsistency,
     ObjectConsistency,
+    count_votes,
+    distinct_placements,
     judge_consistency,
 )
-from ms_slam_env.metrics.sightings import LabelledView, count_votes, distinct_placements
 from ms_slam_env.scenes.mesh_queries import sample_surface
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sensor.scene_cache import get_scene

@@ -22,7 +22,7 @@ from ms_slam_env.evaluation.map_quality import ComparedMap, share_keys
 from ms_slam_env.evaluation.seen_surface import seen_surface
 from ms_slam_env.geometry import transform_points
 from ms_slam_env.geometry.cloud_registration import CUTOFF_M, REGISTRATIONS
-from ms_slam_env.metrics.accuracy import SAMPLES
+from ms_slam_env.metrics.reconstruction import SAMPLES
 from ms_slam_env.sequences.recording import Recording, open_recording, recorded_sequence
 
 Float64 = NDArray[np.float64]

@@ -20,8 +20,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.geometry.point_clouds import voxel_downsample
-from ms_slam_env.metrics.accuracy import RATIO_THRESHOLD_M
-from ms_slam_env.metrics.reconstruction import harmonic_mean, nearest_distances, rer
+from ms_slam_env.metrics.reconstruction import (
+    RATIO_THRESHOLD_M,
+    harmonic_mean,
+    nearest_distances,
+    rer,
+)
 
 Float64 = NDArray[np.float64]
 

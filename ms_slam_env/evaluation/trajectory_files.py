@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from ms_slam_env import metrics
 from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.errors import InputError
-from ms_slam_env.metrics.absolute import ALIGNMENTS
 from ms_slam_env.metrics.relative import DELTA_UNITS, PAIRINGS, TOLERANCE
+from ms_slam_env.metrics.trajectory import ALIGNMENTS
 from ms_slam_env.sequences import associate, read_trajectory
 
 Float64 = NDArray[np.float64]

@@ -2,60 +2,62 @@
 
 from ms_slam_env.geometry.cloud_registration import CloudRegistration, register_clouds
 from ms_slam_env.geometry.point_clouds import umeyama, voxel_downsample
-from ms_slam_env.metrics.absolute import (
-    Alignment,
-    absolute_errors,
-    ate_rmse,
-    ate_statistics,
-    find_alignment,
-)
-from ms_slam_env.metrics.accuracy import Completion, completion
-from ms_slam_env.metrics.cloud import (
-    CloudDistance,
-    cloud_distance,
-    hausdorff_distance,
-    noise_ratio,
-    point_spacing,
-    statistical_inliers,
-)
 from ms_slam_env.metrics.consistency import (
     ConsistencyRule,
+    LabelledView,
     MapConsistency,
     ObjectConsistency,
+    SightingRule,
+    count_votes,
+    distinct_placements,
     judge_consistency,
 )
 from ms_slam_env.metrics.cost import CostMeter, EnergyCounter, FrameCost, energy_counters
 from ms_slam_env.metrics.initialisation import Initialisation, initialisation, local_scales
 from ms_slam_env.metrics.multi_robot import mean_path_length, task_time, team_ate, team_rpe
 from ms_slam_env.metrics.reconstruction import (
+    CloudDistance,
+    Completion,
+    cloud_distance,
+    completion,
     f_score,
+    hausdorff_distance,
     icp,
     nearest_distances,
+    noise_ratio,
+    point_spacing,
     precision,
     rcm,
     recall,
     rer,
+    statistical_inliers,
 )
 from ms_slam_env.metrics.relative import (
+    Drift,
+    drifts,
+    equal_pieces,
     pose_pairs,
     relative_errors,
     rpe_rmse,
     rpe_statistics,
 )
-from ms_slam_env.metrics.relocalisation import mean_relocalisation_time, relocalisation_times
 from ms_slam_env.metrics.robustness import (
     TrackingRobustness,
+    mean_relocalisation_time,
+    relocalisation_times,
     tracked_segments,
     tracking_robustness,
 )
-from ms_slam_env.metrics.segments import Drift, drifts, equal_pieces
-from ms_slam_env.metrics.sightings import (
-    LabelledView,
-    SightingRule,
-    count_votes,
-    distinct_placements,
+from ms_slam_env.metrics.trajectory import (
+    Alignment,
+    ErrorStatistics,
+    absolute_errors,
+    ate_rmse,
+    ate_statistics,
+    find_alignment,
+    path_length,
+    statistics_of,
 )
-from ms_slam_env.metrics.trajectory import ErrorStatistics, path_length, statistics_of
 
 __all__ = [
     "Alignment",

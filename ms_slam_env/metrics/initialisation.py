@@ -10,13 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import Float64
 from ms_slam_env.geometry.point_clouds import umeyama
-from ms_slam_env.metrics.trajectory import check_lengths, check_positions
-
-Float64 = NDArray[np.float64]
+from ms_slam_env.metrics.trajectory import check_pair, check_positions, check_positive
 
 
 @dataclass(frozen=True)
@@ -47,16 +46,11 @@ def local_scales(
         InputError: bad positions, times that do not increase, lengths that differ, a window that is
             not positive.
     """
-    positions, true_positions = (
-        check_positions(estimate, "estimate"),
-        check_positions(truth, "truth"),
-    )
-    check_lengths(positions, true_positions)
+    positions, true_positions = check_pair(estimate, truth, need_poses=False)
     seconds = np.asarray(times, dtype=np.float64)
     if seconds.shape != (len(positions),) or not (np.diff(seconds) > 0).all():
         raise InputError(f"times must be ({len(positions)},) and increase")
-    if not (np.isfinite(window_s) and window_s > 0):
-        raise InputError(f"window_s must be finite and > 0, got {window_s}")
+    check_positive(window_s, "window_s")
     first = np.searchsorted(seconds, seconds - window_s / 2, "left")
     end = np.searchsorted(seconds, seconds + window_s / 2, "right")
     scales = np.full(len(positions), np.nan)
@@ -97,8 +91,8 @@ def initialisation(
     """
     options = {"settled_s": settled_s, "threshold": threshold, "global_scale": global_scale}
     for name, value in options.items():
-        if value is not None and not (np.isfinite(value) and value > 0):
-            raise InputError(f"{name} must be finite and > 0, got {value}")
+        if value is not None:
+            check_positive(value, name)
     scales = local_scales(times, estimate, truth, window_s)
     seconds = np.asarray(times, dtype=np.float64)
     if global_scale is None:

@@ -9,22 +9,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ms_slam_env.errors import InputError
-from ms_slam_env.metrics.absolute import absolute_errors
 from ms_slam_env.metrics.relative import relative_errors
 from ms_slam_env.metrics.trajectory import (
     ErrorStatistics,
+    absolute_errors,
     check_kind,
-    check_lengths,
-    check_poses,
-    check_positions,
+    check_pair,
     path_length,
     statistics_of,
 )
-
-Float64 = NDArray[np.float64]
 
 
 def team_ate(
@@ -49,15 +45,10 @@ def team_ate(
     """
     _check_team(estimates, truths)
     check_kind(kind)
-    check = check_poses if kind == "rotation" else check_positions
-    pairs = []
-    for k, (estimate, truth) in enumerate(zip(estimates, truths, strict=True)):
-        own, true = (
-            check(estimate, f"estimate of robot {k}"),
-            check(truth, f"truth of robot {k}"),
-        )
-        check_lengths(own, true)
-        pairs.append((own, true))
+    pairs = [
+        check_pair(estimate, truth, kind == "rotation", f" of robot {k}")
+        for k, (estimate, truth) in enumerate(zip(estimates, truths, strict=True))
+    ]
     own, true = (np.concatenate(side) for side in zip(*pairs, strict=True))
     return statistics_of(absolute_errors(own, true, align, kind))
 

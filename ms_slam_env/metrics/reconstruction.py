@@ -1,17 +1,25 @@
-"""Errors of maps: precision, recall, F-score, reconstruction error (RER), completeness (RCM)."""
+"""Errors of maps: precision, recall, F-score, reconstruction error (RER), completeness, distances.
+
+Clouds are compared where they lie; register them first (`register_clouds`) if that is wanted.
+Sources beside those named below: Qu, Zhang, Yang, Dong, "USME: unified SLAM measurement and
+evaluation", Navigation Positioning and Timing 2021, section 1.2; for accuracy and completion Sucar,
+Liu, Ortiz, Davison, "iMAP", ICCV 2021, section 4, and Zhu et al., "NICE-SLAM", CVPR 2022,
+which take 200,000 points evenly from the surface of either mesh.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import transform_points
+from ms_slam_env.geometry import Float64, transform_points
 from ms_slam_env.geometry.cloud_registration import CUTOFF_M, register_clouds
 from ms_slam_env.geometry.point_clouds import check_points
-
-Float64 = NDArray[np.float64]
+from ms_slam_env.metrics.trajectory import check_count, check_positive
 
 ICP_POINTS = 5000  # of a map, evenly picked, are enough to place it
 
@@ -24,7 +32,7 @@ def nearest_distances(points: ArrayLike, truth: ArrayLike) -> Float64:
 
 def precision(points: ArrayLike, truth: ArrayLike, threshold_m: float) -> float:
     """Share of ``points`` (N, 3) nearer than ``threshold_m`` to ``truth`` (M, 3)."""
-    _check_threshold(threshold_m)
+    check_positive(threshold_m, "a threshold", "m")
     return float((nearest_distances(points, truth) < threshold_m).mean())
 
 
@@ -59,7 +67,9 @@ def rer(points: ArrayLike, truth: ArrayLike, registration: str = "icp") -> float
         InputError: bad points or an unknown registration.
     """
     cloud, true_cloud = check_points(points, "points"), check_points(truth, "truth")
-    return _rms(_registered_distances(cloud, cKDTree(true_cloud), registration))
+    found = register_clouds(cloud, true_cloud, registration, max_points=ICP_POINTS)
+    distances = cKDTree(true_cloud).query(transform_points(found.T_target_source, cloud))[0]
+    return float(np.sqrt(np.mean(distances**2)))
 
 
 def icp(source: ArrayLike, target: ArrayLike, cutoff_m: float = CUTOFF_M) -> Float64:
@@ -70,21 +80,127 @@ def icp(source: ArrayLike, target: ArrayLike, cutoff_m: float = CUTOFF_M) -> Flo
     return register_clouds(source, target, "icp", cutoff_m, ICP_POINTS).T_target_source
 
 
-def _registered_distances(cloud: Float64, true_tree: cKDTree, registration: str) -> Float64:
-    """Distances (N,) of the cloud to the truth, after registration to it."""
-    found = register_clouds(cloud, np.asarray(true_tree.data), registration, max_points=ICP_POINTS)
-    return true_tree.query(transform_points(found.T_target_source, cloud))[0]
-
-
-def _rms(distances: Float64) -> float:
-    return float(np.sqrt(np.mean(distances**2)))
-
-
 def harmonic_mean(a: float, b: float) -> float:
     """2 a b / (a + b), 0 where both are 0."""
     return 2 * a * b / (a + b) if a + b > 0 else 0.0
 
 
-def _check_threshold(threshold_m: float) -> None:
-    if not (np.isfinite(threshold_m) and threshold_m > 0):
-        raise InputError(f"a threshold must be finite and > 0 m, got {threshold_m}")
+SAMPLES = 200_000
+RATIO_THRESHOLD_M = 0.05
+
+
+@dataclass(frozen=True)
+class Completion:
+    """How near a reconstruction is to the truth, and how much of that it has.
+
+    Attributes:
+        accuracy_cm: mean distance of points of the reconstruction to the truth.
+        completion_cm: mean distance of true points to the reconstruction.
+        completion_ratio: share of the true points nearer than the threshold to it; the papers
+            print it in per cent, at 5 cm.
+    """
+
+    accuracy_cm: float
+    completion_cm: float
+    completion_ratio: float
+
+
+def completion(
+    points: ArrayLike, truth: ArrayLike, threshold_m: float = RATIO_THRESHOLD_M
+) -> Completion:
+    """Accuracy and completion of ``points`` (N, 3) against ``truth`` (M, 3), metres.
+
+    Raises:
+        InputError: bad points, or a threshold that is not positive.
+    """
+    check_positive(threshold_m, "a threshold", "m")
+    to_truth, to_map = nearest_distances(points, truth), nearest_distances(truth, points)
+    return Completion(
+        accuracy_cm=100 * float(to_truth.mean()),
+        completion_cm=100 * float(to_map.mean()),
+        completion_ratio=float((to_map < threshold_m).mean()),
+    )
+
+
+@dataclass(frozen=True)
+class CloudDistance:
+    """Distances of a cloud's points to another cloud (C2C), metres.
+
+    Attributes:
+        mean: over the points.
+        std: of the distances.
+        rms: root mean square.
+        max: the directed Hausdorff distance.
+    """
+
+    mean: float
+    std: float
+    rms: float
+    max: float
+
+
+def statistical_inliers(
+    points: ArrayLike, neighbours: int = 20, std_ratio: float = 2.0
+) -> NDArray[np.bool_]:
+    """Which of ``points`` (N, 3) a statistical outlier removal keeps, (N,) bool.
+
+    USME, section 1.2 (1), after Rusu et al., "Towards 3D point cloud based object maps", 2008: the
+    mean distance d of a point to its ``neighbours`` nearest points, itself among them, must be
+    below mean(d) + ``std_ratio`` std(d) over the cloud. A point that coincides with all its
+    neighbours is dropped too, as Open3D does.
+
+    Raises:
+        InputError: bad points, fewer than 2 neighbours or fewer points than neighbours, a ratio
+            that is not positive.
+    """
+    values = check_points(points, "points")
+    check_count(neighbours, "neighbours", least=2)
+    if len(values) < neighbours:
+        raise InputError(f"{neighbours} neighbours need as many points, got {len(values)}")
+    check_positive(std_ratio, "std_ratio")
+    mean = cKDTree(values).query(values, k=neighbours)[0].mean(axis=1)
+    limit = mean.mean() + std_ratio * mean.std(ddof=1)
+    return (mean > 0) & (mean < limit)
+
+
+def noise_ratio(points: ArrayLike, neighbours: int = 20, std_ratio: float = 2.0) -> float:
+    """Share of ``points`` (N, 3) that `statistical_inliers` drops, USME equation (8): N_n / N_c.
+
+    USME removes the irrelevant points by eye; here the filter does, so that a program can.
+    """
+    return 1.0 - float(statistical_inliers(points, neighbours, std_ratio).mean())
+
+
+def point_spacing(points: ArrayLike) -> float:
+    """Mean distance in metres of a point (N, 3) to its nearest other: how sparse a cloud is.
+
+    USME takes the number of points for that, which grows with the area that was mapped.
+
+    Raises:
+        InputError: bad points, or fewer than 2.
+    """
+    values = check_points(points, "points")
+    if len(values) < 2:
+        raise InputError("the spacing of points needs at least 2")
+    return float(cKDTree(values).query(values, k=2)[0][:, 1].mean())
+
+
+def cloud_distance(points: ArrayLike, truth: ArrayLike) -> CloudDistance:
+    """Cloud-to-cloud distance: of each of ``points`` (N, 3) to the nearest of ``truth`` (M, 3)."""
+    distances = nearest_distances(points, truth)
+    return CloudDistance(
+        mean=float(distances.mean()),
+        std=float(distances.std()),
+        rms=float(np.sqrt(np.mean(distances**2))),
+        max=float(distances.max()),
+    )
+
+
+def hausdorff_distance(points: ArrayLike, truth: ArrayLike, symmetric: bool = True) -> float:
+    """Hausdorff distance in metres of clouds (N, 3) and (M, 3), USME equation (7).
+
+    Directed it is max over a in ``points`` of min over b in ``truth`` of |a - b|, which does not
+    see what ``points`` lacks; symmetric it is the larger of both directions.
+    """
+    there = cloud_distance(points, truth).max
+    return max(there, cloud_distance(truth, points).max) if symmetric else there

@@ -1,4 +1,4 @@
-"""Relative errors of estimated trajectories (RPE): of the motions between pairs of poses.
+"""Relative errors of estimated trajectories (RPE): of motions between pairs of poses, and by piece.
 
 Sources: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012; Qu, Zhang,
 Yang, Dong, "USME", Navigation Positioning and Timing 2021, equations (3) to (5).
@@ -6,23 +6,28 @@ Yang, Dong, "USME", Navigation Positioning and Timing 2021, equations (3) to (5)
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.geometry import invert
+from ms_slam_env.geometry import Float64, invert
 from ms_slam_env.metrics.trajectory import (
     ErrorStatistics,
+    check_count,
     check_kind,
-    check_lengths,
+    check_pair,
     check_poses,
+    check_positive,
     check_times,
     path_distances,
     rotation_angles,
     statistics_of,
+    with_arguments_of,
 )
 
-Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 DELTA_UNITS = ("frames", "m", "s")
@@ -62,12 +67,12 @@ def pose_pairs(
     if not (np.isfinite(tolerance) and tolerance >= 0):
         raise InputError(f"tolerance must be finite and >= 0, got {tolerance}")
     if unit == "frames":
-        _check_frames(delta, len(poses))
+        check_count(delta, "delta")
+        if len(poses) <= delta:
+            raise InputError(f"delta = {delta} needs at least {delta + 1} poses, got {len(poses)}")
         along, reach = np.arange(len(poses), dtype=np.float64), 0.0
     else:
-        is_number = isinstance(delta, (int, float, np.number)) and not isinstance(delta, bool)
-        if not (is_number and np.isfinite(delta) and delta > 0):
-            raise InputError(f"delta must be finite and > 0 {unit}, got {delta!r}")
+        check_positive(delta, "delta", unit)
         along, reach = _distances(poses, unit, times), tolerance * delta
     found = _all(along, delta, reach) if pairs == "all" else _consecutive(along, delta)
     if len(found) == 0:
@@ -97,19 +102,14 @@ def relative_errors(
     Args:
         estimate: T_world_camera (N, 4, 4).
         truth: likewise, corresponding by row.
-        delta: as all that follows, see `pose_pairs`.
+        delta: as all but the kind, see `pose_pairs`.
         kind: ``translation`` or ``rotation``.
-        unit: of ``delta``.
-        times: of the poses.
-        pairs: which.
-        tolerance: of ``delta``.
 
     Raises:
         InputError: wrong shapes, lengths that differ, NaN, unknown kind, or as `pose_pairs`.
     """
     check_kind(kind)
-    poses, true_poses = check_poses(estimate, "estimate"), check_poses(truth, "truth")
-    check_lengths(poses, true_poses)
+    poses, true_poses = check_pair(estimate, truth)
     first, second = pose_pairs(true_poses, delta, unit, times, pairs, tolerance).T
     return motion_errors(poses, true_poses, first, second, kind)
 
@@ -126,44 +126,16 @@ def motion_errors(
     return rotation_angles(error[:, :3, :3])
 
 
-def rpe_statistics(
-    estimate: ArrayLike,
-    truth: ArrayLike,
-    delta: float = 1,
-    kind: str = "translation",
-    unit: str = "frames",
-    times: ArrayLike | None = None,
-    pairs: str = "all",
-    tolerance: float = TOLERANCE,
-) -> ErrorStatistics:
+@with_arguments_of(relative_errors)
+def rpe_statistics(errors: Float64) -> ErrorStatistics:
     """Statistics of the relative pose error (m or rad); arguments of `relative_errors`."""
-    return statistics_of(
-        relative_errors(estimate, truth, delta, kind, unit, times, pairs, tolerance)
-    )
+    return statistics_of(errors)
 
 
-def rpe_rmse(
-    estimate: ArrayLike,
-    truth: ArrayLike,
-    delta: float = 1,
-    kind: str = "translation",
-    unit: str = "frames",
-    times: ArrayLike | None = None,
-    pairs: str = "all",
-    tolerance: float = TOLERANCE,
-) -> float:
-    """Relative pose error (m or rad), USME equation (5): the root mean square.
-
-    Arguments of `relative_errors`.
-    """
-    return rpe_statistics(estimate, truth, delta, kind, unit, times, pairs, tolerance).rmse
-
-
-def _check_frames(delta: float, count: int) -> None:
-    if isinstance(delta, bool) or not isinstance(delta, (int, np.integer)) or delta < 1:
-        raise InputError(f"delta must be an integer >= 1, got {delta!r}")
-    if count <= delta:
-        raise InputError(f"delta = {delta} needs at least {delta + 1} poses, got {count}")
+@with_arguments_of(relative_errors)
+def rpe_rmse(errors: Float64) -> float:
+    """Root mean square of the `relative_errors` (m or rad), USME (5); takes their arguments."""
+    return statistics_of(errors).rmse
 
 
 def _distances(poses: Float64, unit: str, times: ArrayLike | None) -> Float64:
@@ -200,3 +172,86 @@ def _consecutive(along: Float64, delta: float) -> Int64:
         found.append((first, second))
         first = second
     return np.array(found, dtype=np.int64).reshape(-1, 2)
+
+
+LENGTH_SHARES = (0.1, 0.2, 0.3, 0.4, 0.5)
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Relative errors over one length of path, as shares of it.
+
+    Attributes:
+        length_m: of the true path.
+        segments: how many sub-trajectories of this length there are.
+        translation: metres of error a metre of ``length_m``, without unit; times 100 in per cent.
+        rotation_rad_m: radians of error a metre.
+    """
+
+    length_m: float
+    segments: int
+    translation: ErrorStatistics
+    rotation_rad_m: ErrorStatistics
+
+
+def equal_pieces(count: int, pieces: int) -> Int64:
+    """Bounds (K, 2) of ``pieces`` pieces of ``count`` poses: first, and one after the last.
+
+    Lengths differ by one pose at most.
+
+    Raises:
+        InputError: fewer than one piece, or more pieces than poses.
+    """
+    check_count(pieces, "segments")
+    if pieces > count:
+        raise InputError(f"{count} poses cannot be cut into {pieces} segments")
+    edges = np.arange(pieces + 1) * count // pieces
+    return np.stack([edges[:-1], edges[1:]], axis=1)
+
+
+def drifts(
+    estimate: ArrayLike,
+    truth: ArrayLike,
+    lengths_m: Sequence[float] | None = None,
+    every: int = 1,
+) -> list[Drift]:
+    """Relative errors over sub-trajectories of given lengths, by length.
+
+    Source: Geiger, Lenz, Urtasun, "Are we ready for autonomous driving? The KITTI vision benchmark
+    suite", CVPR 2012, whose lengths are 100 to 800 m and whose sub-trajectories begin at every 10th
+    frame. One ends at the first pose farther along the true path than its length; errors of the
+    motion, as in `relative_errors`, are divided by the length.
+
+    Args:
+        estimate: T_world_camera (N, 4, 4).
+        truth: likewise, corresponding by row.
+        lengths_m: metres; None for a tenth to a half of the true path (Zhang and Scaramuzza, "A
+            tutorial on quantitative trajectory evaluation", IROS 2018).
+        every: a sub-trajectory begins at every such frame.
+
+    Returns:
+        One for each length that the path has room for; none if the truth stands still and no
+        lengths are given.
+
+    Raises:
+        InputError: wrong shapes, lengths that differ, NaN, a length or step that is not positive.
+    """
+    poses, true_poses = check_pair(estimate, truth)
+    check_count(every, "every")
+    along = path_distances(true_poses[:, :3, 3])
+    if lengths_m is None:
+        lengths_m = [share * float(along[-1]) for share in LENGTH_SHARES] if along[-1] > 0 else []
+    found = []
+    for length in lengths_m:
+        check_positive(length, "the length of a segment", "m")
+        first = np.arange(0, len(poses), every)
+        second = np.searchsorted(along, along[first] + length, "right")
+        first, second = first[second < len(poses)], second[second < len(poses)]
+        if len(first) == 0:
+            continue
+        translation, rotation = (
+            statistics_of(motion_errors(poses, true_poses, first, second, kind) / length)
+            for kind in ("translation", "rotation")
+        )
+        found.append(Drift(float(length), len(first), translation, rotation))
+    return found

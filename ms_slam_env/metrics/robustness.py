@@ -1,7 +1,7 @@
-"""Robustness of tracking: do the pieces of a trajectory between losses fit together?
+"""Robustness: do the pieces of a trajectory between losses fit together; how long is SLAM lost?
 
 Source: Qu, Zhang, Yang, Dong, "USME: unified SLAM measurement and evaluation", Navigation
-Positioning and Timing 2021, equations (9) and (10); after Li et al., "Survey and evaluation of
+Positioning and Timing 2021, equations (9) to (11); after Li et al., "Survey and evaluation of
 monocular visual-inertial SLAM algorithms for augmented reality", 2019.
 """
 
@@ -15,10 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import logm
 
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.geometry import check_pose
+from ms_slam_env.geometry import Float64, check_pose
 from ms_slam_env.geometry.point_clouds import umeyama
-
-Float64 = NDArray[np.float64]
 
 SEGMENT_ALIGNMENTS = ("se3", "sim3")
 
@@ -107,7 +105,9 @@ def tracking_robustness(
             raise InputError(f"the truth stands still in frames {first} to {end - 1}: no scale")
         points = _levers(own, lever_m / scale)
         R, t, scale = umeyama(points, _levers(true, lever_m), align == "sim3")
-        similarities.append(_similarity(R, t, scale))  # (9)
+        S = np.eye(4)
+        S[:3, :3], S[:3, 3] = scale * R, t
+        similarities.append(S)  # (9)
     parts = np.array(
         [similarity_log(np.linalg.inv(a) @ b) for a, b in itertools.pairwise(similarities)]
     ).reshape(-1, 7)
@@ -132,14 +132,57 @@ def similarity_log(S: ArrayLike) -> Float64:
     return np.array([*generator[:3, 3], *phi, np.trace(generator[:3, :3]) / 3])
 
 
-def _similarity(R: Float64, t: Float64, scale: float) -> Float64:
-    S = np.eye(4)
-    S[:3, :3], S[:3, 3] = scale * R, t
-    return S
-
-
 def _levers(poses: Float64, lever_m: float) -> Float64:
     """Points (4 N, 3): the positions of poses and the points along their axes."""
     position = poses[:, None, :3, 3]
     axes = np.swapaxes(poses[:, :3, :3], 1, 2)
     return np.concatenate([position, position + lever_m * axes], axis=1).reshape(-1, 3)
+
+
+def relocalisation_times(timestamps: ArrayLike, black: ArrayLike, tracked: ArrayLike) -> Float64:
+    """Time (N,) in seconds from the end of each run of black frames to the next pose.
+
+    Terms of USME equation 11, t_e,i - t_s,i: t_s,i is the time of the first frame after the i-th
+    run, t_e,i that of the first frame from then on that is tracked; 0 if they are the same frame.
+    Infinite if the next run, or the end, comes first. A run at the very end counts for nothing:
+    there was no frame to be found again in.
+
+    Args:
+        timestamps: (M,) of the frames, seconds, ascending.
+        black: (M,) bool, the frames that were made black.
+        tracked: (M,) bool, the frames that SLAM says it has a pose for.
+
+    Raises:
+        InputError: arrays of other or unequal shapes, times that are not finite and ascending, or
+            no frame at all.
+    """
+    times = np.asarray(timestamps, dtype=np.float64)
+    hidden, found = np.asarray(black, dtype=bool), np.asarray(tracked, dtype=bool)
+    if times.ndim != 1 or len(times) == 0 or not times.shape == hidden.shape == found.shape:
+        raise InputError(
+            f"timestamps {times.shape}, black {hidden.shape} and tracked {found.shape} must be of "
+            "one length, at least 1"
+        )
+    if not np.isfinite(times).all() or (np.diff(times) < 0).any():
+        raise InputError("timestamps must be finite and ascending")
+    starts = np.flatnonzero(hidden[:-1] & ~hidden[1:]) + 1  # first frames that see again
+    ends = np.append(np.flatnonzero(~hidden[:-1] & hidden[1:]) + 1, len(times))
+    result = np.full(len(starts), np.inf)
+    for index, start in enumerate(starts):
+        end = ends[ends > start][0]
+        poses = np.flatnonzero(found[start:end])
+        if len(poses):
+            result[index] = times[start + poses[0]] - times[start]
+    return result
+
+
+def mean_relocalisation_time(timestamps: ArrayLike, black: ArrayLike, tracked: ArrayLike) -> float:
+    """Mean of :func:`relocalisation_times`: USME equation 11, (1/N) sum_i (t_e,i - t_s,i), seconds.
+
+    Infinite if SLAM was not found again after one of the runs, NaN without any run.
+
+    Raises:
+        InputError: as there.
+    """
+    times = relocalisation_times(timestamps, black, tracked)
+    return float(times.mean()) if len(times) else float("nan")

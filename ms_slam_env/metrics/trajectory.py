@@ -1,15 +1,30 @@
-"""What every measure of trajectories needs: checked poses, statistics, lengths, angles."""
+"""Absolute errors of estimated trajectories (ATE), and what every measure of trajectories needs.
+
+Sources: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012; Qu, Zhang,
+Yang, Dong, "USME", Navigation Positioning and Timing 2021, equations (1) and (2). With R_i, p_i the
+true pose and R'_i, p'_i the estimate after alignment, the errors at pose i are |p_i - p'_i| and the
+angle of R_i^T R'_i; ATE is their root mean square. (USME's (1), which our text of it lacks, is
+usually written with p_i - dR_i p'_i, dR_i = R_i R'_i^T; that depends on where the world has its
+origin, and no tool computes it.)
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import wraps
+from inspect import signature
+from typing import ParamSpec, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.geometry import Float64
+from ms_slam_env.geometry.point_clouds import umeyama
 
-Float64 = NDArray[np.float64]
+P = ParamSpec("P")
+T = TypeVar("T")
 
 ERROR_KINDS = ("translation", "rotation")
 
@@ -91,18 +106,54 @@ def check_times(times: ArrayLike, count: int, name: str = "times") -> Float64:
     return values
 
 
-def check_lengths(estimate: Float64, truth: Float64) -> None:
-    """Refuse trajectories that cannot correspond by row."""
-    if len(estimate) != len(truth):
+def check_pair(
+    estimate: ArrayLike, truth: ArrayLike, need_poses: bool = True, whose: str = ""
+) -> tuple[Float64, Float64]:
+    """Estimate and truth, checked, which correspond by row: poses (N, 4, 4) or positions (N, 3)."""
+    check = check_poses if need_poses else check_positions
+    own, true = check(estimate, f"estimate{whose}"), check(truth, f"truth{whose}")
+    if len(own) != len(true):
         raise InputError(
-            f"estimate has {len(estimate)} poses and truth {len(truth)}; they must correspond"
+            f"estimate has {len(own)} poses and truth {len(true)}; they must correspond"
         )
+    return own, true
+
+
+def check_count(value: object, name: str, least: int = 1) -> None:
+    """Refuse what is no integer >= ``least``."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        raise InputError(f"{name} must be an integer >= {least}, got {value!r}")
+
+
+def check_positive(value: float, name: str, unit: str = "") -> None:
+    """Refuse what is not finite and above 0."""
+    is_number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+    if not (is_number and np.isfinite(value) and value > 0):
+        raise InputError(f"{name} must be finite and > 0{unit and ' '}{unit}, got {value!r}")
 
 
 def check_kind(kind: str) -> None:
     """Refuse what is no kind of error."""
     if kind not in ERROR_KINDS:
         raise unknown("kind of error", kind, ERROR_KINDS)
+
+
+def with_arguments_of(
+    errors: Callable[P, Float64],
+) -> Callable[[Callable[[Float64], T]], Callable[P, T]]:
+    """Let a function of errors (N,) take the arguments that ``errors`` computes them from."""
+
+    def wrap(summary: Callable[[Float64], T]) -> Callable[P, T]:
+        @wraps(summary)
+        def of_arguments(*args: P.args, **options: P.kwargs) -> T:
+            return summary(errors(*args, **options))
+
+        hints = {**errors.__annotations__, "return": summary.__annotations__["return"]}
+        of_arguments.__annotations__ = hints
+        of_arguments.__signature__ = signature(errors)  # type: ignore[attr-defined]
+        return of_arguments
+
+    return wrap
 
 
 def _numbers(values: ArrayLike, name: str) -> Float64:
@@ -118,3 +169,99 @@ def _filled(values: Float64, name: str) -> Float64:
     if not np.isfinite(values).all():
         raise InputError(f"{name} holds values that are not finite")
     return values
+
+
+ALIGNMENTS = ("se3", "sim3", "none")
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Similarity that takes an estimate to the truth: x_truth = scale R x_estimate + t.
+
+    Attributes:
+        R: (3, 3).
+        t: (3,) metres.
+        scale: 1 unless it was asked for.
+        unique: whether one rotation is the best; positions on a line, or in a point, leave it open.
+    """
+
+    R: Float64
+    t: Float64
+    scale: float
+    unique: bool
+
+    def positions(self, positions: Float64) -> Float64:
+        """Aligned positions (N, 3)."""
+        return self.scale * positions @ self.R.T + self.t
+
+    def poses(self, poses: Float64) -> Float64:
+        """Aligned poses (N, 4, 4); rotations stay rotations."""
+        aligned = np.array(poses, dtype=np.float64)
+        aligned[:, :3, :3] = self.R @ aligned[:, :3, :3]
+        aligned[:, :3, 3] = self.positions(aligned[:, :3, 3])
+        return aligned
+
+
+def find_alignment(estimate: ArrayLike, truth: ArrayLike, align: str = "se3") -> Alignment:
+    """Best alignment of positions, in the sense of least squares (Umeyama, PAMI 1991).
+
+    Args:
+        estimate: T_world_camera (N, 4, 4), or positions (N, 3).
+        truth: likewise, corresponding by row.
+        align: ``se3`` (best rigid motion), ``sim3`` (and scale) or ``none``.
+
+    Raises:
+        InputError: wrong shapes, no poses, lengths that differ, NaN, unknown alignment; ``sim3``
+            of an estimate that stands still.
+    """
+    if align not in ALIGNMENTS:
+        raise unknown("alignment", align, ALIGNMENTS)
+    positions, true_positions = check_pair(estimate, truth, need_poses=False)
+    if align == "none":
+        return Alignment(np.eye(3), np.zeros(3), 1.0, unique=True)
+    R, t, scale = umeyama(positions, true_positions, with_scale=align == "sim3")
+    centred = true_positions - true_positions.mean(axis=0)
+    spread = np.linalg.svd(centred.T @ (positions - positions.mean(axis=0)), compute_uv=False)
+    return Alignment(R, t, scale, unique=bool(spread[1] > 1e-12 * max(spread[0], 1e-12)))
+
+
+def absolute_errors(
+    estimate: ArrayLike, truth: ArrayLike, align: str = "se3", kind: str = "translation"
+) -> Float64:
+    """Errors (N,) of the poses after alignment of the positions, USME equation (1).
+
+    Args:
+        estimate: T_world_camera (N, 4, 4); positions (N, 3) do for ``translation``.
+        truth: likewise, corresponding by row.
+        align: ``se3`` (best rigid motion), ``sim3`` (and scale) or ``none``.
+        kind: ``translation``, metres, or ``rotation``, radians.
+
+    Raises:
+        InputError: as `find_alignment`; an unknown kind; ``rotation`` after an alignment whose
+            rotation is open, because the positions lie on a line.
+    """
+    check_kind(kind)
+    if kind == "rotation":
+        poses, true_poses = check_pair(estimate, truth)
+        found = find_alignment(poses, true_poses, align)
+        if not found.unique:
+            raise InputError(
+                "positions on a line leave the alignment of orientations open; align='none' works"
+            )
+        relative = np.swapaxes(true_poses[:, :3, :3], 1, 2) @ found.poses(poses)[:, :3, :3]
+        return rotation_angles(relative)
+    positions, true_positions = check_pair(estimate, truth, need_poses=False)
+    found = find_alignment(positions, true_positions, align)
+    return np.linalg.norm(found.positions(positions) - true_positions, axis=1)
+
+
+@with_arguments_of(absolute_errors)
+def ate_statistics(errors: Float64) -> ErrorStatistics:
+    """Statistics of the absolute trajectory error (m or rad); arguments of `absolute_errors`."""
+    return statistics_of(errors)
+
+
+@with_arguments_of(absolute_errors)
+def ate_rmse(errors: Float64) -> float:
+    """Root mean square of the `absolute_errors` (m or rad), USME (2); takes their arguments."""
+    return statistics_of(errors).rmse

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import look_at, relative_angle
+from ms_slam_env.geometry import Float64, look_at, relative_angle
 from ms_slam_env.scenes.base import Scene
-
-Float64 = NDArray[np.float64]
 
 HEIGHT_M = 1.3
 CLEARANCE_M = 0.35  # free space kept around the camera

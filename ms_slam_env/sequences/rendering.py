@@ -12,14 +12,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame
+from ms_slam_env.geometry import Float64
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sensor import FRAME_RATE_HZ, NoiseConfig, TrueView
 from ms_slam_env.sequences.perturbations.base import Perturbation, random_numbers
 from ms_slam_env.sequences.perturbed_camera import Imperfections, PerturbedCamera
 from ms_slam_env.sequences.sequence import Sequence
 from ms_slam_env.sequences.trajectory import PoseInterpolation
-
-Float64 = NDArray[np.float64]
 
 
 class RenderedFrames(collections.abc.Sequence[RGBDFrame]):

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.errors import InputError
-
-Float64 = NDArray[np.float64]
+from ms_slam_env.geometry import Float64
 
 
 @dataclass(frozen=True)

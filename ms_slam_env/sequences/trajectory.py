@@ -10,11 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import check_pose, pose_from_quaternion, quaternion_from_pose
+from ms_slam_env.geometry import Float64, check_pose, pose_from_quaternion, quaternion_from_pose
 
 Int64 = NDArray[np.int64]
-
-Float64 = NDArray[np.float64]
 
 MAX_DIFFERENCE_S = 0.02
 """Timestamps further apart do not belong together (the tolerance of the TUM tools)."""

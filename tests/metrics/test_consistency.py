@@ -12,12 +12,14 @@ from hypothesis import strategies as st
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, look_at, make_pose, so3_exp, transform_points
-from ms_slam_env.metrics.consistency import ConsistencyRule, MapConsistency, judge_consistency
-from ms_slam_env.metrics.sightings import (
+from ms_slam_env.metrics.consistency import (
+    ConsistencyRule,
     LabelledView,
+    MapConsistency,
     SightingRule,
     count_votes,
     distinct_placements,
+    judge_consistency,
 )
 
 CAMERA = Intrinsics(fx=50.0, fy=50.0, cx=31.5, cy=23.5, width=64, height=48)

@@ -26,7 +26,7 @@ from ms_slam_env.metrics.cost import (
     nvml_counter,
     rapl_counter,
 )
-from ms_slam_env.metrics.cost.memory import resident_mb
+from ms_slam_env.metrics.cost.meter import resident_mb
 
 RANGE_UJ = 262_143_328_850
 

@@ -1,10 +1,13 @@
 """What SLAM costs a frame: execution time (EXT), memory (MEM), energy (ENE)."""
 
-from ms_slam_env.metrics.cost.energy import EnergyCounter, NoEnergy, energy_counters
-from ms_slam_env.metrics.cost.memory import forget_peak_memory, memory_mb
-from ms_slam_env.metrics.cost.meter import CostMeter, FrameCost
-from ms_slam_env.metrics.cost.nvml import nvml_counter
-from ms_slam_env.metrics.cost.rapl import rapl_counter
+from ms_slam_env.metrics.cost.energy import (
+    EnergyCounter,
+    NoEnergy,
+    energy_counters,
+    nvml_counter,
+    rapl_counter,
+)
+from ms_slam_env.metrics.cost.meter import CostMeter, FrameCost, forget_peak_memory, memory_mb
 
 __all__ = [
     "CostMeter",

@@ -9,10 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from ms_slam_env.geometry import look_at, relative_angle
+from ms_slam_env.geometry import Float64, look_at, relative_angle
 from ms_slam_env.scenes.base import Scene
-
-Float64 = NDArray[np.float64]
 
 _SAMPLES_PER_HOP = 40
 _TREMOR_M = 0.002

@@ -7,14 +7,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import so3_exp
+from ms_slam_env.geometry import Float64, so3_exp
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sequences.paths.base import (
     CameraPath,
@@ -25,8 +24,6 @@ from ms_slam_env.sequences.paths.base import (
     unit,
 )
 from ms_slam_env.sequences.paths.wandering import RADIUS_M, Gaze, free_path
-
-Float64 = NDArray[np.float64]
 
 _SAMPLES = 2000
 _SPACING_M = 0.25  # between places of the roadmap

@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.config import Checked, bounded
+from ms_slam_env.geometry import Float64
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sequences.paths.base import CameraPath, hand_tremor, resample
 from ms_slam_env.sequences.paths.handheld import HandheldPath
 from ms_slam_env.sequences.paths.wandering import free_path
 from ms_slam_env.sequences.trajectory import PoseInterpolation
-
-Float64 = NDArray[np.float64]
 
 PACES = (0.1, 1.0, 4.0)
 """Of an `UnevenPath`: nearly still, walking, in a hurry; multiples of its mean pace."""

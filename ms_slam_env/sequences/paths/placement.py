@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import check_pose, make_pose, so3_exp
+from ms_slam_env.geometry import Float64, check_pose, make_pose, so3_exp
 from ms_slam_env.scenes.base import Scene
-
-Float64 = NDArray[np.float64]
 
 SCALES = tuple(round(1.0 - 0.05 * k, 2) for k in range(19))
 """Scales tried, from the largest to the smallest."""

@@ -5,17 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.geometry import look_at
+from ms_slam_env.geometry import Float64, look_at
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sequences.paths.base import CameraPath, frame_times, hand_tremor, resample, unit
 from ms_slam_env.sequences.paths.wandering import RADIUS_M
-
-Float64 = NDArray[np.float64]
 
 _SAMPLE_M = 0.1
 _CORNER_M = 0.9  # width of the filter that rounds corners

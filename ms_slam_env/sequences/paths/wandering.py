@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import Float64
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sensor import FRAME_RATE_HZ
 from ms_slam_env.sequences.paths.base import (
@@ -20,8 +20,6 @@ from ms_slam_env.sequences.paths.base import (
     resample,
     unit,
 )
-
-Float64 = NDArray[np.float64]
 
 _NEAREST_M = 0.6
 _MAX_SLOPE = 0.8  # sine of the angle above or below the horizon

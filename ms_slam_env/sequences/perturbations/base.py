@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import Float64
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sensor import ChangingLight
 from ms_slam_env.sequences.perturbations.movers import Mover
 from ms_slam_env.sequences.trajectory import PoseInterpolation
 
-Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 

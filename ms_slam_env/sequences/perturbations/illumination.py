@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import Float64
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.mesh_queries import RayCaster
 from ms_slam_env.scenes.movers import Shape
@@ -18,8 +19,6 @@ from ms_slam_env.sequences.perturbations.base import LightPerturbation, random_n
 from ms_slam_env.sequences.perturbations.movers import Track
 from ms_slam_env.sequences.perturbations.moving_objects import Places
 from ms_slam_env.sequences.trajectory import PoseInterpolation
-
-Float64 = NDArray[np.float64]
 
 _BULB = Shape("box", (), radius_m=0.15, length_m=0.1, width_m=0.1, height_m=0.05, depth_m=0.05)
 _NEAREST_M = 0.2  # closer the light of the lamp grows no more

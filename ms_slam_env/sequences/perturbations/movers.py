@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
+from ms_slam_env.geometry import Float64
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.light_probe import LightProbe
 from ms_slam_env.scenes.movers import Joint, Shape
 from ms_slam_env.sensor import Body
-
-Float64 = NDArray[np.float64]
 
 _SPACING_M = 0.02
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import Float64
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.mesh_queries import RayCaster
 from ms_slam_env.scenes.movers import MOVERS, Shape, make_mover
@@ -22,8 +23,6 @@ from ms_slam_env.sequences.perturbations.movers import (
     straight_track,
 )
 from ms_slam_env.sequences.trajectory import PoseInterpolation
-
-Float64 = NDArray[np.float64]
 
 _TRIES = 4000
 _CANDIDATES = 8  # free ways among which the one that is seen most is taken

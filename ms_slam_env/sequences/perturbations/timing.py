@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ms_slam_env.config import Checked, bounded
+from ms_slam_env.geometry import Float64
 from ms_slam_env.sequences.perturbations.base import (
     FrameSelection,
     Int64,
@@ -15,8 +15,6 @@ from ms_slam_env.sequences.perturbations.base import (
     random_numbers,
 )
 from ms_slam_env.sequences.trajectory import PoseInterpolation
-
-Float64 = NDArray[np.float64]
 
 _STEP_S = 1e-3
 _RAMP = 0.25  # share of a stretch over which the speed rises, and falls again

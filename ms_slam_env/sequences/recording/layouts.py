@@ -8,10 +8,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.geometry import Float64
 from ms_slam_env.sequences.recording.listings import (
     Calibration,
     Listed,
@@ -26,8 +26,6 @@ from ms_slam_env.sequences.recording.listings import (
 from ms_slam_env.sequences.recording.recording import Entry, Recording, Registration
 from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S, associate, read_trajectory
 from ms_slam_env.sequences.writing import UNFINISHED
-
-Float64 = NDArray[np.float64]
 
 FRAME_RATE_HZ = 30.0  # where a layout has no times
 IMAGES = (".png", ".pgm", ".jpg", ".jpeg", ".ppm", ".tif", ".tiff")

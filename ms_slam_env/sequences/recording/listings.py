@@ -8,14 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import check_pose
-
-Float64 = NDArray[np.float64]
-
+from ms_slam_env.geometry import Float64, check_pose
 
 _ROUNDED = 1e-2  # as for the length of a quaternion
 

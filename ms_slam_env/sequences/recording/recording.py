@@ -20,10 +20,9 @@ from ms_slam_env.camera import XTION_SIZES, Intrinsics, RGBDFrame
 from ms_slam_env.camera.frame import reduce_color, reduce_depth
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.geometry import Float64
 from ms_slam_env.sequences.sequence import Sequence
 from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S, associate
-
-Float64 = NDArray[np.float64]
 
 # What Pillow raises for files that are missing, truncated or damaged, format by format.
 _BROKEN_IMAGE = (
