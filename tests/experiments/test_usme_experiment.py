@@ -11,7 +11,7 @@ from ms_slam_env import scenes, slam
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
 from ms_slam_env.experiments import usme
-from ms_slam_env.experiments.harness import running
+from ms_slam_env.experiments.harness import running, usme_runs
 
 make_scene = cache(scenes.make)
 
@@ -20,20 +20,20 @@ make_scene = cache(scenes.make)
 def cheap(monkeypatch):
     """Scenes are built once, the true surface is seen in small images."""
     monkeypatch.setattr(scenes, "make", make_scene)
-    monkeypatch.setattr(usme, "_VIEW_SIZE", "80x60")
+    monkeypatch.setattr(usme_runs, "_VIEW_SIZE", "80x60")
 
 
 def test_options_of_a_backend_are_those_of_the_scene():
-    assert usme.slam_options("living_room", "surfel") == {}
+    assert usme_runs.slam_options("living_room", "surfel") == {}
     for backend in slam.BACKENDS:
-        options = usme.slam_options("city_street", backend)
+        options = usme_runs.slam_options("city_street", backend)
         assert options["depth_cutoff_m"] == 10.0
 
 
 @pytest.mark.usefixtures("cheap")
 def test_one_run_has_every_measure():
-    spec = usme.UsmeSpec("room-fast-black", "surfel", "80x60", SEED, frames_scale=0.12)
-    result = usme.run_usme(spec)
+    spec = usme_runs.UsmeSpec("room-fast-black", "surfel", "80x60", SEED, frames_scale=0.12)
+    result = usme_runs.run_usme(spec)
     assert result["frames"] > 30
     assert 0.0 <= result["lost_share"] <= 1.0
     assert not np.isnan(result["relocalisation_s"])
@@ -53,10 +53,10 @@ def test_one_run_has_every_measure():
 def test_a_map_against_itself_is_without_error():
     rng = np.random.default_rng(0)
     plane = np.column_stack([rng.uniform(0, 2, (20_000, 2)), 0.003 * rng.standard_normal(20_000)])
-    found = usme.map_measures(plane, plane, "living_room")
+    found = usme_runs.map_measures(plane, plane, "living_room")
     assert found["c2c_mean_m"] < 1e-3
     assert found["recall_near"] > 0.99
-    empty = usme.map_measures(np.zeros((0, 3)), plane, "living_room")
+    empty = usme_runs.map_measures(np.zeros((0, 3)), plane, "living_room")
     assert (empty["map_points"], empty["c2c_mean_m"]) == (0, None)
 
 

@@ -254,7 +254,7 @@ def compare(_: Path) -> Any:
 
 @experiment("usme", CHAOTIC)
 def usme(folder: Path) -> Any:
-    from ms_slam_env.experiments.usme import UsmeSpec, run_usme
+    from ms_slam_env.experiments.harness.usme_runs import UsmeSpec, run_usme
     from ms_slam_env.sequences.usme_suite import make_suite
 
     name, size, seed, scale = "room-fast-black", "80x60", 2000, 0.3
