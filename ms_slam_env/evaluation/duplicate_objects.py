@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -47,6 +49,19 @@ class JudgedMap:
     def name(self, item: ObjectConsistency) -> str:
         """Name of an object."""
         return self.labels[item.label]
+
+    def verdict(self) -> dict[str, Any]:
+        """Metrics: ``success``, ``objects`` (judged), ``worst_apart_share``, ``duplicated``."""
+        found = self.consistency
+        return {
+            "success": found.success,
+            "objects": len(found.objects),
+            "worst_apart_share": max((o.apart_share for o in found.objects), default=math.nan),
+            "duplicated": [
+                {"object": self.name(item), "apart_share": item.apart_share}
+                for item in found.duplicated
+            ],
+        }
 
 
 def labelled_view(

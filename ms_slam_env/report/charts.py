@@ -236,6 +236,38 @@ def by_group(
     return panels
 
 
+def bars(
+    rows: Sequence[Row], field: str, by: str, keys: Iterable[str], label: Callable[[Any], str] = str
+) -> list[Panel]:
+    """A panel for each metric: its median, of flags the share, with its interval as a bar.
+
+    Args:
+        rows: of an experiment.
+        field: of the specifications, whose values stand along the x axis.
+        by: field whose values have a colour each.
+        keys: metrics on the y axes.
+        label: name of a colour from the value of ``by``.
+    """
+    cells = grouped(rows, (by, field))
+    places = list(dict.fromkeys(place for _, place in cells))
+    return [
+        Panel(
+            "",
+            key,
+            [
+                interval_series(
+                    label(name),
+                    places,
+                    [summary(cells.get((name, place), []), key) for place in places],
+                    "bars",
+                )
+                for name in dict.fromkeys(name for name, _ in cells)
+            ],
+        )
+        for key in keys
+    ]
+
+
 def scatter(
     rows: Sequence[Row],
     x: str,

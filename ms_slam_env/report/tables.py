@@ -238,7 +238,8 @@ def format_value(value: Value, key: str) -> str:
     if isinstance(value, str):
         return value
     if isinstance(value, Interval):
-        return format_interval(value, of.scale, of.digits)
+        digits = 3 if of.unit == "count" else of.digits  # a median lies between two counts
+        return format_interval(value, of.scale, digits)
     if isinstance(value, bool):
         return "yes" if value else "no"
     if of.scale == 1 and float(value).is_integer() and (isinstance(value, int) or of.digits > 8):

@@ -204,9 +204,9 @@ def pose_sources(_: Path) -> Any:
 
 @experiment("arm_experiment")
 def arm_experiment(_: Path) -> Any:
-    from ms_slam_env.benchmark.arm_experiment import RunSpec, run
+    from ms_slam_env.experiments.arm_experiment import ArmExperiment, RunSpec
 
-    return run(RunSpec("random", "carpet", 1000, ARM, steps=100, seconds=0.6))
+    return ArmExperiment.run(RunSpec("random", "carpet", 1000, ARM, steps=100, seconds=0.6))
 
 
 @experiment("arm_masks")
@@ -406,12 +406,12 @@ def map_consistency(_: Path) -> Any:
     return {"points": len(judged.points), "success": judged.consistency.success, **objects}
 
 
-@experiment("map_consistency_check", CHAOTIC)
-def map_consistency_check(_: Path) -> Any:
-    from ms_slam_env.benchmark.map_consistency_check import CopySpec, run
+@experiment("duplicate_objects", CHAOTIC)
+def duplicate_objects(_: Path) -> Any:
+    from ms_slam_env.experiments.duplicate_objects import CopySpec, DuplicateObjects
     from ms_slam_env.metrics.consistency import ConsistencyRule
 
-    return run(CopySpec("table", 1000, 0.1, 0, ConsistencyRule()))
+    return DuplicateObjects.run(CopySpec("table", 1000, 0.1, 0, ConsistencyRule()))
 
 
 @experiment("map_evaluation", EXACT)

@@ -15,10 +15,7 @@ PATHS = sorted(FOLDER.rglob("*.json"))
 
 NOT_CONVERTED = {
     "adaptation",
-    "arm_experiment",
-    "arm_fuse_all",
     "arm_masks",
-    "arm_stop_and_look",
     "env_speed",
     "explore",
     "explore_divergence",
