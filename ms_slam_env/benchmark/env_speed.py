@@ -1,6 +1,6 @@
 """Decisions a second of the environment, and where the time of a decision goes.
 
-``python -m ms_slam_env.benchmark.env_speed`` writes ``env_speed.json`` and prints a table.
+``ms-slam experiment env-speed`` writes ``env_speed.json`` and prints a table.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import write_json
 from ms_slam_env.report.tables import markdown_table
 
-PROGRAM = "python -m ms_slam_env.benchmark.env_speed"
+PROGRAM = "ms-slam experiment env-speed"
 ORDER = ("ik", "physics", "move", "mask", "render", "slam", "divergence", "coverage", "lookahead")
 """Order of the stages in the table; others follow."""
 REST = "rest"

@@ -1,6 +1,6 @@
 """Time of the lookahead: 49 predicted views and their divergences, from a map of given size.
 
-``python -m ms_slam_env.benchmark.lookahead_speed --out DIR`` writes ``lookahead_speed.json``.
+``ms-slam experiment lookahead-speed --out DIR`` writes ``lookahead_speed.json``.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ Every frame of a rendered sequence is tracked against a map that was fused at th
 the error is that of one alignment and drift has no part in it; the state is then set back and the
 frame fused at its true pose. If the covariance C of the twist xi (the error) is right, xi^T C^-1 xi
 follows the chi-squared distribution with six degrees of freedom. Run as
-``python -m ms_slam_env.benchmark.pose_covariance --out DIR``.
+``ms-slam experiment pose-covariance --out DIR``.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from ms_slam_env.sequences import handheld_trajectory
 
 Float64 = NDArray[np.float64]
 
-PROGRAM = "python -m ms_slam_env.benchmark.pose_covariance"
+PROGRAM = "ms-slam experiment pose-covariance"
 DEGREES_OF_FREEDOM = 6
 BOUNDS = (0.5, 0.9, 0.95)
 WARM_UP = 5  # frames before the first error, so that there is a map

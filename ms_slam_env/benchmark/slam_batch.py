@@ -1,6 +1,6 @@
 """Frames a second of many surfel SLAMs in one batch, on the CPU and on a GPU.
 
-``python -m ms_slam_env.benchmark.slam_batch --device cpu --batch 1 4 16`` writes
+``ms-slam experiment slam-batch --device cpu --batch 1 4 16`` writes
 ``slam_batch.json`` and prints a table.
 """
 
@@ -31,7 +31,7 @@ from ms_slam_env.report.tables import format_number, markdown_table
 from ms_slam_env.sequences import handheld_trajectory, render_sequence
 from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
 
-PROGRAM = "python -m ms_slam_env.benchmark.slam_batch"
+PROGRAM = "ms-slam experiment slam-batch"
 Float64 = NDArray[np.float64]
 
 

@@ -1,6 +1,6 @@
 """Processor time of a frame of the surfel SLAM, by stage, image size and stored surfels.
 
-``python -m ms_slam_env.benchmark.slam_speed --out DIR`` writes ``slam_speed.json``,
+``ms-slam experiment slam-speed --out DIR`` writes ``slam_speed.json``,
 ``slam_speed.md`` and ``slam_speed.png``. With ``--against CHECKOUT`` the package of another
 checkout runs in turns with this one, and the table shows the ratio.
 """
@@ -30,7 +30,7 @@ from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import write_json
 from ms_slam_env.sequences import handheld_trajectory, render_sequence
 
-PROGRAM = "python -m ms_slam_env.benchmark.slam_speed"
+PROGRAM = "ms-slam experiment slam-speed"
 NEW, OLD = "this", "other"
 _START = "import runpy, sys; sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], None, '__main__')"
 

@@ -310,14 +310,15 @@ def loop_closure(_: Path) -> Any:
 
 @experiment("multi_robot", CHAOTIC)
 def multi_robot(_: Path) -> Any:
-    from ms_slam_env.benchmark.multi_robot_run import MultiRobotSpec, run_team
+    from ms_slam_env.experiments.harness.teams import MultiRobotSpec
+    from ms_slam_env.experiments.multi_robot import MultiRobot
     from ms_slam_env.slam.map_merging import MergeConfig
 
     merge = MergeConfig(queries=6, lost_queries=1, patience=2)
     spec = MultiRobotSpec(
         "table", 1000, frames=12, image_size="80x60", least_overlap=0.5, merge=merge
     )
-    return run_team(spec)
+    return MultiRobot.run(spec)
 
 
 @experiment("pose_covariance", CHAOTIC)

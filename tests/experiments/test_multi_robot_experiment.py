@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
 from two_robots import TRUTHS, run_robot
 
-from ms_slam_env.benchmark import (
-    multi_robot,
-    multi_robot_paths,
-    multi_robot_report,
-    multi_robot_run,
-)
-from ms_slam_env.benchmark.multi_robot_paths import overlap, team_paths
-from ms_slam_env.benchmark.multi_robot_run import PairMerge, Team, judge_team, place_robots
+from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
+from ms_slam_env.experiments import multi_robot
+from ms_slam_env.experiments.harness import teams
+from ms_slam_env.experiments.harness.teams import (
+    MultiRobotSpec,
+    PairMerge,
+    Team,
+    judge_team,
+    overlap,
+    place_robots,
+    team_paths,
+)
+from ms_slam_env.experiments.multi_robot import MultiRobot
+from ms_slam_env.experiments.pictures import judged_map
 from ms_slam_env.geometry import invert, make_pose, so3_exp
 from ms_slam_env.sequences import HandheldPath
 from ms_slam_env.slam.map_hypotheses import RobotRun
-from ms_slam_env.slam.map_merging import Fit, Merge
+from ms_slam_env.slam.map_merging import Fit, Merge, MergeConfig
 
 
 @pytest.fixture(scope="module")
@@ -73,32 +78,32 @@ def test_a_team_is_placed_through_whoever_was_merged() -> None:
     assert list(placed) == [0, 1, 2]
     for k, T in placed.items():
         np.testing.assert_allclose(T, team.true_pose(0, k), atol=1e-9)
-    found = judge_team(team, merges, multi_robot_run.MultiRobotSpec(robots=3))
+    found = judge_team(team, merges, MultiRobotSpec(robots=3))
     assert found["merged_robots"] == 3
     assert found["team_ate_unaligned_m"] == pytest.approx(0, abs=1e-9)
     assert found["team_rpe_m"] == pytest.approx(0, abs=1e-9)
-    assert found["map_f_score_2cm"] == 1.0
+    assert found["f_score_2cm"] == 1.0
     assert found["task_time_s"] == pytest.approx(1.0 + 5 / 30)
     assert found["mean_path_m"] == pytest.approx(0.5)
     assert [pair["merged"] for pair in found["pairs"]] == [False, True, True]
-    assert not any(pair["wrong"] for pair in found["pairs"])
-    alone = found["robots"][0]
-    assert alone["map_recall_2cm"] == pytest.approx(1 / 3, abs=0.02)
+    assert not any(pair["wrong_merge"] for pair in found["pairs"])
+    alone = found["alone"][0]
+    assert alone["recall_2cm"] == pytest.approx(1 / 3, abs=0.02)
     assert list(place_robots(3, {**merges, (0, 2): merged(None)})) == [0]
 
 
 def test_a_bad_merge_is_called_wrong() -> None:
     team = exact_team(2)
-    spec = multi_robot_run.MultiRobotSpec()
+    spec = MultiRobotSpec()
     off = team.true_pose(0, 1) @ make_pose(np.eye(3), [0.2, 0, 0])
     found = judge_team(team, {(0, 1): merged(off)}, spec)
     (pair,) = found["pairs"]
-    assert pair["wrong"]
-    assert pair["error_m"] == pytest.approx(0.2)
+    assert pair["wrong_merge"]
+    assert pair["merge_error_m"] == pytest.approx(0.2)
     assert found["team_ate_unaligned_m"] == pytest.approx(0.2 / np.sqrt(2))
     foreign = dataclasses.replace(spec, setting="foreign")
     found = judge_team(team, {(0, 1): merged(team.true_pose(0, 1))}, foreign)
-    assert found["pairs"][0]["wrong"]  # another scene has no place in this one
+    assert found["pairs"][0]["wrong_merge"]  # another scene has no place in this one
 
 
 def test_paths_of_a_team_share_what_they_see(box_scene, monkeypatch) -> None:
@@ -110,15 +115,15 @@ def test_paths_of_a_team_share_what_they_see(box_scene, monkeypatch) -> None:
     np.testing.assert_array_equal(paths, again)
     assert not np.allclose(paths[0], paths[1])
     assert overlap({(0,), (1,)}, {(1,), (2,), (3,)}) == 0.5
-    monkeypatch.setattr(multi_robot_paths, "_ATTEMPTS", 2)
+    monkeypatch.setattr(teams, "_ATTEMPTS", 2)
     with pytest.raises(InputError, match=r"shares 100 %"):
         team_paths(box_scene, path, 3, 2, 1.0)
 
 
 def test_a_team_maps_its_paths_in_frames_of_its_own(box_scene, monkeypatch) -> None:
-    monkeypatch.setattr(multi_robot_run.scenes, "make", lambda *_: box_scene)
-    spec = multi_robot_run.MultiRobotSpec(frames=4, image_size="80x60", least_overlap=0.0)
-    team = multi_robot_run.make_team(spec)
+    monkeypatch.setattr(teams.scenes, "make", lambda *_: box_scene)
+    spec = MultiRobotSpec(frames=4, image_size="80x60", least_overlap=0.0)
+    team = teams.make_team(spec)
     for robot, truth in zip(team.robots, team.truths, strict=True):
         np.testing.assert_array_equal(robot.estimates[0], np.eye(4))
         assert robot.tracked.all()
@@ -127,38 +132,35 @@ def test_a_team_maps_its_paths_in_frames_of_its_own(box_scene, monkeypatch) -> N
     assert box_scene.clearance(team.seen.astype(float)).max() < 1e-4
 
 
-def test_the_command_reports_teams(robots, tmp_path, monkeypatch, capsys) -> None:
-    def here(specs, run, *_):
-        rows = []
-        for spec in specs:
-            rows.append({"spec": dataclasses.asdict(spec), "result": run(spec), "error": None})
-        return rows
-
+def test_tables_and_the_picture_of_a_team(robots, tmp_path, monkeypatch) -> None:
     def judged(points, *_, **__):
         return {"f_score_2cm": 0.5, "f_score_5cm": 1.0, "map_points": len(points)}
 
     floor = np.zeros((1, 3))
     team = Team(robots, list(TRUTHS), [np.arange(10) / 30] * 2, floor, floor, [0.5])
-    monkeypatch.setattr(multi_robot_run, "map_quality", judged)  # takes seconds
-    monkeypatch.setattr(multi_robot, "run_all", here)
+    monkeypatch.setattr(teams, "map_quality", judged)  # takes seconds
     monkeypatch.setattr(multi_robot, "make_team", lambda _: team)
-    monkeypatch.setattr(multi_robot_run, "make_team", lambda _: team)
-    monkeypatch.setattr(multi_robot_report, "CAMERA", multi_robot_report.CAMERA.scaled(0.125))
-    options = ["--scenes", "table", "--merge.sources", "features", "--out", str(tmp_path)]
-    assert multi_robot.main(options) == 0
-    assert "| table | 1000 | shared | 2 of 2 |" in capsys.readouterr().out
-    found = json.loads((tmp_path / "multi_robot.json").read_text())
-    assert found["provenance"]["versions"]
-    assert len(found["teams"][0]["robots"]) == 2
-    assert found["summary"][0]["merged_same_scene"] == 1
+    monkeypatch.setattr(judged_map, "CAMERA", judged_map.CAMERA.scaled(0.125))
+    merge = MergeConfig(sources=("features",))
+    experiment = MultiRobot(scenes=("table",), merge=merge)
+    (spec,) = experiment.specs()
+    result = MultiRobot.run(spec)
+    rows = [{"spec": dataclasses.asdict(spec), "result": result, "error": None}]
+    settings, sources, (line,), (pair,) = (table.rows for table in experiment.tables(rows))
+    assert (settings[0]["merged"].value, settings[0]["wrong_merge"].value) == (1, 0)
+    assert sources[0]["source"] == "features"
+    assert line["merged_robots"] == 2
+    assert line["alone_f_score_2cm"] == 0.5
+    assert pair["pair"] == "0-1"
+    experiment.write_pictures(rows, tmp_path)
     assert (tmp_path / "map_table_1000_2.png").stat().st_size > 1000
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--robots", "4"], r"robots = 4 is outside \[2, 3\]"),
-        (["--settings", "apart"], "setting"),
+        (["--robots", "4"], "robots = 4 is outside [2, 3]"),
+        (["--settings", "apart"], "unknown setting 'apart'"),
         (["--scenes", "mars"], "unknown scene 'mars'"),
         (["--image-size", "1x1"], "unknown image size"),
         (["--noise", "loud"], "unknown noise model"),
@@ -168,6 +170,6 @@ def test_the_command_reports_teams(robots, tmp_path, monkeypatch, capsys) -> Non
         (["--least-overlap", "2"], "least_overlap = 2"),
     ],
 )
-def test_bad_input(options, message, tmp_path) -> None:
-    with pytest.raises(InputError, match=message):
-        multi_robot.main([*options, "--out", str(tmp_path)])
+def test_bad_input(options, message, capsys) -> None:
+    assert main(["experiment", "multi-robot", *options]) == 2
+    assert message in capsys.readouterr().err

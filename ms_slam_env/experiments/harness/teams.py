@@ -1,22 +1,24 @@
-"""One team of robots: each maps its own path in a frame of its own; maps merged and judged."""
+"""A team of robots: paths that see the same surfaces, each mapped in a frame of its own, merged."""
 
 from __future__ import annotations
 
 import itertools
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import metrics, scenes, slam
-from ms_slam_env.benchmark.multi_robot_paths import Views, team_paths
 from ms_slam_env.camera import xtion
-from ms_slam_env.config import check_choice, check_range
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.map_quality import map_quality
+from ms_slam_env.evaluation.run_sequence import run_sequence
 from ms_slam_env.geometry import invert, transform_points
+from ms_slam_env.geometry.point_clouds import voxel_downsample
+from ms_slam_env.scenes import Scene
+from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sequences import HandheldPath, render_sequence
 from ms_slam_env.slam.map_hypotheses import RobotRun
 from ms_slam_env.slam.map_merging import (
@@ -38,6 +40,12 @@ _OTHER_SEED = 50_000
 _SURFACE_M = 0.01
 _LOOK_EVERY = 5  # frames between views that the surface to be mapped is made of
 
+VOXEL_M = 0.10
+_ATTEMPTS = 30
+_SEEDS_A_ROBOT = 1000
+_LOOKS = 25  # poses of a path that are looked from
+_REACH_M = 4.0  # of the sensor
+
 
 @dataclass(frozen=True)
 class MultiRobotSpec:
@@ -54,9 +62,6 @@ class MultiRobotSpec:
         least_overlap: of the surfaces that they see.
         params: of the SLAM.
         merge: how maps are merged.
-
-    Raises:
-        InputError: a value out of range.
     """
 
     scene: str = "living_room"
@@ -69,17 +74,6 @@ class MultiRobotSpec:
     least_overlap: float = 0.3
     params: dict[str, Any] = field(default_factory=dict)
     merge: MergeConfig = field(default_factory=MergeConfig)
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        try:
-            check_range(self, "robots", 2, 3)
-            check_choice(self, "setting", SETTINGS)
-            check_range(self, "frames", 2, 1_000_000)
-            check_range(self, "least_overlap", 0.0, 1.0)
-        except InputError as error:
-            # Users know the fields as options of a command, not this class.
-            raise InputError(str(error).replace("MultiRobotSpec.", "")) from None
 
 
 @dataclass(frozen=True)
@@ -139,20 +133,80 @@ def make_team(spec: MultiRobotSpec) -> Team:
         noise_seed = 10 * spec.seed + number
         frames = tuple(render_sequence(place, truth, K, spec.noise, noise_seed).frames)
         backend = slam.make("surfel", K, **spec.params)
-        backend.reset()
-        results = [backend.track(frame) for frame in frames]
-        runs.append(
-            RobotRun(
-                backend,
-                frames,
-                np.stack([result.T_world_camera for result in results]),
-                np.array([result.tracking_ok for result in results]),
-            )
-        )
+        run = run_sequence(backend, frames)
+        runs.append(RobotRun(backend, frames, run.estimates, run.tracking_ok))
     here = [truth for place, truth in zip(own, poses, strict=True) if place is scene]
     seen = Views(scene).points(np.concatenate(here)[::_LOOK_EVERY], _SURFACE_M)
     surface = scene.surface_points(_SURFACE_M)[0]
     return Team(runs, poses, [path.timestamps] * spec.robots, surface, seen, overlaps)
+
+
+class Views:
+    """Which surface a path sees, as occupied voxels of ``VOXEL_M``."""
+
+    def __init__(self, scene: Scene) -> None:
+        """Prepare to look around in a scene."""
+        self._sensor = RGBDSensor(scene, xtion("80x60"), noise="none")
+
+    def of(self, poses: Float64) -> set[tuple[int, ...]]:
+        """Voxels seen from poses (N, 4, 4)."""
+        points = self.points(poses[:: max(1, len(poses) // _LOOKS)], VOXEL_M)
+        return set(map(tuple, np.floor(points / VOXEL_M).astype(int).tolist()))
+
+    def points(self, poses: Float64, voxel_m: float) -> Float64:
+        """Points (M, 3) of the true surface that poses (N, 4, 4) see, one a voxel."""
+        seen = []
+        for pose in poses:
+            view = self._sensor.ground_truth(pose)
+            near = (view.depth > 0) & (view.depth <= _REACH_M)
+            seen.append(view.points[near].astype(np.float64))
+        return voxel_downsample(np.concatenate(seen), voxel_m)
+
+
+def overlap(a: set[tuple[int, ...]], b: set[tuple[int, ...]]) -> float:
+    """Share of the smaller of two sets of voxels that is in the other too."""
+    return len(a & b) / max(1, min(len(a), len(b)))
+
+
+def team_paths(
+    scene: Scene, path: HandheldPath, seed: int, robots: int, least_overlap: float
+) -> tuple[list[Float64], list[float]]:
+    """A path for each robot, each seeing enough of what one before it sees.
+
+    Args:
+        scene: where.
+        path: how they are carried.
+        seed: of the paths.
+        robots: how many.
+        least_overlap: share of the smaller set of surfaces seen, [0, 1]; 0 = any path will do.
+
+    Returns:
+        paths (N, 4, 4), and for every robot but the first its largest overlap with one before.
+
+    Raises:
+        InputError: no free path, or none that overlaps.
+    """
+    views = Views(scene)
+    paths: list[Float64] = []
+    seen: list[set[tuple[int, ...]]] = []
+    overlaps: list[float] = []
+    for robot in range(robots):
+        for attempt in range(_ATTEMPTS):
+            number = (seed * robots + robot) * _SEEDS_A_ROBOT + attempt
+            poses = path.poses(scene, number)
+            voxels = views.of(poses)
+            shared = max((overlap(voxels, other) for other in seen), default=1.0)
+            if shared >= least_overlap:
+                break
+        else:
+            raise InputError(
+                f"found no path of robot {robot} in scene {scene.name!r}, seed {scene.seed}, that "
+                f"shares {100 * least_overlap:.0f} % of what another sees"
+            )
+        paths.append(poses)
+        seen.append(voxels)
+        overlaps.append(shared)
+    return paths, overlaps[1:]
 
 
 @dataclass(frozen=True)
@@ -203,23 +257,22 @@ def judge_team(
 ) -> dict[str, Any]:
     """Figures of a team, of the robots that were merged with the first and of each alone.
 
-    ``pairs``: of each pair what came of it, with ``error_m`` (at robot b's mean camera position),
-    ``error_origin_m`` (at the origin of its frame) and ``error_deg`` of T_a_b, and ``wrong``;
-    ``alone`` has the same from the guesses of each source alone. ``merged_robots``;
-    ``team_ate_m``, ``team_ate_max_m`` (one SE(3) alignment for all), ``team_ate_unaligned_m``
-    (the first robot's start is the only tie), ``team_rpe_m``, ``task_time_s``, ``mean_path_m``;
-    ``map_...`` of the merged map against all that the robots saw; ``robots``: the same of each
-    robot alone, its map tied by its own true start.
+    Keys as in the registry of metrics: what came of each pair, and ``by_source`` from the guesses
+    of one source; the trajectories (one SE(3) alignment for all, and the first robot's start as the
+    only tie); the merged map against all that the robots saw; ``alone``: each robot without the
+    others, its map tied by its own true start.
     """
     foreign = len(team.robots) - 1 if spec.setting == FOREIGN else None
     pairs = []
     for (a, b), pair in merges.items():
         same_scene = foreign not in (a, b)
-        alone = {
-            name: _judge_merge(team, a, b, merge, same_scene) for name, merge in pair.alone.items()
-        }
+        by_source = [
+            {"source": name, **_judge_merge(team, a, b, merge, same_scene)}
+            for name, merge in pair.alone.items()
+        ]
         entry = _judge_merge(team, a, b, pair.merge, same_scene)
-        pairs.append({"a": a, "b": b, "same_scene": same_scene, **entry, "alone": alone})
+        about = {"pair": f"{a}-{b}", "same_scene": same_scene}
+        pairs.append({**about, **entry, "by_source": by_source})
     T_first = place_robots(len(team.robots), merges)
     members = list(T_first)
     T_world_first = team.truths[0][0]
@@ -230,7 +283,6 @@ def judge_team(
         truths.append(team.truths[k])
         points.append(transform_points(T, team.robots[k].backend.surface_points()))
     ate = metrics.team_ate(estimates, truths)
-    merged_map = map_quality(np.concatenate(points), team.surface, reference=team.seen)
     return {
         "pairs": pairs,
         "path_overlaps": team.overlaps,
@@ -241,32 +293,43 @@ def judge_team(
         "team_rpe_m": metrics.team_rpe(estimates, truths).rmse,
         "task_time_s": metrics.task_time([team.times[k] for k in members]),
         "mean_path_m": metrics.mean_path_length(truths),
-        **{f"map_{name}": value for name, value in merged_map.items()},
-        "robots": [_alone(team, k) for k in range(len(team.robots)) if k != foreign],
+        **map_quality(np.concatenate(points), team.surface, reference=team.seen),
+        "alone": [_alone(team, k) for k in range(len(team.robots)) if k != foreign],
     }
 
 
 def _judge_merge(team: Team, a: int, b: int, merge: Merge, same_scene: bool) -> dict[str, Any]:
-    """Figures of one attempt; see ``judge_team``."""
+    """Figures of one attempt to merge robot b's map into robot a's."""
+    fit = merge.fit
     entry: dict[str, Any] = {
-        **{"merged": merge.T_a_b is not None, "reason": merge.reason, "wrong": False},
-        **{"found": merge.found, "agreeing": merge.agreeing, "refined_m": merge.refined_m},
-        **asdict(merge.fit),
+        "merged": merge.T_a_b is not None,
+        "merge_refusal": merge.reason,
+        "wrong_merge": False,
+        "hypotheses": merge.found,
+        "agreeing_hypotheses": merge.agreeing,
+        "refined_m": merge.refined_m,
+        "overlap_share": fit.overlap,
+        "consistent_share": fit.consistent,
+        "photometric_correlation": fit.alike,
     }
     if merge.T_a_b is not None:
         entry |= pair_error(team, a, b, merge.T_a_b)
-        off = entry["error_m"] > WRONG_M or entry["error_deg"] > WRONG_DEG
-        entry["wrong"] = bool(off or not same_scene)
+        off = entry["merge_error_m"] > WRONG_M or entry["merge_error_deg"] > WRONG_DEG
+        entry["wrong_merge"] = bool(off or not same_scene)
     return entry
 
 
 def pair_error(team: Team, a: int, b: int, T_a_b: Float64) -> dict[str, float]:
-    """Error of a relative pose; see ``judge_team``."""
+    """Error of a relative pose, at robot b's mean camera position and at its frame's origin."""
     true = team.true_pose(a, b)
     centre = team.robots[b].estimates[:, :3, 3].mean(axis=0)
     error_m, error_deg = pose_difference(T_a_b, true, centre)
     origin_m = pose_difference(T_a_b, true, np.zeros(3))[0]
-    return {"error_m": error_m, "error_origin_m": origin_m, "error_deg": error_deg}
+    return {
+        "merge_error_m": error_m,
+        "merge_error_origin_m": origin_m,
+        "merge_error_deg": error_deg,
+    }
 
 
 def _alone(team: Team, k: int) -> dict[str, Any]:
@@ -278,9 +341,6 @@ def _alone(team: Team, k: int) -> dict[str, Any]:
         "ate_unaligned_m": metrics.ate_rmse(truth[0] @ robot.estimates, truth, align="none"),
         "rpe_m": metrics.rpe_rmse(robot.estimates, truth),
         "lost_share": 1.0 - float(robot.tracked.mean()),
-        "path_m": metrics.path_length(truth),
-        **{
-            f"map_{name}": value
-            for name, value in map_quality(points, team.surface, reference=team.seen).items()
-        },
+        "path_length_m": metrics.path_length(truth),
+        **map_quality(points, team.surface, reference=team.seen),
     }
