@@ -322,22 +322,25 @@ def multi_robot(_: Path) -> Any:
 
 
 @experiment("pose_covariance", CHAOTIC)
-def pose_covariance(folder: Path) -> Any:
-    from ms_slam_env.benchmark.pose_covariance import PoseCovarianceConfig, run
+def pose_covariance(_: Path) -> Any:
+    from ms_slam_env.experiments.pose_covariance import PoseCovariance
 
     seeds = {"validation_seeds": (1000,), "test_seeds": (1001,)}
-    report = run(PoseCovarianceConfig(folder, ("wall",), **seeds, size="80x60", frames=16))
-    return {key: report[key] for key in ("rows", "validation_factor", "test_coverage_with_factor")}
+    experiment = PoseCovariance(("wall",), **seeds, size="80x60", frames=16)
+    rows = [
+        {"spec": dataclasses.asdict(spec), "result": PoseCovariance.run(spec), "error": None}
+        for spec in experiment.specs()
+    ]
+    return {"rows": experiment.tables(rows)[0].rows, **experiment.content(rows)}
 
 
 @experiment("slam_batch")
 def slam_batch(_: Path) -> Any:
-    from ms_slam_env.benchmark.slam_batch import SlamBatchConfig, measure, render
+    from ms_slam_env.experiments.slam_batch import SlamBatch
 
-    config = SlamBatchConfig(
-        scene="table", seed=1000, size="80x60", frames=6, warm_up=1, sequences=2, max_surfels=8000
-    )
-    return measure(config, 3, *render(config))
+    sequence = {"scene": "table", "seed": 1000, "size": "80x60", "frames": 6, "sequences": 2}
+    (spec,) = SlamBatch(batch=(3,), warm_up=1, max_surfels=8000, **sequence).specs()
+    return SlamBatch.run(spec)
 
 
 @experiment("slam_speed")

@@ -23,7 +23,7 @@ NORMAL_NOISE = wp.constant(wp.float64(0.3))  # share of that mean that is worth 
 LEAST_INFORMATION = wp.constant(wp.float64(0.5))  # per matched point, 1/m^2: 2 cm of 5000 points
 OPEN_VARIANCE = wp.constant(wp.float64(0.03 * 0.03))  # m^2, of a frame's predicted motion
 GEOMETRIC_NOISE = wp.constant(wp.float64(0.022))  # covariance of the gradient over A or B;
-PHOTOMETRIC_NOISE = wp.constant(wp.float64(0.34))  # see benchmark/pose_covariance.py
+PHOTOMETRIC_NOISE = wp.constant(wp.float64(0.34))  # see experiments/pose_covariance.py
 SINGULAR = wp.constant(wp.float64(1.0e-6))
 
 

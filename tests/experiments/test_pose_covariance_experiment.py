@@ -1,0 +1,55 @@
+"""The benchmark of the pose's covariance, on errors whose distribution is known and a short run."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+
+from ms_slam_env.errors import InputError
+from ms_slam_env.experiments import pose_covariance as pc
+
+
+def _errors(factor: float, count: int = 20_000) -> np.ndarray:
+    """Squared errors of random covariances that are ``factor`` times too small."""
+    rng = np.random.default_rng(0)
+    roots = rng.normal(size=(count, 6, 6))
+    twists = np.sqrt(factor) * (roots @ rng.normal(size=(count, 6, 1)))[..., 0]
+    return pc.squared(twists, roots @ roots.transpose(0, 2, 1))
+
+
+def test_right_covariances_hold_their_promises():
+    errors, promised = _errors(1.0), list(pc.BOUNDS.values())
+    np.testing.assert_allclose(pc.coverage(errors), promised, atol=0.01)
+    assert pc.scale(errors) == pytest.approx(1.0, rel=0.03)
+
+
+def test_the_factor_repairs_wrong_ones():
+    errors, promised = _errors(4.0), list(pc.BOUNDS.values())
+    assert pc.coverage(errors)[1] < 0.5
+    assert pc.scale(errors) == pytest.approx(4.0, rel=0.03)
+    np.testing.assert_allclose(pc.coverage(errors, pc.scale(errors)), promised, atol=0.01)
+
+
+def test_a_short_run_is_about_calibrated():
+    seeds = {"validation_seeds": (1000,), "test_seeds": (1000,)}
+    experiment = pc.PoseCovariance(("wall",), **seeds, size="80x60", frames=20)
+    spec, _ = experiment.specs()
+    rows = [
+        {"spec": {**asdict(spec), "seeds": seeds}, "result": result, "error": None}
+        for result in (pc.PoseCovariance.run(spec),)
+        for seeds in ("validation", "test")
+    ]
+    _, everything, wall = experiment.tables(rows)[0].rows
+    assert (wall["sequence"], wall["frames"]) == ("test, wall", 15)
+    assert wall["alignment_error_m"] == pytest.approx(everything["alignment_error_m"])
+    assert wall["predicted_error_m"] == pytest.approx(wall["alignment_error_m"], rel=0.7)
+    assert 0.1 < experiment.content(rows)["validation_factor"] < 4
+    (panel,) = experiment.charts(rows)[0].panels
+    assert panel.series[1].y == sorted(panel.series[1].y)
+
+
+def test_too_few_frames_are_refused():
+    with pytest.raises(InputError, match="frames"):
+        pc.PoseCovariance(frames=3)
