@@ -344,34 +344,33 @@ def slam_batch(_: Path) -> Any:
 
 
 @experiment("slam_speed")
-def slam_speed(folder: Path) -> Any:
+def slam_speed(_: Path) -> Any:
     """Surfels and lost frames; the rest are times."""
-    from ms_slam_env.benchmark.slam_speed import SlamSpeedConfig, store_sequence
-    from ms_slam_env.benchmark.slam_speed_child import measure
+    from ms_slam_env.experiments.harness.slam_speed_child import measure
+    from ms_slam_env.experiments.slam_speed import stored_sequence
 
-    config = SlamSpeedConfig(out=folder, scene="table", seed=1000, frames=6, warm_up=2)
-    stored = str(store_sequence(config, "80x60"))
-    rows = measure(stored, "80x60", (1, 30_000), config.warm_up, {"compaction_interval": 7})
+    _, path = stored_sequence("table", 1000, 6, "80x60")
+    rows = measure(path, "80x60", (1, 30_000), 2, {"compaction_interval": 7})
     return [{key: row[key] for key in ("target", "surfels", "lost_frames")} for row in rows]
 
 
 @experiment("lookahead_speed")
 def lookahead_speed(_: Path) -> Any:
     """Size of the map and number of views; the rest are times."""
-    from ms_slam_env.benchmark.lookahead_speed import LookaheadSpeedConfig, measure
+    from ms_slam_env.experiments.lookahead_speed import LookaheadSpeed
 
-    config = LookaheadSpeedConfig(scene="table", seed=1000, size="80x60", surfels=3000, repeats=1)
-    found = measure(config)
+    (spec,) = LookaheadSpeed("table", 1000, "80x60", surfels=3000, repeats=1).specs()
+    found = LookaheadSpeed.run(spec)
     return {key: found[key] for key in ("surfels", "views")}
 
 
 @experiment("env_speed")
 def env_speed(_: Path) -> Any:
     """Frames a step; the rest are times."""
-    from ms_slam_env.benchmark.env_speed import Arguments, Case, measure
+    from ms_slam_env.experiments.env_speed import EnvSpeed, EnvSpeedSpec
 
-    args = Arguments(embodiments=("free",), scene="table", seconds=0.01, warm_up=1)
-    return {"frames_per_step": measure(args, Case("free", 1, "features"))["frames_per_step"]}
+    spec = EnvSpeedSpec("free", 1, "features", scene="table", seconds=0.01, warm_up=1)
+    return {"frames_per_step": EnvSpeed.run(spec)["frames_per_step"]}
 
 
 # --- maps -----------------------------------------------------------------------------------------

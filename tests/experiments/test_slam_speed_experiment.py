@@ -1,0 +1,114 @@
+"""The measurement of the SLAM's speed, with a tiny budget."""
+
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ms_slam_env.errors import InputError
+from ms_slam_env.experiments.harness.slam_speed_child import APART_M, with_far_places
+from ms_slam_env.experiments.slam_speed import SlamSpeed, backend_parameters, run_child, summarise
+
+TINY = {"scene": "carpet", "seed": 1000, "sizes": ("80x60",), "frames": 5, "warm_up": 2}
+
+
+def test_stages_add_up_and_stored_surfels_are_as_asked():
+    options = {"stored": (30_000,), "repeats": 1, "backend": ("compaction_interval=7",)}
+    experiment = SlamSpeed(**TINY, **options, against=Path())
+    specs = experiment.specs()
+    assert [spec.version for spec in specs] == ["this", "other"]
+    rows = [{"spec": asdict(s), "result": SlamSpeed.run(s), "error": None} for s in specs]
+    for row in rows:
+        (run,) = row["result"]["runs"]
+        stages = [one["stage_cpu_ms"] for one in run["stages"]]
+        assert 30_000 <= run["surfels_stored"] < 35_000
+        assert sum(stages) == pytest.approx(run["cpu_ms_mean"])
+        assert min(stages) >= 0
+        assert run["lost_frames"] == 0
+    other, this = experiment.tables(rows)[0].rows
+    assert this["same_poses"] is True
+    assert this["cpu_ratio"] > 0
+    assert other["cpu_ratio"] is None
+    assert len(experiment.charts(rows)[0].panels[0].series) == 2
+
+
+def test_the_package_of_the_other_checkout_is_used(tmp_path):
+    package = tmp_path / "ms_slam_env"
+    package.mkdir()
+    (package / "__init__.py").write_text("raise RuntimeError('another package')")
+    with pytest.raises(RuntimeError, match="another package"):
+        run_child({}, tmp_path)
+
+
+def test_far_places_are_older_stable_and_out_of_sight():
+    rng = np.random.default_rng(0)
+    here = {
+        "position": rng.uniform(-5, 5, (100, 3)).astype(np.float32),
+        "normal": np.tile(np.float32([1, 0, 0]), (100, 1)),
+        "radius": np.ones(100, dtype=np.float32),
+        "confidence": np.linspace(0, 20, 100, dtype=np.float32),
+    }
+    counters = {"count": np.int32([100]), "dead": np.int32([1])}
+    state = {"map": {"surfels": [here], "counters": counters}}
+    grown = with_far_places(state, 730, 10.0)["map"]
+    surfels = grown["surfels"][0]
+    assert grown["counters"]["count"][0] == 730
+    assert counters["count"][0] == 100
+    np.testing.assert_array_equal(surfels["position"][-100:], here["position"])
+    assert (surfels["confidence"][:-100] >= 10).all()
+    distance = np.linalg.norm(surfels["position"][:-100], axis=1)
+    assert distance.min() > APART_M - 10
+    places = {tuple(np.round(p / APART_M).astype(int)) for p in surfels["position"][:-100]}
+    assert len(places) == 7
+    np.testing.assert_allclose(np.linalg.norm(surfels["normal"], axis=1), 1, rtol=1e-5)
+
+
+def test_the_ratio_is_the_median_over_rounds():
+    stages = ("preprocess", "render", "track", "fuse", "rest")
+    rows = [
+        {
+            "spec": {"version": version, "size": "80x60"},
+            "result": {
+                "runs": [
+                    {
+                        "target_surfels": 1,
+                        "surfels_stored": 5.0,
+                        "cpu_ms_mean": time,
+                        "cpu_ms_median": time,
+                        "stages": [{"stage": name, "stage_cpu_ms": time / 5} for name in stages],
+                        "lost_frames": 0,
+                        "poses_sha256": version,
+                    }
+                ]
+            },
+            "error": None,
+        }
+        for version, times in (("this", (1.0, 2.0, 9.0)), ("other", (2.0, 2.0, 3.0)))
+        for time in times
+    ]
+    this = next(line for line in summarise(rows) if line["version"] == "this")
+    assert this["cpu_ratio"] == 1.0
+    assert this["cpu_ms_mean"] == 2.0
+    assert this["same_poses"] is False
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason"),
+    [
+        ({"frames": 1}, "SlamSpeed.frames = 1 is outside"),
+        ({"warm_up": 80}, "SlamSpeed.warm_up = 80 is outside"),
+        ({"stored": (0,)}, "must hold integers"),
+    ],
+)
+def test_bad_input(fields, reason):
+    with pytest.raises(InputError, match=reason):
+        SlamSpeed(**fields)
+
+
+def test_bad_checkout_and_parameter(tmp_path):
+    with pytest.raises(InputError, match="holds no package"):
+        SlamSpeed(against=tmp_path)
+    with pytest.raises(InputError, match="name=value"):
+        backend_parameters(("coverage_px",))
+    assert backend_parameters(("iterations=[1, 2]",)) == {"iterations": [1, 2]}
