@@ -67,9 +67,12 @@ class Arguments:
 def main(arguments: Sequence[str]) -> int:
     """Explore, write, and print the table."""
     args = parse(Arguments, arguments, "ms-slam explore")
-    from ms_slam_env.benchmark.explore import Exploration, run_exploration
-    from ms_slam_env.benchmark.explore_evaluation import SlamEvaluator
-    from ms_slam_env.exploration import ExplorationSettings
+    from ms_slam_env.exploration import (
+        Exploration,
+        ExplorationSettings,
+        SlamEvaluator,
+        run_exploration,
+    )
     from ms_slam_env.slam.configuration import SlamConfiguration, read_configuration
 
     names = " ".join((*args.objectives, *args.constraints))
@@ -93,5 +96,6 @@ def main(arguments: Sequence[str]) -> int:
     )
     base = SlamConfiguration() if args.config is None else read_configuration(args.config)
     exploration = Exploration(evaluator, settings, args.parameters, base, args.held_out)
-    print(run_exploration(exploration, args.out, args.trials, args.workers, args.ray))
+    results = run_exploration(exploration, args.out, args.trials, args.workers, args.ray)
+    print(results.as_markdown())
     return 0

@@ -20,7 +20,7 @@ from ms_slam_env.report.tables import Grouping, Table, make_table
 from ms_slam_env.sensor.scene_cache import get_scene
 from ms_slam_env.sequences import handheld_trajectory, render_sequence
 
-DIVERGENCES = ("M_I", "M_D", "mean_I", "mean_D")
+DIVERGENCES = ("M_I", "M_D", "intensity_divergence_mean", "depth_divergence_mean")
 
 
 @dataclass(frozen=True)
@@ -100,8 +100,8 @@ class FrameSkipping(Experiment):
             "lost": bool(worst > LOST_ERROR_M or run.lost_frames),
             "M_I": float(divergences[:, 0].max()),
             "M_D": float(divergences[:, 1].max()),
-            "mean_I": float(divergences[:, 0].mean()),
-            "mean_D": float(divergences[:, 1].mean()),
+            "intensity_divergence_mean": float(divergences[:, 0].mean()),
+            "depth_divergence_mean": float(divergences[:, 1].mean()),
         }
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:

@@ -1,8 +1,11 @@
 """Design-space exploration: parameters, studies on disk, workers and Pareto fronts.
 
-Saeedi et al., ICRA 2017, section IV. What is evaluated is passed in as a callable.
+Saeedi et al., ICRA 2017, section IV. :func:`explore` takes what is evaluated as a callable;
+:func:`run_exploration` explores SLAM configurations over sequences and writes what came of it.
 """
 
+from ms_slam_env.exploration.evaluator import SlamEvaluator
+from ms_slam_env.exploration.exploration import Exploration, run_exploration
 from ms_slam_env.exploration.explorer import explore
 from ms_slam_env.exploration.objectives import METRICS, Constraint, parse_constraint
 from ms_slam_env.exploration.parameters import Choice, Float, Integer, Parameter
@@ -14,12 +17,15 @@ __all__ = [
     "Choice",
     "Constraint",
     "Evaluate",
+    "Exploration",
     "ExplorationSettings",
     "Float",
     "Integer",
     "Parameter",
     "SearchSpace",
+    "SlamEvaluator",
     "explore",
     "make_space",
     "parse_constraint",
+    "run_exploration",
 ]

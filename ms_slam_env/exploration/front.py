@@ -39,16 +39,6 @@ class Point:
     on_front: bool
     is_default: bool
 
-    def row(self) -> dict[str, Any]:
-        """Flat, for JSON."""
-        flags = {"feasible": self.feasible, "on_front": self.on_front, "default": self.is_default}
-        return {
-            "trial": self.number,
-            **self.measured,
-            **flags,
-            "params": self.params,
-        }
-
 
 def points_of(storage: StudyStorage) -> list[Point]:
     """The finished trials, in the order of their numbers."""

@@ -17,30 +17,54 @@ class Metric:
     """A figure of an evaluation; smaller is better.
 
     Attributes:
-        label: for figures and tables.
-        worst: what counts where nothing better is known, in the metric's unit.
+        key: in the registry of metrics, by which results are written.
+        worst: what counts where nothing better is known, in the objective's unit.
         is_error: whether it says nothing of a run that lost track.
+        wall_key: in place of ``key`` where time is measured by the clock.
+        scale: from the objective's unit to the registry's.
     """
 
-    label: str
+    key: str
     worst: float
     is_error: bool
+    wall_key: str = ""
+    scale: float = 1.0
 
 
 METRICS: dict[str, Metric] = {
-    "ate_m": Metric("ATE [m]", 1.0, True),
-    "ate_max_m": Metric("maximum ATE [m]", 1.0, True),
-    "ext_ms": Metric("EXT [ms/frame]", 1e3, False),
-    "load_ms": Metric("EXT [ms/frame of the sequence]", 1e3, False),
-    "mem_mb": Metric("MEM [MB]", 1e5, False),
-    "energy_j": Metric("ENE [J/frame]", 1e3, False),
-    "map_error_mm": Metric("map error [mm]", 1e3, True),
-    "lost": Metric("share of frames lost", 1.0, False),
+    "ate_m": Metric("ate_m", 1.0, True),
+    "ate_max_m": Metric("ate_max_m", 1.0, True),
+    "ext_ms": Metric("cpu_ms_median", 1e3, False, "ext_ms_median"),
+    "load_ms": Metric("load_cpu_ms", 1e3, False, "load_ext_ms"),
+    "mem_mb": Metric("mem_peak_mb", 1e5, False),
+    "energy_j": Metric("ene_frame_j", 1e3, False),
+    "map_error_mm": Metric("map_error_median_m", 1e3, True, scale=1e-3),
+    "lost": Metric("lost_share", 1.0, False),
 }
 """What an evaluation can measure; all are minimised."""
 
 FAILURE = "failure"
 """Key of an evaluation under which it says, in words, why it measured less than it should."""
+
+
+OTHERS = ("M_I", "M_D", "frames", FAILURE)
+"""What else an evaluation may return, under the registry's own names."""
+
+
+def key_of(name: str, clock: str) -> str:
+    """The key in the registry of metric ``name``, time measured by ``processor`` or ``wall``."""
+    metric = METRICS[name]
+    return (clock == "wall" and metric.wall_key) or metric.key
+
+
+def as_metrics(measured: Measured, clock: str) -> dict[str, Any]:
+    """What an evaluation returned, by keys and in units of the registry; None where unknown."""
+    found: dict[str, Any] = {}
+    for name, metric in METRICS.items():
+        if name in measured:
+            value = measured[name]
+            found[key_of(name, clock)] = None if value is None else metric.scale * value
+    return found | {name: measured[name] for name in OTHERS if name in measured}
 
 
 @dataclass(frozen=True)

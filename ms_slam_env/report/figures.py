@@ -35,9 +35,10 @@ def draw(chart: Chart) -> Figure:
     names = list(dict.fromkeys(s.name for panel in chart.panels for s in panel.series))
     categories = {str(y) for p in chart.panels if not p.y for s in p.series for y in s.y}
     longest = max(map(len, categories), default=0)
+    width = 5.2 if len(chart.panels) == 1 else 3.4  # one panel shares its width with the legend
     figure = new_figure(
         len(chart.panels),
-        3.4 + max(0.0, 0.08 * longest - 1.0) / len(chart.panels),
+        width + max(0.0, 0.08 * longest - 1.0) / len(chart.panels),
         max(3.2, 1.2 + 0.4 * len(categories)),
     )
     axes = figure.subplots(1, len(chart.panels), squeeze=False)[0]

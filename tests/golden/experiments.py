@@ -441,15 +441,14 @@ def map_evaluation(folder: Path) -> Any:
 
 @cache
 def _evaluator(*sequences: str) -> Any:
-    from ms_slam_env.benchmark.explore_evaluation import SlamEvaluator
+    from ms_slam_env.exploration import SlamEvaluator
 
     return SlamEvaluator(sequences, 12, image_size="80x60", map_error=True)
 
 
 @experiment("explore")
 def explore(folder: Path) -> Any:
-    from ms_slam_env.benchmark.explore import Exploration, run_exploration
-    from ms_slam_env.exploration import ExplorationSettings
+    from ms_slam_env.exploration import Exploration, ExplorationSettings, run_exploration
 
     exploration = Exploration(
         _evaluator("table:1000"),
@@ -457,9 +456,13 @@ def explore(folder: Path) -> Any:
         ("points_per_level", "depth_cutoff_m", "keep_every=1:3"),
         held_out=("table:1001",),
     )
-    run_exploration(exploration, folder, 3)
-    content = json.loads((folder / "explore.json").read_text())
-    return {name: content[name] for name in ("trials", "reference", "hypervolume", "held_out")}
+    results = run_exploration(exploration, folder, 3)
+    return {
+        "trials": [{**row["spec"], **row["result"]} for row in results.rows],
+        "reference": results.content["reference"],
+        "hypervolume": results.content["hypervolume"],
+        "held_out": results.tables[1].rows,
+    }
 
 
 @experiment("explore_evaluation")
@@ -475,18 +478,22 @@ def explore_evaluation(_: Path) -> Any:
 
 @experiment("explore_divergence")
 def explore_divergence(_: Path) -> Any:
-    from ms_slam_env.benchmark.explore_divergence import summary
-    from ms_slam_env.slam.configuration import SlamConfiguration
+    from ms_slam_env.experiments.explore_divergence import METRICS, ExploreDivergence, RateSpec
 
-    rows = [
-        {
-            "keep_every": every,
-            **_evaluator(text).measure(SlamConfiguration(keep_every=every), text),
-        }
+    specs = [
+        RateSpec(text, every, "80x60", 12)
         for text in ("table:1000", "table:1001")
         for every in (1, 4)
     ]
-    return {"rows": rows, "summary": [summary(rows, every) for every in (1, 4)]}
+    rows = [
+        {"spec": dataclasses.asdict(spec), "result": ExploreDivergence.run(spec), "error": None}
+        for spec in specs
+    ]
+    lines: Any = ExploreDivergence().tables(rows)[0].rows
+    return {
+        "rows": [{"keep_every": row["spec"]["keep_every"], **row["result"]} for row in rows],
+        "summary": [{key: line[key].value for key in METRICS} for line in lines],
+    }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -503,9 +510,9 @@ class _Formula:
 @experiment("explore_samplers", EXACT)
 def explore_samplers(folder: Path) -> Any:
     """Samplers on a formula: with real runs, an objective is a time."""
-    from ms_slam_env.benchmark.explore_grid import Grid
-    from ms_slam_env.benchmark.explore_samplers import run_study, summarise
+    from ms_slam_env.experiments.explore_samplers import run_study, summarise
     from ms_slam_env.exploration import make_space
+    from ms_slam_env.exploration.grid import Grid
 
     space = make_space(["icp_rgb_weight=0:1", "keep_every=1:6"])
     grid = Grid(space, _Formula(), 4, folder / "evaluations.jsonl")  # type: ignore[arg-type]
@@ -514,7 +521,16 @@ def explore_samplers(folder: Path) -> Any:
         sampler: [run_study(grid, sampler, seed, 12, reference) for seed in (0, 1)]
         for sampler in ("random", "nsga2", "tpe")
     }
-    return {"measured": grid.measured, "histories": histories, "summary": summarise(histories)}
+    rows = [
+        {
+            "spec": {"sampler": sampler, "seed": seed},
+            "result": {"hypervolume_half": history[5], "hypervolume": history[-1]},
+            "error": None,
+        }
+        for sampler, found in histories.items()
+        for seed, history in enumerate(found)
+    ]
+    return {"measured": grid.measured, "histories": histories, "summary": summarise(rows)}
 
 
 # --- recordings -----------------------------------------------------------------------------------

@@ -29,7 +29,7 @@ def check_results(cls: type[Experiment], committed: Results) -> list[str]:
     Raises:
         InputError: rows that the experiment has no specification for.
     """
-    rows = sorted(finished(committed.rows), key=lambda row: row["elapsed_s"])
+    rows = sorted(finished(committed.rows), key=lambda row: row.get("elapsed_s", 0.0))
     different: dict[str, Any] = {}
     for row in rows:
         different.setdefault(str(next(iter(row["spec"].values()))), row)

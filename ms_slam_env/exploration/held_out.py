@@ -9,14 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from ms_slam_env.benchmark.explore_evaluation import Row, SlamEvaluator
-from ms_slam_env.exploration.objectives import FAILURE
+from ms_slam_env.exploration.evaluator import Row, SlamEvaluator
+from ms_slam_env.exploration.objectives import FAILURE, METRICS, key_of
 from ms_slam_env.report.records import RecordFile, spec_key
 from ms_slam_env.report.statistics import bootstrap_interval
 from ms_slam_env.slam.configuration import SlamConfiguration
 
 DEFAULT = "default"
-FIGURES = ("ate_m", "ext_ms", "load_ms")
+COMPARED = ("ate_m", "ext_ms", "load_ms")
+"""Metrics by which configurations are compared."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class _Run:
     sequence: str
 
 
-def judge(
+def compare_held_out(
     evaluator: SlamEvaluator,
     configurations: Mapping[str, SlamConfiguration],
     sequences: Sequence[str],
@@ -39,10 +40,10 @@ def judge(
     Runs that are on disk already are not repeated.
 
     Returns:
-        a row for each configuration: ``ate_m``, ``ext_ms``, ``load_ms`` (means over the sequences),
-        ``ate_m_ratio`` and so on of these to the default's with ``_low`` and ``_high`` of the 95 %
-        bootstrap interval over the sequences, ``failed`` (number of sequences), ``sequences``.
-        Sequences on which either failed have no part in means and ratios.
+        a line for each configuration: the keys of ``COMPARED`` (means over the sequences), with
+        ``_ratio`` the interval of these to the default's, by a bootstrap over the sequences;
+        ``failed_runs`` and ``sequences_count``. Sequences on which either failed have no part in
+        means and ratios.
     """
     records = RecordFile(out / "held_out.jsonl")
     done = records.load()
@@ -57,27 +58,23 @@ def judge(
             rows[name].append(done[key])
     if not sequences:
         return []
-    return [_summary(name, own, rows[DEFAULT]) for name, own in rows.items()]
+    return [_line(name, own, rows[DEFAULT], evaluator.clock) for name, own in rows.items()]
 
 
-def _summary(name: str, own: Sequence[Row], default: Sequence[Row]) -> dict[str, Any]:
+def _line(name: str, own: Sequence[Row], default: Sequence[Row], clock: str) -> dict[str, Any]:
     pairs = [(a, b) for a, b in zip(own, default, strict=True) if _usable(a) and _usable(b)]
-    result: dict[str, Any] = {
-        "configuration": name,
-        "sequences": len(own),
-        "failed": sum(not _usable(row) for row in own),
+    line: dict[str, Any] = {
+        "configuration": name.replace("_", " "),
+        "sequences_count": len(own),
+        "failed_runs": sum(not _usable(row) for row in own),
     }
-    for figure in FIGURES:
-        mine = np.array([row[figure] for row, _ in pairs])
-        theirs = np.array([row[figure] for _, row in pairs])
-        ratio = bootstrap_interval((mine, theirs), _ratio_of_means)
-        result |= {
-            figure: float(mine.mean()) if len(mine) else None,
-            f"{figure}_ratio": ratio.value,
-            f"{figure}_ratio_low": ratio.low,
-            f"{figure}_ratio_high": ratio.high,
-        }
-    return result
+    for compared in COMPARED:
+        key, scale = key_of(compared, clock), METRICS[compared].scale
+        mine = np.array([row[compared] for row, _ in pairs])
+        theirs = np.array([row[compared] for _, row in pairs])
+        line[key] = scale * float(mine.mean()) if len(mine) else None
+        line[f"{key}_ratio"] = bootstrap_interval((mine, theirs), _ratio_of_means)
+    return line
 
 
 def _ratio_of_means(x: Any, y: Any, axis: int) -> Any:
@@ -85,4 +82,4 @@ def _ratio_of_means(x: Any, y: Any, axis: int) -> Any:
 
 
 def _usable(row: Row) -> bool:
-    return not row.get(FAILURE) and all(row.get(figure) is not None for figure in FIGURES)
+    return not row.get(FAILURE) and all(row.get(name) is not None for name in COMPARED)

@@ -12,7 +12,7 @@ import numpy as np
 
 from ms_slam_env import metrics, slam
 from ms_slam_env.camera import XTION_SIZES
-from ms_slam_env.config import check_choice, check_range
+from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.evaluation.map_quality import map_quality
@@ -35,7 +35,7 @@ _WARM_UP_FRAMES = 15
 
 
 @dataclass(frozen=True)
-class SlamEvaluator:
+class SlamEvaluator(Checked):
     """Runs configurations over sequences, which stay in memory; it can be sent to other processes.
 
     Attributes:
@@ -54,25 +54,21 @@ class SlamEvaluator:
     """
 
     sequences: tuple[str, ...]
-    frames: int = 90
-    speed_m_s: float = 0.5
-    turn_deg_s: float = 30.0
+    frames: int = bounded(90, 10, 100_000)
+    speed_m_s: float = bounded(0.5, 0.0, 10.0)
+    turn_deg_s: float = bounded(30.0, 0.0, 1000.0)
     image_size: str = "160x120"
-    max_lost: float = 0.02
-    clock: str = "processor"
+    max_lost: float = bounded(0.02, 0.0, 1.0)
+    clock: str = chosen("processor", *CLOCKS)
     map_error: bool = False
 
     def __post_init__(self) -> None:
         """Refuse what no run could use."""
+        super().__post_init__()
         if not self.sequences:
             raise InputError("no sequence to explore on")
         for text in self.sequences:
             parse_sequence(text)
-        check_range(self, "frames", 10, 100_000)
-        check_range(self, "speed_m_s", 0.0, 10.0)
-        check_range(self, "turn_deg_s", 0.0, 1000.0)
-        check_range(self, "max_lost", 0.0, 1.0)
-        check_choice(self, "clock", tuple(CLOCKS))
         if self.image_size not in XTION_SIZES:
             raise unknown("image size", self.image_size, XTION_SIZES)
 

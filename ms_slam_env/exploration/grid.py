@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ms_slam_env.benchmark.explore_evaluation import Row, SlamEvaluator
 from ms_slam_env.errors import InputError
-from ms_slam_env.exploration import Float, Integer, SearchSpace
+from ms_slam_env.exploration.evaluator import Row, SlamEvaluator
+from ms_slam_env.exploration.parameters import Float, Integer
+from ms_slam_env.exploration.space import SearchSpace
 from ms_slam_env.report.records import RecordFile, spec_key
 
 

@@ -1,28 +1,35 @@
 """Explorations of a real backend: what is measured, written, chosen, and refused."""
 
-import json
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
 from ms_slam_env import slam
-from ms_slam_env.benchmark import explore_evaluation, explore_samplers
-from ms_slam_env.benchmark.explore import Exploration, run_exploration
-from ms_slam_env.benchmark.explore_divergence import main as divergence_main
-from ms_slam_env.benchmark.explore_evaluation import SlamEvaluator, summarise
-from ms_slam_env.benchmark.explore_grid import Grid
-from ms_slam_env.benchmark.explore_judge import judge
 from ms_slam_env.camera import xtion
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.seen_surface import seen_surface
 from ms_slam_env.evaluation.sequence_divergence import sequence_divergence
-from ms_slam_env.exploration import ExplorationSettings, make_space
+from ms_slam_env.exploration import (
+    Exploration,
+    ExplorationSettings,
+    SlamEvaluator,
+    make_space,
+    run_exploration,
+)
+from ms_slam_env.exploration import evaluator as evaluator_module
+from ms_slam_env.exploration.evaluator import CLOCKS, summarise
+from ms_slam_env.exploration.grid import Grid
+from ms_slam_env.exploration.held_out import compare_held_out
+from ms_slam_env.exploration.objectives import METRICS, as_metrics, key_of
 from ms_slam_env.geometry import look_at
 from ms_slam_env.geometry.point_clouds import voxel_downsample
 from ms_slam_env.metrics import ate_rmse
 from ms_slam_env.metrics.cost import energy_counters
+from ms_slam_env.metrics.registry import metric
+from ms_slam_env.report.results import read_results
 from ms_slam_env.sequences import open_sequence, render_sequence
 from ms_slam_env.sequences.writing import write_sequence
 from ms_slam_env.slam.configuration import SlamConfiguration, read_configuration
@@ -84,8 +91,8 @@ def test_a_backend_that_breaks_down_is_a_result(evaluator, monkeypatch):
     def broken(*_, **__):
         raise np.linalg.LinAlgError("Singular matrix")
 
-    monkeypatch.setattr(explore_evaluation.slam, "make", broken)
-    monkeypatch.setattr(explore_evaluation, "_warm_up", lambda *_: None)
+    monkeypatch.setattr(evaluator_module.slam, "make", broken)
+    monkeypatch.setattr(evaluator_module, "_warm_up", lambda *_: None)
     row = evaluator(SlamConfiguration())
     assert "Singular matrix" in row["failure"]
     assert (row["lost"], row.get("ate_m")) == (1.0, None)
@@ -116,39 +123,39 @@ def explored(evaluator, sequences, tmp_path_factory):
 
 
 def test_results_on_disk(explored):
-    _, out, table = explored
-    content = json.loads((out / "explore.json").read_text())
-    assert len(content["trials"]) == len(content["hypervolume"]) == 4
-    assert content["trials"][0]["default"]
-    assert content["trials"][0]["params"]["points_per_level"] == 5000
-    assert content["provenance"]["command"]
-    assert all(trial["M_I"] > 0 for trial in content["trials"])
-    judged = {row["configuration"] for row in content["held_out"]}
-    front = {row["trial"] for row in content["trials"] if row["on_front"]}
-    chosen = {name: row["trial"] for name, row in content["chosen"].items()}
+    _, out, results = explored
+    again = read_results(out / "explore.json")
+    assert (again.kind, again.rows_key) == ("exploration", "trials")
+    trials = [{**row["spec"], **row["result"]} for row in again.rows]
+    assert len(trials) == len(again.content["hypervolume"]) == 4
+    assert trials[0]["is_default"]
+    assert trials[0]["params"]["points_per_level"] == 5000
+    assert all(trial["M_I"] > 0 and trial["cpu_ms_median"] > 0 for trial in trials)
+    held_out: Any = again.tables[1].rows
+    front = {trial["trial"] for trial in trials if trial["on_front"]}
+    chosen = {name: point["trial"] for name, point in again.content["chosen"].items()}
     others = front - set(chosen.values())
-    assert judged == {"default", *chosen, *(f"trial {number}" for number in others)}
-    assert content["held_out"][0]["ate_m_ratio"] == 1.0
-    for name in ("pareto.png", "hypervolume.png", "table.md", "study.db"):
+    judged = {str(line["configuration"]).replace(" ", "_") for line in held_out}
+    assert judged == {"default", *chosen, *(f"trial_{number}" for number in others)}
+    assert held_out[0]["ate_m_ratio"].value == 1.0
+    for name in ("pareto.png", "hypervolume.png", "held_out.png", "study.db"):
         assert (out / name).stat().st_size > 0
-    assert "4 finished trials" in table
-    assert (out / "table.md").read_text() == table
+    assert len(again.charts[0].panels) == 3  # pairs of the three objectives
+    assert "4 finished trials" in (out / "table.md").read_text()
+    assert again.as_markdown() == results.as_markdown()
 
 
 def test_going_on_keeps_what_is_there(explored, monkeypatch):
-    exploration, out, _ = explored
-    before = json.loads((out / "explore.json").read_text())
+    exploration, out, before = explored
     monkeypatch.setattr(SlamEvaluator, "measure", None)  # nothing is left to measure
-    run_exploration(exploration, out, 4)
-    after = json.loads((out / "explore.json").read_text())
-    assert after["trials"] == before["trials"]
-    assert after["held_out"] == before["held_out"]
+    after = run_exploration(exploration, out, 4)
+    assert after.rows == before.rows
+    assert after.tables == before.tables
 
 
 def test_chosen_configurations_are_taken_everywhere(explored, sequences, tmp_path):
     exploration, out, _ = explored
-    content = json.loads((out / "explore.json").read_text())
-    for name, row in content["chosen"].items():
+    for name, row in read_results(out / "explore.json").content["chosen"].items():
         path = out / row["file"]
         configuration = read_configuration(path)
         assert configuration.about["purpose"] == name
@@ -174,27 +181,26 @@ def test_held_out_ratios(tmp_path, monkeypatch):
         for name, cutoff in (("default", 4.0), ("fastest", 2.0), ("knee", 1.0))
     }
     evaluator = SlamEvaluator(("table:0",))
-    rows = judge(evaluator, configurations, ("table:1", "table:2"), tmp_path)
-    default, fastest, knee = rows
-    assert (default["ate_m_ratio"], default["ext_ms_ratio"]) == (1.0, 1.0)
-    assert (fastest["ate_m"], fastest["ext_ms"]) == (pytest.approx(0.015), 2.0)
-    assert fastest["ate_m_ratio"] == pytest.approx(0.5)
-    assert fastest["ext_ms_ratio_low"] == fastest["ext_ms_ratio_high"] == pytest.approx(0.25)
-    assert (knee["failed"], knee["ate_m"]) == (2, None)
-    assert judge(evaluator, configurations, (), tmp_path) == []
+    lines = compare_held_out(evaluator, configurations, ("table:1", "table:2"), tmp_path)
+    default, fastest, knee = lines
+    assert (default["ate_m_ratio"].value, default["cpu_ms_median_ratio"].value) == (1.0, 1.0)
+    assert (fastest["ate_m"], fastest["cpu_ms_median"]) == (pytest.approx(0.015), 2.0)
+    assert fastest["ate_m_ratio"].value == pytest.approx(0.5)
+    ratio = fastest["cpu_ms_median_ratio"]
+    assert ratio.low == ratio.high == pytest.approx(0.25)
+    assert (knee["failed_runs"], knee["ate_m"]) == (2, None)
+    assert compare_held_out(evaluator, configurations, (), tmp_path) == []
 
 
-def test_samplers_are_compared_seed_by_seed():
-    histories = {"random": [[0.1, 0.2], [0.2, 0.4]], "tpe": [[0.1, 0.3], [0.3, 0.5]]}
-    random, tpe = explore_samplers.summarise(histories)
-    assert random["gain_end"] == 0
-    assert (tpe["hypervolume_half"], tpe["hypervolume_end"]) == (
-        pytest.approx(0.2),
-        pytest.approx(0.4),
-    )
-    assert (tpe["gain_end"], tpe["gain_end_low"]) == (pytest.approx(0.1), pytest.approx(0.1))
-    assert tpe["wins"] == 2
-    assert "2 of 2" in explore_samplers.table([random, tpe])
+def test_results_have_the_keys_of_the_registry():
+    measured = {"ate_m": 0.1, "ext_ms": 2.0, "map_error_mm": 3.0, "energy_j": None, "lost": 0.5}
+    assert as_metrics(measured, "processor") == {
+        **{"ate_m": 0.1, "cpu_ms_median": 2.0, "ene_frame_j": None, "lost_share": 0.5},
+        "map_error_median_m": pytest.approx(0.003),
+    }
+    assert as_metrics(measured, "wall")["ext_ms_median"] == 2.0
+    for name in METRICS:
+        assert all(metric(key_of(name, clock)).better == "lower" for clock in CLOCKS)
 
 
 def test_a_grid_measures_each_point_once(sequences, tmp_path):
@@ -215,35 +221,6 @@ def test_a_grid_measures_each_point_once(sequences, tmp_path):
     assert again.measured == 1
     with pytest.raises(InputError, match="'image_size' has no order"):
         Grid(make_space(["image_size"]), evaluator, 3, tmp_path / "other.jsonl")
-
-
-def test_samplers_explore_one_function(sequences, tmp_path):
-    arguments = explore_samplers.Arguments(
-        ("random", "nsga2", "tpe"),
-        2,
-        4,
-        sequences[:1],
-        ("keep_every=1:3",),
-        image_size="80x60",
-        out=tmp_path,
-    )
-    explore_samplers.run(arguments)
-    content = json.loads((tmp_path / "samplers.json").read_text())
-    assert content["points_measured"] == content["points_of_the_grid"] == 3
-    for runs in content["hypervolume"].values():
-        assert np.shape(runs) == (2, 4)
-        assert np.all(np.diff(runs) >= 0)
-        assert runs[0][0] == runs[1][0] == pytest.approx(0.25)  # the default: half the reference
-    assert (tmp_path / "hypervolume.png").stat().st_size > 0
-
-
-def test_divergence_grows_when_frames_are_left_out(sequences, tmp_path):
-    command = ["--sequences", sequences[0], "--keep-every", "1", "4", "--image-size", "80x60"]
-    assert divergence_main([*command, "--out", str(tmp_path)]) == 0
-    summary = json.loads((tmp_path / "divergence.json").read_text())["summary"]
-    assert summary[1]["M_I"] > summary[0]["M_I"]
-    assert summary[1]["load_ms"] < summary[0]["load_ms"]
-    assert (tmp_path / "divergence.png").stat().st_size > 0
 
 
 @pytest.mark.parametrize(

@@ -8,12 +8,9 @@ from typing import Any
 
 from tqdm import tqdm
 
-from ms_slam_env.benchmark.explore_evaluation import SlamEvaluator
-from ms_slam_env.benchmark.explore_figures import save_figures
-from ms_slam_env.benchmark.explore_judge import DEFAULT, judge
-from ms_slam_env.benchmark.explore_report import table
 from ms_slam_env.errors import InputError
-from ms_slam_env.exploration import ExplorationSettings, explore, make_space
+from ms_slam_env.exploration.evaluator import SlamEvaluator
+from ms_slam_env.exploration.explorer import explore
 from ms_slam_env.exploration.front import (
     Point,
     choose,
@@ -21,10 +18,14 @@ from ms_slam_env.exploration.front import (
     importances,
     points_of,
 )
+from ms_slam_env.exploration.held_out import DEFAULT, compare_held_out
+from ms_slam_env.exploration.results import ABOUT, TITLE, Explored
+from ms_slam_env.exploration.settings import ExplorationSettings
+from ms_slam_env.exploration.space import make_space
 from ms_slam_env.exploration.study_storage import StudyStorage
 from ms_slam_env.metrics.cost import energy_counters
-from ms_slam_env.report.provenance import provenance
-from ms_slam_env.report.records import write_json
+from ms_slam_env.report.figures import save_charts
+from ms_slam_env.report.results import TABLE, Results, write_results
 from ms_slam_env.sequences import check_sequence
 from ms_slam_env.slam.configuration import SlamConfiguration, write_configuration
 
@@ -74,14 +75,11 @@ def run_exploration(
     trials: int,
     workers: int = 1,
     ray_address: str | None = None,
-) -> str:
+) -> Results:
     """Explore until ``trials`` trials have finished, and write what came of it to ``out``.
 
-    ``study.db`` (Optuna's, to go on from), ``explore.json``, ``table.md``, ``pareto.png``,
-    ``hypervolume.png``, ``importance.png``, and the chosen configurations as YAML.
-
-    Returns:
-        the table.
+    ``study.db`` (Optuna's, to go on from), ``explore.json``, ``table.md``, ``pareto.png`` and
+    other figures, and the chosen configurations as YAML.
 
     Raises:
         InputError: bad input, or ``out`` holds another exploration.
@@ -99,15 +97,15 @@ def run_exploration(
             ray_address,
             lambda finished: _show(bar, finished),
         )
-    return write_results(exploration, storage, out)
+    return write_exploration(exploration, storage, out)
 
 
 def _show(bar: tqdm, finished: int) -> None:
     bar.update(finished - bar.n)
 
 
-def write_results(exploration: Exploration, storage: StudyStorage, out: Path) -> str:
-    """Write everything but the study; return the table."""
+def write_exploration(exploration: Exploration, storage: StudyStorage, out: Path) -> Results:
+    """Write everything but the study."""
     objectives = exploration.settings.objectives
     points = points_of(storage)
     reference = storage.reference() or {}
@@ -116,36 +114,64 @@ def write_results(exploration: Exploration, storage: StudyStorage, out: Path) ->
     for name, point in chosen.items():
         made = _configuration(storage, point, name, exploration.evaluator.image_size)
         write_configuration(out / files[name], made)
+    explored = Explored(
+        objectives,
+        exploration.evaluator.clock,
+        list(storage.space.parameters),
+        points,
+        chosen,
+        reference,
+        hypervolume_history(points, reference, objectives).tolist(),
+        importances(storage),
+        _held_out(exploration, storage, points, chosen, out),
+    )
+    charts = explored.charts()
+    results = write_results(
+        out / "explore.json",
+        kind="exploration",
+        title=TITLE,
+        about=ABOUT,
+        tables=explored.tables(),
+        charts=charts,
+        rows=explored.rows(),
+        rows_key="trials",
+        content={
+            "config": {
+                **asdict(exploration.evaluator),
+                **asdict(exploration.settings),
+                "parameters": {name: str(kind) for name, kind in storage.space.parameters.items()},
+                "base": asdict(exploration.base),
+                "held_out": exploration.held_out,
+            },
+            "objectives": objectives,
+            "reference": reference,
+            "chosen": {
+                name: {"file": files[name], "trial": point.number, "params": point.params}
+                for name, point in chosen.items()
+            },
+            "hypervolume": explored.hypervolume,
+            "importance": explored.importance,
+        },
+    )
+    (out / TABLE).write_text(results.as_markdown(), encoding="utf-8")
+    save_charts(charts, out)
+    return results
+
+
+def _held_out(
+    exploration: Exploration,
+    storage: StudyStorage,
+    points: list[Point],
+    chosen: dict[str, Point],
+    out: Path,
+) -> list[dict[str, Any]]:
+    """The default, the chosen configurations and the rest of the front on held-out sequences."""
     known = {point.number for point in chosen.values()}
     others = {f"trial {p.number}": p for p in points if p.on_front and p.number not in known}
-    judged = {
+    configurations = {DEFAULT: storage.space.base} | {
         name: storage.space.configuration(point.params) for name, point in (chosen | others).items()
     }
-    configurations = {DEFAULT: storage.space.base, **judged}
-    held_out = judge(exploration.evaluator, configurations, exploration.held_out, out)
-    history = hypervolume_history(points, reference, objectives)
-    content: dict[str, Any] = {
-        "provenance": provenance(),
-        "config": {
-            **asdict(exploration.evaluator),
-            **asdict(exploration.settings),
-            "parameters": {name: str(kind) for name, kind in storage.space.parameters.items()},
-            "base": asdict(exploration.base),
-            "held_out": exploration.held_out,
-        },
-        "objectives": objectives,
-        "reference": reference,
-        "chosen": {name: {"file": files[name], **point.row()} for name, point in chosen.items()},
-        "hypervolume": [float(value) for value in history],
-        "importance": importances(storage),
-        "held_out": held_out,
-        "trials": [point.row() for point in points],
-    }
-    write_json(out / "explore.json", content)
-    text = table(content)
-    (out / "table.md").write_text(text, encoding="utf-8")
-    save_figures(content, out)
-    return text
+    return compare_held_out(exploration.evaluator, configurations, exploration.held_out, out)
 
 
 def _configuration(
