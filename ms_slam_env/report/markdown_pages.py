@@ -7,7 +7,8 @@ Between two comments, each on a line of its own, stands what a result says::
 
 The first word is a folder of results, whose ``results.json`` is read, or a JSON file in one. The
 options: ``table``, number or title of a table (by default the first); ``columns``, their names (by
-default all); ``rows``, at most so many of the first; ``made_by=yes``, the command in a line below.
+default all); ``where``, a column and the text that it must have, as in ``where=sequence=median``;
+``rows``, at most so many of the first; ``made_by=yes``, the command in a line below.
 Where the result is older than the code, the first of its tables on the page says so above.
 """
 
@@ -26,7 +27,7 @@ from ms_slam_env.report.tables import Table
 
 _START = re.compile(r"^<!-- results: (?P<what>.*) -->$")
 _END = "<!-- end -->"
-_OPTIONS = ("table", "columns", "rows", "made_by")
+_OPTIONS = ("table", "columns", "where", "rows", "made_by")
 
 
 def update_pages(pages: Iterable[Path], results: Path, write: bool = True) -> list[Path]:
@@ -125,8 +126,12 @@ def _cut(table: Table, options: dict[str, str]) -> Table:
     for name in names:
         if name not in columns:
             raise unknown("column", name, columns)
-    count = options.get("rows", str(len(table.rows)))
+    column, _, wanted = options.get("where", "").partition("=")
+    if column and column not in columns:
+        raise unknown("column", column, columns)
+    rows = [row for row in table.rows if not column or str(row.get(column)) == wanted]
+    count = options.get("rows", str(len(rows)))
     if not count.isdecimal():
         raise InputError(f"rows = {count!r} is no number")
     chosen = tuple(columns[name] for name in names)
-    return dataclasses.replace(table, title="", columns=chosen, rows=table.rows[: int(count)])
+    return dataclasses.replace(table, title="", columns=chosen, rows=tuple(rows[: int(count)]))
