@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from ms_slam_env.config import check_range
+from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Checked):
     """Train a camera-motion policy with PPO; these options are the command line.
 
     Attributes:
@@ -54,39 +54,29 @@ class Args:
     embodiment: str | None = None
     observation: Literal["features", "lookahead"] = "lookahead"
     scenes: tuple[str, ...] = ("living_room", "corridor", "table")
-    scene_seeds: int = 4
-    episode_steps: int = 150
+    scene_seeds: int = bounded(4, 1, 100_000)
+    episode_steps: int = bounded(150, 1, 100_000)
     step_m: float | None = None
     step_deg: float | None = None
-    num_envs: int = 2
+    num_envs: int = bounded(2, 1, 100_000)
     seed: int = 0
-    total_timesteps: int = 200_000
-    minutes: float | None = None
-    eval_every: int = 10_000
-    eval_episodes: int = 12
+    total_timesteps: int = bounded(200_000, 0, 1_000_000_000)
+    minutes: float | None = bounded(None, 0, 1_000_000)
+    eval_every: int = bounded(10_000, 0, 1_000_000_000)
+    eval_episodes: int = bounded(12, 1, 100_000)
     deterministic_eval: bool = False
-    n_steps: int = 512
-    batch_size: int = 128
-    n_epochs: int = 8
-    learning_rate: float = 3e-4
-    gamma: float = 0.98
-    gae_lambda: float = 0.95
-    ent_coef: float = 0.003
-    clip_range: float = 0.2
-    hidden: int = 128
+    n_steps: int = bounded(512, 2, 1_000_000)  # advantages of one sample have no spread
+    batch_size: int = bounded(128, 2, 1_000_000)
+    n_epochs: int = bounded(8, 1, 1000)
+    learning_rate: float = bounded(3e-4, 0, 1)
+    gamma: float = bounded(0.98, 0, 1)
+    gae_lambda: float = bounded(0.95, 0, 1)
+    ent_coef: float = bounded(0.003, 0, 1)
+    clip_range: float = bounded(0.2, 0, 1)
+    hidden: int = bounded(128, 1, 100_000)
 
     def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        for name in ("scene_seeds", "episode_steps", "num_envs", "eval_episodes", "hidden"):
-            check_range(self, name, 1, 100_000)
-        for name in ("n_steps", "batch_size"):
-            check_range(self, name, 2, 1_000_000)  # advantages of one sample have no spread
-        for name in ("total_timesteps", "eval_every"):
-            check_range(self, name, 0, 1_000_000_000)
-        check_range(self, "n_epochs", 1, 1000)
-        for name in ("learning_rate", "gamma", "gae_lambda", "ent_coef", "clip_range"):
-            check_range(self, name, 0, 1)
-        if self.minutes is not None:
-            check_range(self, "minutes", 0, 1_000_000)
+        """Refuse values out of range, and training nowhere."""
+        super().__post_init__()
         if not self.scenes:
             raise InputError("Args.scenes names no scene")

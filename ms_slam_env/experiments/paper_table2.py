@@ -6,18 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from ms_slam_env.experiments.harness.episodes import (
-    DEFAULT_STEP_DEG,
-    DEFAULT_STEP_M,
-    EpisodeSpec,
-    check_episodes,
-    check_names,
-    parse_options,
-    run_episode,
-    seed_list,
-    short_planner_names,
-)
-from ms_slam_env.experiments.harness.experiment import Experiment
+from ms_slam_env.experiments.harness.episode_experiment import DOTS, SteppedExperiment
+from ms_slam_env.experiments.harness.episodes import short_planner_names
 from ms_slam_env.report.charts import Chart, by_group
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.statistics import relative_cut
@@ -41,7 +31,7 @@ _CUTS = ("ate_cut", "ate_cut_paper", "rer_cut", "rer_cut_paper")
 
 
 @dataclass(frozen=True)
-class PaperTable2(Experiment):
+class PaperTable2(SteppedExperiment):
     """Table II of the paper: an active planner against random walk
 
     Errors of trajectory and map with free motion and with a fixed translation.
@@ -54,44 +44,17 @@ class PaperTable2(Experiment):
     scenes: tuple[str, ...] = ("living_room",)
     """Names of scenes, or mesh files; the paper has one living room."""
     episodes: int = 20
-    """Seeds for each scene."""
     steps: int = 100
-    """Length of an episode."""
-    step_m: float = DEFAULT_STEP_M
-    """Translation of a motion, metres."""
-    step_deg: float = DEFAULT_STEP_DEG
-    """Rotation of a motion, degrees."""
     seeds: str = "test"
-    """Split that the seeds come from."""
-    options: tuple[str, ...] = ()
-    """Options of the environment, as in targets.M_I=0.05."""
 
-    unit = rows_key = "episodes"
-    run = staticmethod(run_episode)
+    @property
+    def planners(self) -> Sequence[str]:
+        """Both."""
+        return self.baseline, self.active
 
-    def specs(self) -> list[EpisodeSpec]:
-        """Every episode."""
-        check_names((self.baseline, self.active), self.scenes)
-        return [
-            EpisodeSpec(
-                planner,
-                scene,
-                seed,
-                env_id,
-                steps=self.steps,
-                step_m=self.step_m,
-                step_deg=self.step_deg,
-                options=parse_options(self.options),
-            )
-            for scene in self.scenes
-            for seed in seed_list(self.seeds, self.episodes)
-            for env_id in MOTIONS
-            for planner in (self.baseline, self.active)
-        ]
-
-    def prepare(self) -> None:
-        """Start one episode of each planner."""
-        check_episodes(self.specs())
+    def compared(self) -> Sequence[Mapping[str, Any]]:
+        """Both planners with every motion."""
+        return [{"env_id": env_id, "planner": name} for env_id in MOTIONS for name in self.planners]
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
         """Medians by experiment and planner, and the cuts of the errors beside the paper's."""
@@ -143,12 +106,7 @@ class PaperTable2(Experiment):
                 label=label,
             )
         ]
-        caption = "Small dots: episodes. Large mark and bar: median and its 95 % interval."
-        return [Chart("paper_table2", "Errors of trajectory and map", caption, panels)]
-
-    def content(self, rows: Sequence[Row]) -> Mapping[str, Any]:
-        """The seeds."""
-        return {"seeds": seed_list(self.seeds, self.episodes)}
+        return [Chart("paper_table2", "Errors of trajectory and map", DOTS, panels)]
 
 
 def _paper_heading(name: str) -> str:

@@ -9,20 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env.experiments.harness.episode_experiment import DOTS, SteppedExperiment
 from ms_slam_env.experiments.harness.episodes import (
     DEFAULT_PLANNERS,
     DEFAULT_SCENES,
-    DEFAULT_STEP_DEG,
-    DEFAULT_STEP_M,
-    EpisodeSpec,
-    check_episodes,
-    check_names,
-    parse_options,
-    run_episode,
-    seed_list,
     short_planner_names,
 )
-from ms_slam_env.experiments.harness.experiment import Experiment
 from ms_slam_env.report import statistics
 from ms_slam_env.report.charts import (
     Chart,
@@ -43,7 +35,7 @@ _FLOOR_M = 5e-5  # errors below are drawn here on logarithmic axes
 
 
 @dataclass(frozen=True)
-class PlannerBenchmark(Experiment):
+class PlannerBenchmark(SteppedExperiment):
     """Planner benchmark
 
     Planners move the camera, a real SLAM estimates its path and maps the scene. A good planner maps
@@ -53,47 +45,11 @@ class PlannerBenchmark(Experiment):
     planners: tuple[str, ...] = DEFAULT_PLANNERS
     """NAME or module:Class, options appended as in greedy,rho_I=0.3."""
     scenes: tuple[str, ...] = DEFAULT_SCENES
-    """Names of scenes, or mesh files."""
     episodes: int = 10
-    """Seeds for each scene."""
     steps: int = 100
-    """Length of an episode."""
-    step_m: float = DEFAULT_STEP_M
-    """Translation of a motion, metres."""
-    step_deg: float = DEFAULT_STEP_DEG
-    """Rotation of a motion, degrees."""
+    seeds: str = "test"
     env_id: str = "MSActiveSLAM-FreeCamera-v0"
     """Environment."""
-    seeds: str = "test"
-    """Split that the seeds come from: train, validation or test."""
-    options: tuple[str, ...] = ()
-    """Options of the environment, as in lookahead.reference=live targets.M_I=0.05."""
-
-    unit = rows_key = "episodes"
-    run = staticmethod(run_episode)
-
-    def specs(self) -> list[EpisodeSpec]:
-        """Every episode; those of one scene and seed are neighbours and share its geometry."""
-        check_names(self.planners, self.scenes)
-        return [
-            EpisodeSpec(
-                planner=planner,
-                scene=scene,
-                seed=seed,
-                env_id=self.env_id,
-                steps=self.steps,
-                step_m=self.step_m,
-                step_deg=self.step_deg,
-                options=parse_options(self.options),
-            )
-            for scene in self.scenes
-            for seed in seed_list(self.seeds, self.episodes)
-            for planner in self.planners
-        ]
-
-    def prepare(self) -> None:
-        """Start one episode of each planner."""
-        check_episodes(self.specs())
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
         """Over all scenes, across scenes, and for each scene."""
@@ -129,7 +85,7 @@ class PlannerBenchmark(Experiment):
             Chart(
                 "planners",
                 "Measures by planner",
-                "Small dots: episodes. Large mark and bar: median and its 95 % interval.",
+                DOTS,
                 by_group(rows, "planner", _PANELS, ("ate_m",), best, label),
             ),
             Chart(
@@ -151,7 +107,7 @@ class PlannerBenchmark(Experiment):
         grouping = Grouping(("planner",), (*HEADLINE, *DETAILS), rank_by=RANKED_BY)
         lines: Sequence[Mapping[str, Any]] = grouping.table(rows).rows
         return {
-            "seeds": seed_list(self.seeds, self.episodes),
+            **super().content(rows),
             "summary": {
                 line["planner"]: {key: asdict(line[key]) for key in grouping.keys} for line in lines
             },

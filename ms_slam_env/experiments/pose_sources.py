@@ -8,17 +8,8 @@ from typing import Any
 
 from ms_slam_env.env.pose_sources import POSE_SOURCES
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.experiments.harness.episodes import (
-    DEFAULT_STEP_DEG,
-    DEFAULT_STEP_M,
-    EpisodeSpec,
-    check_episodes,
-    check_names,
-    parse_options,
-    run_episode,
-    seed_list,
-)
-from ms_slam_env.experiments.harness.experiment import Experiment
+from ms_slam_env.experiments.harness.episode_experiment import DOTS, SteppedExperiment
+from ms_slam_env.experiments.harness.episodes import parse_options
 from ms_slam_env.report.charts import Chart, by_group
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.statistics import Interval, relative_cut
@@ -32,7 +23,7 @@ _DIGITS = 9  # nanometres: what is left of zero after an alignment
 
 
 @dataclass(frozen=True)
-class PoseSourceExperiment(Experiment):
+class PoseSourceExperiment(SteppedExperiment):
     """The same episodes with the pose from SLAM, kinematics, both, and the truth
 
     What the estimate of the pose costs the map, and the planner that looks at it.
@@ -43,24 +34,11 @@ class PoseSourceExperiment(Experiment):
     planners: tuple[str, ...] = ("random", "greedy")
     """Planners, options appended as in greedy,rho_I=0.3."""
     scenes: tuple[str, ...] = ("living_room", "table", "wall", "carpet")
-    """Names of scenes, or mesh files."""
     episodes: int = 5
-    """Seeds for each scene."""
     steps: int = 60
-    """Length of an episode."""
-    step_m: float = DEFAULT_STEP_M
-    """Translation of a motion, metres."""
-    step_deg: float = DEFAULT_STEP_DEG
-    """Rotation of a motion, degrees."""
+    seeds: str = "test"
     env_id: str = "MSActiveSLAM-v0"
     """The environment."""
-    seeds: str = "test"
-    """Split that the seeds come from."""
-    options: tuple[str, ...] = ()
-    """Options of the environment, as in arm.frames_per_action=1."""
-
-    unit = rows_key = "episodes"
-    run = staticmethod(run_episode)
 
     def __post_init__(self) -> None:
         """Refuse unknown or repeated sources."""
@@ -70,32 +48,16 @@ class PoseSourceExperiment(Experiment):
             if source not in POSE_SOURCES:
                 raise unknown("source of the pose", source, POSE_SOURCES)
 
-    def specs(self) -> list[EpisodeSpec]:
-        """Every episode; those of one scene and seed are neighbours and share its geometry."""
-        check_names(self.planners, self.scenes)
+    def compared(self) -> Sequence[Mapping[str, Any]]:
+        """Every planner with every source."""
         options = parse_options(self.options)
         if "pose" in options:
             raise InputError("option 'pose' is not free: the benchmark sets it")
         return [
-            EpisodeSpec(
-                planner,
-                scene,
-                seed,
-                self.env_id,
-                steps=self.steps,
-                step_m=self.step_m,
-                step_deg=self.step_deg,
-                options={**options, "pose": source},
-            )
-            for scene in self.scenes
-            for seed in seed_list(self.seeds, self.episodes)
+            {"planner": planner, "options": {**options, "pose": source}}
             for planner in self.planners
             for source in self.sources
         ]
-
-    def prepare(self) -> None:
-        """Start one episode of each planner and source."""
-        check_episodes(self.specs())
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
         """One line a scene (last all together), planner and source."""
@@ -123,8 +85,7 @@ class PoseSourceExperiment(Experiment):
         panels = by_group(
             compared(rows), "pose_source", ("ate_unaligned_m", "rpe_m", "f_score_2cm")
         )
-        caption = "Small dots: episodes. Large mark and bar: median and its 95 % interval."
-        return [Chart("pose_sources", "Measures by source of the pose", caption, panels)]
+        return [Chart("pose_sources", "Measures by source of the pose", DOTS, panels)]
 
 
 def compared(rows: Sequence[Row]) -> list[Row]:

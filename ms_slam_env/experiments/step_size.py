@@ -2,20 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from ms_slam_env.experiments.harness.episodes import (
-    DEFAULT_PLANNERS,
-    EpisodeSpec,
-    check_episodes,
-    check_names,
-    parse_options,
-    run_episode,
-    seed_list,
-    short_planner_names,
-)
-from ms_slam_env.experiments.harness.experiment import Experiment
+from ms_slam_env.experiments.harness.episode_experiment import EpisodeExperiment
+from ms_slam_env.experiments.harness.episodes import DEFAULT_PLANNERS, short_planner_names
 from ms_slam_env.report.charts import Chart, over_field
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Grouping, Table
@@ -24,7 +16,7 @@ METRICS = ("lost", "ate_m", "f_score_5cm", "rcm")
 
 
 @dataclass(frozen=True)
-class StepSize(Experiment):
+class StepSize(EpisodeExperiment):
     """Planners with motions of different size
 
     Steps of s cm and s degrees, the same number of steps for every size: a long step shows more and
@@ -34,43 +26,20 @@ class StepSize(Experiment):
     planners: tuple[str, ...] = DEFAULT_PLANNERS
     """NAME or module:Class, options appended as in greedy,rho_I=0.3."""
     scenes: tuple[str, ...] = ("living_room", "table")
-    """Names of scenes, or mesh files."""
     sizes: tuple[float, ...] = (2, 4, 6, 8, 10, 12)
     """Sizes of step: so many centimetres and so many degrees."""
     episodes: int = 5
-    """Seeds for each scene."""
     steps: int = 80
-    """Length of an episode."""
     seeds: str = "validation"
     """Split that the seeds come from; a default read from them may not use the test seeds."""
-    options: tuple[str, ...] = ()
-    """Options of the environment, as in targets.M_I=0.05."""
 
-    unit = "episodes"
-    run = staticmethod(run_episode)
-
-    def specs(self) -> list[EpisodeSpec]:
-        """Every episode."""
-        check_names(self.planners, self.scenes)
+    def compared(self) -> Sequence[Mapping[str, Any]]:
+        """Every planner with every size of step."""
         return [
-            EpisodeSpec(
-                planner,
-                scene,
-                seed,
-                steps=self.steps,
-                step_m=size / 100,
-                step_deg=size,
-                options=parse_options(self.options),
-            )
-            for scene in self.scenes
-            for seed in seed_list(self.seeds, self.episodes)
+            {"planner": planner, "step_m": size / 100, "step_deg": size}
             for size in self.sizes
             for planner in self.planners
         ]
-
-    def prepare(self) -> None:
-        """Start one episode of each planner."""
-        check_episodes(self.specs())
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
         """One line a planner and size."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 import ms_slam_env
 from ms_slam_env import metrics
-from ms_slam_env.config import check_choice, check_range, nested_options, parse_named
+from ms_slam_env.config import Checked, bounded, chosen, nested_options, parse_named
 from ms_slam_env.env import ActiveSlamEnv, Planner
 from ms_slam_env.env.config import make_config
 from ms_slam_env.env.embodiments import EMBODIMENTS
@@ -47,7 +47,7 @@ OWN_OPTIONS = (
 
 
 @dataclass(frozen=True)
-class EpisodeSpec:
+class EpisodeSpec(Checked):
     """Everything that an episode depends on.
 
     Attributes:
@@ -64,19 +64,16 @@ class EpisodeSpec:
     planner: str
     scene: str = "living_room"
     seed: int = 2000
-    env_id: str = "MSActiveSLAM-FreeCamera-v0"
-    steps: int = 100
-    step_m: float = DEFAULT_STEP_M
-    step_deg: float = DEFAULT_STEP_DEG
+    env_id: str = chosen("MSActiveSLAM-FreeCamera-v0", *ms_slam_env.ENV_IDS)
+    steps: int = bounded(100, 1, 1_000_000)
+    step_m: float = bounded(DEFAULT_STEP_M, 0, 1)
+    step_deg: float = bounded(DEFAULT_STEP_DEG, 0, 90)
     options: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Refuse unknown choices and values out of range."""
         try:
-            check_choice(self, "env_id", ms_slam_env.ENV_IDS)
-            check_range(self, "steps", 1, 1_000_000)
-            check_range(self, "step_m", 0, 1)
-            check_range(self, "step_deg", 0, 90)
+            super().__post_init__()
         except InputError as error:
             # Users know the fields as options of a command, not this class.
             raise InputError(str(error).replace("EpisodeSpec.", "")) from None
