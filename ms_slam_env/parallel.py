@@ -26,28 +26,25 @@ import signal
 import threading
 import time
 import traceback
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from ms_slam_env.errors import InputError
 
-THREAD_VARIABLES = (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "NUMEXPR_NUM_THREADS",
-)
+_LIBRARIES = ("OMP", "OPENBLAS", "MKL", "NUMEXPR")
+THREAD_VARIABLES = tuple(f"{library}_NUM_THREADS" for library in _LIBRARIES)
 """By which libraries learn, when they are loaded, how many threads they may start."""
 
 LOCAL_CLUSTER = "local"
 """Address of a Ray cluster on this machine that lives as long as the pool."""
 
 Run = Callable[[Any], Any]
+_HAS_AFFINITY = hasattr(os, "sched_setaffinity")
 
 
 # -- Threads -----------------------------------------------------------------------------------
@@ -55,9 +52,7 @@ Run = Callable[[Any], Any]
 
 def available_cores() -> int:
     """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return len(os.sched_getaffinity(0)) if _HAS_AFFINITY else os.cpu_count() or 1
 
 
 def thread_environment(threads: int) -> dict[str, str]:
@@ -80,14 +75,14 @@ def limit_threads(threads: int) -> None:
 
     os.environ.update(thread_environment(threads))
     cv2.setNumThreads(threads)
-    if hasattr(os, "sched_setaffinity"):
+    if _HAS_AFFINITY:
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:threads])
 
 
 @contextmanager
 def limited_threads(threads: int | None) -> Iterator[None]:
     """Keep the enclosed work on so many cores; None leaves everything as it is."""
-    if threads is None or not hasattr(os, "sched_setaffinity"):
+    if threads is None or not _HAS_AFFINITY:
         yield
         return
     cores = os.sched_getaffinity(0)
@@ -134,60 +129,102 @@ def attempt(run: Run, key: Any, spec: Any) -> Outcome:
     try:
         outcome = Outcome(key, run(spec))
     except Exception as error:
+        frame = traceback.extract_tb(error.__traceback__)[-1]
         outcome = Outcome(
             key,
             error=f"{type(error).__name__}: {error}".splitlines()[0],
             message=str(error),
-            where=_place(error),
+            where=f"{Path(frame.filename).name}:{frame.lineno}",
             traceback=traceback.format_exc(),
             is_bad_input=isinstance(error, InputError),
         )
     return replace(outcome, elapsed_s=round(time.perf_counter() - start, 3))
 
 
-def _place(error: Exception) -> str:
-    frame = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{Path(frame.filename).name}:{frame.lineno}"
+class _Worker(Protocol):
+    """A process, here or in a cluster, that runs one spec after another."""
+
+    def send(self, spec: Any) -> Any:
+        """Begin with a spec; what tells when it is done (a pipe, a future)."""
+
+    def receive(self) -> Outcome:
+        """What came of the spec, without key; `_DiedError` if the worker died on it."""
+
+    def stop(self) -> None:
+        """End the worker, whatever it is doing."""
 
 
-class Pool(ABC):
-    """Workers that each run one spec after another.
+class _DiedError(Exception):
+    """A worker died; the message says how."""
+
+
+class Pool:
+    """Workers that each run one spec after another, started when there is work for them.
 
     Use it as a context: at its end the workers are ended, whatever they are doing.
     """
 
+    def __init__(
+        self,
+        start: Callable[[], _Worker],
+        wait_for: Callable[[list[Any], float | None], Sequence[Any]],
+        workers: int,
+        fresh: bool,
+        leave: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._start, self._wait_for, self._leave = start, wait_for, leave
+        self._workers, self._fresh = workers, fresh
+        self._resting: list[_Worker] = []
+        self._working: dict[Any, tuple[_Worker, Any, float]] = {}  # with key and start of its spec
+
     def __enter__(self) -> Pool:
-        """Return itself."""
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """End the workers."""
         self.stop()
 
     @property
-    @abstractmethod
     def idle(self) -> int:
         """Workers that wait for a spec."""
+        return self._workers - len(self._working)
 
     @property
-    @abstractmethod
     def busy(self) -> int:
         """Workers that have a spec in their hands."""
+        return len(self._working)
 
-    @abstractmethod
     def give(self, key: Any, spec: Any) -> None:
         """Let an idle worker run ``spec``; there must be one."""
+        worker = self._resting.pop() if self._resting else self._start()
+        self._working[worker.send(spec)] = (worker, key, time.perf_counter())
 
-    @abstractmethod
     def take(self, timeout_s: float | None = None) -> list[Outcome]:
         """Wait for outcomes, at most so long; those that are there, none if no worker is busy.
 
         A worker that died is replaced.
         """
+        done = self._wait_for(list(self._working), timeout_s) if self._working else ()
+        return [self._outcome(*self._working.pop(each)) for each in done]
 
-    @abstractmethod
+    def _outcome(self, worker: _Worker, key: Any, start: float) -> Outcome:
+        try:
+            outcome = replace(worker.receive(), key=key)
+        except _DiedError as error:
+            message = f"the process died{error}"
+            elapsed_s = round(time.perf_counter() - start, 3)
+            outcome = Outcome(key, None, message, message, died=True, elapsed_s=elapsed_s)
+        if self._fresh or outcome.died:
+            worker.stop()
+        else:
+            self._resting.append(worker)
+        return outcome
+
     def stop(self) -> None:
         """End the workers; what runs at this moment is lost."""
+        for worker in (*self._resting, *(worker for worker, _, _ in self._working.values())):
+            worker.stop()
+        self._resting, self._working = [], {}
+        self._leave()
 
 
 def run_each(pool: Pool, specs: Mapping[Any, Any]) -> Iterator[Outcome]:
@@ -225,120 +262,67 @@ def open_pool(
     workers = available_cores() if workers is None else workers
     if workers < 1:
         raise InputError(f"workers = {workers} must be at least 1")
-    if ray_address is not None:
-        return RayPool(run, workers, ray_address, dict(environment or {}), fresh)
-    return LocalPool(run, workers, dict(environment or {}), fresh)
+    variables = dict(environment or {})
+    if ray_address is None:
+        return Pool(partial(_Process, run, variables), wait, workers, fresh)
+    ray = _connect(ray_address, workers)
+    actor = ray.remote(num_cpus=1, runtime_env={"env_vars": variables})(_Attempts)
+    there = ray.put(run)
+    return Pool(
+        lambda: _RayWorker(ray, actor.remote(there)),
+        lambda working, timeout_s: ray.wait(working, timeout=timeout_s)[0],
+        workers,
+        fresh,
+        ray.shutdown,
+    )
 
 
 # -- Processes of this machine -----------------------------------------------------------------
 
 
-class LocalPool(Pool):
-    """Processes of this machine, started when there is work for them."""
-
-    def __init__(self, run: Run, workers: int, environment: dict[str, str], fresh: bool) -> None:
-        self._run, self._workers, self._fresh = run, workers, fresh
-        self._environment = environment
-        self._idle: list[_Process] = []
-        self._busy: dict[Any, _Process] = {}  # by pipe
-
-    @property
-    def idle(self) -> int:
-        """Workers that wait for a spec."""
-        return self._workers - len(self._busy)
-
-    @property
-    def busy(self) -> int:
-        """Workers that have a spec in their hands."""
-        return len(self._busy)
-
-    def give(self, key: Any, spec: Any) -> None:
-        """Let a worker run ``spec``."""
-        process = self._idle.pop() if self._idle else _Process(self._run, self._environment)
-        self._busy[process.pipe] = process
-        process.give(key, spec)
-
-    def take(self, timeout_s: float | None = None) -> list[Outcome]:
-        """Wait for outcomes, at most so long."""
-        outcomes = []
-        for pipe in wait(list(self._busy), timeout_s) if self._busy else ():
-            process = self._busy.pop(pipe)
-            outcomes.append(process.take())
-            if self._fresh or outcomes[-1].died:
-                process.stop()
-            else:
-                self._idle.append(process)
-        return outcomes
-
-    def stop(self) -> None:
-        """End the workers."""
-        processes = [*self._idle, *self._busy.values()]
-        self._idle, self._busy = [], {}
-        for process in processes:
-            process.stop()
-
-
 class _Process:
-    """A process that runs one spec after another."""
+    """A process of this machine."""
 
     def __init__(self, run: Run, environment: Mapping[str, str]) -> None:
         context = multiprocessing.get_context("spawn")
-        self.pipe, theirs = context.Pipe()
+        self._pipe, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs, run), daemon=True)
         with _environment(environment):  # inherited, and read when libraries are loaded
             self._process.start()
         theirs.close()  # so that reading ends when the process does
 
-    def give(self, key: Any, spec: Any) -> None:
-        """Let the process run a spec."""
-        self._key, self._start = key, time.perf_counter()
-        self.pipe.send((key, spec))
+    def send(self, spec: Any) -> Connection:
+        self._pipe.send(spec)
+        return self._pipe
 
-    def take(self) -> Outcome:
-        """Its outcome, also if the process died on it."""
+    def receive(self) -> Outcome:
         try:
-            return self.pipe.recv()
+            return self._pipe.recv()
         except (EOFError, ConnectionResetError):
             self._process.join()
-            error = f"the process died, exit code {self._process.exitcode}"
-            elapsed_s = round(time.perf_counter() - self._start, 3)
-            return Outcome(self._key, error=error, message=error, died=True, elapsed_s=elapsed_s)
+            raise _DiedError(f", exit code {self._process.exitcode}") from None
 
     def stop(self) -> None:
-        """End the process."""
         self._process.terminate()
         self._process.join()
-        self.pipe.close()
+        self._pipe.close()
 
 
 @contextmanager
 def _environment(variables: Mapping[str, str]) -> Iterator[None]:
     """Have these environment variables meanwhile."""
-    before = {name: os.environ.get(name) for name in variables}
+    before = {name: os.environ[name] for name in variables if name in os.environ}
     os.environ.update(variables)
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        for name in variables:
+            del os.environ[name]
+        os.environ.update(before)
 
 
 def _serve(pipe: Connection, run: Run) -> None:
-    """Run what comes through ``pipe`` until it ends."""
-    _leave_with_parent()
-    while True:
-        try:
-            key, spec = pipe.recv()
-        except EOFError:
-            return
-        pipe.send(attempt(run, key, spec))
-
-
-def _leave_with_parent() -> None:
-    """Leave Ctrl-C to the parent, and end when the parent is gone, even if it was killed."""
+    """Run what comes through ``pipe``; leave Ctrl-C to the parent, and end when it does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None
@@ -347,72 +331,45 @@ def _leave_with_parent() -> None:
         parent.join()
         os._exit(1)
 
-    threading.Thread(target=watch, daemon=True).start()
+    threading.Thread(target=watch, daemon=True).start()  # the parent may be killed
+    while True:
+        try:
+            spec = pipe.recv()
+        except EOFError:
+            return
+        pipe.send(attempt(run, None, spec))
 
 
 # -- A Ray cluster -----------------------------------------------------------------------------
 
 
-class RayPool(Pool):
-    """Actors of a Ray cluster, a core for each; ``run`` and specs travel there, outcomes back."""
+class _RayWorker:
+    """An actor of a Ray cluster, with a core for itself."""
 
-    def __init__(
-        self, run: Run, workers: int, address: str, environment: dict[str, str], fresh: bool
-    ) -> None:
-        self._ray = _connect(address, workers)
-        self._actor = self._ray.remote(num_cpus=1, runtime_env={"env_vars": environment})(_Actor)
-        self._run = self._ray.put(run)
-        self._fresh = fresh
-        self._idle = [self._actor.remote(self._run) for _ in range(workers)]
-        self._busy: dict[Any, tuple[Any, Any, float]] = {}  # by future: actor, key, start
+    def __init__(self, ray: Any, actor: Any) -> None:
+        self._ray, self._actor = ray, actor
 
-    @property
-    def idle(self) -> int:
-        """Workers that wait for a spec."""
-        return len(self._idle)
+    def send(self, spec: Any) -> Any:
+        self._future = self._actor.attempt.remote(spec)
+        return self._future
 
-    @property
-    def busy(self) -> int:
-        """Workers that have a spec in their hands."""
-        return len(self._busy)
-
-    def give(self, key: Any, spec: Any) -> None:
-        """Let a worker run ``spec``."""
-        actor = self._idle.pop()
-        self._busy[actor.attempt.remote(spec)] = (actor, key, time.perf_counter())
-
-    def take(self, timeout_s: float | None = None) -> list[Outcome]:
-        """Wait for outcomes, at most so long."""
-        ready, _ = self._ray.wait(list(self._busy), timeout=timeout_s) if self._busy else ((), ())
-        return [self._take(future) for future in ready]
-
-    def _take(self, future: Any) -> Outcome:
-        actor, key, start = self._busy.pop(future)
+    def receive(self) -> Outcome:
         try:
-            outcome = replace(self._ray.get(future), key=key)
+            return self._ray.get(self._future)
         except self._ray.exceptions.RayActorError as error:
-            message = f"the process died: {' '.join(str(error).split())}"
-            elapsed_s = round(time.perf_counter() - start, 3)
-            outcome = Outcome(key, error=message, message=message, died=True, elapsed_s=elapsed_s)
-        if self._fresh and not outcome.died:
-            self._ray.kill(actor)
-        is_alive = not (self._fresh or outcome.died)
-        self._idle.append(actor if is_alive else self._actor.remote(self._run))
-        return outcome
+            raise _DiedError(f": {' '.join(str(error).split())}") from None
 
     def stop(self) -> None:
-        """End the workers and leave the cluster."""
-        self._ray.shutdown()
+        self._ray.kill(self._actor)
 
 
-class _Actor:
+class _Attempts:
     """Runs specs on a machine of the cluster."""
 
     def __init__(self, run: Run) -> None:
         self._run = run
 
     def attempt(self, spec: Any) -> Outcome:
-        """Run a spec; the caller knows its key."""
         return attempt(self._run, None, spec)
 
 
