@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import Float64, look_at, relative_angle
+from ms_slam_env.geometry import Float64, look_at
 from ms_slam_env.scenes.base import Scene
+from ms_slam_env.sequences.paths.base import frame_times
 
 HEIGHT_M = 1.3
 CLEARANCE_M = 0.35  # free space kept around the camera
@@ -79,10 +80,7 @@ def along_corridor(scene: Scene, seed: int, step_m: float = 0.02, step_deg: floa
 def _at_speed(eyes: Float64, gaze: Float64, step_m: float, step_deg: float) -> Float64:
     """Poses along densely sampled eyes and directions (M, 3), as fast as the limits permit."""
     dense = np.stack([look_at(eye, eye + aim) for eye, aim in zip(eyes, gaze, strict=True)])
-    steps = np.linalg.norm(np.diff(eyes, axis=0), axis=1) / step_m
-    pairs = zip(dense[:-1, :3, :3], dense[1:, :3, :3], strict=True)
-    turns = np.array([relative_angle(a, b) for a, b in pairs]) / np.radians(step_deg)
-    frames = np.concatenate([[0.0], np.cumsum(np.maximum(steps, turns))])
+    frames = frame_times(dense, step_m, np.radians(step_deg))
     at = np.arange(0.0, frames[-1])
     columns = [np.interp(at, frames, column) for column in np.hstack([eyes, gaze]).T]
     return np.stack([look_at(row[:3], row[:3] + row[3:]) for row in np.stack(columns, axis=1)])

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import collections.abc
 import copy
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,11 +15,11 @@ from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sensor import FRAME_RATE_HZ, NoiseConfig, TrueView
 from ms_slam_env.sequences.perturbations.base import Perturbation, random_numbers
 from ms_slam_env.sequences.perturbed_camera import Imperfections, PerturbedCamera
-from ms_slam_env.sequences.sequence import Sequence
+from ms_slam_env.sequences.sequence import Frames, Sequence
 from ms_slam_env.sequences.trajectory import PoseInterpolation
 
 
-class RenderedFrames(collections.abc.Sequence[RGBDFrame]):
+class RenderedFrames(Frames):
     """Frames of a camera on a trajectory, a function of their index alone; none is kept.
 
     Attributes:
@@ -69,16 +67,8 @@ class RenderedFrames(collections.abc.Sequence[RGBDFrame]):
         """Return the number of frames."""
         return len(self.kept)
 
-    @overload
-    def __getitem__(self, index: int) -> RGBDFrame: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> tuple[RGBDFrame, ...]: ...
-
-    def __getitem__(self, index: int | slice) -> RGBDFrame | tuple[RGBDFrame, ...]:
-        """Render a frame, or several."""
-        if isinstance(index, slice):
-            return tuple(self[i] for i in range(len(self))[index])
+    def frame(self, index: int) -> RGBDFrame:
+        """Render a frame."""
         number = int(self.kept[index])
         return self._camera.take(
             self._trajectory,

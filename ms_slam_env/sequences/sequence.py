@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import collections.abc
+from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +14,28 @@ from numpy.typing import NDArray
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import Float64
+
+
+class Frames(collections.abc.Sequence[RGBDFrame]):
+    """Frames that are rendered or decoded when they are asked for."""
+
+    @abstractmethod
+    def frame(self, index: int) -> RGBDFrame:
+        """Make one frame."""
+
+    @overload
+    def __getitem__(self, index: int) -> RGBDFrame: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> tuple[RGBDFrame, ...]: ...
+
+    def __getitem__(self, index: int | slice) -> RGBDFrame | tuple[RGBDFrame, ...]:
+        if isinstance(index, slice):
+            return tuple(self.frame(number) for number in range(len(self))[index])
+        return self.frame(index)
+
+    def __iter__(self) -> Iterator[RGBDFrame]:
+        return (self.frame(index) for index in range(len(self)))
 
 
 @dataclass(frozen=True)

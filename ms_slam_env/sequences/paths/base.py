@@ -89,5 +89,10 @@ class CameraPath(ABC):
         The same scene and seed give the same way.
 
         Raises:
-            InputError: no free way, or one that the scene does not permit.
+            InputError: no free way, or one that the scene does not permit; of a loop that is too
+                short the message says how many frames the shortest one needs.
         """
+
+    def poses(self, scene: Scene, seed: int) -> Float64:
+        """The poses of `motion` alone."""
+        return self.motion(scene, seed)[1]

@@ -36,23 +36,18 @@ _TURN_RAD = np.radians(70.0)  # between the viewing directions of two waypoints
 _FARTHEST_M = 4.5
 _DESTINATIONS = 120  # tried for one start
 _NEAR_M = 0.6  # destinations nearer than this are tried last
-
-
 _STARTS = 5
 _CLOSED_PATHS = 4  # to choose among, per start
 _PACE_PERIODS_S = (2.3, 5.1, 11.7)
 
 
-@dataclass(frozen=True)
-class _Roadmap:
-    """Free places (N, 3), and the lengths (N, N) of the free straight ways between near ones."""
+def _roadmap(
+    scene: Scene, start: Float64, radius_m: float, rng: np.random.Generator
+) -> tuple[Float64, Float64]:
+    """Free places (N, 3), and the lengths (N, N) of free straight ways between near ones, 0 = none.
 
-    places: Float64
-    lengths: Float64  # 0 = no way
-
-
-def _roadmap(scene: Scene, start: Float64, radius_m: float, rng: np.random.Generator) -> _Roadmap:
-    """Random free places around the height of ``start`` (3,), which is the first of them."""
+    The places are random, around the height of ``start`` (3,), which is the first of them.
+    """
     low, high = scene.bounds()
     low[2], high[2] = start[2] - _HEIGHT_M, start[2] + _HEIGHT_M
     drawn = rng.uniform(low, high, (_SAMPLES, 3))
@@ -65,7 +60,7 @@ def _roadmap(scene: Scene, start: Float64, radius_m: float, rng: np.random.Gener
     for a, b in sorted(cKDTree(nodes).query_pairs(_REACH_M)):
         if scene.segment_is_free(nodes[a], nodes[b], radius_m):
             lengths[a, b] = lengths[b, a] = np.linalg.norm(nodes[a] - nodes[b])
-    return _Roadmap(nodes, lengths)
+    return nodes, lengths
 
 
 def _shortest(lengths: Float64, start: int, end: int) -> list[int]:
@@ -79,20 +74,20 @@ def _shortest(lengths: Float64, start: int, end: int) -> list[int]:
     return way[::-1]
 
 
-def _round_trip(roadmap: _Roadmap, destination: int) -> list[Float64]:
+def _round_trip(places: Float64, lengths: Float64, destination: int) -> list[Float64]:
     """Waypoints to a place and back, by another way where the detour is bearable."""
-    out = _shortest(roadmap.lengths, 0, destination)
+    out = _shortest(lengths, 0, destination)
     if not out:
         return []
-    costs = roadmap.lengths.copy()
-    taken = roadmap.places[out[1:-1]]
+    costs = lengths.copy()
+    taken = places[out[1:-1]]
     if len(taken):
-        distance, _ = cKDTree(taken).query(roadmap.places)
+        distance, _ = cKDTree(taken).query(places)
         is_near = distance < 2 * _SPACING_M
         costs[is_near] *= _DETOUR
         costs[:, is_near] *= _DETOUR
     back = _shortest(costs, destination, 0)
-    eyes = [roadmap.places[i] for i in [*out, *back[1:-1]]]
+    eyes = [places[i] for i in [*out, *back[1:-1]]]
     while len(eyes) < _FEWEST_WAYPOINTS:  # halves every way, so that the turn has its steps
         after = [*eyes[1:], eyes[0]]
         eyes = [p for a, b in zip(eyes, after, strict=True) for p in (a, 0.5 * (a + b))]
@@ -125,14 +120,14 @@ def closed_paths(scene: Scene, rng: np.random.Generator, radius_m: float) -> Ite
     splines between them keep half of it.
     """
     start = scene.sample_start(rng)
-    roadmap = _roadmap(scene, start[:3, 3], radius_m, rng)
+    places, lengths = _roadmap(scene, start[:3, 3], radius_m, rng)
     heading = unit(start[:3, 2] * (1.0, 1.0, 0.0))
     gaze = Gaze(scene)
-    distance = np.linalg.norm(roadmap.places - roadmap.places[0], axis=1)
+    distance = np.linalg.norm(places - places[0], axis=1)
     others = 1 + rng.permutation(len(distance) - 1)
     far_first = others[np.argsort(distance[others] < _NEAR_M, kind="stable")]
     for destination in far_first[:_DESTINATIONS]:
-        eyes = _round_trip(roadmap, int(destination))
+        eyes = _round_trip(places, lengths, int(destination))
         targets = _sweep(eyes, heading, gaze, rng) if eyes else None
         if targets is None:
             continue
@@ -176,16 +171,7 @@ class HandheldPath(Checked, CameraPath):
         return np.arange(self.frames) / self.rate_hz
 
     def motion(self, scene: Scene, seed: int) -> tuple[Float64, Float64]:
-        """Times (N,) in seconds and poses T_world_camera (N, 4, 4)."""
-        return self.timestamps, self.poses(scene, seed)
-
-    def poses(self, scene: Scene, seed: int) -> Float64:
-        """T_world_camera (frames, 4, 4); the same scene and seed give the same path.
-
-        Raises:
-            InputError: no free path, or no loop as short as that; the message says how many frames
-                the shortest one needs.
-        """
+        """See the base class."""
         rng = np.random.default_rng([seed, 78])
         pace = self._pace(rng)
         tremor = hand_tremor(self.frames, rng)
@@ -193,10 +179,12 @@ class HandheldPath(Checked, CameraPath):
         rot_rad = np.radians(self.turn_deg_s) / self.rate_hz
         if not self.loop:
             path, times = free_path(scene, float(pace[-1]), rng, step_m, rot_rad)
-            return resample(path, times, pace, tremor)
+            return self.timestamps, resample(path, times, pace, tremor)
         path, times = self._closed(scene, float(pace[-1]), rng, step_m, rot_rad)
         rounds = max(1, int(pace[-1] / times[-1]))
-        return resample(path, times, _around(pace * rounds / pace[-1], times[-1]), tremor)
+        instants = (pace * rounds / pace[-1] % 1.0) * times[-1]
+        instants[-1] = times[-1]  # the end of the last round
+        return self.timestamps, resample(path, times, instants, tremor)
 
     def _pace(self, rng: np.random.Generator) -> Float64:
         """Progress (frames,) in frames at the mean pace; no step exceeds the limits."""
@@ -232,10 +220,3 @@ class HandheldPath(Checked, CameraPath):
             f"a loop in {where} takes at least {min(lengths, default=shortest) + 1:.0f} frames at "
             f"this pace, not {self.frames}"
         )
-
-
-def _around(rounds: Float64, length: float) -> Float64:
-    """Instants on a closed path after so many rounds, the end of the last round included."""
-    instants = (rounds % 1.0) * length
-    instants[-1] = length
-    return instants

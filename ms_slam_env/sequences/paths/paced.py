@@ -50,22 +50,14 @@ class UnevenPath(Checked, CameraPath):
         padded = np.concatenate([[rates[0]] * width, rates])
         return np.convolve(padded, np.ones(width) / width, "valid")[: self.frames]
 
-    def poses(self, scene: Scene, seed: int) -> Float64:
-        """T_world_camera (frames, 4, 4); the same scene and seed give the same path.
-
-        Raises:
-            InputError: no free path.
-        """
+    def motion(self, scene: Scene, seed: int) -> tuple[Float64, Float64]:
+        """See the base class."""
         progress = np.concatenate([[0.0], np.cumsum(self.paces(seed)[1:])])
         rng = np.random.default_rng([seed, 80])
         tremor = hand_tremor(self.frames, rng)
         step_m, rot_rad = self.speed_m_s / _RATE_HZ, np.radians(self.turn_deg_s) / _RATE_HZ
         path, times = free_path(scene, float(progress[-1]), rng, step_m, rot_rad)
-        return resample(path, times, progress, tremor)
-
-    def motion(self, scene: Scene, seed: int) -> tuple[Float64, Float64]:
-        """Times (N,) in seconds and poses T_world_camera (N, 4, 4)."""
-        return np.arange(self.frames) / _RATE_HZ, self.poses(scene, seed)
+        return np.arange(self.frames) / _RATE_HZ, resample(path, times, progress, tremor)
 
 
 @dataclass(frozen=True)

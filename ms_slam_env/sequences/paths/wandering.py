@@ -24,9 +24,8 @@ from ms_slam_env.sequences.paths.base import (
 _NEAREST_M = 0.6
 _MAX_SLOPE = 0.8  # sine of the angle above or below the horizon
 _LOOKS = 10
-
-
 RADIUS_M = 0.25
+"""Free space kept around the camera."""
 _HOP_M = (0.35, 0.7)  # distance between waypoints
 _MAX_TURN_RAD = np.radians(50.0)  # between the viewing directions of two waypoints
 _ATTEMPTS = 200
@@ -75,9 +74,6 @@ class Gaze:
             if self.scene.segment_is_free(eye, short, 0.01):
                 return target
         return None
-
-
-"""Free space kept around the camera."""
 
 
 class Wanderer:

@@ -10,55 +10,21 @@ from typing import Any
 
 from ms_slam_env.config import from_dict
 from ms_slam_env.errors import unknown
-from ms_slam_env.sequences.perturbations.base import (
-    FrameSelection,
-    ImagePerturbation,
-    LightPerturbation,
-    Moment,
-    MotionPerturbation,
-    OpticalPerturbation,
-    Optics,
-    Perturbation,
-    WorldPerturbation,
-)
-from ms_slam_env.sequences.perturbations.depth import DepthDropout, DepthQuantisation
-from ms_slam_env.sequences.perturbations.exposure import (
+from ms_slam_env.sequences.perturbations.base import Moment, Perturbation
+from ms_slam_env.sequences.perturbations.illumination import Illumination
+from ms_slam_env.sequences.perturbations.images import (
     AutoExposure,
     BlackFrames,
+    DepthDropout,
+    DepthQuantisation,
     ExposureJumps,
     ExposureRamp,
 )
-from ms_slam_env.sequences.perturbations.illumination import Illumination
 from ms_slam_env.sequences.perturbations.moving_objects import MovingObjects
 from ms_slam_env.sequences.perturbations.optics import Misregistration, MotionBlur, RollingShutter
 from ms_slam_env.sequences.perturbations.timing import FastMotion, FrameSkipping
 
-__all__ = [
-    "PERTURBATIONS",
-    "AutoExposure",
-    "BlackFrames",
-    "DepthDropout",
-    "DepthQuantisation",
-    "ExposureJumps",
-    "ExposureRamp",
-    "FastMotion",
-    "FrameSelection",
-    "FrameSkipping",
-    "Illumination",
-    "ImagePerturbation",
-    "LightPerturbation",
-    "Misregistration",
-    "Moment",
-    "MotionBlur",
-    "MotionPerturbation",
-    "MovingObjects",
-    "OpticalPerturbation",
-    "Optics",
-    "Perturbation",
-    "RollingShutter",
-    "WorldPerturbation",
-    "make_perturbation",
-]
+__all__ = ["PERTURBATIONS", "Moment", "Perturbation", "make_perturbation"]
 
 PERTURBATIONS: dict[str, type[Perturbation]] = {
     "rolling-shutter": RollingShutter,

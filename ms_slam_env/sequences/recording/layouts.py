@@ -117,17 +117,13 @@ def open_icl_nuim(folder: Path, intrinsics: Calibration | None) -> Recording:
 
 
 def _listed(folder: Path, layout: str, camera: Calibration) -> Recording:
-    times, truth = _trajectory(folder, camera.flipped)
-    return Recording(
-        name=folder.name,
-        layout=layout,
-        entries=tuple(_pairs(folder)),
-        source=camera.intrinsics,
-        intrinsics=camera.intrinsics,
-        depth_scale=camera.depth_scale or DEPTH_SCALE,
-        truth_times=times,
-        truth=truth,
-    )
+    return _recording(folder, layout, _pairs(folder), camera)
+
+
+def _recording(folder: Path, layout: str, entries: list[Entry], camera: Calibration) -> Recording:
+    scale, (times, truth) = camera.depth_scale or DEPTH_SCALE, _trajectory(folder, camera.flipped)
+    K = camera.intrinsics
+    return Recording(folder.name, layout, tuple(entries), K, K, scale, None, times, truth)
 
 
 def open_seven_scenes(folder: Path, intrinsics: Calibration | None) -> Recording:
@@ -170,20 +166,9 @@ def open_folder(folder: Path, intrinsics: Calibration | None) -> Recording:
         color = list(_images(color_folder))
         if len(color) != len(depth):
             raise InputError(f"{folder}: {len(depth)} depth images but {len(color)} colour images")
-    times, truth = _trajectory(folder, camera.flipped)
-    return Recording(
-        name=folder.name,
-        layout="folder",
-        entries=tuple(
-            Entry(index / FRAME_RATE_HZ, d, c, str(d))
-            for index, (d, c) in enumerate(zip(depth, color, strict=True))
-        ),
-        source=camera.intrinsics,
-        intrinsics=camera.intrinsics,
-        depth_scale=camera.depth_scale or DEPTH_SCALE,
-        truth_times=times,
-        truth=truth,
-    )
+    pairs = enumerate(zip(depth, color, strict=True))
+    entries = [Entry(index / FRAME_RATE_HZ, d, c, str(d)) for index, (d, c) in pairs]
+    return _recording(folder, "folder", entries, camera)
 
 
 def _images(folder: Path) -> list[Path]:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import collections.abc
 import dataclasses
 import struct
 import zlib
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,7 +19,7 @@ from ms_slam_env.camera.frame import reduce_color, reduce_depth
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.geometry import Float64
-from ms_slam_env.sequences.sequence import Sequence
+from ms_slam_env.sequences.sequence import Frames, Sequence
 from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S, associate
 
 # What Pillow raises for files that are missing, truncated or damaged, format by format.
@@ -137,7 +135,7 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class Recording(collections.abc.Sequence[RGBDFrame]):
+class Recording(Frames):
     """Frames in order of time; each is decoded when it is asked for.
 
     Attributes:
@@ -220,18 +218,6 @@ class Recording(collections.abc.Sequence[RGBDFrame]):
         """Return the same recording with the frames of these numbers (M,) only, increasing."""
         return dataclasses.replace(self, entries=tuple(self.entries[int(k)] for k in indices))
 
-    @overload
-    def __getitem__(self, index: int) -> RGBDFrame: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> tuple[RGBDFrame, ...]: ...
-
-    def __getitem__(self, index: int | slice) -> RGBDFrame | tuple[RGBDFrame, ...]:
-        """Decode a frame, or several; see `frame`."""
-        if isinstance(index, slice):
-            return tuple(self.frame(number) for number in range(len(self))[index])
-        return self.frame(index)
-
     def frame(self, index: int) -> RGBDFrame:
         """Decode frame ``index``: depth in metres, 0 = no reading; colour black if there is none.
 
@@ -255,10 +241,6 @@ class Recording(collections.abc.Sequence[RGBDFrame]):
             factor = self.intrinsics.width / self.source.width
             color = self.registration.register(color, depth, self.intrinsics, factor)
         return RGBDFrame(np.ascontiguousarray(color), np.ascontiguousarray(depth), entry.timestamp)
-
-    def __iter__(self) -> Iterator[RGBDFrame]:
-        """Iterate over the frames."""
-        return (self.frame(index) for index in range(len(self)))
 
     def _read(self, path: Path, entry: Entry, kind: str, modes: tuple[str, ...]) -> NDArray[Any]:
         try:
