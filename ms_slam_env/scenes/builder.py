@@ -86,13 +86,7 @@ class MeshBuilder:
         self.cell_m = cell_m
         self._pose = np.eye(4)
         self._label = 0
-        self._vertices: list[Float64] = []
-        self._normals: list[Float64] = []
-        self._light_points: list[Float64] = []
-        self._faces: list[NDArray[np.int64]] = []
-        self._uv: list[Float64] = []
-        self._face_texture: list[NDArray[np.int64]] = []
-        self._face_label: list[NDArray[np.int64]] = []
+        self._patches: list[tuple[NDArray, ...]] = []  # the fields of `Geometry` up to the textures
         self._textures: list[NDArray[np.uint8]] = []
         self._labels: list[str] = []
         self._count = 0
@@ -167,13 +161,11 @@ class MeshBuilder:
         gather = gather + 0.006 * normals
         faces = _grid_faces(n, m)
         R, t = self._pose[:3, :3], self._pose[:3, 3]
-        self._vertices.append(grid.reshape(-1, 3) @ R.T + t)
-        self._normals.append(normals.reshape(-1, 3) @ R.T)
-        self._light_points.append(gather.reshape(-1, 3) @ R.T + t)
-        self._faces.append(faces + self._count)
-        self._uv.append(uv.reshape(-1, 2)[faces])
-        self._face_texture.append(np.full(len(faces), material.texture))
-        self._face_label.append(np.full(len(faces), self._label))
+        vertices, normals = grid.reshape(-1, 3) @ R.T + t, normals.reshape(-1, 3) @ R.T
+        light_points, corners = gather.reshape(-1, 3) @ R.T + t, uv.reshape(-1, 2)[faces]
+        of_faces = (np.full(len(faces), index) for index in (material.texture, self._label))
+        patch = (vertices, normals, light_points, faces + self._count, corners, *of_faces)
+        self._patches.append(patch)
         self._count += n * m
 
     def quad(
@@ -304,20 +296,21 @@ class MeshBuilder:
 
     def build(self) -> Geometry:
         """Return everything added so far."""
-        vertices, faces = np.concatenate(self._vertices), np.concatenate(self._faces)
+        columns = map(np.concatenate, zip(*self._patches, strict=True))
+        vertices, normals, light_points, faces, uv, face_texture, face_label = columns
         corners = vertices.astype(np.float32).astype(np.float64)[faces]
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         keep = np.einsum("ij,ij->i", cross, cross) > 1e-14  # a lathe's pole has empty cells
         return Geometry(
-            vertices=vertices,
-            normals=np.concatenate(self._normals),
-            light_points=np.concatenate(self._light_points),
-            faces=faces[keep].astype(np.int32),
-            uv=np.concatenate(self._uv)[keep].astype(np.float32),
-            face_texture=np.concatenate(self._face_texture)[keep].astype(np.int32),
-            face_label=np.concatenate(self._face_label)[keep].astype(np.int32),
-            textures=tuple(self._textures),
-            labels=tuple(self._labels),
+            vertices,
+            normals,
+            light_points,
+            faces[keep].astype(np.int32),
+            uv[keep].astype(np.float32),
+            face_texture[keep].astype(np.int32),
+            face_label[keep].astype(np.int32),
+            tuple(self._textures),
+            tuple(self._labels),
         )
 
 

@@ -185,11 +185,5 @@ def _lit(
         target = np.array([*draw.uniform(0.2, [w - 0.2, d - 0.2]), draw.uniform(0.5, 1.1)])
         return eye, target
 
-    return MeshScene(
-        living_room,
-        seed,
-        mesh,
-        free_space_around(mesh, centre + np.array([0.0, 0.0, 0.3])),
-        start,
-        exposure,
-    )
+    free = free_space_around(mesh, centre + np.array([0.0, 0.0, 0.3]))
+    return MeshScene(living_room, seed, mesh, free, start, exposure)

@@ -78,14 +78,9 @@ def load_soup(path: Path) -> Soup:
         labels.append(str(part.metadata.get("name") or f"part {k}"))
     if sum(len(c) for c in corners) == 0:
         raise InputError(f"mesh file {str(path)!r} has no triangles")
-    return Soup(
-        np.concatenate(corners),
-        np.concatenate(uvs),
-        np.concatenate(texture),
-        np.concatenate(label),
-        tuple(images),
-        tuple(labels),
-    )
+    joined = map(np.concatenate, (corners, uvs, texture, label))
+    of_corners, of_uv, of_texture, of_label = joined
+    return Soup(of_corners, of_uv, of_texture, of_label, tuple(images), tuple(labels))
 
 
 def split_long_edges(soup: Soup, max_edge_m: float) -> Soup:
@@ -104,14 +99,8 @@ def split_long_edges(soup: Soup, max_edge_m: float) -> Soup:
         halves = np.stack([np.stack([a, middle, c], 1), np.stack([middle, b, c], 1)])
         data = np.concatenate([data[~split], *halves])
         index = np.concatenate([index[~split], index[split], index[split]])
-    return Soup(
-        data[..., :3],
-        data[..., 3:],
-        soup.texture[index],
-        soup.label[index],
-        soup.textures,
-        soup.labels,
-    )
+    corners, uv = data[..., :3], data[..., 3:]
+    return Soup(corners, uv, soup.texture[index], soup.label[index], soup.textures, soup.labels)
 
 
 def _appearance(part: trimesh.Trimesh) -> tuple[Float64, NDArray[np.uint8]]:

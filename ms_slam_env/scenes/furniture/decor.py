@@ -41,18 +41,9 @@ def plant(build: MeshBuilder, rng: Rng, height_m: float, name: str) -> None:
     pot_h = 0.25 * height_m
     r = 0.16 * height_m
     with build.object(f"{name} pot"):
-        build.lathe(
-            [
-                (0.7 * r, 0),
-                (r, pot_h),
-                (r, pot_h),
-                (0.9 * r, pot_h),
-                (0.9 * r, pot_h),
-                (0.88 * r, 0.85 * pot_h),
-            ],
-            glaze(build, rng),
-            20,
-        )
+        rim = [(r, pot_h), (r, pot_h), (0.9 * r, pot_h), (0.9 * r, pot_h)]
+        profile = [(0.7 * r, 0), *rim, (0.88 * r, 0.85 * pot_h)]
+        build.lathe(profile, glaze(build, rng), 20)
         soil = build.material(outdoor.soil(rng), (0.2, 0.2))
         build.lathe([(0.89 * r, 0.85 * pot_h), (0, 0.88 * pot_h)], soil, 20)
     blade = build.material(outdoor.leaf(rng))
@@ -68,10 +59,8 @@ def plant(build: MeshBuilder, rng: Rng, height_m: float, name: str) -> None:
             up = np.concatenate([[0], np.cumsum(np.sin(slope[1:]))]) * length / 5
             out *= min(1.0, 0.42 * height_m / max(out.max(), 1e-6))
             half = wide * np.sin(np.pi * np.clip(0.12 + 0.86 * t, 0, 1)) / 2
-            radial, side = (
-                np.array([np.cos(angle), np.sin(angle), 0]),
-                np.array([-np.sin(angle), np.cos(angle), 0]),
-            )
+            radial = np.array([np.cos(angle), np.sin(angle), 0])
+            side = np.array([-np.sin(angle), np.cos(angle), 0])
             spine = out[:, None] * radial + (up + 0.85 * pot_h)[:, None] * [0, 0, 1]
             fold = 0.25 * half[:, None] * np.array([0, 0, 1.0])
             grid = np.stack(

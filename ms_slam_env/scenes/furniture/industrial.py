@@ -129,12 +129,8 @@ def machine(build: MeshBuilder, rng: Rng, of: Stock, name: str) -> None:
         build.lathe([(0.05, h), (0.05, h + 0.4)], build.plain((60, 60, 60)), 8, (w - 0.2, 0.2, 0))
         for n, colour in enumerate(((60, 190, 80), (230, 180, 40), (210, 50, 40))):
             low = h + 0.4 + 0.1 * n
-            build.lathe(
-                [(0.06, low), (0.06, low + 0.09), (0, low + 0.1)],
-                build.plain(colour),
-                8,
-                (w - 0.2, 0.2, 0),
-            )
+            lamp = [(0.06, low), (0.06, low + 0.09), (0, low + 0.1)]
+            build.lathe(lamp, build.plain(colour), 8, (w - 0.2, 0.2, 0))
 
 
 def column(build: MeshBuilder, of: Stock, height_m: float, name: str) -> None:

@@ -84,12 +84,8 @@ def table(
                 build.box((x, y, 0), (x + leg, y + leg, height_m - thick), material, "zZ")
         if height_m > 0.55:
             for y in (-depth_m + 0.045, -0.06):
-                build.box(
-                    (-half + 0.08, y, height_m - 0.11),
-                    (half - 0.08, y + 0.02, height_m - thick),
-                    material,
-                    "xXZ",
-                )
+                low = (-half + 0.08, y, height_m - 0.11)
+                build.box(low, (half - 0.08, y + 0.02, height_m - thick), material, "xXZ")
 
 
 def place(
@@ -167,13 +163,8 @@ def bookshelf(
             book_row(build, rng, inner * share, step - thick, f"{name} books {k}")
         if share < 1.0:
             with build.frame((half - 0.5 * inner * (1 - share) - thick, -0.03, z)):
-                small_things.ornament(
-                    build,
-                    rng,
-                    0.75 * (step - thick),
-                    0.4 * inner * (1 - share),
-                    f"{name} ornament {k}",
-                )
+                size = 0.75 * (step - thick), 0.4 * inner * (1 - share)
+                small_things.ornament(build, rng, *size, f"{name} ornament {k}")
 
 
 def tv_stand(build: MeshBuilder, rng: Rng, width_m: float) -> float:
@@ -186,18 +177,10 @@ def tv_stand(build: MeshBuilder, rng: Rng, width_m: float) -> float:
         build.box((-half, -depth, 0.06), (half, 0, 0.09), material)
         for low, high in ((-half, -half / 3), (half / 3, half)):
             build.box((low, -depth + 0.005, 0.09), (high, 0, height - 0.03), material, "zZ")
-            build.box(
-                (low + 0.02, -depth - 0.012, 0.11),
-                (high - 0.02, -depth + 0.01, height - 0.05),
-                material,
-                "Y",
-            )
-            middle = (low + high) / 2
-            build.box(
-                (middle - 0.06, -depth - 0.03, height * 0.55),
-                (middle + 0.06, -depth - 0.01, height * 0.55 + 0.015),
-                dark,
-            )
+            front = (high - 0.02, -depth + 0.01, height - 0.05)
+            build.box((low + 0.02, -depth - 0.012, 0.11), front, material, "Y")
+            x, y, z = (low + high) / 2, -depth - 0.03, height * 0.55
+            build.box((x - 0.06, y, z), (x + 0.06, -depth - 0.01, z + 0.015), dark)
         build.quad((-half / 3, -0.03, 0.09), (2 * half / 3, 0, 0), (0, 0, height - 0.12), dark)
         for x in (-half + 0.04, half - 0.08):
             build.box((x, -depth + 0.03, 0), (x + 0.04, -0.03, 0.06), dark, "zZ")
@@ -216,19 +199,12 @@ def drawers(build: MeshBuilder, rng: Rng, width_m: float, height_m: float, name:
         build.box((-half, -depth, 0), (half, 0, height_m), material, "zY")
         for k in range(count):
             z = 0.06 + k * step
-            build.box(
-                (-half + 0.03, -depth - 0.018, z),
-                (half - 0.03, -depth + 0.01, z + step - 0.025),
-                material,
-                "Y",
-            )
+            top = (half - 0.03, -depth + 0.01, z + step - 0.025)
+            build.box((-half + 0.03, -depth - 0.018, z), top, material, "Y")
             for x in (-half / 2, half / 2):
-                build.pillow(
-                    (x - 0.018, -depth - 0.05, z + step / 2 - 0.02),
-                    (x + 0.018, -depth - 0.015, z + step / 2 + 0.016),
-                    knob,
-                    1.0,
-                )
+                low = (x - 0.018, -depth - 0.05, z + step / 2 - 0.02)
+                high = (x + 0.018, -depth - 0.015, z + step / 2 + 0.016)
+                build.pillow(low, high, knob, 1.0)
 
 
 def wall_shelf(build: MeshBuilder, rng: Rng, width_m: float, name: str = "shelf") -> None:

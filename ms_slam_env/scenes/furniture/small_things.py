@@ -86,21 +86,9 @@ def bottle(build: MeshBuilder, rng: Rng, name: str) -> None:
     r, h = rng.uniform(0.033, 0.042), rng.uniform(0.24, 0.31)
     glass = build.plain(hsv(rng.choice([0.3, 0.1, 0.55]), 0.6, rng.uniform(0.15, 0.4)))
     with build.object(name):
-        build.lathe(
-            [
-                (0, 0),
-                (r, 0),
-                (r, 0),
-                (r, 0.6 * h),
-                (0.75 * r, 0.68 * h),
-                (0.36 * r, 0.75 * h),
-                (0.36 * r, h),
-                (0.36 * r, h),
-                (0, h),
-            ],
-            glass,
-            18,
-        )
+        body = [(0, 0), (r, 0), (r, 0), (r, 0.6 * h), (0.75 * r, 0.68 * h)]
+        neck = [(0.36 * r, 0.75 * h), (0.36 * r, h), (0.36 * r, h), (0, h)]
+        build.lathe(body + neck, glass, 18)
         printed_label = build.material(pictures.cover(rng, 128, 256))
         build.lathe([(1.02 * r, 0.15 * h), (1.02 * r, 0.45 * h)], printed_label, 18)
 
@@ -159,19 +147,9 @@ def paper(build: MeshBuilder, rng: Rng, name: str) -> None:
 def pen_pot(build: MeshBuilder, rng: Rng, name: str) -> None:
     """Pot with pens and brushes."""
     with build.object(name):
-        build.lathe(
-            [
-                (0.04, 0),
-                (0.04, 0.1),
-                (0.04, 0.1),
-                (0.036, 0.1),
-                (0.036, 0.1),
-                (0.036, 0.03),
-                (0, 0.03),
-            ],
-            glaze(build, rng),
-            18,
-        )
+        outside = [(0.04, 0), (0.04, 0.1), (0.04, 0.1)]
+        inside = [(0.036, 0.1), (0.036, 0.1), (0.036, 0.03), (0, 0.03)]
+        build.lathe(outside + inside, glaze(build, rng), 18)
         for k in range(int(rng.integers(4, 9))):
             ink = build.plain(hsv(rng.random(), 0.8, 0.7))
             angle, lean = 2.4 * k, rng.uniform(0.05, 0.25)

@@ -28,11 +28,8 @@ def car(build: MeshBuilder, rng: Rng, name: str) -> None:
     colour = hsv(hue, strength, rng.uniform(0.3, 0.9))
     paint = build.material(grain(rng, colour, (128, 128), (0.03, 1.2), (0.02, 0.3)), (1.5, 1.5))
     glass = build.plain((38, 46, 54))
-    dark, light, red = (
-        build.plain((24, 24, 26)),
-        build.plain((240, 240, 230)),
-        build.plain((180, 24, 20)),
-    )
+    colours = ((24, 24, 26), (240, 240, 230), (180, 24, 20))
+    dark, light, red = (build.plain(rgb) for rgb in colours)
     plate = build.material(outdoor.road_sign(rng, f"MS {rng.integers(100, 999)}", (240, 238, 230)))
     upper: Float64 = np.array(
         [(-2.05, 0.72), (-1.9, 0.92), (0.75, 0.94), (1.5, 0.86), (1.95, 0.72), (2.05, 0.55)]

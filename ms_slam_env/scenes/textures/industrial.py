@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ms_slam_env.scenes.base import Rng
-from ms_slam_env.scenes.textures.noise import Image, grain, hsv, noise, shade
+from ms_slam_env.scenes.textures.noise import Image, grain, hsv, noise, shade, write
 
 
 def concrete(rng: Rng, rgb: ArrayLike = (150, 149, 145), size: int = 1024) -> Image:
@@ -72,10 +72,8 @@ def crate(rng: Rng, size: int = 256) -> Image:
     edge = size // 9
     for side in (slice(0, edge), slice(size - edge, size)):
         image[side], image[:, side] = tone * 1.08, tone * 1.04
-    mask = np.zeros((size, size), np.uint8)
     text = f"{rng.integers(10, 99)}-{rng.integers(100, 999)}"
-    cv2.putText(mask, text, (size // 6, int(0.62 * size)), cv2.FONT_HERSHEY_DUPLEX, 1.2, 255, 3)
-    image[mask > 96] = 40
+    write(image, text, (size // 6, int(0.62 * size)), (cv2.FONT_HERSHEY_DUPLEX, 1.2, 3), 40)
     grain = noise(rng, (size, size), 0.9, 10.0)
     return shade(image, (0.09, grain), (0.04, noise(rng, (size, size), 1.3)))
 

@@ -72,22 +72,13 @@ def wallpaper(rng: Rng, rgb: ArrayLike, accent: ArrayLike, size: int = 512) -> I
     else:
         n = int(rng.integers(3, 6))
         cell = size / n
-        petals = int(rng.integers(4, 8))
+        petals, axes = int(rng.integers(4, 8)), (int(cell / 5), int(cell / 14))
         for row in range(-1, 2 * n + 2):
             for column in range(-1, n + 1):
                 centre = (int((column + 0.5 * (row % 2)) * cell), int(row * cell / 2))
                 for k in range(petals):
-                    cv2.ellipse(
-                        mask,
-                        centre,
-                        (int(cell / 5), int(cell / 14)),
-                        360.0 * k / petals,
-                        -30,
-                        200,
-                        255,
-                        -1,
-                        cv2.LINE_AA,
-                    )
+                    turn = 360.0 * k / petals
+                    cv2.ellipse(mask, centre, axes, turn, -30, 200, 255, -1, cv2.LINE_AA)
                 cv2.circle(mask, centre, int(cell / 12), 0, -1, cv2.LINE_AA)
     alpha = (0.65 * mask.astype(np.float32) / 255)[..., None]
     colour = (1 - alpha) * np.asarray(rgb, np.float32) + alpha * np.asarray(accent, np.float32)

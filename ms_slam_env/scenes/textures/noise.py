@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
@@ -63,6 +64,20 @@ def grain(
 ) -> Image:
     """:func:`shade` by fields (h, w) of noise: the amount, exponent and stretch of each."""
     return shade(rgb, *((amount, noise(rng, shape, *how)) for amount, *how in variations))
+
+
+def write(
+    image: NDArray,
+    text: str,
+    at: tuple[int, int],
+    style: tuple[int, float, int],
+    rgb: ArrayLike,
+    line: int = cv2.LINE_8,
+) -> None:
+    """Write on an image (h, w, 3) in place; ``style`` is font, scale and thickness of OpenCV."""
+    mask = np.zeros(image.shape[:2], np.uint8)  # text is drawn on 8 bits only
+    cv2.putText(mask, text, at, style[0], style[1], 255, style[2], line)
+    image[mask > 96] = rgb
 
 
 def hsv(hue: float, saturation: float, value: float) -> NDArray[np.float64]:

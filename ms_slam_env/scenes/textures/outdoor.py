@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ms_slam_env.scenes.base import Rng
-from ms_slam_env.scenes.textures.noise import Image, grain, hsv, noise, shade
+from ms_slam_env.scenes.textures.noise import Image, grain, hsv, noise, shade, write
 
 
 def asphalt(rng: Rng, size: int = 1024) -> Image:
@@ -169,19 +169,9 @@ def road_sign(rng: Rng, text: str, rgb: ArrayLike, size: int = 128) -> Image:
     """A white-rimmed sign with some letters."""
     image = np.full((size // 2, size, 3), 240, np.float32)
     image[4:-4, 4:-4] = np.asarray(rgb, float)
-    mask = np.zeros(image.shape[:2], np.uint8)
-    scale = 0.9 * (size - 24) / max(1, cv2.getTextSize(text, cv2.FONT_HERSHEY_DUPLEX, 1.0, 2)[0][0])
-    cv2.putText(
-        mask,
-        text,
-        (12, int(0.36 * size)),
-        cv2.FONT_HERSHEY_DUPLEX,
-        min(scale, 1.2),
-        255,
-        2,
-        cv2.LINE_AA,
-    )
-    image[mask > 96] = 245
+    font = cv2.FONT_HERSHEY_DUPLEX
+    scale = 0.9 * (size - 24) / max(1, cv2.getTextSize(text, font, 1.0, 2)[0][0])
+    write(image, text, (12, int(0.36 * size)), (font, min(scale, 1.2), 2), 245, cv2.LINE_AA)
     return grain(rng, image, image.shape[:2], (0.03, 0.9))
 
 

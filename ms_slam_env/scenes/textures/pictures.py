@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.scenes.base import Rng
-from ms_slam_env.scenes.textures.noise import Image, grain, hsv, noise
+from ms_slam_env.scenes.textures.noise import Image, grain, hsv, noise, write
 
 _Canvas = NDArray[np.float32]
 
@@ -40,16 +40,8 @@ def _landscape(rng: Rng, h: int, w: int) -> _Canvas:
         x, y = int(rng.uniform(0, w)), int(rng.uniform(0.68, 0.95) * h)
         s = int(h * rng.uniform(0.05, 0.13))
         cv2.line(image, (x, y), (x, y - s), (60, 42, 30), max(1, s // 8))
-        cv2.ellipse(
-            image,
-            (x, y - int(1.4 * s)),
-            (int(0.5 * s), s),
-            0,
-            0,
-            360,
-            hsv(rng.uniform(0.2, 0.38), 0.6, rng.uniform(0.2, 0.5)).tolist(),
-            -1,
-        )
+        crown = hsv(rng.uniform(0.2, 0.38), 0.6, rng.uniform(0.2, 0.5)).tolist()
+        cv2.ellipse(image, (x, y - int(1.4 * s)), (int(0.5 * s), s), 0, 0, 360, crown, -1)
     return image
 
 
@@ -127,17 +119,9 @@ def _flowers(rng: Rng, h: int, w: int) -> _Canvas:
             at = (int(head[0] + r * np.cos(angle)), int(head[1] + r * np.sin(angle)))
             cv2.circle(image, at, int(0.62 * r), (colour * rng.uniform(0.8, 1)).tolist(), -1)
         cv2.circle(image, tuple(head.tolist()), r // 2, (230, 190, 60), -1, cv2.LINE_AA)
-    cv2.ellipse(
-        image,
-        (w // 2, int(0.82 * h)),
-        (int(0.11 * w), int(0.15 * h)),
-        0,
-        0,
-        360,
-        hsv(hue + 0.5, 0.4, 0.5).tolist(),
-        -1,
-        cv2.LINE_AA,
-    )
+    middle, axes = (w // 2, int(0.82 * h)), (int(0.11 * w), int(0.15 * h))
+    vase = hsv(hue + 0.5, 0.4, 0.5).tolist()
+    cv2.ellipse(image, middle, axes, 0, 0, 360, vase, -1, cv2.LINE_AA)
     return image
 
 
@@ -169,10 +153,8 @@ def _text(
     colour: NDArray[np.float64],
     font: int,
 ) -> None:
-    mask = np.zeros(image.shape[:2], np.uint8)  # text is drawn on 8 bits only
-    thickness = max(1, height // 10)
-    cv2.putText(mask, text, at, font, height / 22.0, 255, thickness, cv2.LINE_AA)
-    image[mask > 96] = colour
+    style = (font, height / 22.0, max(1, height // 10))
+    write(image, text, at, style, colour, cv2.LINE_AA)
 
 
 def book_colour(rng: Rng) -> NDArray[np.float64]:
@@ -202,14 +184,8 @@ def spines(rng: Rng, size: tuple[int, int] = (256, 512)) -> Image:
             x = int(rng.uniform(0.1, 0.5) * h)
             spine[:, x : x + h // 4] = book_colour(rng)
         title = f"{_word(rng)} {_word(rng)}"
-        _text(
-            spine,
-            title,
-            (int(rng.uniform(0.06, 0.3) * h), int(0.68 * slot)),
-            int(slot * rng.uniform(0.35, 0.6)),
-            ink,
-            _FONTS[rng.integers(3)],
-        )
+        at = (int(rng.uniform(0.06, 0.3) * h), int(0.68 * slot))
+        _text(spine, title, at, int(slot * rng.uniform(0.35, 0.6)), ink, _FONTS[rng.integers(3)])
         cv2.circle(spine, (int(0.93 * h), slot // 2), slot // 5, ink.tolist(), -1, cv2.LINE_AA)
         rounded = 1.0 - 0.35 * np.abs(np.linspace(-1, 1, slot, dtype=np.float32)) ** 3
         sheet[:, k * slot : (k + 1) * slot] = np.rot90(spine * rounded[:, None, None], -1)
