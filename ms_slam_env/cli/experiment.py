@@ -35,7 +35,7 @@ def run(cls: type[Experiment], arguments: Sequence[str], program: str, out: Path
     """Parse the options of an experiment, run it into ``out`` or where they say, print tables."""
     args: Any = parse(with_run_options(cls, out), arguments, program)
     if args.check:
-        return check(cls, args.against)
+        return check(cls, args.committed)
     own = {field.name: getattr(args, field.name) for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
     outcome = run_experiment(cls(**own), args.out, args.workers, args.ray)
     print(outcome.results.as_markdown())
@@ -61,12 +61,19 @@ def with_run_options(cls: type[Experiment], out: Path) -> type[Any]:
         ("out", Path, "Folder of the results; what it holds already is not run again.", out),
         ("ray", str | None, "Address of a Ray cluster whose workers run the rows, or local.", None),
         ("check", bool, "Run some committed rows again and compare.", False),
-        ("against", Path, "Folder of the committed results.", committed_results(name)),
+        (
+            "committed",
+            Path,
+            "Folder of the results that --check compares.",
+            committed_results(name),
+        ),
     ]
     fields = [
         (key, Annotated[kind, tyro.conf.arg(help=text)], dataclasses.field(default=default))
         for key, kind, text, default in options
     ]
+    own = {field.name for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    assert own.isdisjoint(key for key, *_ in options), f"{name} has an option that all have"
     made = dataclasses.make_dataclass(cls.__name__, fields, bases=(cls,), frozen=True)
     made.__doc__ = cls.__doc__
     return made

@@ -53,13 +53,10 @@ Float64 = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class AdaptationSpec:
-    """One sequence, run by every competitor.
+    """One sequence, run by every competitor; see :class:`Adaptation` for the other fields.
 
     Attributes:
-        scene: a scene's name or a mesh file.
         seed: of the scene, the path and the sensor noise.
-        stretches: how the camera is carried.
-        image_size: of the camera, width x height.
         adaptation: what is compared with each of its configurations.
     """
 
@@ -165,8 +162,9 @@ def competitors(
 ) -> dict[str, SlamBackend]:
     """Each configuration alone, the default ones with every frame, and the adaptation, last."""
     given = adaptation.resolved(intrinsics)
-    also = [one for one in ALSO if _width(one) <= intrinsics.width]
-    fixed = {describe(one): one for one in (*given, *also)}
+    sizes = [XTION_SIZES[one.image_size] if one.image_size else (0, 0) for one in ALSO]
+    also = [one for one, size in zip(ALSO, sizes, strict=True) if size[0] <= intrinsics.width]
+    fixed = {str(one): one for one in (*given, *also)}
     alone = {
         name: AgentConfig(configurations=(one, one), start=0).adapt(slam.make("surfel", intrinsics))
         for name, one in fixed.items()
@@ -174,23 +172,6 @@ def competitors(
     # The same without the first change of configuration, which is from the default to the first.
     adaptive = replace(adaptation, configurations=given).adapt(slam.make("surfel", intrinsics))
     return {**alone, ADAPTIVE: adaptive}
-
-
-def _width(configuration: SlamConfiguration) -> int:
-    """Columns that frames are reduced to; 0 for as they come."""
-    size = configuration.image_size
-    return 0 if size is None else XTION_SIZES[size][0]
-
-
-def describe(configuration: SlamConfiguration) -> str:
-    """A configuration in a few words: image size, iterations and the like, share of frames."""
-    parts = [configuration.image_size or "full size"]
-    for key, value in configuration.slam_config.items():
-        is_list = isinstance(value, (tuple, list))
-        text = "-".join(map(str, value)) if is_list else str(value)
-        parts.append(f"{text} {key.replace('_', ' ').replace(' per level', '')}")
-    every = configuration.keep_every
-    return ", ".join([*parts, "every frame" if every == 1 else f"one frame in {every}"])
 
 
 def judge(

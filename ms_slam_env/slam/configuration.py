@@ -52,6 +52,16 @@ class SlamConfiguration(Checked):
         if self.image_size is not None and self.image_size not in tuple(XTION_SIZES):
             raise unknown("image_size", self.image_size, XTION_SIZES)
 
+    def __str__(self) -> str:
+        """In a few words: image size, iterations and the like, share of the frames."""
+        parts = [self.image_size or "full size"]
+        for key, value in self.slam_config.items():
+            is_list = isinstance(value, (tuple, list))
+            text = "-".join(map(str, value)) if is_list else str(value)
+            parts.append(f"{text} {key.replace('_', ' ').replace(' per level', '')}")
+        every = self.keep_every
+        return ", ".join([*parts, "every frame" if every == 1 else f"one frame in {every}"])
+
 
 def make(name: str | Path, intrinsics: Intrinsics, **params: Any) -> SlamBackend:
     """Make the SLAM backend ``name`` for a camera.
