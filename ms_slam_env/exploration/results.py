@@ -202,7 +202,7 @@ class Explored:
             x if are_numbers else [str(value) for value in x],
             self._values(own, error),
             mode="markers",
-            text=[_description(point) for point in own],
+            text=[f"trial {point.number}" for point in own],
         )
         shown = "parameter_value" if are_numbers else ""
         return Panel(shown, key_of(error, self.clock), [series], "y", title=parameter)
