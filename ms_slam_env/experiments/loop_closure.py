@@ -6,35 +6,32 @@ Each is run twice, with loop closure and without.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ms_slam_env import scenes
 from ms_slam_env.camera import xtion
 from ms_slam_env.config import from_dict, nested_options
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.evaluation.loop_closures import Closure, judge_closure
 from ms_slam_env.evaluation.map_quality import map_quality
 from ms_slam_env.experiments.harness.experiment import Experiment
-from ms_slam_env.experiments.pictures.loop_maps import MapView, save_picture
-from ms_slam_env.geometry import invert, relative_angle
+from ms_slam_env.experiments.pictures.loop_maps import MapView, map_view, save_picture
+from ms_slam_env.geometry import invert
 from ms_slam_env.geometry.point_clouds import voxel_downsample
 from ms_slam_env.metrics import ate_rmse, path_length
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Table, finished, make_table
-from ms_slam_env.scenes import Scene
+from ms_slam_env.report.tables import Table, finished, make_table, summary
 from ms_slam_env.sensor import NoiseConfig
-from ms_slam_env.sequences import HandheldPath, render_sequence
-from ms_slam_env.sequences.loop_paths import along_corridor, around_room
+from ms_slam_env.sequences import render_sequence
+from ms_slam_env.sequences.loop_paths import PATHS, returning_path
 from ms_slam_env.slam.surfel import SurfelConfig
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
-
-Float64 = NDArray[np.float64]
 
 VARIANTS = ("none", "deformation")
 DEFAULT_RECORDINGS = (
@@ -54,15 +51,11 @@ METRICS = (
     *("map_error_capped_rms_m", "lost_frames", "surfels", "cpu_ms_mean", "cpu_ms_max"),
     *("closed_loops", "wrong_closures"),
 )
+GAPS = ("before_m", "after_m")  # between new and old map
 NOISES: dict[str, str | NoiseConfig] = {
     "kinect": "kinect",
-    "coarse": NoiseConfig(axial=2.0, lateral=1.5),
+    "coarse": NoiseConfig(axial=2.0, lateral=1.5),  # times that of a Kinect
 }
-"""``coarse``: twice the axial and 1.5 times the lateral noise of a Kinect."""
-PATHS = ("around", "corridor", "handheld")
-HANDHELD_FRAMES = 600
-WRONG_M, WRONG_DEG = 0.05, 3.0
-"""A closure is wrong if it leaves new and old map further apart than this."""
 _WARM_UP = 5  # frames left out of the timing
 
 
@@ -121,54 +114,106 @@ class LoopClosure(Experiment):
 
     @staticmethod
     def run(spec: LoopSpec) -> dict[str, Any]:
-        """One recording through the SLAM."""
-        return run_loop(spec)
+        """Run one recording through the SLAM."""
+        scene = scenes.make(spec.scene, spec.seed)
+        truth = returning_path(scene, spec.path, spec.seed, spec.step_m, spec.step_deg)
+        camera = xtion(spec.size)
+        sequence = render_sequence(scene, truth, camera, NOISES[spec.noise], spec.seed)
+        options = from_dict(SurfelConfig, spec.options, "options")
+        config = replace(options, loop_closure=spec.closure)
+        system = BatchedSurfelSlam(1, camera, config)
+        system.reset(truth[0])
+        estimate, spent, lost = np.empty_like(truth), [], 0
+        closures: list[Closure] = []
+        views: tuple[MapView, MapView] | None = None
+        for k, frame in enumerate(sequence.frames):
+            past = system.loops.trajectory(0)
+            is_due = bool(spec.picture) and not views and k % config.loops.interval == 0
+            before = map_view(system, k) if is_due else None
+            previous = system.poses[0].copy()
+            start = time.process_time()
+            result = system.track(frame.color[None], frame.depth[None])[0]
+            spent.append(1000 * (time.process_time() - start))
+            estimate[k] = result.T_world_camera
+            lost += not result.tracking_ok
+            if result.loop_closed:
+                # Without the closure the camera had gone on as it truly did.
+                unclosed = previous @ invert(truth[k - 1]) @ truth[k]
+                window = config.loops.window
+                closures.append(judge_closure(k, past, truth, unclosed, estimate[k], window))
+                if before is not None:
+                    views = (before, map_view(system, k))
+        if views:
+            save_picture(views, scene, truth[closures[0].frame], Path(spec.picture), spec.name())
+        frames, bent = system.loops.trajectory(0)
+        final = estimate.copy()
+        final[frames] = bent
+        surface = voxel_downsample(scene.surface_points(0.01)[0], 0.01)
+        error_m = np.linalg.norm(estimate[:, :3, 3] - truth[:, :3, 3], axis=1)
+        return {
+            "frames": len(truth),
+            "path_m": path_length(truth),
+            "ate_unaligned_m": ate_rmse(estimate, truth, align="none"),
+            "ate_m": ate_rmse(estimate, truth),
+            "final_ate_unaligned_m": ate_rmse(final, truth, align="none"),
+            "final_ate_m": ate_rmse(final, truth),
+            "end_error_m": float(error_m[-1]),
+            "largest_error_m": float(error_m.max()),
+            **map_quality(system.map.points(stable=False), surface, ("map_error_capped_rms_m",)),
+            "lost_frames": lost,
+            "closed_loops": len(closures),
+            "closures": [asdict(closure) for closure in closures],
+            "wrong_closures": sum(closure.is_wrong for closure in closures),
+            "cpu_ms_mean": float(np.mean(spent[_WARM_UP:])),
+            "cpu_ms_median": float(np.median(spent[_WARM_UP:])),
+            "cpu_ms_max": float(np.max(spent[_WARM_UP:])),
+            "surfels": system.map.count(),
+        }
 
     def specs(self) -> list[LoopSpec]:
         """Every run."""
         options = nested_options(self.options)
         from_dict(SurfelConfig, options, "options")  # refuse bad ones before anything runs
-        runs = []
-        for size in self.sizes:
-            for number, text in enumerate(self.recordings):
-                for closure in VARIANTS:
-                    shown = ""
-                    if self.pictures is not None and closure != "none":
-                        shown = str(self.pictures / f"{number:02d}_{size}.png")
-                    runs.append(LoopSpec(*_parse(text), size, closure, options, shown))
-        return runs
+        return [
+            LoopSpec(*_parse(text), size, closure, options, shown if closure != "none" else "")
+            for size in self.sizes
+            for number, text in enumerate(self.recordings)
+            for shown in (str(self.pictures / f"{number:02d}_{size}.png") if self.pictures else "",)
+            for closure in VARIANTS
+        ]
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
         """One line a run, and medians over the recordings that both variants finished."""
         lines: list[dict[str, Any]] = [
             {"sequence": LoopSpec(**row["spec"]).name(), "image_size": row["spec"]["size"],
-             "loop_closure": row["spec"]["closure"], **_gaps(row["result"]),
+             "loop_closure": row["spec"]["closure"], **_medians(row["result"]["closures"], GAPS),
              **{key: row["result"][key] for key in METRICS}}
             for row in finished(rows)
         ]  # fmt: skip
-        columns = ["sequence", "image_size", "loop_closure", *METRICS, "before_m", "after_m"]
+        columns = ["sequence", "image_size", "loop_closure", *METRICS, *GAPS]
         pairs = pairs_of(rows)
         medians: list[dict[str, Any]] = [
-            {"loop_closure": variant, "recordings": len(pairs), **_medians(pairs, variant)}
+            {
+                "loop_closure": variant,
+                "recordings": len(pairs),
+                **_medians([p[variant] for p in pairs], METRICS),
+            }
             for variant in VARIANTS
-        ]
+        ]  # fmt: skip
         wins = {key: sum(p["deformation"][key] < p["none"][key] for p in pairs) for key in METRICS}
         note = "Medians over the recordings that both variants finished. Lower with loop closure: "
         note += ", ".join(f"{key} {count} of {len(pairs)}" for key, count in wins.items()) + "."
-        summary = make_table(["loop_closure", "recordings", *METRICS], medians, "Medians", note)
-        return [summary, make_table(columns, lines, "Every recording")]
+        first = make_table(["loop_closure", "recordings", *METRICS], medians, "Medians", note)
+        return [first, make_table(columns, lines, "Every recording")]
 
     def charts(self, rows: Sequence[Row]) -> list[Chart]:
         """Error with loop closure against error without."""
         pairs = pairs_of(rows)
-        panels = []
+        numbers, panels = list(range(1, len(pairs) + 1)), []
         for key in ("ate_m", "map_error_capped_rms_m"):
-            bars = [
-                Series(name, list(range(1, len(pairs) + 1)), [p[name][key] for p in pairs],
-                       mode="markers")
-                for name in VARIANTS
-            ]  # fmt: skip
-            panels.append(Panel("recordings", key, bars))
+            values = {name: [pair[name][key] for pair in pairs] for name in VARIANTS}
+            marks = [Series(name, numbers, y, mode="markers") for name, y in values.items()]
+            panels.append(Panel("recordings", key, marks))
         return [Chart("loop_closure", "Error by recording", "One mark a run.", panels)]
 
 
@@ -181,17 +226,9 @@ def pairs_of(rows: Sequence[Row]) -> list[dict[str, Row]]:
     return [pair for pair in results.values() if len(pair) == len(VARIANTS)]
 
 
-def _medians(pairs: Sequence[dict[str, Row]], variant: str) -> dict[str, float]:
-    return {key: float(np.median([p[variant][key] for p in pairs])) for key in METRICS if pairs}
-
-
-def _gaps(result: Row) -> dict[str, float | None]:
-    """Median gap between new and old map before and after the closures."""
-    return {
-        key: float(np.median([closure[key] for closure in result["closures"]]))
-        if result["closures"] else None
-        for key in ("before_m", "after_m")
-    }  # fmt: skip
+def _medians(results: Iterable[Row], keys: Sequence[str]) -> dict[str, float]:
+    results = list(results)
+    return {key: summary(results, key).value for key in keys}
 
 
 def _parse(text: str) -> tuple[str, int, str, float, float, str]:
@@ -204,137 +241,10 @@ def _parse(text: str) -> tuple[str, int, str, float, float, str]:
     if len(parts) != 6:
         raise InputError(f"recording {text!r} must be scene:seed:path:step_m:step_deg:noise")
     scene, seed, path, step_m, step_deg, noise = parts
-    if path not in PATHS:
-        raise unknown("path", path, PATHS)
-    if noise not in NOISES:
-        raise unknown("noise", noise, NOISES)
+    for kind, value, choices in (("path", path, PATHS), ("noise", noise, tuple(NOISES))):
+        if value not in choices:
+            raise unknown(kind, value, choices)
     try:
         return scene, int(seed), path, float(step_m), float(step_deg), noise
     except ValueError:
         raise InputError(f"recording {text!r}: seed and steps must be numbers") from None
-
-
-def camera_path(scene: Scene, spec: LoopSpec) -> Float64:
-    """Poses (N, 4, 4) of the recording.
-
-    Raises:
-        InputError: an unknown path, or none in this scene.
-    """
-    if spec.path == "around":
-        return around_room(scene, spec.seed, spec.step_m, spec.step_deg)
-    if spec.path == "corridor":
-        return along_corridor(scene, spec.seed, spec.step_m, spec.step_deg)
-    if spec.path == "handheld":
-        pace = HandheldPath(
-            frames=HANDHELD_FRAMES, max_step_m=spec.step_m, max_turn_deg=spec.step_deg, loop=True
-        )
-        return pace.poses(scene, spec.seed)
-    raise unknown("path", spec.path, PATHS)
-
-
-@dataclass(frozen=True)
-class Closure:
-    """One closed loop: how far new and old map were apart before and after, and when."""
-
-    frame: int
-    before_m: float
-    before_deg: float
-    after_m: float
-    after_deg: float
-
-    @property
-    def is_wrong(self) -> bool:
-        """Whether they do not fit after it."""
-        return self.after_m > WRONG_M or self.after_deg > WRONG_DEG
-
-
-def run_loop(spec: LoopSpec) -> dict[str, Any]:
-    """Run one recording; errors in metres, processor time in milliseconds."""
-    scene = scenes.make(spec.scene, spec.seed)
-    truth = camera_path(scene, spec)
-    camera = xtion(spec.size)
-    sequence = render_sequence(scene, truth, camera, NOISES[spec.noise], spec.seed)
-    config = from_dict(SurfelConfig, spec.options, "options")
-    config = replace(config, loop_closure=spec.closure)
-    system = BatchedSurfelSlam(1, camera, config)
-    system.reset(truth[0])
-    estimate, spent, lost = np.empty_like(truth), [], 0
-    closures: list[Closure] = []
-    views: tuple[MapView, MapView] | None = None
-    for k, frame in enumerate(sequence.frames):
-        past = system.loops.trajectory(0)
-        is_due = bool(spec.picture) and not views and k % config.loops.interval == 0
-        before = _map_view(system, k) if is_due else None
-        previous = system.poses[0].copy()
-        start = time.process_time()
-        result = system.track(frame.color[None], frame.depth[None])[0]
-        spent.append(1000 * (time.process_time() - start))
-        estimate[k] = result.T_world_camera
-        lost += not result.tracking_ok
-        if result.loop_closed:
-            # Without the closure the camera had gone on as it truly did.
-            unclosed = previous @ invert(truth[k - 1]) @ truth[k]
-            closures.append(_judge(k, past, truth, unclosed, estimate[k], config.loops.window))
-            if before is not None:
-                views = (before, _map_view(system, k))
-    if views:
-        save_picture(views, scene, truth[closures[0].frame], Path(spec.picture), spec.name())
-    frames, bent = system.loops.trajectory(0)
-    final = estimate.copy()
-    final[frames] = bent
-    surface = voxel_downsample(scene.surface_points(0.01)[0], 0.01)
-    points = system.map.points(stable=False)
-    error_m = np.linalg.norm(estimate[:, :3, 3] - truth[:, :3, 3], axis=1)
-    return {
-        "frames": len(truth),
-        "path_m": path_length(truth),
-        "ate_unaligned_m": ate_rmse(estimate, truth, align="none"),
-        "ate_m": ate_rmse(estimate, truth),
-        "final_ate_unaligned_m": ate_rmse(final, truth, align="none"),
-        "final_ate_m": ate_rmse(final, truth),
-        "end_error_m": float(error_m[-1]),
-        "largest_error_m": float(error_m.max()),
-        **map_quality(points, surface, ("map_error_capped_rms_m",)),
-        "lost_frames": lost,
-        "closed_loops": len(closures),
-        "closures": [asdict(closure) for closure in closures],
-        "wrong_closures": sum(closure.is_wrong for closure in closures),
-        "cpu_ms_mean": float(np.mean(spent[_WARM_UP:])),
-        "cpu_ms_median": float(np.median(spent[_WARM_UP:])),
-        "cpu_ms_max": float(np.max(spent[_WARM_UP:])),
-        "surfels": system.map.count(),
-    }
-
-
-def _judge(
-    frame: int,
-    past: tuple[NDArray[np.int32], Float64],
-    truth: Float64,
-    unclosed: Float64,
-    closed: Float64,
-    window: int,
-) -> Closure:
-    """Compare the poses before and after a closure with where the old map says the camera is.
-
-    That is the true motion from the nearest old frame, applied to its estimate.
-    """
-    frames, poses = past
-    old = frames < frame - window
-    frames, poses = frames[old], poses[old]
-    motions = invert(truth[frames]) @ truth[frame]
-    cosines = np.clip((np.trace(motions[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1)
-    nearest = int((np.linalg.norm(motions[:, :3, 3], axis=1) + np.arccos(cosines)).argmin())
-    ideal = poses[nearest] @ motions[nearest]
-    return Closure(frame, *_apart(ideal, unclosed), *_apart(ideal, closed))
-
-
-def _apart(a: Float64, b: Float64) -> tuple[float, float]:
-    distance = float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
-    return distance, float(np.degrees(relative_angle(a[:3, :3], b[:3, :3])))
-
-
-def _map_view(system: BatchedSurfelSlam, frame: int) -> MapView:
-    surfel_map = system.map
-    points = surfel_map.points(stable=False)
-    created = surfel_map.attribute("created", stable=False)
-    return MapView(points, (frame - created).astype(np.int32))

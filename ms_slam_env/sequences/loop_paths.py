@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from ms_slam_env.errors import InputError
+from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.geometry import Float64, look_at
 from ms_slam_env.scenes.base import Scene
+from ms_slam_env.sequences.paths import HandheldPath
 from ms_slam_env.sequences.paths.base import frame_times
 
 HEIGHT_M = 1.3
 CLEARANCE_M = 0.35  # free space kept around the camera
 STARTS = 64  # places tried for the middle of a room
+PATHS = ("around", "corridor", "handheld")
+HANDHELD_FRAMES = 600
 OVERLAP_TURNS = 0.3  # how far a path goes on over ground that it has seen
 
 
@@ -84,3 +87,20 @@ def _at_speed(eyes: Float64, gaze: Float64, step_m: float, step_deg: float) -> F
     at = np.arange(0.0, frames[-1])
     columns = [np.interp(at, frames, column) for column in np.hstack([eyes, gaze]).T]
     return np.stack([look_at(row[:3], row[:3] + row[3:]) for row in np.stack(columns, axis=1)])
+
+
+def returning_path(scene: Scene, path: str, seed: int, step_m: float, step_deg: float) -> Float64:
+    """Poses (N, 4, 4) of the path of a name, one of `PATHS`, ``handheld`` being a loop of its kind.
+
+    Raises:
+        InputError: an unknown path, or none in this scene.
+    """
+    if path == "around":
+        return around_room(scene, seed, step_m, step_deg)
+    if path == "corridor":
+        return along_corridor(scene, seed, step_m, step_deg)
+    if path == "handheld":
+        return HandheldPath(
+            frames=HANDHELD_FRAMES, max_step_m=step_m, max_turn_deg=step_deg, loop=True
+        ).poses(scene, seed)
+    raise unknown("path", path, PATHS)

@@ -23,7 +23,7 @@ from ms_slam_env.report.records import Row
 from ms_slam_env.report.results import read_results
 from ms_slam_env.report.tables import Grouping, Table
 
-LONGEST = 350  # lines of an experiment
+LONGEST = 250  # lines of an experiment
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,10 @@ import pytest
 from ms_slam_env import scenes
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
-from ms_slam_env.experiments.loop_closure import LoopClosure, LoopSpec, _judge, camera_path
+from ms_slam_env.evaluation.loop_closures import judge_closure
+from ms_slam_env.experiments.loop_closure import LoopClosure, LoopSpec
 from ms_slam_env.geometry import make_pose, relative_angle, so3_exp
+from ms_slam_env.sequences.loop_paths import returning_path
 
 SPEC = LoopSpec("living_room", 1002, "around", 0.06, 5.0, "kinect", "160x120", "deformation")
 
@@ -20,8 +22,7 @@ SPEC = LoopSpec("living_room", 1002, "around", 0.06, 5.0, "kinect", "160x120", "
 @pytest.mark.parametrize(("scene", "path"), [("living_room", "around"), ("corridor", "corridor")])
 def test_paths_keep_their_limits_and_come_back(scene: str, path: str) -> None:
     world = scenes.make(scene, 1001)
-    spec = LoopSpec(scene, 1001, path, 0.05, 4.0, "kinect", "160x120", "none")
-    poses = camera_path(world, spec)
+    poses = returning_path(world, path, 1001, 0.05, 4.0)
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     turns = [
         relative_angle(a, b) for a, b in zip(poses[:-1, :3, :3], poses[1:, :3, :3], strict=True)
@@ -35,7 +36,7 @@ def test_paths_keep_their_limits_and_come_back(scene: str, path: str) -> None:
         for T in later
     ]
     assert min(back) < 0.3
-    np.testing.assert_array_equal(poses, camera_path(world, spec))
+    np.testing.assert_array_equal(poses, returning_path(world, path, 1001, 0.05, 4.0))
 
 
 def test_a_closure_is_judged_by_the_old_map() -> None:
@@ -45,7 +46,7 @@ def test_a_closure_is_judged_by_the_old_map() -> None:
     drifted = make_pose(np.eye(3), [0.03, 0.0, 0.04]) @ ideal
     turned = ideal @ make_pose(so3_exp([0, np.radians(4.0), 0]), [0, 0, 0])
     past = np.arange(63, dtype=np.int32), old_error @ truth[:63]
-    closure = _judge(63, past, truth, drifted, turned, 20)
+    closure = judge_closure(63, past, truth, drifted, turned, 20)
     assert closure.before_m == pytest.approx(0.05)
     assert closure.before_deg == pytest.approx(0.0, abs=1e-6)
     assert closure.after_deg == pytest.approx(4.0)

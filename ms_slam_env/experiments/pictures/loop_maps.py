@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.report.figures import caption, new_figure, save
 from ms_slam_env.scenes import Scene
+from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
 
 Float64 = NDArray[np.float64]
 
@@ -26,6 +27,14 @@ class MapView:
 
     points: Float64
     age: NDArray[np.int32]
+
+
+def map_view(system: BatchedSurfelSlam, frame: int) -> MapView:
+    """All points of a map as of a frame."""
+    surfel_map = system.map
+    points = surfel_map.points(stable=False)
+    created = surfel_map.attribute("created", stable=False)
+    return MapView(points, (frame - created).astype(np.int32))
 
 
 def save_picture(
