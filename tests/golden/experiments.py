@@ -211,12 +211,12 @@ def arm_experiment(_: Path) -> Any:
 
 @experiment("arm_masks")
 def arm_mask_walk(_: Path) -> Any:
-    from ms_slam_env.benchmark import arm_masks
+    from ms_slam_env.experiments import arm_masks
     from ms_slam_env.experiments.harness.arm_truth import furniture_cloud
 
     coarse = furniture_cloud(_scene("carpet", 1000), spacing_m=0.04)  # quick to prepare
     with patch.object(arm_masks, "furniture_of", lambda *_: coarse):
-        found = arm_masks.run_walk(arm_masks.WalkSpec("carpet", 1000, states=1, moves=1))
+        found = arm_masks.ArmMasks.run(arm_masks.WalkSpec("carpet", 1000, states=1, moves=1))
     reasons = Counter(found["cases"].pop("reason"))
     return {**found, "reasons": dict(sorted(reasons.items()))}
 

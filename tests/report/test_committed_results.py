@@ -15,7 +15,6 @@ PATHS = sorted(FOLDER.rglob("*.json"))
 
 NOT_CONVERTED = {
     "adaptation",
-    "arm_masks",
     "env_speed",
     "frame_management",
     "frame_management_steady",

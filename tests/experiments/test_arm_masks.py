@@ -1,16 +1,15 @@
 """The mask experiment: its summary from cases of known content, and one real walk."""
 
-import json
-
 import numpy as np
 import pytest
 
 from ms_slam_env import scenes
-from ms_slam_env.benchmark import arm_masks
-from ms_slam_env.benchmark.arm_masks import Arguments, WalkSpec, main, run_walk
-from ms_slam_env.benchmark.arm_masks_report import as_markdown, summarise
 from ms_slam_env.errors import InputError
+from ms_slam_env.experiments import arm_masks
+from ms_slam_env.experiments.arm_masks import ArmMasks, WalkSpec
 from ms_slam_env.experiments.harness.arm_truth import furniture_cloud
+from ms_slam_env.experiments.harness.mask_tables import mask_tables
+from ms_slam_env.metrics.registry import check_keys
 
 # reason, reached, stopped, gap_m, touches_itself: right where allowed and possible agree
 CASES = [
@@ -23,7 +22,7 @@ CASES = [
     ("furniture", True, False, -0.01, False),  # right: it went through
     ("joint limit", True, False, 0.05, False),  # wrong: it can
 ]
-AT_REST = ("sag_m", "offset_m", "kinematic_m", "kinematic_rad")
+AT_REST = ("sag_m", "offset_at_rest_m", "kinematic_m", "kinematic_rad")
 
 
 def row(scene, seed, cases):
@@ -34,7 +33,7 @@ def row(scene, seed, cases):
         "error": None,
         "result": {
             "cases": {
-                "state": [0] * count,
+                "stop": [0] * count,
                 "action": list(range(1, count + 1)),
                 "reason": list(reason),
                 "reached": list(reached),
@@ -44,7 +43,7 @@ def row(scene, seed, cases):
                 "error_m": [0.001] * count,
                 "error_rad": [0.01] * count,
             },
-            "states": {
+            "stops": {
                 **{name: [0.002, 0.004] for name in AT_REST},
                 "sees_itself": [False, False],
             },
@@ -52,35 +51,30 @@ def row(scene, seed, cases):
     }
 
 
-def test_summary():
-    summary = summarise([row("table", 1000, CASES), row("wall", 1000, CASES[:2])])
-    table, everywhere = summary["masks"]["table"], summary["masks"]["all"]
-    assert table["cases"] == 8
-    assert table["allowed"]["value"] == 5 / 8
-    assert table["right"]["value"] == 4 / 8
-    assert table["wrong_of_allowed"]["value"] == 3 / 5
-    assert table["wrong_of_forbidden"]["value"] == 1 / 3
-    assert summary["masks"]["wall"]["right"]["value"] == 1
-    assert everywhere["right"]["value"] == everywhere["right_over_walks"]["value"] == 6 / 10
-    assert (everywhere["right_over_walks"]["low"], everywhere["right_over_walks"]["high"]) == (
-        0.5,
-        1,
-    )
-    assert summary["reasons"]["furniture"]["right"]["value"] == 1
-    assert summary["reasons"]["joint limit"]["right"]["value"] == 0
-    assert "unreachable" not in summary["reasons"]
-    assert summary["wrongly_allowed"] == {
+def test_tables():
+    rows = [row("table", 1000, CASES), row("wall", 1000, CASES[:2])]
+    masks, reasons, causes, errors = mask_tables(rows)
+    table, wall, everywhere = masks.rows
+    assert table["motions"] == 8
+    assert table["mask_allows"].value == 5 / 8
+    assert table["mask_right"].value == 4 / 8
+    assert table["wrong_of_allowed"].value == 3 / 5
+    assert table["wrong_of_forbidden"].value == 1 / 3
+    assert wall["mask_right"].value == 1
+    assert everywhere["mask_right"].value == 6 / 10
+    by_walks = everywhere["mask_right_by_walks"]
+    assert (by_walks.value, by_walks.low, by_walks.high) == (6 / 10, 0.5, 1)
+    right = {line["reason"]: line["mask_right"].value for line in reasons.rows}
+    assert right == {"ok": 4 / 7, "furniture": 1, "joint limit": 0}
+    assert {line["cause"]: line["motions"] for line in causes.rows} == {
         "not followed": 0,
         "protective stop": 1,
         "touched furniture": 1,
         "touched itself": 1,
     }
-    sag = summary["errors"]["camera below its command at rest (sag) [mm]"]
-    assert (sag["count"], sag["median"]) == (4, pytest.approx(3))
-    assert summary["sees_itself"]["value"] == 0
-    text = as_markdown(summary)
-    assert "| table | 1 | 8 |" in text
-    assert "| joint limit | 1 | 0 " in text
+    (sag,) = [line for line in errors.rows if "sag" in line["error_kind"]]
+    assert (sag["values"], sag["median_m"]) == (4, pytest.approx(0.003))
+    assert "view at 0 % of stops" in masks.note
 
 
 @pytest.mark.parametrize(
@@ -95,7 +89,7 @@ def test_summary():
 )
 def test_bad_input(fields, reason):
     with pytest.raises(InputError, match=reason):
-        Arguments(**fields).specs()
+        ArmMasks(**fields).specs()
 
 
 SPEC = WalkSpec("carpet", 1000, states=1, moves=1)
@@ -109,31 +103,20 @@ def walk():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(arm_masks.scene_library, "make", lambda name, seed: scene)
         patch.setattr(arm_masks, "furniture_of", lambda name, seed: cloud)
-        return run_walk(SPEC), run_walk(SPEC)
+        return ArmMasks.run(SPEC), ArmMasks.run(SPEC)
 
 
 def test_a_walk_attempts_every_motion(walk):
     cases = {name: np.array(values) for name, values in walk[0]["cases"].items()}
     assert (cases["action"] == np.arange(49)).all()
-    assert (cases["state"] == 0).all()
+    assert (cases["stop"] == 0).all()
+    check_keys(walk[0])
     allowed = cases["reason"] == "ok"
     assert allowed[0]  # standing still is always possible
     assert cases["reached"][allowed].mean() > 0.9
     assert (cases["error_m"] < 0.02).all()
-    assert all(len(column) == 1 for column in walk[0]["states"].values())
+    assert all(len(column) == 1 for column in walk[0]["stops"].values())
 
 
 def test_a_walk_can_be_repeated(walk):
     assert walk[0] == walk[1]
-
-
-def test_command(walk, tmp_path, capsys, monkeypatch):
-    def run_all(specs, run, out, workers, description):
-        return [{"spec": vars(spec), "result": walk[0], "error": None} for spec in specs]
-
-    monkeypatch.setattr(arm_masks, "run_all", run_all)
-    words = "--scenes carpet --episodes 1 --states 1 --moves 1"
-    assert main([*words.split(), "--out", str(tmp_path)]) == 0
-    content = json.loads((tmp_path / "arm_masks.json").read_text())
-    assert content["summary"]["masks"]["carpet"]["cases"] == 49
-    assert (tmp_path / "table.md").read_text() in capsys.readouterr().out
