@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "ms_slam_env"
 FLOW = (
     "geometry -> camera -> divergence -> scenes, robot -> sensor -> slam -> mapping -> sequences"
-    " -> metrics -> report -> evaluation -> env -> exploration -> experiments -> benchmark -> cli"
+    " -> metrics -> report -> evaluation -> env -> exploration -> experiments -> cli"
 )
 LEVEL = {name: level for level, name in enumerate(re.split(r" -> |, ", FLOW))}
 BELOW_ALL = {"errors", "config", "command_line", "parallel", "timings", "_warp"}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from ms_slam_env.benchmark import figures
+from ms_slam_env.report import figures
 
 
 @pytest.mark.parametrize(

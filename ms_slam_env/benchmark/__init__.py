@@ -1,1 +1,0 @@
-"""Experiments: planners, their maps and trajectories, judged under one protocol."""
