@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -13,6 +13,7 @@ from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.evaluation.sequence_divergence import consecutive_divergences
 from ms_slam_env.geometry import invert, relative_angle, transform_points
+from ms_slam_env.sequences import Sequence
 
 Float64 = NDArray[np.float64]
 
@@ -43,26 +44,18 @@ class WatchedSequence:
     depth_m: float
 
 
-def watch_frames(
-    frames: Iterable[RGBDFrame],
-    times: Float64,
-    poses: Float64,
-    K: Intrinsics,
-    histograms: Mapping[str, DivergenceConfig],
-) -> WatchedSequence:
-    """Measure each frame against the one before, once through.
+def watch_frames(sequence: Sequence, histograms: Mapping[str, DivergenceConfig]) -> WatchedSequence:
+    """Measure each frame against the one before, once through; without colour intensity is NaN.
 
     Args:
-        frames: N frames.
-        times: (N,) seconds.
-        poses: (N, 4, 4) true T_world_camera.
-        K: intrinsics of the frames.
+        sequence: with true poses.
         histograms: settings of the divergence by name.
     """
+    times, poses, K = sequence.timestamps, sequence.poses, sequence.intrinsics
     motion, shades, depths = [], [], []
 
     def seen() -> Iterator[RGBDFrame]:
-        for index, frame in enumerate(frames):
+        for index, frame in enumerate(sequence.frames):
             shades.append(contrast(frame))
             depths.append(float(frame.depth[frame.depth > 0].mean()) if frame.depth.any() else 0.0)
             if index + 1 < len(poses):
@@ -71,6 +64,8 @@ def watch_frames(
             yield frame
 
     values = consecutive_divergences(seen(), K, list(histograms.values()))
+    if not sequence.has_color:
+        values[..., 0] = np.nan
     return WatchedSequence(
         times[1:] - times[0],
         np.diff(times),

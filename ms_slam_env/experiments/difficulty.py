@@ -5,21 +5,29 @@ Saeedi et al., ICRA 2017, section V-C: the harder a sequence, the larger its div
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ms_slam_env.camera import XTION_SIZES, Intrinsics, RGBDFrame
+from ms_slam_env.camera import XTION_SIZES
 from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.evaluation.image_motion import MOTIONS, WatchedSequence, by_second, watch_frames
 from ms_slam_env.evaluation.sequence_divergence import KINDS, statistics_of
 from ms_slam_env.experiments.harness.experiment import Experiment
+from ms_slam_env.experiments.harness.motion_difficulty import (
+    CORRELATIONS,
+    ORDERED,
+    SEEN,
+    STATISTICS,
+    WHERE,
+    judgements,
+    statistics,
+)
 from ms_slam_env.metrics.registry import metric
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
@@ -27,14 +35,10 @@ from ms_slam_env.report.statistics import rank_correlation
 from ms_slam_env.report.tables import Column, Table, finished, make_table
 from ms_slam_env.sensor.noise import noise_config
 from ms_slam_env.sensor.scene_cache import get_scene
+from ms_slam_env.sequences import Sequence as RGBDSequence
 from ms_slam_env.sequences import icl_nuim, place_trajectory, render_sequence
 
-Float64 = NDArray[np.float64]
-Line = dict[str, Any]
-
 HISTOGRAMS = {"paper": DivergenceConfig.paper(), "default": DivergenceConfig()}
-HARD, EASY = ("lr_kt2", "lr_kt3"), ("lr_kt0", "lr_kt1")
-"""What the paper finds: every motion of the first pair harder than every one of the second."""
 PAPER = {
     "lr_kt0": (0.0250, 0.0026, 0.0014),
     "lr_kt1": (0.0183, 0.0026, 0.0012),
@@ -44,16 +48,6 @@ PAPER = {
 """Table I of the paper: max, mean and "variance" of the intensity divergence."""
 RECORDING = "recorded depth"
 """Scene of a row that was recorded, not rendered."""
-
-_STATISTICS = tuple(
-    f"divergence_{name}"
-    for name in ("max", "mean", "variance", "std", "max_per_s", "mean_per_s", "std_per_s")
-)
-_ORDERED = ("max", "mean", "std")
-_SEEN = ("contrast", "depth_m")
-_CORRELATIONS = ("turn_correlation", "speed_correlation", "image_motion_correlation")
-"""Of the divergence with each of ``MOTIONS``."""
-_WHERE = ("scene", "noise", "histograms", "divergence")
 
 
 @dataclass(frozen=True)
@@ -166,7 +160,7 @@ class Difficulty(Checked, Experiment):
                 **label,
                 **{f"divergence_{key}": value for key, value in numbers.items()},
                 **{key: rank_correlation(own, moved)
-                   for key, moved in zip(_CORRELATIONS, watched.motion.values(), strict=True)},
+                   for key, moved in zip(CORRELATIONS, watched.motion.values(), strict=True)},
             })  # fmt: skip
             seconds, rates = by_second(watched.times_s, own, watched.gaps_s)
             curves.append({**label, "since_start_s": seconds, "divergence_rate": rates})
@@ -184,23 +178,25 @@ class Difficulty(Checked, Experiment):
         lines = statistics(rows)
         which = ("scene", "noise", "motion")
         once = {tuple(map(line.get, which)): line for line in lines}
-        paper: list[Line] = [
-            {"motion": motion, **dict(zip(("max", "mean", "variance"), numbers, strict=True))}
-            for motion, numbers in PAPER.items()
+        names = ("max", "mean", "variance")
+        paper: list[dict[str, Any]] = [
+            {"motion": m, **dict(zip(names, of, strict=True))} for m, of in PAPER.items()
         ]
+        judged = judgements(rows)
+        ordered = [line for line in judged if "places" in line]
         by_motion = [Column(f"motions_{key}", key, f"{metric(key).heading}, by motion")
-                     for key in _CORRELATIONS]  # fmt: skip
-        pairs = [f"{what}_{name}" for name in _ORDERED for what in ("pairs", "places")]
+                     for key in CORRELATIONS]  # fmt: skip
+        pairs = [f"{what}_{name}" for name in ORDERED for what in ("pairs", "places")]
         return [
-            make_table((*which, *_WHERE[2:], *_STATISTICS, "frames", "places"), lines,
+            make_table((*which, *WHERE[2:], *STATISTICS, "frames", "places"), lines,
                        note="Means over the places."),
-            make_table((*which, *MOTIONS, *_SEEN), once.values(), "Motions"),
+            make_table((*which, *MOTIONS, *SEEN), once.values(), "Motions"),
             make_table(
                 ("motion", Column("max", "divergence_max"), Column("mean", "divergence_mean"),
                  Column("variance", "divergence_variance", '"variance"')),
                 paper, "The paper's Table I", "Of intensity."),
-            make_table((*_WHERE, "places", *pairs), order(rows), "Order"),
-            make_table((*_WHERE, *_CORRELATIONS, *by_motion), correlations(rows),
+            make_table((*WHERE, "places", *pairs), ordered, "Order"),
+            make_table((*WHERE, *CORRELATIONS, *by_motion), judged,
                        "What divergence goes with",
                        "By frame: median over motions and places. By motion: of the motions' means "
                        "over all places."),
@@ -231,19 +227,13 @@ class Difficulty(Checked, Experiment):
 
 def watch(spec: DifficultySpec) -> WatchedSequence:
     """Render or read the frames, and measure each against the one before."""
-    watched = watch_frames(*_open(spec), HISTOGRAMS)
-    for values in watched.divergences.values() if spec.scene == RECORDING else ():
-        values[:, 0] = np.nan  # it has no colour
-    return watched
+    return watch_frames(_open(spec), HISTOGRAMS)
 
 
-def _open(spec: DifficultySpec) -> tuple[Iterable[RGBDFrame], Float64, Float64, Intrinsics]:
-    """Frames, their times (N,) and poses (N, 4, 4), and intrinsics."""
+def _open(spec: DifficultySpec) -> RGBDSequence:
+    """The recording, or the motion placed in its scene."""
     if spec.scene == RECORDING:
-        recording = icl_nuim.recorded_depth(spec.data, spec.image_size, spec.every)
-        times, poses = icl_nuim.read_motion(spec.data, spec.motion)
-        nearest = np.abs(times[:, None] - recording.timestamps).argmin(axis=0)
-        return recording, recording.timestamps, poses[nearest], recording.intrinsics
+        return icl_nuim.recorded_motion(spec.data, spec.image_size, spec.every)
     all_times, together = icl_nuim.read_motions(spec.data, spec.motions)
     scene = get_scene(spec.scene, 0)
     placed = place_trajectory(scene, together, spec.placement, spec.scale).poses
@@ -252,96 +242,4 @@ def _open(spec: DifficultySpec) -> tuple[Iterable[RGBDFrame], Float64, Float64, 
     picked = np.arange(len(all_times[number]))[:: spec.every][: spec.first or None]
     times, poses = all_times[number][picked], placed[start + picked]
     K = icl_nuim.INTRINSICS.scaled(XTION_SIZES[spec.image_size][0] / icl_nuim.INTRINSICS.width)
-    sequence = render_sequence(scene, poses, K, spec.noise, spec.placement, timestamps=times)
-    return sequence.frames, times, poses, K
-
-
-def statistics(rows: Sequence[Row]) -> list[Line]:
-    """Of every motion in a scene, histogram and kind: the statistics, averaged over its places.
-
-    ``places`` tells over how many; how the camera moves and what it sees is averaged likewise. Of a
-    motion that was also recorded there is a second line, over as many frames as that.
-    """
-    keys = (*_STATISTICS, *MOTIONS, *_SEEN)
-    return [
-        {
-            **dict(zip((*_WHERE, "motion"), group, strict=True)),
-            **{key: float(np.mean([line[key] for line in lines])) for key in keys},
-            "frames": lines[0]["frames"],
-            "places": len(lines),
-        }
-        for group, lines in _grouped(_lines(rows), (*_WHERE, "motion")).items()
-    ]
-
-
-def order(rows: Sequence[Row]) -> list[Line]:
-    """Whether the paper's order holds, of every scene, histogram and kind.
-
-    ``pairs_max``, ``pairs_mean``, ``pairs_std``: of the four pairs of a motion that the paper finds
-    hard and one that it finds easy, in how many the former has the larger statistic (means over
-    the places); ``places_max`` and so on: in how many single places all four pairs hold.
-    """
-    found = []
-    for entry, by_motion in _by_motion(rows):
-        if not set(HARD + EASY) <= set(by_motion):
-            continue
-        entry["places"] = min(map(len, by_motion.values()))
-        for name in _ORDERED:
-            values = {
-                motion: np.array([line[f"divergence_{name}"] for line in by_motion[motion]])
-                for motion in HARD + EASY
-            }
-            pairs = [(values[hard], values[easy]) for hard in HARD for easy in EASY]
-            entry[f"pairs_{name}"] = sum(int(h.mean() > e.mean()) for h, e in pairs)
-            entry[f"places_{name}"] = int(np.all([h > e for h, e in pairs], axis=0).sum())
-        found.append(entry)
-    return found
-
-
-def correlations(rows: Sequence[Row]) -> list[Line]:
-    """Spearman correlation of the divergence with how the camera and the image move.
-
-    Frame by frame within one motion at one place, the median over motions and places; and
-    ``motions_...``, of the motions' means over all places of a scene.
-    """
-    found = []
-    for entry, by_motion in _by_motion(rows):
-        for motion, key in zip(MOTIONS, _CORRELATIONS, strict=True):
-            single = [line[key] for lines in by_motion.values() for line in lines]
-            entry[key] = None if None in single else float(np.median(single))
-            means = [
-                [np.mean([line[name] for line in lines]) for name in ("divergence_mean", motion)]
-                for lines in by_motion.values()
-            ]
-            if len(means) > 2:
-                entry[f"motions_{key}"] = rank_correlation(*np.array(means).T)
-        found.append(entry)
-    return found
-
-
-def _by_motion(rows: Sequence[Row]) -> Iterator[tuple[Line, dict[str, list[Line]]]]:
-    """Of each scene, histogram and kind: a line's start, and the lines of whole motions by name."""
-    whole = [row for row in rows if not row["spec"]["first"]]
-    for group, lines in _grouped(_lines(whole), _WHERE).items():
-        by_motion = {motion: own for (motion,), own in _grouped(lines, ("motion",)).items()}
-        yield dict(zip(_WHERE, group, strict=True)), by_motion
-
-
-def _lines(rows: Sequence[Row]) -> list[Line]:
-    """One for each finished row, histogram and kind."""
-    lines = []
-    for row in finished(rows):
-        spec, result = row["spec"], row["result"]
-        cut = f", first {spec['first']} frames" if spec["first"] else ""
-        shared = {"scene": Path(spec["scene"]).stem, "noise": spec["noise"]}
-        shared |= {"motion": spec["motion"] + cut}
-        shared |= {key: result[key] for key in ("frames", *MOTIONS, *_SEEN)}
-        lines += [{**shared, **line} for line in result["statistics"]]
-    return lines
-
-
-def _grouped(lines: Iterable[Line], keys: Sequence[str]) -> dict[tuple[str, ...], list[Line]]:
-    groups: dict[tuple[str, ...], list[Line]] = {}
-    for line in lines:
-        groups.setdefault(tuple(line[key] for key in keys), []).append(line)
-    return groups
+    return render_sequence(scene, poses, K, spec.noise, spec.placement, timestamps=times)

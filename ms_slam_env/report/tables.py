@@ -11,6 +11,8 @@ from ms_slam_env.metrics.registry import metric
 from ms_slam_env.report.records import build, check_plain
 from ms_slam_env.report.statistics import Interval, median_interval, share_interval
 
+_SMALLEST = 1e-6  # what is smaller would be a row of zeros
+
 Value = str | float | int | bool | None | Interval
 Row = Mapping[str, Any]
 
@@ -258,7 +260,7 @@ def format_interval(interval: Interval, scale: float = 1.0, digits: int = 2) -> 
 
 
 def format_number(value: float, digits: int = 2) -> str:
-    """``value`` with ``digits`` significant digits, never in exponent notation.
+    """``value`` with ``digits`` significant digits; below a millionth in exponent notation.
 
     Infinity, which is what a time is worth until something that never came, reads ``never``.
     """
@@ -268,6 +270,8 @@ def format_number(value: float, digits: int = 2) -> str:
         return "never"
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"
+    if abs(value) < _SMALLEST:
+        return f"{value:.{digits - 1}e}"
     decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
     return f"{value:.{decimals}f}"
 

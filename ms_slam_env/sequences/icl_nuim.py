@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ms_slam_env.camera import XTION_SIZES, Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.sequences.recording import Recording, open_recording
+from ms_slam_env.sequences.recording.recording import RecordedSequence
 from ms_slam_env.sequences.trajectory import read_trajectory
 
 Float64 = NDArray[np.float64]
@@ -48,3 +49,11 @@ def recorded_depth(data: str, image_size: str, every: int) -> Recording:
     recording = open_recording(Path(data) / f"icl_nuim/{RECORDED}_depth").every(every)
     is_larger = XTION_SIZES[image_size][0] < recording.source.width
     return recording.at_size(image_size) if is_larger else recording
+
+
+def recorded_motion(data: str, image_size: str, every: int) -> RecordedSequence:
+    """The recorded depth, each frame with the true pose nearest in time."""
+    recording = recorded_depth(data, image_size, every)
+    times, poses = read_motion(data, RECORDED)
+    nearest = np.abs(times[:, None] - recording.timestamps).argmin(axis=0)
+    return RecordedSequence(recording, poses[nearest], recording.intrinsics, recording.name)

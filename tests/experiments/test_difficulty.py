@@ -14,14 +14,12 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.image_motion import MOTIONS
 from ms_slam_env.evaluation.sequence_divergence import statistics_of
 from ms_slam_env.experiments import difficulty
-from ms_slam_env.experiments.difficulty import (
+from ms_slam_env.experiments.difficulty import RECORDING, Difficulty, DifficultySpec
+from ms_slam_env.experiments.harness.motion_difficulty import (
+    CORRELATIONS,
     EASY,
     HARD,
-    RECORDING,
-    Difficulty,
-    DifficultySpec,
-    correlations,
-    order,
+    judgements,
     statistics,
 )
 from ms_slam_env.experiments.harness.running import write_all
@@ -42,7 +40,7 @@ def fake_row(motion: str, mean: float, placement: int = 0, first: int = 0) -> di
     line: dict[str, Any] = {"histograms": "paper", "divergence": "intensity"}
     line |= {f"divergence_{key}": mean for key in ("max", "mean", "variance")}
     line |= {f"divergence_{key}": 1.0 for key in ("std", "max_per_s", "mean_per_s", "std_per_s")}
-    line |= {key: 0.1 * placement for key in difficulty._CORRELATIONS}
+    line |= {key: 0.1 * placement for key in CORRELATIONS}
     result = {"frames": 5, "contrast": 1.0, "depth_m": 1.0, "statistics": [line]}
     result |= {name: mean for name in MOTIONS}
     return {"spec": asdict(spec), "result": result, "error": None}
@@ -58,14 +56,15 @@ def test_statistics_are_means_over_places():
 def test_order_counts_pairs_and_places():
     means = {HARD[0]: (3, 3), HARD[1]: (4, 1), EASY[0]: (1, 2), EASY[1]: (2, 1)}
     rows = [fake_row(m, float(v), p) for m, found in means.items() for p, v in enumerate(found)]
-    (intensity,) = order([*rows, fake_row(HARD[0], 0.0, 0, 3)])  # what is cut short has no part
+    (intensity,) = judgements(
+        [*rows, fake_row(HARD[0], 0.0, 0, 3)]
+    )  # what is cut short has no part
     assert (intensity["divergence"], intensity["places"]) == ("intensity", 2)
     assert intensity["pairs_mean"] == 4  # means over the places: 3 and 2.5 against 1.5 and 1.5
     assert intensity["places_mean"] == 1
     assert intensity["places_std"] == 0
-    (line,) = correlations(rows)
-    assert line["turn_correlation"] == pytest.approx(0.05)  # median of the places' 0 and 0.1
-    assert line["motions_turn_correlation"] == pytest.approx(1.0)
+    assert intensity["turn_correlation"] == pytest.approx(0.05)  # median of the places' 0 and 0.1
+    assert intensity["motions_turn_correlation"] == pytest.approx(1.0)
 
 
 @pytest.fixture
