@@ -108,15 +108,15 @@ class EnvSpeed(Experiment, Checked):
         """One line a case, one column a stage that took time in any."""
         lines, seen = [], set()
         for row in finished(rows):
-            stages = {one["stage"]: one["stage_ms"] for one in row["result"]["stages"]}
+            times = {one["stage"]: one["stage_ms"] for one in row["result"]["stages"]}
             figures = {k: v for k, v in row["result"].items() if k != "stages"}
             case = {key: row["spec"][key] for key in ("embodiment", "observation")}
-            lines.append({**case, **figures, **stages})
-            seen |= set(stages)
+            lines.append({**case, **figures, **{f"{key}_ms": ms for key, ms in times.items()}})
+            seen |= set(times)
         order = [*(s for s in ORDER if s in seen), *sorted(seen - {*ORDER, REST}), REST]
         columns: list[Column | str] = [
             *("embodiment", "frames_per_step", "observation", "steps_per_s", "step_cpu_ms"),
-            *(Column(stage, "stage_ms", stage) for stage in order),
+            *(Column(f"{stage}_ms", "stage_ms", stage) for stage in order),
         ]
         return [make_table(columns, lines, note="Stages: mean time a step, by the clock.")]
 

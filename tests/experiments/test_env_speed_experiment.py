@@ -33,8 +33,9 @@ def test_split_adds_up_to_the_step():
     assert {"render", "slam", "lookahead", "rest"} <= set(stages)
     (table,) = EnvSpeed().tables([{"spec": asdict(spec), "result": result, "error": None}])
     names = [column.name for column in table.columns]
-    assert names.index("render") < names.index("slam") < names.index("lookahead")
-    assert names[-1] == "rest"
+    assert names.index("render_ms") < names.index("slam_ms") < names.index("lookahead_ms")
+    assert table.rows[0]["observation"] == "lookahead"
+    assert names[-1] == "rest_ms"
 
 
 def test_every_stage_of_the_lookahead_is_found_by_the_profiler():
