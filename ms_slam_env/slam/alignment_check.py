@@ -68,44 +68,28 @@ VIEW_REASONS: dict[int, str] = MAP_REASONS | {
 
 @dataclass(frozen=True)
 class AlignmentStatistics:
-    """What an alignment explains of a frame; 0 where it was not measured.
+    """What an alignment explains of a frame; 0 where it was not measured."""
 
-    Attributes:
-        matches: number of matched points.
-        overlap: share of the frame's readings that land on a reading of the reference.
-        inlier_ratio: share of those within the distance of its surface.
-        depth_conflict_ratio: share of those so far in front of or behind it that no noise explains
-            it.
-        photometric_inlier_ratio: share of those with a like grey value.
-        correlation: normalised, of the fine structure of both grey images.
-        texture: standard deviation of their fine structure, of the image that has more, grey
-            levels.
-        relief_m: RMS distance of the reference's surface from the plane that fits it best.
-        residual_m: RMS point-to-plane residual of the inliers, metres.
-        cost: mean truncated cost of the visible points, in [0, 3].
-        sigma_m: standard deviation of the worst translation or rotation component that the view
-            constrains.
-        degenerate_directions: number of directions of the pose that it does not constrain.
-        term_conflict: chi squared between the poses that geometry and intensity ask for.
-        motion_m: translation between frame and reference, metres.
-        rotation_cos: cosine of the angle between them.
-    """
-
-    matches: float = 0.0
-    overlap: float = 0.0
-    inlier_ratio: float = 0.0
+    matches: float = 0.0  # number of matched points
+    overlap: float = 0.0  # share of the frame's readings that land on a reading of the reference
+    inlier_ratio: float = 0.0  # share of those within the distance of its surface
+    # share of those so far in front of or behind it that no noise explains it.
     depth_conflict_ratio: float = 0.0
-    photometric_inlier_ratio: float = 0.0
-    correlation: float = 0.0
+    photometric_inlier_ratio: float = 0.0  # share of those with a like grey value
+    correlation: float = 0.0  # normalised, of the fine structure of both grey images
+    # standard deviation of their fine structure, of the image that has more, grey levels.
     texture: float = 0.0
+    # RMS distance of the reference's surface from the plane that fits it best.
     relief_m: float = 0.0
-    residual_m: float = 0.0
-    cost: float = 0.0
+    residual_m: float = 0.0  # RMS point-to-plane residual of the inliers, metres
+    cost: float = 0.0  # mean truncated cost of the visible points, in [0, 3]
+    # standard deviation of the worst translation or rotation component that the view constrains.
     sigma_m: float = 0.0
+    # number of directions of the pose that it does not constrain.
     degenerate_directions: float = 0.0
-    term_conflict: float = 0.0
-    motion_m: float = 0.0
-    rotation_cos: float = 0.0
+    term_conflict: float = 0.0  # chi squared between the poses that geometry and intensity ask for
+    motion_m: float = 0.0  # translation between frame and reference, metres
+    rotation_cos: float = 0.0  # cosine of the angle between them
 
 
 NO_ALIGNMENT = AlignmentStatistics()
@@ -237,15 +221,10 @@ evaluate_on_device = wp.func(evaluate_alignment)
 
 @dataclass(frozen=True)
 class DepthImage:
-    """A depth image with its intensity, sensed or rendered.
+    """A depth image with its intensity, sensed or rendered."""
 
-    Attributes:
-        depth: (H, W) float32 metres; 0 = no reading.
-        intensity: (H, W) float32 in [0, 255].
-    """
-
-    depth: Float32
-    intensity: Float32
+    depth: Float32  # (H, W) float32 metres; 0 = no reading
+    intensity: Float32  # (H, W) float32 in [0, 255]
 
     @property
     def readings(self) -> float:

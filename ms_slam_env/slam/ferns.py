@@ -66,14 +66,10 @@ MEAN_LEVEL = 128.0  # frames are made this bright, on average, before they are t
 
 @dataclass(frozen=True)
 class FernCode:
-    """The code of one frame.
+    """The code of one frame."""
 
-    Attributes:
-        bits: (F,) outcome of the four tests of each fern.
-        known: (F,) which of the four bits could be tested; depth cannot where it has no reading.
-    """
-
-    bits: UInt8
+    bits: UInt8  # (F,) outcome of the four tests of each fern
+    # (F,) which of the four bits could be tested; depth cannot where it has no reading.
     known: UInt8
 
 
@@ -135,19 +131,12 @@ def dissimilarities(code: FernCode, bits: UInt8, known: UInt8) -> Float64:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A keyframe that resembles a frame.
+    """A keyframe that resembles a frame."""
 
-    Attributes:
-        T_world_camera: (4, 4) its pose.
-        dissimilarity: share of ferns that differ, [0, 1].
-        index: of the keyframe in the database.
-        time: when it was observed.
-    """
-
-    T_world_camera: Float64
-    dissimilarity: float
-    index: int
-    time: int
+    T_world_camera: Float64  # (4, 4) its pose
+    dissimilarity: float  # share of ferns that differ, [0, 1]
+    index: int  # of the keyframe in the database
+    time: int  # when it was observed
 
 
 class FernDatabase:

@@ -41,20 +41,14 @@ _RELOCALISED_WEIGHT = 30.0  # of a relocalised frame, in matches of features
 class RobotRun:
     """A robot that has finished its path.
 
-    Attributes:
-        backend: its SLAM, with the map.
-        frames: N, what it saw.
-        estimates: (N, 4, 4) T_map_camera, in the frame of its own map.
-        tracked: (N,) bool.
-
     Raises:
         InputError: no frame, or another number of poses or flags than of frames.
     """
 
-    backend: SlamBackend
-    frames: Sequence[RGBDFrame]
-    estimates: Float64
-    tracked: NDArray[np.bool_]
+    backend: SlamBackend  # its SLAM, with the map
+    frames: Sequence[RGBDFrame]  # N, what it saw
+    estimates: Float64  # (N, 4, 4) T_map_camera, in the frame of its own map
+    tracked: NDArray[np.bool_]  # (N,) bool
 
     def __post_init__(self) -> None:
         """Refuse what does not belong together."""
@@ -70,17 +64,11 @@ class RobotRun:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A guess from one frame.
+    """A guess from one frame."""
 
-    Attributes:
-        T_a_b: (4, 4) maps points of map b into map a.
-        weight: matches behind it.
-        source: one of ``SOURCES``.
-    """
-
-    T_a_b: Float64
-    weight: float
-    source: str
+    T_a_b: Float64  # (4, 4) maps points of map b into map a
+    weight: float  # matches behind it
+    source: str  # one of ``SOURCES``
 
 
 def hypotheses_from_features(a: RobotRun, b: RobotRun, queries: int) -> list[Hypothesis]:
@@ -133,17 +121,11 @@ def query_frames(robot: RobotRun, count: int) -> list[int]:
 
 @dataclass(frozen=True)
 class Landmarks:
-    """Points of one frame.
+    """Points of one frame."""
 
-    Attributes:
-        points: (N, 3) in the frame of the robot's map.
-        descriptors: (N, 128) float32, RootSIFT.
-        depth_m: (N,) distance along the optical axis, by which their error grows.
-    """
-
-    points: Float64
-    descriptors: NDArray[np.float32]
-    depth_m: Float64
+    points: Float64  # (N, 3) in the frame of the robot's map
+    descriptors: NDArray[np.float32]  # (N, 128) float32, RootSIFT
+    depth_m: Float64  # (N,) distance along the optical axis, by which their error grows
 
 
 def landmarks(frame: RGBDFrame, T_map_camera: Float64, K: Intrinsics) -> Landmarks:

@@ -86,37 +86,25 @@ class MergeConfig(Checked):
 
 @dataclass(frozen=True)
 class Fit:
-    """How what either robot saw fits the map of the other.
+    """How what either robot saw fits the map of the other."""
 
-    Attributes:
-        overlap: share of the pixels with a reading that fit.
-        consistent: share of those among the pixels that fit or contradict.
-        alike: correlation with the other map's view, median over the frames that look at it.
-    """
-
-    overlap: float = float("nan")
-    consistent: float = float("nan")
+    overlap: float = float("nan")  # share of the pixels with a reading that fit
+    consistent: float = float("nan")  # share of those among the pixels that fit or contradict
+    # correlation with the other map's view, median over the frames that look at it.
     alike: float = float("nan")
 
 
 @dataclass(frozen=True)
 class Merge:
-    """What came of an attempt.
+    """What came of an attempt."""
 
-    Attributes:
-        T_a_b: (4, 4) maps points of map b into map a; None if the maps were not merged.
-        reason: why not; empty if they were.
-        found: number of guesses.
-        agreeing: largest number of them that agree.
-        fit: of the maps; NaN if no pose was judged.
-        refined_m: by how much registration moved b's cameras, metres; 0 if it was not accepted.
-    """
-
+    # (4, 4) maps points of map b into map a; None if the maps were not merged.
     T_a_b: Float64 | None
-    reason: str
-    found: int = 0
-    agreeing: int = 0
-    fit: Fit = Fit()
+    reason: str  # why not; empty if they were
+    found: int = 0  # number of guesses
+    agreeing: int = 0  # largest number of them that agree
+    fit: Fit = Fit()  # of the maps; NaN if no pose was judged
+    # by how much registration moved b's cameras, metres; 0 if it was not accepted.
     refined_m: float = 0.0
 
 

@@ -18,19 +18,12 @@ from ms_slam_env.slam.base import SlamBackend
 
 @dataclass(frozen=True)
 class BackendEntry:
-    """Where a backend is.
+    """Where a backend is."""
 
-    Attributes:
-        module: its module below ``ms_slam_env.slam``.
-        backend: name of its class, made of intrinsics and configuration.
-        config: name of the dataclass of its parameters.
-        has_devices: whether it takes a device as well.
-    """
-
-    module: str
-    backend: str
-    config: str
-    has_devices: bool = False
+    module: str  # its module below ``ms_slam_env.slam``
+    backend: str  # name of its class, made of intrinsics and configuration
+    config: str  # name of the dataclass of its parameters
+    has_devices: bool = False  # whether it takes a device as well
 
     def load(self, name: str) -> Any:
         """The class ``name`` of its module."""

@@ -30,19 +30,12 @@ Match = TypeVar("Match")
 
 @dataclass(frozen=True)
 class Attempt(Generic[Match]):
-    """A pose that a frame may have.
+    """A pose that a frame may have."""
 
-    Attributes:
-        T_world_camera: (4, 4) the pose.
-        statistics: what it explains of the frame.
-        reason: why it is not accepted; empty if it is.
-        match: what the backend found besides.
-    """
-
-    T_world_camera: Float64
-    statistics: AlignmentStatistics
-    reason: str
-    match: Match
+    T_world_camera: Float64  # (4, 4) the pose
+    statistics: AlignmentStatistics  # what it explains of the frame
+    reason: str  # why it is not accepted; empty if it is
+    match: Match  # what the backend found besides
 
 
 class FrameByFrameSlam(SlamBackend, Generic[Frame, Match]):

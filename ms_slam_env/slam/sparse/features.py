@@ -39,19 +39,13 @@ _LARGEST_SIGMA_PX = 0.7  # a patch that fixes its place less well is on an edge,
 
 @dataclass(frozen=True)
 class Features:
-    """Features of one image.
+    """Features of one image."""
 
-    Attributes:
-        pixels: (N, 2) float64 positions (u, v).
-        inverse_depth: (N,) float64, 1/m; 0 = not known.
-        descriptors: (N, 4) uint64, the 256 bits of ORB.
-        scale: (N,) float64 error of the position, in units of that of a corner of the full image:
-            pixels of the image along a pixel of the level that it was found on.
-    """
-
-    pixels: Float64
-    inverse_depth: Float64
-    descriptors: NDArray[np.uint64]
+    pixels: Float64  # (N, 2) float64 positions (u, v)
+    inverse_depth: Float64  # (N,) float64, 1/m; 0 = not known
+    descriptors: NDArray[np.uint64]  # (N, 4) uint64, the 256 bits of ORB
+    # (N,) float64 error of the position, in units of that of a corner of the full image: pixels of
+    # the image along a pixel of the level that it was found on.
     scale: Float64
 
     def __len__(self) -> int:
@@ -178,21 +172,13 @@ class InverseDepth:
 
 @dataclass(frozen=True)
 class Patches:
-    """Patches of one or several images, and where they should be in another.
+    """Patches of one or several images, and where they should be in another."""
 
-    Attributes:
-        pixels: (N, 2) their centres.
-        inverse_depth: (N,) of the centres, 1/m.
-        slope: (N, 2) its change from pixel to pixel, across and down, 1/m.
-        T_frame_host: (N, 4, 4) the motion between the two images.
-        shift: (N, 2) pixels by which they are expected away from where the motion puts them.
-    """
-
-    pixels: Float64
-    inverse_depth: Float64
-    slope: Float64
-    T_frame_host: Float64
-    shift: Float64
+    pixels: Float64  # (N, 2) their centres
+    inverse_depth: Float64  # (N,) of the centres, 1/m
+    slope: Float64  # (N, 2) its change from pixel to pixel, across and down, 1/m
+    T_frame_host: Float64  # (N, 4, 4) the motion between the two images
+    shift: Float64  # (N, 2) pixels by which they are expected away from where the motion puts them
 
 
 def warp(patches: Patches, intrinsics: Intrinsics) -> tuple[Float64, Float64]:
@@ -220,18 +206,13 @@ def warp(patches: Patches, intrinsics: Intrinsics) -> tuple[Float64, Float64]:
 
 @dataclass(frozen=True)
 class Templates:
-    """What patches look like, and how they respond to a shift.
+    """What patches look like, and how they respond to a shift."""
 
-    Attributes:
-        wanted: (N, K) intensity of their pixels less its mean.
-        step: (N, 2, K) shift, pixels of their image, that a difference of intensity speaks for.
-        contrast: (N,) standard deviation of their intensity, levels.
-        spread: (N, 2, 2) covariance of the place found, for noise of one level, pixels squared.
-    """
-
-    wanted: Float32
+    wanted: Float32  # (N, K) intensity of their pixels less its mean
+    # (N, 2, K) shift, pixels of their image, that a difference of intensity speaks for.
     step: Float32
-    contrast: Float32
+    contrast: Float32  # (N,) standard deviation of their intensity, levels
+    # (N, 2, 2) covariance of the place found, for noise of one level, pixels squared.
     spread: Float32
 
     @classmethod

@@ -47,23 +47,14 @@ def load_gtsam() -> Any:
 
 @dataclass(frozen=True)
 class Bundle:
-    """Keyframes, points and sightings.
+    """Keyframes, points and sightings."""
 
-    Attributes:
-        poses: (K, 4, 4) T_world_camera.
-        fixed: (K,) bool, poses that stay.
-        points: (P, 3) world frame.
-        camera: (O,) pose of each sighting.
-        point: (O,) point of each sighting.
-        seen: O sightings.
-    """
-
-    poses: Float64
-    fixed: NDArray[np.bool_]
-    points: Float64
-    camera: Int64
-    point: Int64
-    seen: Sightings
+    poses: Float64  # (K, 4, 4) T_world_camera
+    fixed: NDArray[np.bool_]  # (K,) bool, poses that stay
+    points: Float64  # (P, 3) world frame
+    camera: Int64  # (O,) pose of each sighting
+    point: Int64  # (O,) point of each sighting
+    seen: Sightings  # O sightings
 
 
 def adjust_bundle(bundle: Bundle, intrinsics: Intrinsics) -> tuple[Float64, Float64]:

@@ -48,19 +48,12 @@ _PATCH_SHIFT_PX = 3.0  # largest distance of a patch from where its point projec
 
 @dataclass(frozen=True)
 class LiveFrame:
-    """A frame that is to be placed.
+    """A frame that is to be placed."""
 
-    Attributes:
-        image: its depth and intensity.
-        inverse_depth: its depth for points between pixels.
-        features: its features.
-        tree: of the features' pixels; None if there are none.
-    """
-
-    image: DepthImage
-    inverse_depth: InverseDepth
-    features: Features
-    tree: cKDTree | None
+    image: DepthImage  # its depth and intensity
+    inverse_depth: InverseDepth  # its depth for points between pixels
+    features: Features  # its features
+    tree: cKDTree | None  # of the features' pixels; None if there are none
 
     @property
     def readings(self) -> float:
@@ -75,25 +68,15 @@ class LiveFrame:
 
 @dataclass(frozen=True)
 class Fix:
-    """A pose and what speaks for it.
+    """A pose and what speaks for it."""
 
-    Attributes:
-        T_world_camera: (4, 4) pose.
-        reference: the keyframe that shares most of its points.
-        point_ids: (M,) points that the frame shows where the pose has them.
-        features: (M,) features of the frame that show them; -1 where a patch does.
-        seen: where the frame shows them, to a fraction of a pixel.
-        matches: how many matches there were, M of which the pose explains.
-        visible: (V,) points that should be in the image.
-    """
-
-    T_world_camera: Float64
-    reference: int
-    point_ids: Int64
-    features: Int64
-    seen: Sightings
-    matches: int
-    visible: Int64
+    T_world_camera: Float64  # (4, 4) pose
+    reference: int  # the keyframe that shares most of its points
+    point_ids: Int64  # (M,) points that the frame shows where the pose has them
+    features: Int64  # (M,) features of the frame that show them; -1 where a patch does
+    seen: Sightings  # where the frame shows them, to a fraction of a pixel
+    matches: int  # how many matches there were, M of which the pose explains
+    visible: Int64  # (V,) points that should be in the image
 
 
 class Localizer:

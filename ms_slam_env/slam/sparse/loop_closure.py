@@ -29,21 +29,13 @@ _SMALL_M, _SMALL_RAD = 0.003, 0.002  # loops off by less need no pose graph
 
 @dataclass(frozen=True)
 class Edge:
-    """The measured motion between two poses.
+    """The measured motion between two poses."""
 
-    Attributes:
-        a: index of the one,
-        b: index of the other.
-        T_a_b: (4, 4) motion.
-        sigma_rad: standard deviation of its rotation,
-        sigma_m: and translation.
-    """
-
-    a: int
-    b: int
-    T_a_b: Float64
-    sigma_rad: float = 0.005
-    sigma_m: float = 0.01
+    a: int  # index of the one,
+    b: int  # index of the other
+    T_a_b: Float64  # (4, 4) motion
+    sigma_rad: float = 0.005  # standard deviation of its rotation,
+    sigma_m: float = 0.01  # and translation
 
 
 def optimise_poses(poses: Float64, edges: Sequence[Edge], fixed: NDArray[np.bool_]) -> Float64:

@@ -25,19 +25,12 @@ _RANSAC_ITERATIONS = 200
 
 @dataclass(frozen=True)
 class Sightings:
-    """Where an image shows points.
+    """Where an image shows points."""
 
-    Attributes:
-        pixels: (N, 2) measured positions.
-        inverse_depth: (N,) measured, 1/m; 0 = not known.
-        sigma_px: (N,) standard deviation of the positions, pixels.
-        sigma_inverse_depth: standard deviation of the inverse depth, 1/m.
-    """
-
-    pixels: Float64
-    inverse_depth: Float64
-    sigma_px: Float64
-    sigma_inverse_depth: float
+    pixels: Float64  # (N, 2) measured positions
+    inverse_depth: Float64  # (N,) measured, 1/m; 0 = not known
+    sigma_px: Float64  # (N,) standard deviation of the positions, pixels
+    sigma_inverse_depth: float  # standard deviation of the inverse depth, 1/m
 
     def __len__(self) -> int:
         """Return the number of sightings."""

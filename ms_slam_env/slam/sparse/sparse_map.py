@@ -22,31 +22,18 @@ _FOUND_SHARE = 0.25  # as in ORB-SLAM
 
 @dataclass
 class Keyframe:
-    """An image that the map is made of.
+    """An image that the map is made of."""
 
-    Attributes:
-        T_world_camera: (4, 4) its pose; optimisation moves it.
-        known: whether the pose was given; optimisation leaves it.
-        features: N features.
-        point_ids: (N,) the point that each shows; -1 = none.
-        color: (H, W, 3) uint8.
-        intensity: (H, W) float32 in [0, 255].
-        depth: (H, W) float32 metres; 0 = no reading.
-        thumbnail: (D,) unit vector of its looks.
-        templates: the patch around each feature.
-        slopes: (N, 2) change of inverse depth from pixel to pixel at each feature, 1/m.
-    """
-
-    T_world_camera: Float64
-    known: bool
-    features: Features
-    point_ids: Int64
-    color: NDArray[np.uint8]
-    intensity: Float32
-    depth: Float32
-    thumbnail: Float32
-    templates: Templates
-    slopes: Float64
+    T_world_camera: Float64  # (4, 4) its pose; optimisation moves it
+    known: bool  # whether the pose was given; optimisation leaves it
+    features: Features  # N features
+    point_ids: Int64  # (N,) the point that each shows; -1 = none
+    color: NDArray[np.uint8]  # (H, W, 3) uint8
+    intensity: Float32  # (H, W) float32 in [0, 255]
+    depth: Float32  # (H, W) float32 metres; 0 = no reading
+    thumbnail: Float32  # (D,) unit vector of its looks
+    templates: Templates  # the patch around each feature
+    slopes: Float64  # (N, 2) change of inverse depth from pixel to pixel at each feature, 1/m
 
     def image(self) -> DepthImage:
         """What frames are compared with."""

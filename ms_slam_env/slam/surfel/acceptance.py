@@ -194,23 +194,16 @@ def geometric_thresholds(lost: NDArray[np.int32]) -> NDArray[Any]:
 
 @dataclass(frozen=True)
 class Alignment:
-    """What ``Tracker.align`` found for B envs.
+    """What ``Tracker.align`` found for B envs."""
 
-    Attributes:
-        T_world_live: (B, 4, 4) pose after alignment, good or not.
-        T_model_live: (B, 4, 4) the same, relative to the pose of the model view.
-        status: (B,) ``TrackingStatus``.
-        statistics: (B,) figures behind the status, ``AlignmentStatistics`` each.
-        photometry: (B,) how the live grey values relate to the model's, ``Photometry`` each.
-        covariance: (B, 6, 6) of the twist (rho, phi), metres and radians, with the true pose
-            T_world_live exp(twist).
-    """
-
-    T_world_live: Float64
-    T_model_live: Float64
-    status: NDArray[np.int32]
-    statistics: NDArray[Any]
+    T_world_live: Float64  # (B, 4, 4) pose after alignment, good or not
+    T_model_live: Float64  # (B, 4, 4) the same, relative to the pose of the model view
+    status: NDArray[np.int32]  # (B,) ``TrackingStatus``
+    statistics: NDArray[Any]  # (B,) figures behind the status, ``AlignmentStatistics`` each
+    # (B,) how the live grey values relate to the model's, ``Photometry`` each.
     photometry: NDArray[Any]
+    # (B, 6, 6) of the twist (rho, phi), metres and radians, with the true pose T_world_live
+    # exp(twist).
     covariance: Float64
 
     @property

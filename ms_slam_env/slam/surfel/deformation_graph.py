@@ -41,15 +41,10 @@ FEWEST_NODES = NEIGHBOURS + 2
 
 @dataclass(frozen=True)
 class DeformationGraph:
-    """Nodes in the order of time, each joined to its neighbours in that order.
+    """Nodes in the order of time, each joined to its neighbours in that order."""
 
-    Attributes:
-        positions: (M, 3) g of the nodes, metres.
-        times: (M,) when their surfels were created, ascending; any unit.
-    """
-
-    positions: Float64
-    times: Float64
+    positions: Float64  # (M, 3) g of the nodes, metres
+    times: Float64  # (M,) when their surfels were created, ascending; any unit
 
     def __len__(self) -> int:
         """Number of nodes M."""
@@ -109,17 +104,11 @@ def sample_graph(positions: ArrayLike, times: ArrayLike, count: int) -> Deformat
 
 @dataclass(frozen=True)
 class Deformation:
-    """The motion of the nodes of a graph.
+    """The motion of the nodes of a graph."""
 
-    Attributes:
-        graph: the nodes.
-        R: (M, 3, 3) linear part of each, close to a rotation.
-        t: (M, 3) translation of each, metres.
-    """
-
-    graph: DeformationGraph
-    R: Float64
-    t: Float64
+    graph: DeformationGraph  # the nodes
+    R: Float64  # (M, 3, 3) linear part of each, close to a rotation
+    t: Float64  # (M, 3) translation of each, metres
 
     def points(self, points: ArrayLike, times: ArrayLike) -> Float64:
         """Where points (N, 3) of times (N,) go: ElasticFusion, equation 8."""
@@ -148,19 +137,13 @@ _DOUBLED = np.where(_ROWS == _COLUMNS, 1.0, np.sqrt(2.0))  # R^T R is symmetric
 
 @dataclass(frozen=True)
 class Constraints:
-    """Points of the map and where they should go.
+    """Points of the map and where they should go."""
 
-    Attributes:
-        sources: (C, 3) points.
-        source_times: (C,) when they were created.
-        targets: (C, 3) where they belong.
-        target_times: (C,) when the surface at the target was created; NaN: the target is fixed,
-            otherwise it moves with the deformation.
-    """
-
-    sources: Float64
-    source_times: Float64
-    targets: Float64
+    sources: Float64  # (C, 3) points
+    source_times: Float64  # (C,) when they were created
+    targets: Float64  # (C, 3) where they belong
+    # (C,) when the surface at the target was created; NaN: the target is fixed, otherwise it moves
+    # with the deformation.
     target_times: Float64
 
     def __len__(self) -> int:

@@ -36,48 +36,28 @@ STEEPEST = wp.constant(0.3)  # cosine of the view angle below which radii no lon
 
 @wp.struct
 class FusionParameters:
-    """Numbers of the fusion rule.
+    """Numbers of the fusion rule."""
 
-    Attributes:
-        distance_m: depth tolerance at 1 m.
-        min_cosine: of the angle between the normals of a surfel and a reading.
-        coverage_px: a surfel this close to a pixel covers it.
-        radius_px: radius of a new surfel, in pixels of the view that made it.
-        max_confidence: where confidence, the weight of the past, stops growing.
-    """
-
-    distance_m: float
-    min_cosine: float
-    coverage_px: float
-    radius_px: float
-    max_confidence: float
+    distance_m: float  # depth tolerance at 1 m
+    min_cosine: float  # of the angle between the normals of a surfel and a reading
+    coverage_px: float  # a surfel this close to a pixel covers it
+    radius_px: float  # radius of a new surfel, in pixels of the view that made it
+    max_confidence: float  # where confidence, the weight of the past, stops growing
 
 
 @wp.struct
 class FusedFrame:
-    """The frames that are fused, images flat; poses, time, weight and mask are (B,).
+    """The frames that are fused, images flat; poses, time, weight and mask are (B,)."""
 
-    Attributes:
-        poses: T_world_camera.
-        mask: 0 leaves an env's map as it is.
-        time: number of the frame in its episode.
-        weight: in (0, 1], lower for a fast camera.
-        depth: (B * H * W) metres.
-        normals: camera frame.
-        color: RGB.
-        radial: (H * W) weights of the pixels.
-        covered: 1 where a surfel of the map covers the pixel.
-    """
-
-    poses: wp.array(dtype=wp.mat44)
-    mask: wp.array(dtype=wp.int32)
-    time: wp.array(dtype=wp.int32)
-    weight: wp.array(dtype=wp.float32)
-    depth: wp.array(dtype=wp.float32)
-    normals: wp.array(dtype=wp.vec3)
-    color: wp.array(dtype=wp.vec3)
-    radial: wp.array(dtype=wp.float32)
-    covered: wp.array(dtype=wp.int32)
+    poses: wp.array(dtype=wp.mat44)  # T_world_camera
+    mask: wp.array(dtype=wp.int32)  # 0 leaves an env's map as it is
+    time: wp.array(dtype=wp.int32)  # number of the frame in its episode
+    weight: wp.array(dtype=wp.float32)  # in (0, 1], lower for a fast camera
+    depth: wp.array(dtype=wp.float32)  # (B * H * W) metres
+    normals: wp.array(dtype=wp.vec3)  # camera frame
+    color: wp.array(dtype=wp.vec3)  # RGB
+    radial: wp.array(dtype=wp.float32)  # (H * W) weights of the pixels
+    covered: wp.array(dtype=wp.int32)  # 1 where a surfel of the map covers the pixel
 
 
 @wp.func_native(

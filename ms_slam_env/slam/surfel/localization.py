@@ -42,23 +42,14 @@ RETRIES = 2  # further searches within a frame whose tracking failed
 
 @dataclass
 class CameraStates:
-    """What is known of the cameras of B envs, between frames.
+    """What is known of the cameras of B envs, between frames."""
 
-    Attributes:
-        poses: (B, 4, 4) T_world_camera.
-        motions: (B, 4, 4) of the last frame, which predict the next.
-        photometry: (B,) how the live grey values relate to the map's.
-        started: (B,) whether a frame has been taken.
-        lost: (B,) frames since tracking was lost.
-        time: (B,) frames taken.
-    """
-
-    poses: Float64
-    motions: Float64
-    photometry: NDArray[Any]
-    started: NDArray[np.bool_]
-    lost: NDArray[np.int32]
-    time: NDArray[np.int32]
+    poses: Float64  # (B, 4, 4) T_world_camera
+    motions: Float64  # (B, 4, 4) of the last frame, which predict the next
+    photometry: NDArray[Any]  # (B,) how the live grey values relate to the map's
+    started: NDArray[np.bool_]  # (B,) whether a frame has been taken
+    lost: NDArray[np.int32]  # (B,) frames since tracking was lost
+    time: NDArray[np.int32]  # (B,) frames taken
 
     @classmethod
     def at_rest(cls, batch: int) -> CameraStates:

@@ -42,17 +42,11 @@ NEAREST = wp.constant(5)  # of deformation_graph: NEIGHBOURS that move a point, 
 
 @dataclass(frozen=True)
 class VisiblePoints:
-    """Surfels in sight of a camera.
+    """Surfels in sight of a camera."""
 
-    Attributes:
-        camera: (N, 3) positions in the camera's frame.
-        world: (N, 3) positions in the world.
-        times: (N,) when they were created, see ``creation_times``.
-    """
-
-    camera: Float64
-    world: Float64
-    times: Float64
+    camera: Float64  # (N, 3) positions in the camera's frame
+    world: Float64  # (N, 3) positions in the world
+    times: Float64  # (N,) when they were created, see ``creation_times``
 
     def take(self, chosen: Int64) -> VisiblePoints:
         """Some of them."""

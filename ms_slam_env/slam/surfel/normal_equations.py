@@ -116,44 +116,29 @@ class Photometry:
 
 @wp.struct
 class Hypotheses:
-    """K pose hypotheses of B envs.
+    """K pose hypotheses of B envs."""
 
-    Attributes:
-        pose: (B, K) T_model_live.
-        photometry: (B, K).
-        state: (B, K) OFF, RUNNING or RESTING.
-        partial: (B, K, rows * pieces, NUM_SUMS) of the parts of a pass.
-        sums: (B, K, NUM_SUMS) of the last pass, see ``Sum``.
-    """
-
-    pose: wp.array2d(dtype=wp.mat44d)
-    photometry: wp.array2d(dtype=Photometry)
-    state: wp.array2d(dtype=wp.int32)
-    partial: wp.array4d(dtype=wp.float32)
-    sums: wp.array3d(dtype=wp.float64)
+    pose: wp.array2d(dtype=wp.mat44d)  # (B, K) T_model_live
+    photometry: wp.array2d(dtype=Photometry)  # (B, K)
+    state: wp.array2d(dtype=wp.int32)  # (B, K) OFF, RUNNING or RESTING
+    partial: wp.array4d(dtype=wp.float32)  # (B, K, rows * pieces, NUM_SUMS) of the parts of a pass
+    sums: wp.array3d(dtype=wp.float64)  # (B, K, NUM_SUMS) of the last pass, see ``Sum``
 
 
 @wp.struct
 class AlignedImages:
-    """Images of B envs at one pyramid level, flat, and the camera of the live ones.
-
-    Attributes:
-        model_size: (width, height); ``live_size`` likewise.
-        live_gradient: (I, dI/du, dI/dv).
-        focal: (fx, fy).
-        centre: (cx, cy).
-    """
+    """Images of B envs at one pyramid level, flat, and the camera of the live ones."""
 
     model_vertices: wp.array(dtype=wp.vec3)
     model_normals: wp.array(dtype=wp.vec3)
     model_intensity: wp.array(dtype=wp.float32)
     live_vertices: wp.array(dtype=wp.vec3)
     live_normals: wp.array(dtype=wp.vec3)
-    live_gradient: wp.array(dtype=wp.vec3)
-    model_size: wp.vec2i
+    live_gradient: wp.array(dtype=wp.vec3)  # (I, dI/du, dI/dv)
+    model_size: wp.vec2i  # (width, height); ``live_size`` likewise
     live_size: wp.vec2i
-    focal: wp.vec2
-    centre: wp.vec2
+    focal: wp.vec2  # (fx, fy)
+    centre: wp.vec2  # (cx, cy)
 
 
 @wp.func_native(

@@ -25,23 +25,14 @@ _KEPT = 8  # pipelines: each has the buffers of its images
 
 @dataclass(frozen=True)
 class Pipeline:
-    """Buffers and launches for frames of one size under one configuration.
+    """Buffers and launches for frames of one size under one configuration."""
 
-    Attributes:
-        intrinsics: of the frames.
-        config: in force.
-        preprocess: of the frames.
-        tracker: of the frames against the map's views.
-        correct_exposure: of the frames before they are fused.
-        map_kernels: over the map.
-    """
-
-    intrinsics: Intrinsics
-    config: SurfelConfig
-    preprocess: Preprocessor
-    tracker: Tracker
-    correct_exposure: ExposureCorrection
-    map_kernels: MapKernels
+    intrinsics: Intrinsics  # of the frames
+    config: SurfelConfig  # in force
+    preprocess: Preprocessor  # of the frames
+    tracker: Tracker  # of the frames against the map's views
+    correct_exposure: ExposureCorrection  # of the frames before they are fused
+    map_kernels: MapKernels  # over the map
 
 
 class PipelineCache:

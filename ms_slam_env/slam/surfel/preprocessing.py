@@ -28,23 +28,15 @@ from ms_slam_env.slam.surfel.device import (
 
 @dataclass(frozen=True)
 class LiveFrame:
-    """The sensor's frames of B envs after preprocessing, on the device.
+    """The sensor's frames of B envs after preprocessing, on the device."""
 
-    Attributes:
-        raw_depth: (B, H, W) float32 metres as sensed; 0 = no reading or beyond the cutoff.
-        depth: (B, H, W) float32 metres, bilaterally filtered and cut off; 0 = no reading.
-        vertices: (B, H, W) vec3 back-projected ``depth``, camera frame; z = 0 where invalid.
-        normals: (B, H, W) vec3 unit normals, camera frame, towards the camera; 0 where invalid.
-        color: (B, H, W) vec3 RGB in [0, 255].
-        intensity: (B, H, W) float32 in [0, 255] (BT.601 luma of ``color``).
-    """
-
-    raw_depth: wp.array
-    depth: wp.array
-    vertices: wp.array
+    raw_depth: wp.array  # (B, H, W) float32 metres as sensed; 0 = no reading or beyond the cutoff
+    depth: wp.array  # (B, H, W) float32 metres, bilaterally filtered and cut off; 0 = no reading
+    vertices: wp.array  # (B, H, W) vec3 back-projected ``depth``, camera frame; z = 0 where invalid
+    # (B, H, W) vec3 unit normals, camera frame, towards the camera; 0 where invalid.
     normals: wp.array
-    color: wp.array
-    intensity: wp.array
+    color: wp.array  # (B, H, W) vec3 RGB in [0, 255]
+    intensity: wp.array  # (B, H, W) float32 in [0, 255] (BT.601 luma of ``color``)
 
 
 @wp.kernel

@@ -32,15 +32,10 @@ Int32 = NDArray[np.int32]
 
 @dataclass(frozen=True)
 class Images:
-    """Frames as sensed.
+    """Frames as sensed."""
 
-    Attributes:
-        color: (B, H, W, 3) uint8.
-        depth: (B, H, W) float32 metres; 0 = no reading.
-    """
-
-    color: NDArray[np.uint8]
-    depth: NDArray[np.float32]
+    color: NDArray[np.uint8]  # (B, H, W, 3) uint8
+    depth: NDArray[np.float32]  # (B, H, W) float32 metres; 0 = no reading
 
 
 class FrameAligner(Protocol):

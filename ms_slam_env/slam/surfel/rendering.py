@@ -25,18 +25,13 @@ class ModelView:
     """The map rendered from one pose per env, on the device.
 
     The view may hold only every n-th row and column of the camera's image.
-
-    Attributes:
-        vertices: (B, H, W) vec3 camera frame of the rendering pose; z = 0 where the map is empty.
-        normals: (B, H, W) vec3 unit normals, same frame, towards the camera; 0 where empty.
-        intensity: (B, H, W) float32 in [0, 255]; 0 where empty.
-        color: (B, H, W) vec3 RGB in [0, 255]; 0 where empty.
     """
 
+    # (B, H, W) vec3 camera frame of the rendering pose; z = 0 where the map is empty.
     vertices: wp.array
-    normals: wp.array
-    intensity: wp.array
-    color: wp.array
+    normals: wp.array  # (B, H, W) vec3 unit normals, same frame, towards the camera; 0 where empty
+    intensity: wp.array  # (B, H, W) float32 in [0, 255]; 0 where empty
+    color: wp.array  # (B, H, W) vec3 RGB in [0, 255]; 0 where empty
 
 
 @dataclass(frozen=True)

@@ -17,19 +17,12 @@ NEVER = wp.constant(2**31 - 1)
 
 @wp.struct
 class CullingRule:
-    """When surfels go.
+    """When surfels go."""
 
-    Attributes:
-        capacity: slots of a map.
-        interval: frames between two removals of unstable surfels.
-        window: frames for which an unstable surfel may stay unseen.
-        confidence_threshold: at which a surfel is stable.
-    """
-
-    capacity: int
-    interval: int
-    window: int
-    confidence_threshold: float
+    capacity: int  # slots of a map
+    interval: int  # frames between two removals of unstable surfels
+    window: int  # frames for which an unstable surfel may stay unseen
+    confidence_threshold: float  # at which a surfel is stable
 
 
 @wp.func

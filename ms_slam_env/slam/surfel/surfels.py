@@ -54,85 +54,52 @@ class VisibleList:
 
 @wp.struct
 class CullingBlocks:
-    """Blocks of B maps: arrays (B, capacity / BLOCK_SIZE, rounded up).
+    """Blocks of B maps: arrays (B, capacity / BLOCK_SIZE, rounded up)."""
 
-    Attributes:
-        low: lower corner of the bounding box, world frame.
-        high: upper corner.
-        expiry: frame that saw the block's longest unseen unstable surfel; the largest number if all
-            are stable or dead.
-        listed: blocks that a camera may see.
-        num_listed: (B,) how many those are.
-        bounded: (B,) slots whose blocks have a box that holds.
-    """
-
-    low: wp.array2d(dtype=wp.vec3)
-    high: wp.array2d(dtype=wp.vec3)
+    low: wp.array2d(dtype=wp.vec3)  # lower corner of the bounding box, world frame
+    high: wp.array2d(dtype=wp.vec3)  # upper corner
+    # frame that saw the block's longest unseen unstable surfel; the largest number if all are
+    # stable or dead.
     expiry: wp.array2d(dtype=wp.int32)
-    listed: wp.array2d(dtype=wp.int32)
-    num_listed: wp.array(dtype=wp.int32)
-    bounded: wp.array(dtype=wp.int32)
+    listed: wp.array2d(dtype=wp.int32)  # blocks that a camera may see
+    num_listed: wp.array(dtype=wp.int32)  # (B,) how many those are
+    bounded: wp.array(dtype=wp.int32)  # (B,) slots whose blocks have a box that holds
 
 
 @wp.struct
 class SplatFootprints:
-    """The surfels of a list in the image, arrays (B, capacity), and those that meet a pixel.
+    """The surfels of a list in the image, arrays (B, capacity), and those that meet a pixel."""
 
-    Attributes:
-        u: column of the centre.
-        v: row of the centre.
-        inverse: inverse depth of the centre.
-        slope_u: change of inverse depth per column.
-        slope_v: change of inverse depth per row.
-        rim: squared radius, square metres.
-        left: first column that the disc may cover; ``right``, ``top`` and ``bottom`` likewise.
-        right: last column.
-        top: first row.
-        bottom: last row.
-        drawn: places in the list of the discs that may cover a pixel.
-        num_drawn: (B,) how many those are.
-    """
-
-    u: wp.array2d(dtype=wp.float32)
-    v: wp.array2d(dtype=wp.float32)
-    inverse: wp.array2d(dtype=wp.float32)
-    slope_u: wp.array2d(dtype=wp.float32)
-    slope_v: wp.array2d(dtype=wp.float32)
-    rim: wp.array2d(dtype=wp.float32)
+    u: wp.array2d(dtype=wp.float32)  # column of the centre
+    v: wp.array2d(dtype=wp.float32)  # row of the centre
+    inverse: wp.array2d(dtype=wp.float32)  # inverse depth of the centre
+    slope_u: wp.array2d(dtype=wp.float32)  # change of inverse depth per column
+    slope_v: wp.array2d(dtype=wp.float32)  # change of inverse depth per row
+    rim: wp.array2d(dtype=wp.float32)  # squared radius, square metres
+    # first column that the disc may cover; ``right``, ``top`` and ``bottom`` likewise.
     left: wp.array2d(dtype=wp.int32)
-    right: wp.array2d(dtype=wp.int32)
-    top: wp.array2d(dtype=wp.int32)
-    bottom: wp.array2d(dtype=wp.int32)
-    drawn: wp.array2d(dtype=wp.int32)
-    num_drawn: wp.array(dtype=wp.int32)
+    right: wp.array2d(dtype=wp.int32)  # last column
+    top: wp.array2d(dtype=wp.int32)  # first row
+    bottom: wp.array2d(dtype=wp.int32)  # last row
+    drawn: wp.array2d(dtype=wp.int32)  # places in the list of the discs that may cover a pixel
+    num_drawn: wp.array(dtype=wp.int32)  # (B,) how many those are
 
 
 @wp.struct
 class Compaction:
-    """Working memory of ``surfel_culling``.
+    """Working memory of ``surfel_culling``."""
 
-    Attributes:
-        survivors: (B, capacity) slots to keep.
-        kept: (B,) how many those are, -1 where no compaction is due.
-        expired: (B,) surfels that died just now.
-    """
-
-    survivors: wp.array2d(dtype=wp.int32)
-    kept: wp.array(dtype=wp.int32)
-    expired: wp.array(dtype=wp.int32)
+    survivors: wp.array2d(dtype=wp.int32)  # (B, capacity) slots to keep
+    kept: wp.array(dtype=wp.int32)  # (B,) how many those are, -1 where no compaction is due
+    expired: wp.array(dtype=wp.int32)  # (B,) surfels that died just now
 
 
 @wp.struct
 class SeenWindow:
-    """Which surfels of B maps take part, by the frame that saw them last.
+    """Which surfels of B maps take part, by the frame that saw them last."""
 
-    Attributes:
-        seen_from: (B,) first frame.
-        seen_to: (B,) last frame.
-    """
-
-    seen_from: wp.array(dtype=wp.int32)
-    seen_to: wp.array(dtype=wp.int32)
+    seen_from: wp.array(dtype=wp.int32)  # (B,) first frame
+    seen_to: wp.array(dtype=wp.int32)  # (B,) last frame
 
 
 def any_time(batch: int, device: str) -> SeenWindow:
@@ -154,32 +121,19 @@ def allocate(struct: Any, batch: int, size: int, device: str) -> Any:
 
 @dataclass(frozen=True)
 class MapBuffers:
-    """Device arrays of B maps, which all that works on these maps shares.
+    """Device arrays of B maps, which all that works on these maps shares."""
 
-    Attributes:
-        batch: number of maps B.
-        capacity: slots of each.
-        workers: threads that share one map.
-        device: of all arrays.
-        surfels: the maps.
-        spare: room for compaction.
-        blocks: of the surfels.
-        visible: working list of the surfels in view.
-        footprints: of such a list.
-        compaction: working memory.
-        active: what frames are tracked against and fused into; all unless its times are set.
-    """
-
-    batch: int
-    capacity: int
-    workers: int
-    device: str
-    surfels: Surfels
-    spare: Surfels
-    blocks: CullingBlocks
-    visible: VisibleList
-    footprints: SplatFootprints
-    compaction: Compaction
+    batch: int  # number of maps B
+    capacity: int  # slots of each
+    workers: int  # threads that share one map
+    device: str  # of all arrays
+    surfels: Surfels  # the maps
+    spare: Surfels  # room for compaction
+    blocks: CullingBlocks  # of the surfels
+    visible: VisibleList  # working list of the surfels in view
+    footprints: SplatFootprints  # of such a list
+    compaction: Compaction  # working memory
+    # what frames are tracked against and fused into; all unless its times are set.
     active: SeenWindow
 
 
@@ -236,31 +190,18 @@ def depth_tolerance(distance_at_1m: float, z: float):
 
 @wp.struct
 class SplatCamera:
-    """Image size, focal lengths (px), principal point (px), and how discs are drawn.
+    """Image size, focal lengths (px), principal point (px), and how discs are drawn."""
 
-    Attributes:
-        width: columns.
-        height: rows.
-        focal: (fx, fy).
-        centre: (cx, cy).
-        z_near: nearest depth drawn, metres.
-        z_far: farthest depth drawn, metres.
-        tolerance_m: discs this far behind the nearest one belong to the same surface (at 1 m).
-        min_px: smallest drawn radius.
-        max_px: largest drawn radius.
-        max_weight: confidence above which a disc weighs no more.
-    """
-
-    width: int
-    height: int
-    focal: wp.vec2
-    centre: wp.vec2
-    z_near: float
-    z_far: float
-    tolerance_m: float
-    min_px: float
-    max_px: float
-    max_weight: float
+    width: int  # columns
+    height: int  # rows
+    focal: wp.vec2  # (fx, fy)
+    centre: wp.vec2  # (cx, cy)
+    z_near: float  # nearest depth drawn, metres
+    z_far: float  # farthest depth drawn, metres
+    tolerance_m: float  # discs this far behind the nearest one belong to the same surface (at 1 m)
+    min_px: float  # smallest drawn radius
+    max_px: float  # largest drawn radius
+    max_weight: float  # confidence above which a disc weighs no more
 
 
 @wp.func

@@ -22,25 +22,20 @@ _CONSTRAINT_ARRAYS = ("sources", "source_times", "targets", "target_times")
 
 @dataclass
 class TrajectoryHistory:
-    """What is remembered of one env.
+    """What is remembered of one env."""
 
-    Attributes:
-        frames: the frames fused.
-        poses: (4, 4) of each, moved by every closure since.
-        anchors: (ANCHORS, 3) points of the map in view of each, moved likewise: a pose keeps its
-            place relative to what it saw, which is metres away and may be far older.
-        anchor_times: (ANCHORS,) when those were created.
-        joined: relative constraints of the loops closed.
-        found: the frame at which a loop was found that waits to be confirmed, -1: there is none.
-        correction: (4, 4) of the world about the camera, which would have closed it.
-    """
-
-    frames: list[int] = field(default_factory=list)
+    frames: list[int] = field(default_factory=list)  # the frames fused
+    # (4, 4) of each, moved by every closure since.
     poses: list[Float64] = field(default_factory=list)
+    # (ANCHORS, 3) points of the map in view of each, moved likewise: a pose keeps its place
+    # relative to what it saw, which is metres away and may be far older.
     anchors: list[Float64] = field(default_factory=list)
-    anchor_times: list[Float64] = field(default_factory=list)
+    anchor_times: list[Float64] = field(default_factory=list)  # (ANCHORS,) when those were created
+    # relative constraints of the loops closed.
     joined: Constraints = field(default_factory=no_constraints)
+    # the frame at which a loop was found that waits to be confirmed, -1: there is none.
     found: int = -1
+    # (4, 4) of the world about the camera, which would have closed it.
     correction: Float64 = field(default_factory=lambda: np.eye(4))
 
     @property

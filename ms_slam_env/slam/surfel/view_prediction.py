@@ -35,19 +35,12 @@ SIZE_STEP_PX = 8  # reference views come in such steps, so that few sets of buff
 
 @dataclass(frozen=True)
 class DeviceViews:
-    """Predicted images on the device; see ``ms_slam_env.slam.base.Views``.
+    """Predicted images on the device; see ``ms_slam_env.slam.base.Views``."""
 
-    Attributes:
-        intensity: (V, h, w) float32 in [0, 255].
-        depth: (V, h, w) float32 metres.
-        normals: (V, h, w) vec3, camera frame.
-        intrinsics: of the images.
-    """
-
-    intensity: wp.array
-    depth: wp.array
-    normals: wp.array
-    intrinsics: Intrinsics
+    intensity: wp.array  # (V, h, w) float32 in [0, 255]
+    depth: wp.array  # (V, h, w) float32 metres
+    normals: wp.array  # (V, h, w) vec3, camera frame
+    intrinsics: Intrinsics  # of the images
 
 
 def mean_pose(poses: Float64) -> Float64:

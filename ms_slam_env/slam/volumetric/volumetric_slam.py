@@ -42,15 +42,10 @@ _FULL_WEIGHT = 3  # observations that tracking asks of the model, as soon as the
 
 @dataclass(frozen=True)
 class _RGBDImage(DepthImage):
-    """A frame with depth beyond the cutoff taken out.
+    """A frame with depth beyond the cutoff taken out."""
 
-    Attributes:
-        raw_depth: (H, W) in units of 1 / DEPTH_SCALE m.
-        color: (H, W, 3).
-    """
-
-    raw_depth: NDArray[np.uint16]
-    color: NDArray[np.uint8]
+    raw_depth: NDArray[np.uint16]  # (H, W) in units of 1 / DEPTH_SCALE m
+    color: NDArray[np.uint8]  # (H, W, 3)
 
 
 class VolumetricSlam(FrameByFrameSlam[_RGBDImage, None]):

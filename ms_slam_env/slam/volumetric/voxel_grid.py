@@ -47,17 +47,11 @@ _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
 
 @dataclass(frozen=True)
 class CastView:
-    """An image cast from the grid.
+    """An image cast from the grid."""
 
-    Attributes:
-        depth: (H, W) float32 metres; 0 where the grid is empty.
-        color: (H, W, 3) float32 RGB in [0, 1].
-        normals: (H, W, 3) float32 unit vectors in the camera frame, towards the camera; 0 where
-            empty.
-    """
-
-    depth: Float32
-    color: Float32
+    depth: Float32  # (H, W) float32 metres; 0 where the grid is empty
+    color: Float32  # (H, W, 3) float32 RGB in [0, 1]
+    # (H, W, 3) float32 unit vectors in the camera frame, towards the camera; 0 where empty.
     normals: Float32
 
     @property
