@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame
+from ms_slam_env.slam.state import Stateful
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -74,7 +75,7 @@ class Views:
     intrinsics: Intrinsics
 
 
-class SlamBackend(ABC):
+class SlamBackend(Stateful):
     """Estimates the camera's pose from RGB-D frames and keeps a map that it can render."""
 
     intrinsics: Intrinsics
@@ -141,14 +142,6 @@ class SlamBackend(ABC):
         """
         return np.zeros(0, dtype=np.int32), np.zeros((0, 4, 4))
 
-    @abstractmethod
-    def get_state(self) -> dict[str, Any]:
-        """Everything needed to go on bit-exactly, as NumPy arrays and plain values."""
-
-    @abstractmethod
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state that ``get_state`` returned."""
-
 
 class BorrowedMap(SlamBackend):
     """A backend whose surface is that of another backend."""
@@ -159,11 +152,7 @@ class BorrowedMap(SlamBackend):
         """The backend with the surface, up to date."""
 
     def predict(self, poses: ArrayLike, scale: float = 1.0) -> Views:
-        """Render the surface from ``poses`` (N, 4, 4) T_world_camera at ``scale`` times the size.
-
-        Raises:
-            InputError: poses of another shape, or a scale outside (0, 1].
-        """
+        """Render the surface from ``poses`` (N, 4, 4) T_world_camera; see ``SlamBackend``."""
         return self._mapper.predict(poses, scale)
 
     def surface_points(self) -> Float64:

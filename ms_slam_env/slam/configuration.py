@@ -46,7 +46,6 @@ class SlamConfiguration(Checked):
     about: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse what no backend could use."""
         super().__post_init__()
         check_parameters(self.slam, self.slam_config)
         if self.image_size is not None and self.image_size not in tuple(XTION_SIZES):

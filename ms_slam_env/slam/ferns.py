@@ -18,6 +18,7 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose
+from ms_slam_env.slam.state import Stateful
 
 _THRESHOLDS = (32.0, 224.0)  # on colours, after that
 _AVERAGED = 8  # rows and columns of the image, at least, that a reduced pixel is the mean of
@@ -35,9 +36,6 @@ class FernConfig(Checked):
         near_m: thresholds on depth are drawn between here
         far_m: and here.
         keyframe_dissimilarity: a frame is kept if it differs by more from every kept one.
-
-    Raises:
-        InputError: a value outside its range.
     """
 
     num_ferns: int = bounded(500, 1, 100_000)
@@ -48,7 +46,6 @@ class FernConfig(Checked):
     keyframe_dissimilarity: float = bounded(0.2, 0.0, 1.0)
 
     def __post_init__(self) -> None:
-        """Refuse values outside the ranges, and thresholds in no order."""
         super().__post_init__()
         if self.near_m >= self.far_m:
             raise InputError(
@@ -77,7 +74,6 @@ class FernEncoder:
     """Encodes frames of one camera; places and thresholds are drawn from a seed."""
 
     def __init__(self, intrinsics: Intrinsics, config: FernConfig, seed: int = 0) -> None:
-        """Draw the ferns."""
         rng = np.random.default_rng(seed)
         height, width = intrinsics.shape
         columns = min(config.columns, width)
@@ -139,7 +135,10 @@ class Candidate:
     time: int  # when it was observed
 
 
-class FernDatabase:
+_ROWS = ("_bits", "_known", "_poses", "_times")  # arrays of a row for each keyframe
+
+
+class FernDatabase(Stateful):
     """Keeps the frames that differ from all kept before, and finds those that resemble another.
 
     The same seed draws the same ferns.
@@ -148,14 +147,12 @@ class FernDatabase:
     def __init__(
         self, intrinsics: Intrinsics, config: FernConfig | None = None, seed: int = 0
     ) -> None:
-        """Start empty."""
         self.config = config or FernConfig()
         self._seed = seed
         self._encoder = FernEncoder(intrinsics, self.config, seed)
         self.clear()
 
     def __len__(self) -> int:
-        """Return the number of keyframes."""
         return self._count
 
     @property
@@ -198,24 +195,17 @@ class FernDatabase:
     def observe(
         self, color: UInt8, depth: NDArray[np.float32], T_world_camera: ArrayLike, time: int = 0
     ) -> bool:
-        """Keep a frame taken at ``T_world_camera`` (4, 4) if none that is kept resembles it.
-
-        Raises:
-            InputError: no pose.
-        """
+        """Keep a frame taken at ``T_world_camera`` (4, 4) if none that is kept resembles it."""
         return self.observe_code(self.encode(color, depth), T_world_camera, time)
 
     def observe_code(self, code: FernCode, T_world_camera: ArrayLike, time: int = 0) -> bool:
-        """The same for a frame that is encoded already; return whether it was kept.
-
-        Raises:
-            InputError: no pose.
-        """
+        """The same for a frame that is encoded already; return whether it was kept."""
         pose = check_pose(T_world_camera, "T_world_camera")
         if self._count and self.dissimilarities(code).min() <= self.config.keyframe_dissimilarity:
             return False
         if self._count == len(self._bits):
-            self._grow()
+            for name in _ROWS:  # double the capacity
+                setattr(self, name, _with_more_rows(getattr(self, name)))
         row = self._count
         self._bits[row], self._known[row] = code.bits, code.known
         self._poses[row], self._times[row] = pose, time
@@ -260,11 +250,7 @@ class FernDatabase:
         return dissimilarities(code, self._bits[: self._count], self._known[: self._count])
 
     def move(self, poses: ArrayLike) -> None:
-        """Put all keyframes at new poses (K, 4, 4), where a loop closure has bent the map.
-
-        Raises:
-            InputError: another number of poses, or what is none.
-        """
+        """Put all keyframes at new poses (K, 4, 4), where a loop closure has bent the map."""
         stack = np.asarray(poses, dtype=np.float64)
         if stack.shape != (self._count, 4, 4):
             raise InputError(f"poses must have shape {(self._count, 4, 4)}, got {stack.shape}")
@@ -273,37 +259,18 @@ class FernDatabase:
         self._poses[: self._count] = stack
 
     def transform(self, T_new_old: ArrayLike) -> None:
-        """Move all keyframes by one rigid motion (4, 4) of the world.
-
-        Raises:
-            InputError: no rigid motion.
-        """
+        """Move all keyframes by one rigid motion (4, 4) of the world."""
         self._poses[: self._count] = check_pose(T_new_old, "T_new_old") @ self._poses[: self._count]
 
     def get_state(self) -> dict[str, Any]:
-        """Everything needed to go on bit-exactly, as NumPy arrays."""
-        rows = slice(self._count)
-        return {
-            "bits": self._bits[rows].copy(),
-            "known": self._known[rows].copy(),
-            "poses": self._poses[rows].copy(),
-            "times": self._times[rows].copy(),
-        }
+        """The keyframes."""
+        return {name[1:]: getattr(self, name)[: self._count].copy() for name in _ROWS}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state of a database of the same camera, configuration and seed."""
         self._count = len(state["bits"])
-        self._bits = state["bits"].copy()
-        self._known = state["known"].copy()
-        self._poses = state["poses"].copy()
-        self._times = state["times"].copy()
-
-    def _grow(self) -> None:
-        """Double the capacity."""
-        self._bits = _with_more_rows(self._bits)
-        self._known = _with_more_rows(self._known)
-        self._poses = _with_more_rows(self._poses)
-        self._times = _with_more_rows(self._times)
+        for name in _ROWS:
+            setattr(self, name, state[name[1:]].copy())
 
 
 def _with_more_rows(array: NDArray[Any]) -> NDArray[Any]:

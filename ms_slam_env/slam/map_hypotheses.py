@@ -51,7 +51,6 @@ class RobotRun:
     tracked: NDArray[np.bool_]  # (N,) bool
 
     def __post_init__(self) -> None:
-        """Refuse what does not belong together."""
         count = len(self.frames)
         if count == 0:
             raise InputError("a robot without frames has no map to merge")
@@ -158,14 +157,8 @@ def match_landmarks(
 ) -> tuple[Float64, int] | None:
     """Find where the frame of robot b lies in map a: T_a_b (4, 4) and the matches behind it.
 
-    Of the frames of robot a the one with most inliers counts.
-
-    Args:
-        a: landmarks of robot a's frames.
-        b: landmarks of a frame of robot b.
-        least_inliers: matches that must fit one rigid motion.
-        tolerance_m: to this at 1 m of depth; grows with depth squared, as the sensor's noise does.
-        rng: draws the trials.
+    Of the frames of robot a the one with most inliers, at least ``least_inliers``, counts. They fit
+    to ``tolerance_m`` at 1 m, which grows with depth squared as the sensor's noise does.
     """
     best: tuple[Float64, int] | None = None
     for one in a:

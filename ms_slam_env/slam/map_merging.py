@@ -56,9 +56,6 @@ class MergeConfig(Checked):
             median over the frames that look at it.
         voxel_m: thinning of the maps before they are registered.
         cutoff_m: farthest pair of points in the registration.
-
-    Raises:
-        InputError: a value out of range.
     """
 
     sources: tuple[str, ...] = SOURCES
@@ -77,7 +74,6 @@ class MergeConfig(Checked):
     cutoff_m: float = bounded(0.10, 1e-3, 10.0)
 
     def __post_init__(self) -> None:
-        """Refuse values out of range and unknown sources."""
         super().__post_init__()
         for source in self.sources:
             if source not in SOURCES:

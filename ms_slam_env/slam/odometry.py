@@ -21,7 +21,6 @@ from ms_slam_env.geometry import invert, relative_angle
 from ms_slam_env.slam.alignment_check import (
     NO_ALIGNMENT,
     VIEW_REASONS,
-    VIEW_THRESHOLDS,
     AcceptanceThresholds,
     DepthImage,
     evaluate_alignment,
@@ -50,9 +49,6 @@ class OdometryConfig(Checked):
         stock: OpenCV's odometry as it is: every motion that it returns is believed, whatever the
             shares above, nothing is sought in views of the map, and a frame that it cannot align
             becomes the keyframe where the camera was last.
-
-    Raises:
-        InputError: a value outside its range.
     """
 
     depth_cutoff_m: float = bounded(4.0, 0.1, 10.0)
@@ -74,15 +70,7 @@ class PreparedImage:
 
 
 class Aligner:
-    """``cv2.Odometry`` on colour and depth with OpenCV's default settings.
-
-    Args:
-        intrinsics: of both images.
-        depth_cutoff_m: readings beyond are ignored.
-
-    Raises:
-        InputError: OpenCV is older than 5 and has no ``cv2.Odometry``.
-    """
+    """``cv2.Odometry`` on colour and depth with OpenCV's default settings."""
 
     def __init__(self, intrinsics: Intrinsics, depth_cutoff_m: float) -> None:
         if int(cv2.__version__.split(".")[0]) < 5:
@@ -130,26 +118,14 @@ class _Placed:
 class OdometrySlam(BorrowedMap, FrameByFrameSlam[DepthImage, _Placed]):
     """Keyframe odometry through OpenCV, its keyframes fused into a surfel map."""
 
+    saved = (*FrameByFrameSlam.saved, "_map")
+
     def __init__(self, intrinsics: Intrinsics, config: OdometryConfig | None = None) -> None:
-        """Start empty at the identity pose."""
         self.config = config or OdometryConfig()
         self._aligner = Aligner(intrinsics, self.config.depth_cutoff_m)
-        if self.config.stock:
-            self.fewest_readings = 0.0
-            self._thresholds = AcceptanceThresholds()
-        else:
-            self._thresholds = replace(
-                VIEW_THRESHOLDS,
-                overlap=self.config.least_overlap,
-                inlier_ratio=self.config.least_inliers,
-                photometric_inlier_ratio=self.config.least_alike,
-            )
-        self._map = SurfelSlam(
-            intrinsics,
-            SurfelConfig(
-                depth_cutoff_m=self.config.depth_cutoff_m, max_surfels=self.config.max_surfels
-            ),
-        )
+        self._judge_views(self.config)
+        kept = {name: getattr(self.config, name) for name in ("depth_cutoff_m", "max_surfels")}
+        self._map = SurfelSlam(intrinsics, SurfelConfig(**kept))
         super().__init__(intrinsics)
 
     @property
@@ -243,17 +219,18 @@ class OdometrySlam(BorrowedMap, FrameByFrameSlam[DepthImage, _Placed]):
     def _mapper(self) -> SurfelSlam:
         return self._map
 
-    def _map_state(self) -> dict[str, Any]:
-        return {
+    def get_state(self) -> dict[str, Any]:
+        """Pose and motion, the images that frames are aligned with, and the map."""
+        return super().get_state() | {
             "key": _save(self._key),
             "last": "key" if self._last is self._key else _save(self._last),
-            "map": self._map.get_state(),
         }
 
-    def _set_map_state(self, state: dict[str, Any]) -> None:
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state of a backend of the same intrinsics and configuration."""
+        super().set_state(state)
         self._key = self._restore(state["key"])
         self._last = self._key if state["last"] == "key" else self._restore(state["last"])
-        self._map.set_state(state["map"])
 
     def _restore(self, saved: dict[str, Any] | None) -> _Placed | None:
         if saved is None:

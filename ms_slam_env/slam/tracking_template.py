@@ -4,16 +4,23 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, Generic, Protocol, TypeVar
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.geometry import check_pose, invert
-from ms_slam_env.slam.alignment_check import FEWEST_READINGS, NO_ALIGNMENT, AlignmentStatistics
+from ms_slam_env.slam.alignment_check import (
+    FEWEST_READINGS,
+    NO_ALIGNMENT,
+    VIEW_THRESHOLDS,
+    AcceptanceThresholds,
+    AlignmentStatistics,
+)
 from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult
+from ms_slam_env.slam.state import Saved
 
 
 class PreparedFrame(Protocol):
@@ -38,7 +45,7 @@ class Attempt(Generic[Match]):
     match: Match  # what the backend found besides
 
 
-class FrameByFrameSlam(SlamBackend, Generic[Frame, Match]):
+class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
     """A backend that tries one pose after another, and takes the first that passes its check.
 
     A subclass says how a frame is prepared, which poses it may have, and how the map grows. While
@@ -49,11 +56,24 @@ class FrameByFrameSlam(SlamBackend, Generic[Frame, Match]):
     """
 
     fewest_readings = FEWEST_READINGS
+    saved: ClassVar[tuple[str, ...]] = ("_pose", "_motion", "_lost")
 
     def __init__(self, intrinsics: Intrinsics) -> None:
-        """Start empty at the identity pose; to be called when there is a map to clear."""
         self.intrinsics = intrinsics
         self.reset()
+
+    def _judge_views(self, config: Any) -> None:
+        """Demand of an alignment with a view the shares in ``config``; nothing of a stock one."""
+        self._thresholds = AcceptanceThresholds()
+        if config.stock:
+            self.fewest_readings = 0.0
+        else:
+            self._thresholds = replace(
+                VIEW_THRESHOLDS,
+                overlap=config.least_overlap,
+                inlier_ratio=config.least_inliers,
+                photometric_inlier_ratio=config.least_alike,
+            )
 
     def reset(self, T_world_camera: ArrayLike | None = None) -> None:
         """Forget everything; the next frame is taken at ``T_world_camera`` (identity if None)."""
@@ -64,11 +84,7 @@ class FrameByFrameSlam(SlamBackend, Generic[Frame, Match]):
         self._clear()
 
     def track(self, frame: RGBDFrame, T_world_camera_guess: ArrayLike | None = None) -> TrackResult:
-        """Estimate the pose of ``frame`` and extend the map; see ``SlamBackend``.
-
-        Raises:
-            InputError: the frame's size is not that of the intrinsics, or the guess is no pose.
-        """
+        """Estimate the pose of ``frame`` and extend the map; see ``SlamBackend``."""
         self.intrinsics.check_image(frame.depth, "frame")
         guess = None
         if T_world_camera_guess is not None:
@@ -89,11 +105,7 @@ class FrameByFrameSlam(SlamBackend, Generic[Frame, Match]):
         return self._lose(reason, statistics)
 
     def fuse(self, frame: RGBDFrame, T_world_camera: ArrayLike) -> TrackResult:
-        """Fuse ``frame`` into the map at a known pose (4, 4), without tracking.
-
-        Raises:
-            InputError: the frame's size is not that of the intrinsics, or the pose is none.
-        """
+        """Fuse ``frame`` into the map at a known pose (4, 4), without tracking."""
         self.intrinsics.check_image(frame.depth, "frame")
         self._pose = np.array(check_pose(T_world_camera, "T_world_camera"))
         return self._take(frame, self._prepare(frame))
@@ -131,22 +143,6 @@ class FrameByFrameSlam(SlamBackend, Generic[Frame, Match]):
             reason=reason,
         )
 
-    def get_state(self) -> dict[str, Any]:
-        """Everything needed to go on bit-exactly, as NumPy arrays and plain values."""
-        return {
-            "pose": self._pose.copy(),
-            "motion": self._motion.copy(),
-            "lost": self._lost,
-            **self._map_state(),
-        }
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state of a backend of the same intrinsics and configuration."""
-        self._pose = state["pose"].copy()
-        self._motion = state["motion"].copy()
-        self._lost = state["lost"]
-        self._set_map_state(state)
-
     @property
     @abstractmethod
     def _has_map(self) -> bool:
@@ -183,11 +179,3 @@ class FrameByFrameSlam(SlamBackend, Generic[Frame, Match]):
 
     def _miss(self, frame: RGBDFrame, prepared: Frame) -> None:
         """Take note of a frame that was found nowhere."""
-
-    @abstractmethod
-    def _map_state(self) -> dict[str, Any]:
-        """The part of the state that is the subclass's own."""
-
-    @abstractmethod
-    def _set_map_state(self, state: dict[str, Any]) -> None:
-        """Go on from ``_map_state``."""

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import cache, partial
 from importlib import import_module
-from importlib.util import find_spec
 from typing import Any
 
 import gymnasium
@@ -21,6 +20,7 @@ from ms_slam_env import ENV_IDS, PERTURBED_ENV_IDS, scenes, slam
 from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
 from ms_slam_env.geometry import invert, look_at, make_pose, se3_exp
 from ms_slam_env.sequences import HandheldPath, render_sequence
+from ms_slam_env.slam import adaptation, frame_selection
 
 Arrays = dict[str, np.ndarray]
 Frames = tuple[list[RGBDFrame], np.ndarray]  # and their true poses (N, 4, 4)
@@ -97,18 +97,14 @@ def surfel(**params: Any) -> slam.SlamBackend:
 
 def selecting() -> slam.SlamBackend:
     """Behind a selection of frames that keeps a budget."""
-    folder = "ms_slam_env.slam.frame_selection"
-    if find_spec(folder) is None:
-        folder = "ms_slam_env.slam.frame_management"  # as it was called when this was first stored
-    return import_module(folder).make_config("budget", share=0.6).manage(surfel())
+    return frame_selection.make_config("budget", share=0.6).manage(surfel())
 
 
 def adapting() -> slam.SlamBackend:
     """With run-time adaptation."""
-    make_config = import_module("ms_slam_env.slam.adaptation").make_config
     fast = {"slam_config": {"iterations": [2, 2, 2], "points_per_level": 1000}}
     options = {"configurations": [fast, {}], "thresholds": [0.06], "dwell_frames": 3}
-    return make_config("divergence", **options).adapt(surfel())
+    return adaptation.make_config("divergence", **options).adapt(surfel())
 
 
 BACKENDS: dict[str, Callable[[], slam.SlamBackend]] = {

@@ -28,7 +28,7 @@ from ms_slam_env.slam.frame_selection import (
     make_config,
 )
 from ms_slam_env.slam.frame_selection.budget import BudgetFilter
-from ms_slam_env.slam.frame_selection.config import EveryFrame
+from ms_slam_env.slam.frame_selection.config import RegularSkipping
 from ms_slam_env.slam.frame_selection.divergence import Change, ChangeConfig
 
 CAMERA = xtion("80x60")
@@ -121,7 +121,7 @@ class Recorder(SlamBackend):
 def test_without_management_nothing_changes(frames):
     bare = _surfel()
     assert make_config("none").manage(bare) is bare
-    managed = SelectiveSlam(_surfel(), EveryFrame())
+    managed = SelectiveSlam(_surfel(), RegularSkipping(1))
     for frame in [*frames[:8], _black(), *frames[8:10]]:
         a, b = bare.track(frame), managed.track(frame)
         np.testing.assert_array_equal(a.T_world_camera, b.T_world_camera)

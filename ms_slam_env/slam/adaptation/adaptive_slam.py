@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,12 +14,13 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.slam.base import SlamBackend
 from ms_slam_env.slam.configuration import SlamConfiguration, merged, read_configuration
 from ms_slam_env.slam.frame_selection import FrameFilter, SelectiveSlam
+from ms_slam_env.slam.state import Stateful
 from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
 
 _NEVER = 1_000_000_000  # frames in a row that are dropped at most
 
 
-class Controller(ABC):
+class Controller(Stateful):
     """Chooses before every frame one of the configurations, by index from fast to robust.
 
     Attributes:
@@ -48,14 +49,6 @@ class Controller(ABC):
             InputError: this variant chooses by itself.
         """
         raise InputError("configurations are chosen from outside under adaptation 'agent' only")
-
-    @abstractmethod
-    def get_state(self) -> dict[str, Any]:
-        """Everything needed to go on bit-exactly, as NumPy arrays and plain values."""
-
-    @abstractmethod
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state that ``get_state`` returned."""
 
 
 MOST = 8

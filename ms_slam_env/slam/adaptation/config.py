@@ -83,7 +83,6 @@ class SwitchingConfig(AdaptationConfig):
     costs: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        """Read the configurations."""
         super().__post_init__()
         if self.configurations is not None:
             object.__setattr__(self, "configurations", as_configurations(self.configurations))

@@ -9,7 +9,6 @@ from __future__ import annotations
 from bisect import bisect_right
 from dataclasses import dataclass, field
 from math import inf
-from typing import Any
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.config import bounded, chosen
@@ -18,6 +17,7 @@ from ms_slam_env.slam.adaptation.adaptive_slam import Controller
 from ms_slam_env.slam.adaptation.config import SwitchingConfig, rising
 from ms_slam_env.slam.frame_selection import ChangeConfig
 from ms_slam_env.slam.frame_selection.divergence import Change
+from ms_slam_env.slam.state import Saved
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,6 @@ class DivergenceAdaptationConfig(SwitchingConfig):
     change: ChangeConfig = field(default_factory=ChangeConfig)
 
     def __post_init__(self) -> None:
-        """Refuse what is no ladder."""
         super().__post_init__()
         wanted = self.num_configurations - 1
         object.__setattr__(self, "thresholds", rising(self.thresholds, "thresholds", wanted))
@@ -57,15 +56,16 @@ class DivergenceAdaptationConfig(SwitchingConfig):
         return DivergenceController(self, intrinsics)
 
 
-class DivergenceController(Controller):
+class DivergenceController(Saved, Controller):
     """Up at once, down after a while below.
 
     Attributes:
         change: between the last two frames, nats or nats per second; 0 before the second frame.
     """
 
+    saved = ("_measure", "change", "_time_s", "index", "_recent")
+
     def __init__(self, config: DivergenceAdaptationConfig, intrinsics: Intrinsics) -> None:
-        """Look at frames of ``intrinsics``."""
         self._config = config
         self._measure = Change(config.change, intrinsics)
         self._release = [config.release_share * x for x in config.thresholds]
@@ -109,22 +109,6 @@ class DivergenceController(Controller):
             nats /= frame.timestamp - before
         self.change = nats
 
-    def get_state(self) -> dict[str, Any]:
-        """The last frame's histograms, and what is known since the last switch."""
-        return {
-            "measure": self._measure.get_state(),
-            "change": self.change,
-            "time_s": self._time_s,
-            "index": self.index,
-            "recent": list(self._recent),
-        }
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state."""
-        self._measure.set_state(state["measure"])
-        self.change, self._time_s = state["change"], state["time_s"]
-        self.index, self._recent = state["index"], list(state["recent"])
-
 
 @dataclass(frozen=True)
 class AgentConfig(SwitchingConfig):
@@ -137,11 +121,12 @@ class AgentConfig(SwitchingConfig):
         return AgentController(self.num_configurations, self.first)
 
 
-class AgentController(Controller):
+class AgentController(Saved, Controller):
     """Keeps to what it was told last."""
 
+    saved = ("index",)
+
     def __init__(self, count: int, first: int) -> None:
-        """Of ``count`` configurations, start with ``first``."""
         self._count, self._first = count, first
         self.reset()
 
@@ -154,19 +139,7 @@ class AgentController(Controller):
         return self.index
 
     def use(self, index: int) -> None:
-        """Take configuration ``index`` from the next frame on.
-
-        Raises:
-            InputError: there is none of that index.
-        """
+        """Take configuration ``index`` from the next frame on."""
         if not 0 <= index < self._count:
             raise InputError(f"configuration {index!r} is outside [0, {self._count - 1}]")
         self.index = int(index)
-
-    def get_state(self) -> dict[str, Any]:
-        """The index."""
-        return {"index": self.index}
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Go on with the index of a state."""
-        self.index = state["index"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.config import bounded, check_range
@@ -12,9 +11,10 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.slam.frame_selection.config import DroppingConfig
 from ms_slam_env.slam.frame_selection.divergence import Change, ChangeConfig
 from ms_slam_env.slam.frame_selection.selective_slam import FrameFilter
+from ms_slam_env.slam.state import Saved
 
 
-class ThresholdController:
+class ThresholdController(Saved):
     """Raises a threshold with what was spent and lowers it with what was allowed.
 
     The threshold is ``start exp(gain debt)``, the debt being what was spent beyond what was
@@ -29,6 +29,8 @@ class ThresholdController:
         lowest: the threshold never falls below it; what is left over then is lost.
         highest: the threshold never rises above it.
     """
+
+    saved = ("debt",)
 
     def __init__(self, start: float, gain: float, lowest: float, highest: float) -> None:
         self._start = start
@@ -92,7 +94,6 @@ class BudgetConfig(DroppingConfig):
     change: ChangeConfig = field(default_factory=ChangeConfig)
 
     def __post_init__(self) -> None:
-        """Refuse values that contradict each other."""
         super().__post_init__()
         check_range(self, "threshold", self.lowest_threshold, 1e6)
         check_range(self, "highest_threshold", self.threshold, 1e6)
@@ -118,8 +119,10 @@ class BudgetConfig(DroppingConfig):
         return BudgetFilter(self, Change(self.change, intrinsics))
 
 
-class BudgetFilter(FrameFilter):
+class BudgetFilter(Saved, FrameFilter):
     """Admits a frame that differs enough from the last processed one for what can be afforded."""
+
+    saved = ("_change", "_controller", "_time", "_processed", "_allowed", "_spent_s", "_count")
 
     def __init__(self, config: BudgetConfig, change: Change) -> None:
         self._config = config
@@ -144,11 +147,7 @@ class BudgetFilter(FrameFilter):
         self._spent_s, self._count = 0.0, 0  # on processed frames, as measured
 
     def admits(self, frame: RGBDFrame, dropped: int, forced: bool = False) -> bool:
-        """Whether its change reaches the threshold of now.
-
-        Raises:
-            InputError: a budget a second, and a time stamp that is not later than the last.
-        """
+        """Whether its change reaches the threshold of now."""
         config = self._config
         self._allowed = self._allowance(frame.timestamp)
         admitted = self._change.measure(frame) >= self.threshold
@@ -188,25 +187,3 @@ class BudgetFilter(FrameFilter):
     def _book(self, spent: float, unit: float) -> None:
         """Book costs, ``unit`` being that of a processed frame."""
         self._controller.update(spent / unit, self._allowed / unit)
-
-    def get_state(self) -> dict[str, Any]:
-        """The last processed frame's histograms, and the accounts."""
-        return {
-            "change": self._change.get_state(),
-            "debt": self._controller.debt,
-            "time": self._time,
-            "processed": self._processed,
-            "allowed": self._allowed,
-            "spent_s": self._spent_s,
-            "count": self._count,
-        }
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Go on with the accounts of a state."""
-        self._change.set_state(state["change"])
-        self._controller.debt = state["debt"]
-        self._time = state["time"]
-        self._processed = state["processed"]
-        self._allowed = state["allowed"]
-        self._spent_s = state["spent_s"]
-        self._count = state["count"]

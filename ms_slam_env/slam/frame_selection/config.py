@@ -8,13 +8,13 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import KW_ONLY, dataclass, field
-from typing import Any
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.config import Checked, Family, bounded, chosen
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.base import SlamBackend
 from ms_slam_env.slam.frame_selection.selective_slam import PREDICTIONS, FrameFilter, SelectiveSlam
+from ms_slam_env.slam.state import Saved
 
 _ROUNDING = 1e-9  # 13 / 1.3 is less than 10
 
@@ -53,29 +53,11 @@ class EveryFrameConfig(FrameSelectionConfig):
 
     def make_filter(self, intrinsics: Intrinsics) -> FrameFilter:
         """The filter that admits everything."""
-        return EveryFrame()
+        return RegularSkipping(1)
 
     def manage(self, backend: SlamBackend) -> SlamBackend:
         """The backend as it is."""
         return backend
-
-
-class EveryFrame(FrameFilter):
-    """Admits every frame."""
-
-    def reset(self) -> None:
-        """Nothing to forget."""
-
-    def admits(self, frame: RGBDFrame, dropped: int, forced: bool = False) -> bool:
-        """Yes."""
-        return True
-
-    def get_state(self) -> dict[str, Any]:
-        """Nothing."""
-        return {}
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Nothing to restore."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +96,6 @@ class RegularConfig(DroppingConfig):
     every: float = bounded(2.0, 1, 10_001)
 
     def __post_init__(self) -> None:
-        """Refuse values that contradict each other."""
         super().__post_init__()
         longest = math.ceil(self.every) - 1
         if longest > self.max_skip:
@@ -128,8 +109,10 @@ class RegularConfig(DroppingConfig):
         return RegularSkipping(self.every)
 
 
-class RegularSkipping(FrameFilter):
+class RegularSkipping(Saved, FrameFilter):
     """Admits frames 0, n, 2n, ..., rounded up, counted since ``reset``."""
+
+    saved = ("_count",)
 
     def __init__(self, every: float) -> None:
         self._every = every
@@ -145,11 +128,3 @@ class RegularSkipping(FrameFilter):
         before = math.floor((self._count - 1) / self._every + _ROUNDING)
         self._count += 1
         return turns > before
-
-    def get_state(self) -> dict[str, Any]:
-        """The count."""
-        return {"count": self._count}
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Go on counting."""
-        self._count = state["count"]

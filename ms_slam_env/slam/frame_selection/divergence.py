@@ -12,6 +12,7 @@ from ms_slam_env.config import Checked, bounded
 from ms_slam_env.divergence import DivergenceConfig, Histograms, make_divergence
 from ms_slam_env.slam.frame_selection.config import DroppingConfig
 from ms_slam_env.slam.frame_selection.selective_slam import FrameFilter
+from ms_slam_env.slam.state import Saved, Stateful
 
 
 @dataclass(frozen=True)
@@ -27,9 +28,6 @@ class ChangeConfig(Checked):
         depth_weight: lambda. On hand-held sequences of validation seeds the sum with 1 followed the
             size of the motion at least as well as either divergence alone.
         divergence: of the two kinds.
-
-    Raises:
-        InputError: a value out of range.
     """
 
     width: int = bounded(80, 8, 10_000)
@@ -37,13 +35,8 @@ class ChangeConfig(Checked):
     divergence: DivergenceConfig = field(default_factory=DivergenceConfig)
 
 
-class Change:
-    """Measures the change of each frame from a reference frame.
-
-    Args:
-        config: how it is measured.
-        intrinsics: of the frames.
-    """
+class Change(Stateful):
+    """Measures the change of each frame from a reference frame."""
 
     def __init__(self, config: ChangeConfig, intrinsics: Intrinsics) -> None:
         self._intrinsics = intrinsics
@@ -58,11 +51,7 @@ class Change:
         self._reference = self._current = None
 
     def measure(self, frame: RGBDFrame) -> float:
-        """Change of ``frame`` from the reference, nats; infinite without one.
-
-        Raises:
-            InputError: the frame's size is not that of the intrinsics.
-        """
+        """Change of ``frame`` from the reference, nats; infinite without one."""
         self._intrinsics.check_image(frame.depth, "frame")
         s = self._stride
         grey = intensity_image(np.ascontiguousarray(frame.color[::s, ::s])).astype(np.float32)
@@ -102,9 +91,6 @@ class DivergenceFilterConfig(DroppingConfig):
     Attributes:
         threshold: of the change, nats; 0 drops nothing.
         change: how it is measured.
-
-    Raises:
-        InputError: a value out of range.
     """
 
     name: str = field(default="divergence", init=False)
@@ -116,8 +102,10 @@ class DivergenceFilterConfig(DroppingConfig):
         return DivergenceFilter(self.threshold, Change(self.change, intrinsics))
 
 
-class DivergenceFilter(FrameFilter):
+class DivergenceFilter(Saved, FrameFilter):
     """Admits a frame that differs enough from the last processed one."""
+
+    saved = ("_change",)
 
     def __init__(self, threshold: float, change: Change) -> None:
         self._threshold = threshold
@@ -133,11 +121,3 @@ class DivergenceFilter(FrameFilter):
         if admitted or forced:
             self._change.keep()
         return admitted
-
-    def get_state(self) -> dict[str, Any]:
-        """The last processed frame's histograms."""
-        return {"change": self._change.get_state()}
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Go on with the last processed frame of a state."""
-        self._change.set_state(state["change"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from dataclasses import replace
 from typing import Any
 
@@ -13,9 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.geometry import check_pose, invert, se3_exp, se3_log
 from ms_slam_env.slam.base import BorrowedMap, Float64, SlamBackend, TrackResult
+from ms_slam_env.slam.state import Saved, Stateful
 
 
-class FrameFilter(ABC):
+class FrameFilter(Stateful):
     """Decides, frame by frame, whether SLAM processes it.
 
     The first frame, those while tracking is lost and those after the longest permitted gap are
@@ -36,23 +37,15 @@ class FrameFilter(ABC):
             forced: the frame is processed whatever the answer is; the filter takes note.
         """
 
-    def charge(self, seconds: float) -> None:  # noqa: B027 -- most take no notice
+    def charge(self, seconds: float) -> None:
         """Take note of the processor time that the last frame took, its judgement included."""
-
-    @abstractmethod
-    def get_state(self) -> dict[str, Any]:
-        """Everything needed to go on bit-exactly, as NumPy arrays and plain values."""
-
-    @abstractmethod
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state that ``get_state`` returned."""
 
 
 PREDICTIONS = ("last", "constant-velocity")
 """Poses that a dropped frame may be given."""
 
 
-class PosePrediction:
+class PosePrediction(Saved):
     """Carries the last processed pose on.
 
     Args:
@@ -60,6 +53,8 @@ class PosePrediction:
             the camera moved between them; else at rest. A frame dropped for its likeness cannot be
             far away: without the limit a camera that stops is carried on.
     """
+
+    saved = ("_pose", "_twist", "_frames")
 
     def __init__(self, is_moving: bool) -> None:
         self._is_moving = is_moving
@@ -94,17 +89,8 @@ class PosePrediction:
         """The same as a guess for tracking; None where no motion is known."""
         return self.pose(frames) if self._twist.any() else None
 
-    def get_state(self) -> dict[str, Any]:
-        """Pose and last motion."""
-        return {"pose": self._pose.copy(), "twist": self._twist.copy(), "frames": self._frames}
 
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state."""
-        self._pose, self._twist = state["pose"].copy(), state["twist"].copy()
-        self._frames = state["frames"]
-
-
-class SelectiveSlam(BorrowedMap):
+class SelectiveSlam(Saved, BorrowedMap):
     """A backend behind a filter: active frame management (Saeedi et al., ICRA 2017, section V-A).
 
     A dropped frame is not shown to the backend; its result has ``processed`` False and a predicted
@@ -120,6 +106,8 @@ class SelectiveSlam(BorrowedMap):
         max_skip: most frames dropped in a row.
         pose: of a dropped frame without a known or guessed pose, ``constant-velocity`` or ``last``.
     """
+
+    saved = ("backend", "_filter", "_prediction", "_frames")
 
     def __init__(
         self,
@@ -150,11 +138,7 @@ class SelectiveSlam(BorrowedMap):
         self._forget()
 
     def track(self, frame: RGBDFrame, T_world_camera_guess: ArrayLike | None = None) -> TrackResult:
-        """Estimate the pose of ``frame`` and fuse it into the map, or drop it. See ``SlamBackend``.
-
-        Raises:
-            InputError: the frame's size is not that of the intrinsics, or the guess is no pose.
-        """
+        """Estimate the pose of ``frame`` and fuse it, or drop it; see ``SlamBackend``."""
         self.intrinsics.check_image(frame.depth, "frame")
         if T_world_camera_guess is not None:
             check_pose(T_world_camera_guess, "T_world_camera_guess")
@@ -170,11 +154,7 @@ class SelectiveSlam(BorrowedMap):
         return result
 
     def fuse(self, frame: RGBDFrame, T_world_camera: ArrayLike) -> TrackResult:
-        """Fuse ``frame`` into the map at a known pose (4, 4), or drop it; nothing is tracked.
-
-        Raises:
-            InputError: the frame's size is not that of the intrinsics, or the pose is none.
-        """
+        """Fuse ``frame`` into the map at a known pose (4, 4), or drop it; nothing is tracked."""
         self.intrinsics.check_image(frame.depth, "frame")
         check_pose(T_world_camera, "T_world_camera")
         begin = time.process_time()
@@ -255,12 +235,8 @@ class SelectiveSlam(BorrowedMap):
     def get_state(self) -> dict[str, Any]:
         """Everything needed to go on bit-exactly, as NumPy arrays and plain values."""
         last = self._last
-        return {
-            "backend": self.backend.get_state(),
-            "filter": self._filter.get_state(),
-            "prediction": self._prediction.get_state(),
-            "frames": self._frames,
-            "last": None if last is None else _plain(last),
+        return super().get_state() | {
+            "last": None if last is None else _copied(vars(last)),
             "processed": np.array(self._processed, dtype=np.int64),
             "dropped": np.array(list(self._offsets), dtype=np.int64),
             "offsets": np.array(list(self._offsets.values())).reshape(-1, 4, 4),
@@ -268,18 +244,10 @@ class SelectiveSlam(BorrowedMap):
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state of the same backend behind the same filter."""
-        self.backend.set_state(state["backend"])
-        self._filter.set_state(state["filter"])
-        self._prediction.set_state(state["prediction"])
-        self._frames = state["frames"]
+        super().set_state(state)
         self._last = None if state["last"] is None else TrackResult(**_copied(state["last"]))
         self._processed = state["processed"].tolist()
         self._offsets = dict(zip(state["dropped"].tolist(), state["offsets"].copy(), strict=True))
-
-
-def _plain(result: TrackResult) -> dict[str, Any]:
-    """The fields of a result, arrays copied."""
-    return _copied(vars(result))
 
 
 def _copied(values: dict[str, Any]) -> dict[str, Any]:

@@ -35,9 +35,6 @@ class SparseConfig(Checked):
         remap_m: the dense map is made anew when a keyframe has moved by this much,
         remap_deg: or turned by this much, since it was fused.
         max_surfels: capacity of the dense map; None as in ``SurfelConfig``.
-
-    Raises:
-        InputError: a value outside its range.
     """
 
     depth_cutoff_m: float = bounded(4.0, 0.1, 10.0)

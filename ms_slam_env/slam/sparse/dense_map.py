@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -12,16 +11,14 @@ from ms_slam_env.geometry import relative_angle
 from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.sparse.config import SparseConfig
 from ms_slam_env.slam.sparse.sparse_map import Keyframe
+from ms_slam_env.slam.state import Saved
 from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
 
 
-class DenseMap:
-    """Surfels fused from keyframes at their poses; made anew when a pose has changed.
+class DenseMap(Saved):
+    """Surfels fused from keyframes at their poses; made anew when a pose has changed."""
 
-    Args:
-        intrinsics: of the keyframes.
-        config: parameters.
-    """
+    saved = ("_surfels", "_poses", "_fused")
 
     def __init__(self, intrinsics: Intrinsics, config: SparseConfig) -> None:
         self._config = config
@@ -66,17 +63,3 @@ class DenseMap:
         moved_m = float(np.linalg.norm(placed[:3, 3] - pose[:3, 3]))
         turned = np.degrees(relative_angle(placed[:3, :3], pose[:3, :3]))
         return moved_m > self._config.remap_m or turned > self._config.remap_deg
-
-    def get_state(self) -> dict[str, Any]:
-        """The surfels, and where the keyframes are."""
-        return {
-            "surfels": self._surfels.get_state(),
-            "poses": np.array(self._poses).reshape(-1, 4, 4),
-            "fused": self._fused,
-        }
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state."""
-        self._surfels.set_state(state["surfels"])
-        self._poses = list(state["poses"].copy())
-        self._fused = state["fused"]

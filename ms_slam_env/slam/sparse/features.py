@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.base import Float32, Float64
+from ms_slam_env.slam.rows import Rows
 from ms_slam_env.slam.sparse.config import SparseConfig
 
 SCALE = 1.2  # between levels of the pyramid, as in ORB-SLAM
@@ -38,7 +39,7 @@ _LARGEST_SIGMA_PX = 0.7  # a patch that fixes its place less well is on an edge,
 
 
 @dataclass(frozen=True)
-class Features:
+class Features(Rows):
     """Features of one image."""
 
     pixels: Float64  # (N, 2) float64 positions (u, v)
@@ -47,19 +48,6 @@ class Features:
     # (N,) float64 error of the position, in units of that of a corner of the full image: pixels of
     # the image along a pixel of the level that it was found on.
     scale: Float64
-
-    def __len__(self) -> int:
-        """Return the number of features."""
-        return len(self.pixels)
-
-    def chosen(self, which: NDArray[Any]) -> Features:
-        """Some of the features."""
-        return Features(
-            self.pixels[which],
-            self.inverse_depth[which],
-            self.descriptors[which],
-            self.scale[which],
-        )
 
     def points(self, intrinsics: Intrinsics) -> Float64:
         """Points (N, 3) in the camera frame; NaN where the depth is not known."""
@@ -71,12 +59,7 @@ class Features:
 
 
 class FeatureExtractor:
-    """Finds and describes corners evenly over the image.
-
-    Args:
-        intrinsics: of every image.
-        config: parameters.
-    """
+    """Finds and describes corners evenly over the image."""
 
     def __init__(self, intrinsics: Intrinsics, config: SparseConfig) -> None:
         self._count = config.features
@@ -205,7 +188,7 @@ def warp(patches: Patches, intrinsics: Intrinsics) -> tuple[Float64, Float64]:
 
 
 @dataclass(frozen=True)
-class Templates:
+class Templates(Rows):
     """What patches look like, and how they respond to a shift."""
 
     wanted: Float32  # (N, K) intensity of their pixels less its mean
@@ -224,14 +207,8 @@ class Templates:
 
     def put(self, where: NDArray[Any], others: Templates) -> None:
         """Put other templates into some places."""
-        for name in ("wanted", "step", "contrast", "spread"):
-            getattr(self, name)[where] = getattr(others, name)
-
-    def chosen(self, which: NDArray[Any]) -> Templates:
-        """Some of the templates."""
-        return Templates(
-            self.wanted[which], self.step[which], self.contrast[which], self.spread[which]
-        )
+        for name, values in vars(others).items():
+            getattr(self, name)[where] = values
 
 
 def cut(image: Float32, pixels: Float64) -> Templates:
@@ -258,12 +235,6 @@ def find_patches(
     """Where (N, 2) patches are in an image (H, W), and how surely (N,): 1 sigma, pixels.
 
     Infinite where a patch was not found.
-
-    Args:
-        image: intensity, levels.
-        templates: of the patches.
-        patches: where they come from.
-        intrinsics: of all images.
     """
     centre, A = warp(patches, intrinsics)
     start = centre + patches.shift

@@ -62,9 +62,6 @@ def adjust_bundle(bundle: Bundle, intrinsics: Intrinsics) -> tuple[Float64, Floa
 
     Depth enters as the disparity of an imagined second camera, as in ORB-SLAM2 (section III-C);
     the errors of the two images are correlated so that pixel and inverse depth are independent.
-
-    Raises:
-        InputError: GTSAM is not installed.
     """
     gtsam = load_gtsam()
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()

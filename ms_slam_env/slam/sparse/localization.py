@@ -18,6 +18,7 @@ from ms_slam_env.slam.alignment_check import (
     measure_alignment,
 )
 from ms_slam_env.slam.base import Float64
+from ms_slam_env.slam.rows import join
 from ms_slam_env.slam.sparse.config import SparseConfig
 from ms_slam_env.slam.sparse.features import (
     Features,
@@ -80,12 +81,7 @@ class Fix:
 
 
 class Localizer:
-    """Places frames in a map.
-
-    Args:
-        sparse_map: keyframes and points.
-        config: parameters.
-    """
+    """Places frames in a map."""
 
     def __init__(self, sparse_map: SparseMap, config: SparseConfig) -> None:
         self._map = sparse_map
@@ -272,12 +268,7 @@ def keyframe_features(
     descriptors = sparse_map.descriptors[fix.point_ids]
     own = fix.features >= 0
     descriptors[own] = features.descriptors[fix.features[own]]
-    return (
-        Features(
-            np.concatenate([fix.seen.pixels, rest.pixels]),
-            np.concatenate([fix.seen.inverse_depth, rest.inverse_depth]),
-            np.concatenate([descriptors, rest.descriptors]),
-            np.concatenate([fix.seen.sigma_px / pixel_noise, rest.scale]),
-        ),
-        np.concatenate([fix.point_ids, np.full(len(rest), -1, dtype=np.int64)]),
-    )
+    seen, scale = fix.seen, fix.seen.sigma_px / pixel_noise
+    found = Features(seen.pixels, seen.inverse_depth, descriptors, scale)
+    none = np.full(len(rest), -1, dtype=np.int64)
+    return join([found, rest]), np.concatenate([fix.point_ids, none])

@@ -17,6 +17,7 @@ from ms_slam_env.slam.sparse.localization import Fix, LiveFrame, Localizer
 from ms_slam_env.slam.sparse.matching import most_alike
 from ms_slam_env.slam.sparse.pose import orthonormal
 from ms_slam_env.slam.sparse.sparse_map import SparseMap
+from ms_slam_env.slam.state import Stateful
 
 _FIXED_SIGMA = 1e-6
 _ITERATIONS = 20
@@ -39,11 +40,7 @@ class Edge:
 
 
 def optimise_poses(poses: Float64, edges: Sequence[Edge], fixed: NDArray[np.bool_]) -> Float64:
-    """Poses (K, 4, 4) of least squares; those that are ``fixed`` (K,) stay.
-
-    Raises:
-        InputError: GTSAM is not installed.
-    """
+    """Poses (K, 4, 4) of least squares; those that are ``fixed`` (K,) stay."""
     gtsam = load_gtsam()
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     stay = gtsam.noiseModel.Isotropic.Sigma(6, _FIXED_SIGMA)
@@ -65,14 +62,8 @@ def optimise_poses(poses: Float64, edges: Sequence[Edge], fixed: NDArray[np.bool
     return optimised
 
 
-class LoopCloser:
-    """Closes loops of a map.
-
-    Args:
-        sparse_map: keyframes and points.
-        localizer: places images in it, and verifies the places.
-        config: parameters.
-    """
+class LoopCloser(Stateful):
+    """Closes loops of a map."""
 
     def __init__(
         self,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, make_pose, transform_points
 from ms_slam_env.slam.base import Float64
+from ms_slam_env.slam.rows import Rows
 
 # 95 % quantiles of the chi-squared distribution with two and three degrees of freedom.
 CHI2_PIXEL, CHI2_PIXEL_AND_DEPTH = 5.991, 7.815
@@ -24,26 +24,13 @@ _RANSAC_ITERATIONS = 200
 
 
 @dataclass(frozen=True)
-class Sightings:
+class Sightings(Rows):
     """Where an image shows points."""
 
     pixels: Float64  # (N, 2) measured positions
     inverse_depth: Float64  # (N,) measured, 1/m; 0 = not known
     sigma_px: Float64  # (N,) standard deviation of the positions, pixels
     sigma_inverse_depth: float  # standard deviation of the inverse depth, 1/m
-
-    def __len__(self) -> int:
-        """Return the number of sightings."""
-        return len(self.pixels)
-
-    def chosen(self, which: NDArray[Any]) -> Sightings:
-        """Some of the sightings."""
-        return Sightings(
-            self.pixels[which],
-            self.inverse_depth[which],
-            self.sigma_px[which],
-            self.sigma_inverse_depth,
-        )
 
 
 def residuals(

@@ -15,6 +15,7 @@ from ms_slam_env.slam.alignment_check import DepthImage
 from ms_slam_env.slam.base import Float32, Float64
 from ms_slam_env.slam.sparse.features import Features, InverseDepth, Templates, cut
 from ms_slam_env.slam.sparse.matching import Int64, thumbnail
+from ms_slam_env.slam.state import Saved
 
 _TRIED_FRAMES = 8  # frames after which a point that is hardly ever found again is dropped
 _FOUND_SHARE = 0.25  # as in ORB-SLAM
@@ -68,11 +69,12 @@ def make_keyframe(
     )
 
 
-class SparseMap:
+class SparseMap(Saved):
     """Keyframes, points, and which keyframe sees which point."""
 
+    saved = ("positions", "descriptors", "hosts", "host_features", "alive", "_tried", "_found")
+
     def __init__(self, intrinsics: Intrinsics) -> None:
-        """Start empty."""
         self.intrinsics = intrinsics
         self.keyframes: list[Keyframe] = []
         self.positions: Float64 = np.zeros((0, 3))
@@ -155,27 +157,12 @@ class SparseMap:
 
     def get_state(self) -> dict[str, Any]:
         """Everything, as arrays."""
-        return {
-            "keyframes": [_save(keyframe) for keyframe in self.keyframes],
-            "positions": self.positions.copy(),
-            "descriptors": self.descriptors.copy(),
-            "hosts": self.hosts.copy(),
-            "host_features": self.host_features.copy(),
-            "alive": self.alive.copy(),
-            "tried": self._tried.copy(),
-            "found": self._found.copy(),
-        }
+        return super().get_state() | {"keyframes": [_save(one) for one in self.keyframes]}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state."""
+        super().set_state(state)
         self.keyframes = [_restore(saved) for saved in state["keyframes"]]
-        self.positions = state["positions"].copy()
-        self.descriptors = state["descriptors"].copy()
-        self.hosts = state["hosts"].copy()
-        self.host_features = state["host_features"].copy()
-        self.alive = state["alive"].copy()
-        self._tried = state["tried"].copy()
-        self._found = state["found"].copy()
 
 
 _OF_KEYFRAME = ("T_world_camera", "point_ids", "color", "intensity", "depth")

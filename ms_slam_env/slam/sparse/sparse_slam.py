@@ -8,7 +8,6 @@ neighbours, and close loops. What a frame shows beyond its corners is the busine
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -41,12 +40,10 @@ _BESIDE = 2  # keyframes beside the guess in which it is sought
 class SparseSlam(BorrowedMap, FrameByFrameSlam[LiveFrame, Fix]):
     """The sparse SLAM of one camera."""
 
-    def __init__(self, intrinsics: Intrinsics, config: SparseConfig | None = None) -> None:
-        """Start empty at the identity pose.
+    saved = (*FrameByFrameSlam.saved, "_reference", "_map", "_loops", "_dense")
 
-        Raises:
-            InputError: GTSAM is not installed.
-        """
+    def __init__(self, intrinsics: Intrinsics, config: SparseConfig | None = None) -> None:
+        """Start empty at the identity pose."""
         load_gtsam()
         self.intrinsics = intrinsics
         self.config = config or SparseConfig()
@@ -178,17 +175,3 @@ class SparseSlam(BorrowedMap, FrameByFrameSlam[LiveFrame, Fix]):
     @property
     def _mapper(self) -> SurfelSlam:
         return self._dense.updated(self._map.keyframes)
-
-    def _map_state(self) -> dict[str, Any]:
-        return {
-            "reference": self._reference,
-            "map": self._map.get_state(),
-            "loops": self._loops.get_state(),
-            "dense": self._dense.get_state(),
-        }
-
-    def _set_map_state(self, state: dict[str, Any]) -> None:
-        self._reference = state["reference"]
-        self._map.set_state(state["map"])
-        self._loops.set_state(state["loops"])
-        self._dense.set_state(state["dense"])

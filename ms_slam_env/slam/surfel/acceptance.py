@@ -221,14 +221,11 @@ class Alignment:
 
     def replace(self, where: NDArray[np.bool_], other: Alignment) -> Alignment:
         """Take the envs ``where`` (B,) from ``other``."""
-        return Alignment(
-            T_world_live=np.where(where[:, None, None], other.T_world_live, self.T_world_live),
-            T_model_live=np.where(where[:, None, None], other.T_model_live, self.T_model_live),
-            status=np.where(where, other.status, self.status),
-            statistics=np.where(where, other.statistics, self.statistics),
-            photometry=np.where(where, other.photometry, self.photometry),
-            covariance=np.where(where[:, None, None], other.covariance, self.covariance),
-        )
+
+        def picked(own: NDArray[Any], others: NDArray[Any]) -> NDArray[Any]:
+            return np.where(where.reshape(-1, *[1] * (own.ndim - 1)), others, own)
+
+        return Alignment(*map(picked, vars(self).values(), vars(other).values()))
 
 
 def accept_any_fit(alignment: Alignment) -> Alignment:

@@ -23,7 +23,6 @@ class SurfelSlam(SlamBackend):
     def __init__(
         self, intrinsics: Intrinsics, config: SurfelConfig | None = None, device: str = "cpu"
     ) -> None:
-        """Start empty at the identity pose."""
         self.intrinsics = intrinsics
         self.device = device
         self._slam = BatchedSurfelSlam(1, intrinsics, config or SurfelConfig(), device)
@@ -74,20 +73,12 @@ class SurfelSlam(SlamBackend):
         self._slam.reset(T_world_camera)
 
     def track(self, frame: RGBDFrame, T_world_camera_guess: ArrayLike | None = None) -> TrackResult:
-        """Estimate the pose of ``frame`` and fuse it into the map; see ``SlamBackend``.
-
-        Raises:
-            InputError: the frame's size is not that of the intrinsics, or the guess is no pose.
-        """
+        """Estimate the pose of ``frame`` and fuse it into the map; see ``SlamBackend``."""
         color, depth = self._images(frame)
         return self._slam.track(color, depth, [T_world_camera_guess])[0]
 
     def fuse(self, frame: RGBDFrame, T_world_camera: ArrayLike) -> TrackResult:
-        """Fuse ``frame`` into the map at a known pose (4, 4), without tracking.
-
-        Raises:
-            InputError: the frame's size is not that of the intrinsics, or the pose is none.
-        """
+        """Fuse ``frame`` into the map at a known pose (4, 4), without tracking."""
         color, depth = self._images(frame)
         pose = check_pose(T_world_camera, "T_world_camera")
         return self._slam.fuse(color, depth, pose[None])[0]
@@ -101,11 +92,7 @@ class SurfelSlam(SlamBackend):
         return reduce_color(frame.color, size)[None], reduce_depth(frame.depth, size)[None]
 
     def predict(self, poses: ArrayLike, scale: float = 1.0) -> Views:
-        """Render the map from ``poses`` (N, 4, 4) T_world_camera at ``scale`` times the size.
-
-        Raises:
-            InputError: poses of another shape, or a scale outside (0, 1].
-        """
+        """Render the map from ``poses`` (N, 4, 4) T_world_camera at ``scale`` times the size."""
         stack = np.asarray(poses, dtype=np.float64)
         if stack.ndim != 3 or stack.shape[1:] != (4, 4):
             raise InputError(f"poses must have shape (N, 4, 4), got {stack.shape}")

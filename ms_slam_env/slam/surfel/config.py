@@ -37,9 +37,6 @@ class LoopConfig(Checked):
             are wide; each cell gives one constraint and one pin.
         error_m: largest RMS distance that the constraints may keep after the graph was optimised.
         error_share: the same as a share of the distance before.
-
-    Raises:
-        InputError: a value outside its range.
     """
 
     window: int = bounded(50, 1, 1_000_000)
@@ -110,9 +107,6 @@ class SurfelConfig(Checked):
         loops: parameters of the latter.
         relocalisation: where a lost frame is searched besides around the last good pose: "ferns",
             at keyframes that resemble it, or "local", nowhere.
-
-    Raises:
-        InputError: a value outside its range.
     """
 
     depth_cutoff_m: float = bounded(4.0, 0.0, 10.0)
@@ -145,7 +139,6 @@ class SurfelConfig(Checked):
     loops: LoopConfig = field(default_factory=LoopConfig)
 
     def __post_init__(self) -> None:
-        """Refuse values outside the ranges."""
         super().__post_init__()
         are_counts = isinstance(self.iterations, (tuple, list)) and all(
             isinstance(count, int) and 0 <= count <= 100 for count in self.iterations

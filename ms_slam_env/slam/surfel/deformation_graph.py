@@ -32,7 +32,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-Float64 = NDArray[np.float64]
+from ms_slam_env.slam.base import Float64
+from ms_slam_env.slam.rows import Rows
+
 Int64 = NDArray[np.int64]
 NEIGHBOURS = 4  # k: of a node, and nodes that influence a point
 TEMPORAL_WINDOW = 20  # nodes nearest in time among which a point's nearest ones are looked for
@@ -47,7 +49,6 @@ class DeformationGraph:
     times: Float64  # (M,) when their surfels were created, ascending; any unit
 
     def __len__(self) -> int:
-        """Number of nodes M."""
         return len(self.positions)
 
     def edges(self) -> Int64:
@@ -136,7 +137,7 @@ _DOUBLED = np.where(_ROWS == _COLUMNS, 1.0, np.sqrt(2.0))  # R^T R is symmetric
 
 
 @dataclass(frozen=True)
-class Constraints:
+class Constraints(Rows):
     """Points of the map and where they should go."""
 
     sources: Float64  # (C, 3) points
@@ -145,10 +146,6 @@ class Constraints:
     # (C,) when the surface at the target was created; NaN: the target is fixed, otherwise it moves
     # with the deformation.
     target_times: Float64
-
-    def __len__(self) -> int:
-        """Number of constraints C."""
-        return len(self.sources)
 
     def errors(self, deformation: Deformation) -> Float64:
         """Distances (C,) that remain, metres."""
@@ -163,22 +160,6 @@ class Constraints:
         sources = deformation.points(self.sources, self.source_times)
         return replace(self, sources=sources, targets=targets)
 
-    def last(self, count: int) -> Constraints:
-        """The newest ``count`` of them."""
-        first = max(0, len(self) - count)
-        return Constraints(
-            self.sources[first:],
-            self.source_times[first:],
-            self.targets[first:],
-            self.target_times[first:],
-        )
-
-
-def join(parts: list[Constraints]) -> Constraints:
-    """All constraints of several sets."""
-    names = ("sources", "source_times", "targets", "target_times")
-    return Constraints(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
-
 
 def no_constraints() -> Constraints:
     """An empty set."""
@@ -189,7 +170,6 @@ class Energy:
     """The weighted residuals of a graph under constraints."""
 
     def __init__(self, graph: DeformationGraph, constraints: Constraints) -> None:
-        """Work out the linear part, which does not change."""
         self.graph = graph
         edges, edge_offset = _edge_rows(graph, W_REG**0.5)
         twist = _twist_rows(graph, TWIST_M * W_REG**0.5)

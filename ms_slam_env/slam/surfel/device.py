@@ -34,7 +34,6 @@ class HostDeviceBuffer:
     """
 
     def __init__(self, shape: int | tuple[int, ...], dtype: Any, device: str) -> None:
-        """Allocate an array."""
         self.array = wp.zeros(shape, dtype=dtype, device=device)
         self._memory: NDArray[Any] | None = None
         if wp.get_device(device).is_cpu:
@@ -60,7 +59,6 @@ class KernelLaunchCache:
     """
 
     def __init__(self, device: str) -> None:
-        """Start with nothing recorded."""
         self._device = device
         self._commands: dict[Hashable, wp.Launch] = {}
 
@@ -97,85 +95,34 @@ def threads_per_row(width: int, device: str, gpu_columns: int = 1) -> tuple[int,
     return columns, -(-width // columns)
 
 
-@wp.func_native("return values.data[i];")
-def fetch(values: wp.array(dtype=wp.float32), i: int) -> wp.float32:
-    """Value ``i``."""
+def _native(dtype: Any, place: str) -> tuple[str, str]:
+    """C++ that returns the value at a place, and that sets it."""
+    if dtype is not wp.vec3:
+        return f"return values.data[{place}];", f"values.data[{place}] = value;"
+    p = f"float* p = (float*)values.data + 3 * ({place}); "
+    get = f"const {p}return wp::vec_t<3, float>(p[0], p[1], p[2]);"
+    return get, f"{p}p[0] = value.c[0]; p[1] = value.c[1]; p[2] = value.c[2];"
 
 
-@wp.func_native("return values.data[i];")
-def fetch(values: wp.array(dtype=wp.int32), i: int) -> wp.int32:
-    """Value ``i``."""
+for _dtype in (wp.float32, wp.int32, wp.uint8, wp.vec3):
+    _get, _set = _native(_dtype, "i")
+    _get_in_row, _set_in_row = _native(_dtype, "size_t(row) * values.shape[1] + i")
 
+    @wp.func_native(_get)
+    def fetch(values: wp.array(dtype=_dtype), i: int) -> _dtype:
+        """Value ``i``."""
 
-@wp.func_native("return values.data[i];")
-def fetch(values: wp.array(dtype=wp.uint8), i: int) -> wp.uint8:
-    """Value ``i``."""
+    @wp.func_native(_get_in_row)
+    def fetch(values: wp.array2d(dtype=_dtype), row: int, i: int) -> _dtype:
+        """Value ``i`` of a row."""
 
+    @wp.func_native(_set)
+    def put(values: wp.array(dtype=_dtype), i: int, value: _dtype):
+        """Set value ``i``."""
 
-@wp.func_native(
-    "const float* p = (const float*)values.data + 3 * i; "
-    "return wp::vec_t<3, float>(p[0], p[1], p[2]);"
-)
-def fetch(values: wp.array(dtype=wp.vec3), i: int) -> wp.vec3:
-    """Value ``i``."""
-
-
-@wp.func_native("return values.data[size_t(row) * values.shape[1] + i];")
-def fetch(values: wp.array2d(dtype=wp.float32), row: int, i: int) -> wp.float32:
-    """Value ``i`` of a row."""
-
-
-@wp.func_native("return values.data[size_t(row) * values.shape[1] + i];")
-def fetch(values: wp.array2d(dtype=wp.int32), row: int, i: int) -> wp.int32:
-    """Value ``i`` of a row."""
-
-
-@wp.func_native(
-    "const float* p = (const float*)values.data + 3 * (size_t(row) * values.shape[1] + i); "
-    "return wp::vec_t<3, float>(p[0], p[1], p[2]);"
-)
-def fetch(values: wp.array2d(dtype=wp.vec3), row: int, i: int) -> wp.vec3:
-    """Value ``i`` of a row."""
-
-
-@wp.func_native("values.data[i] = value;")
-def put(values: wp.array(dtype=wp.float32), i: int, value: wp.float32):
-    """Set value ``i``."""
-
-
-@wp.func_native("values.data[i] = value;")
-def put(values: wp.array(dtype=wp.int32), i: int, value: wp.int32):
-    """Set value ``i``."""
-
-
-@wp.func_native(
-    "float* p = (float*)values.data + 3 * i; "
-    "p[0] = value.c[0]; "
-    "p[1] = value.c[1]; "
-    "p[2] = value.c[2];"
-)
-def put(values: wp.array(dtype=wp.vec3), i: int, value: wp.vec3):
-    """Set value ``i``."""
-
-
-@wp.func_native("values.data[size_t(row) * values.shape[1] + i] = value;")
-def put(values: wp.array2d(dtype=wp.float32), row: int, i: int, value: wp.float32):
-    """Set value ``i`` of a row."""
-
-
-@wp.func_native("values.data[size_t(row) * values.shape[1] + i] = value;")
-def put(values: wp.array2d(dtype=wp.int32), row: int, i: int, value: wp.int32):
-    """Set value ``i`` of a row."""
-
-
-@wp.func_native(
-    "float* p = (float*)values.data + 3 * (size_t(row) * values.shape[1] + i); "
-    "p[0] = value.c[0]; "
-    "p[1] = value.c[1]; "
-    "p[2] = value.c[2];"
-)
-def put(values: wp.array2d(dtype=wp.vec3), row: int, i: int, value: wp.vec3):
-    """Set value ``i`` of a row."""
+    @wp.func_native(_set_in_row)
+    def put(values: wp.array2d(dtype=_dtype), row: int, i: int, value: _dtype):
+        """Set value ``i`` of a row."""
 
 
 @wp.func_native("wp::atomic_max(values.data + i, value);")

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from ms_slam_env._warp import wp
 from ms_slam_env.slam.alignment_check import TrackingStatus
 from ms_slam_env.slam.base import Float64
+from ms_slam_env.slam.state import Saved
 from ms_slam_env.slam.surfel.acceptance import (
     Alignment,
     accept_any_fit,
@@ -41,7 +42,7 @@ RETRIES = 2  # further searches within a frame whose tracking failed
 
 
 @dataclass
-class CameraStates:
+class CameraStates(Saved):
     """What is known of the cameras of B envs, between frames."""
 
     poses: Float64  # (B, 4, 4) T_world_camera
@@ -50,6 +51,8 @@ class CameraStates:
     started: NDArray[np.bool_]  # (B,) whether a frame has been taken
     lost: NDArray[np.int32]  # (B,) frames since tracking was lost
     time: NDArray[np.int32]  # (B,) frames taken
+
+    saved = ("poses", "motions", "photometry", "started", "lost", "time")
 
     @classmethod
     def at_rest(cls, batch: int) -> CameraStates:
@@ -100,7 +103,6 @@ class Localizer:
     def __init__(
         self, states: CameraStates, surfel_map: SurfelMap, relocalization: Relocalization
     ) -> None:
-        """``use`` must follow."""
         self.invalid_frames = InvalidFrameDetector(surfel_map.batch)
         self._states = states
         self._map = surfel_map

@@ -18,7 +18,7 @@ A closed loop makes the estimated pose jump by the drift that it takes back.
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ from ms_slam_env._warp import wp
 from ms_slam_env.geometry import invert
 from ms_slam_env.slam.alignment_check import TrackingStatus
 from ms_slam_env.slam.ferns import Candidate
+from ms_slam_env.slam.state import Saved
 from ms_slam_env.slam.surfel.acceptance import Alignment, acceptance_thresholds
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer
@@ -44,7 +45,6 @@ from ms_slam_env.slam.surfel.surfels import EARLIEST, any_time
 from ms_slam_env.slam.surfel.tracker import Tracker, model_stride
 from ms_slam_env.slam.surfel.trajectory_history import (
     TrajectoryHistory,
-    history_from_state,
     motion_size,
 )
 
@@ -53,14 +53,11 @@ Int32 = NDArray[np.int32]
 Bool = NDArray[np.bool_]
 
 
-class SimilarViews(Protocol):
-    """Finds keyframes that resemble the frame just tracked."""
-
-    def __call__(self, env: int, before: int) -> list[Candidate]:
-        """Those of one env that were taken before a frame, the most similar first."""
+SimilarViews = Callable[[int, int], list[Candidate]]
+"""Keyframes of an env, taken before a frame, that resemble the one just tracked, best first."""
 
 
-class LoopClosure:
+class LoopClosure(Saved):
     """Recognises places seen before and deforms the maps of B envs so that they meet again.
 
     This is the variant "none": frames are tracked against everything in the map, old and new
@@ -68,46 +65,27 @@ class LoopClosure:
     """
 
     def __init__(self, batch: int) -> None:
-        """For ``batch`` envs."""
         self.batch = batch
 
     def reset(self, env: int) -> None:
         """Forget one env."""
 
     def select(self, lost: Int32) -> bool:
-        """Choose the surfels that the next frames are tracked against and fused into.
+        """Choose what the next frames are tracked against and fused into; whether that changed.
 
-        Args:
-            lost: (B,) frames since tracking was lost; 0 = tracked.
-
-        Returns:
-            Whether the choice changed.
+        ``lost`` (B,) counts the frames since tracking was lost; 0 = tracked.
         """
         return False
 
     def record(self, poses: Float64, time: Int32, fused: Bool) -> None:
-        """Take note of frames.
-
-        Args:
-            poses: (B, 4, 4) T_world_camera.
-            time: (B,) numbers of the frames.
-            fused: (B,) whether the frame was fused.
-        """
+        """Take note of the frames ``time`` (B,) at ``poses`` (B, 4, 4) that were ``fused`` (B,)."""
 
     def close(
         self, live: LiveFrame, poses: Float64, time: Int32, tracked: Bool, similar: SimilarViews
     ) -> Bool:
-        """Look for loops after frames were fused and recorded; correct maps and ``poses`` in place.
+        """Look for loops after the frames ``time`` (B,) were recorded; which envs (B,) closed one.
 
-        Args:
-            live: the frames just fused.
-            poses: (B, 4, 4) T_world_camera; those of closed loops are overwritten.
-            time: (B,) numbers of the frames.
-            tracked: (B,) whether the frame was tracked and fused.
-            similar: finds the keyframes that resemble an env's frame.
-
-        Returns:
-            (B,) which envs closed a loop.
+        Maps and ``poses`` (B, 4, 4) are corrected in place.
         """
         return np.zeros(self.batch, dtype=bool)
 
@@ -117,13 +95,6 @@ class LoopClosure:
         Empty where no trajectory is kept.
         """
         return np.zeros(0, dtype=np.int32), np.zeros((0, 4, 4))
-
-    def get_state(self) -> dict[str, Any]:
-        """Everything needed to go on bit-exactly, as NumPy arrays."""
-        return {}
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state that ``get_state`` returned."""
 
 
 SETTLED = 0.02, np.radians(2.0)  # largest motion of a repeated registration
@@ -135,7 +106,6 @@ class InactiveRegistration:
     def __init__(
         self, surfel_map: SurfelMap, inactive: SplatRenderer, config: SurfelConfig, device: str
     ) -> None:
-        """Own a tracker; ``inactive`` renders the inactive surfels."""
         self.config = config.loops
         self.batch = surfel_map.batch
         self._inactive = inactive
@@ -208,8 +178,9 @@ VIEW_APART_M, VIEW_APART_RAD = 1.0, np.radians(60.0)  # views of one place diffe
 class DeformationLoopClosure(LoopClosure):
     """Closes loops of B envs by embedded deformation."""
 
+    saved = ("_histories",)
+
     def __init__(self, surfel_map: SurfelMap, config: SurfelConfig, device: str = "cpu") -> None:
-        """Close loops of the maps in ``surfel_map`` with ``config.loops``."""
         self.map = surfel_map
         self.config = config.loops
         self.batch = surfel_map.batch
@@ -305,14 +276,6 @@ class DeformationLoopClosure(LoopClosure):
     def trajectory(self, env: int) -> tuple[Int32, Float64]:
         """Tracked frames (N,) and their poses (N, 4, 4), moved by the closures since."""
         return self._histories[env].trajectory()
-
-    def get_state(self) -> dict[str, Any]:
-        """Everything needed to go on bit-exactly, as NumPy arrays."""
-        return {"past": [history.get_state() for history in self._histories]}
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state that ``get_state`` returned."""
-        self._histories = [history_from_state(history) for history in state["past"]]
 
 
 def make_loop_closure(surfel_map: SurfelMap, config: SurfelConfig, device: str) -> LoopClosure:

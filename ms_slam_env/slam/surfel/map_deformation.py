@@ -12,13 +12,14 @@ from scipy.spatial import cKDTree
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, transform_points
+from ms_slam_env.slam.base import Float64
+from ms_slam_env.slam.rows import Rows, join
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.deformation_graph import (
     FEWEST_NODES,
     Constraints,
     Deformation,
     identity,
-    join,
     optimise,
     sample_graph,
 )
@@ -33,7 +34,6 @@ from ms_slam_env.slam.surfel.surfels import (
     floor_int,
 )
 
-Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 FEWEST_CONSTRAINTS = 12
@@ -41,16 +41,12 @@ NEAREST = wp.constant(5)  # of deformation_graph: NEIGHBOURS that move a point, 
 
 
 @dataclass(frozen=True)
-class VisiblePoints:
+class VisiblePoints(Rows):
     """Surfels in sight of a camera."""
 
     camera: Float64  # (N, 3) positions in the camera's frame
     world: Float64  # (N, 3) positions in the world
     times: Float64  # (N,) when they were created, see ``creation_times``
-
-    def take(self, chosen: Int64) -> VisiblePoints:
-        """Some of them."""
-        return VisiblePoints(self.camera[chosen], self.world[chosen], self.times[chosen])
 
 
 def creation_times(created: NDArray[np.int32]) -> tuple[Int64, Float64]:
@@ -231,15 +227,7 @@ def merge(
 
 
 class MapDeformer:
-    """Deforms the maps of B envs, one at a time.
-
-    Args:
-        surfel_map: the maps.
-        inactive: renders the inactive surfels.
-        active: renders the active ones.
-        config: of the SLAM.
-        device: Warp device.
-    """
+    """Deforms the maps of B envs, one at a time."""
 
     def __init__(
         self,
@@ -282,8 +270,8 @@ class MapDeformer:
         times[order] = ordered_times
         old, old_depth = self._look(self._inactive, env, corrected, times)
         new, new_depth = self._look(self._active, env, pose, times)
-        old = old.take(self._choose(old, old_depth))
-        new = new.take(self._choose(new, np.where(old_depth > 0, new_depth, 0.0)))
+        old = old.chosen(self._choose(old, old_depth))
+        new = new.chosen(self._choose(new, np.where(old_depth > 0, new_depth, 0.0)))
         if min(len(old.world), len(new.world)) < FEWEST_CONSTRAINTS:
             return None
         surface = surface_constraints(new, old, corrected @ invert(pose))

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
+from ms_slam_env.slam.state import Saved
 from ms_slam_env.slam.surfel.device import (
     HostDeviceBuffer,
     KernelLaunchCache,
@@ -120,7 +121,6 @@ class ExposureCorrection:
     """Brings the live colours back to the map's exposure, so that fusing them leaves no stripes."""
 
     def __init__(self, batch: int, intrinsics: Intrinsics, device: str) -> None:
-        """Allocate for ``batch`` envs with one camera model."""
         self._size = intrinsics.shape
         self._columns, threads = threads_per_row(intrinsics.width, device)
         self._dim = (batch * intrinsics.height, threads)
@@ -154,14 +154,15 @@ def is_invalid_frame(color: NDArray[np.uint8]) -> Bool:
     return (spread < _CONSTANT) | (extreme & (spread < _FAINT))
 
 
-class InvalidFrameDetector:
+class InvalidFrameDetector(Saved):
     """Tells the blank frames of B envs, where frames are not always so.
 
     Recordings without colour have blank images from the first frame on.
     """
 
+    saved = ("colorless",)
+
     def __init__(self, batch: int) -> None:
-        """Expect images."""
         self.colorless = np.zeros(batch, dtype=bool)
 
     def find(self, color: NDArray[np.uint8], started: Bool) -> Bool:

@@ -39,7 +39,6 @@ class PipelineCache:
     """Pipelines of one map, made when they are first asked for and kept for the next time."""
 
     def __init__(self, surfel_map: SurfelMap) -> None:
-        """For the SLAM with this map."""
         self._map = surfel_map
         self._made: OrderedDict[tuple[Intrinsics, SurfelConfig], Pipeline] = OrderedDict()
 

@@ -228,7 +228,6 @@ class Preprocessor:
     def __init__(
         self, batch: int, intrinsics: Intrinsics, config: SurfelConfig, device: str = "cpu"
     ) -> None:
-        """Allocate for ``batch`` envs that share one camera model."""
         self.intrinsics = intrinsics
         self.config = config
         self.device = device

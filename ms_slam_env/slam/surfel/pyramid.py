@@ -137,7 +137,6 @@ class Pyramid:
         with_gradient: bool,
         device: str = "cpu",
     ) -> None:
-        """Allocate ``num_levels`` levels of images (B, H, W) with (H, W) = ``shape``."""
         self._device = device
         self._columns, _ = threads_per_row(shape[1], device)
         self._launches: list[wp.Launch] = []

@@ -15,6 +15,7 @@ from ms_slam_env.slam.alignment_check import (
 )
 from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.ferns import Candidate, FernConfig, FernDatabase
+from ms_slam_env.slam.state import Saved
 from ms_slam_env.slam.surfel.acceptance import Alignment, acceptance_thresholds
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.pose_hypotheses import (
@@ -54,7 +55,7 @@ class FrameAligner(Protocol):
         """The maps as seen from ``poses`` (B, 4, 4)."""
 
 
-class Relocalization:
+class Relocalization(Saved):
     """Where a lost frame of B envs is searched besides around the last good pose.
 
     This is the variant that searches nowhere else: "local".
@@ -89,13 +90,6 @@ class Relocalization:
 
     def clear(self, env: int) -> None:
         """Forget everything about one env."""
-
-    def get_state(self) -> dict[str, Any]:
-        """Everything needed to go on bit-exactly, as NumPy arrays."""
-        return {}
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state of the same variant, batch and camera."""
 
 
 TRIALS = 3  # keyframes tried a frame
@@ -133,8 +127,9 @@ class FernRelocalization(Relocalization):
     anything fused.
     """
 
+    saved = ("databases", "_tentative", "_attempts", "_looked_from")
+
     def __init__(self, batch: int, intrinsics: Intrinsics, depth_cutoff_m: float) -> None:
-        """Start without keyframes."""
         config = FernConfig(far_m=max(depth_cutoff_m, 2 * FernConfig.near_m))
         self.databases = [FernDatabase(intrinsics, config) for _ in range(batch)]
         self._cutoff_m = depth_cutoff_m
@@ -252,23 +247,6 @@ class FernRelocalization(Relocalization):
         self._tentative[env] = np.nan
         self._attempts[env] = 0
         self._looked_from[env] = np.nan
-
-    def get_state(self) -> dict[str, Any]:
-        """Keyframes and poses to confirm."""
-        return {
-            "databases": [database.get_state() for database in self.databases],
-            "tentative": self._tentative.copy(),
-            "attempts": self._attempts.copy(),
-            "looked_from": self._looked_from.copy(),
-        }
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from there."""
-        for database, kept in zip(self.databases, state["databases"], strict=True):
-            database.set_state(kept)
-        self._tentative = state["tentative"].copy()
-        self._attempts = state["attempts"].copy()
-        self._looked_from = state["looked_from"].copy()
 
 
 def _has_pose(poses: Float64) -> Bool:

@@ -64,16 +64,8 @@ class SplatRenderer:
 
     The launches are recorded once: a recorded one costs a fifth of packing its arguments anew.
 
-    Args:
-        buffers: the maps, and working memory shared by all renderers of them.
-        envs: number of images rendered at once.
-        intrinsics: of the images.
-        parameters: how discs are drawn.
-        window: draw the surfels last seen within it; None: all.
-
-    Attributes:
-        view: the images, overwritten by every call of ``splat``.
-        visible: the list that ``cull`` fills, overwritten by other renderers of the map.
+    ``splat`` overwrites ``view``; ``cull`` fills ``visible``, as other renderers of the map do.
+    Only surfels last seen within ``window`` are drawn; None: all.
     """
 
     def __init__(

@@ -22,6 +22,7 @@ from ms_slam_env.geometry import check_pose, invert
 from ms_slam_env.slam.alignment_check import MAP_REASONS, TrackingStatus
 from ms_slam_env.slam.base import Float64, TrackResult
 from ms_slam_env.slam.ferns import Candidate
+from ms_slam_env.slam.state import Saved
 from ms_slam_env.slam.surfel.acceptance import Alignment
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer
@@ -37,13 +38,14 @@ from ms_slam_env.slam.surfel.tracker import model_stride
 FEWEST_READINGS = 0.05  # share of the first frame's pixels that must have depth
 
 
-class BatchedSurfelSlam:
+class BatchedSurfelSlam(Saved):
     """The SLAM of B envs in lockstep; each env's results are those it would have alone."""
+
+    saved = ("_invalid_frames", "map", "relocalization", "loops")
 
     def __init__(
         self, batch: int, intrinsics: Intrinsics, config: SurfelConfig, device: str = "cpu"
     ) -> None:
-        """Allocate maps and buffers for ``batch`` envs with one camera model."""
         self.batch = batch
         self.map = SurfelMap(batch, intrinsics, config, device, model_stride(intrinsics, config))
         self._pipelines = PipelineCache(self.map)
@@ -51,6 +53,7 @@ class BatchedSurfelSlam:
         self.relocalization = make_relocalization(batch, intrinsics, config)
         self._states = CameraStates.at_rest(batch)
         self._localizer = Localizer(self._states, self.map, self.relocalization)
+        self._invalid_frames = self._localizer.invalid_frames
         self._device_poses = HostDeviceBuffer(batch, wp.mat44, device)
         self._device_time = HostDeviceBuffer(batch, wp.int32, device)
         self._device_weight = HostDeviceBuffer(batch, wp.float32, device)
@@ -96,10 +99,6 @@ class BatchedSurfelSlam:
         """Track and fuse one frame per env: colour (B, H, W, 3) uint8, depth (B, H, W) metres.
 
         ``T_world_camera_guess`` holds for every env a pose (4, 4) to start from too, or None.
-
-        Raises:
-            InputError: another batch or image size; NaN, infinite or negative depth; a guess
-                that is no pose.
         """
         live, frames = self.preprocess(color, depth), Images(color, depth)
         guesses = check_guesses(T_world_camera_guess, self.batch)
@@ -112,16 +111,12 @@ class BatchedSurfelSlam:
     def fuse(
         self, color: NDArray[np.uint8], depth: NDArray[np.float32], T_world_camera: Float64
     ) -> list[TrackResult]:
-        """Fuse one frame per env at known poses (B, 4, 4), without tracking.
-
-        Raises:
-            InputError: another batch or image size; NaN, infinite or negative depth; no poses.
-        """
+        """Fuse one frame per env at known poses (B, 4, 4), without tracking."""
         live, frames = self.preprocess(color, depth), Images(color, depth)
         poses = check_poses(T_world_camera, self.batch)
         self._select_surfels(np.ones(self.batch, dtype=np.int32))  # known poses: old and new fit
         states = self._states
-        self._localizer.invalid_frames.find(color, states.started)
+        self._invalid_frames.find(color, states.started)
         for env in range(self.batch):
             moves_on = states.started[env] and not states.lost[env]
             motion = invert(states.poses[env]) @ poses[env]
@@ -214,28 +209,12 @@ class BatchedSurfelSlam:
 
     def get_state(self) -> dict[str, Any]:
         """Everything needed to go on bit-exactly, as NumPy arrays."""
-        states = self._states
-        return {
-            "poses": states.poses.copy(),
-            "motions": states.motions.copy(),
-            "photometry": states.photometry.copy(),
-            "started": states.started.copy(),
-            "colorless": self._localizer.invalid_frames.colorless.copy(),
-            "lost": states.lost.copy(),
-            "time": states.time.copy(),
-            "map": self.map.get_state(),
-            "relocalisation": self.relocalization.get_state(),
-            "loops": self.loops.get_state(),
-        }
+        return self._states.get_state() | super().get_state()
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state of a SLAM of the same batch, intrinsics and configuration."""
-        for name in ("poses", "motions", "photometry", "started", "lost", "time"):
-            setattr(self._states, name, state[name].copy())
-        self._localizer.invalid_frames.colorless = state["colorless"].copy()
-        self.map.set_state(state["map"])
-        self.relocalization.set_state(state["relocalisation"])
-        self.loops.set_state(state["loops"])
+        self._states.set_state(state)
+        super().set_state(state)
         self._localizer.forget_view()
 
 

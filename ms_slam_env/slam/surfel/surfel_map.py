@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.base import Float64, Views
+from ms_slam_env.slam.state import Stateful
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.device import record_launch
 from ms_slam_env.slam.surfel.frustum_culling import (
@@ -45,7 +46,6 @@ from ms_slam_env.slam.surfel.surfels import (
     COUNTERS,
     MapBuffers,
     SeenWindow,
-    allocate_map,
 )
 from ms_slam_env.slam.surfel.view_prediction import DeviceViews, ViewPredictor
 
@@ -60,7 +60,6 @@ class MapKernels:
     def __init__(
         self, buffers: MapBuffers, intrinsics: Intrinsics, config: SurfelConfig, model_stride: int
     ) -> None:
-        """Prepare for frames of ``intrinsics``; see ``SurfelMap``."""
         self.config = config
         self.splat_parameters = SplatParameters(tolerance_m=config.fusion_distance_m)
         self._buffers = buffers
@@ -163,7 +162,7 @@ class MapKernels:
             launch.set_param_by_name("frame", frame)
 
 
-class SurfelMap:
+class SurfelMap(Stateful):
     """Dense maps of ``batch`` envs (Keller et al., 3DV 2013; Whelan et al., IJRR 2016).
 
     Args:
@@ -195,7 +194,7 @@ class SurfelMap:
         self.intrinsics = intrinsics
         self.device = device
         capacity = config.capacity(intrinsics.width)
-        self._buffers = allocate_map(batch, capacity, device, workers)
+        self._buffers = MapBuffers(batch, capacity, device, workers)
         self.surfels, self.active = self._buffers.surfels, self._buffers.active
         self.kernels = self.make_kernels(intrinsics, config, model_stride)
         drawn = self.kernels.splat_parameters

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 from ms_slam_env._warp import wp
@@ -119,43 +118,23 @@ def allocate(struct: Any, batch: int, size: int, device: str) -> Any:
     return arrays
 
 
-@dataclass(frozen=True)
 class MapBuffers:
-    """Device arrays of B maps, which all that works on these maps shares."""
+    """Device arrays of B maps, empty at first, which all that works on these maps shares."""
 
-    batch: int  # number of maps B
-    capacity: int  # slots of each
-    workers: int  # threads that share one map
-    device: str  # of all arrays
-    surfels: Surfels  # the maps
-    spare: Surfels  # room for compaction
-    blocks: CullingBlocks  # of the surfels
-    visible: VisibleList  # working list of the surfels in view
-    footprints: SplatFootprints  # of such a list
-    compaction: Compaction  # working memory
-    # what frames are tracked against and fused into; all unless its times are set.
-    active: SeenWindow
-
-
-def allocate_map(batch: int, capacity: int, device: str, workers: int | None = None) -> MapBuffers:
-    """Empty maps of ``batch`` envs with ``capacity`` slots each."""
-    structs = (Surfels, VisibleList, SplatFootprints, Compaction)
-    surfels, visible, footprints, compaction = (
-        allocate(struct, batch, capacity, device) for struct in structs
-    )
-    return MapBuffers(
-        batch=batch,
-        capacity=capacity,
-        workers=default_workers(batch, device) if workers is None else workers,
-        device=device,
-        surfels=surfels,
-        spare=allocate(Surfels, batch, capacity, device),
-        blocks=allocate(CullingBlocks, batch, -(-capacity // BLOCK_SIZE), device),
-        visible=visible,
-        footprints=footprints,
-        compaction=compaction,
-        active=any_time(batch, device),
-    )
+    def __init__(self, batch: int, capacity: int, device: str, workers: int | None = None) -> None:
+        self.batch, self.capacity, self.device = batch, capacity, device
+        self.workers = default_workers(batch, device) if workers is None else workers
+        of_surfels = batch, capacity, device
+        self.surfels: Surfels = allocate(Surfels, *of_surfels)
+        self.spare: Surfels = allocate(Surfels, *of_surfels)  # room for compaction
+        self.blocks: CullingBlocks = allocate(
+            CullingBlocks, batch, -(-capacity // BLOCK_SIZE), device
+        )
+        self.visible: VisibleList = allocate(VisibleList, *of_surfels)  # working list
+        self.footprints: SplatFootprints = allocate(SplatFootprints, *of_surfels)  # of such a list
+        self.compaction: Compaction = allocate(Compaction, *of_surfels)
+        # What frames are tracked against and fused into: all, unless its times are set.
+        self.active = any_time(batch, device)
 
 
 def default_workers(batch: int, device: str) -> int:

@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.geometry import invert, relative_angle
-from ms_slam_env.slam.surfel.deformation_graph import Constraints, Deformation, join, no_constraints
+from ms_slam_env.slam.base import Float64
+from ms_slam_env.slam.rows import join
+from ms_slam_env.slam.state import Saved
+from ms_slam_env.slam.surfel.deformation_graph import Constraints, Deformation, no_constraints
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 
-Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
 
 ANCHORS = 12  # points of the map that hold a frame's pose
@@ -21,7 +23,7 @@ _CONSTRAINT_ARRAYS = ("sources", "source_times", "targets", "target_times")
 
 
 @dataclass
-class TrajectoryHistory:
+class TrajectoryHistory(Saved):
     """What is remembered of one env."""
 
     frames: list[int] = field(default_factory=list)  # the frames fused
@@ -37,6 +39,8 @@ class TrajectoryHistory:
     found: int = -1
     # (4, 4) of the world about the camera, which would have closed it.
     correction: Float64 = field(default_factory=lambda: np.eye(4))
+
+    saved = ("frames", "poses", "anchors", "anchor_times", "found", "correction")
 
     @property
     def last(self) -> int:
@@ -73,7 +77,8 @@ class TrajectoryHistory:
         self.poses = list(_rigid_motions(points, moved) @ np.stack(self.poses))
         self.poses[-1] = pose.copy()
         self.anchors = list(moved)
-        self.joined = join([self.joined.moved_by(deformation), joined]).last(KEPT_CONSTRAINTS)
+        newest = slice(-KEPT_CONSTRAINTS, None)
+        self.joined = join([self.joined.moved_by(deformation), joined]).chosen(newest)
 
     def path_m(self, frame: int) -> float:
         """Length of the way since a frame."""
@@ -87,34 +92,19 @@ class TrajectoryHistory:
 
     def get_state(self) -> dict[str, Any]:
         """Everything, as NumPy arrays."""
-        frames, poses = self.trajectory()
-        return {
-            "frames": frames,
-            "poses": poses,
-            "anchors": np.array(self.anchors).reshape(-1, ANCHORS, 3),
-            "anchor_times": np.array(self.anchor_times).reshape(-1, ANCHORS),
-            "found": self.found,
-            "correction": self.correction.copy(),
-            "joined": {name: getattr(self.joined, name).copy() for name in _CONSTRAINT_ARRAYS},
-        }
+        joined = {name: getattr(self.joined, name).copy() for name in _CONSTRAINT_ARRAYS}
+        return super().get_state() | {"joined": joined}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state."""
+        super().set_state(state)
+        arrays = {name: state["joined"][name].copy() for name in _CONSTRAINT_ARRAYS}
+        self.joined = Constraints(**arrays)
 
 
 def motion_size(T: Float64) -> float:
     """How far a motion (4, 4) moves points about 1 m away, at most: metres."""
     return float(np.linalg.norm(T[:3, 3]) + relative_angle(np.eye(3), T[:3, :3]))
-
-
-def history_from_state(state: dict[str, Any]) -> TrajectoryHistory:
-    """The history that gave this state."""
-    return TrajectoryHistory(
-        [int(frame) for frame in state["frames"]],
-        list(state["poses"].copy()),
-        list(state["anchors"].copy()),
-        list(state["anchor_times"].copy()),
-        Constraints(**{name: state["joined"][name].copy() for name in _CONSTRAINT_ARRAYS}),
-        state["found"],
-        state["correction"].copy(),
-    )
 
 
 def _seen_now(surfel_map: SurfelMap, env: int, frame: int) -> tuple[Float64, Float64]:

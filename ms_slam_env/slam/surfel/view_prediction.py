@@ -113,13 +113,7 @@ class _Reference:
 
 
 class ViewPredictor:
-    """Predicts views near each other by warping one reference view; far ones one by one.
-
-    Args:
-        buffers: the maps, and working memory shared with their other renderers.
-        intrinsics: of the live camera.
-        parameters: how discs are drawn.
-    """
+    """Predicts views near each other by warping one reference view; far ones one by one."""
 
     def __init__(
         self, buffers: MapBuffers, intrinsics: Intrinsics, parameters: SplatParameters
@@ -135,11 +129,7 @@ class ViewPredictor:
         self._outputs: dict[tuple[int, Intrinsics], tuple[wp.array, DeviceViews]] = {}
 
     def predict(self, poses: Float64, scale: float, first_env: int) -> DeviceViews:
-        """Images (E * N, h, w) from ``poses`` (E, N, 4, 4) of the envs from ``first_env`` on.
-
-        Raises:
-            InputError: poses of another shape, no pose, a scale that is not in (0, 4].
-        """
+        """Images (E * N, h, w) from ``poses`` (E, N, 4, 4) of the envs from ``first_env`` on."""
         if poses.ndim != 4 or poses.shape[2:] != (4, 4) or 0 in poses.shape:
             raise InputError(f"poses must be (envs, views, 4, 4), got {poses.shape}")
         if not np.isfinite(poses).all():

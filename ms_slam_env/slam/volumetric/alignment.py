@@ -31,7 +31,6 @@ class Open3DAlignment(FrameToModel):
     """
 
     def __init__(self, grid: VoxelGrid) -> None:
-        """Take camera and parameters from the grid."""
         self._grid = grid
         self._rgbd_image = grid.open3d.t.geometry.RGBDImage
         self._odometry = grid.open3d.t.pipelines.odometry
@@ -68,7 +67,6 @@ class OpenCVAlignment(FrameToModel):
     """OpenCV's RGB-D odometry; the same result in every run."""
 
     def __init__(self, intrinsics: Intrinsics, depth_cutoff_m: float) -> None:
-        """Set the camera and the largest depth used."""
         self._aligner = Aligner(intrinsics, depth_cutoff_m)
 
     def align(self, frame: DepthImage, view: CastView) -> Float64 | None:

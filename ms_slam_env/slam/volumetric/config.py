@@ -42,9 +42,6 @@ class VolumetricConfig(Checked):
             ``dense_slam.py`` but for ``depth_cutoff_m`` and voxels of 1 cm, whatever the others
             say: nothing is checked, no other pose is tried, and a frame that cannot be aligned is
             fused where the camera was last.
-
-    Raises:
-        InputError: a value outside its range.
     """
 
     voxel_m: float = bounded(0.015, 0.001, 0.2)

@@ -8,7 +8,7 @@ fused. While tracking is lost the pose is held and nothing is fused.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,6 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.slam.alignment_check import (
     NO_ALIGNMENT,
     VIEW_REASONS,
-    VIEW_THRESHOLDS,
     AcceptanceThresholds,
     DepthImage,
     evaluate_alignment,
@@ -51,26 +50,14 @@ class _RGBDImage(DepthImage):
 class VolumetricSlam(FrameByFrameSlam[_RGBDImage, None]):
     """The volumetric SLAM of one camera, through Open3D."""
 
-    def __init__(self, intrinsics: Intrinsics, config: VolumetricConfig | None = None) -> None:
-        """Start empty at the identity pose.
+    saved = (*FrameByFrameSlam.saved, "_fused", "_grid")
 
-        Raises:
-            InputError: Open3D, or a system library that it needs, is not installed.
-        """
+    def __init__(self, intrinsics: Intrinsics, config: VolumetricConfig | None = None) -> None:
+        """Start empty at the identity pose."""
         self.config = config or VolumetricConfig()
         in_force = self.config.in_force
-        if in_force.stock:
-            self.fewest_readings = 0.0
-            self._thresholds = AcceptanceThresholds()
-            self._grid: VoxelGrid = StockVoxelGrid(intrinsics, in_force)
-        else:
-            self._thresholds = replace(
-                VIEW_THRESHOLDS,
-                overlap=in_force.least_overlap,
-                inlier_ratio=in_force.least_inliers,
-                photometric_inlier_ratio=in_force.least_alike,
-            )
-            self._grid = VoxelGrid(intrinsics, in_force)
+        self._judge_views(in_force)
+        self._grid = (StockVoxelGrid if in_force.stock else VoxelGrid)(intrinsics, in_force)
         self._aligner: FrameToModel = (
             Open3DAlignment(self._grid)
             if in_force.aligner == "open3d"
@@ -158,11 +145,7 @@ class VolumetricSlam(FrameByFrameSlam[_RGBDImage, None]):
         self._view = None
 
     def predict(self, poses: ArrayLike, scale: float = 1.0) -> Views:
-        """Cast the grid from ``poses`` (N, 4, 4) T_world_camera at ``scale`` times the size.
-
-        Raises:
-            InputError: poses of another shape, or a scale outside (0, 1].
-        """
+        """Cast the grid from ``poses`` (N, 4, 4) T_world_camera at ``scale`` times the size."""
         stack = np.asarray(poses, dtype=np.float64)
         if stack.ndim != 3 or stack.shape[1:] != (4, 4) or len(stack) == 0:
             raise InputError(f"poses must have shape (N, 4, 4), got {stack.shape}")
@@ -191,11 +174,8 @@ class VolumetricSlam(FrameByFrameSlam[_RGBDImage, None]):
         _, colors, normals = self._grid.surface()
         return {"color": colors, "normal": normals}
 
-    def _map_state(self) -> dict[str, Any]:
-        return {"fused": self._fused, "grid": self._grid.get_state()}
-
-    def _set_map_state(self, state: dict[str, Any]) -> None:
-        self._fused = state["fused"]
-        self._grid.set_state(state["grid"])
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state of a backend of the same intrinsics and configuration."""
+        super().set_state(state)
         self._fresh = False
         self._view = None

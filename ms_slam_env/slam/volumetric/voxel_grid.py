@@ -17,6 +17,7 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert
 from ms_slam_env.slam.base import Float32, Float64
+from ms_slam_env.slam.state import Stateful
 from ms_slam_env.slam.volumetric.config import VolumetricConfig
 
 _NEAREST_M = 0.1
@@ -60,19 +61,14 @@ class CastView:
         return np.asarray(self.color @ _LUMA * np.float32(255.0), dtype=np.float32)
 
 
-class VoxelGrid:
-    """The map of one camera.
-
-    Raises:
-        InputError: Open3D, or a system library that it needs, is not installed.
-    """
+class VoxelGrid(Stateful):
+    """The map of one camera."""
 
     # Open3D finds a voxel's reading by cutting off the fraction of its pixel: with centres at
     # integers that is half a pixel too low.
     _reading_shift_px = 0.5
 
     def __init__(self, intrinsics: Intrinsics, config: VolumetricConfig) -> None:
-        """Allocate an empty grid."""
         self.open3d = load_open3d()
         self.intrinsics = intrinsics
         self.config = config

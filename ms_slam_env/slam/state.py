@@ -1,0 +1,55 @@
+"""Objects that go on bit-exactly from a state that they gave."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from copy import deepcopy
+from typing import Any, ClassVar
+
+
+class Stateful(ABC):
+    """What can be saved and restored."""
+
+    @abstractmethod
+    def get_state(self) -> dict[str, Any]:
+        """Everything needed to go on bit-exactly, as NumPy arrays and plain values."""
+
+    @abstractmethod
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state that ``get_state`` of an object made in the same way returned."""
+
+
+class Saved(Stateful):
+    """An object whose state is the values of the attributes that ``saved`` names.
+
+    Arrays, plain values and lists of them are copied. What is ``Stateful``, or a list of such,
+    gives its own state and takes it back.
+    """
+
+    saved: ClassVar[tuple[str, ...]] = ()
+
+    def get_state(self) -> dict[str, Any]:
+        """Copies of the attributes, by their names without a leading underscore."""
+        return {name.lstrip("_"): _state_of(getattr(self, name)) for name in self.saved}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Take the attributes from a state."""
+        for name in self.saved:
+            setattr(self, name, _restored(getattr(self, name), state[name.lstrip("_")]))
+
+
+def _state_of(value: Any) -> Any:
+    if isinstance(value, Stateful):
+        return value.get_state()
+    if isinstance(value, list):
+        return [_state_of(each) for each in value]
+    return deepcopy(value)
+
+
+def _restored(value: Any, state: Any) -> Any:
+    if isinstance(value, Stateful):
+        value.set_state(state)
+        return value
+    if isinstance(value, list) and value and isinstance(value[0], Stateful):
+        return [_restored(*pair) for pair in zip(value, state, strict=True)]
+    return deepcopy(state)
