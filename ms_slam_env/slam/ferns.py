@@ -213,11 +213,7 @@ class FernDatabase(Stateful):
         return True
 
     def candidates(
-        self,
-        color: UInt8,
-        depth: NDArray[np.float32],
-        count: int,
-        before: int | None = None,
+        self, color: UInt8, depth: NDArray[np.float32], count: int, before: int | None = None
     ) -> list[Candidate]:
         """The at most ``count`` keyframes that resemble a frame most, the best first.
 

@@ -28,8 +28,7 @@ from ms_slam_env.slam.frame_selection import (
     make_config,
 )
 from ms_slam_env.slam.frame_selection.budget import BudgetFilter
-from ms_slam_env.slam.frame_selection.config import RegularSkipping
-from ms_slam_env.slam.frame_selection.divergence import Change, ChangeConfig
+from ms_slam_env.slam.frame_selection.filters import Change, ChangeConfig, RegularSkipping
 
 CAMERA = xtion("80x60")
 START = look_at([-0.8, -0.8, 1.2], [1.2, 0.1, 0.5])

@@ -14,12 +14,13 @@ from typing import Any
 
 from ms_slam_env.config import from_dict
 from ms_slam_env.slam.adaptation.adaptive_slam import AdaptiveSlam, Level, default_configurations
-from ms_slam_env.slam.adaptation.config import (
+from ms_slam_env.slam.adaptation.controllers import (
     AdaptationConfig,
+    AgentConfig,
+    DivergenceAdaptationConfig,
     NoAdaptationConfig,
     SwitchingConfig,
 )
-from ms_slam_env.slam.adaptation.controllers import AgentConfig, DivergenceAdaptationConfig
 
 
 def make_config(name: str, **options: Any) -> AdaptationConfig:

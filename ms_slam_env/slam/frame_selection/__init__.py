@@ -13,12 +13,13 @@ from typing import Any
 
 from ms_slam_env.config import from_dict, nested_options
 from ms_slam_env.slam.frame_selection.budget import BudgetConfig
-from ms_slam_env.slam.frame_selection.config import (
+from ms_slam_env.slam.frame_selection.filters import (
+    ChangeConfig,
+    DivergenceFilterConfig,
     EveryFrameConfig,
     FrameSelectionConfig,
     RegularConfig,
 )
-from ms_slam_env.slam.frame_selection.divergence import ChangeConfig, DivergenceFilterConfig
 from ms_slam_env.slam.frame_selection.selective_slam import FrameFilter, SelectiveSlam
 
 

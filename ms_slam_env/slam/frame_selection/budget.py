@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.config import bounded, check_range
 from ms_slam_env.errors import InputError
-from ms_slam_env.slam.frame_selection.config import DroppingConfig
-from ms_slam_env.slam.frame_selection.divergence import Change, ChangeConfig
+from ms_slam_env.slam.frame_selection.filters import Change, ChangeConfig, DroppingConfig
 from ms_slam_env.slam.frame_selection.selective_slam import FrameFilter
 from ms_slam_env.slam.state import Saved
 

@@ -28,11 +28,7 @@ from ms_slam_env.slam.sparse.features import (
     find_patches,
 )
 from ms_slam_env.slam.sparse.matching import Int64, match_anywhere, match_near
-from ms_slam_env.slam.sparse.pose import (
-    Sightings,
-    pose_from_matches,
-    refine_pose,
-)
+from ms_slam_env.slam.sparse.pose import Sightings, pose_from_matches, refine_pose
 from ms_slam_env.slam.sparse.sparse_map import SparseMap
 from ms_slam_env.slam.tracking_template import Attempt
 

@@ -65,12 +65,7 @@ def optimise_poses(poses: Float64, edges: Sequence[Edge], fixed: NDArray[np.bool
 class LoopCloser(Stateful):
     """Closes loops of a map."""
 
-    def __init__(
-        self,
-        sparse_map: SparseMap,
-        localizer: Localizer,
-        config: SparseConfig,
-    ) -> None:
+    def __init__(self, sparse_map: SparseMap, localizer: Localizer, config: SparseConfig) -> None:
         self._map = sparse_map
         self._localizer = localizer
         self._config = config

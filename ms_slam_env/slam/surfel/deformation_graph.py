@@ -214,10 +214,7 @@ class Energy:
         gradient = self._matrix.T @ (self._matrix @ x + self._offset)
         gradient += rotation.T @ self._rotation_residuals(x)
         factors = splu(
-            H,
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
+            H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
         )
         return -factors.solve(gradient)
 

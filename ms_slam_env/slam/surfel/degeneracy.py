@@ -148,12 +148,7 @@ def remapped_step(
 
 @wp.func
 def pose_covariance(
-    E: mat76d,
-    A: mat66d,
-    B: mat66d,
-    tilted: wp.float64,
-    matched: wp.float64,
-    length: wp.float64,
+    E: mat76d, A: mat66d, B: mat66d, tilted: wp.float64, matched: wp.float64, length: wp.float64
 ):
     """Covariance H^-1 (a A + b B) H^-1 of the pose, metres and radians, H = A + B in metres.
 

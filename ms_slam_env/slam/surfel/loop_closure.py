@@ -43,10 +43,7 @@ from ms_slam_env.slam.surfel.rendering import SplatRenderer
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.surfels import EARLIEST, any_time
 from ms_slam_env.slam.surfel.tracker import Tracker, model_stride
-from ms_slam_env.slam.surfel.trajectory_history import (
-    TrajectoryHistory,
-    motion_size,
-)
+from ms_slam_env.slam.surfel.trajectory_history import TrajectoryHistory, motion_size
 
 Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]

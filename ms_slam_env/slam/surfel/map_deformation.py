@@ -188,13 +188,7 @@ def pixel_of(p: wp.vec3, camera: SplatCamera):
 
 
 @wp.kernel
-def reactivate(
-    surfels: Surfels,
-    b: int,
-    seen_from: int,
-    seen_to: int,
-    now: int,
-) -> None:
+def reactivate(surfels: Surfels, b: int, seen_from: int, seen_to: int, now: int) -> None:
     """Count the surfels of env b that were last seen within these frames as seen now."""
     i = wp.tid()
     seen = surfels.seen[b, i]

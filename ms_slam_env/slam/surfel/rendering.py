@@ -90,10 +90,7 @@ class SplatRenderer:
         self._splats: dict[tuple[int, int], list[wp.Launch]] = {}
         images = [a.flatten() for a in (view.vertices, view.normals, view.intensity, view.color)]
         self._resolve = record_launch(
-            resolve,
-            (envs, intrinsics.height),
-            [self._sums, self.camera, *images],
-            self.device,
+            resolve, (envs, intrinsics.height), [self._sums, self.camera, *images], self.device
         )
 
     def _new_view(self) -> ModelView:

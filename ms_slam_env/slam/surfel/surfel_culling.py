@@ -73,11 +73,7 @@ def cull_unstable(
 
 @wp.kernel
 def list_survivors(
-    surfels: Surfels,
-    rule: CullingRule,
-    frame: FusedFrame,
-    workers: int,
-    compaction: Compaction,
+    surfels: Surfels, rule: CullingRule, frame: FusedFrame, workers: int, compaction: Compaction
 ) -> None:
     """List the slots to keep of every env whose compaction is due; ``kept`` -1: not due.
 
@@ -113,12 +109,7 @@ def copy_surfel(source: Surfels, target: Surfels, b: int, i: int, j: int):
 
 
 @wp.kernel
-def gather(
-    source: Surfels,
-    target: Surfels,
-    compaction: Compaction,
-    workers: int,
-) -> None:
+def gather(source: Surfels, target: Surfels, compaction: Compaction, workers: int) -> None:
     """Copy the survivors that must move to their new slots in ``target``."""
     b, worker = wp.tid()
     count = compaction.kept[b]

@@ -13,20 +13,10 @@ from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.base import Float64, Views
 from ms_slam_env.slam.state import Stateful
+from ms_slam_env.slam.surfel import fusion, surfel_culling
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.device import record_launch
-from ms_slam_env.slam.surfel.frustum_culling import (
-    FrustumCuller,
-    bound_blocks,
-    set_bounded,
-)
-from ms_slam_env.slam.surfel.fusion import (
-    FusedFrame,
-    FusionParameters,
-    add_surfels,
-    radial_weights,
-    update_surfels,
-)
+from ms_slam_env.slam.surfel.frustum_culling import FrustumCuller, bound_blocks, set_bounded
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
 from ms_slam_env.slam.surfel.rendering import (
     ModelView,
@@ -34,19 +24,7 @@ from ms_slam_env.slam.surfel.rendering import (
     SplatRenderer,
     splat_camera,
 )
-from ms_slam_env.slam.surfel.surfel_culling import (
-    CullingRule,
-    cull_unstable,
-    gather,
-    list_survivors,
-    put_back,
-)
-from ms_slam_env.slam.surfel.surfels import (
-    ATTRIBUTES,
-    COUNTERS,
-    MapBuffers,
-    SeenWindow,
-)
+from ms_slam_env.slam.surfel.surfels import ATTRIBUTES, COUNTERS, MapBuffers, SeenWindow
 from ms_slam_env.slam.surfel.view_prediction import DeviceViews, ViewPredictor
 
 
@@ -68,11 +46,11 @@ class MapKernels:
         self._cull = FrustumCuller(buffers, buffers.batch, self._camera, buffers.active)
         self._model_renderer = self.model_renderer(model_stride, buffers.active)
         self._arguments: tuple[Any, ...] = (None,) * 5
-        self._frame = FusedFrame()
+        self._frame = fusion.FusedFrame()
         self._frame.covered = wp.zeros(
             math.prod((buffers.batch, *intrinsics.shape)), dtype=wp.int32, device=buffers.device
         )
-        radial = radial_weights(*intrinsics.shape).ravel()
+        radial = fusion.radial_weights(*intrinsics.shape).ravel()
         self._frame.radial = wp.array(radial, device=buffers.device)
         self._fusion = self._record_fusion()
         self._culling = self._record_culling()
@@ -89,7 +67,7 @@ class MapKernels:
 
     def _record_fusion(self) -> list[wp.Launch]:
         config, buffers = self.config, self._buffers
-        rule = FusionParameters()
+        rule = fusion.FusionParameters()
         rule.distance_m = config.fusion_distance_m
         rule.min_cosine = math.cos(math.radians(config.fusion_angle_deg))
         rule.coverage_px = config.coverage_px
@@ -97,13 +75,13 @@ class MapKernels:
         rule.max_confidence = config.max_confidence
         shared = [self._camera, rule, self._frame, buffers.workers]
         return [
-            self._record(update_surfels, [buffers.surfels, buffers.visible, *shared]),
-            self._record(add_surfels, [buffers.surfels, buffers.capacity, *shared]),
+            self._record(fusion.update_surfels, [buffers.surfels, buffers.visible, *shared]),
+            self._record(fusion.add_surfels, [buffers.surfels, buffers.capacity, *shared]),
         ]
 
     def _record_culling(self) -> list[wp.Launch]:
         config, buffers = self.config, self._buffers
-        rule = CullingRule()
+        rule = surfel_culling.CullingRule()
         rule.capacity = buffers.capacity
         rule.interval = config.compaction_interval
         rule.window = config.unstable_window
@@ -111,11 +89,12 @@ class MapKernels:
         surfels, spare, blocks = buffers.surfels, buffers.spare, buffers.blocks
         workers, compaction = buffers.workers, buffers.compaction
         due = [rule, self._frame, workers, compaction]
+        returned = [spare, surfels, blocks, compaction, rule.capacity, workers]
         return [
-            self._record(cull_unstable, [surfels, blocks, *due]),
-            self._record(list_survivors, [surfels, *due]),
-            self._record(gather, [surfels, spare, compaction, workers]),
-            self._record(put_back, [spare, surfels, blocks, compaction, rule.capacity, workers]),
+            self._record(surfel_culling.cull_unstable, [surfels, blocks, *due]),
+            self._record(surfel_culling.list_survivors, [surfels, *due]),
+            self._record(surfel_culling.gather, [surfels, spare, compaction, workers]),
+            self._record(surfel_culling.put_back, returned),
         ]
 
     def model_renderer(self, stride: int, window: SeenWindow) -> SplatRenderer:
@@ -235,12 +214,7 @@ class SurfelMap(Stateful):
                 counter[env : env + 1].zero_()
 
     def fuse(
-        self,
-        live: LiveFrame,
-        poses: wp.array,
-        time: wp.array,
-        weight: wp.array,
-        mask: wp.array,
+        self, live: LiveFrame, poses: wp.array, time: wp.array, weight: wp.array, mask: wp.array
     ) -> None:
         """Fuse one frame per env.
 

@@ -17,10 +17,7 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert
 from ms_slam_env.slam.alignment_check import DeviceStatistics, DeviceThresholds
 from ms_slam_env.slam.base import Float64
-from ms_slam_env.slam.surfel.acceptance import (
-    Alignment,
-    assess_alignment,
-)
+from ms_slam_env.slam.surfel.acceptance import Alignment, assess_alignment
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.degeneracy import mat66d
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer, KernelLaunchCache, threads_per_row
@@ -287,9 +284,7 @@ class Tracker:
             lambda: self._accumulation(level, stride, state),
         )
         self._launches.launch(
-            ("reduce", *key),
-            reduce_sums,
-            lambda: ((*state.shape, NUM_SUMS), [state.arrays, slots]),
+            ("reduce", *key), reduce_sums, lambda: ((*state.shape, NUM_SUMS), [state.arrays, slots])
         )
 
     def _accumulation(

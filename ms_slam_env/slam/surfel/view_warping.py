@@ -162,9 +162,7 @@ def resolve_views(
     shift = R_back * t
     across = wp.vec3(R_back[0, 0], R_back[1, 0], R_back[2, 0]) / camera.focal[0]
     first_ray = R_back * wp.vec3(
-        -camera.centre[0] / camera.focal[0],
-        (float(v) - camera.centre[1]) / camera.focal[1],
-        1.0,
+        -camera.centre[0] / camera.focal[0], (float(v) - camera.centre[1]) / camera.focal[1], 1.0
     )
     forward = wp.vec3(R[2, 0], R[2, 1], R[2, 2])
     for u in range(width):
