@@ -280,6 +280,19 @@ def measure_alignment(
     )
 
 
+def check_alignment(
+    frame: DepthImage,
+    reference: DepthImage,
+    T_reference_frame: Float64,
+    intrinsics: Intrinsics,
+    thresholds: AcceptanceThresholds,
+    samples: int = 5000,
+) -> tuple[AlignmentStatistics, str]:
+    """What ``measure_alignment`` finds, and why that is not accepted; empty if it is."""
+    found = measure_alignment(frame, reference, T_reference_frame, intrinsics, samples)
+    return found, VIEW_REASONS[evaluate_alignment(found, thresholds)]
+
+
 def _back_project(
     u: NDArray[np.int64], v: NDArray[np.int64], depth: Float64, intrinsics: Intrinsics
 ) -> Float64:

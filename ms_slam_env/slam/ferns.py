@@ -254,10 +254,6 @@ class FernDatabase(Stateful):
             check_pose(pose, "poses")
         self._poses[: self._count] = stack
 
-    def transform(self, T_new_old: ArrayLike) -> None:
-        """Move all keyframes by one rigid motion (4, 4) of the world."""
-        self._poses[: self._count] = check_pose(T_new_old, "T_new_old") @ self._poses[: self._count]
-
     def get_state(self) -> dict[str, Any]:
         """The keyframes."""
         return {name[1:]: getattr(self, name)[: self._count].copy() for name in _ROWS}

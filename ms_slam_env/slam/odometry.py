@@ -20,11 +20,9 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, relative_angle
 from ms_slam_env.slam.alignment_check import (
     NO_ALIGNMENT,
-    VIEW_REASONS,
     AcceptanceThresholds,
     DepthImage,
-    evaluate_alignment,
-    measure_alignment,
+    check_alignment,
 )
 from ms_slam_env.slam.base import BorrowedMap, Float64
 from ms_slam_env.slam.pose_hypotheses import motion_hypotheses
@@ -191,9 +189,9 @@ class OdometrySlam(BorrowedMap, FrameByFrameSlam[DepthImage, _Placed]):
         if T is None:
             reason = "no motion aligns the frame with the view before it"
             return Attempt(reference.T_world_image, NO_ALIGNMENT, reason, reference)
-        found = measure_alignment(frame.image, reference.prepared.image, T, self.intrinsics)
+        images = frame.image, reference.prepared.image
+        found, reason = check_alignment(*images, T, self.intrinsics, thresholds)
         pose = reference.T_world_image @ T
-        reason = VIEW_REASONS[evaluate_alignment(found, thresholds)]
         return Attempt(pose, found, reason, _Placed(pose, frame))
 
     def _start_from(self, frame: RGBDFrame, prepared: DepthImage) -> None:

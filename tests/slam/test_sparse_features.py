@@ -28,7 +28,7 @@ from ms_slam_env.slam.sparse.matching import (
     most_alike,
     thumbnail,
 )
-from ms_slam_env.slam.sparse.sparse_map import SparseMap, make_keyframe
+from ms_slam_env.slam.sparse.sparse_map import Keyframe, SparseMap
 
 CAMERA = xtion("160x120")
 
@@ -201,7 +201,7 @@ def _map(rng: np.random.Generator) -> SparseMap:
         if k == 1:
             ids[5:] = np.arange(5)
         pose = make_pose(np.eye(3), [0.1 * k, 0, 0])
-        sparse_map.add(make_keyframe(pose, k == 0, features, ids, color, intensity, depth))
+        sparse_map.add(Keyframe(pose, k == 0, features, ids, color, intensity, depth))
     return sparse_map
 
 

@@ -89,7 +89,7 @@ def test_a_full_map_drops_surfels_and_recovers() -> None:
     surfel_map = SurfelMap(1, SMALL, config)
     fuse(surfel_map, live_frame(np.eye(4)[None]), np.eye(4)[None], 0)
     pixels = SMALL.width * SMALL.height
-    assert surfel_map.dropped() == pixels - 1000
+    assert surfel_map.surfels.dropped.numpy()[0] == pixels - 1000
     assert surfel_map.count() == 1000
     assert len(surfel_map.points(stable=False)) == 1000
     # Elsewhere the unstable surfels out of view make room at once.

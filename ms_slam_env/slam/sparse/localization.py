@@ -11,11 +11,9 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, transform_points
 from ms_slam_env.slam.alignment_check import (
     NO_ALIGNMENT,
-    VIEW_REASONS,
     AcceptanceThresholds,
     DepthImage,
-    evaluate_alignment,
-    measure_alignment,
+    check_alignment,
 )
 from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.rows import join
@@ -161,10 +159,8 @@ class Localizer:
         else:
             keyframe = self._map.keyframes[fix.reference]
             motion = invert(keyframe.T_world_camera) @ fix.T_world_camera
-            found = measure_alignment(
-                frame.image, keyframe.image(), motion, self._intrinsics, _SAMPLES
-            )
-            reason = VIEW_REASONS[evaluate_alignment(found, self._thresholds)]
+            images, rule = (frame.image, keyframe.image()), (self._thresholds, _SAMPLES)
+            found, reason = check_alignment(*images, motion, self._intrinsics, *rule)
         return Attempt(fix.T_world_camera, found, reason, fix)
 
     def _sightings(self, features: Features, which: Int64) -> Sightings:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -32,9 +32,15 @@ class Keyframe:
     color: NDArray[np.uint8]  # (H, W, 3) uint8
     intensity: Float32  # (H, W) float32 in [0, 255]
     depth: Float32  # (H, W) float32 metres; 0 = no reading
-    thumbnail: Float32  # (D,) unit vector of its looks
-    templates: Templates  # the patch around each feature
-    slopes: Float64  # (N, 2) change of inverse depth from pixel to pixel at each feature, 1/m
+    thumbnail: Float32 = field(init=False)  # (D,) unit vector of its looks
+    templates: Templates = field(init=False)  # the patch around each feature
+    # (N, 2) change of inverse depth from pixel to pixel at each feature, 1/m.
+    slopes: Float64 = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.thumbnail = thumbnail(self.image())
+        self.templates = cut(self.intensity, self.features.pixels)
+        self.slopes = InverseDepth(self.depth).slope(self.features.pixels)
 
     def image(self) -> DepthImage:
         """What frames are compared with."""
@@ -43,30 +49,6 @@ class Keyframe:
     def seen_points(self) -> Int64:
         """Ids of the points that it shows."""
         return self.point_ids[self.point_ids >= 0]
-
-
-def make_keyframe(
-    T_world_camera: Float64,
-    known: bool,
-    features: Features,
-    point_ids: Int64,
-    color: NDArray[np.uint8],
-    intensity: Float32,
-    depth: Float32,
-) -> Keyframe:
-    """A keyframe, with what follows from its image; see ``Keyframe``."""
-    return Keyframe(
-        T_world_camera=T_world_camera,
-        known=known,
-        features=features,
-        point_ids=point_ids,
-        color=color,
-        intensity=intensity,
-        depth=depth,
-        thumbnail=thumbnail(DepthImage(depth, intensity)),
-        templates=cut(intensity, features.pixels),
-        slopes=InverseDepth(depth).slope(features.pixels),
-    )
 
 
 class SparseMap(Saved):
@@ -180,4 +162,4 @@ def _save(keyframe: Keyframe) -> dict[str, Any]:
 def _restore(saved: dict[str, Any]) -> Keyframe:
     features = Features(**{name: saved[name].copy() for name in _OF_FEATURES})
     own = {name: saved[name].copy() for name in _OF_KEYFRAME}
-    return make_keyframe(known=saved["known"], features=features, **own)
+    return Keyframe(known=saved["known"], features=features, **own)

@@ -22,7 +22,7 @@ from ms_slam_env.slam.sparse.local_mapping import adjust_around, load_gtsam
 from ms_slam_env.slam.sparse.localization import Fix, LiveFrame, Localizer, keyframe_features
 from ms_slam_env.slam.sparse.loop_closure import LoopCloser
 from ms_slam_env.slam.sparse.matching import most_alike, thumbnail
-from ms_slam_env.slam.sparse.sparse_map import Keyframe, SparseMap, make_keyframe
+from ms_slam_env.slam.sparse.sparse_map import Keyframe, SparseMap
 from ms_slam_env.slam.state import Saved
 from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
 from ms_slam_env.slam.tracking_template import Attempt, FrameByFrameSlam
@@ -202,7 +202,7 @@ class SparseSlam(BorrowedMap, FrameByFrameSlam[LiveFrame, Fix]):
     def _insert(self, frame: RGBDFrame, live: LiveFrame, fix: Fix | None, known: bool) -> None:
         """Make a frame a keyframe, adjust the map around it, and close a loop if there is one."""
         features, point_ids = keyframe_features(live, fix, self._map, self.config.pixel_noise)
-        keyframe = make_keyframe(
+        keyframe = Keyframe(
             T_world_camera=self._pose,
             known=known,
             features=features,

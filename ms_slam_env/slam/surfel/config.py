@@ -148,10 +148,6 @@ class SurfelConfig(Checked):
                 f"SurfelConfig.iterations = {self.iterations!r} must be 1 to 5 integers in [0, 100]"
             )
         object.__setattr__(self, "iterations", tuple(self.iterations))  # lists come from YAML
-        if not isinstance(self.refuse_bad_fits, bool):
-            raise InputError(
-                f"SurfelConfig.refuse_bad_fits = {self.refuse_bad_fits!r} must be true or false"
-            )
 
     def capacity(self, columns: int) -> int:
         """Surfels that the map of a camera with images of so many columns has room for."""

@@ -7,16 +7,9 @@ from typing import Any
 
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
+from ms_slam_env.slam.surfel import splatting
 from ms_slam_env.slam.surfel.device import record_launch
 from ms_slam_env.slam.surfel.frustum_culling import FrustumCuller
-from ms_slam_env.slam.surfel.splatting import (
-    Sums,
-    list_hidden,
-    project_footprints,
-    resolve,
-    splat_attributes,
-    splat_depth,
-)
 from ms_slam_env.slam.surfel.surfels import MapBuffers, SeenWindow, SplatCamera, VisibleList
 
 
@@ -85,13 +78,12 @@ class SplatRenderer:
         self._buffers = buffers
         pixels = envs * intrinsics.width * intrinsics.height
         self._z_buffer = wp.zeros(pixels, dtype=wp.float32, device=self.device)
-        self._sums = wp.zeros(pixels, dtype=Sums, device=self.device)
+        self._sums = wp.zeros(pixels, dtype=splatting.Sums, device=self.device)
         self._culler = FrustumCuller(buffers, envs, self.camera, window)
         self._splats: dict[tuple[int, int], list[wp.Launch]] = {}
         images = [a.flatten() for a in (view.vertices, view.normals, view.intensity, view.color)]
-        self._resolve = record_launch(
-            resolve, (envs, intrinsics.height), [self._sums, self.camera, *images], self.device
-        )
+        dim, inputs = (envs, intrinsics.height), [self._sums, self.camera, *images]
+        self._resolve = record_launch(splatting.resolve, dim, inputs, self.device)
 
     def _new_view(self) -> ModelView:
         def image(dtype: Any) -> wp.array:
@@ -122,9 +114,9 @@ class SplatRenderer:
         shared = [listed, self.camera, workers, self._buffers.footprints]
         listed_in = [surfels, listed, first_env, *shared[1:]]
         passes = (
-            (project_footprints, shared),
-            (splat_depth, [*shared, self._z_buffer]),
-            (splat_attributes, [*listed_in, self._z_buffer, self._sums]),
+            (splatting.project_footprints, shared),
+            (splatting.splat_depth, [*shared, self._z_buffer]),
+            (splatting.splat_attributes, [*listed_in, self._z_buffer, self._sums]),
         )
         dim = (self.envs, workers)
         return [record_launch(kernel, dim, inputs, self.device) for kernel, inputs in passes]
@@ -134,4 +126,4 @@ class SplatRenderer:
         hidden.count.zero_()
         workers = self._buffers.workers
         inputs = [self.visible, self.camera, workers, self._z_buffer, hidden]
-        wp.launch(list_hidden, (self.envs, workers), inputs, device=self.device)
+        wp.launch(splatting.list_hidden, (self.envs, workers), inputs, device=self.device)

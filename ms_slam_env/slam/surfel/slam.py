@@ -54,10 +54,8 @@ class BatchedSurfelSlam(Saved):
         self._states = CameraStates.at_rest(batch)
         self._localizer = Localizer(self._states, self.map, self.relocalization)
         self._invalid_frames = self._localizer.invalid_frames
-        self._device_poses = HostDeviceBuffer(batch, wp.mat44, device)
-        self._device_time = HostDeviceBuffer(batch, wp.int32, device)
-        self._device_weight = HostDeviceBuffer(batch, wp.float32, device)
-        self._device_mask = HostDeviceBuffer(batch, wp.int32, device)
+        dtypes = (wp.mat44, wp.int32, wp.float32, wp.int32)  # of pose, time, weight and mask
+        self._fused = [HostDeviceBuffer(batch, dtype, device) for dtype in dtypes]
         self._use(self._pipelines.get(intrinsics, config))
 
     @property
@@ -175,17 +173,11 @@ class BatchedSurfelSlam(Saved):
         states = self._states
         self.relocalization.add_keyframes(frames, states.poses, states.time, good)
         if good.any():
-            self._device_poses.write(states.poses)
-            self._device_time.write(states.time)
-            self._device_weight.write(motion_weight(states.motions))
-            self._device_mask.write(good)
-            self.map.fuse(
-                live,
-                self._device_poses.array,
-                self._device_time.array,
-                self._device_weight.array,
-                self._device_mask.array,
-            )
+            weights = motion_weight(states.motions)
+            values: list[NDArray[Any]] = [states.poses, states.time, weights, good]
+            for buffer, value in zip(self._fused, values, strict=True):
+                buffer.write(value)
+            self.map.fuse(live, *(buffer.array for buffer in self._fused))
             self.loops.record(states.poses, states.time, good)
             self._localizer.forget_view()
         states.time += 1

@@ -271,10 +271,6 @@ class SurfelMap(Stateful):
         """Living surfels of one env."""
         return int(self.surfels.count.numpy()[env] - self.surfels.dead.numpy()[env])
 
-    def dropped(self, env: int = 0) -> int:
-        """Surfels that found no room in one env's map since it was cleared."""
-        return int(self.surfels.dropped.numpy()[env])
-
     def points(self, env: int = 0, stable: bool = True) -> Float64:
         """Positions (M, 3) of the living surfels, world frame; only stable ones if asked."""
         return self.attribute("position", env, stable).astype(np.float64)

@@ -12,6 +12,7 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert
 from ms_slam_env.slam.base import Float64
+from ms_slam_env.slam.surfel import view_warping
 from ms_slam_env.slam.surfel.rendering import (
     ModelView,
     SplatParameters,
@@ -19,14 +20,7 @@ from ms_slam_env.slam.surfel.rendering import (
     splat_camera,
 )
 from ms_slam_env.slam.surfel.surfels import MapBuffers, VisibleList, allocate
-from ms_slam_env.slam.surfel.view_warping import (
-    EMPTY,
-    PointCloud,
-    collect_points,
-    copy_view,
-    resolve_views,
-    scatter_points,
-)
+from ms_slam_env.slam.surfel.view_warping import EMPTY, PointCloud
 
 MAX_MARGIN = 1.0  # a reference view wider than the views by more than their own size is refused
 NEAREST_M = 0.5  # surfaces closer than this may leave the reference view's margin
@@ -74,14 +68,9 @@ def wide_intrinsics(intrinsics: Intrinsics, motions: Float64) -> Intrinsics | No
         if beyond > MAX_MARGIN * size:
             return None
         margins.append(SIZE_STEP_PX * math.ceil(beyond / SIZE_STEP_PX))
-    return Intrinsics(
-        fx=intrinsics.fx,
-        fy=intrinsics.fy,
-        cx=intrinsics.cx + margins[0],
-        cy=intrinsics.cy + margins[1],
-        width=w + 2 * margins[0],
-        height=h + 2 * margins[1],
-    )
+    left, top = margins
+    centre = intrinsics.cx + left, intrinsics.cy + top
+    return Intrinsics(intrinsics.fx, intrinsics.fy, *centre, w + 2 * left, h + 2 * top)
 
 
 class _Reference:
@@ -104,12 +93,9 @@ class _Reference:
         self._collect(self.renderer.splat(first_env, self.hidden))
 
     def _collect(self, layer: ModelView) -> None:
-        wp.launch(
-            collect_points,
-            dim=(self.renderer.envs, self.renderer.intrinsics.height),
-            inputs=[layer.vertices, layer.normals, layer.intensity, self.points],
-            device=self.renderer.device,
-        )
+        inputs = [layer.vertices, layer.normals, layer.intensity, self.points]
+        dim = (self.renderer.envs, self.renderer.intrinsics.height)
+        wp.launch(view_warping.collect_points, dim, inputs, device=self.renderer.device)
 
 
 class ViewPredictor:
@@ -157,27 +143,12 @@ class ViewPredictor:
         camera = splat_camera(views.intrinsics, self.parameters)
         total = views.depth.shape[0]
         keys.fill_(int(EMPTY))
-        wp.launch(
-            scatter_points,
-            dim=(total, self.workers),
-            inputs=[points, count, motions, camera, self.workers, keys],
-            device=self.device,
-        )
-        wp.launch(
-            resolve_views,
-            dim=(total, views.intrinsics.height),
-            inputs=[
-                points,
-                count,
-                motions,
-                camera,
-                keys,
-                views.intensity.flatten(),
-                views.depth.flatten(),
-                views.normals.flatten(),
-            ],
-            device=self.device,
-        )
+        shared = [points, count, motions, camera]
+        dim, inputs = (total, self.workers), [*shared, self.workers, keys]
+        wp.launch(view_warping.scatter_points, dim, inputs, device=self.device)
+        images = [image.flatten() for image in (views.intensity, views.depth, views.normals)]
+        dim, inputs = (total, views.intrinsics.height), [*shared, keys, *images]
+        wp.launch(view_warping.resolve_views, dim, inputs, device=self.device)
 
     def _predict_singly(self, poses: Float64, views: DeviceViews, first_env: int) -> None:
         """Splat the surfels themselves into every view, one view per env at a time."""
@@ -189,21 +160,10 @@ class ViewPredictor:
         for n in range(count):
             renderer.cull(self._upload(poses[:, n]), first_env)
             image = renderer.splat(first_env)
-            wp.launch(
-                copy_view,
-                dim=(envs, *views.intrinsics.shape),
-                inputs=[
-                    image.vertices,
-                    image.normals,
-                    image.intensity,
-                    count,
-                    n,
-                    views.intensity,
-                    views.depth,
-                    views.normals,
-                ],
-                device=self.device,
-            )
+            drawn = [image.vertices, image.normals, image.intensity]
+            inputs = [*drawn, count, n, views.intensity, views.depth, views.normals]
+            dim = (envs, *views.intrinsics.shape)
+            wp.launch(view_warping.copy_view, dim, inputs, device=self.device)
 
     def _upload(self, poses: Float64) -> wp.array:
         """(..., 4, 4) float64 as a flat device array of mat44."""
@@ -223,12 +183,9 @@ class ViewPredictor:
         key = (count, intrinsics)
         if key not in self._outputs:
             shape = (count, *intrinsics.shape)
-            views = DeviceViews(
-                intensity=wp.zeros(shape, dtype=wp.float32, device=self.device),
-                depth=wp.zeros(shape, dtype=wp.float32, device=self.device),
-                normals=wp.zeros(shape, dtype=wp.vec3, device=self.device),
-                intrinsics=intrinsics,
-            )
+            dtypes = (wp.float32, wp.float32, wp.vec3)
+            grey, depth, normals = (wp.zeros(shape, dtype=t, device=self.device) for t in dtypes)
+            views = DeviceViews(grey, depth, normals, intrinsics)
             keys = wp.zeros(math.prod(shape), dtype=wp.int64, device=self.device)
             self._outputs[key] = (keys, views)
         return self._outputs[key]

@@ -19,11 +19,9 @@ from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.alignment_check import (
     NO_ALIGNMENT,
-    VIEW_REASONS,
     AcceptanceThresholds,
     DepthImage,
-    evaluate_alignment,
-    measure_alignment,
+    check_alignment,
 )
 from ms_slam_env.slam.base import Float64, Views
 from ms_slam_env.slam.odometry import Aligner
@@ -182,8 +180,8 @@ class VolumetricSlam(FrameByFrameSlam[_RGBDImage, None]):
         T_model_camera = self._aligner.align(image, view)
         if T_model_camera is None:
             return Attempt(pose, NO_ALIGNMENT, "no motion aligns the frame with the model", None)
-        found = measure_alignment(image, reference, T_model_camera, self.intrinsics)
-        reason = VIEW_REASONS[evaluate_alignment(found, thresholds)]
+        motion = T_model_camera, self.intrinsics
+        found, reason = check_alignment(image, reference, *motion, thresholds)
         return Attempt(pose @ T_model_camera, found, reason, None)
 
     def _cast(self, pose: Float64) -> CastView:
