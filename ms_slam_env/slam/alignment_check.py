@@ -168,13 +168,8 @@ LEAST_TEXTURE = 2.0  # grey levels; with less there is nothing to correlate
 def _device_struct(cls: type) -> Any:
     """The Warp struct with the fields of a dataclass, each a float64."""
     annotations = {field.name: wp.float64 for field in fields(cls)}
-    return wp.struct(
-        type(
-            f"Device{cls.__name__}",
-            (),
-            {"__annotations__": annotations, "__module__": __name__, "__doc__": cls.__doc__},
-        )
-    )
+    members = {"__annotations__": annotations, "__module__": __name__, "__doc__": cls.__doc__}
+    return wp.struct(type(f"Device{cls.__name__}", (), members))
 
 
 DeviceStatistics = _device_struct(AlignmentStatistics)

@@ -123,25 +123,16 @@ class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
         before, self._pose = self._pose, attempt.T_world_camera
         self._motion = np.eye(4) if relocalised else invert(before) @ self._pose
         self._extend(frame, prepared, attempt)
-        return TrackResult(
-            T_world_camera=self._pose.copy(),
-            tracking_ok=True,
-            relocalised=relocalised,
-            inlier_fraction=attempt.statistics.inlier_ratio,
-            residual_m=attempt.statistics.residual_m,
-        )
+        found = attempt.statistics
+        figures = found.inlier_ratio, found.residual_m
+        return TrackResult(self._pose.copy(), True, relocalised, *figures)
 
     def _lose(self, reason: str, statistics: AlignmentStatistics) -> TrackResult:
         """Hold the pose and the map."""
         self._motion = np.eye(4)
         self._lost = self._has_map
-        return TrackResult(
-            T_world_camera=self._pose.copy(),
-            tracking_ok=False,
-            inlier_fraction=statistics.inlier_ratio,
-            residual_m=statistics.residual_m,
-            reason=reason,
-        )
+        figures = statistics.inlier_ratio, statistics.residual_m
+        return TrackResult(self._pose.copy(), False, False, *figures, reason)
 
     @property
     @abstractmethod

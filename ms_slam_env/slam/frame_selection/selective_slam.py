@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import time
 from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -139,29 +141,29 @@ class SelectiveSlam(Saved, BorrowedMap):
 
     def track(self, frame: RGBDFrame, T_world_camera_guess: ArrayLike | None = None) -> TrackResult:
         """Estimate the pose of ``frame`` and fuse it, or drop it; see ``SlamBackend``."""
-        self.intrinsics.check_image(frame.depth, "frame")
         if T_world_camera_guess is not None:
             check_pose(T_world_camera_guess, "T_world_camera_guess")
-        begin = time.process_time()
-        if self._is_worth(frame):
+
+        def process() -> TrackResult:
             guess = T_world_camera_guess
             if guess is None and self._dropped:
                 guess = self._prediction.guess(self._dropped + 1)
-            result = self._note(self.backend.track(frame, guess))
-        else:
-            result = self._drop(T_world_camera_guess)
-        self._filter.charge(time.process_time() - begin)
-        return result
+            return self.backend.track(frame, guess)
+
+        return self._process_or_drop(frame, T_world_camera_guess, process)
 
     def fuse(self, frame: RGBDFrame, T_world_camera: ArrayLike) -> TrackResult:
         """Fuse ``frame`` into the map at a known pose (4, 4), or drop it; nothing is tracked."""
-        self.intrinsics.check_image(frame.depth, "frame")
         check_pose(T_world_camera, "T_world_camera")
+        process = partial(self.backend.fuse, frame, T_world_camera)
+        return self._process_or_drop(frame, T_world_camera, process)
+
+    def _process_or_drop(
+        self, frame: RGBDFrame, known_pose: ArrayLike | None, process: Callable[[], TrackResult]
+    ) -> TrackResult:
+        self.intrinsics.check_image(frame.depth, "frame")
         begin = time.process_time()
-        if self._is_worth(frame):
-            result = self._note(self.backend.fuse(frame, T_world_camera))
-        else:
-            result = self._drop(T_world_camera)
+        result = self._note(process()) if self._is_worth(frame) else self._drop(known_pose)
         self._filter.charge(time.process_time() - begin)
         return result
 

@@ -23,22 +23,14 @@ CLEARLY_BETTER = wp.constant(wp.float64(0.97))  # ratios of scores
 CLEARLY_WORSE = wp.constant(wp.float64(1.03))
 DECAY = 0.9  # from frame to frame, of a motion that is predicted only
 NUM_FIRST = 2  # tried first, with the guess if any: at rest and at constant velocity
-PAN_RAD = np.radians(8.0)
-ROLL_RAD = np.radians(8.0)
 
 
-def _rotation(axis: int, angle: float) -> Float64:
-    twist = np.zeros(3)
-    twist[axis] = angle
-    return make_pose(so3_exp(twist), np.zeros(3))
+def _turn(pan_deg: float, tilt_deg: float, roll_deg: float = 0.0) -> Float64:
+    return make_pose(so3_exp(np.radians([tilt_deg, pan_deg, roll_deg])), np.zeros(3))
 
 
 _TURNS = np.stack(
-    [
-        *(_rotation(1, sign * PAN_RAD) for sign in (1, -1)),
-        *(_rotation(0, sign * PAN_RAD) for sign in (1, -1)),
-        *(_rotation(2, sign * ROLL_RAD) for sign in (1, -1)),
-    ]
+    [_turn(*turn) for turn in ((8, 0), (-8, 0), (0, 8), (0, -8), (0, 0, 8), (0, 0, -8))]
 )
 
 
@@ -64,10 +56,6 @@ def relocalization_hypotheses(attempt: int) -> Float64:
         step = rng.uniform(-1, 1, 3) * 0.25 * reach
         hypotheses.append(make_pose(so3_exp(turn), step))
     return np.stack(hypotheses)
-
-
-def _turn(pan_deg: float, tilt_deg: float, roll_deg: float = 0.0) -> Float64:
-    return make_pose(so3_exp(np.radians([tilt_deg, pan_deg, roll_deg])), np.zeros(3))
 
 
 _HERE = np.eye(4)

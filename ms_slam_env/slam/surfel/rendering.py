@@ -45,10 +45,8 @@ def splat_camera(intrinsics: Intrinsics, parameters: SplatParameters) -> SplatCa
     camera.width, camera.height = intrinsics.width, intrinsics.height
     camera.focal = wp.vec2(intrinsics.fx, intrinsics.fy)
     camera.centre = wp.vec2(intrinsics.cx, intrinsics.cy)
-    camera.z_near, camera.z_far = parameters.z_near, parameters.z_far
-    camera.tolerance_m = parameters.tolerance_m
-    camera.min_px, camera.max_px = parameters.min_px, parameters.max_px
-    camera.max_weight = parameters.max_weight
+    for name, value in vars(parameters).items():
+        setattr(camera, name, value)
     return camera
 
 

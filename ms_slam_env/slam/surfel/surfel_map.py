@@ -144,20 +144,10 @@ class MapKernels:
 class SurfelMap(Stateful):
     """Dense maps of ``batch`` envs (Keller et al., 3DV 2013; Whelan et al., IJRR 2016).
 
-    Args:
-        batch: number of envs B.
-        intrinsics: of the live camera.
-        config: parameters of fusion and removal.
-        device: Warp device, ``"cpu"`` or ``"cuda"``.
-        model_stride: ``render_model`` draws every so many-th row and column of the image.
-        workers: threads that share one env's surfels; None: 1 on the CPU, where they run one after
-            the other and the results keep the order of the map, many on a GPU.
-
-    Attributes:
-        surfels: the maps on the device.
-        active: ``fuse`` and ``render_model`` work on the surfels last seen within this window; all
-            unless its times are set.
-        kernels: how ``fuse`` and ``render_model`` do that.
+    ``fuse`` and ``render_model`` work on the surfels last seen within ``active``: all, unless its
+    times are set. ``render_model`` draws every ``model_stride``-th row and column of the image.
+    ``workers`` threads share one env's surfels; None: 1 on the CPU, where they run one after the
+    other and the results keep the order of the map, many on a GPU.
     """
 
     def __init__(

@@ -295,12 +295,10 @@ class Tracker:
         height, width = self._model_shapes[level]
         rows = -(-height // stride)
         images = AlignedImages()
-        images.model_vertices = model.vertices.flatten()
-        images.model_normals = model.normals.flatten()
-        images.model_intensity = model.intensity.flatten()
-        images.live_vertices = live[level].vertices.flatten()
-        images.live_normals = live[level].normals.flatten()
-        images.live_gradient = live[level].gradient.flatten()
+        for name in ("vertices", "normals", "intensity"):
+            setattr(images, f"model_{name}", getattr(model, name).flatten())
+        for name in ("vertices", "normals", "gradient"):
+            setattr(images, f"live_{name}", getattr(live[level], name).flatten())
         images.model_size = wp.vec2i(width, height)
         images.live_size = wp.vec2i(camera.width, camera.height)
         images.focal, images.centre = wp.vec2(camera.fx, camera.fy), wp.vec2(camera.cx, camera.cy)

@@ -138,20 +138,24 @@ class VoxelGrid(Stateful):
         self, pose: Float64, least_weight: float, intrinsics: Intrinsics, names: list[str]
     ) -> Any:
         """Open3D's ray cast of the images ``names``, (H, W, channels) tensors."""
-        return self._grid.ray_cast(
-            self._keys,
-            camera_matrix(self, intrinsics),
-            self.tensor(invert(pose)),
-            intrinsics.width,
-            intrinsics.height,
-            names,
-            DEPTH_SCALE,
-            _NEAREST_M,
-            self.config.depth_cutoff_m,
-            least_weight - 0.5,  # the comparison is strict
-            self.config.truncation_voxels,
-            range_factor(intrinsics),
-        )
+        limits = self.config.depth_cutoff_m, least_weight, range_factor(intrinsics)
+        return self._ray_cast_blocks(self._keys, pose, intrinsics, names, *limits)
+
+    def _ray_cast_blocks(
+        self,
+        keys: Any,
+        pose: Float64,
+        intrinsics: Intrinsics,
+        names: list[str],
+        farthest_m: float,
+        least_weight: float,
+        factor: int,
+    ) -> Any:
+        extrinsic, size = self.tensor(invert(pose)), (intrinsics.width, intrinsics.height)
+        range_m = DEPTH_SCALE, _NEAREST_M, farthest_m
+        rule = least_weight - 0.5, self.config.truncation_voxels, factor  # compared strictly
+        camera = camera_matrix(self, intrinsics)
+        return self._grid.ray_cast(keys, camera, extrinsic, *size, names, *range_m, *rule)
 
     def _block_keys(self) -> Any:
         """Coordinates (M, 3) of all blocks as a tensor, None if there are none."""
@@ -183,20 +187,8 @@ class VoxelGrid(Stateful):
         pose[:3, 3] = (low + high) / 2 - [0.0, 0.0, 4 * radius]
         size = 8
         camera = Intrinsics(float(size), float(size), (size - 1) / 2, (size - 1) / 2, size, size)
-        self._grid.ray_cast(
-            self.tensor(np.repeat(keys, repeats, axis=0)),
-            camera_matrix(self, camera),
-            self.tensor(invert(pose)),
-            size,
-            size,
-            ["depth"],
-            DEPTH_SCALE,
-            _NEAREST_M,
-            8 * radius,
-            0.5,
-            self.config.truncation_voxels,
-            1,
-        )
+        everything = self.tensor(np.repeat(keys, repeats, axis=0))
+        self._ray_cast_blocks(everything, pose, camera, ["depth"], 8 * radius, 1.0, 1)
         self._reserved = repeats * len(keys) - 1
 
     def surface(self) -> tuple[Float64, NDArray[np.uint8], Float32]:
