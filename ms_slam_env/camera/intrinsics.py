@@ -83,7 +83,17 @@ class Intrinsics:
     def rays(self) -> Array:
         """Viewing rays (height, width, 3) in the camera frame with z = 1."""
         v, u = np.mgrid[: self.height, : self.width].astype(np.float64)
+        return self.rays_at(np.stack([u, v], axis=-1))
+
+    def rays_at(self, pixels: ArrayLike) -> Array:
+        """Viewing rays (..., 3) with z = 1 through pixels (..., 2), the inverse of ``project``."""
+        u, v = np.moveaxis(np.asarray(pixels, dtype=np.float64), -1, 0)
         return np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones_like(u)], -1)
+
+    @property
+    def matrix(self) -> Array:
+        """Camera matrix (3, 3)."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def project(self, points: ArrayLike) -> Array:
         """Pixel coordinates (..., 2) of points (..., 3) of the camera frame with z > 0."""

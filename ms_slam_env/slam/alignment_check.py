@@ -292,9 +292,7 @@ def _back_project(
     u: NDArray[np.int64], v: NDArray[np.int64], depth: Float64, intrinsics: Intrinsics
 ) -> Float64:
     """Points (N, 3) of pixels with a depth, camera frame."""
-    x = (u - intrinsics.cx) / intrinsics.fx
-    y = (v - intrinsics.cy) / intrinsics.fy
-    return np.stack([x * depth, y * depth, depth], axis=1)
+    return intrinsics.rays_at(np.stack([u, v], axis=1)) * depth[:, None]
 
 
 def _distance_to_surface(

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame
+from ms_slam_env.errors import InputError
 from ms_slam_env.slam.state import Stateful
 
 Float32 = NDArray[np.float32]
@@ -141,6 +142,16 @@ class SlamBackend(Stateful):
         Closed loops have moved them since ``track`` returned them. Empty where no loops are closed.
         """
         return np.zeros(0, dtype=np.int32), np.zeros((0, 4, 4))
+
+
+def check_views(poses: ArrayLike, scale: float) -> Float64:
+    """``poses`` as an array (N, 4, 4); refuse another shape, and a scale outside (0, 1]."""
+    stack = np.asarray(poses, dtype=np.float64)
+    if stack.ndim != 3 or stack.shape[1:] != (4, 4):
+        raise InputError(f"poses must have shape (N, 4, 4), got {stack.shape}")
+    if not 0 < scale <= 1:
+        raise InputError(f"scale = {scale} is outside (0, 1]")
+    return stack
 
 
 class BorrowedMap(SlamBackend):

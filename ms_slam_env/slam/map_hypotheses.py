@@ -140,8 +140,7 @@ def landmarks(frame: RGBDFrame, T_map_camera: Float64, K: Intrinsics) -> Landmar
     inverse = InverseDepth(frame.depth).at(pixels)
     known = inverse > 0
     depth = 1.0 / inverse[known]
-    u, v = pixels[known].T
-    rays = np.stack([(u - K.cx) / K.fx, (v - K.cy) / K.fy, np.ones_like(u)], axis=1)
+    rays = K.rays_at(pixels[known])
     kept = described[known]
     root = np.sqrt(kept / np.maximum(kept.sum(axis=1, keepdims=True), 1e-9))
     points = transform_points(T_map_camera, rays * depth[:, None])

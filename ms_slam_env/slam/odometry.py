@@ -77,10 +77,7 @@ class Aligner:
                 f"{cv2.__version__}"
             )
         settings = cv2.OdometrySettings()
-        matrix = np.eye(3, dtype=np.float32)
-        matrix[0, 0], matrix[1, 1] = intrinsics.fx, intrinsics.fy
-        matrix[0, 2], matrix[1, 2] = intrinsics.cx, intrinsics.cy
-        settings.setCameraMatrix(matrix)
+        settings.setCameraMatrix(intrinsics.matrix.astype(np.float32))
         settings.setMaxDepth(depth_cutoff_m)
         self._odometry = cv2.Odometry(
             cv2.OdometryType_RGB_DEPTH, settings, cv2.OdometryAlgoType_COMMON

@@ -53,9 +53,7 @@ class Features(Rows):
         """Points (N, 3) in the camera frame; NaN where the depth is not known."""
         known = self.inverse_depth > 0
         depth = np.where(known, 1.0 / np.where(known, self.inverse_depth, 1.0), np.nan)
-        x = (self.pixels[:, 0] - intrinsics.cx) / intrinsics.fx
-        y = (self.pixels[:, 1] - intrinsics.cy) / intrinsics.fy
-        return np.stack([x * depth, y * depth, depth], axis=1)
+        return intrinsics.rays_at(self.pixels) * depth[:, None]
 
 
 class FeatureExtractor:
@@ -172,9 +170,7 @@ def warp(patches: Patches, intrinsics: Intrinsics) -> tuple[Float64, Float64]:
     steps = np.array([[0.0, 0.0], [_HALF, 0.0], [0.0, _HALF]])
     pixels = patches.pixels[:, None] + steps
     inverse = patches.inverse_depth[:, None] + patches.slope @ steps.T
-    rays = np.ones((*pixels.shape[:2], 3))
-    rays[..., 0] = (pixels[..., 0] - intrinsics.cx) / intrinsics.fx
-    rays[..., 1] = (pixels[..., 1] - intrinsics.cy) / intrinsics.fy
+    rays = intrinsics.rays_at(pixels)
     # A point over its depth in the host: R ray + t / depth; the scale does not change its pixel.
     T = patches.T_frame_host
     there = np.einsum("nij,nkj->nki", T[:, :3, :3], rays) + inverse[..., None] * T[:, None, :3, 3]

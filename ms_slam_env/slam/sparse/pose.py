@@ -139,13 +139,10 @@ def pose_from_matches(
     """
     if len(points) < 6:
         return None
-    matrix = np.array(
-        [[intrinsics.fx, 0, intrinsics.cx], [0, intrinsics.fy, intrinsics.cy], [0, 0, 1.0]]
-    )
     found, turn, shift, kept = cv2.solvePnPRansac(
         points,
         pixels,
-        matrix,
+        intrinsics.matrix,
         None,
         iterationsCount=_RANSAC_ITERATIONS,
         reprojectionError=error_px,

@@ -11,7 +11,7 @@ from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.camera.frame import reduce_color, reduce_depth
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose
-from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult, Views
+from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult, Views, check_views
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
@@ -93,12 +93,7 @@ class SurfelSlam(SlamBackend):
 
     def predict(self, poses: ArrayLike, scale: float = 1.0) -> Views:
         """Render the map from ``poses`` (N, 4, 4) T_world_camera at ``scale`` times the size."""
-        stack = np.asarray(poses, dtype=np.float64)
-        if stack.ndim != 3 or stack.shape[1:] != (4, 4):
-            raise InputError(f"poses must have shape (N, 4, 4), got {stack.shape}")
-        if not 0 < scale <= 1:
-            raise InputError(f"scale = {scale} is outside (0, 1]")
-        return self.map.predict(stack, scale)
+        return self.map.predict(check_views(poses, scale), scale)
 
     def surface_points(self) -> Float64:
         """All living surfels (M, 3): the stable ones and the young ones seen of late.

@@ -52,10 +52,7 @@ def wide_intrinsics(intrinsics: Intrinsics, motions: Float64) -> Intrinsics | No
     None if no image of at most (1 + 2 MAX_MARGIN) times the size does: the views are too far apart.
     """
     w, h = intrinsics.width, intrinsics.height
-    u, v = np.array([-0.5, w - 0.5, -0.5, w - 0.5]), np.array([-0.5, -0.5, h - 0.5, h - 0.5])
-    rays = np.stack(
-        [(u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy, np.ones(4)], 1
-    )
+    rays = intrinsics.rays_at([[u, v] for v in (-0.5, h - 0.5) for u in (-0.5, w - 0.5)])
     corners = np.einsum("vij,cj->vci", motions[:, :3, :3], rays)
     if corners[..., 2].min() < 0.2:
         return None

@@ -23,7 +23,7 @@ from ms_slam_env.slam.alignment_check import (
     DepthImage,
     check_alignment,
 )
-from ms_slam_env.slam.base import Float64, Views
+from ms_slam_env.slam.base import Float64, Views, check_views
 from ms_slam_env.slam.odometry import Aligner
 from ms_slam_env.slam.pose_hypotheses import motion_hypotheses
 from ms_slam_env.slam.tracking_template import Attempt, FrameByFrameSlam
@@ -209,11 +209,9 @@ class VolumetricSlam(FrameByFrameSlam[_RGBDImage, None]):
 
     def predict(self, poses: ArrayLike, scale: float = 1.0) -> Views:
         """Cast the grid from ``poses`` (N, 4, 4) T_world_camera at ``scale`` times the size."""
-        stack = np.asarray(poses, dtype=np.float64)
-        if stack.ndim != 3 or stack.shape[1:] != (4, 4) or len(stack) == 0:
+        stack = check_views(poses, scale)
+        if len(stack) == 0:
             raise InputError(f"poses must have shape (N, 4, 4), got {stack.shape}")
-        if not 0 < scale <= 1:
-            raise InputError(f"scale = {scale} is outside (0, 1]")
         intrinsics = self.intrinsics.scaled(scale)
         weight = self._grid.config.least_weight
         views = [self._grid.cast(pose, weight, intrinsics) for pose in stack]

@@ -271,9 +271,8 @@ def smooth_depth(depth: Float32, hit: NDArray[np.bool_], voxel_m: float) -> Floa
 
 def camera_matrix(grid: VoxelGrid, intrinsics: Intrinsics, shift_px: float = 0.0) -> Any:
     """Camera matrix (3, 3) as a tensor, its centre shifted by some pixels."""
-    matrix = np.eye(3)
-    matrix[0, 0], matrix[1, 1] = intrinsics.fx, intrinsics.fy
-    matrix[0, 2], matrix[1, 2] = intrinsics.cx + shift_px, intrinsics.cy + shift_px
+    matrix = intrinsics.matrix
+    matrix[:2, 2] += shift_px
     return grid.tensor(matrix)
 
 
