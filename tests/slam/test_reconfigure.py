@@ -60,7 +60,7 @@ def assert_same(one: object, other: object) -> None:
 
 def assert_same_but_ferns(one: SurfelSlam, other: SurfelSlam, changed: str) -> None:
     """The same state; ferns keep the depths that they ask for, which follow the first cutoff."""
-    left_out = ("relocalisation",) if changed == "cutoff" else ()
+    left_out = ("relocalization",) if changed == "cutoff" else ()
     states = [slam.get_state() for slam in (one, other)]
     for state in states:
         for name in left_out:
