@@ -102,7 +102,10 @@ def from_dict(cls: type[T], values: Mapping[str, Any], path: str = "") -> T:
     if issubclass(cls, Family) and inspect.isabstract(cls):
         cls, values = _variant(cls, values, path)
     fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    fixed = {name: field.default for name, field in fields.items() if not field.init}
     fields = {name: field for name, field in fields.items() if field.init}
+    # asdict writes those too, the name of a variant for example.
+    values = {key: v for key, v in values.items() if key not in fixed or v != fixed[key]}
     hints = get_type_hints(cls)
     arguments: dict[str, Any] = {}
     for key, value in values.items():

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 
 import pytest
 
 from ms_slam_env import slam
 from ms_slam_env.cli import main
+from ms_slam_env.config import from_dict
 from ms_slam_env.errors import InputError
-from ms_slam_env.experiments.adaptation import Adaptation, comparison, judge
+from ms_slam_env.experiments.adaptation import Adaptation, AdaptationSpec, comparison, judge
+from ms_slam_env.report.records import spec_key, to_plain
 from ms_slam_env.report.tables import flattened
 from ms_slam_env.sequences import MotionSegments, open_sequence
 from ms_slam_env.slam.adaptation import make_config
@@ -66,6 +69,12 @@ def test_one_command_writes_table_figures_and_configurations(tmp_path, capsys):
     assert len(content["rows"][0]["result"]["level"]) == 12
     assert content["configurations"][0]["keep_every"] > 1
     assert "What adaptation cuts" in capsys.readouterr().out
+
+
+def test_a_recorded_specification_can_be_run_again():
+    spec = Adaptation(scenes=("table",), sequences=1).specs()[0]
+    recorded = json.loads(json.dumps(to_plain(asdict(spec))))
+    assert spec_key(from_dict(AdaptationSpec, recorded)) == spec_key(spec)
 
 
 @pytest.mark.parametrize(

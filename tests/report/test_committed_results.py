@@ -13,19 +13,7 @@ from ms_slam_env.report.results import Results, is_result, read_results
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "results"
 PATHS = sorted(FOLDER.rglob("*.json"))
 
-NOT_CONVERTED = {
-    "adaptation",
-    "env_speed",
-    "frame_management",
-    "frame_management_steady",
-    "multi_robot/foreign",
-    "multi_robot/three_robots",
-    "multi_robot/two_robots",
-    "pose_covariance",
-    "slam_speed",
-    "speed",
-    "train",
-}
+NOT_CONVERTED = {"train"}
 """Folders with files of an older form; a folder that is converted is taken out."""
 
 
