@@ -129,8 +129,7 @@ class Adaptation(Experiment, Checked):
         for name, backend in competitors(spec.adaptation, sequence.intrinsics).items():
             figures, levels, changes = judge(backend, frames, sequence.poses, violent)
             runs.append({"configuration": name, **figures})
-        change = [round(value, 6) for value in changes]
-        return {"runs": runs, "change": change, "level": levels}
+        return {"runs": runs, "change": [round(x, 6) for x in changes], "level": levels}
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
         """Every competitor's figures, then what adaptation cuts of them."""
@@ -216,18 +215,16 @@ def comparison(runs: Sequence[Row]) -> Table:
     own = by_name.pop(ADAPTIVE, [])
     lines = []
     for name, other in by_name.items():
-        pairs = {
-            key: ([run[key] for run in own], [run[key] for run in other])
+        (own_ms, other_ms), (own_ate, other_ate) = (
+            [[run[key] for run in runs] for runs in (own, other)]
             for key in ("cpu_ms_mean", "ate_interpolated_m")
-        }
-        (own_ate, other_ate) = pairs["ate_interpolated_m"]
-        line: dict[str, Any] = {
+        )
+        lines.append({
             "configuration": name,
-            "cpu_cut": relative_cut(*pairs["cpu_ms_mean"]),
+            "cpu_cut": relative_cut(own_ms, other_ms),
             "ate_cut": relative_cut(own_ate, other_ate),
             "better_share": float(np.mean(np.less(own_ate, other_ate))),
-        }
-        lines.append(line)
+        })  # fmt: skip
     note = "Of the ATE with dropped frames interpolated. A negative cut is a rise; better: lower."
     return make_table(columns, lines, "What adaptation cuts of each configuration", note)
 
@@ -239,26 +236,14 @@ def _time_line(row: Mapping[str, Any]) -> Chart:
     frames = list(range(len(violent)))
     change = np.maximum(result["change"], _SMALLEST_CHANGE).tolist()
     parts = {"quiet motion": ~violent, "violent motion": violent}
-    panels = [
-        Panel(
-            "frame",
-            key,
-            [
-                Series(name, frames, _where(part, values), mode="lines")
-                for name, part in parts.items()
-            ],
-            log,
-            guides,
-        )
-        for key, values, log, guides in (
-            ("change", change, "y", [Guide(t) for t in spec["adaptation"]["thresholds"]]),
-            ("level", result["level"], "", []),
-        )
-    ]
+
+    def panel(key: str, values: Sequence[float], log: str, guides: Sequence[Guide]) -> Panel:
+        shown = {name: [v if here else None for here, v in zip(part, values, strict=True)]
+                 for name, part in parts.items()}  # fmt: skip
+        series = [Series(name, frames, y, mode="lines") for name, y in shown.items()]
+        return Panel("frame", key, series, log, guides)
+
+    thresholds = [Guide(value) for value in spec["adaptation"]["thresholds"]]
+    panels = [panel("change", change, "y", thresholds), panel("level", result["level"], "", ())]
     about = f"{spec['scene']}, seed {spec['seed']}: 0 is the fast configuration; dashed: thresholds"
     return Chart("time_line", "One sequence", about, panels)
-
-
-def _where(part: NDArray[np.bool_], values: Sequence[float]) -> list[float | None]:
-    """The values where ``part``, None elsewhere."""
-    return [value if here else None for here, value in zip(part, values, strict=True)]
