@@ -67,9 +67,9 @@ def evaluate(
                 "return": returns[i],
                 "steps": steps[i],
                 "mapped_area_m2": infos[i]["mapped_area"],
-                "ate_m": infos[i]["ate"],
+                "ate_unaligned_m": infos[i]["ate"],
                 "tracked_share": tracked[i] / steps[i],
-                "lost_share": float(not infos[i]["TimeLimit.truncated"]),
+                "lost": float(not infos[i]["TimeLimit.truncated"]),
             }
             if played_one is not None:
                 played_one()

@@ -221,7 +221,7 @@ class Supervisor(BaseCallback):
             f"{self.num_timesteps} steps, {minutes:.1f} min: validation return "
             f"{result['return']:.2f}, {result['gain']:+.2f} ± {result['gain_sem']:.2f} over random "
             f"walk's {random_walk['return']:.2f}; "
-            f"mapped {result['mapped_area_m2']:.1f} m2, lost {result['lost_share']:.0%}"
+            f"mapped {result['mapped_area_m2']:.1f} m2, lost {result['lost']:.0%}"
         )
 
 

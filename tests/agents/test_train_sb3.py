@@ -140,7 +140,7 @@ def test_learning_curve_is_well_formed(run):
     for point in curve["points"]:
         gain = point["return"] - references["random walk"]["return"]
         assert point["gain"] == pytest.approx(gain)
-    assert all(point["steps"] == 10 and point["lost_share"] == 0 for point in curve["points"])
+    assert all(point["steps"] == 10 and point["lost"] == 0 for point in curve["points"])
 
 
 def test_paired_gain_against_scipy():
