@@ -42,14 +42,9 @@ class StudySpec:
     """One study.
 
     Attributes:
-        sampler: name.
-        seed: of the sampler.
-        trials: finished trials.
-        sequences: that configurations are measured on.
-        parameters: with ranges.
-        levels: points of the grid along each parameter.
-        image_size: of the camera.
-        frames: length of a rendered sequence.
+        sampler: name; with ``seed`` and ``trials`` of the study.
+        sequences: that configurations are measured on, ``frames`` long if rendered.
+        parameters: each at ``levels`` points of the grid.
         reference_factor: the hypervolume counts from so many times the default's figures.
         evaluations: file of what has been measured.
     """
@@ -249,8 +244,4 @@ def _by_sampler(rows: Sequence[Row]) -> dict[str, dict[int, Row]]:
 
 
 def _mean_interval(values: Sequence[float]) -> Interval:
-    return bootstrap_interval((values,), _mean)
-
-
-def _mean(x: Any, axis: int) -> Any:
-    return np.mean(x, axis=axis)
+    return bootstrap_interval((values,), lambda x, axis: np.mean(x, axis=axis))

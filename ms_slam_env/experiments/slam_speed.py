@@ -21,6 +21,7 @@ from ms_slam_env.config import Checked, bounded, check_range
 from ms_slam_env.errors import InputError
 from ms_slam_env.experiments.harness import slam_speed_child
 from ms_slam_env.experiments.harness.experiment import Experiment
+from ms_slam_env.parallel import thread_environment
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Column, Table, finished, make_table
@@ -33,12 +34,7 @@ _START = "import runpy, sys; sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0]
 
 @dataclass(frozen=True)
 class SpeedSpec:
-    """One process; see :class:`SlamSpeed` for the fields.
-
-    Attributes:
-        version: this checkout's package or the other's.
-        repeat: number of the round.
-    """
+    """One process of round ``repeat``, with this checkout's package or another's (``version``)."""
 
     version: str
     size: str
@@ -240,17 +236,13 @@ def run_child(arguments: dict[str, Any], checkout: Path | None) -> list[dict[str
     Raises:
         RuntimeError: the process failed.
     """
-    environment = dict(os.environ)
-    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        environment[variable] = "1"
     root = (checkout or Path(__file__).parents[2]).resolve()
-    environment["PYTHONPATH"] = str(root)
-    # Not as a script: its folder, first on the path then, would hide modules of Python.
+    environment = os.environ | thread_environment(1) | {"PYTHONPATH": str(root)}
+    # Not as a script: its folder, first on the path, would hide modules of Python. In the checkout:
+    # the current folder comes before PYTHONPATH.
     words = [sys.executable, "-c", _START, str(slam_speed_child.__file__), json.dumps(arguments)]
-    # In the checkout: the current folder comes before PYTHONPATH.
     done = subprocess.run(words, env=environment, cwd=root, capture_output=True, text=True)
     if done.returncode != 0:
         lines = done.stderr.strip().splitlines() or ["no message"]
         raise RuntimeError(f"the measurement in {root} failed: {lines[-1]}")
-    found: list[dict[str, Any]] = json.loads(done.stdout.strip().splitlines()[-1])
-    return found
+    return list(json.loads(done.stdout.strip().splitlines()[-1]))
