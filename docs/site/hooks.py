@@ -51,10 +51,14 @@ def on_config(config: Any) -> Any:
     for group in (config.nav, *(next(iter(entry.values())) for entry in config.nav)):
         for entry in group if isinstance(group, list) else ():
             for title in made.keys() & entry.keys():
-                pages = sorted(name for name, _ in made[title])
-                pages.sort(key=lambda name: name.count("/index.md") == 0 or name.count("/") > 1)
-                entry[title] = pages
+                entry[title] = [_nav_entry(name) for name, _ in made[title]]
     return config
+
+
+def _nav_entry(name: str) -> str | dict[str, str]:
+    """A page by its name; results by their folder, since several have one title."""
+    folder, *rest = name.removesuffix("/index.md").split("/")
+    return {"/".join(rest): name} if folder == "results" and rest else name
 
 
 def on_files(files: Files, config: Any) -> Files:
@@ -114,20 +118,22 @@ def _results() -> Iterator[tuple[str, str]]:
     """A page for each folder of committed results, and one that lists them."""
     from ms_slam_env.metrics.registry import RESULTS_VERSION
 
-    rows = []
+    rows, pages = [], []
     for table in sorted(RESULTS.rglob("table.md")):
         name = table.parent.relative_to(RESULTS).as_posix()
         content = _content(table.parent)
         title, about = content.get("title", name), content.get("about", "")
         figures = "".join(f"![{p.stem}]({p.name})\n\n" for p in sorted(table.parent.glob("*.png")))
         text = table.read_text(encoding="utf-8")
-        yield f"results/{name}/index.md", f"# {title}\n\n{about}\n\n{text}\n\n{figures}"
+        page = f"# {title}\n\n{about}\n\n{text}\n\n{figures}"
+        pages.append((f"results/{name}/index.md", page))
         version = content.get("results_version", 1)
         age = "today" if version == RESULTS_VERSION else f"version {version} of {RESULTS_VERSION}"
         rows.append((f"[{name}]({name}/index.md)", title, age))
     listing = _table(["results", "what they show", "made by the algorithms of"], rows)
     about = "What the experiments wrote, as it is committed in `docs/results`."
     yield "results/index.md", f"# Results\n\n{about}\n\n{listing}"
+    yield from pages
 
 
 def _content(folder: Path) -> dict[str, Any]:
@@ -197,7 +203,6 @@ def _gallery() -> Iterator[tuple[str, str]]:
     rows = []
     for env_id in ENV_IDS:
         picture = f"![{env_id}](../pictures/environments/{env_id}.png)"
-        yield f"gallery/{env_id}.md", _environment(env_id)
         rows.append((picture, f"[`{env_id}`]({env_id}.md)", _space(env_id)))
     free = [name for name in PERTURBED_ENV_IDS if "-FreeCamera-" in name]
     pairs = [(name.replace("FreeCamera-", ""), name) for name in free]
@@ -210,6 +215,8 @@ def _gallery() -> Iterator[tuple[str, str]]:
         + "\nWith an imperfect camera; `perturbation={...}` sets its strength:\n\n"
         + _table(["arm", "free camera"], perturbed),
     )
+    for env_id in ENV_IDS:
+        yield f"gallery/{env_id}.md", _environment(env_id)
 
 
 def _space(env_id: str) -> str:
