@@ -22,16 +22,16 @@ ROOMS = {
     "robot": ("free camera, arm", 0),
     "sensor": ("rays, shading, noise", 1),
     "slam": ("tracking, mapping", 2),
-    "mapping": ("occupancy, gain", 0),
+    "mapping": ("occupancy, gain", 3),
     "report": ("tables, charts, pages", 4),
     "sequences": ("recorded, rendered", 1),
-    "exploration": ("design-space search", 5),
+    "exploration": ("design-space search", 3),
     "evaluation": ("run and judge", 2),
     "env": ("the environment", 1),
     "experiments": ("harness, one file each", 2),
-    "baselines": ("planners", 1),
-    "cli": ("ms-slam COMMAND", 4),
-    "agents": ("training", 1),
+    "baselines": ("planners", 0),
+    "cli": ("ms-slam COMMAND", 2),
+    "agents": ("training", 0),
 }
 """Room to what is in it and its column in the drawing; its row follows from what it uses."""
 WIDTH, HEIGHT, GAP_X, GAP_Y, MARGIN = 150, 44, 18, 34, 8
