@@ -47,7 +47,7 @@ benchmark: $(STAMP)
 # The tables of the Markdown pages from docs/results, then the site into site/.
 docs: $(STAMP)
 	$(BIN)/ms-slam docs
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	@echo "site/index.html"
 
 clean:
