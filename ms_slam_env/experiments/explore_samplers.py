@@ -244,4 +244,4 @@ def _by_sampler(rows: Sequence[Row]) -> dict[str, dict[int, Row]]:
 
 
 def _mean_interval(values: Sequence[float]) -> Interval:
-    return bootstrap_interval((values,), lambda x, axis: np.mean(x, axis=axis))
+    return bootstrap_interval((values,), lambda x, axis: np.asarray(np.mean(x, axis=axis)))
