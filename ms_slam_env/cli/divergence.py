@@ -20,7 +20,7 @@ class Arguments:
     """
 
     sequences: tyro.conf.Positional[tuple[str, ...]]
-    """Folders of recordings, or scene:seed[:noise[+perturbation ...]]."""
+    """Folders of recordings, or scene:seed[:word[+word ...]]."""
     image_size: str = "native"
     """Reduce the images to this size, such as 160x120."""
     layout: str = "auto"

@@ -24,7 +24,7 @@ class Arguments:
         "table:1002",
         "carpet:1003",
     )
-    """Sequences to explore on: folders, or scene:seed[:noise[+perturbation ...]]."""
+    """Sequences to explore on: folders, or scene:seed[:word[+word ...]]."""
     held_out: tuple[str, ...] = ()
     """Sequences to judge the front and the chosen configurations on."""
     objectives: tuple[str, ...] = ("ate_m", "ext_ms")

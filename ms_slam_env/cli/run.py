@@ -29,7 +29,7 @@ class Arguments:
     """
 
     sequence: tyro.conf.Positional[str]
-    """Folder of a recording, or scene:seed[:noise[+perturbation ...]] such as
+    """Folder of a recording, or scene:seed[:word[+word ...]] such as
     living_room:2000:kinect+misregistration."""
     config: Path | None = None
     """Configuration file (YAML): backend, parameters, image size, which frames and threads."""

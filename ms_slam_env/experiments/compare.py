@@ -61,7 +61,7 @@ class CompareSpec:
     """A backend on a sequence.
 
     Attributes:
-        sequence: a folder, or ``scene:seed[:noise[+perturbation ...]]``.
+        sequence: a folder, or ``scene:seed[:word[+word ...]]``.
         backend: ``NAME`` or ``NAME,parameter=value,...``.
         image_size: such as 160x120.
         frames: of a rendered sequence.
@@ -90,7 +90,7 @@ class Compare(Experiment, Checked):
     """
 
     sequences: tuple[str, ...] = DEFAULT_SEQUENCES
-    """Folders, or scene:seed[:noise[+perturbation ...]]."""
+    """Folders, or scene:seed[:word[+word ...]]."""
     backends: tuple[str, ...] = (*slam.BACKENDS, *PEERS)
     """NAME, parameters appended as in surfel,loop_closure=deformation; odometry,stock=true is
     OpenCV's odometry as it is, volumetric,stock=true Open3D's dense SLAM."""

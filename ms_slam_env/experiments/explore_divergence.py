@@ -25,7 +25,7 @@ class RateSpec:
     """One configuration on every n-th frame of a sequence.
 
     Attributes:
-        sequence: a folder, or scene:seed[:noise[+perturbation ...]].
+        sequence: a folder, or scene:seed[:word[+word ...]].
         keep_every: every so many frames are processed.
         image_size: of the camera.
         frames: length of a whole rendered sequence.
@@ -52,7 +52,7 @@ class ExploreDivergence(Experiment):
     """
 
     sequences: tuple[str, ...] = ("living_room:1000", "corridor:1001", "table:1002", "carpet:1003")
-    """Folders, or scene:seed[:noise[+perturbation ...]]."""
+    """Folders, or scene:seed[:word[+word ...]]."""
     keep_every: tuple[int, ...] = (1, 2, 3, 4, 6, 8, 10)
     """Every so many frames are processed."""
     config: Path | None = None

@@ -94,7 +94,7 @@ class ExploreSamplers(Checked, Experiment):
     trials: int = bounded(40, 1, 100_000)
     """Finished trials of each study."""
     sequences: tuple[str, ...] = ("living_room:1000",)
-    """Folders, or scene:seed[:noise[+perturbation ...]]."""
+    """Folders, or scene:seed[:word[+word ...]]."""
     parameters: tuple[str, ...] = PARAMETERS
     """As of ms-slam explore, with ranges."""
     levels: int = bounded(4, 2, 1000)

@@ -39,7 +39,7 @@ class SlamEvaluator(Checked):
     """Runs configurations over sequences, which stay in memory; it can be sent to other processes.
 
     Attributes:
-        sequences: folders, or ``scene:seed[:noise[+perturbation ...]]``.
+        sequences: folders, or ``scene:seed[:word[+word ...]]``.
         frames: of a rendered sequence.
         speed_m_s: mean speed of the camera of a rendered sequence, where it does not turn.
         turn_deg_s: mean speed of rotation, where it turns.

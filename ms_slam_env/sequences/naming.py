@@ -54,7 +54,7 @@ RENDERED_SIZE = "160x120"
 """Image size of a rendered sequence where none is asked for."""
 
 _GRAMMAR = (
-    "is neither a folder nor scene:seed[:noise[+perturbation ...]], such as table:2000, "
+    "is neither a folder nor scene:seed[:word[+word ...]], such as table:2000, "
     "table:2000:none or table:2000:kinect+rolling-shutter"
 )
 
