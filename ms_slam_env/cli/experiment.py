@@ -48,8 +48,8 @@ def check(cls: type[Experiment], folder: Path) -> int:
     committed = read_results(folder / RESULTS)
     if committed.stale:
         print(committed.stale)
-    differences = check_results(cls, committed)
-    print("\n".join(differences) or f"{folder}: {cls.check_rows} rows run again, nothing differs")
+    count, differences = check_results(cls, committed)
+    print("\n".join(differences) or f"{folder}: {count} rows run again, nothing differs")
     return 1 if differences else 0
 
 

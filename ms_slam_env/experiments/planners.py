@@ -71,7 +71,8 @@ class PlannerBenchmark(SteppedExperiment):
 
     def charts(self, rows: Sequence[Row]) -> list[Chart]:
         """Every measure by planner, F-score against ATE, ATE over time."""
-        best = [str(row["planner"]) for row in self.tables(rows)[0].rows]
+        ranking = Grouping(("planner",), (RANKED_BY,), rank_by=RANKED_BY).table(rows)
+        best = [str(line["planner"]) for line in ranking.rows]
         label = short_planner_names(best).__getitem__
         bands = [
             quartile_band(

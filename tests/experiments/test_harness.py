@@ -6,7 +6,7 @@ import inspect
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -110,12 +110,20 @@ def test_a_check_finds_what_changed(
 ) -> None:
     run_experiment(Wobbles(), tmp_path, workers=1)
     committed = read_results(tmp_path / "results.json")
-    assert check_results(Wobbles, committed) == []
+    # The class stands in this test's module, which is no experiment's name.
+    assert committed.kind == Wobbles.__module__.rpartition(".")[2]
+    assert check_results(Wobbles, committed) == (Wobbles.check_rows, [])
+    for wrong, message in (
+        (replace(committed, rows=[]), "hold no rows"),
+        (replace(committed, kind="planners"), "are of 'planners'"),
+    ):
+        with pytest.raises(InputError, match=message):
+            check_results(Wobbles, wrong)
     changed = lambda spec: {"ate_m": 0.5, "cpu_ms_median": 9.0, "lost": False}  # noqa: E731
     changed.__annotations__ = {"spec": Wobble}
     monkeypatch.setattr(Wobbles, "run", staticmethod(changed))
-    found = check_results(Wobbles, committed)
-    assert len(found) == Wobbles.check_rows
+    count, found = check_results(Wobbles, committed)
+    assert len(found) == count == Wobbles.check_rows
     assert "ate_m was 0.01, is 0.5" in found[0]
     assert "cpu_ms" not in "".join(found)
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ms_slam_env.config import from_dict
+from ms_slam_env.errors import InputError
 from ms_slam_env.experiments.harness.experiment import Experiment
 from ms_slam_env.metrics.registry import metric
 from ms_slam_env.report.records import from_plain, to_plain
@@ -17,31 +18,38 @@ from ms_slam_env.report.tables import finished
 
 TOLERANCE = 0.02
 """Relative difference that other processors cause: rounding of the last bits, amplified."""
-_SMALLEST = 1e-4
+_SMALLEST = 1e-6
 
 
-def check_results(cls: type[Experiment], committed: Results) -> list[str]:
-    """Run some committed rows again; one line for each value that differs.
+def check_results(cls: type[Experiment], committed: Results) -> tuple[int, list[str]]:
+    """Run some committed rows again; how many, and one line for each value that differs.
 
     The cheapest row is taken for each value of the first field of the specifications (planners,
     say). Only metrics that the registry calls repeatable are compared.
 
     Raises:
-        InputError: rows that the experiment has no specification for.
+        InputError: no finished rows, results of another experiment, or rows that the experiment
+            has no specification for.
     """
+    name = cls.__module__.rpartition(".")[2]
+    if committed.kind != name:
+        raise InputError(f"the committed results are of {committed.kind!r}, not of {name!r}")
     rows = sorted(finished(committed.rows), key=lambda row: row.get("elapsed_s", 0.0))
+    if not rows:
+        raise InputError(f"the committed results of {name!r} hold no rows that could be run again")
     different: dict[str, Any] = {}
     for row in rows:
         different.setdefault(str(next(iter(row["spec"].values()))), row)
     chosen = list(different.values())
     chosen += [row for row in rows if row not in chosen]
+    chosen = chosen[: cls.check_rows]
     differences = []
-    for row in chosen[: cls.check_rows]:
+    for row in chosen:
         spec = from_dict(spec_type(cls), row["spec"])
         again = from_plain(to_plain(cls.run(spec)))
-        name = ", ".join(f"{key} {value}" for key, value in row["spec"].items())
-        differences += [f"{name}: {text}" for text in compare(row["result"], again)]
-    return differences
+        what = ", ".join(f"{key} {value}" for key, value in row["spec"].items())
+        differences += [f"{what}: {text}" for text in compare(row["result"], again)]
+    return len(chosen), differences
 
 
 def spec_type(cls: type[Experiment]) -> type[Any]:
