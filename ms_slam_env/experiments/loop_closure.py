@@ -24,6 +24,7 @@ from ms_slam_env.experiments.pictures.loop_maps import MapView, map_view, save_p
 from ms_slam_env.geometry import invert
 from ms_slam_env.geometry.point_clouds import voxel_downsample
 from ms_slam_env.metrics import ate_rmse, path_length
+from ms_slam_env.metrics.registry import metric
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished, make_table, summary
@@ -67,10 +68,8 @@ class LoopSpec:
         scene: name of the scene, or a mesh file.
         seed: of the scene, the path and the noise.
         path: one of ``PATHS``.
-        step_m: largest translation between frames.
-        step_deg: largest rotation between frames.
+        step_m, step_deg: largest motion between frames.
         noise: one of ``NOISES``.
-        size: of the images.
         closure: variant of loop closure.
         options: parameters of the SLAM.
         picture: where a picture of the first closure goes; empty for none.
@@ -202,7 +201,8 @@ class LoopClosure(Experiment):
         ]  # fmt: skip
         wins = {key: sum(p["deformation"][key] < p["none"][key] for p in pairs) for key in METRICS}
         note = "Medians over the recordings that both variants finished. Lower with loop closure: "
-        note += ", ".join(f"{key} {count} of {len(pairs)}" for key, count in wins.items()) + "."
+        lower = [f"{metric(key).heading} {n} of {len(pairs)}" for key, n in wins.items()]
+        note += ", ".join(lower) + "."
         first = make_table(["loop_closure", "recordings", *METRICS], medians, "Medians", note)
         return [first, make_table(columns, lines, "Every recording")]
 

@@ -136,11 +136,6 @@ def caption(figure: Figure, text: str) -> None:
     figure.suptitle(text, x=0.01, horizontalalignment="left", fontsize="small")
 
 
-def legend_beside(figure: Figure, ax: Axes) -> None:
-    """Put the legend of ``ax`` to the right of every panel, where it hides no data."""
-    figure.legend(*ax.get_legend_handles_labels(), loc="outside right upper", fontsize="small")
-
-
 def plain_log_ticks(axis: Axis) -> None:
     """Label a logarithmic axis, once its data are drawn, with few plain numbers that do not touch.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import time
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -99,15 +98,6 @@ class Team:
     def true_pose(self, a: int, b: int) -> Float64:
         """True T_a_b (4, 4) of two robots' frames."""
         return invert(self.truths[a][0]) @ self.truths[b][0]
-
-
-def run_team(spec: MultiRobotSpec) -> dict[str, Any]:
-    """Map, merge and judge; the figures by name, see ``judge_team``."""
-    team = make_team(spec)
-    begin = time.process_time()
-    merges = merge_pairs(team.robots, spec.merge)
-    merge_s = time.process_time() - begin
-    return {**judge_team(team, merges, spec), "merge_cpu_s": merge_s}
 
 
 def make_team(spec: MultiRobotSpec) -> Team:
