@@ -144,3 +144,39 @@ def test_kernels_decide_as_the_host_does():
     expected = [evaluate_alignment(AlignmentStatistics(*row.tolist()), demanded) for row in values]
     assert len(set(expected)) == len(TrackingStatus) - 1  # all but of a blank frame
     np.testing.assert_array_equal(status.numpy(), expected)
+
+
+@pytest.mark.parametrize(("offset_m", "is_inlier"), [(0.055, True), (0.065, False)])
+def test_a_reading_is_an_inlier_within_the_noise_of_its_depth(offset_m, is_inlier):
+    depth = np.full(CAMERA.shape, 2.0, dtype=np.float32)  # there the rule says 2 cm + 4 cm
+    wall = DepthImage(depth, np.zeros_like(depth))
+    frame = DepthImage(depth + np.float32(offset_m), wall.intensity)
+    assert measure_alignment(frame, wall, REST, CAMERA).inlier_ratio == is_inlier
+
+
+@pytest.mark.parametrize(("levels", "is_inlier"), [(19, True), (21, False)])
+def test_grey_values_are_alike_within_twenty_levels_of_their_median(levels, is_inlier):
+    reference = _view(REST)
+    frame = DepthImage(reference.depth, reference.intensity + 50)
+    frame.intensity[:20] += levels
+    expected = 1.0 if is_inlier else pytest.approx(2 / 3, abs=0.02)
+    assert measure_alignment(frame, reference, REST, CAMERA).photometric_inlier_ratio == expected
+
+
+@pytest.mark.parametrize(
+    ("nearer", "brighter", "status"),
+    [
+        (0.18, 0.0, TrackingStatus.OK),
+        (0.0, 0.07, TrackingStatus.OK),
+        (0.18, 0.07, TrackingStatus.OK),
+        (0.4, 0.0, TrackingStatus.GEOMETRIC_MISMATCH),
+        (0.0, 0.25, TrackingStatus.PHOTOMETRIC_MISMATCH),
+    ],
+)
+def test_a_right_pose_is_accepted_while_something_stands_in_the_view(nearer, brighter, status):
+    """Shares of the rows that a thing 30 cm before the wall covers, and another brightness."""
+    reference, frame = _view(REST), _view(MOVED)
+    frame.depth[: round(nearer * CAMERA.height)] -= 0.3
+    frame.intensity[CAMERA.height - round(brighter * CAMERA.height) :] += 60
+    found = measure_alignment(frame, reference, MOVED, CAMERA)
+    assert evaluate_alignment(found, VIEW_THRESHOLDS) == status

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from box_scene import BoxScene
@@ -238,6 +239,48 @@ def test_consistency_asks_neither_for_exposure_nor_for_texture():
     assert not is_photometrically_consistent(
         _consistency((color, box), (plain, box))
     )  # the wrong texture
+
+
+def _partly_off(offset_m: float, share: float):
+    """The wall's frame and its view, whose lower rows are deeper by ``offset_m``."""
+    color, depth = _view(np.eye(4))
+    off = depth.copy()
+    off[round((1 - share) * len(depth)) :] += np.float32(offset_m)
+    return _consistency((color, off), (color, depth))
+
+
+@pytest.mark.parametrize("share", [0.11, 0.19])
+def test_a_seventh_of_the_depths_may_be_off(share):
+    assert is_photometrically_consistent(_partly_off(0.5, share)) == (share < 0.15)
+
+
+def test_a_slide_of_a_texture_cell_is_refused_by_its_correlation():
+    """6 cm along a wall whose cells have 8: correlation 0.38."""
+    tangent = np.cross([0.3, -0.2, -1.0], [0.0, 1.0, 0.0])
+    beside = make_pose(np.eye(3), 0.06 * tangent / np.linalg.norm(tangent))
+    found = _consistency(_view(np.eye(4)), _view(beside))
+    assert found.correlation > 0.3
+    assert not is_photometrically_consistent(found)
+
+
+def test_a_depth_counts_as_the_same_within_its_noise():
+    depths = _view(np.eye(4))[1]
+    tolerance_m = 0.02 + 0.02 * depths**2
+    assert _partly_off(0.9 * tolerance_m.min(), 1.0).inlier_ratio == 1
+    assert _partly_off(1.4 * tolerance_m.max(), 1.0).inlier_ratio == 0
+
+
+def test_a_blurred_noisy_frame_is_consistent_still(box_scene):
+    """Correlation about 0.6, where a sharp frame without noise has 1."""
+    sensor = RGBDSensor(box_scene, xtion("160x120"), noise="none")
+    seen = sensor.capture(look_at([-0.8, -0.8, 1.2], [1.2, 0.1, 0.5]), 0)
+    rng = np.random.default_rng(0)
+    noisy = cv2.blur(seen.color, (1, 11)) + rng.normal(0, 6, seen.color.shape)
+    found = _consistency(
+        (np.clip(noisy, 0, 255).astype(np.uint8), seen.depth), (seen.color, seen.depth)
+    )
+    assert 0.5 < found.correlation < 0.75
+    assert is_photometrically_consistent(found)
 
 
 def test_what_does_not_overlap_is_not_consistent():

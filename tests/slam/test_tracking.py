@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from box_scene import BoxScene
@@ -21,7 +24,7 @@ from ms_slam_env.slam.surfel.pose_hypotheses import NUM_HYPOTHESES, tracking_hyp
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame, Preprocessor
 from ms_slam_env.slam.surfel.rendering import ModelView
 from ms_slam_env.slam.surfel.solver import reduce_sums
-from ms_slam_env.slam.surfel.tracker import Tracker
+from ms_slam_env.slam.surfel.tracker import Tracker, weights_of
 
 SMALL = Intrinsics(fx=24.0, fy=24.0, cx=15.5, cy=11.5, width=32, height=24)
 T_WORLD_MODEL = look_at([-0.8, -0.8, 1.2], [1.2, 0.1, 0.5])
@@ -38,7 +41,8 @@ def _weights(icp: float = 1.0, rgb: float = 1.0) -> ne.Weights:
     weights.per_cauchy_icp, weights.per_cauchy_rgb = 0.5, 1.0
     weights.grey_variance, weights.pixel_variance = 0.25, 0.09
     weights.distance_m, weights.cos_angle = 0.1, 0.7
-    weights.inlier_sigmas, weights.texture, weights.photometric_inlier = 4.0, 4.0, 20.0
+    weights.inlier_sigmas, weights.conflict_sigmas = 4.0, 8.0
+    weights.texture, weights.photometric_inlier = 4.0, 20.0
     weights.least_scale = 1.0
     return weights
 
@@ -167,6 +171,56 @@ def test_normal_equations_equal_the_loop_over_points(columns):
         np.testing.assert_allclose(actual, expected, atol=2e-3 * np.abs(expected).max())
 
 
+def _expected_counts(data, T, config: SurfelConfig):
+    """Places of ``Sum`` whose values are numbers of points, by the rules of ``config``."""
+    counts, inverse, rules = Counter(), invert(T), config.acceptance
+    for v, u in np.argwhere(data["model_vertices"][..., 2] > 0):
+        counts[ne.Sum.POINTS] += 1
+        q = inverse[:3, :3] @ data["model_vertices"][v, u] + inverse[:3, 3]
+        x, y = SMALL.project(q)
+        if not (0 <= x < SMALL.width - 1 and 0 <= y < SMALL.height - 1):
+            continue
+        counts[ne.Sum.VISIBLE] += 1
+        near = int(y + 0.5), int(x + 0.5)
+        live = data["live_vertices"][near]
+        gap = abs(live[2] - q[2])
+        is_other = live[2] > 0 and gap > config.icp_distance_m
+        if live[2] > 0:
+            sigma = config.depth_noise_m * q[2] ** 2
+            n = inverse[:3, :3] @ data["model_normals"][v, u]
+            angle_deg = np.degrees(np.arccos(n @ data["live_normals"][near]))
+            is_near = not is_other and angle_deg < config.icp_angle_deg
+            counts[ne.Sum.MATCHED] += 1
+            counts[ne.Sum.INLIERS] += is_near and abs(n @ (live - q)) < rules.inlier_sigmas * sigma
+            counts[ne.Sum.DEPTH_CONFLICTS] += gap > rules.conflict_sigmas * sigma
+        grey, *slope = _bilinear(data["live_gradient"], x, y)
+        if not is_other and np.abs(slope).sum() > rules.texture:
+            residual = abs(grey - np.clip(data["model_intensity"][v, u], 0, 255))
+            counts[ne.Sum.TEXTURED] += 1
+            counts[ne.Sum.PHOTOMETRIC_INLIERS] += residual < rules.photometric_inlier
+    return counts
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [{}, {"inlier_sigmas": 2.0}, {"conflict_sigmas": 4.0}, {"texture": 12.0},
+     {"photometric_inlier": 10.0}],
+)  # fmt: skip
+def test_the_points_that_fit_are_those_that_the_options_name(changed):
+    """Half of the points are inliers here: with 99 % of them no test sees a rule that is off."""
+    acceptance = replace(SurfelConfig().acceptance, **changed)
+    config = SurfelConfig(acceptance=acceptance)
+    data, T = _synthetic(), se3_exp([0.02, -0.02, 0.03, 0.01, 0.02, -0.015])
+    errors = np.random.default_rng(1).normal(0, 0.03, (*SMALL.shape, 1))
+    data["live_vertices"] = data["live_vertices"] * (1 + errors)
+    sums = _device_sums(data, T, weights_of(config, 0), light=same_exposure(1))
+    expected = _expected_counts(data, T, config)
+    assert {place: sums[place] for place in expected} == expected
+    if not changed:
+        assert 0.3 < expected[ne.Sum.INLIERS] / expected[ne.Sum.MATCHED] < 0.8
+        assert 0.3 < expected[ne.Sum.PHOTOMETRIC_INLIERS] / expected[ne.Sum.TEXTURED] < 0.9
+
+
 @pytest.mark.parametrize("term", ["icp", "rgb"])
 def test_jacobians_agree_with_finite_differences(term):
     """A residual's change under T <- T exp(xi) is J xi, while its pixel stays the same."""
@@ -226,7 +280,9 @@ class _Pair:
     def align(self, model: LiveFrame, live: LiveFrame):
         view = ModelView(model.vertices, model.normals, model.intensity, model.color)
         self.tracker.set_frame(live)
-        thresholds = acceptance_thresholds(np.zeros(1, dtype=bool), np.zeros(1, dtype=np.int32))
+        thresholds = acceptance_thresholds(
+            SurfelConfig().acceptance, np.zeros(1, dtype=bool), np.zeros(1, dtype=np.int32)
+        )
         hypotheses = tracking_hypotheses(np.eye(4))[None]
         return self.tracker.align(view, T_WORLD_MODEL[None], hypotheses, thresholds)
 

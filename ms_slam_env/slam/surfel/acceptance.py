@@ -18,6 +18,7 @@ from ms_slam_env.slam.alignment_check import (
     evaluate_on_device,
 )
 from ms_slam_env.slam.base import Float64
+from ms_slam_env.slam.surfel.config import AcceptanceConfig
 from ms_slam_env.slam.surfel.degeneracy import (
     eigen,
     is_constrained,
@@ -156,11 +157,12 @@ def assess_alignment(
     statistics[b] = found
 
 
-_ORDINARY = AcceptanceThresholds(matches=100.0, sigma_m=0.04).repeated(1)
-
-
-def acceptance_thresholds(strict: NDArray[np.bool_], lost: NDArray[np.int32]) -> NDArray[Any]:
+def acceptance_thresholds(
+    config: AcceptanceConfig, strict: NDArray[np.bool_], lost: NDArray[np.int32]
+) -> NDArray[Any]:
     """Thresholds (B,) of ordinary tracking, or ``strict`` ones where a wide search found the pose.
+
+    Strict ones are never laxer than those of ``config``, which ordinary tracking has.
 
     The motion may be larger the longer, in frames, tracking has been ``lost``.
 
@@ -171,21 +173,33 @@ def acceptance_thresholds(strict: NDArray[np.bool_], lost: NDArray[np.int32]) ->
     frames of five scenes, hand-held with 4 cm and 2 degrees a frame, whose colour was not
     registered with depth, half of them with exposure jumps, rolling shutter and holes besides.
     """
-    thresholds = np.repeat(_ORDINARY, len(strict))
-    thresholds["overlap"] = np.where(strict, 0.4, 0.3)
-    thresholds["inlier_ratio"] = np.where(strict, 0.7, 0.65)
-    thresholds["photometric_inlier_ratio"] = np.where(strict, 0.75, 0.7)
-    thresholds["depth_conflict_ratio"] = np.where(strict, 0.12, 0.15)
-    thresholds["cost"] = np.where(strict, 1.3, 1.4)
+    least = {"overlap": config.overlap, "inlier_ratio": config.inliers}
+    least["photometric_inlier_ratio"] = config.alike
+    most = {"depth_conflict_ratio": config.conflicts, "cost": config.cost}
+    ordinary = AcceptanceThresholds(config.points, sigma_m=config.sigma, **least, **most)
+    thresholds = ordinary.repeated(len(strict))
+    for name, value in least.items():
+        thresholds[name] = np.where(strict, max(_STRICT[name], value), value)
+    for name, value in most.items():
+        thresholds[name] = np.where(strict, min(_STRICT[name], value), value)
     thresholds["degenerate_directions"] = np.where(strict, 0, 5)
     thresholds["motion_m"] = np.minimum(1.0, 0.3 + 0.1 * lost)
     thresholds["rotation_cos"] = np.cos(np.radians(np.minimum(60.0, 30.0 + 10.0 * lost)))
     return thresholds
 
 
-def geometric_thresholds(lost: NDArray[np.int32]) -> NDArray[Any]:
+_STRICT = {
+    "overlap": 0.4,
+    "inlier_ratio": 0.7,
+    "photometric_inlier_ratio": 0.75,
+    "depth_conflict_ratio": 0.12,
+    "cost": 1.3,
+}
+
+
+def geometric_thresholds(config: AcceptanceConfig, lost: NDArray[np.int32]) -> NDArray[Any]:
     """Thresholds (B,) of an alignment by geometry alone near the expected pose."""
-    thresholds = acceptance_thresholds(np.ones(len(lost), dtype=bool), lost)
+    thresholds = acceptance_thresholds(config, np.ones(len(lost), dtype=bool), lost)
     thresholds["photometric_inlier_ratio"], thresholds["cost"] = 0.0, np.inf
     thresholds["degenerate_directions"] = 3
     thresholds["motion_m"], thresholds["rotation_cos"] = 0.15, np.cos(np.radians(10.0))

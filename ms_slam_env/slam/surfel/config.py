@@ -58,6 +58,43 @@ class LoopConfig(Checked):
     error_share: float = bounded(0.3, 0.0, 1.0)
 
 
+@dataclass(frozen=True)
+class AcceptanceConfig(Checked):
+    """When a pixel counts for an alignment with the map, and when a frame's alignment is accepted.
+
+    Attributes:
+        inlier_sigmas: a matched point is an inlier if its residual is less than so many standard
+            deviations of the depth noise. Chosen together with ``inliers``, as
+            ``acceptance_thresholds`` says: at a right pose, Gaussian depth noise as large as
+            ``depth_noise_m`` leaves all points inliers, 2.5 times as large 89 %, 4 times 68 %.
+        conflict_sigmas: its depth conflicts if it is further away than this along the ray.
+        texture: least intensity gradient of a textured point, grey levels per pixel (of the sum of
+            both components).
+        photometric_inlier: largest photometric residual of an inlier, grey levels, at the usual
+            scale of residuals.
+        points: fewest matched points.
+        overlap: least share of the map's points in view that the live image covers.
+        inliers: least share of the matched points that are inliers.
+        alike: least share of the textured points that are photometric inliers.
+        conflicts: largest share of the matched points whose depth conflicts.
+        cost: largest mean truncated cost of the visible points, in [0, 3].
+        sigma: largest standard deviation (metres, radians) of the worst direction that the view
+            constrains.
+    """
+
+    inlier_sigmas: float = bounded(4.0, 0.1, 100.0)
+    conflict_sigmas: float = bounded(8.0, 0.1, 1000.0)
+    texture: float = bounded(4.0, 0.0, 255.0)
+    photometric_inlier: float = bounded(20.0, 0.1, 255.0)
+    points: int = bounded(100, 6, 1_000_000)
+    overlap: float = bounded(0.3, 0.0, 1.0)
+    inliers: float = bounded(0.65, 0.0, 1.0)
+    alike: float = bounded(0.7, 0.0, 1.0)
+    conflicts: float = bounded(0.15, 0.0, 1.0)
+    cost: float = bounded(1.4, 0.0, 3.0)
+    sigma: float = bounded(0.04, 1e-6, 10.0)
+
+
 RELOCALISATIONS = ("ferns", "local")
 LOOP_CLOSURES = ("none", "deformation")
 
@@ -102,6 +139,7 @@ class SurfelConfig(Checked):
         refuse_bad_fits: whether a frame that fits the map badly counts as lost and stays out of the
             map. If not, every frame is fused at the pose that alignment found, as in ElasticFusion
             without relocalisation, and a map may show things twice.
+        acceptance: which pixels and frames fit the map.
         loop_closure: "none": frames are aligned with all of the map, however old; "deformation":
             with its recent part; where that meets the old part again the map is deformed to fit.
         loops: parameters of the latter.
@@ -134,6 +172,7 @@ class SurfelConfig(Checked):
     lateral_noise_px: float = bounded(0.3, 0.0, 100.0)
     points_per_level: int = bounded(5000, 100, 10_000_000)
     refuse_bad_fits: bool = True
+    acceptance: AcceptanceConfig = field(default_factory=AcceptanceConfig)
     relocalisation: str = chosen("ferns", *RELOCALISATIONS)
     loop_closure: str = chosen("none", *LOOP_CLOSURES)
     loops: LoopConfig = field(default_factory=LoopConfig)

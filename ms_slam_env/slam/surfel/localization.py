@@ -164,7 +164,7 @@ class Localizer:
                 for motion, frames_lost in zip(states.motions, states.lost, strict=True)
             ]
         )
-        thresholds = acceptance_thresholds(lost, states.lost)
+        thresholds = acceptance_thresholds(self._config.acceptance, lost, states.lost)
         alignment = self._align(states.poses, hypotheses, thresholds, states.photometry, guesses)
         invalid = self.invalid_frames.find(frames.color, states.started)
         alignment = alignment.with_status(invalid, TrackingStatus.BLANK)
@@ -182,7 +182,7 @@ class Localizer:
             return alignment
         near = np.repeat(hypotheses[:, :1], NUM_HYPOTHESES, axis=1)
         near[:, :NUM_FIRST] = hypotheses[:, :NUM_FIRST]
-        thresholds = geometric_thresholds(states.lost)
+        thresholds = geometric_thresholds(self._config.acceptance, states.lost)
         again = self._align(states.poses, near, thresholds, geometry_only(states.photometry))
         return alignment.replace(failed & again.tracked, again)
 
@@ -238,7 +238,7 @@ class Localizer:
         return self._tracker.align(view, origins, hypotheses, thresholds, guesses, photometry)
 
     def _strict_thresholds(self) -> NDArray[Any]:
-        return acceptance_thresholds(self._strict, self._states.lost)
+        return acceptance_thresholds(self._config.acceptance, self._strict, self._states.lost)
 
     def _failed(self, alignment: Alignment) -> NDArray[np.bool_]:
         is_blank = alignment.status == TrackingStatus.BLANK

@@ -104,6 +104,7 @@ class InactiveRegistration:
         self, surfel_map: SurfelMap, inactive: SplatRenderer, config: SurfelConfig, device: str
     ) -> None:
         self.config = config.loops
+        self._acceptance = config.acceptance
         self.batch = surfel_map.batch
         self._inactive = inactive
         intrinsics = surfel_map.intrinsics
@@ -160,7 +161,7 @@ class InactiveRegistration:
     def _align(self, origins: Float64, hypotheses: Float64, largest_m: float) -> Alignment:
         stack = np.tile(hypotheses, (self.batch, 1, 1, 1))
         strict, lost = np.ones(self.batch, dtype=bool), np.zeros(self.batch, dtype=np.int32)
-        thresholds = acceptance_thresholds(strict, lost)
+        thresholds = acceptance_thresholds(self._acceptance, strict, lost)
         thresholds["sigma_m"] = self.config.sigma
         thresholds["inlier_ratio"] = self.config.inliers
         thresholds["motion_m"] = largest_m

@@ -97,9 +97,10 @@ class Weights:
     pixel_variance: float  # of the place in the image, pixels^2
     distance_m: float
     cos_angle: float
-    inlier_sigmas: float
-    texture: float  # grey levels per pixel
-    photometric_inlier: float  # largest residual of an inlier, grey levels
+    inlier_sigmas: float  # these four as in ``AcceptanceConfig``
+    conflict_sigmas: float
+    texture: float
+    photometric_inlier: float
     least_scale: float  # least c of photometric residuals, in sigmas
 
 
@@ -273,7 +274,7 @@ for (int first = start; first < end; first += LANES * stride) {
         ay[m] = lz[m] * a - lx[m] * c;
         az[m] = lx[m] * b - ly[m] * a;
         matched += is_matched;
-        depth_conflicts += is_matched & (gap * per_sigma > 8.0f);
+        depth_conflicts += is_matched & (gap * per_sigma > weights.conflict_sigmas);
         inliers += is_inlier;
 
         float sample[3];  // I, dI/du, dI/dv

@@ -17,7 +17,7 @@ from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.ferns import Candidate, FernConfig, FernDatabase
 from ms_slam_env.slam.state import Saved
 from ms_slam_env.slam.surfel.acceptance import Alignment, acceptance_thresholds
-from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.config import AcceptanceConfig, SurfelConfig
 from ms_slam_env.slam.surfel.pose_hypotheses import (
     KEYFRAME_HYPOTHESES,
     NUM_HYPOTHESES,
@@ -100,23 +100,23 @@ GOOD_COST = 1.6  # with one that costs less the other keyframes are left untried
 _LOOKED_AT = 40  # keyframes among which those tried are chosen
 _STEP_M, _STEP_RAD = 0.03, np.radians(3.0)  # frames between such steps are no new keyframes
 _APART = 0.10, np.radians(10.0)  # two of them differ by at least so much
-_STRICT = acceptance_thresholds(np.ones(1, dtype=bool), np.zeros(1, dtype=np.int32))
 
 
-def _lax_thresholds() -> NDArray[Any]:
+def _strict_thresholds(config: AcceptanceConfig, lost: int) -> NDArray[Any]:
+    return acceptance_thresholds(config, np.ones(1, dtype=bool), np.full(1, lost, dtype=np.int32))
+
+
+def _lax_thresholds(config: AcceptanceConfig) -> NDArray[Any]:
     """Thresholds of an alignment that is repeated and checked before it is accepted.
 
     A keyframe's view hides what the camera sees from elsewhere, so that even a perfect alignment
     with it leaves much unexplained.
     """
-    thresholds = acceptance_thresholds(np.ones(1, dtype=bool), np.full(1, 7, dtype=np.int32))
+    thresholds = _strict_thresholds(config, 7)
     thresholds["overlap"], thresholds["cost"] = 0.3, HOPELESS_COST
     thresholds["inlier_ratio"] = thresholds["photometric_inlier_ratio"] = 0.35
     thresholds["depth_conflict_ratio"] = 0.6
     return thresholds
-
-
-_LAX = _lax_thresholds()
 
 
 class FernRelocalization(Relocalization):
@@ -129,10 +129,19 @@ class FernRelocalization(Relocalization):
 
     saved = ("databases", "_tentative", "_attempts", "_looked_from")
 
-    def __init__(self, batch: int, intrinsics: Intrinsics, depth_cutoff_m: float) -> None:
+    def __init__(
+        self,
+        batch: int,
+        intrinsics: Intrinsics,
+        depth_cutoff_m: float,
+        acceptance: AcceptanceConfig | None = None,
+    ) -> None:
         config = FernConfig(far_m=max(depth_cutoff_m, 2 * FernConfig.near_m))
         self.databases = [FernDatabase(intrinsics, config) for _ in range(batch)]
         self._cutoff_m = depth_cutoff_m
+        acceptance = acceptance or AcceptanceConfig()
+        self._strict = _strict_thresholds(acceptance, 0)
+        self._lax = _lax_thresholds(acceptance)
         self._tentative: Float64 = np.full((batch, 4, 4), np.nan)  # to be confirmed; NaN: none
         self._attempts = np.zeros(batch, dtype=np.int32)  # since tracking was lost
         self._looked_from: Float64 = np.full((batch, 4, 4), np.nan)  # the last frame encoded
@@ -171,7 +180,7 @@ class FernRelocalization(Relocalization):
         expected = lost & _has_pose(self._tentative)
         if expected.any():
             hypotheses = tracking_hypotheses(np.eye(4))
-            alignment = _align(aligner, self._tentative, hypotheses, _STRICT)
+            alignment = _align(aligner, self._tentative, hypotheses, self._strict)
             found = expected & alignment.tracked
             found = self.verify(frames, alignment.T_world_live, found, aligner)
         self._tentative[lost] = np.nan
@@ -190,7 +199,7 @@ class FernRelocalization(Relocalization):
             wanted = _has_pose(starts) & (cost > GOOD_COST)
             if not wanted.any():
                 break
-            found = _align(aligner, starts, hypotheses, _LAX)
+            found = _align(aligner, starts, hypotheses, self._lax)
             better = wanted & found.tracked & (found.statistics["cost"] < cost)
             best[better] = found.T_world_live[better]
             cost[better] = found.statistics["cost"][better]
@@ -202,7 +211,7 @@ class FernRelocalization(Relocalization):
             wanted = _has_pose(poses)
             if not wanted.any():
                 return
-            again = _align(aligner, poses, UNMOVED, _LAX)
+            again = _align(aligner, poses, UNMOVED, self._lax)
             wanted &= again.tracked
             verified = self.verify(frames, again.T_world_live, wanted, aligner)
             self._tentative[verified] = again.T_world_live[verified]
@@ -290,4 +299,4 @@ def make_relocalization(batch: int, intrinsics: Intrinsics, config: SurfelConfig
     """The relocalization ``config.relocalisation`` for B envs with one camera model."""
     if config.relocalisation == "local":
         return Relocalization()
-    return FernRelocalization(batch, intrinsics, config.depth_cutoff_m)
+    return FernRelocalization(batch, intrinsics, config.depth_cutoff_m, config.acceptance)

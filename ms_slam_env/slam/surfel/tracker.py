@@ -136,7 +136,7 @@ class Tracker:
         self._covariance = HostDeviceBuffer(batch, mat66d, device)
         self._live_levels: list[Level] = []
         self._model_levels: list[Level] = []
-        self._weights = [_weights(config, level) for level in range(num_levels)]
+        self._weights = [weights_of(config, level) for level in range(num_levels)]
 
     def _stride(self, level: int, share: float = 1.0) -> int:
         return _point_stride(self._model_shapes[level], share * self.config.points_per_level)
@@ -316,7 +316,8 @@ class Tracker:
         )
 
 
-def _weights(config: SurfelConfig, level: int) -> Weights:
+def weights_of(config: SurfelConfig, level: int) -> Weights:
+    """Scales and rules of the residuals at a level of the pyramid, 0 the finest."""
     # Far from the solution large residuals carry the information: coarse levels are tolerant.
     widening = COARSE_TOLERANCE**level
     weights = Weights()
@@ -329,8 +330,7 @@ def _weights(config: SurfelConfig, level: int) -> Weights:
     weights.pixel_variance = config.lateral_noise_px**2
     weights.distance_m = config.icp_distance_m
     weights.cos_angle = float(np.cos(np.radians(config.icp_angle_deg)))
-    weights.inlier_sigmas = 4.0
-    weights.texture = 4.0
-    weights.photometric_inlier = 20.0
+    for rule in ("inlier_sigmas", "conflict_sigmas", "texture", "photometric_inlier"):
+        setattr(weights, rule, getattr(config.acceptance, rule))
     weights.least_scale = config.cauchy_rgb * widening
     return weights
