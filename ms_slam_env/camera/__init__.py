@@ -1,6 +1,15 @@
 """The pinhole camera, RGB-D frames and images."""
 
 from ms_slam_env.camera.frame import RGBDFrame, intensity_image
-from ms_slam_env.camera.intrinsics import XTION_SIZES, Intrinsics, xtion
+from ms_slam_env.camera.image_size import parse_image_size, rendered_size, xtion
+from ms_slam_env.camera.intrinsics import XTION_SIZES, Intrinsics
 
-__all__ = ["XTION_SIZES", "Intrinsics", "RGBDFrame", "intensity_image", "xtion"]
+__all__ = [
+    "XTION_SIZES",
+    "Intrinsics",
+    "RGBDFrame",
+    "intensity_image",
+    "parse_image_size",
+    "rendered_size",
+    "xtion",
+]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.errors import InputError
 
 Array = NDArray[np.float64]
 
@@ -20,13 +20,21 @@ XTION_SIZES: dict[str, tuple[int, int]] = {
 }
 """Image sizes of the simulated ASUS Xtion, name to (width, height)."""
 
+LARGEST_SIDE = 4096
+"""Pixels of a side of an image, more than any RGB-D camera has."""
+
+LARGEST_NUMBER = 1e6
+"""Largest focal length, and farthest centre from the corner, in pixels; the least focal length is
+its inverse."""
+
 
 @dataclass(frozen=True)
 class Intrinsics:
     """Pinhole camera: u = fx x / z + cx, v = fy y / z + cy, in pixels.
 
     Raises:
-        InputError: a size below 1 or a focal length that is not positive and finite.
+        InputError: a side below 1 or above `LARGEST_SIDE` pixels, or focal lengths or a centre
+            that no camera has.
     """
 
     fx: float
@@ -38,11 +46,19 @@ class Intrinsics:
 
     def __post_init__(self) -> None:
         """Refuse values that no camera has."""
-        if self.width < 1 or self.height < 1:
-            raise InputError(f"image size {self.width}x{self.height} must be at least 1x1")
+        if not 1 <= min(self.width, self.height) <= max(self.width, self.height) <= LARGEST_SIDE:
+            raise InputError(
+                f"image size {self.width}x{self.height} must be at least 1x1 and at most "
+                f"{LARGEST_SIDE}x{LARGEST_SIDE}"
+            )
         numbers = (self.fx, self.fy, self.cx, self.cy)
         if not all(math.isfinite(number) for number in numbers) or min(self.fx, self.fy) <= 0:
             raise InputError(f"focal lengths and centre must be finite, fx, fy > 0: {numbers}")
+        if min(self.fx, self.fy) < 1 / LARGEST_NUMBER or max(map(abs, numbers)) > LARGEST_NUMBER:
+            raise InputError(
+                f"focal lengths and centre must be at most {LARGEST_NUMBER:g} px, fx, fy at least "
+                f"{1 / LARGEST_NUMBER:g} px: {numbers}"
+            )
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -80,6 +96,26 @@ class Intrinsics:
             height=round(self.height * factor),
         )
 
+    def resized(self, width: int, height: int) -> Intrinsics:
+        """Intrinsics of the image resampled to ``width`` x ``height``, same field of view."""
+        x, y = width / self.width, height / self.height
+        centre = (self.cx + 0.5) * x - 0.5, (self.cy + 0.5) * y - 0.5
+        return Intrinsics(self.fx * x, self.fy * y, *centre, width, height)
+
+    def cropped(self, left: int, top: int, width: int, height: int) -> Intrinsics:
+        """Intrinsics of the part of the image that begins at column ``left`` and row ``top``.
+
+        Raises:
+            InputError: the image has no such part.
+        """
+        fits = 0 <= left <= self.width - width and 0 <= top <= self.height - height
+        if not fits:
+            raise InputError(
+                f"images of {self.width}x{self.height} have no part of {width}x{height} from "
+                f"{left}, {top} on"
+            )
+        return Intrinsics(self.fx, self.fy, self.cx - left, self.cy - top, width, height)
+
     def rays(self) -> Array:
         """Viewing rays (height, width, 3) in the camera frame with z = 1."""
         v, u = np.mgrid[: self.height, : self.width].astype(np.float64)
@@ -115,18 +151,3 @@ class Intrinsics:
                 if image.ndim >= 2
                 else f"{name} must be an image, got shape {image.shape}"
             )
-
-
-def xtion(size: str = "160x120") -> Intrinsics:
-    """Intrinsics of the ASUS Xtion Pro Live, scaled to ``size``.
-
-    570.3 px at 640x480 is the focal length of the OpenNI driver's default calibration
-    (58 x 45 degrees field of view).
-
-    Raises:
-        InputError: unknown size.
-    """
-    if size not in XTION_SIZES:
-        raise unknown("image size", size, XTION_SIZES)
-    full = Intrinsics(fx=570.3, fy=570.3, cx=319.5, cy=239.5, width=640, height=480)
-    return full.scaled(XTION_SIZES[size][0] / full.width)

@@ -22,7 +22,8 @@ class Arguments:
     sequences: tyro.conf.Positional[tuple[str, ...]]
     """Folders of recordings, or scene:seed[:word[+word ...]]."""
     image_size: str = "native"
-    """Reduce the images to this size, such as 160x120."""
+    """Reduce the images to this size, such as 160x120, or 160x120+crop for their largest central
+    part of that aspect."""
     layout: str = "auto"
     """auto, tum, icl-nuim, 7-scenes or folder."""
     every: int = 1

@@ -36,7 +36,8 @@ class Arguments:
     backend: str | None = None
     """SLAM backend; without a configuration file surfel."""
     image_size: str | None = None
-    """Reduce the images to this size, such as 160x120; by default that of the configuration file,
+    """Reduce the images to this size, such as 160x120; 160x120+crop takes their largest central
+    part of that aspect, 160x120+crop=480x360 that part. By default that of the configuration file,
     else "native"."""
     layout: str = "auto"
     """auto, tum, icl-nuim, 7-scenes or folder."""

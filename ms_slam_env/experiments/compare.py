@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ms_slam_env import metrics, slam
-from ms_slam_env.camera import XTION_SIZES
+from ms_slam_env.camera import parse_image_size
 from ms_slam_env.config import Checked, bounded, parse_named
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.evaluation.map_quality import THRESHOLDS_M, map_quality, share_keys
@@ -123,8 +123,7 @@ class Compare(Experiment, Checked):
             if name not in slam.BACKENDS:
                 raise unknown("SLAM backend", name, slam.BACKENDS)
         for size in self.image_sizes:
-            if size not in XTION_SIZES:
-                raise unknown("image size", size, XTION_SIZES)
+            parse_image_size(size)
 
     def environment(self) -> Mapping[str, str]:
         """Libraries may start as many threads as a backend may use."""

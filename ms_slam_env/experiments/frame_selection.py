@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ms_slam_env import metrics, slam
-from ms_slam_env.camera import XTION_SIZES, RGBDFrame
+from ms_slam_env.camera import RGBDFrame, parse_image_size
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.evaluation.map_quality import map_quality
@@ -97,8 +97,7 @@ class FrameSelection(Experiment, Checked):
                 raise InputError(f"{text!r} measures time: no two runs are alike")
         if self.backend not in slam.BACKENDS:
             raise unknown("SLAM backend", self.backend, slam.BACKENDS)
-        if self.image_size not in XTION_SIZES:
-            raise unknown("image size", self.image_size, XTION_SIZES)
+        parse_image_size(self.image_size)
         return [
             FilterSpec(sequence, self.managements, self.backend, self.image_size, self.frames)
             for sequence in self.sequences

@@ -12,9 +12,9 @@ import tyro
 from numpy.typing import NDArray
 
 from ms_slam_env import slam
-from ms_slam_env.camera import XTION_SIZES
+from ms_slam_env.camera import rendered_size
 from ms_slam_env.config import Checked, bounded, parse_named
-from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.errors import InputError
 from ms_slam_env.experiments.harness.experiment import Experiment
 from ms_slam_env.experiments.harness.usme_runs import UsmeSpec, run_usme
 from ms_slam_env.parallel import limit_threads, thread_environment
@@ -166,5 +166,4 @@ def check_suite(sequences: Sequence[str], image_size: str) -> None:
         raise InputError("Usme.sequences is empty")
     for name in sequences:
         find(name)
-    if image_size not in XTION_SIZES:
-        raise unknown("image size", image_size, XTION_SIZES)
+    rendered_size(image_size)

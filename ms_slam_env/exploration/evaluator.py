@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from ms_slam_env import metrics, slam
-from ms_slam_env.camera import XTION_SIZES
+from ms_slam_env.camera import parse_image_size
 from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.divergence import DivergenceConfig
-from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.map_quality import map_quality
 from ms_slam_env.evaluation.run_sequence import run_sequence
 from ms_slam_env.evaluation.seen_surface import SequenceWithSurface, open_with_surface
@@ -69,8 +69,7 @@ class SlamEvaluator(Checked):
             raise InputError("no sequence to explore on")
         for text in self.sequences:
             parse_sequence(text)
-        if self.image_size not in XTION_SIZES:
-            raise unknown("image size", self.image_size, XTION_SIZES)
+        parse_image_size(self.image_size)
 
     def __call__(self, configuration: SlamConfiguration) -> Row:
         """Measure ``configuration`` on every sequence together; see ``summarise``."""

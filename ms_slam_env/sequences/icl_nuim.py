@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.camera import XTION_SIZES, Intrinsics
+from ms_slam_env.camera import Intrinsics, rendered_size
 from ms_slam_env.errors import InputError
 from ms_slam_env.sequences.recording import Recording, open_recording
 from ms_slam_env.sequences.recording.recording import RecordedSequence
@@ -47,7 +47,7 @@ def read_motions(data: str, names: Sequence[str]) -> tuple[list[Float64], Float6
 def recorded_depth(data: str, image_size: str, every: int) -> Recording:
     """Every so many frames of the recorded depth, at most as large as ``image_size``."""
     recording = open_recording(Path(data) / f"icl_nuim/{RECORDED}_depth").every(every)
-    is_larger = XTION_SIZES[image_size][0] < recording.source.width
+    is_larger = rendered_size(image_size)[0] < recording.source.width
     return recording.at_size(image_size) if is_larger else recording
 
 

@@ -24,6 +24,7 @@ import numpy as np
 
 from ms_slam_env import scenes
 from ms_slam_env.camera import Intrinsics, xtion
+from ms_slam_env.camera.image_size import NATIVE
 from ms_slam_env.config import from_dict, parse_named
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.scenes.registry import check_name
@@ -37,7 +38,7 @@ from ms_slam_env.sequences.paths import (
 )
 from ms_slam_env.sequences.perturbations import PERTURBATIONS, Perturbation, make_perturbation
 from ms_slam_env.sequences.recording import Calibration, open_recording
-from ms_slam_env.sequences.recording.recording import NATIVE, Registration, recorded_sequence
+from ms_slam_env.sequences.recording.recording import Registration, recorded_sequence
 from ms_slam_env.sequences.rendering import render_sequence
 from ms_slam_env.sequences.sequence import Sequence
 
@@ -150,8 +151,9 @@ def open_sequence(
 
     Args:
         name: a folder, or ``scene:seed[:word[+word ...]]`` as this module describes.
-        image_size: such as 160x120; ``native`` or None: that of the images on disk, of rendered
-            ones `RENDERED_SIZE`.
+        image_size: such as 160x120, or 160x120+crop for the central part of that aspect
+            (`ms_slam_env.camera.image_size`); ``native`` or None: that of the images on disk, of
+            rendered ones `RENDERED_SIZE`.
         path: of the camera of rendered sequences whose names do not say it; hand-held by default.
         every: take every n-th frame.
         with_truth: leave out frames whose true pose is not known, and refuse a recording that has

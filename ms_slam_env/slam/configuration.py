@@ -10,9 +10,9 @@ from typing import Any
 
 import yaml
 
-from ms_slam_env.camera import XTION_SIZES, Intrinsics
+from ms_slam_env.camera import Intrinsics, parse_image_size
 from ms_slam_env.config import Checked, bounded, from_dict
-from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.errors import InputError
 from ms_slam_env.slam.base import SlamBackend
 from ms_slam_env.slam.registry import check_parameters, make_backend
 
@@ -26,8 +26,8 @@ class SlamConfiguration(Checked):
     Attributes:
         slam: name of the backend.
         slam_config: its parameters, such as the fields of ``SurfelConfig``.
-        image_size: the frames are reduced to this size, such as 160x120; None leaves it to whoever
-            runs the configuration.
+        image_size: the frames are reduced to this size, such as 160x120 or 160x120+crop; None
+            leaves it to whoever runs the configuration.
         keep_every: of a recorded or rendered sequence, every n-th frame is processed. An
             environment has no frames to leave out and takes no notice.
         threads: cores that the backend may use; None for no limit. Where other work shares the
@@ -48,8 +48,8 @@ class SlamConfiguration(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_parameters(self.slam, self.slam_config)
-        if self.image_size is not None and self.image_size not in tuple(XTION_SIZES):
-            raise unknown("image_size", self.image_size, XTION_SIZES)
+        if self.image_size is not None:
+            parse_image_size(self.image_size)
 
     def __str__(self) -> str:
         """In a few words: image size, iterations and the like, share of the frames."""

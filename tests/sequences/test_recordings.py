@@ -390,7 +390,21 @@ def test_unknown_choices(tum):
     with pytest.raises(InputError, match="unknown layout 'bag'; valid choices: auto, tum"):
         open_recording(tum, layout="bag")
     recording = open_recording(tum)
-    with pytest.raises(InputError, match="valid choices: native, 80x60"):
+    with pytest.raises(InputError, match="valid choices: 80x60"):
         recording.at_size("1x1")
     with pytest.raises(InputError, match="cannot be reduced to 160x120"):
         recording.at_size("160x120")
+
+
+def test_a_cropped_recording_shows_the_middle(tum):
+    recording = open_recording(tum)
+    whole, cropped = recording.frame(1), recording.at_size("native+crop=20x10").frame(1)
+    assert np.array_equal(cropped.color, whole.color[7:17, 6:26])
+    assert np.array_equal(cropped.depth, whole.depth[7:17, 6:26])
+    smaller = recording.at_size("8x12+crop")
+    assert smaller.intrinsics.fx == recording.source.fx / 2
+    reduced = smaller.frame(1)
+    part = whole.color[:, 8:24].astype(float).reshape(12, 2, 8, 2, 3).mean(axis=(1, 3))
+    assert np.abs(reduced.color - part).max() <= 0.5
+    with pytest.raises(InputError, match=r"valid choices: native, 8x12\+crop"):
+        recording.at_size("8x12")

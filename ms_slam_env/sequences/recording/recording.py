@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from ms_slam_env.camera import XTION_SIZES, Intrinsics, RGBDFrame
+from ms_slam_env.camera import Intrinsics, RGBDFrame, parse_image_size
 from ms_slam_env.camera.frame import reduce_color, reduce_depth
+from ms_slam_env.camera.image_size import Crop
 from ms_slam_env.config import Checked, bounded
-from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import Float64
 from ms_slam_env.sequences.sequence import Frames, Sequence
 from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S, associate
@@ -33,9 +34,6 @@ _BROKEN_IMAGE = (
     zlib.error,
     Image.DecompressionBombError,
 )
-
-NATIVE = "native"
-"""The image size that keeps the recording's own."""
 
 
 @dataclass(frozen=True)
@@ -150,6 +148,7 @@ class Recording(Frames):
         truth: (M, 4, 4) true T_world_camera, or None.
         registration: where the colour camera is, if colour has to be brought into the depth
             camera; None where the recording has that done.
+        crop: the part of the images on disk that is taken; None for all of them.
 
     Raises:
         InputError: no frame, or times that do not increase.
@@ -165,6 +164,7 @@ class Recording(Frames):
     truth_times: Float64 | None = None
     truth: Float64 | None = None
     registration: Registration | None = None
+    crop: Crop | None = None
 
     def __post_init__(self) -> None:
         """Refuse what cannot be a sequence."""
@@ -194,21 +194,18 @@ class Recording(Frames):
     def at_size(self, size: str) -> Recording:
         """Return the same recording with its frames resampled to ``size``, such as ``320x240``.
 
+        Args:
+            size: as `ms_slam_env.camera.image_size` describes; ``160x120+crop`` takes the largest
+                central part of that aspect.
+
         Raises:
-            InputError: an unknown size, or one of another shape than the images on disk.
+            InputError: an unknown size, or one that the images on disk cannot be reduced to.
         """
-        if size == NATIVE:
-            return dataclasses.replace(self, intrinsics=self.source)
-        if size not in XTION_SIZES:
-            raise unknown("image size", size, (NATIVE, *XTION_SIZES))
-        width, height = XTION_SIZES[size]
-        factor = width / self.source.width
-        if round(self.source.height * factor) != height or factor > 1:
-            raise InputError(
-                f"sequence {self.name}: images of {self.source.width}x{self.source.height} "
-                f"cannot be reduced to {size}"
-            )
-        return dataclasses.replace(self, intrinsics=self.source.scaled(factor))
+        named = parse_image_size(size)
+        crop = named.part_of(self.source, f"sequence {self.name}")
+        part = self.source.cropped(*dataclasses.astuple(crop))
+        intrinsics = part if named.size is None else part.resized(*named.size)
+        return dataclasses.replace(self, intrinsics=intrinsics, crop=crop)
 
     def every(self, n: int) -> Recording:
         """Return the same recording with every ``n``-th frame, the first among them."""
@@ -233,12 +230,16 @@ class Recording(Frames):
         color: NDArray[Any] = np.zeros((*self.source.shape, 3), dtype=np.uint8)
         if entry.color is not None:
             color = self._read(entry.color, entry, "a colour image", ("RGB", "RGBA", "L", "P"))
+        crop = self.crop or Crop(0, 0, self.source.width, self.source.height)
+        rows = slice(crop.top, crop.top + crop.height)
+        columns = slice(crop.left, crop.left + crop.width)
+        color, depth = color[rows, columns], depth[rows, columns]
         size = (self.intrinsics.width, self.intrinsics.height)
-        if self.intrinsics.shape != self.source.shape:
+        if size != (crop.width, crop.height):
             color = reduce_color(color, size)
             depth = reduce_depth(depth, size)
         if self.registration is not None and entry.color is not None:
-            factor = self.intrinsics.width / self.source.width
+            factor = self.intrinsics.width / crop.width
             color = self.registration.register(color, depth, self.intrinsics, factor)
         return RGBDFrame(np.ascontiguousarray(color), np.ascontiguousarray(depth), entry.timestamp)
 

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from ms_slam_env.camera import XTION_SIZES, Intrinsics, RGBDFrame
+from ms_slam_env.camera import XTION_SIZES, Intrinsics, RGBDFrame, rendered_size
 from ms_slam_env.config import from_dict
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.base import SlamBackend
@@ -121,7 +121,7 @@ def make_levels(
         size = configuration.image_size
         level = Level(
             config=from_dict(SurfelConfig, merged(asdict(own), params), where),
-            image_size=None if size is None else XTION_SIZES[size],
+            image_size=None if size is None else rendered_size(size),
             keep_every=configuration.keep_every,
         )
         try:
