@@ -2,7 +2,8 @@
 
 from ms_slam_baselines.greedy import GreedyDivergence
 from ms_slam_baselines.max_information import MaxInformation
+from ms_slam_baselines.nbv import NextBestView
 from ms_slam_baselines.random_walk import RandomWalk
 from ms_slam_baselines.stationary import Stationary
 
-__all__ = ["GreedyDivergence", "MaxInformation", "RandomWalk", "Stationary"]
+__all__ = ["GreedyDivergence", "MaxInformation", "NextBestView", "RandomWalk", "Stationary"]

@@ -23,6 +23,10 @@ if TYPE_CHECKING:
 
 GROUP = "ms_slam_env.planners"
 
+RECOVERY = "recovery"
+_OPPOSITE = (0, 2, 1, 4, 3, 6, 5)  # of a translation or rotation, in the paper's order
+_REMEMBERED = 12  # motions that can be undone
+
 _TRAINING = ("torch", "stable_baselines3", "sb3_contrib")  # packages of the extra "train"
 
 
@@ -40,6 +44,8 @@ class Planner(ABC):
 
     observation: str = "features"
     """The observation variant that ``act`` expects."""
+    recovers: bool = False
+    """Whether it undoes its last motions while tracking is lost, unless told not to."""
 
     def __init__(self, env: ActiveSlamEnv, seed: int = 0) -> None:
         self.env = env
@@ -51,6 +57,43 @@ class Planner(ABC):
     @abstractmethod
     def act(self, observation: Any, info: dict[str, Any]) -> int:
         """Return the next action, given what ``reset`` or ``step`` last returned."""
+
+
+class Recovering(Planner):
+    """Undoes the last motions, newest first, while tracking is lost; else asks another planner.
+
+    The opposite of [R | t] is taken as the motion with the opposite rotation and translation: off
+    by the step's own rotation of its translation, some 2 cm at 12 cm and 12 deg.
+    """
+
+    def __init__(self, env: ActiveSlamEnv, planner: Planner) -> None:
+        super().__init__(env)
+        self.planner = planner
+        self.observation = planner.observation
+
+    def reset(self) -> None:
+        """Nothing was done yet."""
+        self.made: list[int] = []
+        self.planner.reset()
+
+    def act(self, observation: Any, info: dict[str, Any]) -> int:
+        """Undo a motion, or what the planner says."""
+        if info["tracking_ok"] or not self.made:
+            action = self.planner.act(observation, info)
+            self.made = [*self.made[1 - _REMEMBERED :], action]
+            return action
+        undone = opposite(self.made.pop(), self.env.action_masks().size)
+        return undone if self.env.action_masks()[undone] else 0
+
+
+def opposite(action: int, actions: int = 49) -> int:
+    """The motion that leads back, of 49 motions or of 7 rotations.
+
+    >>> opposite(7 * 5 + 1)  # forward and roll right: backward and roll left
+    44
+    """
+    rotation = _OPPOSITE[action % 7]
+    return rotation if actions == 7 else 7 * _OPPOSITE[action // 7] + rotation
 
 
 def planner_names() -> tuple[str, ...]:
@@ -90,13 +133,17 @@ def planner_class(name: str) -> type[Planner]:
 def make_planner(text: str, env: Any, seed: int = 0) -> Planner:
     """Build the planner that ``NAME,option=value,...`` describes for the unwrapped ``env``.
 
+    Every planner has the option ``recovery``: while tracking is lost its last motions are undone.
+
     Raises:
         InputError: an unknown planner or option, or a value that the planner refuses.
     """
     name, options = parse_named(text, "planner")
     cls = planner_class(name)
     check_options(name, cls, options)
-    return cls(env, seed=seed, **options)
+    recovery = options.pop(RECOVERY, cls.recovers)
+    planner = cls(env, seed=seed, **options)
+    return Recovering(env, planner) if recovery else planner
 
 
 def check_planner(text: str) -> None:
@@ -117,5 +164,7 @@ def check_options(name: str, cls: type[Planner], options: dict[str, Any]) -> Non
     """
     taken = [p for p in inspect.signature(cls).parameters if p not in ("env", "seed")]
     for option in options:
-        if option not in taken:
-            raise unknown(f"option of planner {name}", option, taken or ("(none)",))
+        if option not in (*taken, RECOVERY):
+            raise unknown(f"option of planner {name}", option, (*taken, RECOVERY))
+    if not isinstance(options.get(RECOVERY, False), bool):
+        raise InputError(f"option {RECOVERY} of planner {name} is true or false")

@@ -1,0 +1,16 @@
+"""What is known of space: occupancy, what a view would add to it, where a camera can go."""
+
+from ms_slam_env.mapping.expected_gain import expected_gain
+from ms_slam_env.mapping.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from ms_slam_env.mapping.reachability import reachable_positions
+from ms_slam_env.mapping.view_information import view_information
+
+__all__ = [
+    "FREE",
+    "OCCUPIED",
+    "UNKNOWN",
+    "OccupancyGrid",
+    "expected_gain",
+    "reachable_positions",
+    "view_information",
+]

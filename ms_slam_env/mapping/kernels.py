@@ -1,0 +1,136 @@
+"""Warp kernels of the occupancy grid and of what predicted views tell."""
+
+from ms_slam_env._warp import wp
+
+PASSED = wp.constant(1)  # a cell that a ray crossed which ends on a surface
+STRUCK = wp.constant(2)  # a cell in which a ray ended
+BLANK = wp.constant(3)  # a cell crossed by a ray without a reading: too far, or nothing there
+CAMERA_M = wp.constant(0.1)  # what is nearer, the camera fills itself
+CARVING_STEP = wp.constant(0.7)  # cells of depth between the points of a ray
+MARGIN = wp.constant(0.5)  # cells of depth in front of a surface that are not carved
+NEAREST_M = wp.constant(0.3)  # a sensor sees nothing nearer
+GAIN_STEP = wp.constant(0.8)  # cells of depth between the points of a ray: none is stepped over
+SEEN_THROUGH = wp.constant(0.85**0.8)  # chance that a step through unknown cells meets nothing
+STILL_BLANK = wp.constant(0.7)  # worth of a cell after one more look without a reading
+DEPTH_NOISE = wp.constant(wp.vec3(0.0012, 0.0019, 0.4))  # m, 1/m, m; see view_information
+INTENSITY_NOISE = wp.constant(8.0)  # grey levels, model and live image together
+
+mat66 = wp.types.matrix(shape=(6, 6), dtype=wp.float32)
+vec6 = wp.types.vector(length=6, dtype=wp.float32)
+
+
+@wp.func
+def _cell(at: wp.vec3, shape: wp.vec3i):
+    """The cell of a point, in cells; (-1, -1, -1) outside."""
+    cell = wp.vec3i(int(wp.floor(at[0])), int(wp.floor(at[1])), int(wp.floor(at[2])))
+    for axis in range(3):
+        if cell[axis] < 0 or cell[axis] >= shape[axis]:
+            return wp.vec3i(-1, -1, -1)
+    return cell
+
+
+@wp.kernel
+def mark_rays(
+    directions: wp.array(dtype=wp.vec3),  # at depth 1 m, in cells
+    depths: wp.array(dtype=float),
+    start: wp.vec3,  # of all rays, in cells of ``marks``
+    shape: wp.vec3i,  # of ``marks``
+    cell_m: float,
+    reach_m: float,
+    mark: int,
+    marks: wp.array3d(dtype=wp.int8),
+):
+    """Put one kind of mark on the cells of every ray."""
+    ray = wp.tid()
+    depth = depths[ray]
+    z = wp.float32(CAMERA_M)
+    end = wp.float32(reach_m)
+    if mark == STRUCK:
+        z = depth
+        end = wp.where(depth > 0.0 and depth < reach_m, depth + 0.5 * cell_m, 0.0)
+    elif mark == PASSED:
+        end = wp.where(depth > 0.0, wp.min(reach_m, depth - MARGIN * cell_m), 0.0)
+    elif depth > 0.0:
+        end = 0.0
+    while z < end:
+        cell = _cell(start + z * directions[ray], shape)
+        if cell[0] >= 0:
+            marks[cell[0], cell[1], cell[2]] = wp.int8(mark)
+        z += CARVING_STEP * cell_m
+
+
+@wp.kernel
+def sum_unknown(
+    directions: wp.array(dtype=wp.vec3),  # in the camera frame, z = 1 m
+    rotations: wp.array(dtype=wp.mat33),  # to the world, in cells
+    starts: wp.array(dtype=wp.vec3),  # in cells
+    log_odds: wp.array3d(dtype=wp.int8),
+    blanks: wp.array3d(dtype=wp.int8),
+    cell_m: float,
+    reach_m: float,
+    gains: wp.array2d(dtype=float),
+):
+    """Unknown length of each ray of each pose, weighed by z^2 and by the chance to see it."""
+    pose, ray = wp.tid()
+    shape = wp.vec3i(log_odds.shape[0], log_odds.shape[1], log_odds.shape[2])
+    direction = rotations[pose] * directions[ray]
+    dz = GAIN_STEP * cell_m
+    chance = wp.float32(1.0)
+    gain = wp.float32(0.0)
+    z = wp.float32(NEAREST_M)
+    while z < reach_m:
+        cell = _cell(starts[pose] + z * direction, shape)
+        state = wp.int32(0)
+        worth = wp.float32(1.0)
+        if cell[0] >= 0:
+            state = wp.int32(log_odds[cell[0], cell[1], cell[2]])
+            worth = wp.pow(STILL_BLANK, float(blanks[cell[0], cell[1], cell[2]]))
+        if state > 0:
+            break
+        if state == 0:
+            gain += chance * worth * z * z * dz
+            chance *= SEEN_THROUGH
+        z += dz
+    gains[pose, ray] = gain
+
+
+@wp.func
+def _outer(p: wp.vec3, gradient: wp.vec3, length: float):
+    """J^T J of a residual with a gradient at a point; rotations times a length."""
+    turn = wp.cross(p, gradient) / length
+    J = vec6(gradient[0], gradient[1], gradient[2], turn[0], turn[1], turn[2])
+    return wp.outer(J, J)
+
+
+@wp.kernel
+def sum_information(
+    depth: wp.array3d(dtype=float),
+    normals: wp.array3d(dtype=wp.vec3),
+    intensity: wp.array3d(dtype=float),
+    lengths: wp.array(dtype=float),
+    focal: wp.vec2,
+    centre: wp.vec2,
+    sums: wp.array2d(dtype=mat66),
+):
+    """Sum of J^T J / sigma^2 over a row of each view."""
+    view, v = wp.tid()
+    H = mat66()
+    last = depth.shape[2] - 1
+    for u in range(depth.shape[2]):
+        z = depth[view, v, u]
+        if z > 0.0:
+            x = (float(u) - centre[0]) / focal[0]
+            y = (float(v) - centre[1]) / focal[1]
+            p = wp.vec3(x * z, y * z, z)
+            beyond = wp.max(z - DEPTH_NOISE[2], 0.0)
+            sigma = DEPTH_NOISE[0] + DEPTH_NOISE[1] * beyond * beyond
+            H += _outer(p, normals[view, v, u] / sigma, lengths[view])
+            if u > 0 and u < last and v > 0 and v + 1 < depth.shape[1]:
+                across = wp.min(depth[view, v, u - 1], depth[view, v, u + 1])
+                along = wp.min(depth[view, v - 1, u], depth[view, v + 1, u])
+                if wp.min(across, along) > 0.0:
+                    du = (intensity[view, v, u + 1] - intensity[view, v, u - 1]) * focal[0]
+                    dv = (intensity[view, v + 1, u] - intensity[view, v - 1, u]) * focal[1]
+                    slope = wp.vec3(du, dv, -(du * x + dv * y)) / (2.0 * z * INTENSITY_NOISE)
+                    H += _outer(p, slope, lengths[view])
+    sums[view, v] = H

@@ -1,0 +1,79 @@
+"""A planner that goes back to where tracking last held."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from ms_slam_env.env.planners import Planner, Recovering, make_planner, opposite
+from ms_slam_env.errors import InputError
+from ms_slam_env.robot.action_primitives import decompose
+
+OK, LOST = {"tracking_ok": True}, {"tracking_ok": False}
+
+
+class Counting(Planner):
+    """Takes actions 1, 2, 3, ..."""
+
+    def reset(self):
+        self.last = 0
+
+    def act(self, observation, info):
+        self.last += 1
+        return self.last
+
+
+def recovering(mask=None):
+    mask = np.ones(49, bool) if mask is None else mask
+    planner = Recovering(env := SimpleNamespace(action_masks=lambda: mask), Counting(env))
+    planner.reset()
+    return planner
+
+
+@pytest.mark.parametrize("action", range(49))
+def test_the_opposite_motion_leads_back(action):
+    motions = decompose(0.12, np.radians(12))
+    there_and_back = motions[action] @ motions[opposite(action)]
+    np.testing.assert_allclose(there_and_back[:3, :3], np.eye(3), atol=1e-12)
+    assert np.linalg.norm(there_and_back[:3, 3]) <= 0.12 * np.radians(12) + 1e-9
+    assert opposite(opposite(action)) == action
+
+
+def test_rotations_alone_have_opposites_too():
+    assert [opposite(n, 7) for n in range(7)] == [0, 2, 1, 4, 3, 6, 5]
+
+
+def test_lost_motions_are_undone_newest_first_until_tracking_holds():
+    planner = recovering()
+    assert [planner.act(None, OK) for _ in range(3)] == [1, 2, 3]
+    undone = [planner.act(None, LOST) for _ in range(2)]
+    assert undone == [opposite(3), opposite(2)]
+    assert planner.act(None, OK) == 4
+    assert [planner.act(None, LOST) for _ in range(2)] == [opposite(4), opposite(1)]
+    assert planner.act(None, LOST) == 5  # nothing left to undo
+
+
+def test_what_is_blocked_is_not_done():
+    mask = np.ones(49, bool)
+    mask[opposite(1)] = False
+    planner = recovering(mask)
+    planner.act(None, OK)
+    assert planner.act(None, LOST) == 0
+
+
+def test_an_episode_begins_without_a_past():
+    planner = recovering()
+    planner.act(None, OK)
+    planner.reset()
+    assert planner.act(None, LOST) == 1
+
+
+def test_any_planner_takes_the_option_and_only_true_or_false():
+    env = SimpleNamespace(action_masks=lambda: np.ones(49, bool))
+    assert isinstance(make_planner("random,recovery=true", env), Recovering)
+    assert not isinstance(make_planner("random", env), Recovering)
+    assert not isinstance(make_planner("random,recovery=false", env), Recovering)
+    with pytest.raises(InputError, match=r"recovery of planner random is true or false"):
+        make_planner("random,recovery=7", env)
+    with pytest.raises(InputError, match=r"unknown option of planner random.*recovery"):
+        make_planner("random,recover=true", env)
