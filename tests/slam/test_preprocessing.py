@@ -102,6 +102,24 @@ def test_normals_face_the_camera_or_are_zero_and_edges_have_none():
     assert not live.normals.numpy()[0][:, 39].any()
 
 
+@pytest.mark.parametrize("distance", [0.15, 0.2])
+def test_a_plane_close_by_has_normals_although_its_inverse_depth_is_steep(distance):
+    camera, config = xtion("160x120"), SurfelConfig()
+    normal = np.array([-np.sin(np.radians(60)), 0.0, -np.cos(np.radians(60))])
+    rays = camera.rays()
+    inverse = -(rays @ normal) / distance
+    assert abs(inverse[0, 1] - inverse[0, 0]) > config.normal_edge_per_m  # as across an edge
+    seen = (inverse > 1 / 3.0) & (inverse < 1 / 0.15)
+    depth = np.where(seen, 1 / np.where(seen, inverse, 1), 0).astype(np.float32)
+    live = Preprocessor(1, camera, config)(np.zeros((1, 120, 160, 3), np.uint8), depth[None])
+    # Flatter than 80 degrees there may be none; at the border one neighbour is missing.
+    cosine = -(rays @ normal) / np.linalg.norm(rays, axis=2)
+    inside = (seen & (cosine > np.cos(np.radians(77))))[2:-2, 2:-2]
+    assert inside.sum() > 1000
+    found = live.normals.numpy()[0, 2:-2, 2:-2][inside]
+    np.testing.assert_allclose(found @ normal, 1.0, atol=1e-4)
+
+
 def _downsample(vertices: np.ndarray, intensity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     height, width = vertices.shape[0] // 2, vertices.shape[1] // 2
     coarse, grey = np.zeros((height, width, 3)), np.zeros((height, width))

@@ -25,6 +25,8 @@ from ms_slam_env.slam.surfel.device import (
     threads_per_row,
 )
 
+FLATTEST = wp.constant(5.67)  # tangent of 80 degrees, of the view onto a plane close by
+
 
 @dataclass(frozen=True)
 class LiveFrame:
@@ -126,16 +128,22 @@ def _filter(
 
 
 @wp.func
-def _slope(before: float, here: float, after: float, largest: float):
+def _slope(before: float, here: float, after: float, largest: float, steepest: float):
     """Difference per step of inverse depth to valid neighbours; (slope, 1), or (0, 0) if none.
 
     Inputs are inverse depths, 0 where invalid. A side that jumps by more than ``largest`` is an
-    edge.
+    edge, unless both sides continue one plane that is seen no flatter than ``steepest``: up close
+    the inverse depth of a tilted plane changes as much from pixel to pixel, all over it.
     """
-    forth = wp.where(after > 0.0 and wp.abs(after - here) <= largest, 1.0, 0.0)
-    back = wp.where(before > 0.0 and wp.abs(here - before) <= largest, 1.0, 0.0)
+    difference = after - here
+    difference_back = here - before
+    is_even = wp.abs(difference - difference_back) <= 0.5 * largest
+    is_seen = wp.abs(difference + difference_back) <= 2.0 * steepest * here
+    on_plane = before > 0.0 and after > 0.0 and is_even and is_seen
+    forth = wp.where(after > 0.0 and (wp.abs(difference) <= largest or on_plane), 1.0, 0.0)
+    back = wp.where(before > 0.0 and (wp.abs(difference_back) <= largest or on_plane), 1.0, 0.0)
     count = forth + back
-    total = forth * (after - here) + back * (here - before)
+    total = forth * difference + back * difference_back
     return wp.vec2(total / wp.max(count, 1.0), wp.min(count, 1.0))
 
 
@@ -151,8 +159,8 @@ def _normal(
     focal_per_step: wp.vec2,
 ):
     """Unit normal of a pixel from its inverse depth and its neighbours'; 0 where invalid."""
-    slope_u = _slope(left, inverse, right, largest)
-    slope_v = _slope(above, inverse, below, largest)
+    slope_u = _slope(left, inverse, right, largest, FLATTEST / focal_per_step[0])
+    slope_v = _slope(above, inverse, below, largest, FLATTEST / focal_per_step[1])
     # On a plane n . p = d, inverse depth is n . ray / d, linear in the ray's x and y:
     # its gradient there, and its value at ray (0, 0, 1), are the normal up to scale.
     a = slope_u[0] * focal_per_step[0]
