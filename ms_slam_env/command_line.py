@@ -6,12 +6,14 @@ import contextlib
 import io
 import re
 import sys
+import warnings
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from functools import partial
+from typing import Any, TypeVar
 
 import tyro
 
-from ms_slam_env.errors import InputError
+from ms_slam_env.errors import InputError, InputWarning
 
 T = TypeVar("T")
 
@@ -38,9 +40,17 @@ def parse(cls: type[T], arguments: Sequence[str] | None, prog: str) -> T:
 
 
 def exit_code(run: Callable[[], int], name: str = "ms-slam") -> int:
-    """Run a command: 0 success, 1 failure, 2 bad input, 130 interrupt; errors in one line."""
+    """Run a command: 0 success, 1 failure, 2 bad input, 130 interrupt; errors in one line.
+
+    So are warnings about what was given; those of libraries tell a user nothing.
+    """
     try:
-        return run()
+        with warnings.catch_warnings():
+            if not sys.warnoptions:
+                warnings.simplefilter("ignore", RuntimeWarning)
+            warnings.simplefilter("default", InputWarning)
+            warnings.showwarning = partial(_show_warning, name)
+            return run()
     except InputError as error:
         print(f"{name}: error: {error}", file=sys.stderr)
         return 2
@@ -55,6 +65,15 @@ def exit_code(run: Callable[[], int], name: str = "ms-slam") -> int:
     except KeyboardInterrupt:
         print(f"{name}: interrupted; finished work is kept", file=sys.stderr)
         return 130
+
+
+def _show_warning(
+    name: str, message: Warning | str, category: type[Warning], *where: Any, **_: Any
+) -> None:
+    """Print a warning in one line; others than ours say where they come from."""
+    ours = issubclass(category, InputWarning)
+    place = "" if ours else f" ({category.__name__} in {where[0]}, line {where[1]})"
+    print(f"{name}: warning: {message}{place}", file=sys.stderr)
 
 
 def report_failures(errors: Sequence[str], name: str = "ms-slam") -> int:

@@ -9,6 +9,10 @@ class InputError(ValueError):
     """A value given by the user is wrong; the message is one line fit to be shown as it is."""
 
 
+class InputWarning(UserWarning):
+    """Something that a user gave is taken, but hardly meant; one line, as of `InputError`."""
+
+
 class UnreachableError(InputError):
     """The camera cannot be held at a pose."""
 

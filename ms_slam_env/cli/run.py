@@ -6,11 +6,15 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
 from ms_slam_env.command_line import parse
 from ms_slam_env.errors import InputError
+
+if TYPE_CHECKING:
+    from ms_slam_env.sequences import Sequence as RGBDSequence
 
 _PRINTED = (
     *("frames", "processed_frames", "lost_frames"),
@@ -91,10 +95,33 @@ def main(arguments: Sequence[str]) -> int:
         limit_threads(slam.threads)
     params = merged(slam.slam_config, nested_options(args.params))
     fed = {"keep_every": slam.keep_every, "threads": slam.threads}
+    _say_what_is_missing(sequence)
     result = run_to_folder(sequence, slam.slam, params, args.out, fed, management)
     for name in _PRINTED:
         if result.get(name) is not None:
             print(f"{name:16} {result[name]:.4g}")
     if result.get("ene_j") is None and "ene_source" in result:
         print(f"{'ene_j':16} {result['ene_source']}")
+    _refuse_lost(sequence, result["processed_frames"], result["lost_frames"])
     return 0
+
+
+def _say_what_is_missing(sequence: RGBDSequence) -> None:
+    """Say what the sequence has not, so that nobody takes it for given."""
+    if not sequence.has_color:
+        print("no colour: SLAM has depth alone", file=sys.stderr)
+    if sequence.true_trajectory() is None:
+        print("no true trajectory: errors are not measured", file=sys.stderr)
+
+
+def _refuse_lost(sequence: RGBDSequence, processed: int, lost: int) -> None:
+    """Fail where nothing was tracked beyond the frame that the map began with.
+
+    Raises:
+        RuntimeError: saying so.
+    """
+    if lost < max(1, processed - 1):
+        return
+    if not any(frame.depth.any() for frame in sequence.frames):
+        raise RuntimeError(f"sequence {sequence.name}: no frame has a depth reading")
+    raise RuntimeError(f"sequence {sequence.name}: lost in {lost} of {processed} frames")

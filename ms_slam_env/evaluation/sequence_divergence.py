@@ -6,7 +6,7 @@ divergence, such as mean and variance, to the sequence"; "evaluated per unit of 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -105,7 +105,8 @@ def sequence_divergence(
     """Divergence of every frame from the one before, taking every ``every``-th frame.
 
     Raises:
-        InputError: fewer than two frames are left, or an image cannot be read.
+        InputError: fewer than two frames are left, none has a depth reading, or an image cannot
+            be read.
     """
     if isinstance(every, bool) or not isinstance(every, int) or every < 1:
         raise InputError(f"every must be an integer >= 1, got {every!r}")
@@ -116,12 +117,22 @@ def sequence_divergence(
             "a divergence needs two"
         )
     frames = (sequence.frames[k] for k in tqdm(picked, desc=sequence.name, unit="frame"))
-    config = config or DivergenceConfig()
-    values = consecutive_divergences(frames, sequence.intrinsics, [config])[:, 0]
+    config, K = config or DivergenceConfig(), sequence.intrinsics
+    values = consecutive_divergences(_with_depth(frames, sequence.name), K, [config])[:, 0]
     if not sequence.has_color:
         values[:, 0] = np.nan
     times = sequence.timestamps[list(picked)]
     return SequenceDivergence(sequence.name, times[1:] - times[0], values, np.diff(times))
+
+
+def _with_depth(frames: Iterable[RGBDFrame], name: str) -> Iterator[RGBDFrame]:
+    """The frames; refuse, at their end, those that are all without a depth reading."""
+    has_depth = False
+    for frame in frames:
+        has_depth = has_depth or bool(frame.depth.any())
+        yield frame
+    if not has_depth:
+        raise InputError(f"sequence {name}: no frame has a depth reading")
 
 
 # -- Results -----------------------------------------------------------------------------------

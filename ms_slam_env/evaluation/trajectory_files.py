@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ms_slam_env import metrics
 from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.errors import InputError
+from ms_slam_env.input_files import read_text
 from ms_slam_env.metrics.relative import DELTA_UNITS, PAIRINGS, TOLERANCE
 from ms_slam_env.metrics.trajectory import ALIGNMENTS
 from ms_slam_env.sequences import associate, read_trajectory
@@ -155,11 +156,7 @@ def lost_times(path: Path) -> Float64:
     Raises:
         InputError: a file that cannot be read, or of another form; the message names file and line.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read frames {path}: {error}") from None
-    reader = csv.DictReader(text.splitlines())
+    reader = csv.DictReader(read_text(path, "frames").splitlines())
     if not set(_FRAME_COLUMNS) <= set(reader.fieldnames or ()):
         raise InputError(f"{path}, line 1: expected columns {', '.join(_FRAME_COLUMNS)}")
     lost = []

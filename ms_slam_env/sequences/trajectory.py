@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import Float64, check_pose, pose_from_quaternion, quaternion_from_pose
+from ms_slam_env.input_files import read_text
 
 Int64 = NDArray[np.int64]
 
@@ -67,10 +68,7 @@ def read_trajectory(path: str | Path) -> tuple[Float64, Float64]:
         InputError: no such file, no pose in it, a line that does not parse, or timestamps that
             do not increase; the message names file and line.
     """
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read trajectory {path}: {error}") from None
+    text = read_text(path, "trajectory")
     times: list[float] = []
     poses: list[Float64] = []
     for number, line in enumerate(text.splitlines(), start=1):

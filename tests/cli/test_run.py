@@ -1,6 +1,7 @@
 """``ms-slam run``: what it writes, and what an unfinished run leaves."""
 
 import json
+import re
 import shutil
 
 import numpy as np
@@ -221,3 +222,33 @@ def test_bad_input_is_one_line(arguments, message, sequence, tmp_path, capsys):
     assert main([*words, "--out", str(tmp_path / "out")]) == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert message in lines[-1]
+
+
+def test_a_sequence_that_shows_nothing_fails_in_words(tmp_path, capsys):
+    folder = tmp_path / "dark"
+    (folder / "depth").mkdir(parents=True)
+    for index in range(3):
+        Image.fromarray(np.zeros((60, 80), np.uint16)).save(folder / f"depth/{index}.png")
+    (folder / "intrinsics.txt").write_text("71 71 39.5 29.5 80 60 1000")
+    assert main(["run", str(folder), "--backend", "odometry", "--out", str(tmp_path / "out")]) == 1
+    said = capsys.readouterr().err
+    assert "no colour: SLAM has depth alone" in said
+    assert "no true trajectory: errors are not measured" in said
+    assert "ms-slam: error: sequence dark: no frame has a depth reading" in said
+    assert main(["divergence", str(folder), "--out", str(tmp_path / "out2")]) == 2
+    assert "no frame has a depth reading" in capsys.readouterr().err
+
+
+def test_a_sequence_that_is_lost_throughout_fails(tmp_path, capsys):
+    folder = tmp_path / "jumps"
+    (folder / "depth").mkdir(parents=True)
+    for index in (0, 1, 4):
+        depth = np.zeros((60, 80), np.uint16)
+        depth[20 * (index % 3) :][:5, :5] = 1000  # hardly a reading: nothing can be aligned
+        Image.fromarray(depth).save(folder / f"depth/{index}.png")
+    (folder / "intrinsics.txt").write_text("71 71 39.5 29.5 80 60 1000")
+    assert main(["run", str(folder), "--backend", "odometry", "--out", str(tmp_path / "out")]) == 1
+    said = capsys.readouterr().err
+    assert re.search(r"ms-slam: error: sequence jumps: lost in \d of 3 frames", said)
+    assert "ms-slam: warning: " in said
+    assert "leave out 2 frames" in said

@@ -124,6 +124,9 @@ def test_the_same_sequence_from_a_folder_and_with_part_of_its_truth(tmp_path: Pa
     np.testing.assert_array_equal(placed.poses, partly.poses[2:4])
     np.testing.assert_array_equal(placed.timestamps, partly.timestamps[2:4])
     truth.unlink()
+    with pytest.raises(InputError, match=r"groundtruth\.txt is missing; every generated"):
+        open_sequence(tmp_path / "s")
+    (tmp_path / "s/sequence.json").unlink()
     assert not open_sequence(tmp_path / "s").known.any()
     with pytest.raises(InputError, match="sequence s has no true trajectory"):
         check_sequence(tmp_path / "s")

@@ -12,6 +12,12 @@ import numpy as np
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.geometry import Float64
+from ms_slam_env.input_files import is_named
+from ms_slam_env.sequences.recording.image_folders import (
+    FRAME_RATE_HZ,
+    find_color,
+    folder_entries,
+)
 from ms_slam_env.sequences.recording.listings import (
     Calibration,
     Listed,
@@ -25,10 +31,7 @@ from ms_slam_env.sequences.recording.listings import (
 )
 from ms_slam_env.sequences.recording.recording import Entry, Recording, Registration
 from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S, associate, read_trajectory
-from ms_slam_env.sequences.writing import UNFINISHED
-
-FRAME_RATE_HZ = 30.0  # where a layout has no times
-IMAGES = (".png", ".pgm", ".jpg", ".jpeg", ".ppm", ".tif", ".tiff")
+from ms_slam_env.sequences.writing import DESCRIPTION, UNFINISHED
 
 # Published calibrations of the colour cameras, to which depth is registered, 640x480: TUM RGB-D
 # benchmark, "Intrinsic camera calibration of the Kinect"; ICL-NUIM page; 7-Scenes page (default).
@@ -49,7 +52,7 @@ def _calibration_of(
     """The user's, the folder's, or the published calibration of the dataset, in that order."""
     if given is not None:
         return given
-    if (folder / "intrinsics.txt").is_file():
+    if is_named(folder / "intrinsics.txt"):
         return read_intrinsics(folder / "intrinsics.txt")
     if known is not None:
         return calibration(*known, 640, 480)
@@ -62,10 +65,11 @@ def _calibration_of(
 def _pairs(folder: Path) -> list[Entry]:
     """Frames from ``associations.txt``, or from ``depth.txt`` and ``rgb.txt`` by their times."""
     for name in ("associations.txt", "association.txt"):
-        if (folder / name).is_file():
+        if is_named(folder / name):
             return _associations(folder / name)
     depth = listed_images(folder / "depth.txt")
-    if not (folder / "rgb.txt").is_file():
+    if not is_named(folder / "rgb.txt"):
+        _expect_no_color(folder)
         return [Entry(image.timestamp, image.path, None, image.where) for image in depth]
     color = listed_images(folder / "rgb.txt")
     pairs = list(zip(*associate(_times(depth), _times(color), MAX_DIFFERENCE_S), strict=True))
@@ -74,6 +78,20 @@ def _pairs(folder: Path) -> list[Entry]:
     return [
         Entry(depth[d].timestamp, depth[d].path, color[c].path, depth[d].where) for d, c in pairs
     ]
+
+
+def _expect_no_color(folder: Path) -> None:
+    """Refuse a folder without ``rgb.txt`` where there is colour, or should be."""
+    color = find_color(folder)
+    if color is not None:
+        raise InputError(f"{folder / 'rgb.txt'} is missing, which lists the images of {color.name}")
+    _expect_all_files(folder, "rgb.txt")
+
+
+def _expect_all_files(folder: Path, name: str) -> None:
+    """Refuse a generated sequence that has lost a file."""
+    if is_named(folder / DESCRIPTION):
+        raise InputError(f"{folder / name} is missing; every generated sequence has one")
 
 
 def _times(images: list[Listed]) -> Float64:
@@ -98,9 +116,10 @@ def _associations(path: Path) -> list[Entry]:
 def _trajectory(folder: Path, flipped: bool) -> tuple[Float64, Float64] | tuple[None, None]:
     found = [folder / "groundtruth.txt", *sorted(folder.glob("*.gt.freiburg"))]
     for path in found:
-        if path.is_file():
+        if is_named(path):
             times, poses = read_trajectory(path)
             return times, flip_y(poses) if flipped else poses
+    _expect_all_files(folder, "groundtruth.txt")
     return None, None
 
 
@@ -127,20 +146,21 @@ def _recording(folder: Path, layout: str, entries: list[Entry], camera: Calibrat
 
 
 def open_seven_scenes(folder: Path, intrinsics: Calibration | None) -> Recording:
-    """7-Scenes: ``frame-NNNNNN.color.png``, ``.depth.png`` in millimetres, ``.pose.txt``.
+    """7-Scenes: ``frame-NNNNNN.color.png`` (or JPEG), ``.depth.png`` in millimetres, ``.pose.txt``.
 
     Colour and depth are the raw images of two cameras, so colour is registered by default, with
     the numbers of ``Registration``.
     """
     camera = _calibration_of(folder, intrinsics, SEVEN_SCENES_CAMERA)
     entries, poses = [], []
-    has_color = any(folder.glob("frame-*.color.png"))
+    colors = {path.name.partition(".")[0]: path for path in sorted(folder.glob("frame-*.color.*"))}
     for depth in sorted(folder.glob("frame-*.depth.png")):
         stem = depth.name.removesuffix(".depth.png")
-        color, pose = folder / f"{stem}.color.png", folder / f"{stem}.pose.txt"
+        pose = folder / f"{stem}.pose.txt"
+        color = colors.get(stem, folder / f"{stem}.color.png") if colors else None
         time = number(stem.removeprefix("frame-"), str(depth)) / FRAME_RATE_HZ
-        entries.append(Entry(time, depth, color if has_color else None, str(depth)))
-        if pose.is_file():
+        entries.append(Entry(time, depth, color, str(depth)))
+        if is_named(pose):
             poses.append((time, read_matrix(pose)))
     return Recording(
         name=folder.name,
@@ -157,28 +177,10 @@ def open_seven_scenes(folder: Path, intrinsics: Calibration | None) -> Recording
 
 
 def open_folder(folder: Path, intrinsics: Calibration | None) -> Recording:
-    """Folders ``depth`` and, if there is colour, ``rgb`` or ``color``; files paired by order."""
+    """Folders ``depth`` and, if there is colour, ``rgb``, ``color`` or the like."""
     camera = _calibration_of(folder, intrinsics, None)
-    depth = _images(folder / "depth")
-    color_folder = next((folder / n for n in ("rgb", "color") if (folder / n).is_dir()), None)
-    color: list[Path | None] = [None] * len(depth)
-    if color_folder is not None:
-        color = list(_images(color_folder))
-        if len(color) != len(depth):
-            raise InputError(f"{folder}: {len(depth)} depth images but {len(color)} colour images")
-    pairs = enumerate(zip(depth, color, strict=True))
-    entries = [Entry(index / FRAME_RATE_HZ, d, c, str(d)) for index, (d, c) in pairs]
-    return _recording(folder, "folder", entries, camera)
-
-
-def _images(folder: Path) -> list[Path]:
-    """Images of a folder in the order of the numbers in their names."""
-    if not folder.is_dir():
-        raise InputError(f"{folder} is not a folder of images")
-    found = [path for path in folder.iterdir() if path.suffix.lower() in IMAGES]
-    if not found:
-        raise InputError(f"{folder} holds no image; valid kinds: {', '.join(IMAGES)}")
-    return sorted(found, key=lambda path: [int(n) for n in re.findall(r"\d+", path.stem)])
+    times, _ = _trajectory(folder, camera.flipped)
+    return _recording(folder, "folder", folder_entries(folder, times), camera)
 
 
 LAYOUTS: dict[str, Callable[[Path, Calibration | None], Recording]] = {
@@ -194,8 +196,10 @@ def _recognise(folder: Path) -> str:
     """The layout of a folder, by the files in it."""
     if any(folder.glob("*.gt.freiburg")):
         return "icl-nuim"
-    if any((folder / n).is_file() for n in ("depth.txt", "associations.txt", "association.txt")):
+    if any(is_named(folder / n) for n in ("depth.txt", "associations.txt", "association.txt")):
         return "tum"
+    if is_named(folder / "rgb.txt"):
+        raise InputError(f"{folder / 'depth.txt'} is missing, though there is an rgb.txt")
     if any(folder.glob("frame-*.depth.png")):
         return "7-scenes"
     if (folder / "depth").is_dir():

@@ -12,6 +12,7 @@ import numpy as np
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import Float64, check_pose
+from ms_slam_env.input_files import read_text
 
 _ROUNDED = 1e-2  # as for the length of a quaternion
 
@@ -31,10 +32,7 @@ def rows(path: Path) -> Iterator[tuple[str, list[str]]]:
     Raises:
         InputError: the file cannot be read.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read {path}: {error}") from None
+    text = read_text(path, "listing")
     for number, line in enumerate(text.splitlines(), start=1):
         words = line.split("#")[0].replace(",", " ").split()
         if words:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import struct
-import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,28 +11,16 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame, parse_image_size
 from ms_slam_env.camera.frame import reduce_color, reduce_depth
+from ms_slam_env.camera.image_files import read_color, read_depth
 from ms_slam_env.camera.image_size import Crop
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import Float64
 from ms_slam_env.sequences.sequence import Frames, Sequence
 from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S, associate
-
-# What Pillow raises for files that are missing, truncated or damaged, format by format.
-_BROKEN_IMAGE = (
-    OSError,
-    SyntaxError,
-    ValueError,
-    EOFError,
-    IndexError,
-    struct.error,
-    zlib.error,
-    Image.DecompressionBombError,
-)
 
 
 @dataclass(frozen=True)
@@ -223,13 +210,13 @@ class Recording(Frames):
                 names it and the line that lists it.
         """
         entry = self.entries[index]
-        raw = self._read(entry.depth, entry, "a 16-bit depth image", ("I;16", "I;16B", "I", "L"))
+        raw = _named(entry, read_depth, entry.depth, self.source)
         depth: NDArray[Any] = raw.astype(np.float32) / np.float32(self.depth_scale)
         if self.no_reading is not None:
             depth[raw == self.no_reading] = 0
         color: NDArray[Any] = np.zeros((*self.source.shape, 3), dtype=np.uint8)
         if entry.color is not None:
-            color = self._read(entry.color, entry, "a colour image", ("RGB", "RGBA", "L", "P"))
+            color = _named(entry, read_color, entry.color, self.source)
         crop = self.crop or Crop(0, 0, self.source.width, self.source.height)
         rows = slice(crop.top, crop.top + crop.height)
         columns = slice(crop.left, crop.left + crop.width)
@@ -243,20 +230,15 @@ class Recording(Frames):
             color = self.registration.register(color, depth, self.intrinsics, factor)
         return RGBDFrame(np.ascontiguousarray(color), np.ascontiguousarray(depth), entry.timestamp)
 
-    def _read(self, path: Path, entry: Entry, kind: str, modes: tuple[str, ...]) -> NDArray[Any]:
-        try:
-            with Image.open(path) as image:
-                image.load()
-                if image.mode not in modes:
-                    raise InputError(f"{entry.where}: {path} is not {kind}, mode {image.mode}")
-                pixels = np.asarray(image.convert("RGB") if modes[0] == "RGB" else image)
-        except InputError:
-            raise
-        except _BROKEN_IMAGE as error:
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise InputError(f"{entry.where}: cannot read {path}: {reason}") from None
-        self.source.check_image(pixels, f"{entry.where}: {path}")
-        return pixels
+
+def _named(
+    entry: Entry, read: Callable[[Path, Intrinsics], NDArray[Any]], path: Path, K: Intrinsics
+) -> NDArray[Any]:
+    """What ``read`` makes of a file; errors name the line that lists it."""
+    try:
+        return read(path, K)
+    except InputError as error:
+        raise InputError(f"{entry.where}: {error}") from None
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,87 @@
+"""Image files: of the documented formats and of the size they should have, checked before."""
+
+from __future__ import annotations
+
+import io
+import struct
+import warnings
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from ms_slam_env.camera.intrinsics import Intrinsics
+from ms_slam_env.errors import InputError
+from ms_slam_env.input_files import MAX_IMAGE_BYTES, read_bytes
+
+SUFFIXES = (".png", ".pgm", ".jpg", ".jpeg", ".ppm", ".tif", ".tiff")
+"""Endings of the names of images."""
+
+_FORMATS = ("PNG", "JPEG", "PPM", "TIFF")
+
+_DEPTH = ("I;16", "I;16B", "I;16L", "I")
+_COLOR = ("RGB", "RGBA", "L", "P")
+
+# What Pillow raises for files that are truncated or damaged, format by format.
+_BROKEN = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    EOFError,
+    IndexError,
+    KeyError,
+    TypeError,
+    OverflowError,
+    MemoryError,
+    struct.error,
+    zlib.error,
+    Image.DecompressionBombError,
+)
+
+
+def read_color(path: Path, intrinsics: Intrinsics) -> NDArray[np.uint8]:
+    """Colour image (H, W, 3) in RGB; grey ones and those with a palette are converted.
+
+    Raises:
+        InputError: no such file, no image of a documented format, one that is damaged, or one that
+            has another size than ``intrinsics`` say.
+    """
+    return _read(path, "colour image", _COLOR, intrinsics).astype(np.uint8, copy=False)
+
+
+def read_depth(path: Path, intrinsics: Intrinsics) -> NDArray[Any]:
+    """Values (H, W) of a depth image with 16 bits or more.
+
+    Raises:
+        InputError: as `read_color`; 8 bits, which would be depth in steps of centimetres.
+    """
+    return _read(path, "16-bit depth image", _DEPTH, intrinsics)
+
+
+def _read(path: Path, kind: str, modes: tuple[str, ...], intrinsics: Intrinsics) -> NDArray[Any]:
+    data = io.BytesIO(read_bytes(path, kind, MAX_IMAGE_BYTES))
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what is wrong with the file is said below
+            with Image.open(data, formats=_FORMATS) as image:
+                _check_size(path, image.size, intrinsics)
+                if image.mode not in modes:
+                    raise InputError(f"{path} is not a {kind}: its pixels are {image.mode}")
+                image.load()
+                return np.array(image.convert("RGB") if modes is _COLOR else image)
+    except InputError:
+        raise
+    except _BROKEN as error:
+        said = " ".join(str(error).replace(repr(data), "it").split()) or type(error).__name__
+        raise InputError(f"cannot read {path}: {said}") from None
+
+
+def _check_size(path: Path, size: tuple[int, int], intrinsics: Intrinsics) -> None:
+    if size != (intrinsics.width, intrinsics.height):
+        raise InputError(
+            f"{path} is {size[0]}x{size[1]} but the intrinsics say "
+            f"{intrinsics.width}x{intrinsics.height}"
+        )

@@ -1,0 +1,174 @@
+"""Frames of the plain layout: a folder of depth images and, if there is colour, one of these."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from ms_slam_env.camera.image_files import SUFFIXES
+from ms_slam_env.errors import InputError, InputWarning
+from ms_slam_env.geometry import Float64
+from ms_slam_env.input_files import is_named
+from ms_slam_env.sequences.recording.listings import number, rows
+from ms_slam_env.sequences.recording.recording import Entry
+from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S
+
+FRAME_RATE_HZ = 30.0
+"""Where a layout has no times."""
+
+COLOR_FOLDERS = ("rgb", "color", "colour", "image", "images", "img")
+TIMES_FILES = ("times.txt", "timestamps.txt")
+_NO_COLOR = {"depth", "depth_true", "labels", "mask", "masks", "normals", "objects"}
+
+# Whole numbers this large are times since 1970, in fractions of a second.
+_UNITS = ((1e18, 1e-9), (1e15, 1e-6), (1e12, 1e-3))
+
+
+def folder_entries(folder: Path, truth_times: Float64 | None) -> list[Entry]:
+    """Frames of ``depth`` and of one of `COLOR_FOLDERS`, in the order of the numbers in the names.
+
+    Their times are those of ``times.txt`` (a time a line, seconds), else those of the truth if it
+    has one pose a frame, else what the names say: seconds with a fraction, time since 1970 in
+    milli-, micro- or nanoseconds, or the number of the frame at 30 Hz.
+
+    Args:
+        folder: of the recording.
+        truth_times: (M,) seconds, of the true trajectory in the folder.
+
+    Raises:
+        InputError: no images; not as many of colour as of depth, or of other numbers; times that
+            do not fit.
+    """
+    depth = images(folder / "depth")
+    color_folder = find_color(folder)
+    color: list[Path | None] = [None] * len(depth)
+    if color_folder is not None:
+        color = list(_paired(folder, depth, images(color_folder)))
+    times = _times(folder, depth, truth_times)
+    pairs = zip(times.tolist(), depth, color, strict=True)
+    return [Entry(time, d, c, str(d)) for time, d, c in pairs]
+
+
+def images(folder: Path) -> list[Path]:
+    """Images of a folder in the order of the numbers in their names.
+
+    Raises:
+        InputError: no folder, or no image in it.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder of images")
+    found = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
+    if not found:
+        raise InputError(f"{folder} holds no image; valid kinds: {', '.join(SUFFIXES)}")
+    return sorted(found, key=lambda path: [int(n) for n in re.findall(r"\d{1,30}", path.stem)])
+
+
+def find_color(folder: Path) -> Path | None:
+    """The folder of colour images, of any of the usual names; None without colour.
+
+    Another folder with images is warned of, since it may hold the colour.
+
+    Raises:
+        InputError: two of them.
+    """
+    inside = sorted(path for path in folder.iterdir() if path.is_dir())
+    found = [path for path in inside if path.name.lower() in COLOR_FOLDERS]
+    if len(found) > 1:
+        raise InputError(f"{folder} holds colour in both {found[0].name} and {found[1].name}")
+    others = [path for path in inside if path.name.lower() not in _NO_COLOR and _has_image(path)]
+    if not found and others:
+        _warn(
+            f"{folder}: {others[0].name} holds images that are not read; colour is taken from a "
+            f"folder {', '.join(COLOR_FOLDERS)}"
+        )
+    return found[0] if found else None
+
+
+def _has_image(folder: Path) -> bool:
+    return any(path.suffix.lower() in SUFFIXES for path in folder.iterdir())
+
+
+def _warn(text: str) -> None:
+    warnings.warn(text, InputWarning, stacklevel=2)
+
+
+def _paired(folder: Path, depth: list[Path], color: list[Path]) -> list[Path]:
+    """The colour image of each depth image: the one of its number, or all of a constant offset."""
+    if len(color) != len(depth):
+        raise InputError(f"{folder}: {len(depth)} depth images but {len(color)} colour images")
+    ours, theirs = _numbers(depth), _numbers(color)
+    if ours is None or theirs is None:
+        return color
+    offset = theirs - ours
+    apart = np.flatnonzero(np.abs(offset - np.median(offset)) > MAX_DIFFERENCE_S * FRAME_RATE_HZ)
+    if len(apart):
+        d, c = depth[apart[0]], color[apart[0]]
+        raise InputError(
+            f"{folder}: {d.parent.name}/{d.name} and {c.parent.name}/{c.name} do not belong "
+            "together; an image of depth or colour is missing"
+        )
+    return color
+
+
+def _numbers(paths: list[Path]) -> Float64 | None:
+    """Frame numbers (N,) at 30 Hz that names say, increasing; None where they say none."""
+    stems = [path.stem for path in paths]
+    are_seconds = all(re.fullmatch(r"\d{1,12}\.\d{1,12}", stem) for stem in stems)
+    seconds = np.array([float(stem) for stem in stems]) if are_seconds else None
+    found = _whole_numbers(stems) if seconds is None else FRAME_RATE_HZ * seconds
+    is_order = found is not None and bool((np.diff(found) > 0).all())
+    return found if is_order else None
+
+
+def _whole_numbers(stems: list[str]) -> Float64 | None:
+    """Of names with one number that changes, such as ``cam0_00012_depth``, that number."""
+    words = [re.findall(r"\d{1,20}", stem) for stem in stems]
+    if len({len(word) for word in words}) != 1:
+        return None
+    columns = list(zip(*words, strict=True))
+    columns = [column for column in columns if len(set(column)) > 1] or columns[-1:]
+    if len(columns) != 1:
+        return None
+    values = np.array([int(word) for word in columns[0]], dtype=np.float64)
+    unit = next((unit for least, unit in _UNITS if values[0] >= least), None)
+    return values if unit is None else FRAME_RATE_HZ * unit * values
+
+
+def _times(folder: Path, depth: list[Path], truth_times: Float64 | None) -> Float64:
+    """Seconds (N,) of the frames."""
+    for name in TIMES_FILES:
+        if is_named(folder / name):
+            return _listed_times(folder / name, len(depth))
+    said = _numbers(depth)
+    numbers = np.arange(len(depth), dtype=np.float64) if said is None else said
+    if said is None:
+        _warn(f"{folder}: the names of depth images say no times; 30 frames a second are assumed")
+    taken = ""
+    if truth_times is not None and len(truth_times) == len(depth):
+        taken = "; the true trajectory has one pose a frame, whose times are taken"
+    _warn_of_gaps(folder, depth, numbers, taken)
+    return truth_times if truth_times is not None and taken else numbers / FRAME_RATE_HZ
+
+
+def _listed_times(path: Path, count: int) -> Float64:
+    lines = list(rows(path))
+    if len(lines) != count:
+        raise InputError(f"{path}: {len(lines)} times for {count} depth images")
+    return np.array([number(words[0], where) for where, words in lines])
+
+
+def _warn_of_gaps(folder: Path, depth: list[Path], numbers: Float64, taken: str) -> None:
+    if len(numbers) < 3:
+        return
+    steps = np.diff(numbers)
+    usual = float(np.percentile(steps, 50, method="lower"))
+    gaps = np.flatnonzero(steps > 1.5 * usual)
+    if len(gaps):
+        missing = int(np.sum(np.rint(steps[gaps] / usual) - 1))
+        _warn(
+            f"{folder}: the names leave out {missing} frames in {len(gaps)} gaps, the first after "
+            f"{depth[gaps[0]].name}{taken}"
+        )
