@@ -10,10 +10,11 @@ from ms_slam_env.geometry.pose import (
     relative_angle,
     transform_points,
 )
-from ms_slam_env.geometry.so3 import Float64, hat, se3_exp, se3_log, so3_exp, so3_log
+from ms_slam_env.geometry.so3 import Float64, adjoint, hat, se3_exp, se3_log, so3_exp, so3_log
 
 __all__ = [
     "Float64",
+    "adjoint",
     "check_pose",
     "hat",
     "invert",

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.state import Stateful
+from ms_slam_env.slam.submaps import Submaps, one_submap
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -36,6 +37,11 @@ class TrackResult:
             the twist xi = (rho, phi) in metres and radians, in the camera's frame, with the true
             pose T_world_camera exp(xi). None where no pose was estimated, or by a backend that
             does not know it.
+        submap: number of the submap that the frame is part of, the oldest it is joined to; the pose
+            in one that is not joined to the first is as good as the guess at which it started, and
+            ``covariance`` says so.
+        submaps_joined: whether this frame joined two submaps: the newer was moved onto the older.
+            If that was the present one the pose jumped by what its start had been wrong.
         processed: False where frame management dropped the frame: SLAM has not seen it, the pose
             is predicted and ``tracking_ok`` is what it was.
     """
@@ -56,6 +62,8 @@ class TrackResult:
 
     loop_closed: bool = False
     processed: bool = True
+    submap: int = 0
+    submaps_joined: bool = False
 
 
 @dataclass(frozen=True)
@@ -111,11 +119,17 @@ class SlamBackend(Stateful):
 
     @abstractmethod
     def predict(self, poses: ArrayLike, scale: float = 1.0) -> Views:
-        """Render the map from ``poses`` (N, 4, 4) T_world_camera at ``scale`` times the size."""
+        """Render the map from ``poses`` (N, 4, 4) T_world_camera at ``scale`` times the size.
+
+        Of several submaps the present one, with all that is joined to it.
+        """
 
     @abstractmethod
     def surface_points(self) -> Float64:
-        """Points (M, 3) of the estimated surface in the world frame, metres."""
+        """Points (M, 3) of the estimated surface in the world frame, metres.
+
+        Those of all submaps; of unjoined ones where they lie by the best guess.
+        """
 
     @abstractmethod
     def surface_colors(self) -> NDArray[np.uint8]:
@@ -132,16 +146,21 @@ class SlamBackend(Stateful):
         """What is known of each of ``surface_points``, by name, in the same order.
 
         ``color`` (M, 3) uint8 RGB; where the backend has them ``normal`` (M, 3), ``radius`` (M,)
-        metres, ``confidence`` (M,).
+        metres, ``confidence`` (M,), and ``submap`` (M,) int32 where there are several.
         """
         return {"color": self.surface_colors()}
 
     def corrected_trajectory(self) -> tuple[NDArray[np.int32], Float64]:
         """Frames (N,), counted since ``reset``, and their poses (N, 4, 4) as the map has them now.
 
-        Closed loops have moved them since ``track`` returned them. Empty where no loops are closed.
+        Closed loops and joined submaps have moved them since ``track`` returned them. Empty where
+        there are neither.
         """
         return np.zeros(0, dtype=np.int32), np.zeros((0, 4, 4))
+
+    def submaps(self) -> Submaps:
+        """The submaps, as they hang together now; one where a backend starts no others."""
+        return one_submap()
 
 
 def check_views(poses: ArrayLike, scale: float) -> Float64:

@@ -20,6 +20,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, make_pose, transform_points
 from ms_slam_env.geometry.point_clouds import umeyama
 from ms_slam_env.slam.base import SlamBackend
+from ms_slam_env.slam.map_fit import query_frames
 from ms_slam_env.slam.sparse.features import InverseDepth
 
 Float64 = NDArray[np.float64]
@@ -107,15 +108,6 @@ def hypotheses_from_relocalisation(
                 break
         a.backend.set_state(state)
     return found
-
-
-def query_frames(robot: RobotRun, count: int) -> list[int]:
-    """Indices of at most ``count`` tracked frames, evenly spread over the path."""
-    tracked = np.flatnonzero(robot.tracked)
-    if len(tracked) == 0:
-        return []
-    picked = np.linspace(0, len(tracked) - 1, min(count, len(tracked))).round().astype(int)
-    return tracked[picked].tolist()
 
 
 @dataclass(frozen=True)

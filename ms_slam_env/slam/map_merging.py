@@ -9,36 +9,33 @@ the images of either robot look like the view that the other's map predicts.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.config import Checked, bounded
+from ms_slam_env.config import bounded
 from ms_slam_env.errors import unknown
 from ms_slam_env.geometry import invert, relative_angle, se3_exp, se3_log, transform_points
 from ms_slam_env.geometry.cloud_registration import register_clouds
 from ms_slam_env.geometry.point_clouds import voxel_downsample
-from ms_slam_env.slam.alignment_check import measure_photometric_consistency
+from ms_slam_env.slam.map_fit import Fit, FitConfig, measure_fit, why_not_believed
 from ms_slam_env.slam.map_hypotheses import (
     SOURCES,
     Hypothesis,
     RobotRun,
     hypotheses_from_features,
     hypotheses_from_relocalisation,
-    query_frames,
 )
 
 Float64 = NDArray[np.float64]
 
 _SLACK = 0.01  # by which registration may worsen a share of pixels
-_LOOKS_AT = 0.2  # share of a frame that the other map must show for the frame to be compared
-_FAR_M = 10.0
 
 
 @dataclass(frozen=True)
-class MergeConfig(Checked):
-    """When two maps are taken to show the same place.
+class MergeConfig(FitConfig):
+    """When two robots' maps are taken to show the same place.
 
     Attributes:
         sources: of the guesses.
@@ -49,11 +46,6 @@ class MergeConfig(Checked):
         agree_deg: and whose rotations differ by less than this.
         least_agreeing: so many guesses must agree,
         least_share: and be this share of all.
-        tolerance_m: depth differs from the other map where it differs by more than this.
-        least_overlap: share of the pixels with a reading that must fit the other map.
-        least_consistent: share of those that fit among those that fit or contradict.
-        least_alike: correlation of the images' fine structure with the other map's view, the
-            median over the frames that look at it.
         voxel_m: thinning of the maps before they are registered.
         cutoff_m: farthest pair of points in the registration.
     """
@@ -66,10 +58,6 @@ class MergeConfig(Checked):
     agree_deg: float = bounded(5.0, 1e-2, 180.0)
     least_agreeing: int = bounded(3, 1, 10_000)
     least_share: float = bounded(0.6, 0.0, 1.0)
-    tolerance_m: float = bounded(0.05, 1e-4, 1.0)
-    least_overlap: float = bounded(0.05, 0.0, 1.0)
-    least_consistent: float = bounded(0.85, 0.0, 1.0)
-    least_alike: float = bounded(0.5, -1.0, 1.0)
     voxel_m: float = bounded(0.02, 1e-3, 1.0)
     cutoff_m: float = bounded(0.10, 1e-3, 10.0)
 
@@ -81,16 +69,6 @@ class MergeConfig(Checked):
 
 
 @dataclass(frozen=True)
-class Fit:
-    """How what either robot saw fits the map of the other."""
-
-    overlap: float = float("nan")  # share of the pixels with a reading that fit
-    consistent: float = float("nan")  # share of those among the pixels that fit or contradict
-    # correlation with the other map's view, median over the frames that look at it.
-    alike: float = float("nan")
-
-
-@dataclass(frozen=True)
 class Merge:
     """What came of an attempt."""
 
@@ -99,7 +77,7 @@ class Merge:
     reason: str  # why not; empty if they were
     found: int = 0  # number of guesses
     agreeing: int = 0  # largest number of them that agree
-    fit: Fit = Fit()  # of the maps; NaN if no pose was judged
+    fit: Fit = field(default_factory=Fit)  # of the maps; NaN if no pose was judged
     # by how much registration moved b's cameras, metres; 0 if it was not accepted.
     refined_m: float = 0.0
 
@@ -145,47 +123,10 @@ def decide(
         again = measure_fit(a, b, refined, config)
         if again.overlap >= fit.overlap - _SLACK and again.consistent >= fit.consistent - _SLACK:
             T_a_b, fit, refined_m = refined, again, moved_m
-    if fit.overlap < config.least_overlap:
-        return Merge(None, "the maps hardly overlap there", *counts, fit)
-    if fit.consistent < config.least_consistent:
-        return Merge(None, "the surfaces contradict each other there", *counts, fit)
-    if not fit.alike >= config.least_alike:
-        return Merge(None, "the images do not look alike there", *counts, fit)
+    reason = why_not_believed(fit, config)
+    if reason:
+        return Merge(None, reason, *counts, fit)
     return Merge(T_a_b, "", *counts, fit, refined_m)
-
-
-def measure_fit(a: RobotRun, b: RobotRun, T_a_b: Float64, config: MergeConfig) -> Fit:
-    """Lay both robots' frames upon the view that the other's map predicts there.
-
-    A surface of the map behind the reading may be one that only the map's robot saw, and says
-    nothing. One in front of the reading contradicts it: the ray went through it. Frames that do not
-    look at the other map at all say nothing either.
-    """
-    fits, contradictions, readings = 0, 0, 0
-    alike: list[float] = []
-    for here, there, T_here_there in ((a, b, T_a_b), (b, a, invert(T_a_b))):
-        indices = query_frames(there, config.queries)
-        views = here.backend.predict(T_here_there @ there.estimates[indices])
-        for grey, depth, index in zip(views.intensity, views.depth, indices, strict=True):
-            frame = there.frames[index]
-            valid = frame.depth > 0
-            both = valid & (depth > 0)
-            difference = depth - frame.depth
-            here_fits = both & (np.abs(difference) <= config.tolerance_m)
-            fits += int(here_fits.sum())
-            contradictions += int((both & (difference < -config.tolerance_m)).sum())
-            readings += int(valid.sum())
-            if here_fits.sum() >= _LOOKS_AT * max(1, valid.sum()):
-                same = np.where(here_fits, depth, np.float32(0))
-                found = measure_photometric_consistency(
-                    frame.color, frame.depth, grey, same, _FAR_M
-                )
-                alike.append(found.correlation)
-    return Fit(
-        overlap=fits / readings if readings else 0.0,
-        consistent=fits / (fits + contradictions) if fits else 0.0,
-        alike=float(np.median(alike)) if alike else float("nan"),
-    )
 
 
 def refine(a: RobotRun, b: RobotRun, T_a_b: Float64, config: MergeConfig) -> Float64:

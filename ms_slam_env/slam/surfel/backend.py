@@ -12,8 +12,11 @@ from ms_slam_env.camera.frame import reduce_color, reduce_depth
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose
 from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult, Views, check_views
+from ms_slam_env.slam.submaps import Submaps
 from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.relocalization import Images
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
+from ms_slam_env.slam.surfel.submaps import make_submaps
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 
 
@@ -26,6 +29,7 @@ class SurfelSlam(SlamBackend):
         self.intrinsics = intrinsics
         self.device = device
         self._slam = BatchedSurfelSlam(1, intrinsics, config or SurfelConfig(), device)
+        self._submaps = make_submaps(self._slam)
 
     @property
     def config(self) -> SurfelConfig:
@@ -65,17 +69,19 @@ class SurfelSlam(SlamBackend):
 
     @property
     def map(self) -> SurfelMap:
-        """The surfels."""
+        """The surfels of the present submap, with all that is joined to it."""
         return self._slam.map
 
     def reset(self, T_world_camera: ArrayLike | None = None) -> None:
         """Forget everything; the next frame is taken at ``T_world_camera`` (identity if None)."""
         self._slam.reset(T_world_camera)
+        self._submaps.reset()
 
     def track(self, frame: RGBDFrame, T_world_camera_guess: ArrayLike | None = None) -> TrackResult:
         """Estimate the pose of ``frame`` and fuse it into the map; see ``SlamBackend``."""
         color, depth = self._images(frame)
-        return self._slam.track(color, depth, [T_world_camera_guess])[0]
+        result = self._slam.track(color, depth, [T_world_camera_guess])[0]
+        return self._submaps.follow(Images(color, depth), T_world_camera_guess, result)
 
     def fuse(self, frame: RGBDFrame, T_world_camera: ArrayLike) -> TrackResult:
         """Fuse ``frame`` into the map at a known pose (4, 4), without tracking."""
@@ -99,28 +105,45 @@ class SurfelSlam(SlamBackend):
         """All living surfels (M, 3): the stable ones and the young ones seen of late.
 
         Episodes are too short for most surfels to become stable, and the map itself removes
-        those that stay unconfirmed.
+        those that stay unconfirmed. First those of the present submap, then those of the submaps
+        that it is not joined to, where they lie by the best guess.
         """
-        return self.map.points(stable=False)
+        return self._living("position").astype(np.float64)
 
     def surface_colors(self) -> NDArray[np.uint8]:
         """Colours (M, 3) RGB of ``surface_points``."""
-        return self.map.colors(stable=False)
+        return np.clip(np.rint(self._living("color")), 0, 255).astype(np.uint8)
 
     def map_attributes(self) -> dict[str, NDArray[Any]]:
-        """Colour, normal, radius and confidence of ``surface_points``."""
-        names = ("normal", "radius", "confidence")
-        living = {name: self.map.attribute(name, stable=False) for name in names}
-        return {"color": self.surface_colors(), **living}
+        """Colour, normal, radius, confidence and submap of ``surface_points``."""
+        living = {name: self._living(name) for name in ("normal", "radius", "confidence")}
+        attributes: dict[str, NDArray[Any]] = {"color": self.surface_colors(), **living}
+        detached = self._submaps.detached()
+        if detached:
+            labels = [self._submaps.present, *(each.label for each in detached)]
+            counts = [self.map.count(), *(int(each.living.sum()) for each in detached)]
+            attributes["submap"] = np.repeat(np.array(labels, dtype=np.int32), counts)
+        return attributes
+
+    def _living(self, name: str) -> NDArray[np.float32]:
+        """Array ``name`` of the living surfels of all submaps."""
+        present = self.map.attribute(name, stable=False)
+        others = [each.surfels[name][each.living] for each in self._submaps.detached()]
+        return np.concatenate([present, *others]) if others else present
 
     def corrected_trajectory(self) -> tuple[NDArray[np.int32], Float64]:
-        """Fused frames (N,) and their poses (N, 4, 4) as the map has them now; see the base."""
-        return self._slam.loops.trajectory(0)
+        """Fused frames (N,) and their poses (N, 4, 4) as the maps have them now; see the base."""
+        return self._submaps.trajectory()
+
+    def submaps(self) -> Submaps:
+        """The submaps, as they hang together now."""
+        return self._submaps.summary()
 
     def get_state(self) -> dict[str, Any]:
         """Everything needed to go on bit-exactly, as NumPy arrays."""
-        return self._slam.get_state()
+        return self._slam.get_state() | {"submaps": self._submaps.get_state()}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state that ``get_state`` returned."""
         self._slam.set_state(state)
+        self._submaps.set_state(state["submaps"])

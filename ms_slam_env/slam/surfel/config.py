@@ -95,8 +95,41 @@ class AcceptanceConfig(Checked):
     sigma: float = bounded(0.04, 1e-6, 10.0)
 
 
+@dataclass(frozen=True)
+class SubmapConfig(Checked):
+    """When a submap starts, how older ones are looked for, and when two are joined.
+
+    Attributes:
+        after: frames in a row that show something and are refused before a submap starts.
+        fewest_keyframes: a map with fewer is forgotten when it is lost.
+        interval: frames between two looks for an older submap.
+        dissimilarity: of a frame and a keyframe that may show the same place, share of the ferns.
+        looks: that must agree on how two submaps lie,
+        step_m: from places this far apart,
+        step_deg: or this far turned, unless ``interval`` frames lie between.
+        agreement_m: they agree if they put the camera no further apart,
+        agreement_deg: and turn it no further.
+        guess_sigma_m: standard deviation of each coordinate of a guessed pose at which a submap
+            starts, given by the caller; without one, by every frame that was lost,
+        guess_sigma_deg: and of its rotation about each axis.
+    """
+
+    after: int = bounded(5, 1, 1_000_000)
+    fewest_keyframes: int = bounded(1, 1, 10_000)
+    interval: int = bounded(5, 1, 10_000)
+    dissimilarity: float = bounded(0.5, 0.0, 1.0)
+    looks: int = bounded(3, 1, 100)
+    step_m: float = bounded(0.05, 0.0, 10.0)
+    step_deg: float = bounded(5.0, 0.0, 180.0)
+    agreement_m: float = bounded(0.03, 0.0, 1.0)
+    agreement_deg: float = bounded(1.5, 0.0, 180.0)
+    guess_sigma_m: float = bounded(0.03, 0.0, 10.0)
+    guess_sigma_deg: float = bounded(2.0, 0.0, 180.0)
+
+
 RELOCALISATIONS = ("ferns", "local")
 LOOP_CLOSURES = ("none", "deformation")
+SUBMAPS = ("atlas", "off")
 
 
 @dataclass(frozen=True)
@@ -145,6 +178,10 @@ class SurfelConfig(Checked):
         loops: parameters of the latter.
         relocalisation: where a lost frame is searched besides around the last good pose: "ferns",
             at keyframes that resemble it, or "local", nowhere.
+        submaps: "atlas": a camera that stays lost goes on in a new map, which is joined to the old
+            one where that is seen again; "off": it waits. Of several cameras in lockstep each
+            waits.
+        submap_rules: parameters of the former.
     """
 
     depth_cutoff_m: float = bounded(4.0, 0.0, 10.0)
@@ -176,6 +213,8 @@ class SurfelConfig(Checked):
     relocalisation: str = chosen("ferns", *RELOCALISATIONS)
     loop_closure: str = chosen("none", *LOOP_CLOSURES)
     loops: LoopConfig = field(default_factory=LoopConfig)
+    submaps: str = chosen("off", *SUBMAPS)
+    submap_rules: SubmapConfig = field(default_factory=SubmapConfig)
 
     def __post_init__(self) -> None:
         super().__post_init__()

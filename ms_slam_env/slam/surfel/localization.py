@@ -130,6 +130,10 @@ class Localizer:
             self._view_poses = poses.copy()
         return self._view
 
+    def set_frame(self, live: LiveFrame) -> None:
+        """Take the frames that ``align_from`` aligns next."""
+        self._tracker.set_frame(live)
+
     def align_from(
         self, origins: Float64, hypotheses: Float64, thresholds: NDArray[Any]
     ) -> Alignment:
@@ -197,7 +201,7 @@ class Localizer:
         poses = self._states.poses
         origins = np.where(failed[:, None, None], guesses, poses)
         hypotheses = np.tile(tracking_hypotheses(np.eye(4)), (len(poses), 1, 1, 1))
-        again = self.align_from(origins, hypotheses, self._strict_thresholds())
+        again = self.align_from(origins, hypotheses, self.strict_thresholds())
         return alignment.replace(failed & again.tracked, again.seen_from(poses))
 
     def _search_around(self, alignment: Alignment) -> Alignment:
@@ -210,7 +214,7 @@ class Localizer:
             hypotheses = np.stack(
                 [relocalization_hypotheses(attempt + RETRIES * int(lost)) for lost in states.lost]
             )
-            again = self.align_from(states.poses, hypotheses, self._strict_thresholds())
+            again = self.align_from(states.poses, hypotheses, self.strict_thresholds())
             alignment = alignment.replace(failed & again.tracked, again)
         return alignment
 
@@ -237,7 +241,8 @@ class Localizer:
         view = self.render(origins)
         return self._tracker.align(view, origins, hypotheses, thresholds, guesses, photometry)
 
-    def _strict_thresholds(self) -> NDArray[Any]:
+    def strict_thresholds(self) -> NDArray[Any]:
+        """Thresholds (B,) of alignments that a wide search leads to."""
         return acceptance_thresholds(self._config.acceptance, self._strict, self._states.lost)
 
     def _failed(self, alignment: Alignment) -> NDArray[np.bool_]:

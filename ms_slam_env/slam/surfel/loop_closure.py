@@ -93,6 +93,13 @@ class LoopClosure(Saved):
         """
         return np.zeros(0, dtype=np.int32), np.zeros((0, 4, 4))
 
+    def get_history(self, env: int) -> TrajectoryHistory:
+        """A copy of what is remembered of one env; empty where nothing is."""
+        return TrajectoryHistory()
+
+    def set_history(self, env: int, history: TrajectoryHistory) -> None:
+        """Remember this of one env."""
+
 
 SETTLED = 0.02, np.radians(2.0)  # largest motion of a repeated registration
 
@@ -274,6 +281,16 @@ class DeformationLoopClosure(LoopClosure):
     def trajectory(self, env: int) -> tuple[Int32, Float64]:
         """Tracked frames (N,) and their poses (N, 4, 4), moved by the closures since."""
         return self._histories[env].trajectory()
+
+    def get_history(self, env: int) -> TrajectoryHistory:
+        """A copy of what is remembered of one env."""
+        copied = TrajectoryHistory()
+        copied.set_state(self._histories[env].get_state())
+        return copied
+
+    def set_history(self, env: int, history: TrajectoryHistory) -> None:
+        """Remember this of one env."""
+        self._histories[env] = history
 
 
 def make_loop_closure(surfel_map: SurfelMap, config: SurfelConfig, device: str) -> LoopClosure:

@@ -14,7 +14,7 @@ from ms_slam_env.slam.alignment_check import (
     measure_photometric_consistency,
 )
 from ms_slam_env.slam.base import Float64
-from ms_slam_env.slam.ferns import Candidate, FernConfig, FernDatabase
+from ms_slam_env.slam.ferns import Candidate, FernConfig, FernDatabase, dissimilarities
 from ms_slam_env.slam.state import Saved
 from ms_slam_env.slam.surfel.acceptance import Alignment, acceptance_thresholds
 from ms_slam_env.slam.surfel.config import AcceptanceConfig, SurfelConfig
@@ -78,6 +78,13 @@ class Relocalization(Saved):
         """
         return None
 
+    def propose(self, frames: Images, lost: Bool, aligner: FrameAligner) -> Float64:
+        """Poses (B, 4, 4) at which the envs that are ``lost`` (B,) may be; NaN: none.
+
+        The map's view from there is like the frame; nothing has confirmed them yet.
+        """
+        return np.full((len(lost), 4, 4), np.nan)
+
     def similar(self, env: int, frames: Images, before: int) -> list[Candidate]:
         """The best few keyframes from before a time that resemble an env's frame, best first."""
         return []
@@ -90,6 +97,24 @@ class Relocalization(Saved):
 
     def clear(self, env: int) -> None:
         """Forget everything about one env."""
+
+    def keyframe_poses(self, env: int) -> Float64:
+        """Poses (K, 4, 4) of the keyframes of one env."""
+        return np.zeros((0, 4, 4))
+
+    def least_dissimilarity(self, env: int, frames: Images, keyframes: dict[str, Any]) -> float:
+        """Of an env's frame and the one of some keyframes that resembles it most, in [0, 1].
+
+        Infinity where there is none.
+        """
+        return np.inf
+
+    def get_keyframes(self, env: int) -> dict[str, Any]:
+        """The keyframes of one env, as arrays."""
+        return {}
+
+    def set_keyframes(self, env: int, keyframes: dict[str, Any]) -> None:
+        """Know these keyframes of one env, and nothing else."""
 
 
 TRIALS = 3  # keyframes tried a frame
@@ -186,9 +211,14 @@ class FernRelocalization(Relocalization):
         self._tentative[lost] = np.nan
         missing = lost & ~found
         if missing.any():
-            self._refine(frames, self._find(frames, missing, aligner), aligner)
-            self._attempts[missing] += 1
+            self._tentative[missing] = self.propose(frames, missing, aligner)[missing]
         return (found, alignment) if alignment is not None and found.any() else None
+
+    def propose(self, frames: Images, lost: Bool, aligner: FrameAligner) -> Float64:
+        """From other keyframes at every attempt; see the base class."""
+        poses = self._refine(frames, self._find(frames, lost, aligner), aligner)
+        self._attempts[lost] += 1
+        return poses
 
     def _find(self, frames: Images, lost: Bool, aligner: FrameAligner) -> Float64:
         """Poses (B, 4, 4) that the best alignments with keyframes' views lead to; NaN: none."""
@@ -205,18 +235,20 @@ class FernRelocalization(Relocalization):
             cost[better] = found.statistics["cost"][better]
         return best
 
-    def _refine(self, frames: Images, poses: Float64, aligner: FrameAligner) -> None:
-        """Align again with the views from ``poses`` (B, 4, 4); keep what is like them."""
+    def _refine(self, frames: Images, poses: Float64, aligner: FrameAligner) -> Float64:
+        """Align again with the views from ``poses`` (B, 4, 4); keep what is like them, else NaN."""
+        kept = np.full_like(poses, np.nan)
         for _ in range(REFINEMENTS):
             wanted = _has_pose(poses)
             if not wanted.any():
-                return
+                break
             again = _align(aligner, poses, UNMOVED, self._lax)
             wanted &= again.tracked
             verified = self.verify(frames, again.T_world_live, wanted, aligner)
-            self._tentative[verified] = again.T_world_live[verified]
+            kept[verified] = again.T_world_live[verified]
             going_on = wanted & ~verified
             poses = np.where(going_on[:, None, None], again.T_world_live, np.nan)
+        return kept
 
     def _keyframes_to_try(self, frames: Images, lost: Bool) -> Float64:
         """Poses (TRIALS, B, 4, 4) of keyframes, NaN for none; others at every attempt."""
@@ -256,6 +288,25 @@ class FernRelocalization(Relocalization):
         self._tentative[env] = np.nan
         self._attempts[env] = 0
         self._looked_from[env] = np.nan
+
+    def keyframe_poses(self, env: int) -> Float64:
+        """Poses (K, 4, 4) of the keyframes of one env."""
+        return self.databases[env].poses
+
+    def least_dissimilarity(self, env: int, frames: Images, keyframes: dict[str, Any]) -> float:
+        """See the base class."""
+        code = self.databases[env].encode(frames.color[env], frames.depth[env])
+        found = dissimilarities(code, keyframes["bits"], keyframes["known"])
+        return float(found.min(initial=np.inf))
+
+    def get_keyframes(self, env: int) -> dict[str, Any]:
+        """State of the database of one env."""
+        return self.databases[env].get_state()
+
+    def set_keyframes(self, env: int, keyframes: dict[str, Any]) -> None:
+        """Know these keyframes of one env, and nothing else."""
+        self.clear(env)
+        self.databases[env].set_state(keyframes)
 
 
 def _has_pose(poses: Float64) -> Bool:

@@ -25,11 +25,18 @@ from ms_slam_env.slam.ferns import Candidate
 from ms_slam_env.slam.state import Saved
 from ms_slam_env.slam.surfel.acceptance import Alignment
 from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.detached_map import DetachedMap
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer
 from ms_slam_env.slam.surfel.localization import CameraStates, Localizer
 from ms_slam_env.slam.surfel.loop_closure import make_loop_closure
+from ms_slam_env.slam.surfel.photometry import is_invalid_frame
 from ms_slam_env.slam.surfel.pipeline import Pipeline, PipelineCache, check_change
-from ms_slam_env.slam.surfel.pose_hypotheses import check_guesses, check_poses, motion_weight
+from ms_slam_env.slam.surfel.pose_hypotheses import (
+    check_guesses,
+    check_poses,
+    motion_weight,
+    tracking_hypotheses,
+)
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
 from ms_slam_env.slam.surfel.relocalization import Images, make_relocalization
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
@@ -198,6 +205,79 @@ class BatchedSurfelSlam(Saved):
                 results[env], T_world_camera=self.poses[env].copy(), loop_closed=True
             )
         return results
+
+    # -- Maps that come and go ---------------------------------------------------------------
+
+    def detach_map(self, label: int, env: int = 0) -> DetachedMap:
+        """A copy of what an env has mapped until now, as submap ``label``."""
+        return DetachedMap(
+            self.map.get_surfels(env),
+            self.relocalization.get_keyframes(env),
+            self.loops.get_history(env),
+            label,
+            self.last_frame(env),
+        )
+
+    def attach_map(self, detached: DetachedMap, env: int = 0) -> None:
+        """Go on with another map; the camera stays where it is."""
+        self.map.set_surfels(env, detached.surfels)
+        self.relocalization.set_keyframes(env, detached.keyframes)
+        self.loops.set_history(env, detached.history)
+        self._localizer.forget_view()
+
+    def restart(self, T_world_camera: Float64, env: int = 0) -> None:
+        """Forget an env's map and its last frame, which is to be taken first of a new one."""
+        frame = self.last_frame(env)
+        self.reset(T_world_camera, env)
+        self._states.time[env] = frame
+
+    def move_camera(self, T: Float64, env: int = 0) -> None:
+        """Move an env's camera by ``T`` (4, 4) of the world."""
+        self._states.poses[env] = T @ self._states.poses[env]
+
+    def last_frame(self, env: int = 0) -> int:
+        """Number of an env's last frame."""
+        return int(self._states.time[env]) - 1
+
+    def motion(self, env: int = 0) -> Float64:
+        """Motion (4, 4) that is expected of an env's next frame."""
+        return self._states.motions[env].copy()
+
+    def frames_lost(self, env: int = 0) -> int:
+        """Frames since an env's tracking was lost; 0: it is not."""
+        return int(self._states.lost[env])
+
+    def keyframe_poses(self, env: int = 0) -> Float64:
+        """Poses (K, 4, 4) of an env's keyframes."""
+        return self.relocalization.keyframe_poses(env)
+
+    def shows_something(self, frames: Images, env: int = 0) -> bool:
+        """Whether a map could start with an env's frame: it is not blank and has depth."""
+        blank = is_invalid_frame(frames.color[env : env + 1])[0]
+        readings = float((frames.depth[env] > 0).mean())
+        return readings >= FEWEST_READINGS and (not blank or self._invalid_frames.colorless[env])
+
+    # -- Finding a frame in the map without tracking it; of one env ------------------------------
+
+    def show(self, frames: Images) -> None:
+        """Take the frames that the next three look at."""
+        self._localizer.set_frame(self.preprocess(frames.color, frames.depth))
+
+    def align_near(self, pose: Float64) -> Alignment:
+        """Align with the map as seen from ``pose`` (4, 4), under strict thresholds."""
+        hypotheses = tracking_hypotheses(np.eye(4))[None]
+        thresholds = self._localizer.strict_thresholds()
+        return self._localizer.align_from(pose[None], hypotheses, thresholds)
+
+    def verify(self, frames: Images, poses: Float64) -> bool:
+        """Whether the map's view from ``poses`` (1, 4, 4) is like the frame."""
+        found = np.ones(1, dtype=bool)
+        return bool(self.relocalization.verify(frames, poses, found, self._localizer)[0])
+
+    def propose(self, frames: Images) -> Float64 | None:
+        """A pose (4, 4) where the frame may have been taken, from keyframes; None without."""
+        poses = self.relocalization.propose(frames, np.ones(1, dtype=bool), self._localizer)
+        return poses[0] if np.isfinite(poses).all() else None
 
     def get_state(self) -> dict[str, Any]:
         """Everything needed to go on bit-exactly, as NumPy arrays."""

@@ -281,25 +281,38 @@ class SurfelMap(Stateful):
     def get_state(self) -> dict[str, Any]:
         """Everything needed to go on bit-exactly: per env, the used part of every array."""
         counters = {name: getattr(self.surfels, name).numpy().copy() for name in COUNTERS}
-        used = counters["count"]
         return {
             "counters": counters,
-            "surfels": [
-                {
-                    name: getattr(self.surfels, name)[env, : int(used[env])].numpy().copy()
-                    for name in ATTRIBUTES
-                }
-                for env in range(self.batch)
-            ],
+            "surfels": [self.get_surfels(env) for env in range(self.batch)],
         }
+
+    def get_surfels(self, env: int) -> dict[str, NDArray[Any]]:
+        """The used part of every array of one env, dead surfels included."""
+        used = int(self.surfels.count.numpy()[env])
+        return {name: getattr(self.surfels, name)[env, :used].numpy().copy() for name in ATTRIBUTES}
+
+    def set_surfels(self, env: int, arrays: dict[str, NDArray[Any]]) -> None:
+        """Make these the surfels of one env; what does not fit into the map is dropped."""
+        capacity = self._buffers.capacity
+        total = len(arrays["confidence"])
+        used = min(total, capacity)
+        confidence = arrays["confidence"][:used]
+        counts = used, int((confidence == 0).sum()), total - used
+        for name, count in zip(COUNTERS, counts, strict=True):
+            getattr(self.surfels, name)[env : env + 1].assign(np.array([count], dtype=np.int32))
+        self._assign(env, {name: values[:used] for name, values in arrays.items()})
+        self.surfels_moved()
+
+    def _assign(self, env: int, arrays: dict[str, NDArray[Any]]) -> None:
+        for name in ATTRIBUTES:
+            used = len(arrays[name])
+            if used:
+                getattr(self.surfels, name)[env, :used].assign(arrays[name])
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state that ``get_state`` of a map of this size returned."""
         for name in COUNTERS:
             getattr(self.surfels, name).assign(state["counters"][name])
         for env, arrays in enumerate(state["surfels"]):
-            for name in ATTRIBUTES:
-                used = len(arrays[name])
-                if used:
-                    getattr(self.surfels, name)[env, :used].assign(arrays[name])
+            self._assign(env, arrays)
         self.surfels_moved()

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.geometry import invert, relative_angle
+from ms_slam_env.geometry import invert, relative_angle, transform_points
 from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.rows import join
 from ms_slam_env.slam.state import Saved
@@ -79,6 +79,29 @@ class TrajectoryHistory(Saved):
         self.anchors = list(moved)
         newest = slice(-KEPT_CONSTRAINTS, None)
         self.joined = join([self.joined.moved_by(deformation), joined]).chosen(newest)
+
+    def moved(self, T: Float64) -> TrajectoryHistory:
+        """The same with the world moved by ``T`` (4, 4)."""
+        joined = self.joined
+        sources, targets = (transform_points(T, p) for p in (joined.sources, joined.targets))
+        return replace(
+            self,
+            poses=[T @ pose for pose in self.poses],
+            anchors=[transform_points(T, points) for points in self.anchors],
+            joined=replace(joined, sources=sources, targets=targets),
+            found=-1,
+        )
+
+    def merged(self, other: TrajectoryHistory) -> TrajectoryHistory:
+        """This and another of the same world, in the order of time."""
+        order = np.argsort(self.frames + other.frames, kind="stable").tolist()
+        both = TrajectoryHistory()
+        for name in ("frames", "poses", "anchors", "anchor_times"):
+            values = getattr(self, name) + getattr(other, name)
+            setattr(both, name, [values[k] for k in order])
+        newest = slice(-KEPT_CONSTRAINTS, None)
+        both.joined = join([self.joined, other.joined]).chosen(newest)
+        return both
 
     def path_m(self, frame: int) -> float:
         """Length of the way since a frame."""

@@ -1,0 +1,130 @@
+"""Whether two maps, laid upon each other, show the same: by what cameras saw of each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ms_slam_env.camera import RGBDFrame
+from ms_slam_env.config import Checked, bounded
+from ms_slam_env.geometry import invert
+from ms_slam_env.slam.alignment_check import measure_photometric_consistency
+from ms_slam_env.slam.base import Float64, Views
+
+_LOOKS_AT = 0.2  # share of a frame that the other map must show for the frame to be compared
+_FAR_M = 10.0
+
+
+@dataclass(frozen=True)
+class FitConfig(Checked):
+    """When two maps that lie so are taken to show the same place.
+
+    Attributes:
+        queries: frames of each map that are laid upon the other.
+        tolerance_m: depth differs from the other map where it differs by more than this.
+        least_overlap: share of the pixels with a reading that must fit the other map.
+        least_consistent: share of those that fit among those that fit or contradict.
+        least_alike: correlation of the images' fine structure with the other map's view, the
+            median over the frames that look at it.
+    """
+
+    queries: int = bounded(24, 1, 10_000)
+    tolerance_m: float = bounded(0.05, 1e-4, 1.0)
+    least_overlap: float = bounded(0.05, 0.0, 1.0)
+    least_consistent: float = bounded(0.85, 0.0, 1.0)
+    least_alike: float = bounded(0.5, -1.0, 1.0)
+
+
+class MapRenderer(Protocol):
+    """What can render a map."""
+
+    def predict(self, poses: ArrayLike, scale: float = 1.0) -> Views:
+        """Views of the map from ``poses`` (N, 4, 4)."""
+
+
+class SeenMap(Protocol):
+    """A map, and N frames of what it shows."""
+
+    @property
+    def backend(self) -> MapRenderer:
+        """What holds the map."""
+
+    @property
+    def frames(self) -> Sequence[RGBDFrame]:
+        """N."""
+
+    @property
+    def estimates(self) -> Float64:
+        """(N, 4, 4) T_map_camera."""
+
+    @property
+    def tracked(self) -> NDArray[np.bool_]:
+        """(N,) which of them are part of the map."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How what either robot saw fits the map of the other."""
+
+    overlap: float = float("nan")  # share of the pixels with a reading that fit
+    consistent: float = float("nan")  # share of those among the pixels that fit or contradict
+    # correlation with the other map's view, median over the frames that look at it.
+    alike: float = float("nan")
+
+
+def why_not_believed(fit: Fit, config: FitConfig) -> str:
+    """Why maps that fit so are not taken to show the same place; empty if they are."""
+    if fit.overlap < config.least_overlap:
+        return "the maps hardly overlap there"
+    if fit.consistent < config.least_consistent:
+        return "the surfaces contradict each other there"
+    if not fit.alike >= config.least_alike:
+        return "the images do not look alike there"
+    return ""
+
+
+def measure_fit(a: SeenMap, b: SeenMap, T_a_b: Float64, config: FitConfig) -> Fit:
+    """Lay the frames of both maps upon the view that the other predicts there.
+
+    A surface of the map behind the reading may be one that only the map's camera saw, and says
+    nothing. One in front of the reading contradicts it: the ray went through it. Frames that do not
+    look at the other map at all say nothing either.
+    """
+    fits, contradictions, readings = 0, 0, 0
+    alike: list[float] = []
+    for here, there, T_here_there in ((a, b, T_a_b), (b, a, invert(T_a_b))):
+        indices = query_frames(there, config.queries)
+        views = here.backend.predict(T_here_there @ there.estimates[indices])
+        for grey, depth, index in zip(views.intensity, views.depth, indices, strict=True):
+            frame = there.frames[index]
+            valid = frame.depth > 0
+            both = valid & (depth > 0)
+            difference = depth - frame.depth
+            here_fits = both & (np.abs(difference) <= config.tolerance_m)
+            fits += int(here_fits.sum())
+            contradictions += int((both & (difference < -config.tolerance_m)).sum())
+            readings += int(valid.sum())
+            if here_fits.sum() >= _LOOKS_AT * max(1, valid.sum()):
+                same = np.where(here_fits, depth, np.float32(0))
+                found = measure_photometric_consistency(
+                    frame.color, frame.depth, grey, same, _FAR_M
+                )
+                alike.append(found.correlation)
+    return Fit(
+        overlap=fits / readings if readings else 0.0,
+        consistent=fits / (fits + contradictions) if fits else 0.0,
+        alike=float(np.median(alike)) if alike else float("nan"),
+    )
+
+
+def query_frames(seen: SeenMap, count: int) -> list[int]:
+    """Indices of at most ``count`` tracked frames, evenly spread over the path."""
+    tracked = np.flatnonzero(seen.tracked)
+    if len(tracked) == 0:
+        return []
+    picked = np.linspace(0, len(tracked) - 1, min(count, len(tracked))).round().astype(int)
+    return tracked[picked].tolist()

@@ -1,0 +1,393 @@
+"""Submaps of the surfel SLAM of one camera: begin one when lost, find older ones, join them.
+
+The idea of ORB-SLAM's Atlas (Elvira, Tardós and Montiel, IROS 2019). A frame that is refused is not
+the end: after a few of them the map is put aside, and a new one starts where the camera is best
+guessed to be. While it grows, every few frames the camera is looked for in the maps put aside: near
+where it should be and at keyframes that resemble the frame. Several such looks from different
+places must agree on how the maps lie, and the views of both maps must agree there; then the newer
+map is moved onto the older, and both are one again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ms_slam_env.camera import RGBDFrame
+from ms_slam_env.geometry import invert
+from ms_slam_env.slam.base import Float64, TrackResult, Views
+from ms_slam_env.slam.map_fit import FitConfig, measure_fit, why_not_believed
+from ms_slam_env.slam.state import Saved
+from ms_slam_env.slam.submaps import SubmapLedger, Submaps, one_submap
+from ms_slam_env.slam.surfel.config import SubmapConfig
+from ms_slam_env.slam.surfel.detached_map import DetachedMap
+from ms_slam_env.slam.surfel.pose_hypotheses import damped, is_within
+from ms_slam_env.slam.surfel.relocalization import Images
+from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
+from ms_slam_env.slam.surfel.surfel_map import SurfelMap
+from ms_slam_env.slam.surfel.view_prediction import mean_pose
+
+_FIT = FitConfig(queries=8)
+
+
+class NoSubmaps(Saved):
+    """The variant "off": a lost camera stands still until it finds its map again."""
+
+    def __init__(self, slam: BatchedSurfelSlam) -> None:
+        self._slam = slam
+
+    def reset(self) -> None:
+        """Forget all submaps."""
+
+    def follow(self, frames: Images, guess: ArrayLike | None, result: TrackResult) -> TrackResult:
+        """Do what is to be done after a frame was tracked or not; the result to return for it."""
+        return result
+
+    def detached(self) -> Sequence[DetachedMap]:
+        """The maps put aside."""
+        return ()
+
+    @property
+    def present(self) -> int:
+        """Number of the submap that frames are tracked in."""
+        return 0
+
+    def trajectory(self) -> tuple[NDArray[np.int32], Float64]:
+        """Frames (N,) and their poses (N, 4, 4) as the maps have them now."""
+        return self._slam.loops.trajectory(0)
+
+    def summary(self) -> Submaps:
+        """The submaps as they hang together."""
+        return one_submap()
+
+
+class AtlasSubmaps(NoSubmaps):
+    """The variant "atlas": a lost camera goes on in a new submap."""
+
+    saved = ("_ledger", "_search", "_present", "_refused", "_expected", "_motion")
+
+    def __init__(self, slam: BatchedSurfelSlam) -> None:
+        super().__init__(slam)
+        self._finder: MapFinder | None = None  # made when there is something to find
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all submaps."""
+        self._ledger = SubmapLedger()
+        self._detached: list[DetachedMap] = []
+        self._search = JointSearch()
+        self._present = 0
+        self._refused = 0  # frames in a row that showed something and were not tracked
+        self._motion = np.eye(4)  # expected of the next frame
+        self._expected = np.eye(4)  # where it takes a camera that is lost
+
+    @property
+    def _config(self) -> SubmapConfig:
+        return self._slam.config.submap_rules
+
+    @property
+    def present(self) -> int:
+        """Number of the submap that frames are tracked in."""
+        return self._present
+
+    def detached(self) -> Sequence[DetachedMap]:
+        """The maps put aside."""
+        return self._detached
+
+    def trajectory(self) -> tuple[NDArray[np.int32], Float64]:
+        """Frames (N,) and their poses (N, 4, 4) as the maps have them now."""
+        poses: dict[int, Float64] = {}
+        for frames, stack in (self._ledger.trajectory(), self._slam.loops.trajectory(0)):
+            poses |= dict(zip(frames.tolist(), stack, strict=True))
+        order = sorted(poses)
+        stack = np.array([poses[frame] for frame in order]).reshape(-1, 4, 4)
+        return np.array(order, dtype=np.int32), stack
+
+    def summary(self) -> Submaps:
+        """The submaps as they hang together."""
+        return self._ledger.summary()
+
+    # -- After every frame ---------------------------------------------------------------------
+
+    def follow(self, frames: Images, guess: ArrayLike | None, result: TrackResult) -> TrackResult:
+        """Start a submap after a few refused frames, look for older ones while there are any."""
+        if not result.tracking_ok:
+            return self._labelled(self._after_refusal(frames, guess, result))
+        self._refused = 0
+        self._expected, self._motion = result.T_world_camera, self._slam.motion()
+        if not self._detached:
+            if self._ledger.has_several:
+                self._ledger.record(self._slam.last_frame(), self._present, self._expected)
+            return self._labelled(result)
+        return self._labelled(self._after_tracking(frames, result))
+
+    def _labelled(self, result: TrackResult) -> TrackResult:
+        """Say which submap the frame is in, and how sure it is where that lies."""
+        if self._present == 0:
+            return result
+        pose = result.T_world_camera
+        covariance = self._ledger.covariance(self._present, pose)
+        if result.covariance is not None:
+            covariance = covariance + result.covariance
+        return replace(
+            result,
+            submap=self._present,
+            covariance=covariance if result.tracking_ok else None,
+        )
+
+    # -- Losing a map --------------------------------------------------------------------------
+
+    def _after_refusal(
+        self, frames: Images, guess: ArrayLike | None, result: TrackResult
+    ) -> TrackResult:
+        self._motion = damped(self._motion)
+        self._expected = self._expected @ self._motion
+        if guess is not None:
+            self._expected = np.array(guess, dtype=np.float64)
+        if not self._slam.shows_something(frames):
+            return result
+        self._refused += 1
+        if self._refused < self._config.after:
+            return result
+        return self._start(frames, self._link(guess is not None))
+
+    def _link(self, is_guessed: bool) -> Float64:
+        """Covariance (6, 6) of where the camera is expected."""
+        rules = self._config
+        sigma_m, sigma_rad = rules.guess_sigma_m, np.radians(rules.guess_sigma_deg)
+        if not is_guessed:
+            frames = self._slam.frames_lost()
+            sigma_m, sigma_rad = sigma_m * frames, sigma_rad * frames
+        return np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3)
+
+    def _start(self, frames: Images, link: Float64) -> TrackResult:
+        """Put the map aside and start another with this frame."""
+        frame = self._slam.last_frame()
+        self._ledger.correct(*self._slam.loops.trajectory(0))
+        if len(self._slam.keyframe_poses()) >= self._config.fewest_keyframes:
+            self._detached.append(self._slam.detach_map(self._present))
+        self._slam.restart(self._expected)
+        self._present = self._ledger.start(frame, self._expected, link)
+        self._search, self._refused = JointSearch(), 0
+        result = self._slam.track(frames.color, frames.depth)[0]
+        if result.tracking_ok:
+            self._ledger.record(frame, self._present, result.T_world_camera)
+        return result
+
+    # -- Finding an older one --------------------------------------------------------------------
+
+    def _after_tracking(self, frames: Images, result: TrackResult) -> TrackResult:
+        frame, pose = self._slam.last_frame(), result.T_world_camera
+        self._ledger.record(frame, self._present, pose)
+        if not self._search.is_due(frame, pose, self._config):
+            return result
+        if self._finder is None:
+            self._finder = MapFinder(self._slam)
+        joint = self._search.look(frame, pose, frames, self._detached, self._finder, self._config)
+        if joint is None:
+            return result
+        other, T_other_present = joint
+        if not self._bears_out(other, T_other_present, pose):
+            return result
+        return self._join(other, T_other_present, result)
+
+    def _bears_out(self, other: DetachedMap, T_other_present: Float64, pose: Float64) -> bool:
+        """Whether the views of both maps, where cameras were, agree on how the maps lie."""
+        assert self._finder is not None
+        own = np.concatenate([self._slam.keyframe_poses(), pose[None]])
+        others = self._finder.keyframe_poses()
+        present = MapViews.of(self._slam.map, own, pose)
+        there = MapViews.of(self._finder.map, others, T_other_present @ pose)
+        fit = measure_fit(there, present, T_other_present, _FIT)
+        return not why_not_believed(fit, _FIT)
+
+    def _join(
+        self, other: DetachedMap, T_other_present: Float64, result: TrackResult
+    ) -> TrackResult:
+        """Move the newer map onto the older one, and go on in both as one."""
+        frame, slam, ledger = self._slam.last_frame(), self._slam, self._ledger
+        older, newer = sorted((other.label, self._present))
+        is_older_present = older == self._present
+        correction = invert(T_other_present) if is_older_present else T_other_present
+        ledger.correct(*slam.loops.trajectory(0))
+        detached = [each for each in self._detached if each is not other]
+        for label, part in ledger.between(older, newer, correction).items():
+            ledger.move(label, part)
+            detached = [each.moved(part) if each.label == label else each for each in detached]
+        ledger.join(older, newer, correction, frame)
+        here, there = slam.detach_map(older), replace(other.resumed(frame), label=older)
+        stable = slam.config.confidence_threshold
+        if is_older_present:
+            slam.attach_map(here.merged(there.moved(correction), stable))
+        else:
+            slam.attach_map(there.merged(here.moved(correction), stable))
+            slam.move_camera(correction)
+        self._detached, self._present, self._search = detached, older, JointSearch()
+        self._expected = slam.poses[0].copy()
+        return replace(result, T_world_camera=slam.poses[0].copy(), submaps_joined=True)
+
+    def get_state(self) -> dict[str, Any]:
+        """Everything, as NumPy arrays and plain values."""
+        return super().get_state() | {"detached": [each.get_state() for each in self._detached]}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state."""
+        super().set_state(state)
+        self._detached = [DetachedMap() for _ in state["detached"]]
+        for each, values in zip(self._detached, state["detached"], strict=True):
+            each.set_state(values)
+        if self._finder is not None:
+            self._finder.forget()
+
+
+class MapFinder:
+    """Finds frames in maps that were put aside; nothing is fused."""
+
+    def __init__(self, slam: BatchedSurfelSlam) -> None:
+        self._present = slam
+        self._slam = BatchedSurfelSlam(1, slam.intrinsics, slam.config, slam.map.device)
+        self._loaded: DetachedMap | None = None
+
+    @property
+    def map(self) -> SurfelMap:
+        """The surfels of the map that was searched last."""
+        return self._slam.map
+
+    def keyframe_poses(self) -> Float64:
+        """Poses (K, 4, 4) of its keyframes."""
+        return self._slam.keyframe_poses()
+
+    def forget(self) -> None:
+        """Load a map anew next time."""
+        self._loaded = None
+
+    def dissimilarity(self, frames: Images, other: DetachedMap) -> float:
+        """Of a frame and the keyframe of a map that resembles it most; infinity: it has none."""
+        return self._present.relocalization.least_dissimilarity(0, frames, other.keyframes)
+
+    def near(self, frames: Images, other: DetachedMap, pose: Float64) -> Float64 | None:
+        """Where in a map a frame was taken if that is near ``pose`` (4, 4); None if it is not."""
+        self._load(other, frames)
+        found = self._slam.align_near(pose)
+        if not found.tracked[0] or not self._slam.verify(frames, found.T_world_live):
+            return None
+        return found.T_world_live[0]
+
+    def anywhere(self, frames: Images, other: DetachedMap) -> Float64 | None:
+        """Where in a map a frame was taken, from keyframes that resemble it; None if none does."""
+        self._load(other, frames)
+        pose = self._slam.propose(frames)
+        return None if pose is None else self.near(frames, other, pose)
+
+    def _load(self, other: DetachedMap, frames: Images) -> None:
+        self._slam.reconfigure(self._present.config, self._present.intrinsics)
+        if self._loaded is not other:
+            self._slam.attach_map(other)
+            self._loaded = other
+        self._slam.show(frames)
+
+
+class JointSearch(Saved):
+    """How the present map lies relative to one of those put aside: the looks that agree on it."""
+
+    saved = ("_label", "_votes", "_frame", "_pose", "_looks")
+
+    def __init__(self) -> None:
+        self._label = -1  # of the map put aside; -1: nothing was found yet
+        self._votes: list[Float64] = []  # (4, 4) T_other_present of each look
+        self._frame = -(10**9)  # of the last look
+        self._pose = np.eye(4)  # (4, 4) in the present map at the last look
+        self._looks = 0  # in vain, since the map was lost
+
+    def is_due(self, frame: int, pose: Float64, rules: SubmapConfig) -> bool:
+        """Whether it is time for a look; the next one that may agree is from another place."""
+        if frame - self._frame >= rules.interval:
+            return True
+        moved = not is_within(pose, self._pose, rules.step_m, np.radians(rules.step_deg))
+        return self._label >= 0 and moved
+
+    def look(
+        self,
+        frame: int,
+        pose: Float64,
+        frames: Images,
+        detached: Sequence[DetachedMap],
+        finder: MapFinder,
+        rules: SubmapConfig,
+    ) -> tuple[DetachedMap, Float64] | None:
+        """Look for the camera at ``pose`` (4, 4) in the maps put aside.
+
+        Returns:
+            The map and T_other_present (4, 4), once enough looks agree.
+        """
+        self._frame, self._pose = frame, pose.copy()
+        other, found = self._find(pose, frames, detached, finder, rules)
+        if other is None or found is None:
+            self._label, self._votes = -1, []
+            self._looks += 1
+            return None
+        T_other_present = found @ invert(pose)
+        reach = rules.agreement_m, np.radians(rules.agreement_deg)
+        if self._votes and not is_within(found, self._votes[0] @ pose, *reach):
+            self._votes = []
+        self._label = other.label
+        self._votes.append(T_other_present)
+        if len(self._votes) < rules.looks:
+            return None
+        mean = mean_pose(np.stack(self._votes) @ pose)
+        self._label, self._votes = -1, []
+        return other, mean @ invert(pose)
+
+    def _find(
+        self,
+        pose: Float64,
+        frames: Images,
+        detached: Sequence[DetachedMap],
+        finder: MapFinder,
+        rules: SubmapConfig,
+    ) -> tuple[DetachedMap | None, Float64 | None]:
+        expected = [each for each in detached if each.label == self._label]
+        if expected:
+            return expected[0], finder.near(frames, expected[0], self._votes[-1] @ pose)
+        dissimilar = [finder.dissimilarity(frames, each) for each in detached]
+        order = np.argsort(dissimilar, kind="stable")
+        which = int(order[self._looks % len(order)])
+        if dissimilar[which] > rules.dissimilarity:
+            which = int(order[0])
+        other = detached[which]
+        found = finder.near(frames, other, pose)
+        if found is None and dissimilar[which] <= rules.dissimilarity:
+            found = finder.anywhere(frames, other)
+        return other, found
+
+
+@dataclass(frozen=True)
+class MapViews:
+    """A map and what it shows from where cameras were, in the place of their frames."""
+
+    backend: SurfelMap
+    frames: list[RGBDFrame]  # N
+    estimates: Float64  # (N, 4, 4) T_map_camera
+    tracked: NDArray[np.bool_]  # (N,) all of them
+
+    @classmethod
+    def of(cls, surfel_map: SurfelMap, poses: Float64, here: Float64) -> MapViews:
+        """Views from those of the poses (K, 4, 4) that are nearest to one (4, 4)."""
+        distance = np.linalg.norm(poses[:, :3, 3] - here[:3, 3], axis=1)
+        chosen = poses[np.argsort(distance, kind="stable")[: _FIT.queries]]
+        frames = _as_frames(surfel_map.predict(chosen))
+        return cls(surfel_map, frames, chosen, np.ones(len(chosen), dtype=bool))
+
+
+def _as_frames(views: Views) -> list[RGBDFrame]:
+    grey = np.rint(views.intensity).astype(np.uint8)[..., None].repeat(3, axis=-1)
+    return [RGBDFrame(color, depth) for color, depth in zip(grey, views.depth, strict=True)]
+
+
+def make_submaps(slam: BatchedSurfelSlam) -> NoSubmaps:
+    """The variant ``config.submaps`` for a SLAM of one camera."""
+    return AtlasSubmaps(slam) if slam.config.submaps == "atlas" else NoSubmaps(slam)
