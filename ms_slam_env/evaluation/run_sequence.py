@@ -153,6 +153,11 @@ class SequenceRun:
         return np.array([result.tracking_ok for result in self.results], dtype=bool)
 
     @property
+    def anchored(self) -> NDArray[np.bool_]:
+        """(N,) whether SLAM was tracking in the first submap or one joined to it by then."""
+        return self.tracking_ok & np.array([result.submap == 0 for result in self.results])
+
+    @property
     def processed(self) -> NDArray[np.bool_]:
         """(N,) whether SLAM has seen the frame; False where frame selection dropped it."""
         return np.array([result.processed for result in self.results], dtype=bool)

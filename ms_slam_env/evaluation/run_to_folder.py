@@ -14,6 +14,13 @@ from numpy.typing import NDArray
 
 from ms_slam_env import metrics, slam
 from ms_slam_env.evaluation.run_sequence import SequenceRun
+from ms_slam_env.evaluation.submaps import (
+    paths_by_submap,
+    submap_errors,
+    submap_measures,
+    submap_numbers,
+    write_submaps,
+)
 from ms_slam_env.evaluation.trajectory_charts import error_panel, path_panel, thinned
 from ms_slam_env.geometry import invert
 from ms_slam_env.report.charts import Chart, Panel, Series
@@ -34,6 +41,7 @@ Float64 = NDArray[np.float64]
 TRAJECTORY, UNFINISHED = "trajectory.txt", "trajectory.incomplete.txt"
 CORRECTED, TRUTH = "trajectory.corrected.txt", "groundtruth.txt"
 MAP, FRAMES, METRICS = "map.ply", "frames.csv", "metrics.json"
+SUBMAPS = "submaps.csv"
 
 _ABOUT = "A SLAM backend over a sequence: its path, its error, what each frame cost."
 _TABLES = {
@@ -41,6 +49,7 @@ _TABLES = {
         *("frames", "processed_frames", "lost_frames", "path_m", "ate_m", "ate_max_m", "ate_rad"),
         *("ate_unaligned_m", "rpe_m", "rpe_rad", "final_ate_m", "final_rpe_m"),
     ),
+    "Submaps": ("submaps", "joined_submaps", "unjoined_share", "joined_ate_m", "submap_ate_m"),
     "Cost": (
         *("cpu_ms_median", "cpu_ms_p95", "cpu_ms_max", "ext_ms", "ext_ms_p95", "ext_ms_max"),
         *("mem_mb", "mem_peak_mb", "ene_j", "ene_frame_j", "ene_source"),
@@ -66,7 +75,8 @@ def run_to_folder(
     renamed to ``trajectory.txt``, beside ``map.ply`` and ``metrics.json``. Where the backend closes
     loops, ``trajectory.corrected.txt`` holds the poses as the finished map has them; where the true
     poses are known, ``groundtruth.txt`` holds those; what every frame cost stands in
-    ``frames.csv``. A run that fails or is interrupted leaves the unfinished file and a
+    ``frames.csv``; where there are several submaps ``submaps.csv`` says which holds each frame. A
+    run that fails or is interrupted leaves the unfinished file and a
     ``metrics.json`` that says so, and says how the frames were ``fed`` to the backend.
 
     Returns:
@@ -80,7 +90,7 @@ def run_to_folder(
     system = selection.manage(slam.make(backend, sequence.intrinsics, **params))
     run = SequenceRun(system, sequence, meter=costs, progress=sequence.name)
     out.mkdir(parents=True, exist_ok=True)
-    for old in (TRAJECTORY, CORRECTED, TRUTH, MAP, METRICS, FRAMES):
+    for old in (TRAJECTORY, CORRECTED, TRUTH, MAP, METRICS, FRAMES, SUBMAPS):
         (out / old).unlink(missing_ok=True)
     content = {"complete": False, **_about(sequence, backend, params, fed or {}, selection)}
     final: dict[str, Any] = {}
@@ -97,6 +107,9 @@ def run_to_folder(
             write_trajectory(out / CORRECTED, run.timestamps, corrected)
             errors = trajectory_errors(run, corrected, sequence)
             final = {f"final_{key}": errors[key] for key in ("ate_m", "rpe_m") if key in errors}
+        if len(system.submaps()) > 1:
+            write_submaps(out / SUBMAPS, run)
+            final |= _submap_errors(run, corrected, sequence)
         truth = sequence.true_trajectory()
         if truth is not None:
             write_trajectory(out / TRUTH, *truth)
@@ -159,6 +172,7 @@ def measure(run: SequenceRun, sequence: Sequence) -> dict[str, Any]:
         "lost_frames": run.lost_frames,
         "processed_frames": int(run.processed.sum()),
         "path_m": metrics.path_length(run.estimates),
+        **submap_measures(run),
         **run.meter.summary(),
         **trajectory_errors(run, run.estimates, sequence),
     }
@@ -196,6 +210,15 @@ def _pairs(run: SequenceRun, poses: Float64, sequence: Sequence) -> tuple[Float6
     return times[own], poses[own], truth[1][true]
 
 
+def _submap_errors(
+    run: SequenceRun, corrected: Float64 | None, sequence: Sequence
+) -> dict[str, Any]:
+    """See `submap_errors`; of the poses as the finished map has them."""
+    times, P, Q = _pairs(run, run.estimates if corrected is None else corrected, sequence)
+    known = np.isin(run.timestamps, times)
+    return dict(submap_errors(P, Q, submap_numbers(run)[known]))
+
+
 def _orientation_error(P: Float64, Q: Float64) -> float | None:
     """RMS angle in radians between aligned and true poses; None if positions leave it open."""
     unique = metrics.find_alignment(P, Q).unique
@@ -226,6 +249,12 @@ def _charts(run: SequenceRun, sequence: Sequence) -> list[Chart]:
         paths["estimate, loops closed"] = corrected[:, :3, 3]
     found = [Chart("path", "Path", "The two directions in which it extends most.",
                    [path_panel(paths)])]  # fmt: skip
+    if len(run.backend.submaps()) > 1:
+        final = run.estimates if corrected is None else corrected
+        pieces = {name: path for name, path in paths.items() if name == "truth"}
+        pieces |= paths_by_submap(final, submap_numbers(run))
+        caption = "As the finished map has the frames; submaps that were joined are one."
+        found.append(Chart("submaps", "Path by submap", caption, [path_panel(pieces)]))
     if len(P) > 1:
         aligned = metrics.find_alignment(P, Q).poses(P)
         distance = np.linalg.norm(aligned[:, :3, 3] - Q[:, :3, 3], axis=1)

@@ -117,7 +117,9 @@ def run_usme(spec: UsmeSpec) -> dict[str, Any]:
         "final_ate_m": _final_ate(run, truth),
         "lost_share": run.lost,
         "robustness": _robustness(poses, truth, tracked),
-        "relocalisation_s": metrics.mean_relocalisation_time(seconds, np.array(black), tracked),
+        "relocalisation_s": metrics.mean_relocalisation_time(
+            seconds, np.array(black), run.anchored
+        ),
         "initialisation_s": start.time_s,
         "scale_error": start.scale_error,
         **costs.summary(skip=min(_WARM_UP, len(poses) - 1)),

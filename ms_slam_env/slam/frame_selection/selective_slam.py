@@ -16,6 +16,7 @@ from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.geometry import check_pose, invert, se3_exp, se3_log
 from ms_slam_env.slam.base import BorrowedMap, Float64, SlamBackend, TrackResult
 from ms_slam_env.slam.state import Saved, Stateful
+from ms_slam_env.slam.submaps import Submaps
 
 
 class FrameFilter(Stateful):
@@ -184,8 +185,10 @@ class SelectiveSlam(Saved, BorrowedMap):
         self._processed.append(self._frames)
         self._frames += 1
         self._last = result
-        continues = before is not None and before.tracking_ok and result.tracking_ok
-        moved = continues and not (result.relocalised or result.loop_closed)
+        jumped = result.relocalised or result.loop_closed or result.submaps_joined
+        moved = False
+        if before is not None and before.submap == result.submap:
+            moved = before.tracking_ok and result.tracking_ok and not jumped
         self._prediction.observe(result.T_world_camera, dropped + 1, moved)
         return result
 
@@ -203,6 +206,7 @@ class SelectiveSlam(Saved, BorrowedMap):
             relocalised=False,
             covariance=None,
             loop_closed=False,
+            submaps_joined=False,
             processed=False,
         )
 
@@ -213,6 +217,13 @@ class SelectiveSlam(Saved, BorrowedMap):
     def map_points(self) -> Float64:
         """Every point (M, 3) of the backend's map, metres."""
         return self.backend.map_points()
+
+    def submaps(self) -> Submaps:
+        """The backend's submaps; their frames are counted since ``reset`` with the dropped ones."""
+        own = self.backend.submaps()
+        counted = np.array(self._processed or [0], dtype=np.int32)
+        joined = np.where(own.joined_at >= 0, counted[own.joined_at], -1).astype(np.int32)
+        return replace(own, first_frames=counted[own.first_frames], joined_at=joined)
 
     def corrected_trajectory(self) -> tuple[NDArray[np.int32], Float64]:
         """Frames (N,), counted since ``reset`` with the dropped ones, and their poses (N, 4, 4).

@@ -78,10 +78,13 @@ class Relocalization(Saved):
         """
         return None
 
-    def propose(self, frames: Images, lost: Bool, aligner: FrameAligner) -> Float64:
+    def propose(
+        self, frames: Images, lost: Bool, attempts: Int32, aligner: FrameAligner
+    ) -> Float64:
         """Poses (B, 4, 4) at which the envs that are ``lost`` (B,) may be; NaN: none.
 
-        The map's view from there is like the frame; nothing has confirmed them yet.
+        The map's view from there is like the frame; nothing has confirmed them yet. Every attempt
+        (B,) looks elsewhere.
         """
         return np.full((len(lost), 4, 4), np.nan)
 
@@ -211,21 +214,23 @@ class FernRelocalization(Relocalization):
         self._tentative[lost] = np.nan
         missing = lost & ~found
         if missing.any():
-            self._tentative[missing] = self.propose(frames, missing, aligner)[missing]
+            proposed = self.propose(frames, missing, self._attempts, aligner)
+            self._tentative[missing] = proposed[missing]
+            self._attempts[missing] += 1
         return (found, alignment) if alignment is not None and found.any() else None
 
-    def propose(self, frames: Images, lost: Bool, aligner: FrameAligner) -> Float64:
+    def propose(
+        self, frames: Images, lost: Bool, attempts: Int32, aligner: FrameAligner
+    ) -> Float64:
         """From other keyframes at every attempt; see the base class."""
-        poses = self._refine(frames, self._find(frames, lost, aligner), aligner)
-        self._attempts[lost] += 1
-        return poses
+        return self._refine(frames, self._find(frames, lost, attempts, aligner), aligner)
 
-    def _find(self, frames: Images, lost: Bool, aligner: FrameAligner) -> Float64:
+    def _find(self, frames: Images, lost: Bool, attempts: Int32, aligner: FrameAligner) -> Float64:
         """Poses (B, 4, 4) that the best alignments with keyframes' views lead to; NaN: none."""
-        hypotheses = KEYFRAME_HYPOTHESES[self._attempts % len(KEYFRAME_HYPOTHESES)]
+        hypotheses = KEYFRAME_HYPOTHESES[attempts % len(KEYFRAME_HYPOTHESES)]
         best = np.full((len(lost), 4, 4), np.nan)
         cost = np.full(len(lost), np.inf)
-        for starts in self._keyframes_to_try(frames, lost):
+        for starts in self._keyframes_to_try(frames, lost, attempts):
             wanted = _has_pose(starts) & (cost > GOOD_COST)
             if not wanted.any():
                 break
@@ -250,12 +255,12 @@ class FernRelocalization(Relocalization):
             poses = np.where(going_on[:, None, None], again.T_world_live, np.nan)
         return kept
 
-    def _keyframes_to_try(self, frames: Images, lost: Bool) -> Float64:
+    def _keyframes_to_try(self, frames: Images, lost: Bool, attempts: Int32) -> Float64:
         """Poses (TRIALS, B, 4, 4) of keyframes, NaN for none; others at every attempt."""
         poses = np.full((TRIALS, len(lost), 4, 4), np.nan)
         for env in np.flatnonzero(lost):
             near = self.databases[env].candidates(frames.color[env], frames.depth[env], _LOOKED_AT)
-            first = TRIALS * int(self._attempts[env] % ROUNDS)
+            first = TRIALS * int(attempts[env] % ROUNDS)
             apart = _spread(near, first + TRIALS)
             chosen = apart[first:] or apart[:TRIALS]
             for rank, candidate in enumerate(chosen):

@@ -274,9 +274,10 @@ class BatchedSurfelSlam(Saved):
         found = np.ones(1, dtype=bool)
         return bool(self.relocalization.verify(frames, poses, found, self._localizer)[0])
 
-    def propose(self, frames: Images) -> Float64 | None:
+    def propose(self, frames: Images, attempt: int) -> Float64 | None:
         """A pose (4, 4) where the frame may have been taken, from keyframes; None without."""
-        poses = self.relocalization.propose(frames, np.ones(1, dtype=bool), self._localizer)
+        attempts, lost = np.array([attempt], dtype=np.int32), np.ones(1, dtype=bool)
+        poses = self.relocalization.propose(frames, lost, attempts, self._localizer)
         return poses[0] if np.isfinite(poses).all() else None
 
     def get_state(self) -> dict[str, Any]:

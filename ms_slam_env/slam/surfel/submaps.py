@@ -277,10 +277,10 @@ class MapFinder:
             return None
         return found.T_world_live[0]
 
-    def anywhere(self, frames: Images, other: DetachedMap) -> Float64 | None:
+    def anywhere(self, frames: Images, other: DetachedMap, attempt: int) -> Float64 | None:
         """Where in a map a frame was taken, from keyframes that resemble it; None if none does."""
         self._load(other, frames)
-        pose = self._slam.propose(frames)
+        pose = self._slam.propose(frames, attempt)
         return None if pose is None else self.near(frames, other, pose)
 
     def _load(self, other: DetachedMap, frames: Images) -> None:
@@ -361,7 +361,7 @@ class JointSearch(Saved):
         other = detached[which]
         found = finder.near(frames, other, pose)
         if found is None and dissimilar[which] <= rules.dissimilarity:
-            found = finder.anywhere(frames, other)
+            found = finder.anywhere(frames, other, self._looks)
         return other, found
 
 
