@@ -232,7 +232,7 @@ def _tables(result: Mapping[str, Any]) -> list[Table]:
     tables = []
     for title, keys in _TABLES.items():
         known = [key for key in keys if result.get(key) is not None]
-        if known:
+        if known and (title != "Submaps" or result["submaps"] > 1):
             tables.append(make_table(known, [{key: result[key] for key in known}], title))
     return tables
 

@@ -11,6 +11,7 @@ from PIL import Image
 
 from ms_slam_env.camera import xtion
 from ms_slam_env.cli import main
+from ms_slam_env.evaluation.run_to_folder import run_to_folder
 from ms_slam_env.geometry import look_at
 from ms_slam_env.metrics import ate_rmse
 from ms_slam_env.metrics.registry import RESULTS_VERSION
@@ -46,6 +47,37 @@ def sequence(box_scene, tmp_path_factory):
     times = [frame.timestamp for frame in rendered.frames]
     write_trajectory(folder / "groundtruth.txt", times, poses)
     return folder
+
+
+def test_a_run_of_several_submaps_says_which_frame_is_in_which(box_scene, tmp_path):
+    path = _turning(np.concatenate([np.arange(0, 46, 3), np.arange(130, 30, -3)]))
+    sequence = render_sequence(box_scene, path, xtion("160x120"), "kinect", 0)
+    params = {"submaps": "atlas", "max_surfels": 120_000, "submap_rules": {"after": 3}}
+    result = run_to_folder(sequence, "surfel", params, tmp_path)
+    assert (result["submaps"], result["joined_submaps"], result["unjoined_share"]) == (2, 1, 0)
+    assert result["lost_frames"] == 2
+    assert result["submap_ate_m"] <= result["joined_ate_m"] + 1e-9  # one submap in the end
+    assert result["joined_ate_m"] < 0.01
+    assert result["ate_m"] > 0.1  # of the poses as they were given, before the joint
+    rows = [line.split(",") for line in (tmp_path / "submaps.csv").read_text().splitlines()]
+    assert rows[0] == ["timestamp", "submap", "joined_to", "sigma_m", "sigma_deg"]
+    own, now = (np.array([int(row[k]) for row in rows[1:]]) for k in (1, 2))
+    assert own[:16].tolist() == now[:16].tolist() == [0] * 16
+    assert own[16:18].tolist() == [-1, -1]
+    assert own[18] == 1
+    assert not now[18:].any()
+    written = json.loads((tmp_path / "metrics.json").read_text())
+    assert "Submaps" in [table["title"] for table in written["tables"]]
+    (chart,) = [chart for chart in written["charts"] if chart["name"] == "submaps"]
+    assert [line["name"] for line in chart["panels"][0]["series"]] == ["truth", "submap 0"]
+
+
+def _turning(degrees):
+    """Poses (N, 4, 4) of a camera that turns on the spot."""
+    eye = np.array([-0.8, -0.8, 1.2])
+    angles = np.radians(degrees)
+    aims = np.stack([np.cos(angles), np.sin(angles), np.full(len(angles), -0.35)], axis=1)
+    return np.stack([look_at(eye, eye + aim) for aim in aims])
 
 
 def test_writes_trajectory_map_and_metrics(sequence, tmp_path, capsys):
