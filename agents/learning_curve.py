@@ -1,59 +1,140 @@
-"""The learning curve of a training run as JSON, CSV and picture."""
+"""The learning curve of a training run, as a result like all others."""
 
 from __future__ import annotations
 
-import csv
-import io
-import json
-import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from matplotlib.figure import Figure
+from ms_slam_agents.evaluation import paired_gain
+
+from ms_slam_env.errors import InputError
+from ms_slam_env.report.charts import Chart, Panel, Series
+from ms_slam_env.report.figures import save_charts
+from ms_slam_env.report.records import Row, write_text
+from ms_slam_env.report.results import RESULTS, TABLE, Results, read_results, write_results
+from ms_slam_env.report.tables import Table, make_table
+
+BASELINE = "random walk"
+POLICY = "policy"
+
+_SCORES = ("return", "steps", "mapped_area_m2", "ate_unaligned_m", "lost_steps_share", "terminated")
+_TRAINED = ("timesteps", "training_min", "return", "return_gain", "return_gain_sem", *_SCORES[1:])
 
 
-def _write(path: Path, content: bytes) -> None:
-    """Write a file so that an interrupt leaves the old content or the new, never half."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(content)
-    os.replace(partial, path)
+@dataclass
+class Curve:
+    """Scores of a policy while it is trained, and of reference planners on the same episodes.
+
+    Attributes:
+        episodes: of each evaluation.
+        references: planner to scores, as ``evaluate`` returns them.
+        points: scores with ``timesteps`` and ``training_min``, the oldest first.
+        config: the training script's options.
+    """
+
+    episodes: int
+    references: dict[str, dict[str, Any]] = field(default_factory=dict)
+    points: list[dict[str, Any]] = field(default_factory=list)
+    config: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def minutes(self) -> float:
+        """Time trained up to the last point."""
+        return float(self.points[-1]["training_min"]) if self.points else 0.0
+
+    @property
+    def best(self) -> float:
+        """Highest return of a point after training began; -inf without any."""
+        found = [point["return"] for point in self.points if point["timesteps"]]
+        return max(found, default=-float("inf"))
+
+    def add(self, timesteps: int, minutes: float, scores: Mapping[str, Any]) -> dict[str, Any]:
+        """Add a point; with random walk among the references, with its gain over that."""
+        point = {"timesteps": timesteps, "training_min": round(minutes, 3), **scores}
+        if BASELINE in self.references:
+            point |= paired_gain(point["returns"], self.references[BASELINE]["returns"])
+        self.points.append(point)
+        return point
+
+    def write(self, out: Path) -> Results:
+        """Write ``results.json``, ``table.md`` and the figure into folder ``out``."""
+        charts = [self._chart()]
+        results = write_results(
+            out / RESULTS,
+            kind="train",
+            title="A policy while it is trained",
+            about="Scores on validation episodes, always the same with the same random numbers, "
+            "beside planners that are not trained.",
+            tables=self._tables(),
+            charts=charts,
+            rows=self._rows(),
+            content={"config": self.config, "episodes": self.episodes},
+        )
+        write_text(out / TABLE, results.as_markdown())
+        save_charts(charts, out)
+        return results
+
+    def _rows(self) -> list[Row]:
+        named = [*self.references.items(), *((POLICY, point) for point in self.points)]
+        return [{"spec": {"planner": n}, "result": scores, "error": None} for n, scores in named]
+
+    def _tables(self) -> list[Table]:
+        columns = _TRAINED if self.references else tuple(c for c in _TRAINED if "gain" not in c)
+        note = f"Means of {self.episodes} validation episodes"
+        note += "; gains over random walk, in pairs." if self.references else "."
+        tables = [make_table(columns, self.points, "The policy", note)]
+        if self.references:
+            lines = [{"planner": name, **scores} for name, scores in self.references.items()]
+            tables.append(make_table(("planner", *_SCORES), lines, "References"))
+        return tables
+
+    def _chart(self) -> Chart:
+        timesteps = [point["timesteps"] for point in self.points]
+        ends = [timesteps[0], timesteps[-1]]
+        panels = []
+        for key in ("return", "mapped_area_m2"):
+            values = [point[key] for point in self.points]
+            band = self._band() if key == "return" else ((), ())
+            series = [Series(POLICY, timesteps, values, *band)]
+            for name, scores in self.references.items():
+                series.append(Series(name, ends, [scores[key]] * 2, mode="lines"))
+            panels.append(Panel("timesteps", key, series))
+        caption = f"Means of {self.episodes} episodes"
+        caption += "; band: standard error of the gain over random walk" if self.references else ""
+        return Chart("learning_curve", "Learning curve", caption, panels)
+
+    def _band(self) -> tuple[list[float], list[float]]:
+        """Lower and upper ends around the returns; empty without random walk."""
+        known = [(p["return"], p["return_gain_sem"]) for p in self.points if "return_gain_sem" in p]
+        if len(known) < len(self.points):
+            return [], []
+        return [mean - error for mean, error in known], [mean + error for mean, error in known]
 
 
-def write_curve(out: Path, curve: dict[str, Any]) -> None:
-    """Write ``learning_curve`` as JSON (everything), CSV (the points) and PNG."""
-    _write(out / "learning_curve.json", json.dumps(curve, indent=1).encode())
-    table = io.StringIO()
-    writer = csv.DictWriter(table, fieldnames=list(curve["points"][0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(curve["points"])
-    _write(out / "learning_curve.csv", table.getvalue().encode())
-    _write(out / "learning_curve.png", _draw(curve))
+def read_curve(path: Path) -> Curve:
+    """The curve in a ``results.json`` of a training run.
+
+    Raises:
+        InputError: another result.
+    """
+    results = read_results(path)
+    curve = Curve(0)
+    try:
+        curve.episodes = int(results.content["episodes"])
+        for row in results.rows:
+            if row["spec"]["planner"] == POLICY:
+                curve.points.append(_checked(row["result"], "timesteps", "training_min"))
+            else:
+                curve.references[row["spec"]["planner"]] = _checked(row["result"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path} is no result of ms-slam train: {error!r}") from None
+    return curve
 
 
-def _draw(curve: dict[str, Any]) -> bytes:
-    """Draw validation return and mapped area over training, with the references as lines."""
-    points = curve["points"]
-    timesteps = [point["timesteps"] for point in points]
-    figure = Figure(figsize=(10, 4), layout="constrained")
-    axes = figure.subplots(1, 2)
-    for axis, name, label in (
-        (axes[0], "return", "return of a validation episode"),
-        (axes[1], "mapped_area_m2", "surface mapped in its place, m²"),
-    ):
-        axis.plot(timesteps, [point[name] for point in points], "o-", ms=3, label="policy")
-        for i, (planner, result) in enumerate(curve["references"].items(), start=1):
-            axis.axhline(result[name], color=f"C{i}", ls="--", label=planner)
-        axis.set(xlabel="training steps", ylabel=label)
-        axis.grid(alpha=0.3)
-    mean = np.array([point["return"] for point in points])
-    error = np.array([point["gain_sem"] for point in points])
-    axes[0].fill_between(timesteps, mean - error, mean + error, alpha=0.2, lw=0)
-    axes[0].legend(fontsize="small")
-    figure.suptitle(
-        f"mean of {curve['eval_episodes']} episodes; "
-        "band: standard error of the paired difference to random walk"
-    )
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", dpi=110)
-    return picture.getvalue()
+def _checked(scores: dict[str, Any], *more: str) -> dict[str, Any]:
+    """Scores with a number for everything that tables and charts show."""
+    for key in (*_SCORES, *more):
+        float(scores[key])
+    return scores

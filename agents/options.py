@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from ms_slam_env.config import Checked, bounded
+from ms_slam_env.config import Checked, bounded, from_dict
 from ms_slam_env.errors import InputError
 
 
@@ -16,12 +17,13 @@ class Args(Checked):
 
     Attributes:
         out: folder for everything the run writes.
-        resume: go on from ``out/latest.zip``, with the learning settings saved in it.
+        resume: go on from ``out/latest.safetensors``; options that are not given are those of the
+            run so far.
         algorithm: PPO over the actions that are not blocked, or over all of them.
         env_id: id of the environment.
         embodiment: what carries the camera; None: what the id says.
-        observation: ``lookahead`` shows the agent what the greedy planner sees, ``features`` is
-            cheaper.
+        observation: ``features``, as environments have it by default, or ``lookahead``, which shows
+            the agent what the greedy planner sees and takes longer.
         scenes: trained and validated on, with training and validation seeds.
         scene_seeds: seeds of each scene, from the split's first; a scene takes seconds to build.
         episode_steps: time limit of an episode.
@@ -30,13 +32,16 @@ class Args(Checked):
         num_envs: parallel environments, one process and one thread each.
         seed: of network, training episodes and sampling.
         total_timesteps: environment steps, all runs of a resumed training together.
-        minutes: stop this run after training for so much wall-clock time, the evaluations during
-            it included; the episodes of the references before, and the last evaluation after it,
-            come on top. None: by steps alone.
+        minutes: stop this run after training for so much wall-clock time; evaluations and the
+            episodes of the references come on top. None: by steps alone.
         eval_every: environment steps between evaluations; 0: only first and last.
-        eval_episodes: validation episodes, the same at each evaluation.
+        eval_episodes: validation episodes, the same at each evaluation, with the same random
+            numbers.
+        references: play the validation episodes with random walk, standing still and the greedy
+            planner too, before training.
         deterministic_eval: evaluate the most probable action instead of sampling.
-        n_steps: steps of each environment between updates.
+        n_steps: steps of each environment between updates; fewer where ``total_timesteps`` leaves
+            fewer.
         batch_size: of the gradient steps.
         n_epochs: passes over the data of one update.
         learning_rate: of Adam.
@@ -52,7 +57,7 @@ class Args(Checked):
     algorithm: Literal["maskable_ppo", "ppo"] = "maskable_ppo"
     env_id: str = "MSActiveSLAM-FreeCamera-v0"
     embodiment: str | None = None
-    observation: Literal["features", "lookahead"] = "lookahead"
+    observation: Literal["features", "lookahead"] = "features"
     scenes: tuple[str, ...] = ("living_room", "corridor", "table")
     scene_seeds: int = bounded(4, 1, 100_000)
     episode_steps: int = bounded(150, 1, 100_000)
@@ -60,10 +65,11 @@ class Args(Checked):
     step_deg: float | None = None
     num_envs: int = bounded(2, 1, 100_000)
     seed: int = 0
-    total_timesteps: int = bounded(200_000, 0, 1_000_000_000)
+    total_timesteps: int = bounded(200_000, 2, 1_000_000_000)
     minutes: float | None = bounded(None, 0, 1_000_000)
     eval_every: int = bounded(10_000, 0, 1_000_000_000)
-    eval_episodes: int = bounded(12, 1, 100_000)
+    eval_episodes: int = bounded(24, 1, 100_000)
+    references: bool = True
     deterministic_eval: bool = False
     n_steps: int = bounded(512, 2, 1_000_000)  # advantages of one sample have no spread
     batch_size: int = bounded(128, 2, 1_000_000)
@@ -73,10 +79,50 @@ class Args(Checked):
     gae_lambda: float = bounded(0.95, 0, 1)
     ent_coef: float = bounded(0.003, 0, 1)
     clip_range: float = bounded(0.2, 0, 1)
-    hidden: int = bounded(128, 1, 100_000)
+    hidden: int = bounded(128, 1, 4096)
 
     def __post_init__(self) -> None:
         """Refuse values out of range, and training nowhere."""
         super().__post_init__()
         if not self.scenes:
             raise InputError("Args.scenes names no scene")
+
+
+KEPT = ("algorithm", "env_id", "embodiment", "observation", "step_m", "step_deg", "hidden")
+"""Options that a run keeps when it is resumed: another network, or another problem."""
+
+
+def resumed(given: Args, saved: Mapping[str, Any]) -> Args:
+    """The options of the run to resume, for what the command line does not say.
+
+    Args:
+        given: as the command line says, with the defaults for the rest.
+        saved: options in the policy file.
+
+    Raises:
+        InputError: options that no run has, or that name code which only the file wants loaded.
+    """
+    kept = {name: tuple(v) if isinstance(v, list) else v for name, v in saved.items()}
+    kept |= {"out": given.out, "resume": given.resume}
+    made = from_dict(Args, kept)
+    for name, value in kept.items():
+        texts = value if isinstance(value, tuple) else (value,)
+        named = [text for text in texts if isinstance(text, str) and ":" in text]
+        if named and value != getattr(given, name):
+            raise InputError(f"saved option {name} names code, {named[0]!r}: give --{name} again")
+    for name, hint in get_type_hints(Args).items():
+        if not _is_of(getattr(made, name), hint):
+            raise InputError(f"saved option {name} = {getattr(made, name)!r} is of the wrong type")
+    return made
+
+
+def _is_of(value: Any, hint: Any) -> bool:
+    """Whether ``value`` is of the type ``hint`` of an option."""
+    parts = get_args(hint)
+    if get_origin(hint) is Literal:
+        return value in parts
+    if get_origin(hint) is tuple:
+        return isinstance(value, tuple) and all(isinstance(part, parts[0]) for part in value)
+    if parts:
+        return any(_is_of(value, part) for part in parts)
+    return isinstance(value, (int, float) if hint is float else hint)

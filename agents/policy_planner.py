@@ -5,9 +5,7 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from ms_slam_agents import artefact
-from ms_slam_agents.evaluation import most_probable, sample
+from ms_slam_agents.policy import Policy
 
 from ms_slam_env.env import Planner
 from ms_slam_env.errors import InputError
@@ -31,8 +29,8 @@ class TrainedPolicy(Planner):
             text ``true`` or ``false``.
 
     Raises:
-        InputError: no policy file, one trained for another observation variant or number of
-            actions, or a ``deterministic`` that is no truth value.
+        InputError: no policy file, an untrained one, one trained for another observation variant
+            or number of actions, or a ``deterministic`` that is no truth value.
     """
 
     observation = "lookahead"
@@ -45,50 +43,42 @@ class TrainedPolicy(Planner):
         deterministic: bool | str = False,
     ) -> None:
         super().__init__(env, seed)
-        path = path or os.environ.get(PATH_VARIABLE)
+        path = str(path or os.environ.get(PATH_VARIABLE) or "")
         if not path:
             raise InputError(
                 f"planner {_NAMES[self.observation]} needs a policy file: option path=..., "
                 f"or the environment variable {PATH_VARIABLE}"
             )
         self.deterministic = _truth(deterministic)
-        trained_on = artefact.load_metadata(path).observation
-        if trained_on != self.observation:
-            right = f": use {_NAMES[trained_on]}" if trained_on in _NAMES else ""
+        self.policy = Policy.load(path)
+        metadata = self.policy.metadata
+        if metadata.observation != self.observation:
+            right = _NAMES.get(metadata.observation)
             raise InputError(
-                f"{path!r} was trained on observation {trained_on!r}, planner "
-                f"{_NAMES[self.observation]} runs policies trained on {self.observation!r}{right}"
+                f"{path!r} was trained on observation {metadata.observation!r}, planner "
+                f"{_NAMES[self.observation]} runs policies trained on {self.observation!r}"
+                + (f": use {right}" if right else "")
             )
-        self.policy = artefact.Policy.load(path)
-        parts = artefact.action_parts(env.action_space)
-        if self.policy.parts != parts:
-            raise InputError(
-                f"{path!r} chooses among {_product(self.policy.parts)} actions, "
-                f"the environment has {_product(parts)}"
-            )
+        if not metadata.epochs:
+            raise InputError(f"{path!r} is untrained: its network has had no update")
+        try:
+            self.policy.check_fits(env)
+        except InputError as error:
+            raise InputError(f"{path!r}: {error}") from None
 
     def act(self, observation: Any, info: dict[str, Any]) -> Any:
         """Draw an unmasked action from the policy's probabilities, or take the most probable.
 
         An integer, or an array of them where an action has several.
         """
-        mask = self.env.action_masks()
-        probabilities = self.policy.probabilities(observation[None], mask[None])
-        if self.deterministic:
-            (action,) = most_probable(probabilities, self.policy.parts)
-        else:
-            (action,) = sample(probabilities, self.rng, self.policy.parts)
-        return action if np.ndim(action) else int(action)
+        rng = None if self.deterministic else self.rng
+        return self.policy.act(observation, self.env.action_masks(), rng)
 
 
 class TrainedFeaturesPolicy(TrainedPolicy):
     """A policy trained by ``train_sb3`` on the observation variant ``features``."""
 
     observation = "features"
-
-
-def _product(parts: tuple[int, ...]) -> str:
-    return " x ".join(map(str, parts))
 
 
 def _truth(value: bool | str) -> bool:

@@ -22,8 +22,10 @@ _CLASS = re.compile(r"^Error parsing \w+: ")  # names our dataclass, which tells
 _PROPOSAL = re.compile(r"^[│ ] +(--[a-z][\w-]*)", re.MULTILINE)
 
 
-def parse(cls: type[T], arguments: Sequence[str] | None, prog: str) -> T:
+def parse(cls: type[T], arguments: Sequence[str] | None, prog: str, default: T | None = None) -> T:
     """Build dataclass ``cls`` from command-line ``arguments`` (the process's own if None).
+
+    What they do not say is as in ``default``, by default as the dataclass has it.
 
     Raises:
         InputError: arguments that do not fit; what tyro says in a box, in one line.
@@ -32,7 +34,8 @@ def parse(cls: type[T], arguments: Sequence[str] | None, prog: str) -> T:
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
-            return tyro.cli(cls, args=arguments, prog=prog)
+            start = tyro.MISSING_NONPROP if default is None else default
+            return tyro.cli(cls, args=arguments, prog=prog, default=start)
     except SystemExit as stop:
         if stop.code in (0, None):
             raise

@@ -27,7 +27,7 @@ RECOVERY = "recovery"
 _OPPOSITE = (0, 2, 1, 4, 3, 6, 5)  # of a translation or rotation, in the paper's order
 _REMEMBERED = 12  # motions that can be undone
 
-_TRAINING = ("torch", "stable_baselines3", "sb3_contrib")  # packages of the extra "train"
+_TRAINING = ("safetensors", "torch", "stable_baselines3", "sb3_contrib")  # of the extra "train"
 
 
 class Planner(ABC):

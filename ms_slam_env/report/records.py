@@ -125,9 +125,12 @@ def from_plain(content: Any) -> Any:
 _PLAIN: Mapping[str, tuple[type, ...]] = {
     "str": (str,),
     "bool": (bool,),
+    "int": (int,),
     "float": (int, float),
+    "dict[str, Any]": (dict,),
     "Sequence[Point]": (str, int, float, NoneType),
     "Sequence[float | None]": (int, float, NoneType),
+    "Sequence[int]": (int,),
     "Sequence[str]": (str,),
 }  # annotation to what JSON may have there
 

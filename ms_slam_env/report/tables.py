@@ -246,7 +246,8 @@ def format_value(value: Value, key: str) -> str:
         return "yes" if value else "no"
     if of.scale == 1 and float(value).is_integer() and (isinstance(value, int) or of.digits > 8):
         return str(int(value))
-    return format_number(value * of.scale, of.digits)
+    between = of.unit == "count" and of.digits > 8  # a mean of counts
+    return format_number(value * of.scale, 3 if between else of.digits)
 
 
 def format_interval(interval: Interval, scale: float = 1.0, digits: int = 2) -> str:

@@ -5,8 +5,9 @@ import pytest
 
 pytest.importorskip("sb3_contrib")
 
-from ms_slam_agents import artefact, train_sb3
-from ms_slam_agents.policy_planner import TrainedFeaturesPolicy, TrainedPolicy
+from ms_slam_agents import train_sb3
+from ms_slam_agents.policy import Policy
+from ms_slam_agents.policy_planner import TrainedFeaturesPolicy
 
 import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env.errors import InputError
@@ -26,17 +27,18 @@ def test_two_processes_train_a_policy_that_plans(tmp_path):
         "n-epochs": 1,
         "eval-episodes": 1,  # in this process: the two others train
         "eval-every": 0,
+        "step-m": 0.1,
     }
     words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
     assert train_sb3.main(words) == 0
-    path = tmp_path / "run" / "latest.zip"
-    metadata = artefact.load_metadata(path)
-    assert (metadata.timesteps, metadata.observation) == (16, "lookahead")
+    path = tmp_path / "run" / "latest.safetensors"
+    policy = Policy.load(path)
+    assert (policy.metadata.timesteps, policy.metadata.epochs) == (16, 1)
+    assert policy.metadata.env_options == {"step_m": 0.1}
 
-    env = gym.make(
-        metadata.env_id, scene="table", scene_seed=1000, observation=TrainedPolicy.observation
-    )
-    planner = TrainedPolicy(env.unwrapped, path=str(path))  # before the first reset
+    env = policy.make_env(scene="table", scene_seed=1000)
+    assert env.unwrapped.config.step_m == 0.1
+    planner = TrainedFeaturesPolicy(env.unwrapped, path=str(path))  # before the first reset
     observation, info = env.reset(seed=0)
     for _ in range(3):
         action = planner.act(observation, info)
@@ -64,6 +66,18 @@ def test_bad_options_of_the_environment_give_one_line(tmp_path, capsys, option, 
     assert not (tmp_path / "run").exists()
 
 
+def test_a_policy_with_the_defaults_fits_the_environment_with_the_defaults():
+    """The observation of training is the one that an environment has if nobody says another."""
+    args = train_sb3.Args(scenes=("table",), scene_seeds=1)
+    trained_in = train_sb3.make_env(args, "validation", ())
+    for env_id in (args.env_id, "MSActiveSLAM-v0"):  # of the README
+        env = gym.make(env_id, scene="table", scene_seed=1000)
+        assert env.observation_space == trained_in.observation_space
+        assert env.action_space == trained_in.action_space
+        env.close()
+    trained_in.close()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ["maskable_ppo", "ppo"])
 def test_motion_and_slam_configuration_are_learnt_together(tmp_path, algorithm):
@@ -86,7 +100,7 @@ def test_motion_and_slam_configuration_are_learnt_together(tmp_path, algorithm):
     }
     words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
     assert train_sb3.main(words) == 0
-    path = tmp_path / "run" / "latest.zip"
+    path = tmp_path / "run" / "latest.safetensors"
     env = gym.make(
         "MSActiveSLAM-Adaptive-v0",
         embodiment="free",

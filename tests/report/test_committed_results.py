@@ -13,25 +13,16 @@ from ms_slam_env.report.results import Results, is_result, read_results
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "results"
 PATHS = sorted(FOLDER.rglob("*.json"))
 
-NOT_CONVERTED = {"train"}
-"""Folders with files of an older form; a folder that is converted is taken out."""
-
 
 def is_converted(path: Path) -> bool:
     return is_result(json.loads(path.read_text(encoding="utf-8")))
 
 
-def folder_of(path: Path) -> str:
-    return path.parent.relative_to(FOLDER).as_posix()
-
-
 RESULTS = [path for path in PATHS if is_converted(path)]
 
 
-def test_every_file_is_a_result_but_in_folders_not_converted_yet() -> None:
-    older = {folder_of(path) for path in PATHS if path not in RESULTS}
-    assert older - NOT_CONVERTED == set()
-    assert NOT_CONVERTED - older == set(), "these are converted or gone: take them out of the list"
+def test_every_file_is_a_result() -> None:
+    assert [path for path in PATHS if path not in RESULTS] == []
 
 
 @pytest.mark.parametrize("path", RESULTS, ids=lambda path: str(path.relative_to(FOLDER)))

@@ -1,0 +1,275 @@
+"""A trained policy as one safetensors file: numbers and a JSON text, nothing that could run.
+
+Tensors: ``policy.*``, the network under Stable-Baselines3's names; ``observation.*`` and
+``return.*``, the running moments that normalised training; in a file to resume from also
+``optimizer.*``, the moments of Adam. The text is :class:`Metadata`. Whatever is loaded is checked
+first, since policies come from strangers.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.report.records import build, to_plain
+
+Tensors = dict[str, NDArray[Any]]
+Shapes = dict[str, tuple[int, ...]]
+
+ALGORITHMS = ("maskable_ppo", "ppo")
+VERSION = 1
+STEP = "optimizer.step"
+MOMENTS = ("exp_avg", "exp_avg_sq")  # of Adam, each of its parameter's shape
+
+_TEXT = "ms_slam_policy"
+_LARGEST_FILE = 2**30  # bytes
+_LARGEST_LAYER = 100_000
+_MOST_LAYERS = 16
+_ENV_ID = re.compile(r"[\w-]+")  # gym.make imports what stands before a colon
+_ENV_OPTIONS = {"embodiment": str, "step_m": (int, float), "step_rad": (int, float)}
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """What a policy file says about its numbers.
+
+    Attributes:
+        algorithm: one of ``ALGORITHMS``.
+        env_id: id of the environment it was trained in.
+        env_options: of that environment, where not its defaults: those of ``embodiment``,
+            ``step_m`` and ``step_rad``.
+        observation: observation variant that the policy expects.
+        inputs: numbers of an observation.
+        hidden: widths of the hidden layers, tanh between them.
+        actions: choices of each number that an action consists of.
+        timesteps: environment steps trained.
+        epochs: passes over its experience that the network learnt from; 0: it is untrained.
+        minutes: wall-clock time trained, evaluations left out.
+        options: the training script's options.
+        provenance: command, versions, commit and machine.
+        version: of this format.
+    """
+
+    algorithm: str
+    env_id: str
+    observation: str
+    inputs: int
+    hidden: Sequence[int]
+    actions: Sequence[int]
+    timesteps: int
+    epochs: int
+    minutes: float
+    env_options: dict[str, Any] = field(default_factory=dict)
+    options: dict[str, Any] = field(default_factory=dict)
+    provenance: dict[str, Any] = field(default_factory=dict)
+    version: int = VERSION
+
+    def __post_init__(self) -> None:
+        """Hold sequences as tuples, however they came."""
+        for name in ("hidden", "actions"):
+            if isinstance(getattr(self, name), list):
+                object.__setattr__(self, name, tuple(getattr(self, name)))
+
+    def check(self) -> None:
+        """Refuse values that no policy has.
+
+        Raises:
+            InputError: naming the value.
+        """
+        if self.algorithm not in ALGORITHMS:
+            raise unknown("algorithm", self.algorithm, ALGORITHMS)
+        if not _ENV_ID.fullmatch(self.env_id):
+            raise InputError(f"env_id {self.env_id!r} is no name of an environment")
+        for name, value in self.env_options.items():
+            if name not in _ENV_OPTIONS:
+                raise unknown("option of env_options", name, _ENV_OPTIONS)
+            if not isinstance(value, _ENV_OPTIONS[name]):  # type: ignore[arg-type]
+                raise InputError(f"env_options.{name} = {value!r} is of the wrong type")
+        for name, sizes in (
+            ("inputs", (self.inputs,)), ("hidden", self.hidden), ("actions", self.actions)
+        ):  # fmt: skip
+            many = 0 < len(sizes) <= _MOST_LAYERS
+            if not many or not all(0 < size <= _LARGEST_LAYER for size in sizes):
+                raise InputError(f"{name} = {str(sizes)[:80]} are no sizes of layers")
+        counts = (self.timesteps, self.epochs, self.minutes)
+        if not all(0 <= count < math.inf for count in counts):
+            raise InputError(f"timesteps, epochs, minutes = {counts} are no counts")
+
+
+@dataclass(frozen=True)
+class PolicyFile:
+    """What a policy file holds.
+
+    Attributes:
+        metadata: what it says about itself.
+        tensors: name to array; shapes as ``tensor_shapes`` says.
+    """
+
+    metadata: Metadata
+    tensors: Tensors
+
+    @property
+    def can_resume(self) -> bool:
+        """Whether the state of the optimiser is there."""
+        return STEP in self.tensors
+
+    def part(self, name: str) -> Tensors:
+        """The tensors ``name.*``, by the rest of their names."""
+        start = f"{name}."
+        return {k.removeprefix(start): v for k, v in self.tensors.items() if k.startswith(start)}
+
+    def without_optimizer(self) -> PolicyFile:
+        """The same policy, to run alone: a third of the size."""
+        kept = {k: v for k, v in self.tensors.items() if not k.startswith("optimizer.")}
+        return PolicyFile(self.metadata, kept)
+
+
+def network_shapes(metadata: Metadata) -> Shapes:
+    """Shapes of the network's parameters, by Stable-Baselines3's names, in its order."""
+    shapes: Shapes = {}
+    sizes = (metadata.inputs, *metadata.hidden)
+    layers = list(zip(sizes[1:], sizes[:-1], strict=True))
+    heads = {"action_net": sum(metadata.actions), "value_net": 1}
+    for net in ("policy_net", "value_net"):
+        for i, shape in enumerate(layers):
+            shapes |= _linear(f"mlp_extractor.{net}.{2 * i}", *shape)  # tanh at the odd places
+    for head, outputs in heads.items():
+        shapes |= _linear(head, outputs, sizes[-1])
+    return shapes
+
+
+def _linear(name: str, outputs: int, inputs: int) -> Shapes:
+    return {f"{name}.weight": (outputs, inputs), f"{name}.bias": (outputs,)}
+
+
+def tensor_shapes(metadata: Metadata, with_optimizer: bool) -> Shapes:
+    """Shapes of all tensors of a file, by name."""
+    network = network_shapes(metadata)
+    shapes = {f"policy.{name}": shape for name, shape in network.items()}
+    for moments, shape in (("observation", (metadata.inputs,)), ("return", ())):
+        shapes |= {f"{moments}.mean": shape, f"{moments}.var": shape, f"{moments}.count": ()}
+    if with_optimizer:
+        shapes[STEP] = ()
+        for moment in MOMENTS:
+            shapes |= {f"optimizer.{name}.{moment}": shape for name, shape in network.items()}
+    return shapes
+
+
+def write_policy(path: Path, policy: PolicyFile) -> None:
+    """Write a policy file; an interrupt leaves the old file or the new, never half of one.
+
+    Raises:
+        InputError: tensors that do not fit the metadata.
+    """
+    shapes = tensor_shapes(policy.metadata, STEP in policy.tensors)
+    _check_shapes({name: np.shape(value) for name, value in policy.tensors.items()}, shapes)
+    text = json.dumps(to_plain(policy.metadata), allow_nan=False)
+    # np.array: in C order, and () stays (), as np.ascontiguousarray would not have it.
+    tensors = {name: np.array(value, order="C") for name, value in policy.tensors.items()}
+    partial = path.with_name(path.name + ".partial")
+    partial.write_bytes(save(tensors, {_TEXT: text}))
+    os.replace(partial, path)
+
+
+def read_policy(path: str | Path) -> PolicyFile:
+    """Read a policy file. Nothing in it is executed, whoever wrote it.
+
+    Raises:
+        InputError: no such file, or one that is not a policy, whole and of this version.
+    """
+    path = Path(path)
+    _check_file(path)
+    try:
+        with safe_open(path, framework="numpy") as file:
+            metadata = _read_metadata((file.metadata() or {}).get(_TEXT))
+            found = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118 -- no dict
+            shapes = tensor_shapes(metadata, with_optimizer=STEP in found)
+            # Before any is read into memory.
+            _check_shapes({name: tuple(t.get_shape()) for name, t in found.items()}, shapes)
+            _check_types({name: t.get_dtype() for name, t in found.items()})
+            tensors = {name: file.get_tensor(name) for name in shapes}
+    except InputError as error:
+        raise InputError(f"{str(path)!r} is not a policy: {error}") from None
+    except (SafetensorError, OSError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"{str(path)!r} is not a policy: {reason}") from None
+    _check_values(path, tensors)
+    return PolicyFile(metadata, tensors)
+
+
+def _check_file(path: Path) -> None:
+    """Refuse what is no regular file of a policy's size; opening a FIFO would wait for ever."""
+    if not path.exists():
+        raise InputError(f"no policy file {str(path)!r}")
+    if not path.is_file():
+        raise InputError(f"{str(path)!r} is not a policy: not a regular file")
+    if path.stat().st_size > _LARGEST_FILE:
+        raise InputError(f"{str(path)!r} is not a policy: larger than {_LARGEST_FILE >> 20} MiB")
+    with path.open("rb") as file:
+        if file.read(4) == b"PK\x03\x04":
+            raise InputError(
+                f"{str(path)!r} is an archive of Stable-Baselines3, which can hold code: "
+                "convert it with ms-slam train sb3 convert"
+            )
+
+
+def _read_metadata(text: str | None) -> Metadata:
+    """The metadata in ``text``.
+
+    Raises:
+        InputError: saying what is wrong with it.
+    """
+    if text is None:
+        raise InputError("a safetensors file of something else")
+    try:
+        content = json.loads(text, parse_constant=_refuse_constant)
+        version = content.get("version")
+        if version != VERSION or isinstance(version, bool):
+            raise InputError(f"format version {version!r}, this package reads {VERSION}")
+        metadata = build(Metadata, content)
+        metadata.check()
+    except InputError:
+        raise
+    except (ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        reason = str(error).replace("Metadata.__init__() ", "").splitlines()[0]
+        raise InputError(f"metadata: {reason}") from None
+    return metadata
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name} is no JSON")
+
+
+def _check_shapes(found: Shapes, shapes: Shapes) -> None:
+    if found.keys() != shapes.keys():
+        missing, extra = sorted(shapes.keys() - found), sorted(found.keys() - shapes)
+        raise InputError(f"no tensor {missing[0]}" if missing else f"unknown tensor {extra[0]}")
+    for name, shape in shapes.items():
+        if found[name] != shape:
+            raise InputError(f"tensor {name} has shape {found[name]}, not {shape}")
+
+
+def _check_types(found: Mapping[str, str]) -> None:
+    for name, kind in found.items():
+        if kind not in ("F32", "F64"):
+            raise InputError(f"tensor {name} has type {kind}, not F32 or F64")
+
+
+def _check_values(path: Path, tensors: Tensors) -> None:
+    for name, value in tensors.items():
+        if not np.isfinite(value).all():
+            raise InputError(f"{str(path)!r}: tensor {name} holds NaN or infinity")
+        if name.endswith((".var", ".count", ".step", ".exp_avg_sq")) and (value < 0).any():
+            raise InputError(f"{str(path)!r}: tensor {name} holds negative numbers")

@@ -1,0 +1,103 @@
+"""Between a model of Stable-Baselines3 in training and the numbers of a policy file."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from ms_slam_agents.policy_file import MOMENTS, STEP, PolicyFile, Tensors
+from sb3_contrib import MaskablePPO
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecNormalize
+
+Model = PPO | MaskablePPO
+
+ALGORITHMS: dict[str, type[PPO] | type[MaskablePPO]] = {"maskable_ppo": MaskablePPO, "ppo": PPO}
+
+
+def tensors_of(model: Model) -> Tensors:
+    """Network, optimiser and running moments of a model on normalised environments."""
+    normalize = _normalize(model)
+    return {
+        **{f"policy.{name}": p.numpy() for name, p in model.policy.state_dict().items()},
+        **optimizer_tensors(list(model.policy.state_dict()), model.policy.optimizer.state_dict()),
+        **_moments("observation", normalize.obs_rms),
+        **_moments("return", normalize.ret_rms),
+    }
+
+
+def optimizer_tensors(parameters: list[str], state: dict[str, Any]) -> Tensors:
+    """State of Adam, as ``state_dict`` has it, under the names of the network's parameters.
+
+    Empty before the first update. All parameters have taken the same number of steps.
+    """
+    tensors: Tensors = {}
+    for i, of_parameter in state["state"].items():
+        tensors[STEP] = np.array(float(of_parameter["step"]))
+        for moment in MOMENTS:
+            tensors[f"optimizer.{parameters[i]}.{moment}"] = of_parameter[moment].numpy()
+    return tensors
+
+
+def restore(model: Model, file: PolicyFile) -> None:
+    """Put a model where training stood when the file was written, but for its environments."""
+    network = {name: torch.from_numpy(value) for name, value in file.part("policy").items()}
+    model.policy.load_state_dict(network)
+    if file.can_resume:
+        _restore_optimizer(model, file.part("optimizer"), list(network))
+    normalize = _normalize(model)
+    _restore_moments(normalize.obs_rms, file.part("observation"))
+    _restore_moments(normalize.ret_rms, file.part("return"))
+    model.num_timesteps = file.metadata.timesteps
+    model._n_updates = file.metadata.epochs
+
+
+def _restore_optimizer(model: Model, saved: Tensors, parameters: list[str]) -> None:
+    state = model.policy.optimizer.state_dict()
+    state["state"] = {
+        i: {"step": torch.tensor(float(saved["step"]))}
+        | {moment: torch.from_numpy(saved[f"{name}.{moment}"]) for moment in MOMENTS}
+        for i, name in enumerate(parameters)
+    }
+    model.policy.optimizer.load_state_dict(state)
+
+
+def _normalize(model: Model) -> VecNormalize:
+    normalize = model.get_vec_normalize_env()
+    assert normalize is not None
+    return normalize
+
+
+def _moments(name: str, running: Any) -> Tensors:
+    parts = {"mean": running.mean, "var": running.var, "count": running.count}
+    return {f"{name}.{part}": np.asarray(v, dtype=np.float64) for part, v in parts.items()}
+
+
+def _restore_moments(running: Any, saved: Tensors) -> None:
+    running.mean, running.var = saved["mean"].copy(), saved["var"].copy()
+    running.count = float(saved["count"])
+
+
+def update_on_partial_rollout(model: Model, least: int) -> bool:
+    """Let the network learn from a rollout that was stopped; return whether it was long enough.
+
+    Args:
+        model: whose ``learn`` was ended by a callback.
+        least: samples that are worth an update.
+    """
+    buffer = model.rollout_buffer
+    steps = buffer.pos
+    if buffer.full or steps * buffer.n_envs < least:
+        return False
+    for name, value in vars(buffer).items():
+        if isinstance(value, np.ndarray):
+            setattr(buffer, name, value[:steps])
+    buffer.buffer_size, buffer.full = steps, True
+    assert model._last_obs is not None
+    assert model._last_episode_starts is not None
+    with torch.no_grad():
+        values = model.policy.predict_values(torch.as_tensor(model._last_obs))
+    buffer.compute_returns_and_advantage(values, model._last_episode_starts)
+    model.train()
+    return True

@@ -1,0 +1,186 @@
+"""Watches a training run: ends it by the clock or a signal, saves and judges the policy."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+from ms_slam_agents.evaluation import evaluate_policy
+from ms_slam_agents.learning_curve import BASELINE, Curve
+from ms_slam_agents.options import Args
+from ms_slam_agents.policy import Policy, action_parts
+from ms_slam_agents.policy_file import Metadata, PolicyFile, write_policy
+from ms_slam_agents.sb3_state import Model, tensors_of, update_on_partial_rollout
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnv
+from tqdm import tqdm
+
+from ms_slam_env.report.provenance import provenance
+from ms_slam_env.report.records import to_plain
+
+LATEST = "latest.safetensors"
+BEST = "best.safetensors"
+
+
+class Supervisor(BaseCallback):
+    """Stops by the clock or a signal, saves after each update, evaluates every so often.
+
+    Args:
+        args: of the training script.
+        env_options: those of the environment that the policy depends on.
+        validation: environments of ``FixedEpisodes``.
+        curve: so far.
+        minutes_before: trained by the runs that this one goes on from.
+    """
+
+    model: Model
+
+    def __init__(
+        self,
+        args: Args,
+        env_options: dict[str, Any],
+        validation: VecEnv,
+        curve: Curve,
+        minutes_before: float = 0.0,
+    ) -> None:
+        super().__init__()
+        self.args = args
+        self.env_options = env_options
+        self.validation = validation
+        self.curve = curve
+        self.stop_reason = ""
+        self.unlearnt_steps = 0
+        self._minutes_before = minutes_before
+        self._evaluation_s = 0.0
+        self._provenance = provenance()
+
+    def stop(self, reason: str) -> None:
+        """End training after the current step."""
+        self.stop_reason = self.stop_reason or reason
+
+    @property
+    def minutes(self) -> float:
+        """Wall-clock time that this run has trained, evaluations left out."""
+        return (time.monotonic() - self._start - self._evaluation_s) / 60
+
+    def _on_training_start(self) -> None:
+        self._start = time.monotonic()
+        self._epochs_before = self.model._n_updates
+        if self.args.minutes is None:
+            self._bar = tqdm(
+                total=self.args.total_timesteps,
+                initial=self.num_timesteps,
+                unit="step",
+                smoothing=0.1,
+            )
+        else:
+            self._bar = tqdm(total=round(60 * self.args.minutes), unit="s")
+        self._next_evaluation = self.num_timesteps
+        if self._is_evaluated():
+            self._plan_evaluation()  # resumed where it was evaluated
+
+    @property
+    def has_learnt(self) -> bool:
+        """Whether this run has updated the network."""
+        return self.model._n_updates > self._epochs_before
+
+    def _on_rollout_start(self) -> None:
+        self._save_latest()
+        if self.num_timesteps >= self._next_evaluation:
+            self._evaluate()
+            self._plan_evaluation()
+
+    def _on_step(self) -> bool:
+        self._show_progress()
+        terms: dict[str, list[float]] = {}
+        for info in self.locals["infos"]:
+            for name, value in info["reward_terms"].items():
+                terms.setdefault(name, []).append(value)
+        for name, values in terms.items():
+            self.logger.record_mean(f"reward/{name}", float(np.mean(values)))
+        if self.args.minutes is not None and self.minutes >= self.args.minutes:
+            self.stop("time is up")
+        return not self.stop_reason
+
+    def _show_progress(self) -> None:
+        """Move the bar: it counts seconds where time ends the run, steps otherwise."""
+        if self.args.minutes is None:
+            self._bar.update(self.training_env.num_envs)
+            return
+        self._bar.set_postfix_str(f"{self.num_timesteps} steps", refresh=False)
+        seconds = min(round(60 * self.args.minutes), int(60 * self.minutes))
+        self._bar.update(seconds - self._bar.n)
+
+    def _on_training_end(self) -> None:
+        if self.stop_reason and not update_on_partial_rollout(self.model, self.args.batch_size):
+            buffer = self.model.rollout_buffer
+            self.unlearnt_steps = 0 if buffer.full else buffer.pos * buffer.n_envs
+        self._save_latest()
+        is_interrupted = self.stop_reason.startswith("interrupt")
+        if self.has_learnt and not is_interrupted and not self._is_evaluated():
+            self._evaluate()
+        self._bar.close()
+
+    def _is_evaluated(self) -> bool:
+        points = self.curve.points
+        return bool(points) and points[-1]["timesteps"] == self.num_timesteps
+
+    def _save_latest(self) -> None:
+        write_policy(self.args.out / LATEST, self.policy_file())
+
+    def policy_file(self) -> PolicyFile:
+        """The policy as it is now, with the state of the optimiser."""
+        space = self.training_env.observation_space
+        assert space.shape is not None
+        metadata = Metadata(
+            algorithm=self.args.algorithm,
+            env_id=self.args.env_id,
+            env_options=self.env_options,
+            observation=self.args.observation,
+            inputs=space.shape[0],
+            hidden=(self.args.hidden, self.args.hidden),
+            actions=action_parts(self.training_env.action_space),
+            timesteps=self.num_timesteps,
+            epochs=self.model._n_updates,
+            minutes=self._minutes_before + self.minutes,
+            options=to_plain(asdict(self.args)),
+            provenance=self._provenance,
+        )
+        return PolicyFile(metadata, tensors_of(self.model))
+
+    def _plan_evaluation(self) -> None:
+        every = self.args.eval_every
+        done = self.num_timesteps
+        self._next_evaluation = (done // every + 1) * every if every else sys.maxsize
+
+    def _evaluate(self) -> None:
+        started = time.monotonic()
+        file = self.policy_file().without_optimizer()
+        minutes = file.metadata.minutes
+        scores = evaluate_policy(
+            self.validation, self.args.eval_episodes, Policy(file), self.args.deterministic_eval
+        )
+        if file.metadata.epochs and scores["return"] > self.curve.best:
+            write_policy(self.args.out / BEST, file)
+        point = self.curve.add(self.num_timesteps, minutes, scores)
+        self.curve = replace(self.curve, config=file.metadata.options)
+        self.curve.write(self.args.out)
+        for name in scores.keys() - {"returns"}:
+            self.logger.record(f"validation/{name}", scores[name])
+        self._evaluation_s += time.monotonic() - started
+        self._bar.write(f"{self.num_timesteps} steps, {minutes:.1f} min: {self._in_words(point)}")
+
+    def _in_words(self, point: dict[str, Any]) -> str:
+        gain = ""
+        if "return_gain" in point:
+            gain = (
+                f", {point['return_gain']:+.2f} ± {point['return_gain_sem']:.2f} over random "
+                f"walk's {self.curve.references[BASELINE]['return']:.2f}"
+            )
+        return (
+            f"validation return {point['return']:.2f}{gain}; mapped "
+            f"{point['mapped_area_m2']:.1f} m2, ended early {point['terminated']:.0%}"
+        )

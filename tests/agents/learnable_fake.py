@@ -1,0 +1,97 @@
+"""A small environment that can be learnt in seconds, and options to train in it."""
+
+from types import SimpleNamespace
+from typing import ClassVar
+
+import gymnasium as gym
+import numpy as np
+from ms_slam_agents.learning_curve import read_curve as read_curve_file
+
+from ms_slam_env.env.config import TargetConfig
+
+NUM_ACTIONS = 7
+ENV_ID = "LearnableFake-v0"
+
+
+class LearnableFake(gym.Env):
+    """The observation names the right action, which is never blocked; half of the others are."""
+
+    log: ClassVar[list] = []
+
+    def __init__(self, scene="", split="train", num_scene_seeds=1, observation="features"):
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (NUM_ACTIONS,), np.float32)
+        self.action_space = gym.spaces.Discrete(NUM_ACTIONS)
+        self.config = SimpleNamespace(targets=TargetConfig(rho_I=0, rho_D=0))
+        self.split = split
+
+    def action_masks(self):
+        return self.mask.copy()
+
+    def lookahead(self):
+        return 1.0 - np.repeat(np.eye(NUM_ACTIONS)[self.right][:, None], 2, axis=1)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.score = 0.0
+        return self._next(), self._info(0.0)
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        self.log.append((self.split, bool(self.mask[action])))
+        reward = float(action == self.right)
+        self.score += reward
+        return self._next(), reward, False, False, self._info(reward)
+
+    def _next(self):
+        self.right = int(self.np_random.integers(NUM_ACTIONS))
+        self.mask = self.np_random.random(NUM_ACTIONS) < 0.5
+        self.mask[self.right] = True
+        return (10 * np.eye(NUM_ACTIONS)[self.right] + 3).astype(np.float32)
+
+    def _info(self, reward):
+        return {
+            "tracking_ok": True,
+            "mapped_area": self.score,
+            "ate": 0.0,
+            "reward_terms": {"right": reward},
+        }
+
+
+gym.register(ENV_ID, LearnableFake)
+
+
+def arguments(out, *extra, steps=64, algorithm="maskable_ppo"):
+    options = {
+        "out": out,
+        "env-id": ENV_ID,
+        "algorithm": algorithm,
+        "observation": "features",
+        "total-timesteps": steps,
+        "num-envs": 1,
+        "episode-steps": 10,
+        "eval-episodes": 3,
+        "eval-every": 32,
+        "n-steps": 32,
+        "batch-size": 16,
+        "n-epochs": 2,
+        "hidden": 16,
+    }
+    return [word for name, value in options.items() for word in (f"--{name}", str(value))] + [
+        *extra
+    ]
+
+
+def read_curve(out):
+    return read_curve_file(out / "results.json")
+
+
+def fake_env(num_actions=NUM_ACTIONS, seed=0, inputs=NUM_ACTIONS):
+    rng = np.random.default_rng(seed)
+    mask = rng.random(num_actions) < 0.5
+    mask[0] = True
+    return SimpleNamespace(
+        action_space=gym.spaces.Discrete(num_actions),
+        observation_space=gym.spaces.Box(-np.inf, np.inf, (inputs,), np.float32),
+        action_masks=lambda: mask.copy(),
+        mask=mask,
+    )
