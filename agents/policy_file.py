@@ -171,8 +171,9 @@ def write_policy(path: Path, policy: PolicyFile) -> None:
     """Write a policy file; an interrupt leaves the old file or the new, never half of one.
 
     Raises:
-        InputError: tensors that do not fit the metadata.
+        InputError: tensors that do not fit the metadata, or numbers that no training goes on from.
     """
+    _check_values(path, policy.tensors)
     shapes = tensor_shapes(policy.metadata, STEP in policy.tensors)
     _check_shapes({name: np.shape(value) for name, value in policy.tensors.items()}, shapes)
     text = json.dumps(to_plain(policy.metadata), allow_nan=False)

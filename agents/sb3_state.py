@@ -79,16 +79,16 @@ def _restore_moments(running: Any, saved: Tensors) -> None:
     running.count = float(saved["count"])
 
 
-def update_on_partial_rollout(model: Model, least: int) -> bool:
+def update_on_partial_rollout(model: Model, batch_size: int) -> bool:
     """Let the network learn from a rollout that was stopped; return whether it was long enough.
 
     Args:
         model: whose ``learn`` was ended by a callback.
-        least: samples that are worth an update.
+        batch_size: samples of a gradient step; fewer are not worth an update.
     """
     buffer = model.rollout_buffer
     steps = buffer.pos
-    if buffer.full or steps * buffer.n_envs < least:
+    if buffer.full or steps * buffer.n_envs < batch_size:
         return False
     for name, value in vars(buffer).items():
         if isinstance(value, np.ndarray):
@@ -99,5 +99,17 @@ def update_on_partial_rollout(model: Model, least: int) -> bool:
     with torch.no_grad():
         values = model.policy.predict_values(torch.as_tensor(model._last_obs))
     buffer.compute_returns_and_advantage(values, model._last_episode_starts)
+    model.batch_size = whole_batches(steps * buffer.n_envs, batch_size)
     model.train()
     return True
+
+
+def whole_batches(samples: int, batch_size: int) -> int:
+    """The smallest size from ``batch_size`` on that leaves no batch of a single sample.
+
+    The advantages of one sample have no spread, by which sb3-contrib divides.
+    """
+    batch_size = min(batch_size, samples)
+    while samples % batch_size == 1:
+        batch_size += 1
+    return batch_size

@@ -28,7 +28,7 @@ from ms_slam_agents.evaluation import FixedEpisodes, references
 from ms_slam_agents.learning_curve import Curve, read_curve
 from ms_slam_agents.options import KEPT, Args, resumed
 from ms_slam_agents.policy_file import PolicyFile, read_policy
-from ms_slam_agents.sb3_state import ALGORITHMS, Model, restore
+from ms_slam_agents.sb3_state import ALGORITHMS, Model, restore, whole_batches
 from ms_slam_agents.supervisor import LATEST, Supervisor
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
@@ -101,7 +101,7 @@ def make_model(args: Args, venv: VecEnv, file: PolicyFile | None) -> Model:
         normalize,
         learning_rate=args.learning_rate,
         n_steps=n_steps,
-        batch_size=min(args.batch_size, n_steps * venv.num_envs),
+        batch_size=whole_batches(n_steps * venv.num_envs, args.batch_size),
         n_epochs=args.n_epochs,
         gamma=args.gamma,
         gae_lambda=args.gae_lambda,

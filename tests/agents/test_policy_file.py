@@ -41,6 +41,9 @@ METADATA = Metadata(
 )
 
 
+BIAS = "policy.action_net.bias"
+
+
 def make_tensors(metadata=METADATA, with_optimizer=True):
     rng = np.random.default_rng(0)
     shapes = tensor_shapes(metadata, with_optimizer)
@@ -95,14 +98,15 @@ def test_what_is_written_comes_back_to_the_bit(tmp_path, with_optimizer):
 
 
 def test_tensors_that_do_not_fit_are_not_written(tmp_path):
+    tensors = make_tensors() | {BIAS: np.full(7, np.inf, np.float32)}
+    with pytest.raises(InputError, match="NaN or infinity"):
+        write_policy(tmp_path / "a", PolicyFile(METADATA, tensors))
     with pytest.raises(InputError, match="no tensor optimizer"):
         write_policy(
             tmp_path / "a", PolicyFile(replace(METADATA, hidden=(4, 3, 2)), make_tensors())
         )
     assert not list(tmp_path.iterdir())
 
-
-BIAS = "policy.action_net.bias"
 
 BROKEN = {
     "empty": (b"", "not a policy"),

@@ -13,6 +13,7 @@ pytest.importorskip("sb3_contrib")
 from learnable_fake import ENV_ID, LearnableFake, arguments, read_curve
 from ms_slam_agents import evaluation, supervisor, train_sb3
 from ms_slam_agents.policy_file import read_policy
+from ms_slam_agents.sb3_state import whole_batches
 from scipy.stats import sem
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -205,6 +206,25 @@ def test_a_run_without_an_update_fails_and_leaves_no_best_policy(tmp_path, monke
     monkeypatch.undo()
     assert train_sb3.main([*arguments(tmp_path, "--resume", steps=42)]) == 0
     assert read_policy(tmp_path / "latest.safetensors").metadata.timesteps == 42
+
+
+@pytest.mark.parametrize("algorithm", ["maskable_ppo", "ppo"])
+def test_a_rollout_of_one_sample_more_than_a_batch_leaves_numbers(tmp_path, monkeypatch, algorithm):
+    """sb3-contrib divides by the spread of a batch, which one sample has not."""
+    end_after(18, monkeypatch)
+    words = arguments(tmp_path, "--no-references", steps=10**6, algorithm=algorithm)
+    assert train_sb3.main([*words, "--minutes", "1"]) == 0
+    assert read_policy(tmp_path / "latest.safetensors").metadata.epochs == 2
+    monkeypatch.undo()
+    assert train_sb3.main([*words, "--total-timesteps", "35", "--resume"]) == 0
+
+
+@pytest.mark.parametrize("batch_size", [2, 3, 16, 200])
+def test_no_batch_is_a_single_sample(batch_size):
+    for samples in range(2, 150):
+        found = whole_batches(samples, batch_size)
+        assert min(batch_size, samples) <= found <= samples
+        assert samples % found != 1
 
 
 def test_a_budget_below_a_rollout_shrinks_it(tmp_path):
