@@ -30,7 +30,7 @@ def test_two_processes_train_a_policy_that_plans(tmp_path):
         "step-m": 0.1,
     }
     words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
-    assert train_sb3.main(words) == 0
+    assert train_sb3.main([*words, "--no-references"]) == 0
     path = tmp_path / "run" / "latest.safetensors"
     policy = Policy.load(path)
     assert (policy.metadata.timesteps, policy.metadata.epochs) == (16, 1)
