@@ -5,8 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium
+from gymnasium.envs.registration import WrapperSpec
 
 MAX_EPISODE_STEPS = 150
+
+FOLLOWS_STATES = WrapperSpec("FollowStates", "ms_slam_env.env.wrappers:FollowStates", {})
+"""Outermost of the registered environments: Gymnasium's own wrappers follow a loaded state."""
 
 ADAPTIVE_ID = "MSActiveSLAM-Adaptive-v0"
 """The agent chooses motion and SLAM configuration, by an arm unless ``embodiment`` is given."""
@@ -62,7 +66,8 @@ def register_all() -> None:
             gymnasium.register(
                 env_id,
                 entry_point="ms_slam_env.env.make:make_env",
-                vector_entry_point="ms_slam_env.env.make:InProcessVectorEnv",
                 max_episode_steps=MAX_EPISODE_STEPS,
+                disable_env_checker=True,  # for who writes environments; it wants a reset first
+                additional_wrappers=(FOLLOWS_STATES,),
                 kwargs=arguments,
             )

@@ -1,7 +1,7 @@
 """The pinhole camera, RGB-D frames and images."""
 
 from ms_slam_env.camera.frame import RGBDFrame, intensity_image
-from ms_slam_env.camera.image_size import parse_image_size, rendered_size, xtion
+from ms_slam_env.camera.image_size import parse_image_size, pinhole, rendered_size, xtion
 from ms_slam_env.camera.intrinsics import XTION_SIZES, Intrinsics
 
 __all__ = [
@@ -10,6 +10,7 @@ __all__ = [
     "RGBDFrame",
     "intensity_image",
     "parse_image_size",
+    "pinhole",
     "rendered_size",
     "xtion",
 ]

@@ -7,6 +7,7 @@ place of the size reduces nothing.
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass
 
@@ -148,4 +149,23 @@ def xtion(size: str = "160x120") -> Intrinsics:
     """
     width, height = rendered_size(size)
     focal = 570.3 * max(width / 640, height / 480)
+    return Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
+
+
+def pinhole(size: str, field_of_view_deg: float | None = None) -> Intrinsics:
+    """A camera with square pixels and its axis in the middle of the image.
+
+    Args:
+        size: of the image, as ``xtion`` takes it.
+        field_of_view_deg: from the left edge to the right one; None for the Xtion's own.
+
+    Raises:
+        InputError: unknown size, or an angle outside [10, 150].
+    """
+    if field_of_view_deg is None:
+        return xtion(size)
+    width, height = rendered_size(size)
+    if not 10 <= field_of_view_deg <= 150:
+        raise InputError(f"field_of_view_deg = {field_of_view_deg} is outside [10, 150]")
+    focal = 0.5 * width / math.tan(math.radians(field_of_view_deg) / 2)
     return Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)

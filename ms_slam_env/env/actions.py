@@ -16,6 +16,30 @@ from ms_slam_env.slam.base import SlamBackend
 Bool = NDArray[np.bool_]
 
 
+class MaskedDiscrete(spaces.Discrete):
+    """``Discrete`` that samples with masks of truth values, as ``info["action_mask"]`` is."""
+
+    def sample(self, mask: Any = None, probability: Any = None) -> np.int64:
+        """An action, among those whose mask (n,) is true if there is one."""
+        return super().sample(_int8(mask), probability)
+
+
+class MaskedMultiDiscrete(spaces.MultiDiscrete):
+    """``MultiDiscrete`` that samples with one mask of all its parts, one after the other."""
+
+    def sample(self, mask: Any = None, probability: Any = None) -> NDArray[np.int64]:
+        """Actions, among those whose mask (n + K,), or tuple of masks, is true if there is one."""
+        if isinstance(mask, np.ndarray):
+            mask = tuple(np.split(mask, np.cumsum(self.nvec)[:-1]))
+        return super().sample(None if mask is None else tuple(map(_int8, mask)), probability)
+
+
+def _int8(mask: Any) -> Any:
+    """A mask as Gymnasium takes it; of another type only one of truth values is meant."""
+    is_bool = isinstance(mask, np.ndarray) and mask.dtype == bool
+    return mask.astype(np.int8) if is_bool else mask
+
+
 class ActionDecoder(ABC):
     """Turns an action of the agent into a motion, and whatever else it asks for.
 
@@ -55,11 +79,11 @@ class MotionActions(ActionDecoder):
 
     def __init__(self, num_motions: int) -> None:
         self.num_motions = num_motions
-        self.space = spaces.Discrete(num_motions)
+        self.space = MaskedDiscrete(num_motions)
 
     def decode(self, action: Any) -> int:
         """See the base class."""
-        array = np.asarray(action)
+        array = _as_array(action)
         is_integer = array.shape == () and np.issubdtype(array.dtype, np.integer)
         if not is_integer or not 0 <= int(array) < self.num_motions:
             raise InputError(f"action {action!r} is not an integer in [0, {self.num_motions - 1}]")
@@ -90,11 +114,11 @@ class MotionAndConfigurationActions(ActionDecoder):
         self._slam = slam
         self._costs = adaptation.costs_of(slam.intrinsics)
         self.num_configurations = len(self._costs)
-        self.space = spaces.MultiDiscrete([num_motions, len(self._costs)])
+        self.space = MaskedMultiDiscrete([num_motions, len(self._costs)])
 
     def decode(self, action: Any) -> int:
         """See the base class; the configuration is in force from the next frame on."""
-        array = np.asarray(action)
+        array = _as_array(action)
         if array.shape != (2,) or array not in self.space:
             sizes = " x ".join(f"[0, {n - 1}]" for n in self.space.nvec)
             raise InputError(f"action {action!r} is not two integers in {sizes}")
@@ -114,3 +138,11 @@ class MotionAndConfigurationActions(ActionDecoder):
     def configuration_cost(self) -> float:
         """See the base class."""
         return self._costs[self.configuration]
+
+
+def _as_array(action: Any) -> NDArray[Any]:
+    """An action as an array; lists of unequal lengths become one that is no action."""
+    try:
+        return np.asarray(action)
+    except (TypeError, ValueError):
+        return np.empty(0)

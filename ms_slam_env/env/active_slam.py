@@ -2,36 +2,61 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from functools import cached_property, partial
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import slam as slam_backends
-from ms_slam_env.camera import RGBDFrame, intensity_image, xtion
+from ms_slam_env.camera import RGBDFrame, intensity_image
 from ms_slam_env.divergence import Histograms, make_divergence
 from ms_slam_env.env.actions import ActionDecoder, MotionActions, MotionAndConfigurationActions
 from ms_slam_env.env.camera_feed import make_camera_feed
-from ms_slam_env.env.config import check_same_settings, make_config
+from ms_slam_env.env.config import make_config
 from ms_slam_env.env.coverage import CoverageGrid
 from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.env.episode import Episode
 from ms_slam_env.env.lookahead import Lookahead
-from ms_slam_env.env.observations import CONFIGURATION, RobotKnowledge, make_observation
+from ms_slam_env.env.observations import (
+    CONFIGURATION,
+    STATE_NAMES,
+    RobotKnowledge,
+    make_observation,
+)
 from ms_slam_env.env.pose_sources import POSE_SOURCES
 from ms_slam_env.env.rendering import draw_moment
 from ms_slam_env.env.reward import Outcome, reward_terms
+from ms_slam_env.env.state import (
+    check_episode,
+    check_like,
+    check_parts,
+    check_same_settings,
+    is_open,
+)
 from ms_slam_env.errors import InputError, UnreachableError, unknown
 from ms_slam_env.geometry import check_pose, invert
-from ms_slam_env.robot import MotionResult
+from ms_slam_env.robot import Embodiment, MotionResult
+from ms_slam_env.scenes.base import Scene
+from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sensor.scene_cache import get_scene, get_sensor
 from ms_slam_env.sequences.perturbations.base import Perturbation
 from ms_slam_env.slam.base import SlamBackend, TrackResult, Views
 from ms_slam_env.timings import Timings
 
 Float64 = NDArray[np.float64]
+
+
+class World(NamedTuple):
+    """A scene and what an environment has in it."""
+
+    scene: Scene
+    sensor: RGBDSensor
+    embodiment: Embodiment
+    coverage: CoverageGrid
+
 
 _START_TRIES = 10  # a drawn start sees surface in most of its view: one try is nearly always enough
 
@@ -62,8 +87,16 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
     or as ``slam_configuration``.
 
     ## Reward
-    Weighted sum of the terms of :func:`ms_slam_env.env.reward.reward_terms`. The costs of SLAM
-    configurations are numbers (``adaptation.costs``) and not a clock's: two runs agree.
+    The sum of these terms (``info["reward_terms"]``), each times its weight (option ``reward``):
+    ``intensity_divergence`` and ``depth_divergence``, -0.1 per M_I and M_D of distance to the
+    target, of each at most 2, depth times lambda (0.1); ``trajectory_error``, -10 per metre that
+    the pose error grew, at most 0.1 m either way; ``new_surface``, +1 per m2 newly mapped in its
+    true place; ``lost``, -0.5 a step; ``lost_for_good``, -10 once; ``blocked``, -0.1 a masked
+    action; where the agent chooses the SLAM configuration ``compute``, -0.1 times its cost, a
+    number (``adaptation.costs``) and not a clock's, so that two runs agree.
+    Scale: random possible motions in a living room brought -0.2 to 1.6 a step in 90 % of the
+    steps with the arm and -0.4 to 1.3 with the free camera, from -1.7 (lost) to 4.0 at the
+    extremes, and -10.8 to -11.7 at the end of an episode that was lost for good.
 
     ## Start
     A free pose of the scene, drawn from the seed; SLAM starts at the true pose with one frame.
@@ -73,10 +106,13 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
     limit (``max_episode_steps`` of ``gym.make``, 150 by default).
 
     ## Info
-    ``T_world_camera``, ``T_world_camera_estimate`` (4, 4); ``pose_error`` m; ``ate`` running RMSE
-    of the pose error over all frames, m, no alignment; ``divergence`` (2,) intensity and depth
-    between the last frames of this step and the one before, nats; ``tracking_ok``;
-    ``reward_terms``; ``action_mask`` (n,) bool; ``mapped_area`` m2; ``time`` simulated seconds;
+    ``T_world_camera``, ``T_world_camera_estimate`` (4, 4); ``pose_covariance`` (6, 6) of the
+    estimate, of the twist (rho, phi) in metres and radians in the camera's frame, infinite where
+    SLAM gave none (at the start, while lost, by another backend or source of the pose);
+    ``pose_error`` m; ``ate`` running RMSE of the pose error over all frames, m, no alignment;
+    ``divergence`` (2,) intensity and depth between the last frames of this step and the one
+    before, nats; ``tracking_ok``; ``reward_terms``; ``action_mask`` (n,) bool; ``mapped_area`` m2;
+    ``mapped_share`` of the surface that opens into free space, [0, 1]; ``time`` simulated seconds;
     ``energy`` mechanical work of the motion so far, J; ``scene``, ``scene_seed``.
     No clock: timings are in ``env.unwrapped.timings``. Where the agent chooses it:
     ``slam_configuration``, the index in force.
@@ -124,7 +160,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         self._arguments = (embodiment, render_mode, agent_configures_slam, options)
         self.render_mode = render_mode
         self.config = config = make_config(options)
-        self.intrinsics = xtion(config.image_size)
+        self.intrinsics = config.camera
         self._rays = self.intrinsics.rays()
         self.timings = Timings()
 
@@ -149,6 +185,9 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         self.action_space = self._actions.space
         self.observation_space = self._observation.space
         self._episode: Episode | None = None
+        self._place: tuple[str, int] | None = None
+        self._fresh_slam = self.slam.get_state()
+        self.on_load: Callable[[int], None] = _nothing
 
     # -- Gymnasium ---------------------------------------------------------------------------
 
@@ -165,16 +204,13 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
             InputError: a bad option, or a start from where there is nothing to map; the
                 environment must then be reset again before it is used.
         """
+        _check_reset(seed, options)
         super().reset(seed=seed)
         self._episode = None  # the world of the old episode may be gone before this one begins
-        unknown_options = set(options or {}) - {"T_world_camera"}
-        if unknown_options:
-            raise InputError(
-                f"unknown reset option {sorted(unknown_options)}; valid choices: T_world_camera"
-            )
         name, scene_seed = self.config.draw_scene(self.np_random)
-        self._enter_scene(name, scene_seed)
-        start = options["T_world_camera"] if options else None
+        self._place = name, scene_seed
+        self.scene, self.sensor, self.embodiment, self.coverage = self._world(name, scene_seed)
+        start = (options or {}).get("T_world_camera")
         if start is None:
             self._start_somewhere(name, scene_seed)
         else:
@@ -303,6 +339,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
             **self.episode.info(),
             "action_mask": self.action_masks(),
             "mapped_area": self.coverage.mapped_area,
+            "mapped_share": self.coverage.mapped_share,
         }
         if self._actions.num_configurations > 1:
             info[CONFIGURATION] = self._actions.configuration
@@ -310,11 +347,15 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
 
     # -- The start of an episode -------------------------------------------------------------
 
-    def _enter_scene(self, name: str, scene_seed: int) -> None:
-        self.scene = get_scene(name, scene_seed)
-        self.sensor = get_sensor(name, scene_seed, self.config.image_size, self.config.noise)
-        self.embodiment = self._embodiment_type.build(self.scene, self.config, self.timings)
-        self.coverage = CoverageGrid(self.scene)
+    def _world(self, name: str, scene_seed: int) -> World:
+        """A scene and what stands in it."""
+        scene = get_scene(name, scene_seed)
+        sensor = get_sensor(name, scene_seed, self.intrinsics, self.config.noise)
+        robot = self._embodiment_type.build(scene, self.config, self.timings)
+        return World(scene, sensor, robot, CoverageGrid(scene))
+
+    def _here(self) -> World:
+        return World(self.scene, self.sensor, self.embodiment, self.coverage)
 
     def _start_somewhere(self, name: str, scene_seed: int) -> None:
         """Begin at the first pose drawn that can be used.
@@ -364,6 +405,11 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         if self._episode is None:
             raise InputError("the environment must be reset before it is used: call env.reset()")
         return self._episode
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """What the numbers of the observations' state vector are; see ``STATE_NAMES``."""
+        return STATE_NAMES
 
     # -- What planners use -------------------------------------------------------------------
 
@@ -423,20 +469,69 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Go on from a state that ``save_state`` of an env with the same world and robot returned.
 
+        No reset is needed before. Gymnasium's own wrappers of an environment made by ``gym.make``
+        follow: the time limit counts the steps of the state's episode.
+
         Raises:
-            InputError: options that shape the state differ; the environment is as it was.
+            InputError: options that shape the state differ, or it is not such a state; the
+                environment is as it was.
         """
+        check_parts(state)
         check_same_settings(state["settings"], self._settings())
-        episode: Episode = state["episode"]
-        self._enter_scene(episode.scene, episode.scene_seed)
-        self._episode = episode.copy()
-        self.slam.set_state(state["slam"])
-        self.embodiment.set_state(state["embodiment"])
+        motions, blank = self._embodiment_type.num_motions, self._blank
+        check_episode(state["episode"], self._episode, blank, self.intrinsics.shape, motions)
+        episode = state["episode"]
+        place = episode.scene, episode.scene_seed
+        world = self._here() if place == self._place else self._world(*place)
+        self._check_state(state, world)
+        self._take_up(state, world)
+        self._place = place
+        self.scene, self.sensor, self.embodiment, self.coverage = world
         self.coverage.set_state(state["coverage"])
-        start = episode.frames[0].T_world_camera
-        self.camera_feed.set_state(state["camera_feed"], self.scene, self.sensor, start)
         self._T_world_kinematic = state["T_world_kinematic"].copy()
         self.np_random.bit_generator.state = state["random"]
+        self._episode = episode.copy()
+        self.on_load(len(episode.divergences_of_steps) - 1)
+
+    def _check_state(self, state: Mapping[str, Any], world: World) -> None:
+        """Refuse parts of a state that do not belong into a world."""
+        like = {
+            "slam": self._fresh_slam,
+            "embodiment": world.embodiment.get_state(),
+            "coverage": world.coverage.get_state(),
+            "T_world_kinematic": np.eye(4),
+            "random": self.np_random.bit_generator.state,
+            "camera_feed": self.camera_feed.example,
+        }
+        for name, own in like.items():
+            check_like(state[name], own, name)
+        if state["camera_feed"]["noise_seed"] != state["episode"].noise_seed:
+            raise InputError("this is no state to go on from: camera_feed is of another episode")
+
+    def _take_up(self, state: Mapping[str, Any], world: World) -> None:
+        """Give SLAM, camera and robot their states; all or none."""
+        robot, start = world.embodiment, state["episode"].frames[0].T_world_camera
+        undo = [partial(robot.set_state, robot.get_state())]
+        if self._episode is not None and self.camera_feed.has_begun:
+            own = self.camera_feed.get_state(), self.scene, self.sensor
+            began = self._episode.frames[0].T_world_camera
+            undo.append(partial(self.camera_feed.set_state, *own, began))
+        if is_open(self._fresh_slam):
+            undo.append(partial(self.slam.set_state, self.slam.get_state()))
+        try:
+            robot.set_state(state["embodiment"])
+            self.camera_feed.set_state(state["camera_feed"], world.scene, world.sensor, start)
+            self.slam.set_state(state["slam"])
+        except Exception as error:  # whatever a part makes of what only looks like its state
+            for back in undo:
+                back()
+            raise InputError(f"this is no state to go on from: {error!r}") from error
+
+    @cached_property
+    def _blank(self) -> Histograms:
+        """Histograms of a frame with nothing in it."""
+        nothing = np.zeros((1, *self.intrinsics.shape), np.float32)
+        return self._divergence.histograms(nothing, nothing)
 
     def _settings(self) -> dict[str, Any]:
         """What two environments must have in common to go on from one state."""
@@ -458,3 +553,20 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         self.perturb(*pickled["perturbations"])
         if pickled["state"] is not None:
             self.load_state(pickled["state"])
+
+
+def _nothing(steps: int) -> None:
+    """What is done at a loaded state where nobody asked for more."""
+
+
+def _check_reset(seed: Any, options: Any) -> None:
+    """Refuse arguments of ``reset`` of the wrong type, and unknown options."""
+    is_seed = isinstance(seed, (int, np.integer)) and not isinstance(seed, bool) and seed >= 0
+    if seed is not None and not is_seed:
+        raise InputError(f"reset(seed={seed!r}): must be an integer >= 0 or None")
+    if options is not None and not isinstance(options, Mapping):
+        raise InputError(f"reset(options={options!r}): must be a mapping or None")
+    unknown_options = set(options or {}) - {"T_world_camera"}
+    if unknown_options:
+        names = sorted(map(str, unknown_options))
+        raise InputError(f"unknown reset option {names}; valid choices: T_world_camera")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,13 @@ class CameraFeed(ABC):
     """
 
     perturbations: tuple[Perturbation, ...] = ()
+    example: ClassVar[Mapping[str, Any]] = {"noise_seed": 0}
+    """A state, as small as there is."""
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether it took part in the episode from its start."""
+        return True
 
     @abstractmethod
     def begin(
@@ -103,6 +111,8 @@ class PerturbedFeed(CameraFeed):
     one of the same motion; after the last one the motion goes on. What moves through the scene
     begins where the camera of the start can see it, and waits rather than bump into the camera.
     """
+
+    example: ClassVar[Mapping[str, Any]] = {"noise_seed": 0, "brightness": [], "waits": []}
 
     def __init__(self, perturbations: tuple[Perturbation, ...]) -> None:
         """Take the perturbations.
@@ -207,8 +217,13 @@ class PerturbedFeed(CameraFeed):
         """What moves through the scene, with its poses by time."""
         return tuple(self._movers)
 
+    @property
+    def has_begun(self) -> bool:
+        """See the base class."""
+        return bool(self._began)
+
     def _check_begun(self) -> None:
-        if not self._began:
+        if not self.has_begun:
             raise InputError(
                 "a perturbation was put on after the episode began: call env.reset() first"
             )
@@ -231,7 +246,7 @@ class PerturbedFeed(CameraFeed):
     ) -> None:
         """See the base class."""
         super().set_state(state, scene, sensor, start)
-        self._brightness = list(state["brightness"])
+        self._brightness = [float(value) for value in state["brightness"]]
         for mover, waits in zip(self._movers, state["waits"], strict=True):
             mover.set_state(waits)
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.camera import XTION_SIZES
+from ms_slam_env.camera import Intrinsics, pinhole
 from ms_slam_env.config import Checked, bounded, check_range, chosen, from_dict
 from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.env.observations import OBSERVATIONS
@@ -20,6 +20,7 @@ from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.robot.arm import ArmConfig
 from ms_slam_env.scenes import SEED_SPLITS
 from ms_slam_env.scenes.registry import check_name
+from ms_slam_env.sensor.noise import NoiseConfig, noise_config
 from ms_slam_env.slam.adaptation import AdaptationConfig, NoAdaptationConfig
 from ms_slam_env.slam.configuration import is_file_name, read_configuration
 from ms_slam_env.slam.frame_selection import EveryFrameConfig, FrameSelectionConfig
@@ -29,6 +30,7 @@ OTHER_OPTIONS = ("embodiment", "render_mode", "max_episode_steps")
 
 _OF_STATE = (
     "image_size",
+    "field_of_view_deg",
     "noise",
     "arm",
     "pose",
@@ -124,8 +126,10 @@ class EnvConfig(Checked):
         split: which seeds to draw from: train, validation or test.
         num_scene_seeds: how many seeds of the split are used; a scene takes seconds to build, so
             a small pool is kept in memory.
-        image_size: of the camera, width x height.
-        noise: sensor noise, ``kinect`` or ``none``.
+        image_size: of the camera, WIDTHxHEIGHT pixels.
+        field_of_view_deg: of the camera, from left to right; None for that of the Xtion, 58.6.
+        noise: sensor noise: ``kinect``, ``range`` or ``none``; a mapping with the ``name`` of one,
+            a ``strength`` (1 as it is, 0 off) and fields of ``ms_slam_env.sensor.NoiseConfig``.
         arm: the arm, where the embodiment is one.
         pose: where the estimated pose comes from: ``slam``, ``slam-kinematics`` (SLAM that starts
             its search from the arm's forward kinematics), ``kinematics`` (noisy forward kinematics
@@ -153,8 +157,9 @@ class EnvConfig(Checked):
     scene_seed: int | None = None
     split: str = chosen("train", *SEED_SPLITS)
     num_scene_seeds: int = 4
-    image_size: str = chosen("160x120", *XTION_SIZES)
-    noise: str = chosen("kinect", "kinect", "none")
+    image_size: str = "160x120"
+    field_of_view_deg: float | None = bounded(None, 10, 150)
+    noise: str | NoiseConfig = "kinect"
     arm: ArmConfig = field(default_factory=ArmConfig)
     pose: str = chosen("slam", *POSE_SOURCES)
     slam: str = "surfel"
@@ -173,6 +178,10 @@ class EnvConfig(Checked):
     def __post_init__(self) -> None:
         """Refuse unknown choices and values out of range."""
         super().__post_init__()
+        _ = self.camera  # refuses a bad size
+        if not isinstance(self.noise, str):
+            object.__setattr__(self, "noise", noise_config(self.noise))
+        noise_config(self.noise)
         check_range(self, "num_scene_seeds", 1, len(SEED_SPLITS[self.split]))
         if self.frame_management.uses_clock:
             raise InputError(
@@ -190,6 +199,11 @@ class EnvConfig(Checked):
             raise InputError(f"EnvConfig.scene = {self.scene!r} must be a name or several")
         for name in self.scenes:
             check_name(name)
+
+    @property
+    def camera(self) -> Intrinsics:
+        """Intrinsics of the camera."""
+        return pinhole(self.image_size, self.field_of_view_deg)
 
     @property
     def scenes(self) -> tuple[str, ...]:
@@ -240,17 +254,3 @@ def _read_slam_config(options: Mapping[str, Any]) -> Mapping[str, Any]:
         raise InputError(f"slam = {options['slam']!r} but {given} configures {file.slam!r}")
     size = {} if file.image_size is None else {"image_size": file.image_size}
     return {**size, **options, "slam": file.slam, "slam_config": file.slam_config}
-
-
-def check_same_settings(saved: Mapping[str, Any], own: Mapping[str, Any]) -> None:
-    """Refuse a state that an environment with other options saved.
-
-    Raises:
-        InputError: naming the first option that differs and both values.
-    """
-    for name, value in own.items():
-        if name not in saved or saved[name] != value:
-            raise InputError(
-                f"the state was saved with {name} = {saved.get(name)!r}, "
-                f"this environment has {value!r}"
-            )

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +16,56 @@ from ms_slam_env.scenes.base import Scene
 Float64 = NDArray[np.float64]
 
 _STRIDE = 2  # every second pixel in each direction marks coverage
+
+
+_SAMPLES_A_VOXEL = 2  # along an edge: four points on each face, so that none is missed
+
+
+@dataclass(frozen=True)
+class Voxels:
+    """The voxels of a scene; worked out once and shared.
+
+    Attributes:
+        origin: (3,) lower corner of the first, metres.
+        shape: (3,) how many along each axis.
+        reachable: (number of voxels,) whether there is surface in it that opens into free space.
+    """
+
+    origin: Float64
+    shape: tuple[int, ...]
+    reachable: NDArray[np.bool_]
+
+    @cached_property
+    def num_reachable(self) -> int:
+        """How many are reachable."""
+        return int(np.count_nonzero(self.reachable))
+
+    @staticmethod
+    def of(scene: Scene, voxel_m: float) -> Voxels:
+        """The voxels of a scene, with an edge in metres."""
+        known = _VOXELS.setdefault(scene, {})
+        if voxel_m not in known:
+            known[voxel_m] = _voxels(scene, voxel_m)
+        return known[voxel_m]
+
+    def index(self, points: Float64, voxel_m: float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Voxels of the points (N, 3) that lie in the grid, and which do (N,)."""
+        cells = np.floor((points - self.origin) / voxel_m).astype(np.int64)
+        inside = ((cells >= 0) & (cells < self.shape)).all(axis=1)
+        return np.ravel_multi_index(tuple(cells[inside].T), self.shape), inside
+
+
+_VOXELS: WeakKeyDictionary[Scene, dict[float, Voxels]] = WeakKeyDictionary()
+
+
+def _voxels(scene: Scene, voxel_m: float) -> Voxels:
+    low, high = scene.bounds()
+    origin = low - 2 * voxel_m
+    shape = np.ceil((high + 2 * voxel_m - origin) / voxel_m).astype(np.int64) + 1
+    voxels = Voxels(origin, tuple(shape.tolist()), np.zeros(int(np.prod(shape)), dtype=bool))
+    surface, _ = scene.surface_points(voxel_m / _SAMPLES_A_VOXEL)
+    voxels.reachable[voxels.index(surface, voxel_m)[0]] = True
+    return voxels
 
 
 class CoverageGrid:
@@ -27,19 +80,13 @@ class CoverageGrid:
     """
 
     def __init__(self, scene: Scene, voxel_m: float = 0.05) -> None:
-        margin = 2 * voxel_m
         self.voxel_m = voxel_m
-        low, high = scene.bounds()
-        self._origin = low - margin
-        extent = high + margin - self._origin
-        self._shape = np.ceil(extent / voxel_m).astype(np.int64) + 1
-        self._mapped = np.zeros(int(np.prod(self._shape)), dtype=bool)
+        self._voxels = Voxels.of(scene, voxel_m)
+        self._mapped = np.zeros(len(self._voxels.reachable), dtype=bool)
 
     def add(self, points_true: Float64, points_estimated: Float64) -> float:
         """Mark points (N, 3); return the area newly mapped in its true place, square metres."""
-        cells = np.floor((points_true - self._origin) / self.voxel_m).astype(np.int64)
-        inside = ((cells >= 0) & (cells < self._shape)).all(axis=1)
-        flat = np.ravel_multi_index(tuple(cells[inside].T), tuple(self._shape))
+        flat, inside = self._voxels.index(points_true, self.voxel_m)
         error = np.linalg.norm(points_estimated - points_true, axis=1)[inside]
         correct = flat[error < self.voxel_m]
         new = np.unique(correct[~self._mapped[correct]])
@@ -78,7 +125,16 @@ class CoverageGrid:
     @property
     def mapped_area(self) -> float:
         """Area mapped in its true place so far, square metres (one voxel face a voxel)."""
-        return int(self._mapped.sum()) * self.voxel_m**2
+        return int(np.count_nonzero(self._mapped)) * self.voxel_m**2
+
+    @property
+    def mapped_share(self) -> float:
+        """Share of the reachable surface that was mapped in its true place so far, [0, 1].
+
+        Reachable is what opens into free space (``Scene.surface_points``), counted in voxels.
+        """
+        mapped = np.count_nonzero(self._mapped & self._voxels.reachable)
+        return mapped / max(1, self._voxels.num_reachable)
 
     def get_state(self) -> dict[str, Any]:
         """The marked voxels, packed."""

@@ -43,6 +43,9 @@ class FrameRecord:
     pose_error: float
 
 
+_GROWING = ("frames", "divergences_of_steps", "reward_terms")
+
+
 @dataclass
 class Episode:
     """Trajectories, last frame and running measures of an episode of N frames in S steps.
@@ -62,6 +65,8 @@ class Episode:
         reward_terms: of the last step, name to weighted value.
         histograms, step_histograms: of the last frame, and of the last one of the step before.
         frame: the last live frame.
+        pose_covariance: (6, 6) of the last estimated pose, as ``TrackResult`` has it; None where
+            none was estimated: at the start, while lost, or by who does not know it.
         predicted_divergences: (n, 2) of the candidates, once they have been asked for.
     """
 
@@ -80,6 +85,7 @@ class Episode:
     histograms: Histograms | None = None
     step_histograms: Histograms | None = None
     frame: RGBDFrame | None = None
+    pose_covariance: Float64 | None = None
     predicted_divergences: Float64 | None = None
 
     # -- Writing -----------------------------------------------------------------------------
@@ -111,10 +117,14 @@ class Episode:
             divergence=divergence,
             pose_error=float(np.linalg.norm(off)),
         )
+        for array in vars(made).values():
+            if isinstance(array, np.ndarray):
+                array.flags.writeable = False  # copies of the episode share it
         self.frames.append(made)
         self.frame = seen.frame
         self.tracking_ok = result.tracking_ok
         self.inlier_fraction = result.inlier_fraction
+        self.pose_covariance = result.covariance
         self.squared_error_sum += made.pose_error**2
         self.predicted_divergences = None
 
@@ -126,8 +136,9 @@ class Episode:
         self.steps_lost = 0 if self.tracking_ok else self.steps_lost + 1
 
     def copy(self) -> Episode:
-        """An independent copy."""
-        return copy.deepcopy(self)
+        """An independent copy; what was recorded never changes and is shared."""
+        own = {name: copy.copy(getattr(self, name)) for name in _GROWING}
+        return replace(self, **own)
 
     # -- The present -------------------------------------------------------------------------
 
@@ -167,6 +178,7 @@ class Episode:
         return {
             "T_world_camera": self.frames[-1].T_world_camera.copy(),
             "T_world_camera_estimate": self.T_world_camera_estimate.copy(),
+            "pose_covariance": self._covariance_or_infinite(),
             "pose_error": self.pose_error,
             "ate": self.ate,
             "divergence": self.divergence.copy(),
@@ -177,6 +189,10 @@ class Episode:
             "scene": self.scene,
             "scene_seed": self.scene_seed,
         }
+
+    def _covariance_or_infinite(self) -> Float64:
+        known = self.pose_covariance
+        return np.diag(np.full(6, np.inf)) if known is None else np.array(known, dtype=np.float64)
 
     # -- The past ----------------------------------------------------------------------------
 

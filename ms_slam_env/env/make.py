@@ -5,13 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import gymnasium
-from gymnasium.vector import SyncVectorEnv
-
 from ms_slam_env.env.active_slam import ActiveSlamEnv
 from ms_slam_env.env.config import EnvConfig
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.registration import MAX_EPISODE_STEPS
 from ms_slam_env.sequences.perturbations import FastMotion, make_perturbation
 
 _FASTER = 2.0  # of the ids with fast motion, unless their option says otherwise
@@ -27,18 +23,6 @@ def make_env(perturbed_by: str | None = None, **options: Any) -> ActiveSlamEnv:
 # Without "human" Gymnasium would warn, wrap the environment and fail at the first reset for want of
 # pygame; with it the environment itself is asked, and refuses in one line.
 make_env.metadata = {"render_modes": ["rgb_array", "human"]}  # type: ignore[attr-defined]
-
-
-class InProcessVectorEnv(SyncVectorEnv):
-    """Vector entry point: ``num_envs`` time-limited environments stepped in this process."""
-
-    def __init__(
-        self, num_envs: int, max_episode_steps: int = MAX_EPISODE_STEPS, **options: Any
-    ) -> None:
-        def make() -> gymnasium.Env[Any, Any]:
-            return gymnasium.wrappers.TimeLimit(make_env(**options), max_episode_steps)
-
-        super().__init__([make] * num_envs)
 
 
 def _make_perturbed(

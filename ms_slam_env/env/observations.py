@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
-from ms_slam_env.robot import NUM_ROTATIONS, NUM_TRANSLATIONS
+from ms_slam_env.robot import NUM_ROTATIONS, NUM_TRANSLATIONS, ROTATIONS, TRANSLATIONS
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -20,14 +20,38 @@ Float64 = NDArray[np.float64]
 CONFIGURATION = "slam_configuration"
 """Key of the SLAM configuration in ``info``, and in an observation of several parts."""
 
-NUM_STATE = 3 + 6 + 2 + 3 + NUM_TRANSLATIONS + NUM_ROTATIONS
+STATE_NAMES: tuple[str, ...] = (
+    *("x", "y", "z"),
+    *("R_xx", "R_yx", "R_zx", "R_xy", "R_yy", "R_zy"),
+    *("intensity_divergence", "depth_divergence"),
+    *("tracking_ok", "inlier_fraction", "lost_share"),
+    *(f"translation_{name}" for name in TRANSLATIONS),
+    *(f"rotation_{name.replace(' ', '_')}" for name in ROTATIONS),
+)
+"""What the numbers of the state vector are, in order.
+
+Position relative to the start in units of 5 m (in the start camera's frame: x right, y down, z
+forward); the first two columns of the rotation, R_ij the component along i of the camera's axis j;
+the divergences of the last step in units of M_I and M_D; SLAM's word on its last frame, the share
+of pixels that it explained, and consecutive steps lost as a share of the patience; the last motion,
+one-hot.
+"""
+
+NUM_STATE = len(STATE_NAMES)
 
 _POSITION_SCALE_M = 5.0
+_POSITION_CAP = 200.0  # in units of that: a kilometre, farther than any scene
 _DIVERGENCE_CAP = 5.0  # in units of M_I, M_D
 _MAX_DEPTH_M = 20.0
 _DEPTH_SCALE_M = 4.0
+_DEPTH_CAP = _MAX_DEPTH_M / _DEPTH_SCALE_M
 _GREY_BINS = 16
 _ROWS, _COLUMNS = 6, 8
+
+
+_LOW = [-_POSITION_CAP] * 3 + [-1.0] * 6 + [0.0] * (NUM_STATE - 9)
+_HIGH = [_POSITION_CAP] * 3 + [1.0] * 6 + [_DIVERGENCE_CAP] * 2 + [1.0] * (NUM_STATE - 11)
+_STATE_BOUNDS = np.array([_LOW, _HIGH], dtype=np.float32)
 
 
 @dataclass(frozen=True)
@@ -78,7 +102,7 @@ class RGBDObservation(Observation):
             {
                 "color": spaces.Box(0, 255, (*intrinsics.shape, 3), np.uint8),
                 "depth": spaces.Box(0, _MAX_DEPTH_M, intrinsics.shape, np.float32),
-                "state": _unbounded(NUM_STATE),
+                "state": spaces.Box(*_STATE_BOUNDS),
             }
         )
 
@@ -95,7 +119,9 @@ class FeaturesObservation(Observation):
     """State vector (28), grey histogram (16), coarse depth (96), motion mask (n): float32."""
 
     def __init__(self, intrinsics: Intrinsics, num_motions: int) -> None:
-        self.space = _unbounded(NUM_STATE + _GREY_BINS + 2 * _ROWS * _COLUMNS + num_motions)
+        cells = _ROWS * _COLUMNS
+        highs = [*(1,) * _GREY_BINS, *(_DEPTH_CAP,) * cells, *(1,) * (cells + num_motions)]
+        self.space = _longer(spaces.Box(*_STATE_BOUNDS), highs)
 
     def build(self, knowledge: RobotKnowledge) -> Float32:
         """Return the vector."""
@@ -116,11 +142,11 @@ class LookaheadObservation(Observation):
 
     def __init__(self, intrinsics: Intrinsics, num_motions: int) -> None:
         self._features = FeaturesObservation(intrinsics, num_motions)
-        self.space = _longer(self._features.space, 2 * num_motions)
+        self.space = _longer(self._features.space, [_DIVERGENCE_CAP] * (2 * num_motions))
 
     def build(self, knowledge: RobotKnowledge) -> Float32:
         """Return the vector."""
-        predicted = np.minimum(knowledge.lookahead(), _DIVERGENCE_CAP)
+        predicted = np.clip(knowledge.lookahead(), 0, _DIVERGENCE_CAP)
         return np.concatenate(
             [self._features.build(knowledge), predicted.ravel().astype(np.float32)]
         )
@@ -140,7 +166,7 @@ class WithConfiguration(Observation):
             part = spaces.Box(0, 1, (num_configurations,), np.float32)
             self.space = spaces.Dict({**space.spaces, CONFIGURATION: part})
         else:
-            self.space = _longer(space, num_configurations)
+            self.space = _longer(space, [1] * num_configurations)
 
     def build(self, knowledge: RobotKnowledge) -> Any:
         """Return the observation with its new part."""
@@ -170,29 +196,26 @@ def make_observation(
 
 
 def state_vector(knowledge: RobotKnowledge) -> Float32:
-    """Pose estimate, divergences, tracking and last motion, (28,) float32 of order one.
-
-    Position / 5 m (3), first two columns of the rotation (6), divergences / M clipped at 5 (2),
-    tracking_ok, inlier fraction, lost share (3), last translation (7) and rotation (7) one-hot.
-    """
+    """The numbers of ``STATE_NAMES``, (28,) float32 of order one, clipped to their bounds."""
     translation, rotation = divmod(knowledge.motion, NUM_ROTATIONS)
-    return np.concatenate(
+    state = np.concatenate(
         [
             knowledge.T_start_camera[:3, 3] / _POSITION_SCALE_M,
             knowledge.T_start_camera[:3, :2].T.ravel(),
-            np.minimum(knowledge.divergence, _DIVERGENCE_CAP),
+            knowledge.divergence,
             [knowledge.tracking_ok, knowledge.inlier_fraction, knowledge.lost_share],
             np.eye(NUM_TRANSLATIONS)[translation],
             np.eye(NUM_ROTATIONS)[rotation],
         ]
     ).astype(np.float32)
+    return np.clip(state, *_STATE_BOUNDS)
 
 
 def coarse_depth(depth: Float32) -> Float32:
     """Mean valid depth / 4 m and share of valid pixels in 6 x 8 cells, (96,) float32."""
     valid = (depth > 0).astype(np.float32)
     total, count, cell = (_cell_sums(image) for image in (depth, valid, np.ones_like(valid)))
-    mean = total / np.maximum(count, 1) / _DEPTH_SCALE_M
+    mean = np.minimum(total / np.maximum(count, 1) / _DEPTH_SCALE_M, _DEPTH_CAP)
     return np.concatenate([mean.ravel(), (count / cell).ravel()]).astype(np.float32)
 
 
@@ -203,10 +226,9 @@ def _cell_sums(image: Float32) -> Float32:
     return np.add.reduceat(np.add.reduceat(image, rows, axis=0), columns, axis=1)
 
 
-def _unbounded(size: int) -> spaces.Box:
-    return spaces.Box(-np.inf, np.inf, (size,), np.float32)
-
-
-def _longer(space: spaces.Space[Any], more: int) -> spaces.Box:
+def _longer(space: spaces.Space[Any], highs: Sequence[float]) -> spaces.Box:
+    """A vector's space and more numbers, from 0 to ``highs``."""
     assert isinstance(space, spaces.Box)
-    return _unbounded(space.shape[0] + more)
+    more = np.asarray(highs, dtype=np.float32)
+    low = np.concatenate([space.low, np.zeros_like(more)])
+    return spaces.Box(low, np.concatenate([space.high, more]))

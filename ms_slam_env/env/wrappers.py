@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from typing import Any
 
 import gymnasium
@@ -11,6 +12,40 @@ from numpy.typing import NDArray
 from ms_slam_env.env.active_slam import ActiveSlamEnv
 from ms_slam_env.errors import InputError
 from ms_slam_env.sequences.perturbations import make_perturbation
+
+
+class FollowStates(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
+    """Takes Gymnasium's time limit and order check along when the environment loads a state.
+
+    They count from a reset: an environment that goes back in time, as tree search does, would be
+    truncated after the steps of all its attempts, and one that loads a state without a reset would
+    not take a step. Every environment of ``gym.make`` has this wrapper around it.
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        gymnasium.utils.RecordConstructorArgs.__init__(self)
+        super().__init__(env)
+        self._watch()
+
+    def _watch(self) -> None:
+        inner = self.env.unwrapped
+        assert isinstance(inner, ActiveSlamEnv)
+        inner.on_load = self._follow
+
+    def _follow(self, steps: int) -> None:
+        """What Gymnasium's wrappers know of an episode that has had ``steps``."""
+        env = self.env
+        while isinstance(env, gymnasium.Wrapper):
+            if isinstance(env, gymnasium.wrappers.TimeLimit):
+                env._elapsed_steps = steps
+            elif isinstance(env, gymnasium.wrappers.OrderEnforcing):
+                env._has_reset = True
+            env = env.env
+
+    def __setstate__(self, pickled: dict[str, Any]) -> None:
+        """Watch the environment that was pickled along, and tell the rest where it is."""
+        self.__dict__.update(pickled)
+        self._watch()
 
 
 class Perturbed(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
@@ -45,3 +80,19 @@ class Perturbed(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordCon
     def action_masks(self) -> NDArray[np.bool_]:
         """(n,) which actions are possible now; the name is sb3-contrib's."""
         return self.get_wrapper_attr("unwrapped").action_masks()
+
+
+class RecordVideo(gymnasium.wrappers.RecordVideo):
+    """Gymnasium's wrapper of this name; without MoviePy it says how to install it.
+
+    Raises:
+        InputError: MoviePy, the extra ``video``, is not installed.
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any], *args: Any, **options: Any) -> None:
+        if importlib.util.find_spec("moviepy") is None:
+            raise InputError(
+                "recording videos needs MoviePy: pip install 'ms-slam-env[video]'; "
+                "without it `ms-slam record` writes films"
+            )
+        super().__init__(env, *args, **options)

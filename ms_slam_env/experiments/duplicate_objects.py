@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import slam as slam_backends
+from ms_slam_env.camera import xtion
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.duplicate_objects import JudgedMap, judge_map, labelled_view
 from ms_slam_env.experiments.harness.episodes import check_names, seed_list
@@ -136,7 +137,7 @@ class DuplicateObjects(Experiment):
 
 def make_map(spec: CopySpec) -> tuple[JudgedMap, Float64]:
     """The judged map, and the positions (N, 3) at which SLAM was told the camera was."""
-    sensor = get_sensor(spec.scene, spec.seed, IMAGE_SIZE, "kinect")
+    sensor = get_sensor(spec.scene, spec.seed, xtion(IMAGE_SIZE), "kinect")
     rng = np.random.default_rng(spec.seed)
     truth = random_walk(sensor.scene, rng)
     estimate = truth.copy()

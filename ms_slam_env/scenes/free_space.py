@@ -93,9 +93,20 @@ class FreeSpace:
             for k in range(3)
         )
         free = rule(empty, self.origin, self.voxel_m)
-        self.distance: Float32 = np.where(free, np.sqrt(square), 0.0).astype(np.float32)
-        _, ny, nz = shape
-        self._limit = np.array(shape) - 1.001
+        self._take(np.where(free, np.sqrt(square), 0.0).astype(np.float32))
+
+    @classmethod
+    def of_grid(cls, distance: Float32, origin: Float64, voxel_m: float) -> FreeSpace:
+        """A free space from its attributes, as ``FreeSpace`` worked them out before."""
+        space = cls.__new__(cls)
+        space.origin, space.voxel_m = origin, voxel_m
+        space._take(distance)
+        return space
+
+    def _take(self, distance: Float32) -> None:
+        self.distance = distance
+        _, ny, nz = distance.shape
+        self._limit = np.array(distance.shape) - 1.001
         corner = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
         self._corner_offset = corner @ np.array([ny * nz, nz, 1])
         self._stride = np.array([ny * nz, nz, 1])

@@ -11,9 +11,11 @@ import cv2
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from ms_slam_env.errors import InputError
-from ms_slam_env.scenes.base import Float64, Rng
+from ms_slam_env.scenes import mesh_cache
+from ms_slam_env.scenes.base import Float64, Rng, TexturedMesh
 from ms_slam_env.scenes.builder import Geometry
 from ms_slam_env.scenes.free_space import VOXEL_M, Enclosed, FreeSpace
 from ms_slam_env.scenes.lighting import Lamp, Lighting, auto_exposure, light_mesh, linear_to_srgb
@@ -183,6 +185,7 @@ def _plain(rgb: Any) -> NDArray[np.uint8]:
     return np.broadcast_to(np.asarray(rgb, dtype=np.float64), (4, 4, 3)).astype(np.uint8).copy()
 
 
+_OF_MESH = ("vertices", "faces", "uv", "face_texture", "face_label", "irradiance")
 _MAX_EDGE_M = 0.3
 _LAMPS = 10
 _KEY = 0.2
@@ -192,6 +195,7 @@ _FACING_M = 0.06
 def from_file(path: Path, seed: int = 0) -> MeshScene:
     """Load a mesh and light it with lamps in its free space.
 
+    What takes long is shown, and kept on disk for the next time (``mesh_cache``).
     The free space is the largest enclosed part (see ``Enclosed``); faces are turned towards it.
 
     Args:
@@ -201,25 +205,14 @@ def from_file(path: Path, seed: int = 0) -> MeshScene:
     Raises:
         InputError: no such file, not readable as a mesh, or without a triangle.
     """
-    soup = split_long_edges(load_soup(path), _MAX_EDGE_M)
-    faces = np.arange(3 * len(soup.corners)).reshape(-1, 3)
-    rays = RayCaster(soup.corners.reshape(-1, 3), faces)
-    samples, _ = sample_surface(soup.corners.reshape(-1, 3), faces, 0.4 * VOXEL_M)
-    free = FreeSpace(samples, Enclosed(rays))
-    if not free.distance.any():
-        raise InputError(f"mesh {str(path)!r} leaves no free space for a camera")
-    soup = _turn_to_free_space(soup, free)
-    geometry = _geometry(soup)
-    rng = np.random.default_rng([seed, 7])
-    cells = _free_cells(free)
-    lamps = tuple(
-        Lamp(tuple(place), tuple(rng.uniform(0.6, 1.0) * np.array([1.0, 0.95, 0.88])), 0.1, 2)
-        for place in _spread(cells, _LAMPS)
-    )
-    mesh = light_mesh(geometry, Lighting(lamps, ambient=(0.15, 0.15, 0.15), bounce_rays=12))
-    focus = _spread(cells, 6)
-    exposure = auto_exposure(mesh, focus, _KEY, frozenset())
-    eyes = _eye_cells(free, cells)
+    soup = load_soup(path)
+    given = soup.corners, soup.uv, soup.texture, soup.label, *soup.textures
+    name = mesh_cache.key(given, (seed, soup.labels))
+    arrays = mesh_cache.remembered(name, partial(_light, soup, seed, path))
+    free = FreeSpace.of_grid(arrays["distance"], arrays["origin"], float(arrays["voxel_m"]))
+    of_mesh = {field: arrays[field] for field in _OF_MESH}
+    mesh = TexturedMesh(**of_mesh, textures=soup.textures, labels=soup.labels)
+    eyes = _eye_cells(free, _free_cells(free))
 
     def start(draw: Rng) -> tuple[Float64, Float64]:
         eye = eyes[draw.integers(len(eyes))] + draw.uniform(-0.4, 0.4, 3) * free.voxel_m
@@ -227,7 +220,44 @@ def from_file(path: Path, seed: int = 0) -> MeshScene:
         return eye, eye + np.array([np.cos(angle), np.sin(angle), -drop])
 
     maker = partial(from_file, path)
-    return MeshScene(maker, seed, mesh, free, start, exposure, name=str(path))
+    return MeshScene(maker, seed, mesh, free, start, float(arrays["exposure"]), name=str(path))
+
+
+def _light(soup: Soup, seed: int, path: Path) -> mesh_cache.Arrays:
+    """What is kept of a mesh: lit, with its free space and its exposure.
+
+    Raises:
+        InputError: no free space.
+    """
+    with tqdm(total=4, desc=f"preparing {path.name}", unit="stage", disable=None) as bar:
+        soup = split_long_edges(soup, _MAX_EDGE_M)
+        faces = np.arange(3 * len(soup.corners)).reshape(-1, 3)
+        rays = RayCaster(soup.corners.reshape(-1, 3), faces)
+        samples, _ = sample_surface(soup.corners.reshape(-1, 3), faces, 0.4 * VOXEL_M)
+        free = FreeSpace(samples, Enclosed(rays))
+        bar.update()
+        if not free.distance.any():
+            raise InputError(f"mesh {str(path)!r} leaves no free space for a camera")
+        geometry = _geometry(_turn_to_free_space(soup, free))
+        bar.update()
+        cells = _free_cells(free)
+        mesh = light_mesh(geometry, _lighting(cells, seed))
+        bar.update()
+        exposure = auto_exposure(mesh, _spread(cells, 6), _KEY, frozenset())
+        bar.update()
+    grid = {"distance": free.distance, "origin": free.origin, "voxel_m": np.array(free.voxel_m)}
+    lit = {name: getattr(mesh, name) for name in _OF_MESH}
+    return {**lit, **grid, "exposure": np.array(exposure)}
+
+
+def _lighting(cells: Float64, seed: int) -> Lighting:
+    """Lamps in the free space, whose strength the seed varies."""
+    rng = np.random.default_rng([seed, 7])
+    lamps = tuple(
+        Lamp(tuple(place), tuple(rng.uniform(0.6, 1.0) * np.array([1.0, 0.95, 0.88])), 0.1, 2)
+        for place in _spread(cells, _LAMPS)
+    )
+    return Lighting(lamps, ambient=(0.15, 0.15, 0.15), bounce_rays=12)
 
 
 def _turn_to_free_space(soup: Soup, free: FreeSpace) -> Soup:

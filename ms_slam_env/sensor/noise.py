@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError, unknown
@@ -119,14 +121,39 @@ NOISE_MODELS: dict[str, NoiseConfig] = {
 """Noise models by name."""
 
 
-def noise_config(noise: str | NoiseConfig) -> NoiseConfig:
-    """Return the configuration of a noise model given by name or directly.
+_MOST_STRENGTH = 100
+_STRENGTHS = ("disparity_step_px", "axial", "lateral", "edge_dropout", "shot", "read")
+
+
+def noise_config(noise: str | NoiseConfig | Mapping[str, Any]) -> NoiseConfig:
+    """Return the configuration of a noise model given by name, as options, or directly.
+
+    Options are ``name`` (kinect by default), ``strength``, a factor on everything of the model that
+    is random or quantised (at most to the end of each range), and fields of ``NoiseConfig``, which
+    take precedence.
 
     Raises:
-        InputError: unknown name, or neither a name nor a NoiseConfig.
+        InputError: an unknown name or option, a value out of range, or something else.
     """
     if isinstance(noise, NoiseConfig):
         return noise
-    if not isinstance(noise, str) or noise not in NOISE_MODELS:
-        raise unknown("noise model", noise, NOISE_MODELS)
-    return NOISE_MODELS[noise]
+    options = dict(noise) if isinstance(noise, Mapping) else {"name": noise}
+    name, strength = options.pop("name", "kinect"), options.pop("strength", 1.0)
+    if not isinstance(name, str) or name not in NOISE_MODELS:
+        raise unknown("noise model", name, NOISE_MODELS)
+    names = [field.name for field in fields(NoiseConfig)]
+    for option in options:
+        if option not in names:
+            raise unknown("option of noise", option, ("name", "strength", *names))
+    return replace(_scaled(NOISE_MODELS[name], strength), **options)
+
+
+def _scaled(model: NoiseConfig, strength: Any) -> NoiseConfig:
+    is_number = isinstance(strength, (int, float)) and not isinstance(strength, bool)
+    if not is_number or not 0 <= strength <= _MOST_STRENGTH:
+        raise InputError(f"noise strength = {strength!r} is outside [0, {_MOST_STRENGTH}]")
+    if strength == 1:
+        return model
+    most = {field.name: field.metadata["range"][1] for field in fields(NoiseConfig)}
+    scaled = {name: strength * getattr(model, name) for name in _STRENGTHS}
+    return replace(model, **{name: min(value, most[name]) for name, value in scaled.items()})

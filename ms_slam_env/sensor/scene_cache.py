@@ -5,9 +5,10 @@ from __future__ import annotations
 from functools import lru_cache
 
 from ms_slam_env import scenes
-from ms_slam_env.camera import xtion
+from ms_slam_env.camera import Intrinsics
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sensor import RGBDSensor
+from ms_slam_env.sensor.noise import NoiseConfig
 
 _SCENES_KEPT = 32  # a scene with its textures takes tens of megabytes
 
@@ -19,6 +20,8 @@ def get_scene(name: str, seed: int) -> Scene:
 
 
 @lru_cache(maxsize=_SCENES_KEPT)
-def get_sensor(name: str, seed: int, image_size: str, noise: str) -> RGBDSensor:
+def get_sensor(
+    name: str, seed: int, intrinsics: Intrinsics, noise: str | NoiseConfig
+) -> RGBDSensor:
     """A sensor looking at that scene; its noise seed is set by each environment."""
-    return RGBDSensor(get_scene(name, seed), xtion(image_size), noise=noise)
+    return RGBDSensor(get_scene(name, seed), intrinsics, noise=noise)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from ms_slam_env import slam as slam_backends
+from ms_slam_env.camera import xtion
 from ms_slam_env.evaluation.duplicate_objects import (
     JudgedMap,
     judge_map,
@@ -28,7 +29,7 @@ from ms_slam_env.sensor.scene_cache import get_sensor
 
 def map_with_offset(offset_m: float) -> tuple[JudgedMap, np.ndarray]:
     """A table seen from two sides, the second time at poses that are off to the left."""
-    sensor = get_sensor("table", 1001, "160x120", "kinect")
+    sensor = get_sensor("table", 1001, xtion("160x120"), "kinect")
     start = sensor.scene.sample_start(np.random.default_rng(1001))
     slam = slam_backends.make("surfel", sensor.intrinsics)
     views = []
@@ -61,7 +62,10 @@ def test_a_map_fails_when_its_second_half_is_off(
 
 def test_an_empty_map_shows_nothing_twice() -> None:
     judged = judge_map(
-        np.zeros((0, 3)), np.zeros((0, 3)), [], get_sensor("table", 1001, "160x120", "kinect")
+        np.zeros((0, 3)),
+        np.zeros((0, 3)),
+        [],
+        get_sensor("table", 1001, xtion("160x120"), "kinect"),
     )
     assert judged.consistency.success
     assert judged.consistency.objects == ()
@@ -69,7 +73,7 @@ def test_an_empty_map_shows_nothing_twice() -> None:
 
 def test_the_whole_surface_counts_as_true() -> None:
     points, owner = labelled_surface("table", 1001)
-    mesh = get_sensor("table", 1001, "160x120", "kinect").scene.mesh
+    mesh = get_sensor("table", 1001, xtion("160x120"), "kinect").scene.mesh
     assert set(owner) == set(mesh.face_label)
     area = 0.5 * np.linalg.norm(
         np.cross(*np.moveaxis(np.diff(mesh.vertices[mesh.faces], axis=1), 1, 0)), axis=1

@@ -114,7 +114,8 @@ class DynamicArm(ArmEmbodiment):
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state that ``get_state`` returned."""
-        self.stand_at(state["T_world_base"])
+        if not np.array_equal(self.T_world_base, state["T_world_base"]):
+            self.stand_at(state["T_world_base"])
         self._restore(state)
 
     def _plan(self, action: int, stretch: float = 1.0) -> Plan:

@@ -150,7 +150,7 @@ class Mover:
 
     def set_state(self, waits: list[tuple[float, float]]) -> None:
         """Go on from what ``get_state`` returned."""
-        self._waits = list(waits)
+        self._waits = [(float(time), float(length)) for time, length in waits]
 
     def pose(self, times_s: ArrayLike) -> Float64:
         """T_world_object (..., 4, 4) at times (...)."""

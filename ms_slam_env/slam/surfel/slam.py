@@ -286,6 +286,7 @@ class BatchedSurfelSlam(Saved):
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state of a SLAM of the same batch, intrinsics and configuration."""
+        self.map.check_fits(state["map"])
         self._states.set_state(state)
         super().set_state(state)
         self._localizer.forget_view()

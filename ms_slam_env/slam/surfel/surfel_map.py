@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
+from ms_slam_env.errors import InputError
 from ms_slam_env.slam.base import Float64, Views
 from ms_slam_env.slam.state import Stateful
 from ms_slam_env.slam.surfel import fusion, surfel_culling
@@ -305,9 +306,17 @@ class SurfelMap(Stateful):
 
     def _assign(self, env: int, arrays: dict[str, NDArray[Any]]) -> None:
         for name in ATTRIBUTES:
-            used = len(arrays[name])
-            if used:
-                getattr(self.surfels, name)[env, :used].assign(arrays[name])
+            _write(getattr(self.surfels, name), env, arrays[name])
+
+    def check_fits(self, state: dict[str, Any]) -> None:
+        """Refuse a state with more surfels than there is room for.
+
+        Raises:
+            InputError: naming both numbers.
+        """
+        most = max(len(arrays["radius"]) for arrays in state["surfels"])
+        if most > self._buffers.capacity:
+            raise InputError(f"a map of {most} surfels; there is room for {self._buffers.capacity}")
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state that ``get_state`` of a map of this size returned."""
@@ -316,3 +325,11 @@ class SurfelMap(Stateful):
         for env, arrays in enumerate(state["surfels"]):
             self._assign(env, arrays)
         self.surfels_moved()
+
+
+def _write(array: wp.array, env: int, values: NDArray[Any]) -> None:
+    """Write the first ``len(values)`` elements of one env's row."""
+    if array.device.is_cpu:  # a view: ``assign`` costs five times as much
+        array.numpy()[env, : len(values)] = values
+    elif len(values):
+        array[env, : len(values)].assign(values)

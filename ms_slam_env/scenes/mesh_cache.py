@@ -1,0 +1,84 @@
+"""Lit meshes kept on disk: what a mesh file becomes takes up to a minute to work out.
+
+Entries lie in ``$MS_SLAM_ENV_CACHE``, else in ``ms_slam_env`` below ``$XDG_CACHE_HOME`` or
+``~/.cache``: one file of plain arrays each, named by a hash of what the mesh file holds and of the
+version of the algorithm. The longest unused go when all take more than ``MOST_BYTES``; the folder
+may be deleted at any time. What cannot be read is worked out anew, and a folder that cannot be
+written is done without.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+import zipfile
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+VERSION = 1
+"""Of what is kept and how it is worked out; goes up when either changes."""
+
+MOST_BYTES = 2 * 1024**3
+"""Of all entries together."""
+
+Arrays = dict[str, NDArray[Any]]
+
+_UNREADABLE = (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile)
+
+
+def folder() -> Path:
+    """Where the entries lie."""
+    own = os.environ.get("MS_SLAM_ENV_CACHE")
+    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    return Path(own) if own else Path(base) / "ms_slam_env"
+
+
+def key(arrays: Iterable[NDArray[Any]], more: object) -> str:
+    """Name of an entry: a hash of everything that it follows from."""
+    digest = hashlib.sha256(repr((VERSION, more)).encode())
+    for array in arrays:
+        digest.update(repr((array.shape, array.dtype.str)).encode())
+        digest.update(np.ascontiguousarray(array))
+    return digest.hexdigest()[:40]
+
+
+def remembered(name: str, work_out: Callable[[], Arrays]) -> Arrays:
+    """The arrays of entry ``name``; worked out, and kept, where it is not there or broken."""
+    path = folder() / f"mesh-{name}.npz"
+    with suppress(*_UNREADABLE), np.load(path, allow_pickle=False) as stored:
+        found = {array: stored[array] for array in stored["names"].tolist()}
+        os.utime(path)
+        return found
+    arrays = work_out()
+    with suppress(OSError):
+        _keep(path, arrays)
+    return arrays
+
+
+def _keep(path: Path, arrays: Arrays) -> None:
+    """Write an entry beside its place and move it there, so that none is ever half written."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, draft = tempfile.mkstemp(dir=path.parent, prefix="draft-", suffix=".npz")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, names=np.array(list(arrays)), **arrays)
+        Path(draft).replace(path)
+    finally:
+        Path(draft).unlink(missing_ok=True)
+    _make_room(path.parent)
+
+
+def _make_room(place: Path) -> None:
+    """Delete the longest unused entries until all fit."""
+    entries = sorted(place.glob("mesh-*.npz"), key=lambda one: one.stat().st_mtime, reverse=True)
+    total = 0
+    for one in entries:
+        total += one.stat().st_size
+        if total > MOST_BYTES:
+            one.unlink(missing_ok=True)

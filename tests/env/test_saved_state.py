@@ -1,0 +1,256 @@
+"""Saved states: what is no state is refused and changes nothing, whatever is wrong with it."""
+
+import copy
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import ms_slam_env
+from ms_slam_env.env import ActiveSlamEnv
+from ms_slam_env.errors import InputError
+
+OPTIONS = {"scene": "table", "scene_seed": 0, "image_size": "80x60"}
+MUTATIONS = {
+    "gone": lambda value: KeyError,
+    "none": lambda value: None,
+    "text": lambda value: "x",
+    "number": lambda value: 7.5,
+    "object": lambda value: object(),
+    "empty list": lambda value: [],
+    "negative": lambda value: -np.ones_like(value) if isinstance(value, np.ndarray) else -1,
+    "huge": lambda value: value + 10**9 if isinstance(value, int) else 10**400,
+    "nan": lambda value: _filled(value, np.nan),
+    "infinite": lambda value: _filled(value, -np.inf),
+    "scaled": lambda value: value * 2 if _is_floats(value) else np.zeros((3, 3)),
+    "another row": lambda value: np.concatenate([value, value[:1]]) if _has_rows(value) else (),
+    "no row": lambda value: value[:0] if _has_rows(value) else {},
+    "flat": lambda value: value.ravel() if isinstance(value, np.ndarray) else [value],
+    "other type": lambda value: value.astype("f2") if _is_floats(value) else np.zeros(2, object),
+}
+
+
+def _is_floats(value):
+    return isinstance(value, np.ndarray) and value.dtype.kind == "f"
+
+
+def _has_rows(value):
+    return isinstance(value, np.ndarray) and value.ndim > 0 and len(value) > 0
+
+
+def _filled(value, number):
+    return np.full_like(value, number) if _is_floats(value) else number
+
+
+def places(value, path=()):
+    """Paths of everything in a state but the settings, in order."""
+    if path[:1] != ("settings",):
+        yield path
+        for key in _keys(value):
+            yield from places(_child(value, key), (*path, key))
+
+
+def _keys(value):
+    if isinstance(value, dict):
+        return list(value)
+    if isinstance(value, (list, tuple)):
+        return range(min(len(value), 2))
+    return list(vars(value)) if hasattr(value, "__dict__") else []
+
+
+def _child(value, key):
+    return value[key] if isinstance(value, (dict, list, tuple)) else getattr(value, key)
+
+
+def mutated(state, path, mutation):
+    """A copy of a state with another value at a path."""
+    state = copy.deepcopy(state)
+    owner = state
+    for key in path[:-1]:
+        owner = _child(owner, key)
+    value = MUTATIONS[mutation](_child(owner, path[-1]))
+    if isinstance(owner, (dict, list)):
+        if value is KeyError:
+            del owner[path[-1]]
+        else:
+            owner[path[-1]] = value
+    elif value is KeyError:
+        del owner.__dict__[path[-1]]
+    else:
+        owner.__dict__[path[-1]] = value
+    return state
+
+
+def same(a, b):
+    """Whether two states are the same to the bit."""
+    if isinstance(a, np.ndarray):
+        return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+    if _keys(a):
+        keys = range(len(a)) if isinstance(a, (list, tuple)) else _keys(a)
+        sizes = not isinstance(a, (list, tuple)) or len(a) == len(b)
+        return type(a) is type(b) and sizes and all(same(_child(a, k), _child(b, k)) for k in keys)
+    return type(a) is type(b) and a == b
+
+
+def an_action(env, rng):
+    mask = env.action_masks()[: env._embodiment_type.num_motions]
+    motion = int(rng.choice(np.flatnonzero(mask)))
+    is_pair = isinstance(env.action_space, gym.spaces.MultiDiscrete)
+    return np.array([motion, int(rng.integers(3))]) if is_pair else motion
+
+
+def after_steps(env, count):
+    env.reset(seed=3)
+    rng = np.random.default_rng(0)
+    for _ in range(count):
+        env.step(an_action(env, rng))
+    return env
+
+
+@pytest.fixture(scope="module", params=ms_slam_env.ENV_IDS)
+def played(request):
+    """An environment after some steps, its state, an earlier one, and all places in that."""
+    env = after_steps(gym.make(request.param, **OPTIONS).unwrapped, 1)
+    earlier = env.save_state()
+    after_steps(env, 3)
+    paths = [path for path in places(earlier) if path]
+    return Played(env=env, before=env.save_state(), earlier=earlier, paths=paths)
+
+
+class Played(dict):
+    """With a short text, which Hypothesis writes into its reports."""
+
+    def __repr__(self):
+        return str(self["env"])
+
+
+@settings(
+    max_examples=60,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+@given(data=st.data())
+def test_a_mutated_state_is_refused_whole_or_can_be_gone_on_from(played, data):
+    env, before, earlier, paths = played.values()
+    path = paths[data.draw(st.integers(0, len(paths) - 1))]
+    state = mutated(earlier, path, data.draw(st.sampled_from(sorted(MUTATIONS))))
+    complaint = None
+    try:
+        env.load_state(state)
+    except InputError as error:
+        complaint = str(error)
+    if complaint:
+        assert "\n" not in complaint
+        assert same(env.save_state(), before)
+    else:
+        observation, reward, *_ = env.step(an_action(env, np.random.default_rng(1)))
+        assert observation in env.observation_space
+        assert np.isfinite(reward)
+        env.load_state(before)
+
+
+@pytest.mark.parametrize("part", ["slam", "episode", "random", "settings", "coverage"])
+def test_a_state_without_a_part_is_refused_by_its_name(played, part):
+    env, before, earlier, _ = played.values()
+    with pytest.raises(InputError, match=f"lacks \\['{part}'\\]"):
+        env.load_state({name: value for name, value in earlier.items() if name != part})
+    assert same(env.save_state(), before)
+
+
+@pytest.mark.parametrize("state", [None, 3, [], "state", {}])
+def test_what_is_no_state_is_refused(played, state):
+    with pytest.raises(InputError, match="state"):
+        played["env"].load_state(state)
+
+
+def test_a_pose_of_another_shape_and_an_empty_episode_are_refused(played):
+    env, before, earlier, _ = played.values()
+    for change, message in (
+        (lambda s: s.__setitem__("T_world_kinematic", np.eye(3)), "shape"),
+        (lambda s: s["episode"].__dict__.__setitem__("frames", []), "no frame"),
+    ):
+        state = copy.deepcopy(earlier)
+        change(state)
+        with pytest.raises(InputError, match=message):
+            env.load_state(state)
+        assert same(env.save_state(), before)
+
+
+def test_a_map_larger_than_there_is_room_for_is_refused(played):
+    env, before, earlier, _ = played.values()
+    state = copy.deepcopy(earlier)
+    slam = state["slam"].get("backend", state["slam"])["map"]
+    rows = np.zeros(env.config.slam_config.get("max_surfels", 10**6) + 1, dtype=int)
+    slam["surfels"] = [{name: array[rows] for name, array in slam["surfels"][0].items()}]
+    slam["counters"]["count"] = np.array([len(rows)], dtype=np.int32)
+    with pytest.raises(InputError, match="there is room for"):
+        env.load_state(state)
+    assert same(env.save_state(), before)
+
+
+def test_a_state_of_another_backend_names_both():
+    one = ActiveSlamEnv(slam="odometry", **OPTIONS)
+    other = ActiveSlamEnv(slam="surfel", **OPTIONS)
+    one.reset(seed=0)
+    with pytest.raises(InputError, match=r"saved with slam = 'odometry'.*has 'surfel'"):
+        other.load_state(one.save_state())
+
+
+@pytest.mark.parametrize("slam", ["odometry", "sparse", "volumetric"])
+def test_other_backends_refuse_whole_too(slam):
+    pytest.importorskip({"sparse": "gtsam", "volumetric": "open3d"}.get(slam, "numpy"))
+    env = after_steps(ActiveSlamEnv(slam=slam, **OPTIONS), 2)
+    before = env.save_state()
+    for part in list(before["slam"]):
+        for mutation in ("gone", "text", "object"):
+            with pytest.raises(InputError):
+                env.load_state(mutated(before, ("slam", part), mutation))
+    assert same(env.save_state(), before)
+    env.load_state(before)
+    env.step(0)
+
+
+def test_a_state_is_independent_of_what_comes_after_it():
+    env = after_steps(ActiveSlamEnv(**OPTIONS), 2)
+    state = env.save_state()
+    kept = pickle.loads(pickle.dumps(state))
+    env.load_state(state)
+    for _ in range(3):
+        env.step(1)
+    assert same(state, kept)
+
+
+def test_a_fresh_environment_goes_on_without_a_reset():
+    played = after_steps(gym.make("MSActiveSLAM-FreeCamera-v0", **OPTIONS).unwrapped, 2)
+    state = played.save_state()
+    fresh = gym.make("MSActiveSLAM-FreeCamera-v0", **OPTIONS)
+    fresh.unwrapped.load_state(state)
+    here, there = fresh.step(8), played.step(8)
+    np.testing.assert_array_equal(here[0], there[0])
+    assert here[1:4] == there[1:4]
+
+
+def test_the_time_limit_counts_the_steps_of_the_episode_loaded():
+    env = gym.make("MSActiveSLAM-FreeCamera-v0", max_episode_steps=4, **OPTIONS)
+    env.reset(seed=0)
+    env.step(0)
+    env.step(0)
+    state = env.unwrapped.save_state()
+    for _ in range(3):  # six steps since the reset, never more than four of an episode
+        env.unwrapped.load_state(state)
+        assert [env.step(0)[3] for _ in range(2)] == [False, True]
+
+
+def test_the_time_limit_of_a_pickled_environment_goes_on():
+    env = gym.make("MSActiveSLAM-FreeCamera-v0", max_episode_steps=4, **OPTIONS)
+    env.reset(seed=0)
+    state = env.unwrapped.save_state()
+    env.step(0)
+    twin = pickle.loads(pickle.dumps(env))
+    assert [twin.step(0)[3] for _ in range(3)] == [False, False, True]
+    twin.unwrapped.load_state(state)
+    assert not twin.step(0)[3]
