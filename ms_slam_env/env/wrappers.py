@@ -91,8 +91,5 @@ class RecordVideo(gymnasium.wrappers.RecordVideo):
 
     def __init__(self, env: gymnasium.Env[Any, Any], *args: Any, **options: Any) -> None:
         if importlib.util.find_spec("moviepy") is None:
-            raise InputError(
-                "recording videos needs MoviePy: pip install 'ms-slam-env[video]'; "
-                "without it `ms-slam record` writes films"
-            )
+            raise InputError("recording videos needs MoviePy: pip install 'ms-slam-env[video]'")
         super().__init__(env, *args, **options)
