@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 BLOCKS = re.findall(
     r"^## (.*?)$|^```python\n(.*?)^```", (ROOT / "docs/rl.md").read_text(), re.MULTILINE | re.DOTALL
 )
-SMALL = 'OPTIONS = {"scene": "table", "scene_seed": 0, "image_size": "80x60", "observation": "features"}'
+SMALL = f"OPTIONS = {dict(scene='table', scene_seed=0, image_size='80x60', observation='features')}"
 
 
 def test_the_examples_run(monkeypatch: pytest.MonkeyPatch) -> None:
