@@ -63,8 +63,8 @@ def test_frames_energy_and_timings_are_counted(env):
     assert 0 < off[-1] < 0.03
 
 
-def test_vector_entry_point_steps_several_arms():
-    envs = gym.make_vec("MSActiveSLAM-v0", 2, vectorization_mode="vector_entry_point", **OPTIONS)
+def test_make_vec_steps_several_arms():
+    envs = gym.make_vec("MSActiveSLAM-v0", 2, **OPTIONS)
     _, info = envs.reset(seed=4)
     actions = [int(np.flatnonzero(mask)[-1]) for mask in info["action_mask"]]
     _, rewards, *_, info = envs.step(np.array(actions))
