@@ -51,7 +51,7 @@ class Voxels:
     def index(self, points: Float64, voxel_m: float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Voxels of the points (N, 3) that lie in the grid, and which do (N,)."""
         cells = np.floor((points - self.origin) / voxel_m).astype(np.int64)
-        inside = ((cells >= 0) & (cells < self.shape)).all(axis=1)
+        inside = np.all((cells >= 0) & (cells < np.array(self.shape)), axis=1)
         return np.ravel_multi_index(tuple(cells[inside].T), self.shape), inside
 
 

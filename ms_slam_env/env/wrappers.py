@@ -37,7 +37,7 @@ class FollowStates(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
         env = self.env
         while isinstance(env, gymnasium.Wrapper):
             if isinstance(env, gymnasium.wrappers.TimeLimit):
-                env._elapsed_steps = steps
+                env._elapsed_steps = steps  # type: ignore[assignment]
             elif isinstance(env, gymnasium.wrappers.OrderEnforcing):
                 env._has_reset = True
             env = env.env

@@ -44,7 +44,7 @@ def key(arrays: Iterable[NDArray[Any]], more: object) -> str:
     digest = hashlib.sha256(repr((VERSION, more)).encode())
     for array in arrays:
         digest.update(repr((array.shape, array.dtype.str)).encode())
-        digest.update(np.ascontiguousarray(array))
+        digest.update(array.tobytes())
     return digest.hexdigest()[:40]
 
 
@@ -67,7 +67,8 @@ def _keep(path: Path, arrays: Arrays) -> None:
     handle, draft = tempfile.mkstemp(dir=path.parent, prefix="draft-", suffix=".npz")
     try:
         with os.fdopen(handle, "wb") as file:
-            np.savez(file, names=np.array(list(arrays)), **arrays)
+            named: dict[str, Any] = {"names": np.array(list(arrays)), **arrays}
+            np.savez(file, **named)
         Path(draft).replace(path)
     finally:
         Path(draft).unlink(missing_ok=True)

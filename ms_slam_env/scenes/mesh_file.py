@@ -206,7 +206,7 @@ def from_file(path: Path, seed: int = 0) -> MeshScene:
         InputError: no such file, not readable as a mesh, or without a triangle.
     """
     soup = load_soup(path)
-    given = soup.corners, soup.uv, soup.texture, soup.label, *soup.textures
+    given: list[NDArray[Any]] = [soup.corners, soup.uv, soup.texture, soup.label, *soup.textures]
     name = mesh_cache.key(given, (seed, soup.labels))
     arrays = mesh_cache.remembered(name, partial(_light, soup, seed, path))
     free = FreeSpace.of_grid(arrays["distance"], arrays["origin"], float(arrays["voxel_m"]))

@@ -329,7 +329,7 @@ class SurfelMap(Stateful):
 
 def _write(array: wp.array, env: int, values: NDArray[Any]) -> None:
     """Write the first ``len(values)`` elements of one env's row."""
-    if array.device.is_cpu:  # a view: ``assign`` costs five times as much
+    if wp.get_device(array.device).is_cpu:  # a view: ``assign`` costs five times as much
         array.numpy()[env, : len(values)] = values
     elif len(values):
         array[env, : len(values)].assign(values)
