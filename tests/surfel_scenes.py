@@ -66,6 +66,7 @@ def live_frame(
         normals=wp.array(np.array(normals, dtype=np.float32), dtype=wp.vec3),
         color=wp.array(color, dtype=wp.vec3),
         intensity=wp.array(color @ np.float32([0.299, 0.587, 0.114]), dtype=wp.float32),
+        moving=wp.zeros(depth.shape, dtype=wp.int32),
     )
 
 

@@ -42,6 +42,8 @@ class TrackResult:
             ``covariance`` says so.
         submaps_joined: whether this frame joined two submaps: the newer was moved onto the older.
             If that was the present one the pose jumped by what its start had been wrong.
+        moving: (h, w) bool, every n-th row and column of the mask of what moves in the frame, which
+            is neither tracked nor mapped; None by a backend that does not look for it.
         processed: False where frame management dropped the frame: SLAM has not seen it, the pose
             is predicted and ``tracking_ok`` is what it was.
     """
@@ -64,6 +66,7 @@ class TrackResult:
     processed: bool = True
     submap: int = 0
     submaps_joined: bool = False
+    moving: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)

@@ -130,6 +130,7 @@ class SubmapConfig(Checked):
 RELOCALISATIONS = ("ferns", "local")
 LOOP_CLOSURES = ("none", "deformation")
 SUBMAPS = ("atlas", "off")
+MOTION_MASKS = ("none", "geometric")
 
 
 @dataclass(frozen=True)
@@ -182,6 +183,8 @@ class SurfelConfig(Checked):
             one where that is seen again; "off": it waits. Of several cameras in lockstep each
             waits.
         submap_rules: parameters of the former.
+        motion_mask: "geometric": what moves is neither tracked nor mapped, see ``motion_mask``;
+            "none": the world is taken to be still.
     """
 
     depth_cutoff_m: float = bounded(4.0, 0.0, 10.0)
@@ -215,6 +218,7 @@ class SurfelConfig(Checked):
     loops: LoopConfig = field(default_factory=LoopConfig)
     submaps: str = chosen("off", *SUBMAPS)
     submap_rules: SubmapConfig = field(default_factory=SubmapConfig)
+    motion_mask: str = chosen("none", *MOTION_MASKS)
 
     def __post_init__(self) -> None:
         super().__post_init__()

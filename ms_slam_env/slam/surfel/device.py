@@ -19,11 +19,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env._warp import wp
+from ms_slam_env.slam.state import Stateful
 
 Dim = int | Sequence[int]
 
 
-class HostDeviceBuffer:
+class HostDeviceBuffer(Stateful):
     """A device array; on a CPU the host works on its memory.
 
     There ``assign`` and ``numpy`` of a small array cost 5 to 15 microseconds a call, most of it
@@ -49,6 +50,14 @@ class HostDeviceBuffer:
     def read(self) -> NDArray[Any]:
         """A copy of the values."""
         return (self.array.numpy() if self._memory is None else self._memory).copy()
+
+    def get_state(self) -> dict[str, Any]:
+        """The values."""
+        return {"values": self.read()}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Set the values."""
+        self.write(state["values"])
 
 
 class KernelLaunchCache:

@@ -58,6 +58,7 @@ class FusedFrame:
     color: wp.array(dtype=wp.vec3)  # RGB
     radial: wp.array(dtype=wp.float32)  # (H * W) weights of the pixels
     covered: wp.array(dtype=wp.int32)  # 1 where a surfel of the map covers the pixel
+    moving: wp.array(dtype=wp.int32)  # 1 where something moves, which is no part of the map
 
 
 @wp.func_native(
@@ -166,6 +167,7 @@ for (int k = 0; k < n; ++k) {
 
 // What the frame and the map hold there.
 float alpha[LANES], confidence[LANES], radius[LANES];
+int moving[LANES];
 float lx[LANES], ly[LANES], lz[LANES], red[LANES], green[LANES], blue[LANES];
 float old_red[LANES], old_green[LANES], old_blue[LANES];
 for (int k = 0; k < n; ++k) {
@@ -175,6 +177,7 @@ for (int k = 0; k < n; ++k) {
     ly[k] = normal[1];
     lz[k] = normal[2];
     alpha[k] = gain * frame.radial.data[nearest];
+    moving[k] = frame.moving.data[image + nearest];
 }
 for (int k = 0; k < n; ++k) {
     const size_t i = map + index[k];
@@ -204,8 +207,9 @@ for (int k = 0; k < n; ++k) {
     const float agreement = lx[k] * N[3 * k] + ly[k] * N[3 * k + 1] + lz[k] * N[3 * k + 2];
     const float squared = lx[k] * lx[k] + ly[k] * ly[k] + lz[k] * lz[k];
     const bool hit = total[k] > 0.25f, agrees = agreement > parameters.min_cosine;
-    matched[k] = hit;
-    refined[k] = hit & agrees & (live_radius < COARSER * radius[k]);
+    const bool goes = hit & (moving[k] != 0);
+    matched[k] = hit & !goes;
+    refined[k] = matched[k] & agrees & (live_radius < COARSER * radius[k]);
     const float per_total = 1.0f / total[k];
     const float keep = confidence[k] / (confidence[k] + alpha[k]);
     const float take = 1.0f - keep;
@@ -228,8 +232,8 @@ for (int k = 0; k < n; ++k) {
     const float more = confidence[k] + alpha[k];
     const float grown = more < parameters.max_confidence ? more : parameters.max_confidence;
     const float doubted = squared > 0.0f ? confidence[k] - 0.5f * alpha[k] : confidence[k];
-    const float halved = behind[k] ? 0.5f * confidence[k] - 0.5f : confidence[k];
-    const float result = hit ? (agrees ? grown : doubted) : halved;
+    const float halved = (behind[k] | goes) ? 0.5f * confidence[k] - 0.5f : confidence[k];
+    const float result = (hit & !goes) ? (agrees ? grown : doubted) : halved;
     confidence[k] = result > 0.0f ? result : 0.0f;
 }
 
@@ -282,8 +286,9 @@ def update_surfels(
 ) -> None:
     """Average each visible surfel with the readings about its projection; mark covered pixels.
 
-    A surfel in front of all four readings contradicts free space; one whose normal disagrees
-    contradicts the surface: both lose confidence and die at zero.
+    A surfel in front of all four readings contradicts free space, one on a reading of what moves
+    was mapped before it was known to move, one whose normal disagrees contradicts the surface: all
+    lose confidence and die at zero.
     """
     b, worker = wp.tid()
     if frame.mask[b] == 0:
@@ -322,7 +327,7 @@ def add_surfels(
     frame: FusedFrame,
     workers: int,
 ) -> None:
-    """Start a surfel at every uncovered reading with a normal; a full map drops it.
+    """Start a surfel at every uncovered, unmoving reading with a normal; a full map drops it.
 
     ``count`` runs past the capacity when surfels are dropped; ``put_back`` sets it right.
     """
@@ -338,7 +343,8 @@ def add_surfels(
     pixel = int(worker)
     while pixel < height * width:
         z = fetch(frame.depth, image + pixel)
-        if fetch(frame.covered, image + pixel) == 0 and z > 0.0:
+        at = image + pixel
+        if fetch(frame.covered, at) == 0 and fetch(frame.moving, at) == 0 and z > 0.0:
             v = pixel / width
             u = pixel - v * width
             p = wp.vec3(

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env._warp import wp
+from ms_slam_env.geometry import relative_angle
 from ms_slam_env.slam.alignment_check import TrackingStatus
 from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.state import Saved
@@ -19,6 +20,7 @@ from ms_slam_env.slam.surfel.acceptance import (
     geometric_thresholds,
 )
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer
+from ms_slam_env.slam.surfel.motion_mask import MotionMask
 from ms_slam_env.slam.surfel.photometry import (
     InvalidFrameDetector,
     geometry_only,
@@ -38,6 +40,8 @@ from ms_slam_env.slam.surfel.relocalization import Images, Relocalization
 from ms_slam_env.slam.surfel.rendering import ModelView
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 
+CLEARLY_BETTER = 0.9  # ratio of costs
+APART_M, APART_RAD = (0.006, 0.1), np.radians((0.4, 6.0))  # more than noise, less than a jump
 RETRIES = 2  # further searches within a frame whose tracking failed
 
 
@@ -101,12 +105,17 @@ class Localizer:
     """
 
     def __init__(
-        self, states: CameraStates, surfel_map: SurfelMap, relocalization: Relocalization
+        self,
+        states: CameraStates,
+        surfel_map: SurfelMap,
+        relocalization: Relocalization,
+        motion_mask: MotionMask,
     ) -> None:
         self.invalid_frames = InvalidFrameDetector(surfel_map.batch)
         self._states = states
         self._map = surfel_map
         self._relocalization = relocalization
+        self._motion_mask = motion_mask
         self._device_poses = HostDeviceBuffer(surfel_map.batch, wp.mat44, surfel_map.device)
         self._strict = np.ones(surfel_map.batch, dtype=bool)
         self._view: ModelView
@@ -146,7 +155,14 @@ class Localizer:
         ``guesses`` (B, 4, 4) are NaN for an env without; None if none has one.
         """
         self._tracker.set_frame(live)
-        alignment = self._track(frames, guesses)
+        states = self._states
+        expected = states.poses @ states.motions
+        self._motion_mask.expect(live, expected, states.started & (states.lost == 0))
+        invalid = self.invalid_frames.find(frames.color, states.started)
+        alignment = self._track(invalid, guesses)
+        if self._motion_mask.find(*self._trusted(alignment, expected)).any():
+            alignment = self._track(invalid, guesses)
+        alignment = self._doubt(alignment, expected, invalid, guesses)
         if not self._config.refuse_bad_fits:
             alignment = accept_any_fit(alignment)
         if guesses is not None:
@@ -154,9 +170,42 @@ class Localizer:
         alignment = self._search_around(alignment)
         if self._config.refuse_bad_fits:
             alignment = self._search_elsewhere(alignment, frames)
+        self._motion_mask.find(*self._trusted(alignment, expected))
         return alignment
 
-    def _track(self, frames: Images, guesses: Float64 | None) -> Alignment:
+    def _doubt(
+        self,
+        alignment: Alignment,
+        expected: Float64,
+        invalid: NDArray[np.bool_],
+        guesses: Float64 | None,
+    ) -> Alignment:
+        """Ask of poses off the ``expected`` ones whether the camera or what it sees has moved.
+
+        In front of a wall the pose follows whatever passes by, and then nothing seems to move.
+        Seen from the expected pose it does; without it the grey values must fit clearly better.
+        """
+        doubtful = self._motion_mask.can_doubt & alignment.tracked & (self._states.lost == 0)
+        doubtful &= self._states.started & _is_apart(alignment.T_world_live, expected)
+        if not doubtful.any():
+            return alignment
+        moving = doubtful & self._motion_mask.find(expected, doubtful)
+        if not moving.any():
+            return alignment
+        again = self._track(invalid, guesses)
+        better = again.statistics["cost"] < CLEARLY_BETTER * alignment.statistics["cost"]
+        better &= again.statistics["degenerate_directions"] == 0
+        return alignment.replace(moving & again.tracked & better, again)
+
+    def _trusted(
+        self, alignment: Alignment, expected: Float64
+    ) -> tuple[Float64, NDArray[np.bool_]]:
+        """Poses (B, 4, 4) that the frames were taken at, as far as is known, and whether it is."""
+        is_known = self._states.started & (alignment.tracked | (self._states.lost == 0))
+        tracked = alignment.tracked[:, None, None]
+        return np.where(tracked, alignment.T_world_live, expected), is_known
+
+    def _track(self, invalid: NDArray[np.bool_], guesses: Float64 | None) -> Alignment:
         """Align with the views from the last poses; a lost env searches wider at every frame."""
         states = self._states
         lost = states.lost > 0
@@ -170,7 +219,6 @@ class Localizer:
         )
         thresholds = acceptance_thresholds(self._config.acceptance, lost, states.lost)
         alignment = self._align(states.poses, hypotheses, thresholds, states.photometry, guesses)
-        invalid = self.invalid_frames.find(frames.color, states.started)
         alignment = alignment.with_status(invalid, TrackingStatus.BLANK)
         return self._without_color(hypotheses, alignment)
 
@@ -239,6 +287,8 @@ class Localizer:
         guesses: Float64 | None = None,
     ) -> Alignment:
         view = self.render(origins)
+        if self._motion_mask.hide(view, origins):
+            self.forget_view()  # it is whole no more
         return self._tracker.align(view, origins, hypotheses, thresholds, guesses, photometry)
 
     def strict_thresholds(self) -> NDArray[Any]:
@@ -248,3 +298,13 @@ class Localizer:
     def _failed(self, alignment: Alignment) -> NDArray[np.bool_]:
         is_blank = alignment.status == TrackingStatus.BLANK
         return self._states.started & ~alignment.tracked & ~is_blank
+
+
+def _is_apart(poses: Float64, others: Float64) -> NDArray[np.bool_]:
+    """Which of the poses (B, 4, 4) differ, but not so much that ``others`` tell nothing."""
+    step = np.linalg.norm(poses[:, :3, 3] - others[:, :3, 3], axis=1)
+    turn = np.array(
+        [relative_angle(a, b) for a, b in zip(poses[:, :3, :3], others[:, :3, :3], strict=True)]
+    )
+    is_more = (step > APART_M[0]) | (turn > APART_RAD[0])
+    return is_more & (step < APART_M[1]) & (turn < APART_RAD[1])

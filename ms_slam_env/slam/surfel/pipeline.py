@@ -18,7 +18,10 @@ from ms_slam_env.slam.surfel.preprocessing import Preprocessor
 from ms_slam_env.slam.surfel.surfel_map import MapKernels, SurfelMap
 from ms_slam_env.slam.surfel.tracker import Tracker, model_stride
 
-FIXED = ("max_surfels", "acceptance", "relocalisation", "loop_closure", "loops", "submaps")
+FIXED = (
+    *("max_surfels", "acceptance", "relocalisation", "loop_closure", "loops", "submaps"),
+    "motion_mask",
+)
 """Fields of ``SurfelConfig`` that a running SLAM keeps: they shape what it has stored, or what its
 parts were made with."""
 _KEPT = 8  # pipelines: each has the buffers of its images

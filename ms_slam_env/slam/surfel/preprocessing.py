@@ -39,6 +39,7 @@ class LiveFrame:
     normals: wp.array
     color: wp.array  # (B, H, W) vec3 RGB in [0, 255]
     intensity: wp.array  # (B, H, W) float32 in [0, 255] (BT.601 luma of ``color``)
+    moving: wp.array  # (B, H, W) int32, 1 where the motion mask says that something moves
 
 
 @wp.kernel
@@ -250,6 +251,7 @@ class Preprocessor:
             normals=wp.zeros(shape, dtype=wp.vec3, device=device),
             color=wp.zeros(shape, dtype=wp.vec3, device=device),
             intensity=wp.zeros(shape, dtype=wp.float32, device=device),
+            moving=wp.zeros(shape, dtype=wp.int32, device=device),
         )
         self._filtered, self._weights, self._shifts = (
             wp.zeros_like(self._inverse_depth) for _ in range(3)

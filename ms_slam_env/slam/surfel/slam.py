@@ -29,6 +29,7 @@ from ms_slam_env.slam.surfel.detached_map import DetachedMap
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer
 from ms_slam_env.slam.surfel.localization import CameraStates, Localizer
 from ms_slam_env.slam.surfel.loop_closure import make_loop_closure
+from ms_slam_env.slam.surfel.motion_mask import make_motion_mask
 from ms_slam_env.slam.surfel.photometry import is_invalid_frame
 from ms_slam_env.slam.surfel.pipeline import Pipeline, PipelineCache, check_change
 from ms_slam_env.slam.surfel.pose_hypotheses import (
@@ -48,7 +49,7 @@ FEWEST_READINGS = 0.05  # share of the first frame's pixels that must have depth
 class BatchedSurfelSlam(Saved):
     """The SLAM of B envs in lockstep; each env's results are those it would have alone."""
 
-    saved = ("_invalid_frames", "map", "relocalization", "loops")
+    saved = ("_invalid_frames", "map", "relocalization", "loops", "motion_mask")
 
     def __init__(
         self, batch: int, intrinsics: Intrinsics, config: SurfelConfig, device: str = "cpu"
@@ -59,7 +60,8 @@ class BatchedSurfelSlam(Saved):
         self.loops = make_loop_closure(self.map, config, device)
         self.relocalization = make_relocalization(batch, intrinsics, config)
         self._states = CameraStates.at_rest(batch)
-        self._localizer = Localizer(self._states, self.map, self.relocalization)
+        self.motion_mask = make_motion_mask(batch, intrinsics, config, device)
+        self._localizer = Localizer(self._states, self.map, self.relocalization, self.motion_mask)
         self._invalid_frames = self._localizer.invalid_frames
         dtypes = (wp.mat44, wp.int32, wp.float32, wp.int32)  # of pose, time, weight and mask
         self._fused = [HostDeviceBuffer(batch, dtype, device) for dtype in dtypes]
@@ -76,6 +78,8 @@ class BatchedSurfelSlam(Saved):
             return
         check_change(self.config, config, intrinsics != self.intrinsics)
         self.relocalization.adapt(intrinsics, config.depth_cutoff_m)
+        if intrinsics != self.intrinsics:
+            self.motion_mask.resize(intrinsics)
         self._use(self._pipelines.get(intrinsics, config))
 
     def _use(self, pipeline: Pipeline) -> None:
@@ -93,6 +97,7 @@ class BatchedSurfelSlam(Saved):
         self.map.clear(env)
         self.relocalization.clear(env)
         self.loops.reset(env)
+        self.motion_mask.forget(env)
         self._localizer.forget_view()
 
     def track(
@@ -122,6 +127,8 @@ class BatchedSurfelSlam(Saved):
         self._select_surfels(np.ones(self.batch, dtype=np.int32))  # known poses: old and new fit
         states = self._states
         self._invalid_frames.find(color, states.started)
+        self.motion_mask.expect(live, poses, states.started)
+        self.motion_mask.find(poses, states.started)
         for env in range(self.batch):
             moves_on = states.started[env] and not states.lost[env]
             motion = invert(states.poses[env]) @ poses[env]
@@ -131,7 +138,10 @@ class BatchedSurfelSlam(Saved):
         states.poses = poses
         states.lost[:] = 0
         self._fuse(live, frames, np.ones(self.batch, dtype=bool))
-        return [TrackResult(pose.copy(), True) for pose in poses]
+        return [
+            TrackResult(pose.copy(), True, moving=self.motion_mask.mask(env))
+            for env, pose in enumerate(poses)
+        ]
 
     def _select_surfels(self, lost: NDArray[np.int32]) -> None:
         """Let loop closure choose what frames are aligned with and fused into."""
@@ -153,7 +163,7 @@ class BatchedSurfelSlam(Saved):
             reason = "the first frame has too few depth readings"
             return TrackResult(pose, False, inlier_fraction=0.0, reason=reason)
         self._states.started[env] = True
-        return TrackResult(pose, True)
+        return TrackResult(pose, True, moving=self.motion_mask.mask(env))
 
     def _move_on(self, env: int, alignment: Alignment) -> TrackResult:
         """Take the pose of a frame that was tracked, else hold the last one."""
@@ -173,12 +183,14 @@ class BatchedSurfelSlam(Saved):
             reason=MAP_REASONS[status],
             degenerate_directions=int(alignment.statistics[env]["degenerate_directions"]),
             covariance=alignment.covariance[env] if tracked else None,
+            moving=self.motion_mask.mask(env),
         )
 
     def _fuse(self, live: LiveFrame, frames: Images, good: NDArray[np.bool_]) -> None:
         """Fuse the frames with a good pose; a fast camera's readings weigh less."""
         states = self._states
         self.relocalization.add_keyframes(frames, states.poses, states.time, good)
+        self.motion_mask.remember(live, states.poses, good)
         if good.any():
             weights = motion_weight(states.motions)
             values: list[NDArray[Any]] = [states.poses, states.time, weights, good]
@@ -201,6 +213,7 @@ class BatchedSurfelSlam(Saved):
         closed = self.loops.close(live, self.poses, self._states.time - 1, tracked, similar)
         for env in np.flatnonzero(closed):
             self.relocalization.move_keyframes(int(env), *self.loops.trajectory(int(env)))
+            self.motion_mask.forget(int(env))  # the map and the earlier frames no longer agree
             results[env] = replace(
                 results[env], T_world_camera=self.poses[env].copy(), loop_closed=True
             )
@@ -234,6 +247,7 @@ class BatchedSurfelSlam(Saved):
     def move_camera(self, T: Float64, env: int = 0) -> None:
         """Move an env's camera by ``T`` (4, 4) of the world."""
         self._states.poses[env] = T @ self._states.poses[env]
+        self.motion_mask.forget(env)
 
     def last_frame(self, env: int = 0) -> int:
         """Number of an env's last frame."""

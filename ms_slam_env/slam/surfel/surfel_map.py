@@ -137,7 +137,7 @@ class MapKernels:
         self._arguments, frame = arguments, self._frame
         frame.poses, frame.time, frame.weight, frame.mask = poses, time, weight, mask
         frame.depth, frame.normals = live.depth.flatten(), live.normals.flatten()
-        frame.color = live.color.flatten()
+        frame.color, frame.moving = live.color.flatten(), live.moving.flatten()
         for launch in (*self._fusion, *self._culling[:2]):
             launch.set_param_by_name("frame", frame)
 
