@@ -95,9 +95,10 @@ def limits(case: str, name: str, values: np.ndarray) -> tuple[float, float]:
 
 
 def distances(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Distances between values; two that are no number agree, one and a number do not."""
+    """Distances between values; two that are no number or infinite agree, one and a number not."""
     a, b = before.astype(float), after.astype(float)
-    apart = np.where(np.isnan(a) & np.isnan(b), 0.0, np.abs(a - b))
+    with np.errstate(invalid="ignore"):  # infinity less infinity
+        apart = np.where((a == b) | (np.isnan(a) & np.isnan(b)), 0.0, np.abs(a - b))
     return np.nan_to_num(apart, nan=np.inf)
 
 
