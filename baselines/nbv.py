@@ -23,6 +23,14 @@ Float64 = NDArray[np.float64]
 
 _NEAR_M = 0.5  # readings nearer than this are few: the next step may leave none
 _NEAR_SHARE = 0.1
+_KEPT_AWAY = 0.7  # steps from where tracking was lost
+_KEPT = 0.9
+"""Share of the present information that is kept where there is less than enough.
+
+Over 310 steps of `wall` and `living_room` (training seeds), the pose error of a motion to a view
+with 75 / m^2 a pixel and more was 2 to 3 mm in the median and 7 mm in nine of ten, and tracking was
+lost in 1 %; below 30 / m^2 it was 11 cm, most of the motion, and tracking was lost in 28 %.
+"""
 
 
 class NextBestView(Planner):
@@ -41,7 +49,7 @@ class NextBestView(Planner):
         cost: how much less a view is worth six steps farther away: exp(-cost).
         replan: steps after which a goal is drawn anew.
         overlap: share of a view that the map should fill.
-        information: a view's weakest direction has at least this share of the present one.
+        information: about a view's weakest direction, 1/m^2 a pixel of it; see `_KEPT`.
         own_gain: steps that the best view on the way is worth.
         cell_m: edge of a cell of the occupancy grid.
     """
@@ -59,7 +67,7 @@ class NextBestView(Planner):
         cost: float = 0.35,
         replan: int = 7,
         overlap: float = 0.5,
-        information: float = 1 / 9,
+        information: float = 150.0,
         own_gain: float = 1.0,
         cell_m: float = 0.1,
     ) -> None:
@@ -74,6 +82,14 @@ class NextBestView(Planner):
         self.grid = OccupancyGrid(self.cell_m)
         self.goal: Float64 | None = None
         self.age = 0
+        self.lost_at = np.zeros((0, 4, 4))
+        """Poses (N, 4, 4) at which tracking was lost."""
+
+    def undo(self, action: int) -> None:
+        """Keep away from where tracking was lost: the estimate is held, the motion was made."""
+        there = self.env.candidate_poses()[action]
+        self.lost_at = np.concatenate([self.lost_at, there[None]])
+        self.goal = None
 
     def act(self, observation: Any, info: dict[str, Any]) -> int:
         """Carve the last frame, keep or draw a goal, take the best admissible motion."""
@@ -118,6 +134,9 @@ class NextBestView(Planner):
         near = ((views.depth > 0) & (views.depth < _NEAR_M)).mean(axis=(1, 2))
         weakest = np.linalg.eigvalsh(view_information(views))[:, 0]
         can = possible & (shown >= min(self.overlap, shown[0]))
-        can &= weakest >= self.information * weakest[0]
+        enough = self.information * views.depth[0].size
+        can &= weakest >= min(enough, _KEPT * weakest[0])
         can &= near <= max(_NEAR_SHARE, near[0])
+        for lost in self.lost_at:
+            can &= distance_in_steps(poses, lost, *self.steps).max(axis=1) > _KEPT_AWAY
         return can if can.any() else possible

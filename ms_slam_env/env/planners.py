@@ -58,6 +58,9 @@ class Planner(ABC):
     def act(self, observation: Any, info: dict[str, Any]) -> int:
         """Return the next action, given what ``reset`` or ``step`` last returned."""
 
+    def undo(self, action: int) -> None:  # noqa: B027 -- most planners learn nothing from it
+        """Be told that tracking was lost by an action, which is about to be undone."""
+
 
 class Recovering(Planner):
     """Undoes the last motions, newest first, while tracking is lost; else asks another planner.
@@ -82,6 +85,7 @@ class Recovering(Planner):
             action = self.planner.act(observation, info)
             self.made = [*self.made[1 - _REMEMBERED :], action]
             return action
+        self.planner.undo(self.made[-1])
         undone = opposite(self.made.pop(), self.env.action_masks().size)
         return undone if self.env.action_masks()[undone] else 0
 

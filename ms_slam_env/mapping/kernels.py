@@ -13,7 +13,6 @@ GAIN_STEP = wp.constant(0.8)  # cells of depth between the points of a ray: none
 SEEN_THROUGH = wp.constant(0.85**0.8)  # chance that a step through unknown cells meets nothing
 STILL_BLANK = wp.constant(0.7)  # worth of a cell after one more look without a reading
 DEPTH_NOISE = wp.constant(wp.vec3(0.0012, 0.0019, 0.4))  # m, 1/m, m; see view_information
-INTENSITY_NOISE = wp.constant(8.0)  # grey levels, model and live image together
 
 mat66 = wp.types.matrix(shape=(6, 6), dtype=wp.float32)
 vec6 = wp.types.vector(length=6, dtype=wp.float32)
@@ -94,43 +93,26 @@ def sum_unknown(
     gains[pose, ray] = gain
 
 
-@wp.func
-def _outer(p: wp.vec3, gradient: wp.vec3, length: float):
-    """J^T J of a residual with a gradient at a point; rotations times a length."""
-    turn = wp.cross(p, gradient) / length
-    J = vec6(gradient[0], gradient[1], gradient[2], turn[0], turn[1], turn[2])
-    return wp.outer(J, J)
-
-
 @wp.kernel
 def sum_information(
     depth: wp.array3d(dtype=float),
     normals: wp.array3d(dtype=wp.vec3),
-    intensity: wp.array3d(dtype=float),
     lengths: wp.array(dtype=float),
     focal: wp.vec2,
     centre: wp.vec2,
     sums: wp.array2d(dtype=mat66),
 ):
-    """Sum of J^T J / sigma^2 over a row of each view."""
+    """Sum of J^T J / sigma^2 over a row of each view, rotations times the view's length."""
     view, v = wp.tid()
     H = mat66()
-    last = depth.shape[2] - 1
     for u in range(depth.shape[2]):
         z = depth[view, v, u]
         if z > 0.0:
             x = (float(u) - centre[0]) / focal[0]
             y = (float(v) - centre[1]) / focal[1]
-            p = wp.vec3(x * z, y * z, z)
             beyond = wp.max(z - DEPTH_NOISE[2], 0.0)
-            sigma = DEPTH_NOISE[0] + DEPTH_NOISE[1] * beyond * beyond
-            H += _outer(p, normals[view, v, u] / sigma, lengths[view])
-            if u > 0 and u < last and v > 0 and v + 1 < depth.shape[1]:
-                across = wp.min(depth[view, v, u - 1], depth[view, v, u + 1])
-                along = wp.min(depth[view, v - 1, u], depth[view, v + 1, u])
-                if wp.min(across, along) > 0.0:
-                    du = (intensity[view, v, u + 1] - intensity[view, v, u - 1]) * focal[0]
-                    dv = (intensity[view, v + 1, u] - intensity[view, v - 1, u]) * focal[1]
-                    slope = wp.vec3(du, dv, -(du * x + dv * y)) / (2.0 * z * INTENSITY_NOISE)
-                    H += _outer(p, slope, lengths[view])
+            n = normals[view, v, u] / (DEPTH_NOISE[0] + DEPTH_NOISE[1] * beyond * beyond)
+            turn = wp.cross(wp.vec3(x * z, y * z, z), n) / lengths[view]
+            J = vec6(n[0], n[1], n[2], turn[0], turn[1], turn[2])
+            H += wp.outer(J, J)
     sums[view, v] = H

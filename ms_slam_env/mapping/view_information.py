@@ -16,11 +16,11 @@ def view_information(views: Views) -> Float64:
     """Information matrices (N, 6, 6) of the camera's pose, translation first.
 
     H = sum J^T J / sigma_z^2 over the pixels of a view, with J = [n, p x n / d] of point-to-plane
-    alignment at the predicted points p and normals n, and likewise with the gradient of intensity
-    at p in place of n and sigma_I in place of sigma_z, as both errors are minimised together. d is
-    the mean depth: it makes rotations comparable with translations, so that one eigenvalue, in
-    1/m^2, speaks of both. sigma_z = 1.2 mm + 1.9 mm (z - 0.4 m)^2 / m^2 (Nguyen et al., 3DIMPVT
-    2012, the axial noise of a Kinect).
+    alignment at the predicted points p and normals n. d is the view's mean depth: it makes
+    rotations comparable with translations, so that one eigenvalue, in 1/m^2, speaks of both.
+    sigma_z = 1.2 mm + 1.9 mm (z - 0.4 m)^2 / m^2 (Nguyen et al., 3DIMPVT 2012, the axial noise of
+    a Kinect). Texture is left out: it tells small motions only, and over a pattern that repeats a
+    step of 12 cm may end on the wrong repetition.
     """
     k = views.intrinsics
     with wp.ScopedDevice("cpu"):
@@ -28,7 +28,6 @@ def view_information(views: Views) -> Float64:
         given = [
             wp.array(views.depth, dtype=float, copy=False),
             wp.array(views.normals, dtype=wp.vec3, copy=False),
-            wp.array(views.intensity, dtype=float, copy=False),
             wp.array(mean_depth(views).astype(np.float32)),
             wp.vec2(k.fx, k.fy),
             wp.vec2(k.cx, k.cy),
