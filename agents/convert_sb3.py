@@ -33,6 +33,7 @@ from ms_slam_agents.sb3_state import optimizer_tensors
 
 from ms_slam_env.command_line import parse
 from ms_slam_env.errors import InputError
+from ms_slam_env.output_files import check_out_file
 from ms_slam_env.report.provenance import provenance
 
 _LARGEST_MEMBER = 2**29  # bytes, unpacked
@@ -54,7 +55,7 @@ class Arguments:
 
 def main(arguments: Sequence[str]) -> int:
     """Convert as the command line says; return the exit code."""
-    args = parse(Arguments, arguments, "ms-slam train sb3 convert")
+    args = parse(Arguments, arguments, "ms-slam train sb3 convert", check_out_file)
     if not args.trust:
         raise InputError(
             f"{args.archive} may hold code: add --trust if you know where it comes from"

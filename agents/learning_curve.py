@@ -11,9 +11,8 @@ from ms_slam_agents.evaluation import paired_gain
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.report.charts import Chart, Panel, Series
-from ms_slam_env.report.figures import save_charts
-from ms_slam_env.report.records import Row, write_text
-from ms_slam_env.report.results import RESULTS, TABLE, Results, read_results, write_results
+from ms_slam_env.report.records import Row
+from ms_slam_env.report.results import RESULTS, Results, read_results, write_result_folder
 from ms_slam_env.report.tables import Table, make_table
 
 BASELINE = "random walk"
@@ -60,21 +59,18 @@ class Curve:
 
     def write(self, out: Path) -> Results:
         """Write ``results.json``, ``table.md`` and the figure into folder ``out``."""
-        charts = [self._chart()]
-        results = write_results(
-            out / RESULTS,
+        return write_result_folder(
+            out,
+            RESULTS,
             kind="train",
             title="A policy while it is trained",
             about="Scores on validation episodes, always the same with the same random numbers, "
             "beside planners that are not trained.",
             tables=self._tables(),
-            charts=charts,
+            charts=[self._chart()],
             rows=self._rows(),
             content={"config": self.config, "episodes": self.episodes},
         )
-        write_text(out / TABLE, results.as_markdown())
-        save_charts(charts, out)
-        return results
 
     def _rows(self) -> list[Row]:
         named = [*self.references.items(), *((POLICY, point) for point in self.points)]

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,6 +22,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.output_files import write_bytes
 from ms_slam_env.report.records import build, to_plain
 
 Tensors = dict[str, NDArray[Any]]
@@ -168,7 +168,7 @@ def tensor_shapes(metadata: Metadata, with_optimizer: bool) -> Shapes:
 
 
 def write_policy(path: Path, policy: PolicyFile) -> None:
-    """Write a policy file; an interrupt leaves the old file or the new, never half of one.
+    """Write a policy file, as `output_files.write_bytes` does.
 
     Raises:
         InputError: tensors that do not fit the metadata, or numbers that no training goes on from.
@@ -179,9 +179,7 @@ def write_policy(path: Path, policy: PolicyFile) -> None:
     text = json.dumps(to_plain(policy.metadata), allow_nan=False)
     # np.array: in C order, and () stays (), as np.ascontiguousarray would not have it.
     tensors = {name: np.array(value, order="C") for name, value in policy.tensors.items()}
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(save(tensors, {_TEXT: text}))
-    os.replace(partial, path)
+    write_bytes(path, save(tensors, {_TEXT: text}))
 
 
 def read_policy(path: str | Path) -> PolicyFile:

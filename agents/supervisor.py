@@ -56,6 +56,13 @@ class Supervisor(BaseCallback):
         self._minutes_before = minutes_before
         self._evaluation_s = 0.0
         self._provenance = provenance()
+        self._bar = tqdm(disable=True)
+
+    def __enter__(self) -> Supervisor:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._bar.close()
 
     def stop(self, reason: str) -> None:
         """End training after the current step."""

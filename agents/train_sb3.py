@@ -41,6 +41,7 @@ from stable_baselines3.common.vec_env import (
 import ms_slam_env  # registers the ids, in a worker process too
 from ms_slam_env.command_line import exit_code, parse
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.interrupts import kept
 from ms_slam_env.report.results import RESULTS
 
 VALIDATION_SEED = 1_000_000  # of the first validation episode; training draws from small seeds
@@ -210,12 +211,13 @@ def train(args: Args) -> int:
 
         for number in (signal.SIGINT, signal.SIGTERM):
             handlers[number] = signal.signal(number, interrupt)
-        model.learn(
-            max(0, args.total_timesteps - model.num_timesteps),
-            callback=supervisor,
-            tb_log_name=args.algorithm,
-            reset_num_timesteps=not args.resume,
-        )
+        with kept(f"what was trained before the last update is kept in {args.out}"), supervisor:
+            model.learn(
+                max(0, args.total_timesteps - model.num_timesteps),
+                callback=supervisor,
+                tb_log_name=args.algorithm,
+                reset_num_timesteps=not args.resume,
+            )
     finally:
         for caught, handler in handlers.items():
             signal.signal(caught, handler)

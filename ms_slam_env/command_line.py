@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
+import os
 import re
+import signal
 import sys
 import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any, TypeVar
 
 import tyro
 
 from ms_slam_env.errors import InputError, InputWarning
+from ms_slam_env.interrupts import Interrupts
+from ms_slam_env.output_files import DISK_ERRORS, check_out_folder
 
 T = TypeVar("T")
 
@@ -22,52 +28,102 @@ _CLASS = re.compile(r"^Error parsing \w+: ")  # names our dataclass, which tells
 _PROPOSAL = re.compile(r"^[│ ] +(--[a-z][\w-]*)", re.MULTILINE)
 
 
-def parse(cls: type[T], arguments: Sequence[str] | None, prog: str, default: T | None = None) -> T:
+def parse(
+    cls: type[T],
+    arguments: Sequence[str] | None,
+    prog: str,
+    check_out: Callable[[Path], None] = check_out_folder,
+    default: T | None = None,
+) -> T:
     """Build dataclass ``cls`` from command-line ``arguments`` (the process's own if None).
 
-    What they do not say is as in ``default``, by default as the dataclass has it.
+    What they do not say is as in ``default``, by default as the dataclass has it. Its field
+    ``out``, where it has one, is checked by ``check_out``.
 
     Raises:
-        InputError: arguments that do not fit; what tyro says in a box, in one line.
+        InputError: arguments that do not fit; what tyro says in a box, in one line. Or an ``out``
+            that nothing can be written to.
         SystemExit: with code 0 after ``--help``.
     """
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
             start = tyro.MISSING_NONPROP if default is None else default
-            return tyro.cli(cls, args=arguments, prog=prog, default=start)
+            made = tyro.cli(cls, args=arguments, prog=prog, default=start)
     except SystemExit as stop:
         if stop.code in (0, None):
             raise
         raise InputError(_one_line(complaint.getvalue())) from None
+    out = getattr(made, "out", None)
+    if out is not None:
+        check_out(out)
+    return made
 
 
 def exit_code(run: Callable[[], int], name: str = "ms-slam") -> int:
-    """Run a command: 0 success, 1 failure, 2 bad input, 130 interrupt; errors in one line.
+    """Run a command; errors and interrupts in one line.
 
     So are warnings about what was given; those of libraries tell a user nothing.
+
+    Returns:
+        0 success, 1 failure (also of the disk), 2 bad input, 130 after Ctrl-C, 143 after SIGTERM.
     """
+    interrupts = Interrupts()
     try:
-        with warnings.catch_warnings():
+        with interrupts, warnings.catch_warnings():
             if not sys.warnoptions:
                 warnings.simplefilter("ignore", RuntimeWarning)
             warnings.simplefilter("default", InputWarning)
             warnings.showwarning = partial(_show_warning, name)
-            return run()
-    except InputError as error:
-        print(f"{name}: error: {error}", file=sys.stderr)
-        return 2
+            code = run()
+            _flush()
+            return code
+    except BaseException as error:
+        ending = _ending(error, interrupts.signal)
+        if ending is None:
+            raise
+        code, text = ending
+        print(f"{name}: {text}", file=sys.stderr)
+        return code
+
+
+def _ending(error: BaseException, stopped: int | None) -> tuple[int, str] | None:
+    """Exit code and message of what ended a command; None if it is an error of the program."""
+    if stopped is not None or isinstance(error, KeyboardInterrupt):
+        # After a signal anything may come out of a library that was in the middle of something.
+        kept = str(error) if isinstance(error, KeyboardInterrupt) else ""
+        text = f"interrupted; {kept}" if kept else "interrupted"
+        return 128 + (stopped or signal.SIGINT), text
+    if isinstance(error, InputError):
+        return 2, f"error: {error}"
+    if isinstance(error, OSError):
+        code = 1 if error.errno in DISK_ERRORS else 2
+        name = error.filename or (_name_of_output() if code == 1 else None)
+        if name is not None:
+            return code, f"error: {name}: {error.strerror}"
+    if isinstance(error, RuntimeError):
+        return 1, f"error: {error}"
+    return None
+
+
+def _flush() -> None:
+    """Let a standard output that takes nothing more be an error now, not after the exit code."""
+    try:
+        sys.stdout.flush()
     except OSError as error:
-        if error.filename is None:
-            raise  # not about a file that the user named
-        print(f"{name}: error: {error.filename}: {error.strerror}", file=sys.stderr)
-        return 2
-    except RuntimeError as error:
-        print(f"{name}: error: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print(f"{name}: interrupted; finished work is kept", file=sys.stderr)
-        return 130
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), sys.stdout.fileno())
+        raise OSError(errno.EIO, error.strerror, "standard output") from None
+
+
+def _name_of_output() -> str:
+    """Where an error of the disk that names no file came from: does the output take a line?"""
+    try:
+        sys.stdout.write("\n")
+        _flush()
+    except OSError:
+        return "standard output"
+    return "a file could not be written"
 
 
 def _show_warning(

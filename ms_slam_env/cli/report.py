@@ -9,6 +9,7 @@ from pathlib import Path
 import tyro
 
 from ms_slam_env.command_line import parse
+from ms_slam_env.output_files import check_out_file
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class Arguments:
 
 def main(arguments: Sequence[str]) -> int:
     """Write the page and print where it is."""
-    args = parse(Arguments, arguments, "ms-slam report")
+    args = parse(Arguments, arguments, "ms-slam report", check_out_file)
     from ms_slam_env.report.page import write_report
 
     path = write_report(args.folder, args.out)

@@ -13,6 +13,7 @@ from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import unknown
 from ms_slam_env.experiments.pictures.usme import save_usme_picture
 from ms_slam_env.experiments.usme import Usme, check_suite
+from ms_slam_env.output_files import check_out_file, check_out_folder
 from ms_slam_env.sequences.usme_suite import NAMES, make_suite
 
 
@@ -66,7 +67,8 @@ def main(arguments: Sequence[str]) -> int:
         raise unknown("command of ms-slam usme", name, COMMANDS)
     if name == "run":
         return run(Usme, rest, "ms-slam usme run", Path("results/usme_run"))
-    command = parse(COMMANDS[name], rest, f"ms-slam usme {name}")
+    check_out = check_out_file if name == "picture" else check_out_folder
+    command = parse(COMMANDS[name], rest, f"ms-slam usme {name}", check_out)
     if isinstance(command, Make):
         folders = make_suite(
             command.out,

@@ -25,7 +25,7 @@ from ms_slam_env.evaluation.trajectory_files import (
 from ms_slam_env.metrics.registry import metric
 from ms_slam_env.report import figures
 from ms_slam_env.report.charts import Chart, Panel, Series
-from ms_slam_env.report.results import TABLE, write_results
+from ms_slam_env.report.results import write_result_folder
 from ms_slam_env.report.tables import Column, Table, format_value, make_table
 from ms_slam_env.sequences import write_trajectory
 
@@ -70,21 +70,18 @@ class Evaluation:
 
 def write_evaluation(parts: Sequence[Evaluation], out: Path) -> None:
     """Write ``evaluation.json``, ``table.md``, figures and files of all parts into ``out``."""
-    charts = [chart for part in parts for chart in part.charts]
-    results = write_results(
-        out / EVALUATION,
+    write_result_folder(
+        out,
+        EVALUATION,
+        lambda folder: [part.write(folder) for part in parts],
         kind="evaluation",
         title="Estimate against the truth",
         about=_ABOUT,
         tables=[table for part in parts for table in part.tables],
-        charts=charts,
+        charts=[chart for part in parts for chart in part.charts],
         content={"config": {key: value for part in parts for key, value in part.config.items()}},
         metrics={key: value for part in parts for key, value in part.found.items()},
     )
-    (out / TABLE).write_text(results.as_markdown(), encoding="utf-8")
-    figures.save_charts(charts, out)
-    for part in parts:
-        part.write(out)
 
 
 def _one_line(keys: Sequence[str], found: Found, title: str, note: str = "") -> Table:

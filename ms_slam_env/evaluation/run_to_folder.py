@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from ms_slam_env.evaluation.submaps import (
 )
 from ms_slam_env.evaluation.trajectory_charts import error_panel, path_panel, thinned
 from ms_slam_env.geometry import invert
+from ms_slam_env.output_files import growing_file, result_folder, write_bytes, write_text
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.results import write_results
 from ms_slam_env.report.tables import Table, make_table
@@ -71,60 +72,62 @@ def run_to_folder(
 
     Those that ``selection`` drops are not processed; their poses are predicted.
     SLAM starts at the true pose of the first frame where that is known, else at the identity.
-    While it runs, the trajectory so far stands in ``trajectory.incomplete.txt``; at the end it is
-    renamed to ``trajectory.txt``, beside ``map.ply`` and ``metrics.json``. Where the backend closes
-    loops, ``trajectory.corrected.txt`` holds the poses as the finished map has them; where the true
-    poses are known, ``groundtruth.txt`` holds those; what every frame cost stands in
-    ``frames.csv``; where there are several submaps ``submaps.csv`` says which holds each frame. A
-    run that fails or is interrupted leaves the unfinished file and a
-    ``metrics.json`` that says so, and says how the frames were ``fed`` to the backend.
+    While it runs, the trajectory so far stands in ``trajectory.incomplete.txt``. At the end that
+    becomes ``trajectory.txt``, beside ``map.ply``, ``frames.csv`` with what every frame cost and,
+    last, ``metrics.json``, which also says how the frames were ``fed`` to the backend. Where it
+    closes loops, ``trajectory.corrected.txt`` holds the poses as the finished map has them; where
+    the true poses are known, ``groundtruth.txt`` holds those; where there are several submaps,
+    ``submaps.csv`` says which holds each frame. A run that fails or is interrupted leaves the
+    unfinished trajectory, and ``frames.csv`` and ``metrics.json`` of the frames so far, which says
+    so.
 
     Returns:
         the metrics in ``metrics.json``.
 
     Raises:
         InputError: a bad option, or an image that cannot be read.
+        OSError: a file that cannot be written.
     """
-    costs = metrics.CostMeter(str(params.get("device", "cpu")))
+    meter = metrics.CostMeter(str(params.get("device", "cpu")))
     selection = selection or EveryFrameConfig()
     system = selection.manage(slam.make(backend, sequence.intrinsics, **params))
-    run = SequenceRun(system, sequence, meter=costs, progress=sequence.name)
-    out.mkdir(parents=True, exist_ok=True)
-    for old in (TRAJECTORY, CORRECTED, TRUTH, MAP, METRICS, FRAMES, SUBMAPS):
+    run = SequenceRun(system, sequence, meter=meter, progress=sequence.name)
+    content = _about(sequence, backend, params, fed or {}, selection)
+    for old in (METRICS, TRAJECTORY, CORRECTED, TRUTH, MAP, FRAMES, SUBMAPS):
         (out / old).unlink(missing_ok=True)
-    content = {"complete": False, **_about(sequence, backend, params, fed or {}, selection)}
-    final: dict[str, Any] = {}
     try:
-        with (out / UNFINISHED).open("w", encoding="utf-8") as file:
-            file.write(TRAJECTORY_HEADER + "\n")
+        with growing_file(out / UNFINISHED) as add:
+            add(TRAJECTORY_HEADER)
             for step in run:
-                pose = step.result.T_world_camera
-                file.write(trajectory_line(step.frame.timestamp, pose) + "\n")
-                file.flush()
-        write_ply(out / MAP, system.surface_points(), system.map_attributes())
-        corrected = run.corrected()
-        if corrected is not None:
-            write_trajectory(out / CORRECTED, run.timestamps, corrected)
-            errors = trajectory_errors(run, corrected, sequence)
-            final = {f"final_{key}": errors[key] for key in ("ate_m", "rpe_m") if key in errors}
-        if len(system.submaps()) > 1:
-            write_submaps(out / SUBMAPS, run)
-            final |= _submap_errors(run, corrected, sequence)
-        truth = sequence.true_trajectory()
-        if truth is not None:
-            write_trajectory(out / TRUTH, *truth)
-        os.replace(out / UNFINISHED, out / TRAJECTORY)
-        content["complete"] = True
+                add(trajectory_line(step.frame.timestamp, step.result.T_world_camera))
+        result = _write(run, sequence, out, {"complete": True, **content})
     except BaseException as error:
+        stopped = isinstance(error, KeyboardInterrupt)
         content["error"] = str(error) or type(error).__name__
+        with suppress(OSError):  # a disk that is full: the poses so far are all there is
+            _write(run, sequence, out, {"complete": False, "interrupted": stopped, **content})
+            if stopped:
+                error.args = (f"{len(run)} of {len(sequence)} frames are kept in {out}",)
         raise
-    finally:
-        result = {**final, **measure(run, sequence)}
-        write_frames(out / FRAMES, run)
+    (out / UNFINISHED).unlink()
+    return result
+
+
+def _write(
+    run: SequenceRun, sequence: Sequence, out: Path, content: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Write what is known of a run, finished or not; return its metrics."""
+    result: dict[str, Any] = {}
+    with result_folder(out, METRICS) as folder:
+        if content["complete"]:
+            write_bytes(folder / TRAJECTORY, (out / UNFINISHED).read_bytes())
+            result |= _write_finished(run, sequence, folder)
+        result |= measure(run, sequence)
+        write_frames(folder / FRAMES, run)
         write_results(
-            out / METRICS,
+            folder / METRICS,
             kind="run",
-            title=f"{backend} over {sequence.name}",
+            title=f"{content['backend']} over {sequence.name}",
             about=_ABOUT,
             tables=_tables(result),
             charts=_charts(run, sequence),
@@ -132,6 +135,23 @@ def run_to_folder(
             metrics=result,
         )
     return result
+
+
+def _write_finished(run: SequenceRun, sequence: Sequence, folder: Path) -> dict[str, Any]:
+    """Write map and other trajectories; return errors of those with loops closed, and by submap."""
+    write_ply(folder / MAP, run.backend.surface_points(), run.backend.map_attributes())
+    truth, corrected = sequence.true_trajectory(), run.corrected()
+    if truth is not None:
+        write_trajectory(folder / TRUTH, *truth)
+    final: dict[str, Any] = {}
+    if corrected is not None:
+        write_trajectory(folder / CORRECTED, run.timestamps, corrected)
+        errors = trajectory_errors(run, corrected, sequence)
+        final = {f"final_{key}": errors[key] for key in ("ate_m", "rpe_m") if key in errors}
+    if len(run.backend.submaps()) > 1:
+        write_submaps(folder / SUBMAPS, run)
+        final |= _submap_errors(run, corrected, sequence)
+    return final
 
 
 def _about(
@@ -302,7 +322,7 @@ def write_frames(path: Path, run: SequenceRun) -> None:
     for timestamp, ok, *values in zip(run.timestamps, run.tracking_ok, *columns, strict=True):
         words = ["" if math.isnan(value) else f"{value:.3f}" for value in values]
         lines.append(",".join([f"{timestamp:.6f}", str(int(ok)), *words]))
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_text(path, "\n".join(lines) + "\n")
 
 
 _PLY_NAMES = {
@@ -317,7 +337,7 @@ def write_ply(
 ) -> None:
     """Write points (M, 3) and what is known of each, by name: (M,) or (M, 3) arrays, binary PLY.
 
-    ``color`` is uint8, everything else 32-bit floats. An interrupt leaves no half file.
+    ``color`` is uint8, everything else 32-bit floats.
     """
     columns = {name: np.asarray(points[:, k], "<f4") for k, name in enumerate("xyz")}
     for name, values in attributes.items():
@@ -334,6 +354,4 @@ def write_ply(
         *(f"property {_PLY_TYPES[c.dtype.str[1:]]} {name}" for name, c in columns.items()),
         "end_header",
     ]
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes("\n".join(lines).encode() + b"\n" + table.tobytes())
-    os.replace(partial, path)
+    write_bytes(path, "\n".join(lines).encode() + b"\n" + table.tobytes())

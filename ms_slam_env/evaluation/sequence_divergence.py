@@ -20,8 +20,7 @@ from ms_slam_env.divergence import DivergenceConfig, make_divergence
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.trajectory_charts import thinned
 from ms_slam_env.report.charts import Chart, Panel, Series
-from ms_slam_env.report.figures import save_charts
-from ms_slam_env.report.results import TABLE, Results, write_results
+from ms_slam_env.report.results import Results, write_result_folder
 from ms_slam_env.report.tables import Table, make_table
 from ms_slam_env.sequences import Sequence as RGBDSequence
 
@@ -192,17 +191,14 @@ def write_divergences(
     measured: Sequence[SequenceDivergence], settings: Mapping[str, Any], out: Path
 ) -> Results:
     """Write ``divergence.json``, ``table.md`` and ``divergence.png`` into folder ``out``."""
-    shown = chart(measured)
-    results = write_results(
-        out / "divergence.json",
+    return write_result_folder(
+        out,
+        "divergence.json",
         kind="divergence",
         title="How hard sequences are",
         about=_ABOUT,
         tables=[table(measured)],
-        charts=[shown],
+        charts=[chart(measured)],
         content=settings,
         metrics={"sequences": as_metrics(measured)},
     )
-    (out / TABLE).write_text(results.as_markdown(), encoding="utf-8")
-    save_charts([shown], out)
-    return results

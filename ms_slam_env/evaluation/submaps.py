@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env import metrics
 from ms_slam_env.evaluation.run_sequence import SequenceRun
+from ms_slam_env.output_files import write_text
 
 Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
@@ -79,7 +80,7 @@ def write_submaps(path: Path, run: SequenceRun) -> None:
         words = [f"{sigmas[0]:.4f}", f"{np.degrees(sigmas[1]):.3f}"]
         own = result.submap if result.tracking_ok else -1
         lines.append(",".join([f"{time:.6f}", str(own), str(number), *words]))
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def _parts(link: Float64) -> tuple[Float64, Float64]:

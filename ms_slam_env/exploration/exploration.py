@@ -24,8 +24,7 @@ from ms_slam_env.exploration.settings import ExplorationSettings
 from ms_slam_env.exploration.space import make_space
 from ms_slam_env.exploration.study_storage import StudyStorage
 from ms_slam_env.metrics.cost import energy_counters
-from ms_slam_env.report.figures import save_charts
-from ms_slam_env.report.results import TABLE, Results, write_results
+from ms_slam_env.report.results import Results, write_result_folder
 from ms_slam_env.sequences import check_sequence
 from ms_slam_env.slam.configuration import SlamConfiguration, write_configuration
 
@@ -111,9 +110,12 @@ def write_exploration(exploration: Exploration, storage: StudyStorage, out: Path
     reference = storage.reference() or {}
     chosen = choose(points, objectives)
     files = {name: f"{name.replace('_', '-')}.yaml" for name in chosen}
-    for name, point in chosen.items():
-        made = _configuration(storage, point, name, exploration.evaluator.image_size)
-        write_configuration(out / files[name], made)
+
+    def write_chosen(folder: Path) -> None:
+        for name, point in chosen.items():
+            made = _configuration(storage, point, name, exploration.evaluator.image_size)
+            write_configuration(folder / files[name], made)
+
     explored = Explored(
         objectives,
         exploration.evaluator.clock,
@@ -125,14 +127,15 @@ def write_exploration(exploration: Exploration, storage: StudyStorage, out: Path
         importances(storage),
         _held_out(exploration, storage, points, chosen, out),
     )
-    charts = explored.charts()
-    results = write_results(
-        out / "explore.json",
+    return write_result_folder(
+        out,
+        "explore.json",
+        write_chosen,
         kind="exploration",
         title=TITLE,
         about=ABOUT,
         tables=explored.tables(),
-        charts=charts,
+        charts=explored.charts(),
         rows=explored.rows(),
         rows_key="trials",
         content={
@@ -153,9 +156,6 @@ def write_exploration(exploration: Exploration, storage: StudyStorage, out: Path
             "importance": explored.importance,
         },
     )
-    (out / TABLE).write_text(results.as_markdown(), encoding="utf-8")
-    save_charts(charts, out)
-    return results
 
 
 def _held_out(

@@ -11,6 +11,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.exploration.settings import Evaluate, ExplorationSettings
 from ms_slam_env.exploration.space import SearchSpace
 from ms_slam_env.exploration.study_storage import StudyStorage
+from ms_slam_env.interrupts import kept
 from ms_slam_env.parallel import Outcome, Pool, open_pool
 
 if TYPE_CHECKING:
@@ -56,11 +57,12 @@ def explore(
         raise InputError(f"{name} = {value} must be at least 1")
     storage = StudyStorage(folder, space, settings)
     report = progress or (lambda finished: None)
-    if workers == 1 and ray_address is None:
-        _explore_here(storage, evaluate, budget, report)
-    else:
-        with open_pool(evaluate, workers, ray_address) as pool:
-            _explore_with(pool, storage, budget, report)
+    with kept(f"finished trials are kept in {folder}; the same command goes on"):
+        if workers == 1 and ray_address is None:
+            _explore_here(storage, evaluate, budget, report)
+        else:
+            with open_pool(evaluate, workers, ray_address) as pool:
+                _explore_with(pool, storage, budget, report)
     return storage
 
 

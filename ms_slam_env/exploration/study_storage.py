@@ -7,6 +7,7 @@ and SQLite undoes what it had half written. Optuna's journal keeps half a line a
 from __future__ import annotations
 
 import contextlib
+import errno
 import math
 import os
 import socket
@@ -22,6 +23,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.exploration.objectives import FAILURE, METRICS, Measured, objective_values
 from ms_slam_env.exploration.settings import ExplorationSettings, make_sampler
 from ms_slam_env.exploration.space import SearchSpace
+from ms_slam_env.output_files import check_out_folder
 from ms_slam_env.slam.configuration import SlamConfiguration
 
 if TYPE_CHECKING:
@@ -33,6 +35,11 @@ _NAME = "exploration"
 _MOST_RETRIES = 2  # of a trial whose process died; then its values may be what kills processes
 _LOCK_TIMEOUT_S = 600.0
 _DEFAULT, _OWNER, _RETRY_OF, _RETRIES = "default", "owner", "retry_of", "retries"
+_DISK_ERRORS = {
+    "database or disk is full": errno.ENOSPC,
+    "disk I/O error": errno.EIO,
+    "attempt to write a readonly database": errno.EROFS,
+}  # by SQLite's messages, sqlite3.c
 MEASURED = "measured"
 """User attribute of a finished trial: everything that its evaluation returned."""
 
@@ -47,11 +54,13 @@ class StudyStorage:
 
     Raises:
         InputError: the folder holds a study with other settings, or no study file at all.
+        OSError: the disk is full, broken or read-only.
     """
 
     def __init__(self, folder: Path, space: SearchSpace, settings: ExplorationSettings) -> None:
         self.folder, self.space, self.settings = folder, space, settings
         self.owner = process_name()
+        check_out_folder(folder)
         folder.mkdir(parents=True, exist_ok=True)
         with self._alone():
             self.study = self._open()
@@ -89,7 +98,7 @@ class StudyStorage:
         """Finish ``trial`` with what its evaluation returned; no matter if it was taken back."""
         from optuna.exceptions import UpdateFinishedTrialError
 
-        with contextlib.suppress(UpdateFinishedTrialError):
+        with self._disk_errors(), contextlib.suppress(UpdateFinishedTrialError):
             self._tell(trial, measured)
 
     def _tell(self, trial: Trial, measured: Measured) -> None:
@@ -111,8 +120,9 @@ class StudyStorage:
         """Mark ``trial`` as failed: its process died or could not work; it will be redone."""
         from optuna.trial import TrialState
 
-        trial.set_user_attr("given_up", why)
-        self.study.tell(trial, state=TrialState.FAIL, skip_if_finished=True)
+        with self._disk_errors():
+            trial.set_user_attr("given_up", why)
+            self.study.tell(trial, state=TrialState.FAIL, skip_if_finished=True)
 
     def configuration(self, trial: Trial | FrozenTrial) -> SlamConfiguration:
         """What is to be evaluated."""
@@ -124,7 +134,8 @@ class StudyStorage:
         """Finished trials, in the order of their numbers."""
         from optuna.trial import TrialState
 
-        return self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+        with self._disk_errors():
+            return self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
 
     def reference(self) -> dict[str, float] | None:
         """Where objectives stop to count, by name; None until the default has finished."""
@@ -142,16 +153,18 @@ class StudyStorage:
             ) from None
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         try:
-            storage = RDBStorage(
-                f"sqlite:///{self.folder / STUDY_FILE}", engine_kwargs={"creator": self._connect}
-            )
-            study = optuna.create_study(
-                storage=storage,
-                study_name=_NAME,
-                directions=["minimize"] * len(self.settings.objectives),
-                load_if_exists=True,
-                sampler=optuna.samplers.RandomSampler(),
-            )
+            with self._disk_errors():
+                storage = RDBStorage(
+                    f"sqlite:///{self.folder / STUDY_FILE}",
+                    engine_kwargs={"creator": self._connect},
+                )
+                study = optuna.create_study(
+                    storage=storage,
+                    study_name=_NAME,
+                    directions=["minimize"] * len(self.settings.objectives),
+                    load_if_exists=True,
+                    sampler=optuna.samplers.RandomSampler(),
+                )
         except Exception as error:
             if isinstance(error, (OSError, MemoryError)):
                 raise
@@ -238,9 +251,25 @@ class StudyStorage:
                 lock.execute("BEGIN EXCLUSIVE")
             except sqlite3.DatabaseError as error:  # no right to write, or another kind of file
                 raise InputError(f"{path}: {error}") from None
-            yield
+            with self._disk_errors():
+                yield
         finally:
             lock.close()
+
+    @contextmanager
+    def _disk_errors(self) -> Iterator[None]:
+        """Let what SQLite says of a disk, through two libraries, be the system's error again."""
+        try:
+            yield
+        except Exception as error:
+            cause: BaseException | None = error
+            while cause is not None and not isinstance(cause, sqlite3.Error):
+                cause = cause.__cause__ or cause.__context__
+            number = _DISK_ERRORS.get(str(cause))
+            if number is None:
+                raise
+            path = str(self.folder / STUDY_FILE)
+            raise OSError(number, f"{os.strerror(number)} ({cause})", path) from error
 
 
 def _plain(value: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from ms_slam_env.metrics.registry import metric
+from ms_slam_env.output_files import write_bytes
 from ms_slam_env.report.charts import Chart, Panel, Series
 
 _LOOKS: dict[str, dict[str, Any]] = {
@@ -151,10 +153,11 @@ def plain_log_ticks(axis: Axis) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def save(figure: Figure, path: Path) -> Path:
-    """Write a figure as PNG."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=120)
+def save(figure: Figure, path: Path, dpi: int = 120) -> Path:
+    """Write a figure as PNG, whole or not at all."""
+    picture = io.BytesIO()
+    figure.savefig(picture, dpi=dpi, format="png")
+    write_bytes(path, picture.getvalue())
     return path
 
 

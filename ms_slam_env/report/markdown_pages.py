@@ -21,7 +21,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.report.records import write_text
+from ms_slam_env.output_files import write_text
 from ms_slam_env.report.results import RESULTS, Results, made_by, read_results
 from ms_slam_env.report.tables import Table
 

@@ -15,10 +15,11 @@ from typing import Any
 from ms_slam_env import __version__
 from ms_slam_env.errors import InputError
 from ms_slam_env.metrics.registry import metric
+from ms_slam_env.output_files import check_out_file, write_text
 from ms_slam_env.report.charts import Chart
 from ms_slam_env.report.discovery import PICTURES, FoundResult, NotShown, find_results
 from ms_slam_env.report.plotly_charts import plots_of
-from ms_slam_env.report.records import to_plain, write_text
+from ms_slam_env.report.records import to_plain
 from ms_slam_env.report.results import Results
 from ms_slam_env.report.statistics import Interval
 from ms_slam_env.report.tables import Table, Value, format_value
@@ -42,12 +43,12 @@ def write_report(folder: Path, out: Path | None = None) -> Path:
         path of the page.
 
     Raises:
-        InputError: no such folder, no result in it, Plotly not installed.
+        InputError: no such folder, no result in it, Plotly not installed, or ``out`` is no place
+            for a file.
     """
-    found, absent = find_results(folder)
     target = folder / "report.html" if out is None else out
-    if target.is_dir():
-        raise InputError(f"--out {target} is a folder; a file is needed, such as report.html")
+    check_out_file(target)
+    found, absent = find_results(folder)
     write_text(target, page(folder.resolve().name, found, absent))
     return target
 

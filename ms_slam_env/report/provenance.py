@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
 import platform
 import shlex
 import subprocess
@@ -11,6 +13,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+_PACKAGE = Path(__file__).resolve().parents[1]
 _PACKAGES = (
     "ms-slam-env",
     "embreex",
@@ -24,7 +27,7 @@ _PACKAGES = (
 
 
 def provenance() -> dict[str, Any]:
-    """Command, time (UTC), versions, git commit (None outside a checkout) and platform."""
+    """Command, time (UTC), versions, git commit (None outside its checkout) and platform."""
     return {
         "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "time": datetime.now(timezone.utc).isoformat(timespec="seconds"),
@@ -36,23 +39,55 @@ def provenance() -> dict[str, Any]:
     }
 
 
-def git_commit() -> str | None:
-    """Commit of the checkout that the package lies in, ``-dirty`` if files differ from it."""
-    here = Path(__file__).resolve().parents[1]
-    commands = (["rev-parse", "HEAD"], ["status", "--porcelain", "--untracked-files=no", "."])
-    answers = []
-    for command in commands:
-        try:
-            done = subprocess.run(
-                ["git", "-C", str(here), *command], capture_output=True, text=True, timeout=10
-            )
-        except (OSError, subprocess.TimeoutExpired):
-            return None
-        if done.returncode != 0:
-            return None
-        answers.append(done.stdout.strip())
-    commit, changes = answers
-    return f"{commit}-dirty" if changes else commit
+def git_commit(package: Path = _PACKAGE) -> str | None:
+    """Commit of the checkout that the package's files are in, ``-dirty`` if files differ from it.
+
+    None where the package is not tracked: the repository around an environment is the user's. Only
+    what git has recorded is asked, and the files are compared here: ``git status`` would run what
+    the repository configures (file-system monitor, hooks, filters).
+    """
+    commit = _git(package, "rev-parse", "--verify", "HEAD")
+    listing = _git(package, "ls-tree", "-r", "-z", "HEAD", ".")
+    blobs = {}
+    for entry in filter(None, (listing or "").split("\0")):
+        about, _, name = entry.partition("\t")
+        blobs[name] = about.split()[-1]
+    if commit is None or "__init__.py" not in blobs:
+        return None
+    is_dirty = any(not _is_blob(package / name, blob) for name, blob in blobs.items())
+    return f"{commit}-dirty" if is_dirty else commit
+
+
+def _git(folder: Path, *command: str) -> str | None:
+    """What git answers in a folder, of which nothing is run or fetched; None if it fails."""
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("GIT_")}
+    environment |= {"GIT_NO_LAZY_FETCH": "1", "GIT_OPTIONAL_LOCKS": "0"}
+    off = ("core.fsmonitor=false", f"core.hooksPath={os.devnull}", "protocol.allow=never")
+    options = [word for setting in off for word in ("-c", setting)]
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(folder), *options, *command],
+            capture_output=True,
+            env=environment,
+            timeout=10,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return None if done.returncode else done.stdout.decode(errors="replace").strip()
+
+
+def _is_blob(path: Path, blob: str) -> bool:
+    """Whether a file's content, whatever its line ends, is that of an object of git."""
+    try:
+        data = path.read_bytes()
+    except OSError:
+        return False
+    algorithm = "sha1" if len(blob) == 40 else "sha256"
+    return any(
+        hashlib.new(algorithm, b"blob %d\0" % len(text) + text, usedforsecurity=False).hexdigest()
+        == blob
+        for text in (data, data.replace(b"\r\n", b"\n"))
+    )
 
 
 def _cpu() -> str:

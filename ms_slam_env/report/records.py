@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 import json
 import math
-import os
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from types import NoneType
@@ -14,7 +14,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ms_slam_env.errors import InputError
+from ms_slam_env.errors import InputError, InputWarning
+from ms_slam_env.output_files import append_line, write_text
 
 Row = dict[str, Any]
 T = TypeVar("T")
@@ -37,8 +38,8 @@ def spec_key(spec: Any) -> str:
 class RecordFile:
     """Append-only file of JSON lines, each with a ``key``; the last line of a key counts.
 
-    A line is written by one ``write`` call and synced before ``append`` returns. A line that a kill
-    cut short is dropped when the file is next read.
+    A line is on disk, whole, when ``append`` returns. One that a kill cut short does not count, and
+    the next ``append`` removes it.
 
     Args:
         path: of the file; it and its folder are created by the first ``append``.
@@ -58,7 +59,11 @@ class RecordFile:
         data = self.path.read_bytes()
         complete, _, cut_short = data.rpartition(b"\n")
         if cut_short:
-            os.truncate(self.path, len(data) - len(cut_short))
+            warnings.warn(
+                f"{self.path}: the last line was cut short and is dropped",
+                InputWarning,
+                stacklevel=2,
+            )
         rows: dict[str, Row] = {}
         for number, line in enumerate(complete.split(b"\n") if complete else [], start=1):
             try:
@@ -69,28 +74,13 @@ class RecordFile:
         return rows
 
     def append(self, row: Row) -> None:
-        """Add one row; it is on disk when this returns."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        line = json.dumps(to_plain(row), allow_nan=False).encode() + b"\n"
-        descriptor = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
-        try:
-            os.write(descriptor, line)
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        """Add one row, as `output_files.append_line` does."""
+        append_line(self.path, json.dumps(to_plain(row), allow_nan=False).encode() + b"\n")
 
 
 def write_json(path: Path, content: Any) -> None:
     """Write ``content``, whole or not at all; see :func:`to_plain` for what JSON does not have."""
     write_text(path, json.dumps(to_plain(content), indent=1, allow_nan=False) + "\n")
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write ``text``; an interrupt leaves the old file or the new one, never half of one."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(text.encode("utf-8", errors="replace"))
-    os.replace(partial, path)
 
 
 def to_plain(content: Any) -> Any:

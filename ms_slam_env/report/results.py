@@ -12,7 +12,7 @@ Whatever has a kind and tables is shown by ``ms-slam report``, which knows nothi
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import NoneType
@@ -20,6 +20,7 @@ from typing import Any
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.metrics.registry import RESULTS_VERSION, RESULTS_VERSIONS, check_keys
+from ms_slam_env.output_files import result_folder, write_text
 from ms_slam_env.report.charts import Chart, chart_from_json
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import check_plain, from_plain, write_json
@@ -129,6 +130,31 @@ def write_results(
         },
     )
     return written
+
+
+def write_result_folder(
+    out: Path, name: str, write_more: Callable[[Path], object] = lambda folder: None, **result: Any
+) -> Results:
+    """Write a result with its tables in Markdown and its charts as PNG, all of it or nothing.
+
+    Args:
+        out: folder of the result.
+        name: of the result file.
+        write_more: writes what else belongs to it into the folder that it is given.
+        result: see `write_results`.
+
+    Raises:
+        InputError: a result with a key that the registry does not know.
+        OSError: a file that cannot be written.
+    """
+    from ms_slam_env.report.figures import save_charts
+
+    with result_folder(out, name) as folder:
+        results = write_results(folder / name, **result)
+        write_text(folder / TABLE, results.as_markdown())
+        save_charts(results.charts, folder)
+        write_more(folder)
+    return results
 
 
 def read_results(path: Path) -> Results:

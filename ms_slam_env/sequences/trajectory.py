@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import Float64, check_pose, pose_from_quaternion, quaternion_from_pose
 from ms_slam_env.input_files import read_text
+from ms_slam_env.output_files import write_text
 
 Int64 = NDArray[np.int64]
 
@@ -42,7 +43,7 @@ def write_trajectory(path: str | Path, timestamps: ArrayLike, poses: ArrayLike) 
     if times.ndim != 1 or matrices.shape != (len(times), 4, 4):
         raise InputError(f"{len(times)} timestamps do not fit poses of shape {matrices.shape}")
     lines = [TRAJECTORY_HEADER, *map(trajectory_line, times, matrices)]
-    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_text(Path(path), "\n".join(lines) + "\n")
 
 
 def _parse(line: str, where: str) -> Sequence[float]:

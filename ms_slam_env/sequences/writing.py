@@ -15,6 +15,8 @@ from tqdm import tqdm
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
+from ms_slam_env.interrupts import kept
+from ms_slam_env.output_files import write_bytes, write_text
 from ms_slam_env.sequences.rendering import RenderedSequence
 from ms_slam_env.sequences.trajectory import write_trajectory
 
@@ -68,21 +70,21 @@ def write_sequence(
     partial = working_folder(target)
     _begin(partial, content)
     names = [f"{time:.6f}" for time in sequence.frames.timestamps]
-    for index, name in enumerate(tqdm(names, desc=sequence.name, unit="frame")):
-        _write_frame(partial, name, sequence, index, with_truth)
+    with kept(f"finished frames are kept in {partial}; the same command goes on"):
+        for index, name in enumerate(tqdm(names, desc=sequence.name, unit="frame")):
+            _write_frame(partial, name, sequence, index, with_truth)
     for kind in ("rgb", "depth", *(("depth_true", "labels") if with_truth else ())):
         lines = "".join(f"{name} {kind}/{name}.png\n" for name in names)
-        (partial / f"{kind}.txt").write_text(f"# timestamp filename\n{lines}", encoding="utf-8")
+        write_text(partial / f"{kind}.txt", f"# timestamp filename\n{lines}")
     if with_truth:
         objects = enumerate(sequence.frames.labels, start=1)
         lines = "".join(f"{value} {label}\n" for value, label in objects)
-        (partial / "objects.txt").write_text(f"# value object\n{lines}", encoding="utf-8")
+        write_text(partial / "objects.txt", f"# value object\n{lines}")
     write_trajectory(partial / "groundtruth.txt", sequence.frames.timestamps, sequence.poses)
     for name, poses in sequence.frames.object_trajectories.items():
-        (partial / "objects").mkdir(exist_ok=True)
         file = partial / "objects" / f"{name.replace(' ', '_')}.txt"
         write_trajectory(file, sequence.frames.timestamps, poses)
-    (partial / "intrinsics.txt").write_text(_intrinsics(sequence.intrinsics), encoding="utf-8")
+    write_text(partial / "intrinsics.txt", _intrinsics(sequence.intrinsics))
     os.replace(partial / UNFINISHED, partial / DESCRIPTION)
     os.replace(partial, target)
     return True
@@ -111,7 +113,7 @@ def _begin(partial: Path, content: dict[str, Any]) -> None:
                 "folder"
             )
     partial.mkdir(parents=True, exist_ok=True)
-    _replace(partial / UNFINISHED, (json.dumps(content, indent=1) + "\n").encode())
+    write_text(partial / UNFINISHED, json.dumps(content, indent=1) + "\n")
 
 
 def _read(path: Path) -> Any:
@@ -153,13 +155,5 @@ def _intrinsics(K: Intrinsics) -> str:
 
 
 def _write_image(path: Path, pixels: NDArray[Any]) -> None:
-    path.parent.mkdir(exist_ok=True)
     _, data = cv2.imencode(".png", np.ascontiguousarray(pixels))
-    _replace(path, data.tobytes())
-
-
-def _replace(path: Path, data: bytes) -> None:
-    """Write a file that appears when it is whole."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(data)
-    os.replace(partial, path)
+    write_bytes(path, data.tobytes(), durable=False)

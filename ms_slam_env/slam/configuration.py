@@ -13,6 +13,7 @@ import yaml
 from ms_slam_env.camera import Intrinsics, parse_image_size
 from ms_slam_env.config import Checked, bounded, from_dict
 from ms_slam_env.errors import InputError
+from ms_slam_env.output_files import write_text
 from ms_slam_env.slam.base import SlamBackend
 from ms_slam_env.slam.registry import check_parameters, make_backend
 
@@ -118,8 +119,7 @@ def write_configuration(path: str | Path, configuration: SlamConfiguration) -> N
         for name, value in dataclasses.asdict(configuration).items()
         if value is not None
     }
-    with Path(path).open("w", encoding="utf-8") as file:
-        yaml.safe_dump(_plain(content), file, sort_keys=False)
+    write_text(Path(path), yaml.safe_dump(_plain(content), sort_keys=False))
 
 
 def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:

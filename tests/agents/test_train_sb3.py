@@ -1,5 +1,6 @@
 """The training script end to end on a small fake environment that can be learnt."""
 
+import errno
 import os
 import signal
 import time
@@ -17,6 +18,7 @@ from ms_slam_agents.sb3_state import whole_batches
 from scipy.stats import sem
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from ms_slam_env import output_files
 from ms_slam_env.report.results import read_results
 
 
@@ -307,3 +309,15 @@ def test_numbers_out_of_range_are_refused(option, tmp_path, capsys):
     error = capsys.readouterr().err
     assert f"Args.{option.replace('-', '_')} = -1" in error
     assert len(error.splitlines()) == 1
+
+
+def test_a_full_disk_is_one_line_that_names_the_file(tmp_path, capsys, monkeypatch):
+    def write(descriptor, data):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(output_files.os, "write", write)
+    assert train_sb3.main(arguments(tmp_path, steps=64)) == 1
+    last = capsys.readouterr().err.replace("\r", "\n").splitlines()[-1]
+    assert last.startswith(f"ms-slam train: error: {tmp_path}")
+    assert last.endswith(": No space left on device")
+    assert not [path for path in tmp_path.rglob("*") if path.suffix in (".json", ".safetensors")]

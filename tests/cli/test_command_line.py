@@ -90,7 +90,7 @@ def test_a_folder_that_cannot_be_made_is_one_line_and_code_2(
     estimate, truth = write_pair(tmp_path)
     for command in (TWO_EPISODES, ["evaluate", str(estimate), str(truth)]):
         assert main([*command, *out]) == 2
-        assert "Not a directory" in one_line(capsys.readouterr().err)
+        assert "file is a file; a folder is needed" in one_line(capsys.readouterr().err)
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["-h"], ["--version"]])

@@ -110,7 +110,9 @@ def test_an_interrupted_command_goes_on_to_the_same_files(tmp_path) -> None:
     command = [sys.executable, "-c", INTERRUPTED, "generate", *options, "--out", str(target)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 130, done.stderr
-    assert done.stderr.strip().splitlines()[-1].endswith("interrupted; finished work is kept")
+    last = done.stderr.strip().splitlines()[-1]
+    assert last.endswith("stopped.partial; the same command goes on")
+    assert last.startswith("ms-slam: interrupted; finished frames are kept in ")
     assert not target.exists()
     assert len(list((tmp_path / "stopped.partial").glob("depth/*.png"))) == 2
     assert main(["generate", *options, "--out", str(target)]) == 0

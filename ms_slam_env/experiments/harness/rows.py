@@ -11,6 +11,8 @@ from typing import Any
 from tqdm import tqdm
 
 from ms_slam_env.errors import InputError
+from ms_slam_env.interrupts import kept
+from ms_slam_env.output_files import check_out_folder
 from ms_slam_env.parallel import Outcome, one_thread_unless_set, open_pool, run_each
 from ms_slam_env.report.provenance import git_commit
 from ms_slam_env.report.records import RecordFile, Row, spec_key
@@ -53,10 +55,7 @@ def run_all(
     """
     if workers is not None and workers < 1:
         raise InputError(f"workers = {workers} must be at least 1")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"no results can be written to {out}: {error.strerror}") from None
+    check_out_folder(out)
     records = RecordFile(out / RECORDS)
     keys = [spec_key(spec) for spec in specs]
     rows = {key: row for key, row in records.load().items() if row["error"] is None}
@@ -81,7 +80,8 @@ def run_all(
                     bar.write(f"failed: {name}: {row['error']}", file=sys.stderr)
 
             variables = one_thread_unless_set() if environment is None else environment
-            with open_pool(run, workers, ray, environment=variables, fresh=fresh) as pool:
+            pool = open_pool(run, workers, ray, environment=variables, fresh=fresh)
+            with kept(f"finished {description} are kept in {out}; the same command goes on"), pool:
                 for outcome in run_each(pool, todo):
                     finish(_row(outcome, todo[outcome.key]))
     return [rows[key] for key in keys]

@@ -11,7 +11,7 @@ from typing import Any
 from ms_slam_env.experiments.harness.experiment import Experiment
 from ms_slam_env.experiments.harness.rows import check_any_finished, failures, run_all
 from ms_slam_env.report.records import Row, from_plain, to_plain
-from ms_slam_env.report.results import RESULTS, TABLE, Results, write_results
+from ms_slam_env.report.results import RESULTS, Results, write_result_folder
 
 
 @dataclass(frozen=True)
@@ -60,25 +60,20 @@ def run_experiment(
 
 def write_all(experiment: Experiment, rows: Sequence[Row], out: Path) -> Results:
     """Write everything that is made of the rows into folder ``out``."""
-    from ms_slam_env.report.figures import save_charts
-
     rows = from_plain(to_plain(rows))
-    charts = experiment.charts(rows)
-    results = write_results(
-        out / RESULTS,
+    return write_result_folder(
+        out,
+        RESULTS,
+        lambda folder: experiment.write_pictures(rows, folder),
         kind=type(experiment).__module__.rpartition(".")[2],
         title=experiment.title(),
         about=experiment.about(),
         tables=experiment.tables(rows),
-        charts=charts,
+        charts=experiment.charts(rows),
         rows=rows,
         rows_key=experiment.rows_key,
         content={"config": as_config(experiment), **experiment.content(rows)},
     )
-    (out / TABLE).write_text(results.as_markdown(), encoding="utf-8")
-    save_charts(charts, out)
-    experiment.write_pictures(rows, out)
-    return results
 
 
 def as_config(experiment: Any) -> dict[str, Any]:

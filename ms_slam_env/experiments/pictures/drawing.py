@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.command_line import exit_code, parse
+from ms_slam_env.output_files import check_out_file, write_bytes
 
 Image = NDArray[np.uint8]
 
@@ -19,7 +20,10 @@ BORDER, TITLE = 4, 18  # pixels
 
 
 def run_script(
-    options: type[Any], draw: Callable[[Any], Image | str], arguments: Sequence[str] | None = None
+    options: type[Any],
+    draw: Callable[[Any], Image | str],
+    arguments: Sequence[str] | None = None,
+    check_out: Callable[[Path], None] = check_out_file,
 ) -> int:
     """Draw by the command line of dataclass ``options``; return the exit code.
 
@@ -29,17 +33,22 @@ def run_script(
     name = f"python -m ms_slam_env.experiments.pictures.{Path(inspect.getfile(options)).stem}"
 
     def run() -> int:
-        args: Any = parse(options, arguments, name)
-        args.out.parent.mkdir(parents=True, exist_ok=True)
+        args: Any = parse(options, arguments, name, check_out)
         drawn = draw(args)
         if isinstance(drawn, str):
             print(f"{args.out}: {drawn}")
         else:
-            compression = [cv2.IMWRITE_PNG_COMPRESSION, 9]
-            cv2.imwrite(str(args.out), drawn[..., ::-1], compression)
+            save_image(args.out, drawn, compression=9)
         return 0
 
     return exit_code(run, name)
+
+
+def save_image(path: Path, image: Image, compression: int = 1) -> Path:
+    """Write an RGB image (H, W, 3) as PNG, whole or not at all."""
+    _, data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, compression])
+    write_bytes(path, data.tobytes())
+    return path
 
 
 def titled_row(images: Iterable[Image], title: str) -> Image:

@@ -14,7 +14,8 @@ import gymnasium as gym
 import numpy as np
 
 from ms_slam_env import ENV_IDS
-from ms_slam_env.experiments.pictures.drawing import Image, run_script
+from ms_slam_env.experiments.pictures.drawing import Image, run_script, save_image
+from ms_slam_env.output_files import check_out_folder
 
 
 @dataclass(frozen=True)
@@ -52,12 +53,10 @@ def moment(env_id: str, options: Options) -> Image:
 
 def draw(options: Options) -> str:
     """Write the pictures; return what was done."""
-    options.out.mkdir(parents=True, exist_ok=True)
     for env_id in ENV_IDS:
-        picture = moment(env_id, options)
-        cv2.imwrite(str(options.out / f"{env_id}.png"), picture[..., ::-1])
+        save_image(options.out / f"{env_id}.png", moment(env_id, options))
     return f"{len(ENV_IDS)} pictures"
 
 
 if __name__ == "__main__":
-    sys.exit(run_script(Options, draw))
+    sys.exit(run_script(Options, draw, check_out=check_out_folder))

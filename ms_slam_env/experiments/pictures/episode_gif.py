@@ -15,6 +15,7 @@ from tqdm import tqdm
 from ms_slam_env.env.planners import make_planner
 from ms_slam_env.experiments.harness.episodes import DEFAULT_STEP_DEG, DEFAULT_STEP_M
 from ms_slam_env.experiments.pictures.drawing import run_script
+from ms_slam_env.output_files import write_bytes
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,9 @@ def save_episode(options: Options) -> str:
         pictures.append(cv2.resize(picture, (options.width, height), interpolation=cv2.INTER_AREA))
         if terminated or truncated:
             break
-    iio.imwrite(options.out, np.stack(pictures), duration=150, loop=0, plugin="pillow")
+    gif = iio.imwrite("<bytes>", np.stack(pictures), extension=".gif", duration=150, loop=0,
+                      plugin="pillow")  # fmt: skip
+    write_bytes(options.out, gif)
     return f"{len(pictures)} steps, ATE {1e3 * info['ate']:.1f} mm"
 
 

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from ms_slam_env.experiments.pictures.drawing import run_script
+from ms_slam_env.report.figures import save
 from ms_slam_env.robot import NUM_ROTATIONS, NUM_TRANSLATIONS, ROTATIONS, TRANSLATIONS
 
 
@@ -61,7 +62,7 @@ def save_lookahead(options: Options) -> str:
     figure.tight_layout(rect=(0, 0, 0.92, 1), pad=0.4)
     bar = figure.add_axes((0.93, 0.1, 0.015, 0.8))
     figure.colorbar(ScalarMappable(scale, "plasma"), bar, label="intensity divergence (nats)")
-    figure.savefig(options.out, dpi=80)
+    save(figure, options.out, dpi=80)
     return f"{options.scene} seed {options.scene_seed} after {options.steps_before} steps"
 
 

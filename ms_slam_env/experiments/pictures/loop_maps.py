@@ -41,7 +41,6 @@ def save_picture(
     views: tuple[MapView, MapView], scene: Scene, T_world_camera: Float64, path: Path, title: str
 ) -> Path:
     """Draw both maps within a band of heights; the lower row shows a part in view, enlarged."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     surface = _band(scene.surface_points(0.01)[0])
     centre = _joined_part(views[0], T_world_camera)
     figure = new_figure(2, width=5.2, height=9.0)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import scenes
+from ms_slam_env.experiments.pictures.drawing import save_image
 from ms_slam_env.sequences.usme_suite import SUITE, render
 
 Image = NDArray[np.uint8]
@@ -30,9 +31,7 @@ def save_usme_picture(path: Path, seed: int) -> Path:
         shown = [sequence.frames[k].color for k in (count // 3, int(0.52 * count))]
         tiles.append(_tile(entry.name, shown))
     rows = [np.concatenate(tiles[k : k + _COLUMNS], 1) for k in range(0, len(tiles), _COLUMNS)]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), np.concatenate(rows, 0))
-    return path
+    return save_image(path, np.concatenate(rows, 0)[..., ::-1])
 
 
 def _tile(name: str, images: Sequence[Image]) -> Image:

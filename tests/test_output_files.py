@@ -1,0 +1,319 @@
+"""What a full disk, a kill or a wrong place leaves behind: the old files or the new, never half."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from ms_slam_env import output_files
+from ms_slam_env.errors import InputError
+from ms_slam_env.output_files import (
+    append_line,
+    check_out_file,
+    check_out_folder,
+    growing_file,
+    result_folder,
+    write_bytes,
+    write_text,
+)
+
+WRITE = os.write
+
+
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
+    """Leave so many bytes on the disk: a write takes what fits, at most 7 bytes, then fails."""
+    left = 0
+
+    def write(descriptor: int, data: bytes) -> int:
+        nonlocal left
+        if not left:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        taken = WRITE(descriptor, bytes(data[: min(left, 7)]))
+        left -= taken
+        return taken
+
+    def leave(size: int) -> None:
+        nonlocal left
+        left = size
+
+    monkeypatch.setattr(output_files.os, "write", write)
+    return leave
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes() if path.is_file() else b"folder"
+        for path in folder.rglob("*")
+    }
+
+
+def test_short_writes_are_continued(tmp_path: Path, disk: Callable[[int], None]) -> None:
+    disk(1000)
+    write_bytes(tmp_path / "new" / "a.bin", bytes(range(100)))
+    append_line(tmp_path / "new" / "a.bin", b"123456789\n")  # without a line end so far
+    append_line(tmp_path / "new" / "a.bin", b"abcdefghijk\n")
+    with growing_file(tmp_path / "b.txt") as add:
+        add("one line of more than seven bytes")
+        assert (tmp_path / "b.txt").read_text() == "one line of more than seven bytes\n"
+        add("two")
+    assert (tmp_path / "b.txt").read_text() == "one line of more than seven bytes\ntwo\n"
+    assert (tmp_path / "new" / "a.bin").read_bytes() == (
+        bytes(range(11)) + b"123456789\nabcdefghijk\n"
+    )
+
+
+@pytest.mark.parametrize("space", [0, 5, 13])
+@pytest.mark.parametrize("is_new", [True, False])
+def test_what_does_not_fit_leaves_what_was(
+    tmp_path: Path, disk: Callable[[int], None], space: int, is_new: bool
+) -> None:
+    path = tmp_path / "a.jsonl"
+    if not is_new:
+        path.write_text("first line\n")
+    before = content(tmp_path)
+    for write in (write_bytes, append_line):
+        disk(space)
+        with pytest.raises(OSError, match=r"No space left on device: .*a\.jsonl'") as caught:
+            write(path, b"fourteen bytes and more\n")
+        assert caught.value.filename == str(path)
+        if write is append_line and is_new:
+            before = {"a.jsonl": b""}
+        assert content(tmp_path) == before
+    disk(100)
+    append_line(path, b"fits\n")
+    assert path.read_text() == ("" if is_new else "first line\n") + "fits\n"
+
+
+@pytest.mark.parametrize("length", [1, 65535, 65536, 70000, 200_000])
+def test_a_torn_last_line_is_removed_however_long(tmp_path: Path, length: int) -> None:
+    path = tmp_path / "a.jsonl"
+    for whole in ("", "first\n", "first\nsecond\n"):
+        path.write_text(whole + "x" * length)
+        append_line(path, b"new\n")
+        assert path.read_text() == whole + "new\n"
+
+
+def test_the_limit_of_a_file_s_size_is_like_a_full_disk(tmp_path: Path) -> None:
+    """Without privileges, and without a word of ours in between: the system's own short write."""
+    code = """
+import errno, resource, sys
+from pathlib import Path
+from ms_slam_env.output_files import DISK_ERRORS, append_line, write_bytes
+resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
+path = Path(sys.argv[1])
+for k in range(30):
+    try:
+        append_line(path, b"%029d\\n" % k)
+    except OSError as error:
+        assert k >= 3 and error.errno in DISK_ERRORS and error.filename == str(path), error
+    else:
+        assert k < 3
+try:
+    write_bytes(path.with_name("b"), bytes(101))
+except OSError as error:
+    assert error.errno == errno.EFBIG
+else:
+    raise AssertionError
+"""
+    subprocess.run([sys.executable, "-c", code, str(tmp_path / "a")], check=True)
+    assert (tmp_path / "a").read_text() == "".join(f"{k:029d}\n" for k in range(3))
+    assert not (tmp_path / "b").exists()
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 64 kB."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(folder)]
+    try:
+        done = subprocess.run(mount, capture_output=True, text=True)
+    except OSError as error:
+        pytest.skip(f"no file system can be mounted: {error}")
+    if done.returncode:
+        pytest.skip(f"no file system can be mounted: {done.stderr.strip()}")
+    yield folder
+    subprocess.run(["umount", str(folder)], check=True)
+
+
+def test_a_disk_that_is_really_full(small_disk: Path) -> None:
+    records, old = small_disk / "a.jsonl", small_disk / "old.json"
+    write_text(old, "old")
+    line = b"x" * 999 + b"\n"
+
+    def fill() -> None:
+        for _ in range(100):
+            append_line(records, line)
+
+    with pytest.raises(OSError, match=r"No space left") as caught:
+        fill()
+    assert caught.value.filename == str(records)
+    assert set(records.read_bytes().splitlines(keepends=True)) == {line}
+    with pytest.raises(OSError, match=r"No space left"), result_folder(small_disk, "m") as folder:
+        write_bytes(folder / "large", bytes(40_000))
+    with pytest.raises(OSError, match=r"old\.json"):
+        write_text(old, "y" * 40_000)
+    assert old.read_text() == "old"
+    assert sorted(path.name for path in small_disk.iterdir()) == ["a.jsonl", "old.json"]
+
+
+# -- Folders of results ------------------------------------------------------------------------
+
+
+def write_result(out: Path, text: str) -> None:
+    with result_folder(out, "result.json") as folder:
+        write_text(folder / "result.json", text)
+        write_text(folder / "z.txt", text)
+        write_text(folder / "below" / "a.txt", text)
+
+
+def test_the_file_that_makes_a_result_count_comes_last_and_goes_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "new" / "out"
+    write_result(out, "1")
+    (out / "rows.jsonl").write_text("is another's")
+    expected = {"result.json": b"2", "z.txt": b"2", "below": b"folder", "below/a.txt": b"2"}
+    seen = []
+    replace = os.replace
+
+    def look(source: Path, target: Path) -> None:
+        if target.parent in (out, out / "below"):
+            seen.append((target.name, (out / "result.json").exists()))
+        replace(source, target)
+
+    monkeypatch.setattr(output_files.os, "replace", look)
+    write_result(out, "2")
+    assert seen[-1] == ("result.json", False)
+    assert not any(was_there for _, was_there in seen)
+    assert content(out) == expected | {"rows.jsonl": b"is another's"}
+
+
+@pytest.mark.parametrize("error", [OSError(errno.EIO, "Input/output error"), KeyboardInterrupt()])
+def test_a_result_that_fails_leaves_the_one_before(tmp_path: Path, error: BaseException) -> None:
+    def fail(out: Path) -> None:
+        with result_folder(out, "result.json") as folder:
+            write_text(folder / "result.json", "2")
+            write_text(folder / "z.txt", "2")
+            raise error
+
+    write_result(tmp_path / "out", "1")
+    before = content(tmp_path / "out")
+    for out in (tmp_path / "out", tmp_path / "never" / "made"):
+        with pytest.raises(type(error)):
+            fail(out)
+    assert content(tmp_path / "out") == before
+    assert not (tmp_path / "never").exists()
+
+
+def test_an_error_names_the_file_where_it_was_to_be(
+    tmp_path: Path, disk: Callable[[int], None]
+) -> None:
+    disk(3)
+    with pytest.raises(OSError, match="No space") as caught, result_folder(tmp_path, "m") as folder:
+        write_text(folder / "figure.png", "4444")
+    assert caught.value.filename == str(tmp_path / "figure.png")
+
+
+def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
+    code = """
+import os, signal, sys
+from pathlib import Path
+from ms_slam_env.output_files import result_folder, write_text
+with result_folder(Path(sys.argv[1]), "result.json") as folder:
+    write_text(folder / "result.json", "killed")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path)])
+    assert done.returncode == -signal.SIGKILL
+    left = content(tmp_path)
+    assert b"killed" in left.values()
+    assert all(name.startswith(".") for name in left)  # which readers pass over
+    write_result(tmp_path, "1")
+    assert not any(name.startswith(".") for name in content(tmp_path))
+
+
+# -- Where results may go ----------------------------------------------------------------------
+
+
+def make_fifo(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def make_socket(path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as made:
+        made.bind(os.path.relpath(path))  # a path in full may be too long
+
+
+@pytest.mark.parametrize(
+    ("make", "kind"),
+    [
+        (make_fifo, "a FIFO"),
+        (make_socket, "a socket"),
+        (lambda path: path.symlink_to(os.devnull), "a character device"),
+        (lambda path: path.symlink_to("nowhere"), "a link to nothing"),
+    ],
+)
+def test_nothing_is_written_to_a_special_file(
+    tmp_path: Path, make: Callable[[Path], None], kind: str
+) -> None:
+    path = tmp_path / "special"
+    make(path)
+    before = path.lstat()
+    for refused in (
+        lambda: check_out_folder(path),
+        lambda: check_out_folder(path / "below" / "it"),
+        lambda: check_out_file(path),
+        lambda: check_out_file(path / "below.txt"),
+        lambda: write_bytes(path, b"x"),
+        lambda: append_line(path, b"x\n"),
+        lambda: growing_file(path).__enter__(),
+    ):
+        with pytest.raises(InputError, match=f"special is {kind}; a (file|folder) is needed"):
+            refused()
+    assert path.lstat() == before
+    assert [child.name for child in tmp_path.iterdir()] == ["special"]
+
+
+def test_folder_and_file_are_not_mixed_up(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="file is a file; a folder is needed"):
+        check_out_folder(tmp_path / "file")
+    with pytest.raises(InputError, match="file is a file; a folder is needed"):
+        check_out_file(tmp_path / "file" / "report.html")
+    with pytest.raises(InputError, match="is a folder; a file is needed"):
+        check_out_file(tmp_path)
+    (tmp_path / "link").symlink_to(tmp_path, target_is_directory=True)
+    for fine in (tmp_path, tmp_path / "new" / "below", tmp_path / "link", Path("results")):
+        check_out_folder(fine)
+    check_out_file(tmp_path / "file")
+    check_out_file(Path("report.html"))
+
+
+def test_a_folder_that_takes_no_files_is_refused(tmp_path: Path) -> None:
+    code = """
+import os, sys
+from pathlib import Path
+from ms_slam_env.errors import InputError
+from ms_slam_env.output_files import check_out_folder
+if os.geteuid() == 0:
+    os.setgid(65534)
+    os.setuid(65534)
+try:
+    check_out_folder(Path(sys.argv[1]))
+except InputError as error:
+    print(error)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code, "/proc/new"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "/proc: nothing can be written there\n"
