@@ -337,8 +337,9 @@ def test_a_failed_write_leaves_the_old_page(
         raise OSError(28, "No space left on device", str(target))
 
     monkeypatch.setattr(os, "replace", fail)
-    assert main(["report", str(tmp_path)]) == 2
+    assert main(["report", str(tmp_path)]) == 1
     assert (tmp_path / "report.html").read_text() == "old"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["report.html", "results.json"]
 
 
 def make_nothing(folder: Path) -> None:
