@@ -13,9 +13,9 @@ import tyro
 from ms_slam_env.command_line import parse, report_failures
 from ms_slam_env.errors import InputError
 from ms_slam_env.experiments.harness import (
+    EXPERIMENTS,
     Experiment,
     experiment_class,
-    experiment_names,
     run_experiment,
 )
 from ms_slam_env.experiments.harness.checking import check_results, committed_results
@@ -28,7 +28,8 @@ def main(arguments: Sequence[str]) -> int:
         print(listing())
         return 0 if arguments else 2
     name, *rest = arguments
-    return run(experiment_class(name), rest, f"ms-slam experiment {name}", Path("results") / name)
+    folder = Path("results") / name.replace(":", ".")
+    return run(experiment_class(name), rest, f"ms-slam experiment {name}", folder)
 
 
 def run(cls: type[Experiment], arguments: Sequence[str], program: str, out: Path) -> int:
@@ -81,7 +82,7 @@ def with_run_options(cls: type[Experiment], out: Path) -> type[Any]:
 
 def listing() -> str:
     """Every experiment and what it is."""
-    names = experiment_names()
+    names = EXPERIMENTS.names()
     if not names:
         raise InputError("no experiment is installed")
     width = max(map(len, names))

@@ -40,6 +40,7 @@ from ms_slam_env.errors import InputError, UnreachableError, unknown
 from ms_slam_env.geometry import check_pose, invert
 from ms_slam_env.robot import Embodiment, MotionResult
 from ms_slam_env.scenes.base import Scene
+from ms_slam_env.scenes.registry import SceneName
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sensor.scene_cache import get_scene, get_sensor
 from ms_slam_env.sequences.perturbations.base import Perturbation
@@ -185,7 +186,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         self.action_space = self._actions.space
         self.observation_space = self._observation.space
         self._episode: Episode | None = None
-        self._place: tuple[str, int] | None = None
+        self._place: tuple[SceneName, int] | None = None
         self._fresh_slam = self.slam.get_state()
         self.on_load: Callable[[int], None] = _nothing
 
@@ -347,7 +348,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
 
     # -- The start of an episode -------------------------------------------------------------
 
-    def _world(self, name: str, scene_seed: int) -> World:
+    def _world(self, name: SceneName, scene_seed: int) -> World:
         """A scene and what stands in it."""
         scene = get_scene(name, scene_seed)
         sensor = get_sensor(name, scene_seed, self.intrinsics, self.config.noise)
@@ -357,7 +358,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
     def _here(self) -> World:
         return World(self.scene, self.sensor, self.embodiment, self.coverage)
 
-    def _start_somewhere(self, name: str, scene_seed: int) -> None:
+    def _start_somewhere(self, name: SceneName, scene_seed: int) -> None:
         """Begin at the first pose drawn that can be used.
 
         Raises:
@@ -371,7 +372,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
             why += "; give one with reset(options={'T_world_camera': ...})"
         raise InputError(f"none of {_START_TRIES} drawn start poses can be used, the last: {why}")
 
-    def _start_at(self, start: Float64, name: str, scene_seed: int) -> str:
+    def _start_at(self, start: Float64, name: SceneName, scene_seed: int) -> str:
         """Put the camera at a pose (4, 4) and take the first frame; return why not, or nothing."""
         self._episode = None
         try:
@@ -387,7 +388,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
             return str(error)
         self.slam.reset(here)
         self._T_world_kinematic = here @ invert(self.embodiment.T_world_camera_kinematic)
-        self._episode = Episode(name, scene_seed, noise_seed)
+        self._episode = Episode(getattr(name, "__name__", str(name)), scene_seed, noise_seed)
         self._track_frame(here, here, time_s=0.0)
         self._episode.end_step(np.zeros(2), energy_j=0.0)
         if self._episode.tracking_ok:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,13 +14,16 @@ from numpy.typing import NDArray
 from ms_slam_env.camera import Intrinsics, pinhole
 from ms_slam_env.config import Checked, bounded, check_range, chosen, from_dict
 from ms_slam_env.divergence import DivergenceConfig
-from ms_slam_env.env.observations import OBSERVATIONS
+from ms_slam_env.env.observations import POINT as OBSERVATION_POINT
+from ms_slam_env.env.observations import Observation
 from ms_slam_env.env.pose_sources import POSE_SOURCES
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.extension import ExtensionPoint
 from ms_slam_env.robot.arm import ArmConfig
 from ms_slam_env.scenes import SEED_SPLITS
-from ms_slam_env.scenes.registry import check_name
+from ms_slam_env.scenes.registry import SceneName, check_name
 from ms_slam_env.sensor.noise import NoiseConfig, noise_config
+from ms_slam_env.slam import SlamBackend
 from ms_slam_env.slam.adaptation import AdaptationConfig, NoAdaptationConfig
 from ms_slam_env.slam.configuration import is_file_name, read_configuration
 from ms_slam_env.slam.frame_selection import EveryFrameConfig, FrameSelectionConfig
@@ -134,7 +137,7 @@ class EnvConfig(Checked):
         pose: where the estimated pose comes from: ``slam``, ``slam-kinematics`` (SLAM that starts
             its search from the arm's forward kinematics), ``kinematics`` (noisy forward kinematics
             alone; SLAM only maps) or ``ground_truth``. Kinematics need an arm.
-        slam: SLAM backend.
+        slam: SLAM backend, ``module:Class`` or a class.
         adaptation: how the running SLAM changes its configuration: ``none``, ``divergence`` or, as
             ``MSActiveSLAM-Adaptive-v0`` has it, ``agent``; a mapping with the ``name`` of one for
             options. Every frame is processed, whatever ``keep_every`` of a configuration says.
@@ -143,17 +146,18 @@ class EnvConfig(Checked):
             of a dropped frame is predicted, its surface is not mapped.
         slam_config: options of the backend, or a configuration file (YAML), which also says what
             ``slam`` is and what ``image_size`` is where that is not given.
-        observation: ``rgbd``, ``features`` or ``lookahead``.
+        observation: ``rgbd``, ``features`` or ``lookahead``, ``module:Class`` or a class.
         step_m: translation of a motion, metres.
         step_rad: rotation of a motion, radians.
         lost_patience: steps that tracking may stay lost before the episode ends.
         divergence: how divergence is measured.
         lookahead: how candidates are predicted.
         targets: motion-and-structure parameters and thresholds.
-        reward: weights of the reward terms.
+        reward: weights of the reward terms; or a function of a step's ``Outcome``, or its name
+            ``module:function``, that returns a number, or terms by name whose sum is the reward.
     """
 
-    scene: str | tuple[str, ...] = "living_room"
+    scene: SceneName | tuple[SceneName, ...] = "living_room"
     scene_seed: int | None = None
     split: str = chosen("train", *SEED_SPLITS)
     num_scene_seeds: int = 4
@@ -162,18 +166,18 @@ class EnvConfig(Checked):
     noise: str | NoiseConfig = "kinect"
     arm: ArmConfig = field(default_factory=ArmConfig)
     pose: str = chosen("slam", *POSE_SOURCES)
-    slam: str = "surfel"
+    slam: str | type[SlamBackend] = "surfel"
     slam_config: dict[str, object] = field(default_factory=dict)
     adaptation: AdaptationConfig = field(default_factory=NoAdaptationConfig)
     frame_management: FrameSelectionConfig = field(default_factory=EveryFrameConfig)
-    observation: str = chosen("features", *OBSERVATIONS)
+    observation: str | type[Observation] = "features"
     step_m: float = bounded(0.12, 0, 1)
     step_rad: float = bounded(math.radians(12), 0, math.pi / 2)
     lost_patience: int = bounded(10, 1, 1_000_000)
     divergence: DivergenceConfig = field(default_factory=DivergenceConfig)
     lookahead: LookaheadConfig = field(default_factory=LookaheadConfig)
     targets: TargetConfig = field(default_factory=TargetConfig)
-    reward: RewardConfig = field(default_factory=RewardConfig)
+    reward: RewardConfig | Callable[..., Any] = field(default_factory=RewardConfig)
 
     def __post_init__(self) -> None:
         """Refuse unknown choices and values out of range."""
@@ -194,11 +198,15 @@ class EnvConfig(Checked):
             raise InputError(
                 f"EnvConfig.scene_seed = {self.scene_seed!r} must be an integer or None"
             )
-        is_names = isinstance(self.scene, (str, tuple, list)) and len(self.scene) > 0
-        if not is_names or not all(isinstance(name, str) for name in self.scenes):
+        is_name = isinstance(self.scene, str) or callable(self.scene)
+        is_names = isinstance(self.scene, (tuple, list)) and len(self.scene) > 0
+        names = self.scenes if is_name or is_names else ()
+        if not names or not all(isinstance(name, str) or callable(name) for name in names):
             raise InputError(f"EnvConfig.scene = {self.scene!r} must be a name or several")
-        for name in self.scenes:
+        for name in names:
             check_name(name)
+        OBSERVATION_POINT.find(self.observation)
+        object.__setattr__(self, "reward", _reward(self.reward))
 
     @property
     def camera(self) -> Intrinsics:
@@ -206,11 +214,11 @@ class EnvConfig(Checked):
         return pinhole(self.image_size, self.field_of_view_deg)
 
     @property
-    def scenes(self) -> tuple[str, ...]:
+    def scenes(self) -> tuple[SceneName, ...]:
         """The scenes to draw from."""
-        return (self.scene,) if isinstance(self.scene, str) else tuple(self.scene)
+        return tuple(self.scene) if isinstance(self.scene, (tuple, list)) else (self.scene,)
 
-    def draw_scene(self, rng: np.random.Generator) -> tuple[str, int]:
+    def draw_scene(self, rng: np.random.Generator) -> tuple[SceneName, int]:
         """Name and seed of an episode's scene."""
         name = self.scenes[int(rng.integers(len(self.scenes)))]
         if self.scene_seed is not None:
@@ -220,6 +228,26 @@ class EnvConfig(Checked):
     def of_state(self, embodiment: str) -> dict[str, Any]:
         """What two environments must have in common to go on from one state."""
         return {"embodiment": embodiment, **{name: getattr(self, name) for name in _OF_STATE}}
+
+
+REWARDS = ExtensionPoint("reward", "ms_slam_env.rewards", form="module:function")
+"""Where functions of a step's ``Outcome`` are found."""
+
+
+def _reward(given: object) -> RewardConfig | Callable[..., Any]:
+    """Weights, or a function."""
+    if isinstance(given, Mapping):
+        return from_dict(RewardConfig, given, "reward")
+    if isinstance(given, RewardConfig):
+        return given
+    if not isinstance(given, str) and not callable(given):
+        weights = ", ".join(field.name for field in dataclasses.fields(RewardConfig))
+        raise InputError(
+            f"reward = {given!r} must be a function of an Outcome, module:function, or a mapping "
+            f"of options: {weights}"
+        )
+    found: Callable[..., Any] = REWARDS.find(given)
+    return found
 
 
 def make_config(

@@ -12,6 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
+from ms_slam_env.extension import ExtensionPoint
 from ms_slam_env.robot import NUM_ROTATIONS, NUM_TRANSLATIONS, ROTATIONS, TRANSLATIONS
 
 Float32 = NDArray[np.float32]
@@ -184,12 +185,18 @@ OBSERVATIONS: dict[str, Callable[[Intrinsics, int], Observation]] = {
 }
 """Name of the option ``observation`` to variant."""
 
+POINT = ExtensionPoint("observation", "ms_slam_env.observations", Observation, own=OBSERVATIONS)
+"""Where observations are found; each is made of intrinsics and the number of motions."""
+
 
 def make_observation(
-    name: str, intrinsics: Intrinsics, num_motions: int, num_configurations: int = 1
+    name: str | type[Observation],
+    intrinsics: Intrinsics,
+    num_motions: int,
+    num_configurations: int = 1,
 ) -> Observation:
     """Build variant ``name``, with the SLAM configuration in force if there are several."""
-    observation = OBSERVATIONS[name](intrinsics, num_motions)
+    observation: Observation = POINT.find(name)(intrinsics, num_motions)
     if num_configurations == 1:
         return observation
     return WithConfiguration(observation, num_configurations)

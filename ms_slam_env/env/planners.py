@@ -1,33 +1,22 @@
-"""Planners: their interface, and how they are found by name.
-
-A name is an entry point of the group ``ms_slam_env.planners``, or ``module:Class``.
-"""
+"""Planners: their interface, and how they are found by name."""
 
 from __future__ import annotations
 
-import inspect
-import os
-import sys
 from abc import ABC, abstractmethod
-from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ms_slam_env.config import parse_named
-from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.errors import InputError
+from ms_slam_env.extension import ExtensionPoint, check_options
 
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv
 
-GROUP = "ms_slam_env.planners"
-
 RECOVERY = "recovery"
 _OPPOSITE = (0, 2, 1, 4, 3, 6, 5)  # of a translation or rotation, in the paper's order
 _REMEMBERED = 12  # motions that can be undone
-
-_TRAINING = ("safetensors", "torch", "stable_baselines3", "sb3_contrib")  # of the extra "train"
 
 
 class Planner(ABC):
@@ -100,38 +89,8 @@ def opposite(action: int, actions: int = 49) -> int:
     return rotation if actions == 7 else 7 * _OPPOSITE[action // 7] + rotation
 
 
-def planner_names() -> tuple[str, ...]:
-    """Names of the installed planners, sorted."""
-    return tuple(sorted({entry.name for entry in entry_points(group=GROUP)}))
-
-
-def planner_class(name: str) -> type[Planner]:
-    """The class behind a name.
-
-    Raises:
-        InputError: an unknown name (the message lists the installed planners), a ``module:Class``
-            that cannot be imported, or a class that is no ``Planner``.
-    """
-    if ":" in name:
-        if os.getcwd() not in sys.path:  # a console script, unlike ``python -m``, leaves it out
-            sys.path.insert(0, os.getcwd())
-        entry = EntryPoint(name=name, value=name, group=GROUP)
-    else:
-        found = [entry for entry in entry_points(group=GROUP) if entry.name == name]
-        if not found:
-            raise unknown("planner", name, (*planner_names(), "module:Class"))
-        entry = found[0]
-    module_name, _, class_name = entry.value.partition(":")
-    try:
-        cls = getattr(import_module(module_name), class_name)
-    except ModuleNotFoundError as error:
-        hint = "; pip install 'ms-slam-env[train]'" if error.name in _TRAINING else ""
-        raise InputError(f"planner {name!r} cannot be loaded: {error}{hint}") from error
-    except (ImportError, AttributeError, ValueError) as error:  # ValueError: no module named
-        raise InputError(f"planner {name!r} cannot be loaded: {error}") from error
-    if not (inspect.isclass(cls) and issubclass(cls, Planner)):
-        raise InputError(f"planner {name!r} is not a subclass of ms_slam_env.env.Planner")
-    return cls
+PLANNERS = ExtensionPoint("planner", "ms_slam_env.planners", Planner)
+"""Where planners are found."""
 
 
 def make_planner(text: str, env: Any, seed: int = 0) -> Planner:
@@ -142,11 +101,9 @@ def make_planner(text: str, env: Any, seed: int = 0) -> Planner:
     Raises:
         InputError: an unknown planner or option, or a value that the planner refuses.
     """
-    name, options = parse_named(text, "planner")
-    cls = planner_class(name)
-    check_options(name, cls, options)
+    cls, options = _parsed(text)
     recovery = options.pop(RECOVERY, cls.recovers)
-    planner = cls(env, seed=seed, **options)
+    planner: Planner = cls(env, seed=seed, **options)
     return Recovering(env, planner) if recovery else planner
 
 
@@ -156,19 +113,14 @@ def check_planner(text: str) -> None:
     Raises:
         InputError: an unknown planner or option.
     """
+    _parsed(text)
+
+
+def _parsed(text: str) -> tuple[type[Planner], dict[str, Any]]:
+    """Class and options that ``text`` describes."""
     name, options = parse_named(text, "planner")
-    check_options(name, planner_class(name), options)
-
-
-def check_options(name: str, cls: type[Planner], options: dict[str, Any]) -> None:
-    """Refuse options that the class does not take.
-
-    Raises:
-        InputError: naming the option and listing the valid ones.
-    """
-    taken = [p for p in inspect.signature(cls).parameters if p not in ("env", "seed")]
-    for option in options:
-        if option not in (*taken, RECOVERY):
-            raise unknown(f"option of planner {name}", option, (*taken, RECOVERY))
+    cls: type[Planner] = PLANNERS.find(name)
+    check_options(f"planner {name}", cls, options, ("env", "seed"), (RECOVERY,))
     if not isinstance(options.get(RECOVERY, False), bool):
         raise InputError(f"option {RECOVERY} of planner {name} is true or false")
+    return cls, options

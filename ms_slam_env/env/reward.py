@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,16 +37,26 @@ class Outcome:
     configuration_cost: float | None = None
 
 
+Reward = Callable[[Outcome], "float | Mapping[str, float]"]
+"""A reward of a user's own."""
+
+
 def reward_terms(
-    outcome: Outcome, weights: RewardConfig, targets: TargetConfig
+    outcome: Outcome, weights: RewardConfig | Reward, targets: TargetConfig
 ) -> dict[str, float]:
     """Weighted terms, name to value; the reward is their sum.
+
+    Instead of weights, a function of the outcome may say them: terms by name, or one number.
 
     The two divergence terms are the summands of Algorithm 1, line 9, in units of M_I and M_D so
     that one weight serves every scene; they alone would make an agent imitate the greedy planner.
     Surface newly mapped in its true place is what a user wants from the camera: neither standing
     still nor getting lost gathers any. The error terms say at once what lost surface says late.
     """
+    if not isinstance(weights, RewardConfig):
+        value = weights(outcome)
+        terms = value if isinstance(value, Mapping) else {"reward": value}
+        return {name: float(term) for name, term in terms.items()}
     distance = np.abs(outcome.divergence - targets.divergence) / targets.maxima
     intensity, depth = np.minimum(distance, _DISTANCE_CAP)
     growth = float(np.clip(outcome.pose_error_growth_m, -_ERROR_CAP_M, _ERROR_CAP_M))

@@ -15,7 +15,7 @@ from ms_slam_env import scenes as scene_library
 from ms_slam_env.camera import xtion
 from ms_slam_env.config import Checked, bounded, from_dict
 from ms_slam_env.env import EnvConfig
-from ms_slam_env.errors import InputError, UnreachableError, unknown
+from ms_slam_env.errors import InputError, UnreachableError
 from ms_slam_env.experiments.harness.arm_truth import (
     ArmTruth,
     Cloud,
@@ -38,7 +38,8 @@ from ms_slam_env.robot.arm import ArmConfig
 from ms_slam_env.robot.arm.base_placement import COLUMN_RADIUS_M
 from ms_slam_env.robot.arm.dynamic_arm import DynamicArm
 from ms_slam_env.robot.arm.feasibility import REASONS
-from ms_slam_env.scenes import SCENES, Scene
+from ms_slam_env.scenes import Scene
+from ms_slam_env.scenes.registry import check_name
 from ms_slam_env.timings import Timings
 
 DEFAULT_SCENES = ("window", "table", "wall", "carpet", "living_room")
@@ -141,8 +142,7 @@ class ArmMasks(Checked, Experiment):
     def specs(self) -> list[WalkSpec]:
         """Every walk."""
         for name in self.scenes:
-            if name not in SCENES:
-                raise unknown("scene", name, SCENES)
+            check_name(name)
         options = parse_options(self.options)
         if set(options) - {"arm"}:
             raise InputError(f"options {sorted(options)}: only those of the arm, as in arm.model=x")

@@ -12,7 +12,7 @@ import numpy as np
 from ms_slam_env import metrics, slam
 from ms_slam_env.camera import parse_image_size
 from ms_slam_env.config import Checked, bounded, parse_named
-from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.map_quality import THRESHOLDS_M, map_quality, share_keys
 from ms_slam_env.evaluation.run_sequence import run_sequence
 from ms_slam_env.evaluation.seen_surface import open_with_surface
@@ -120,8 +120,7 @@ class Compare(Experiment, Checked):
             check_sequence(text)
         for text in self.backends:
             name, _ = parse_named(text, "backend")
-            if name not in slam.BACKENDS:
-                raise unknown("SLAM backend", name, slam.BACKENDS)
+            slam.POINT.find(name)
         for size in self.image_sizes:
             parse_image_size(size)
 

@@ -13,7 +13,7 @@ import numpy as np
 from ms_slam_env import metrics, slam
 from ms_slam_env.camera import RGBDFrame, parse_image_size
 from ms_slam_env.config import Checked, bounded
-from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.map_quality import map_quality
 from ms_slam_env.evaluation.run_sequence import run_sequence
 from ms_slam_env.evaluation.seen_surface import seen_surface
@@ -95,8 +95,7 @@ class FrameSelection(Experiment, Checked):
         for text in self.managements:
             if parse_frame_selection(text).uses_clock:
                 raise InputError(f"{text!r} measures time: no two runs are alike")
-        if self.backend not in slam.BACKENDS:
-            raise unknown("SLAM backend", self.backend, slam.BACKENDS)
+        slam.POINT.find(self.backend)
         parse_image_size(self.image_size)
         return [
             FilterSpec(sequence, self.managements, self.backend, self.image_size, self.frames)

@@ -34,7 +34,8 @@ from ms_slam_env.report.charts import Chart, Panel, interval_series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.statistics import median_interval
 from ms_slam_env.report.tables import Table, Value, finished, format_value, make_table, summary
-from ms_slam_env.scenes import ROOMS, SCENES, Scene
+from ms_slam_env.scenes import ROOMS, Scene
+from ms_slam_env.scenes.registry import check_name
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.surfel.config import RELOCALISATIONS
 
@@ -94,8 +95,10 @@ class Relocalization(Experiment, Checked):
 
     def specs(self) -> list[RelocalizationSpec]:
         """Every map."""
+        for scene in self.scenes:
+            check_name(scene)
         for name, given, valid in (
-            ("scene", self.scenes, SCENES),
+            ("scene", self.scenes, self.scenes),
             ("setting", self.settings, ALL_SETTINGS),
             ("variant", self.variants, RELOCALISATIONS),
         ):

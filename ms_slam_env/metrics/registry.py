@@ -8,16 +8,19 @@ from __future__ import annotations
 
 import difflib
 import math
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import yaml
 
-from ms_slam_env.errors import InputError
+from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.extension import ExtensionPoint
 
 RESULTS_VERSIONS = {
     1: "before results had a version: by algorithms and measures that have changed since",
@@ -54,6 +57,13 @@ _SCALES = {
     ("share", "%"): 1e2,
     ("count", "1000"): 1e-3,
 }
+
+
+POINT = ExtensionPoint("metrics", "ms_slam_env.metrics", form="module:function")
+"""Where more entries are found: functions that return a mapping like that of the file."""
+
+EXTRA_METRICS = "MS_SLAM_METRICS"
+"""Variable that names more sources, with commas: YAML files or ``module:function``."""
 
 
 @dataclass(frozen=True)
@@ -122,21 +132,53 @@ class Metric:
 def registry() -> Mapping[str, Metric]:
     """All metrics by key, in the order of the file.
 
+    Besides our own, those of entry points and of the variable ``MS_SLAM_METRICS``.
+
     Raises:
-        ValueError: an entry of another form, or a unit that cannot be shown as it says.
+        InputError: an entry of another form, a unit that cannot be shown as it says, or a key of
+            ours with another meaning.
     """
     text = resources.files(__package__).joinpath("registry.yaml").read_text(encoding="utf-8")
-    metrics: dict[str, Metric] = {}
-    known = {field.name for field in fields(Metric)}
-    for key, entry in yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader)).items():
-        if not set(entry) <= known:
-            raise ValueError(f"metric {key}: {', '.join(set(entry) - known)} is no field")
-        metrics[key] = Metric(key, **entry)
-        if not math.isfinite(metrics[key].scale) or metrics[key].better not in (
-            *("", "lower", "higher"),
-        ):
-            raise ValueError(f"metric {key}: bad scale or direction")
+    own = yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    metrics = {key: _metric(key, entry) for key, entry in own.items()}
+    sources = [*POINT.names(), *filter(None, os.environ.get(EXTRA_METRICS, "").split(","))]
+    for source in sources:
+        for key, entry in _more(source).items():
+            if key in metrics and metrics[key] != _metric(key, entry):
+                raise InputError(f"metric {key!r} of {source} is defined otherwise already")
+            metrics[key] = _metric(key, entry)
     return metrics
+
+
+def _more(source: str) -> Mapping[str, Any]:
+    """Entries of an entry point or ``module:function`` that returns them, or of a YAML file."""
+    try:
+        is_file = source.lower().endswith((".yaml", ".yml"))
+        found = (
+            yaml.safe_load(Path(source).read_text(encoding="utf-8"))
+            if is_file
+            else POINT.find(source)()
+        )
+    except (OSError, yaml.YAMLError) as error:
+        raise InputError(f"metrics {source}: {' '.join(str(error).split())}") from None
+    if not isinstance(found, Mapping):
+        raise InputError(f"metrics {source}: no mapping of keys to entries")
+    return found
+
+
+def _metric(key: str, entry: Any) -> Metric:
+    known = {field.name for field in fields(Metric)}
+    if not isinstance(entry, Mapping) or not {"heading", "definition"} <= set(entry) <= known:
+        names = ", ".join(sorted(known - {"key"}))
+        raise InputError(f"metric {key!r}: needs heading and definition, and takes {names}")
+    made = Metric(**{**entry, "key": key})
+    if made.better not in ("", "lower", "higher"):
+        raise unknown(f"better of metric {key!r}", made.better, ("lower", "higher"))
+    try:
+        made.scale  # noqa: B018 -- whether its unit can be shown as it says
+    except KeyError:
+        raise InputError(f"metric {key!r}: {made.unit} cannot be shown in {made.shown}") from None
+    return made
 
 
 def metric(key: str) -> Metric:
@@ -149,7 +191,9 @@ def metric(key: str) -> Metric:
     if found is None:
         similar = difflib.get_close_matches(key, registry(), n=3)
         hint = f"; similar: {', '.join(similar)}" if similar else ""
-        raise InputError(f"unknown metric {key!r}: not in metrics/registry.yaml{hint}")
+        raise InputError(
+            f"unknown metric {key!r}: neither in metrics/registry.yaml nor in {EXTRA_METRICS}{hint}"
+        )
     return found
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.errors import InputError
+from ms_slam_env.extension import ExtensionPoint
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.city_street import city_street
 from ms_slam_env.scenes.corridor import corridor
@@ -30,7 +32,9 @@ _LARGE = {
     "city_street": city_street,
     "factory_hall": factory_hall,
 }
-_MAKERS = {**_ROOMS, **_LARGE}
+POINT = ExtensionPoint(
+    "scene", "ms_slam_env.scenes", own={**_ROOMS, **_LARGE}, form="module:function"
+)
 
 ROOMS: tuple[str, ...] = tuple(_ROOMS)
 """Names of the scenes the size of a room, which benchmarks and tests take by default."""
@@ -38,7 +42,7 @@ ROOMS: tuple[str, ...] = tuple(_ROOMS)
 LARGE_SCENES: tuple[str, ...] = tuple(_LARGE)
 """Names of the streets and the hall: farther than a Kinect sees, slow to build (5 to 12 s)."""
 
-SCENES: tuple[str, ...] = tuple(_MAKERS)
+SCENES: tuple[str, ...] = tuple(POINT.own)
 """Names of the procedural scenes; the first is the default."""
 
 MESH_SUFFIXES: tuple[str, ...] = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
@@ -57,26 +61,36 @@ def split_of(seed: int) -> str | None:
     return next((name for name, seeds in SEED_SPLITS.items() if seed in seeds), None)
 
 
-def check_name(name: str) -> None:
+SceneName = str | Callable[[int], Scene]
+"""A scene's name, the path of a mesh file, or a function of the seed."""
+
+
+def is_mesh_file(name: object) -> bool:
+    """Whether ``name`` is meant as a mesh file."""
+    return isinstance(name, (str, Path)) and Path(name).suffix.lower() in MESH_SUFFIXES
+
+
+def check_name(name: object) -> None:
     """Refuse what is neither a scene's name nor a mesh file that is there.
 
     Raises:
         InputError: listing the valid choices.
     """
-    if name in _MAKERS:
-        return
-    if Path(name).suffix.lower() not in MESH_SUFFIXES:
-        formats = ", ".join(MESH_SUFFIXES)
-        raise unknown("scene", name, (*_MAKERS, f"or the path of a mesh file ({formats})"))
-    if not Path(name).is_file():
-        raise InputError(f"mesh file {name!r} does not exist")
+    if is_mesh_file(name):
+        if not Path(str(name)).is_file():
+            raise InputError(f"mesh file {str(name)!r} does not exist")
+    elif isinstance(name, str) and ":" not in name and name not in POINT.names():
+        raise POINT.unknown(name, (f"the path of a mesh file ({', '.join(MESH_SUFFIXES)})",))
+    else:
+        POINT.find(name)
 
 
-def make(name: str | Path = "living_room", seed: int = 0) -> Scene:
+def make(name: SceneName | Path = "living_room", seed: int = 0) -> Scene:
     """Build a scene; the same name and seed give the same scene, bit for bit.
 
     Args:
-        name: one of ``SCENES``, or the path of a mesh file (z up, metres).
+        name: one of ``SCENES``, an entry point (group ``ms_slam_env.scenes``) or
+            ``module:function``, a function of the seed, or the path of a mesh file (z up, metres).
         seed: varies layout, sizes, colours, textures and lights of a procedural scene, and the
             lamps of a mesh file; not negative.
 
@@ -86,8 +100,11 @@ def make(name: str | Path = "living_room", seed: int = 0) -> Scene:
     """
     if not isinstance(seed, (int, np.integer)) or isinstance(seed, bool) or seed < 0:
         raise InputError(f"scene seed {seed!r} must be an integer >= 0")
-    key = str(name)
-    if key in _MAKERS:
-        return _MAKERS[key](int(seed))
+    key = str(name) if isinstance(name, Path) else name
     check_name(key)
-    return from_file(Path(key), int(seed))
+    if is_mesh_file(key):
+        return from_file(Path(str(key)), int(seed))
+    scene = POINT.find(key)(int(seed))
+    if not isinstance(scene, Scene):
+        raise InputError(f"scene {name!r} made {type(scene).__name__}, no ms_slam_env.scenes.Scene")
+    return scene

@@ -15,6 +15,7 @@ What is left out is Kinect noise, the path that the command has for its sequence
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,6 +28,7 @@ from ms_slam_env.camera import Intrinsics, xtion
 from ms_slam_env.camera.image_size import NATIVE
 from ms_slam_env.config import from_dict, parse_named
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.extension import is_reference
 from ms_slam_env.scenes.registry import check_name
 from ms_slam_env.sensor import NOISE_MODELS
 from ms_slam_env.sequences.paths import (
@@ -36,7 +38,7 @@ from ms_slam_env.sequences.paths import (
     UnevenPath,
     WanderingPath,
 )
-from ms_slam_env.sequences.perturbations import PERTURBATIONS, Perturbation, make_perturbation
+from ms_slam_env.sequences.perturbations import POINT, Perturbation, make_perturbation
 from ms_slam_env.sequences.recording import Calibration, open_recording
 from ms_slam_env.sequences.recording.recording import Registration, recorded_sequence
 from ms_slam_env.sequences.rendering import render_sequence
@@ -98,11 +100,12 @@ def parse_sequence(text: str | Path) -> SequenceName | Path:
     """
     if Path(text).is_dir():
         return Path(text)
-    scene, *rest = str(text).split(":")
-    if not 1 <= len(rest) <= 2 or not rest[0].isdigit():
+    parts = re.fullmatch(r"(.+?):(\d+)(?::(.*))?", str(text))
+    if parts is None:
         raise InputError(f"sequence {str(text)!r} {_GRAMMAR}")
-    named = SequenceName(scene, int(rest[0]))
-    for word in rest[1].split("+") if len(rest) == 2 else ():
+    scene, seed, words = parts.groups()
+    named = SequenceName(scene, int(seed))
+    for word in () if words is None else words.split("+"):
         named = _with_word(named, word, str(text))
     return named
 
@@ -116,9 +119,10 @@ def _with_word(named: SequenceName, word: str, text: str) -> SequenceName:
         made = dataclasses.replace(named, path=name, path_options=options)
         made.camera_path(HandheldPath())  # refuses bad options here
         return made
-    if name not in PERTURBATIONS:
+    if not is_reference(name) and name not in POINT.names():
         free = () if named.path else PATHS
-        raise unknown(f"part of sequence {text!r}", name, (*NOISE_MODELS, *PERTURBATIONS, *free))
+        names = (*NOISE_MODELS, *POINT.names(), *free, POINT.form)
+        raise unknown(f"part of sequence {text!r}", name, names)
     made_perturbations = (*named.perturbations, make_perturbation(name, options))
     return dataclasses.replace(named, perturbations=made_perturbations)
 

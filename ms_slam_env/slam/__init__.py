@@ -8,10 +8,11 @@ from ms_slam_env.slam.configuration import (
     read_configuration,
     write_configuration,
 )
-from ms_slam_env.slam.registry import BACKENDS, check_parameters
+from ms_slam_env.slam.registry import BACKENDS, POINT, check_parameters
 
 __all__ = [
     "BACKENDS",
+    "POINT",
     "SlamBackend",
     "SlamConfiguration",
     "TrackResult",

@@ -63,11 +63,14 @@ class SlamConfiguration(Checked):
         return ", ".join([*parts, "every frame" if every == 1 else f"one frame in {every}"])
 
 
-def make(name: str | Path, intrinsics: Intrinsics, **params: Any) -> SlamBackend:
+def make(
+    name: str | Path | type[SlamBackend], intrinsics: Intrinsics, **params: Any
+) -> SlamBackend:
     """Make the SLAM backend ``name`` for a camera.
 
     Args:
-        name: one of ``BACKENDS``, or a configuration file (YAML) that names one with parameters;
+        name: one of ``BACKENDS``, an entry point (group ``ms_slam_env.slam``), ``module:Class``, a
+            class, or a configuration file (YAML) that names one with parameters;
             the frames' size is that of ``intrinsics`` all the same.
         intrinsics: of every frame.
         params: of the backend, such as the fields of ``SurfelConfig``; ``device`` = "cpu" or
@@ -76,7 +79,7 @@ def make(name: str | Path, intrinsics: Intrinsics, **params: Any) -> SlamBackend
     Raises:
         InputError: unknown backend, unknown parameter or value out of range, or a bad file.
     """
-    if is_file_name(name):
+    if isinstance(name, (str, Path)) and is_file_name(name):
         configuration = read_configuration(name)
         name, params = configuration.slam, merged(configuration.slam_config, params)
     return make_backend(name, intrinsics, params)

@@ -13,6 +13,7 @@ from typing import Any
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.config import from_dict
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.extension import ExtensionPoint, check_options
 from ms_slam_env.slam.base import SlamBackend
 
 
@@ -30,13 +31,18 @@ class BackendEntry:
         return getattr(import_module(f"ms_slam_env.slam.{self.module}"), name)
 
 
-BACKENDS = {
+_OWN = {
     "surfel": BackendEntry("surfel", "SurfelSlam", "SurfelConfig", has_devices=True),
     "odometry": BackendEntry("odometry", "OdometrySlam", "OdometryConfig"),
     "volumetric": BackendEntry("volumetric", "VolumetricSlam", "VolumetricConfig"),
     "sparse": BackendEntry("sparse", "SparseSlam", "SparseConfig"),
 }
-"""The backends by name."""
+
+BACKENDS: tuple[str, ...] = tuple(_OWN)
+"""Names of our backends."""
+
+POINT = ExtensionPoint("SLAM backend", "ms_slam_env.slam", SlamBackend, own=_OWN)
+"""Where backends are found; a user's class is made of intrinsics and its options as keywords."""
 
 
 def make_backend(name: object, intrinsics: Intrinsics, params: Mapping[str, Any]) -> SlamBackend:
@@ -46,7 +52,10 @@ def make_backend(name: object, intrinsics: Intrinsics, params: Mapping[str, Any]
         InputError: unknown backend, unknown parameter or value out of range.
     """
     config = check_parameters(name, params)
-    entry = BACKENDS[str(name)]
+    entry = POINT.find(name)
+    if not isinstance(entry, BackendEntry):
+        own: SlamBackend = entry(intrinsics, **params)
+        return own
     device = [params.get("device", "cpu")] if entry.has_devices else []
     made: SlamBackend = entry.load(entry.backend)(intrinsics, config, *device)
     return made
@@ -56,16 +65,18 @@ def check_parameters(name: object, params: object) -> Any:
     """Refuse what ``make_backend`` would refuse, without making a backend.
 
     Returns:
-        the backend's parameters as its dataclass.
+        the backend's parameters as its dataclass; of a user's class as they are.
 
     Raises:
         InputError: unknown backend, unknown parameter or value out of range.
     """
-    if not isinstance(name, str) or name not in BACKENDS:
-        raise unknown("SLAM backend", name, BACKENDS)
+    entry = POINT.find(name)
     if not isinstance(params, Mapping) or not all(isinstance(key, str) for key in params):
         raise InputError(f"slam_config = {params!r} must be a mapping of options")
-    entry, options = BACKENDS[name], dict(params)
+    options = dict(params)
+    if not isinstance(entry, BackendEntry):
+        check_options(f"SLAM backend {name}", entry, options, ("intrinsics",))
+        return options
     if entry.has_devices:
         _check_device(options.pop("device", "cpu"))
     return from_dict(entry.load(entry.config), options, "slam_config")

@@ -181,7 +181,7 @@ def test_observations_of_another_environment_are_refused():
 def test_running_a_policy_needs_no_pytorch():
     code = (
         "import sys, numpy as np; from ms_slam_agents.policy import Policy;"
-        "from ms_slam_env.env.planners import planner_class; planner_class('policy-features');"
+        "from ms_slam_env.env.planners import PLANNERS; PLANNERS.find('policy-features');"
         f"policy = Policy.load({str(SHIPPED)!r});"
         "assert not {'torch', 'stable_baselines3', 'sb3_contrib'} & set(sys.modules);"
         "print(policy.act(np.zeros(189), np.ones(49, dtype=bool)))"

@@ -12,9 +12,8 @@ import pytest
 from ms_slam_env.config import parse_named
 from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.env.planners import (
+    PLANNERS,
     make_planner,
-    planner_class,
-    planner_names,
 )
 from ms_slam_env.errors import InputError
 from ms_slam_env.experiments.harness.episodes import (
@@ -56,7 +55,7 @@ def test_stationary_does_not_move_and_maps_less(result: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("name", ["random", "stationary", "greedy", "max-information"])
 def test_planners_are_installed(name: str) -> None:
-    assert name in planner_names()
+    assert name in PLANNERS.names()
 
 
 def test_planner_is_found_in_the_current_folder(
@@ -67,18 +66,18 @@ def test_planner_is_found_in_the_current_folder(
     )
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
-    assert planner_class("my_planners_of_a_test:Mine").__name__ == "Mine"
+    assert PLANNERS.find("my_planners_of_a_test:Mine").__name__ == "Mine"
 
 
 def test_a_trained_policy_without_its_extra_says_what_to_install(monkeypatch):
     def missing(name):
         raise ModuleNotFoundError("No module named 'torch'", name="torch")
 
-    monkeypatch.setattr("ms_slam_env.env.planners.import_module", missing)
+    monkeypatch.setattr("ms_slam_env.extension.import_module", missing)
     with pytest.raises(
         InputError, match=r"No module named 'torch'; pip install 'ms-slam-env\[train"
     ):
-        planner_class("policy")
+        PLANNERS.find("policy")
 
 
 def test_planner_by_module_and_class_takes_options() -> None:

@@ -65,7 +65,7 @@ def test_the_path_is_named_or_that_of_the_command() -> None:
     [
         ("table", "sequence 'table' is neither a folder nor scene:seed"),
         ("table:x", "neither a folder nor scene:seed"),
-        ("table:1:2:3", "neither a folder nor scene:seed"),
+        ("table:1:2:3", "unknown part of sequence .* .2:3.; valid choices: kinect"),
         ("table:1:fog", "'fog'; valid choices: kinect, range, none, .*rolling-shutter, .*handheld"),
         ("table:1:uneven+steady", "'steady'; valid choices"),
         ("table:1:motion-blur+none", "'none'"),

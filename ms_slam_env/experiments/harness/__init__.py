@@ -1,10 +1,11 @@
 """What all experiments share: finding, running, checking and writing them."""
 
 from ms_slam_env.experiments.harness.experiment import Experiment
-from ms_slam_env.experiments.harness.finding import experiment_class, experiment_names
+from ms_slam_env.experiments.harness.finding import EXPERIMENTS, experiment_class, experiment_names
 from ms_slam_env.experiments.harness.running import Outcome, run_experiment
 
 __all__ = [
+    "EXPERIMENTS",
     "Experiment",
     "Outcome",
     "experiment_class",

@@ -15,20 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ms_slam_env
-from ms_slam_env import metrics
+from ms_slam_env import metrics, slam
 from ms_slam_env.config import Checked, bounded, chosen, nested_options, parse_named
 from ms_slam_env.env import ActiveSlamEnv, Planner
 from ms_slam_env.env.config import make_config
 from ms_slam_env.env.embodiments import EMBODIMENTS
-from ms_slam_env.env.planners import check_planner, make_planner, planner_class
+from ms_slam_env.env.planners import PLANNERS, check_planner, make_planner
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.evaluation.map_quality import map_quality
 from ms_slam_env.evaluation.map_truth import reference_of, true_surface
 from ms_slam_env.registration import ADAPTIVE_ID
-from ms_slam_env.scenes import SCENES, SEED_SPLITS
+from ms_slam_env.scenes import SEED_SPLITS
 from ms_slam_env.scenes.mesh_file import load_soup
-from ms_slam_env.scenes.registry import check_name
-from ms_slam_env.slam import BACKENDS
+from ms_slam_env.scenes.registry import check_name, is_mesh_file
 
 Float64 = NDArray[np.float64]
 
@@ -156,7 +155,7 @@ def check_episodes(specs: Sequence[EpisodeSpec]) -> None:
 
 def make_env(spec: EpisodeSpec) -> gym.Env[Any, Any]:
     """The environment of an episode."""
-    planner_type = planner_class(parse_named(spec.planner, "planner")[0])
+    planner_type = PLANNERS.find(parse_named(spec.planner, "planner")[0])
     return gym.make(
         spec.env_id,
         max_episode_steps=spec.steps,
@@ -260,9 +259,7 @@ def parse_options(texts: Sequence[str]) -> dict[str, Any]:
     if embodiment not in EMBODIMENTS:
         raise unknown("embodiment", embodiment, EMBODIMENTS)
     configured = {name: value for name, value in result.items() if name != "embodiment"}
-    backend = make_config(configured, ("embodiment",), OWN_OPTIONS).slam
-    if backend not in BACKENDS:
-        raise unknown("SLAM backend", backend, BACKENDS)
+    slam.POINT.find(make_config(configured, ("embodiment",), OWN_OPTIONS).slam)
     return result
 
 
@@ -280,10 +277,9 @@ def check_names(planners: Sequence[str], scenes: Sequence[str]) -> None:
     for planner in planners:
         check_planner(planner)
     for scene in scenes:
-        if scene in SCENES:
-            continue
         check_name(scene)
-        load_soup(Path(scene))
+        if is_mesh_file(scene):
+            load_soup(Path(scene))
 
 
 def seed_list(split: str, count: int) -> list[int]:

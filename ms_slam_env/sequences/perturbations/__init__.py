@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ms_slam_env.config import from_dict
-from ms_slam_env.errors import unknown
+from ms_slam_env.extension import ExtensionPoint
 from ms_slam_env.sequences.perturbations.base import Moment, Perturbation
 from ms_slam_env.sequences.perturbations.illumination import Illumination
 from ms_slam_env.sequences.perturbations.images import (
@@ -43,13 +43,17 @@ PERTURBATIONS: dict[str, type[Perturbation]] = {
 }
 """Name to class."""
 
+POINT = ExtensionPoint("perturbation", "ms_slam_env.perturbations", Perturbation, own=PERTURBATIONS)
+"""Where perturbations are found."""
 
-def make_perturbation(name: str, options: Mapping[str, Any] | None = None) -> Perturbation:
+
+def make_perturbation(
+    name: str | type[Perturbation], options: Mapping[str, Any] | None = None
+) -> Perturbation:
     """Make a perturbation; options that are left out keep their default strength.
 
     Raises:
         InputError: unknown name or option, or a value out of range.
     """
-    if name not in PERTURBATIONS:
-        raise unknown("perturbation", name, PERTURBATIONS)
-    return from_dict(PERTURBATIONS[name], options or {}, name)
+    made: Perturbation = from_dict(POINT.find(name), options or {}, str(name))
+    return made
