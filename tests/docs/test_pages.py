@@ -46,7 +46,8 @@ def test_commands_of_a_page_exist(page: Path) -> None:
     text = text_of(page)
     used = set(re.findall(r"\bms-slam ([a-z]+)\b", text))
     assert used <= set(COMMANDS)
-    experiments = {name.replace("-", "_") for name in re.findall(r"ms-slam experiment (\w+)(?![\w:])", text)}
+    named = re.findall(r"ms-slam experiment (\w+)(?![\w:])", text)
+    experiments = {name.replace("-", "_") for name in named}
     assert experiments <= {*experiment_names(), "list", "NAME"}
 
 
