@@ -311,7 +311,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
 
     def _cover(self, frame: RGBDFrame, T_true: Float64, result: TrackResult) -> float:
         """Mark what a frame added to the map; return the newly mapped area, m2."""
-        if not (result.tracking_ok and result.processed):
+        if not result.fused:
             return 0.0
         depths = frame.depth, self.camera_feed.true_depth()
         return self.coverage.see(*depths, self._rays, T_true, result.T_world_camera)

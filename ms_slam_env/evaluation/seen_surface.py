@@ -14,8 +14,8 @@ from ms_slam_env.sequences import CameraPath, Sequence, open_sequence
 Float64 = NDArray[np.float64]
 
 SURFACE_SPACING_M = 0.01
-CUTOFF_M = 4.0
-"""Readings beyond do not count as seen: the farthest that SLAM itself looks by default."""
+CUTOFF_M = 5.0
+"""Readings beyond do not count as seen: the simulated sensor has none, where SLAM looks farther."""
 
 _MOST_VIEWS = 60  # neighbours see the same
 

@@ -25,6 +25,7 @@ from ms_slam_env.extension import ExtensionPoint
 RESULTS_VERSIONS = {
     1: "before results had a version: by algorithms and measures that have changed since",
     2: "the algorithms of release 0.1, maps judged against surface as far away as SLAM looks",
+    3: "near planes keep their normals, far depth is weighted, doubtful frames are asked twice",
 }
 """Version to what its algorithms are.
 

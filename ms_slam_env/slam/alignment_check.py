@@ -40,7 +40,11 @@ class TrackingStatus(IntEnum):
     PHOTOMETRIC_MISMATCH = 5
     IMPLAUSIBLE_MOTION = 6
     BLANK = 7
+    UNCERTAIN = 8
 
+
+DISPUTED = (TrackingStatus.GEOMETRIC_MISMATCH, TrackingStatus.PHOTOMETRIC_MISMATCH)
+"""Refusals that a look at the map's view may overrule."""
 
 MAP_REASONS: dict[int, str] = {
     TrackingStatus.OK: "",
@@ -51,6 +55,7 @@ MAP_REASONS: dict[int, str] = {
     TrackingStatus.PHOTOMETRIC_MISMATCH: "the frame's intensity does not fit the map",
     TrackingStatus.IMPLAUSIBLE_MOTION: "the motion is implausibly large",
     TrackingStatus.BLANK: "the image is black or blank",
+    TrackingStatus.UNCERTAIN: "the frame fits the map, but not well enough to be fused",
 }
 """The status in words where a frame was aligned with the map."""
 
@@ -160,6 +165,13 @@ depth, all at once, it was 0.5 or more at three of four. At poses that the track
 
 TEXTURELESS_THRESHOLDS = AcceptanceThresholds(overlap=0.4, inlier_ratio=0.95, relief_m=0.05)
 """The same where there is nothing to correlate: depth alone must tell the place; planes look alike.
+"""
+
+CONVINCING_CORRELATION = 0.7
+"""With this a frame that the tracker's thresholds refused is right after all.
+
+``ms-slam experiment acceptance_roc``: of the frames that the thresholds refuse, that are nearly
+accepted (``AcceptanceConfig.doubted``) and have such a correlation, nearly all are right.
 """
 
 LEAST_TEXTURE = 2.0  # grey levels; with less there is nothing to correlate
@@ -361,6 +373,14 @@ def is_photometrically_consistent(found: AlignmentStatistics) -> bool:
     textured = found.texture >= LEAST_TEXTURE
     thresholds = CONSISTENCY_THRESHOLDS if textured else TEXTURELESS_THRESHOLDS
     return evaluate_alignment(found, thresholds) == TrackingStatus.OK
+
+
+def status_on_appeal(found: AlignmentStatistics) -> TrackingStatus:
+    """OK, UNCERTAIN or PHOTOMETRIC_MISMATCH: what the map's view says of a doubtful alignment."""
+    if not is_photometrically_consistent(found):
+        return TrackingStatus.PHOTOMETRIC_MISMATCH
+    sure = found.texture >= LEAST_TEXTURE and found.correlation >= CONVINCING_CORRELATION
+    return TrackingStatus.OK if sure else TrackingStatus.UNCERTAIN
 
 
 def _relief(depth: Float32, where: NDArray[np.bool_]) -> float:

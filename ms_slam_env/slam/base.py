@@ -24,7 +24,9 @@ class TrackResult:
 
     Attributes:
         T_world_camera: (4, 4) estimated pose; the last good one while tracking is lost.
-        tracking_ok: whether the frame was aligned with the map and fused into it.
+        tracking_ok: whether the pose is known: the frame was aligned with the map.
+        uncertain: whether that is doubtful: the pose is the best there is, its covariance is
+            larger, and nothing was fused into the map.
         relocalised: whether this frame ended a period of lost tracking.
         inlier_fraction: share of the frame's valid pixels that the alignment explained.
         residual_m: RMS point-to-plane residual of the inliers, metres.
@@ -56,6 +58,12 @@ class TrackResult:
     reason: str = ""
     degenerate_directions: int = 0
     covariance: Float64 | None = None
+    uncertain: bool = False
+
+    @property
+    def fused(self) -> bool:
+        """Whether the frame became part of the map."""
+        return self.tracking_ok and self.processed and not self.uncertain
 
     @property
     def degenerate(self) -> bool:

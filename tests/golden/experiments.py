@@ -334,6 +334,14 @@ def pose_covariance(_: Path) -> Any:
     return {"rows": experiment.tables(rows)[0].rows, **experiment.content(rows)}
 
 
+@experiment("acceptance_roc", CHAOTIC)
+def acceptance_roc(_: Path) -> Any:
+    from ms_slam_env.experiments.acceptance_roc import AcceptanceRoc
+
+    experiment = AcceptanceRoc(("wall:1000",), image_size="80x60", frames=31)
+    return AcceptanceRoc.run(experiment.specs()[0])
+
+
 @experiment("slam_batch")
 def slam_batch(_: Path) -> Any:
     from ms_slam_env.experiments.slam_batch import SlamBatch

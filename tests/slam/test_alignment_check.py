@@ -24,6 +24,7 @@ from ms_slam_env.slam.alignment_check import (
     evaluate_alignment,
     evaluate_on_device,
     measure_alignment,
+    status_on_appeal,
 )
 from ms_slam_env.slam.pose_hypotheses import motion_hypotheses
 
@@ -130,6 +131,25 @@ def _evaluate(
     status[b] = evaluate_on_device(statistics[b], thresholds[b])
 
 
+@pytest.mark.parametrize(
+    ("correlation", "inliers", "texture", "expected"),
+    [
+        (0.9, 0.95, 10.0, TrackingStatus.OK),
+        (0.6, 0.95, 10.0, TrackingStatus.UNCERTAIN),
+        (0.3, 0.95, 10.0, TrackingStatus.PHOTOMETRIC_MISMATCH),
+        (0.9, 0.5, 10.0, TrackingStatus.PHOTOMETRIC_MISMATCH),
+        (0.0, 0.99, 0.1, TrackingStatus.UNCERTAIN),  # depth alone never convinces
+    ],
+)
+def test_the_maps_view_overrules_a_refusal_as_far_as_it_agrees(
+    correlation, inliers, texture, expected
+):
+    view = AlignmentStatistics(
+        overlap=0.9, inlier_ratio=inliers, correlation=correlation, texture=texture, relief_m=0.2
+    )
+    assert status_on_appeal(view) == expected
+
+
 def test_kernels_decide_as_the_host_does():
     count, demanded = 300, AcceptanceThresholds(*[0.2] * 3, 0.8, 0.2, 0.2, 0.2, *[0.8] * 4, 0.2)
     shape = count, len(fields(AlignmentStatistics))
@@ -142,7 +162,7 @@ def test_kernels_decide_as_the_host_does():
     ]
     wp.launch(_evaluate, dim=count, inputs=arrays, outputs=[status])
     expected = [evaluate_alignment(AlignmentStatistics(*row.tolist()), demanded) for row in values]
-    assert len(set(expected)) == len(TrackingStatus) - 1  # all but of a blank frame
+    assert len(set(expected)) == len(TrackingStatus) - 2  # all but of a blank frame and of doubt
     np.testing.assert_array_equal(status.numpy(), expected)
 
 

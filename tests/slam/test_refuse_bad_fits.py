@@ -40,15 +40,15 @@ def test_a_frame_from_elsewhere_is_refused_or_fused() -> None:
     assert len(careless.map_points()) > 1.1 * len(careful.map_points())
 
 
-@pytest.mark.parametrize(("inliers", "tracked"), [(0.65, [True] * 4), (1.0, [True] + [False] * 3)])
-def test_the_share_of_inliers_that_is_demanded_is_an_option(inliers: float, tracked: list) -> None:
+@pytest.mark.parametrize(("inliers", "fused"), [(0.65, [True] * 4), (1.0, [True] + [False] * 3)])
+def test_the_share_of_inliers_that_is_demanded_is_an_option(inliers: float, fused: list) -> None:
     scene = BoxScene()
     sensor = RGBDSensor(scene, xtion("80x60"), noise="kinect")
     start = scene.sample_start(np.random.default_rng(0))
     slam = slam_backends.make("surfel", xtion("80x60"), acceptance={"inliers": inliers})
     slam.reset(start)
     frames = [sensor.capture(start, index=k) for k in range(4)]
-    assert [slam.track(frame).tracking_ok for frame in frames] == tracked
+    assert [slam.track(frame).fused for frame in frames] == fused
 
 
 def test_only_booleans_are_taken() -> None:

@@ -11,23 +11,15 @@ from surfel_scenes import WALL_NORMAL, WALL_POINT
 from ms_slam_env.camera import intensity_image, xtion
 from ms_slam_env.geometry import invert, make_pose, se3_exp, so3_exp
 from ms_slam_env.slam.alignment_check import DepthImage
-from ms_slam_env.slam.sparse.config import SparseConfig
-from ms_slam_env.slam.sparse.features import (
-    FeatureExtractor,
-    Features,
-    InverseDepth,
-    Patches,
-    cut,
-    find_patches,
-    warp,
-)
-from ms_slam_env.slam.sparse.matching import (
+from ms_slam_env.slam.feature_matching import (
     hamming_distance,
     match_anywhere,
     match_near,
     most_alike,
     thumbnail,
 )
+from ms_slam_env.slam.features import FeatureExtractor, Features, InverseDepth
+from ms_slam_env.slam.sparse.features import Patches, cut, find_patches, warp
 from ms_slam_env.slam.sparse.sparse_map import Keyframe, SparseMap
 
 CAMERA = xtion("160x120")
@@ -113,7 +105,7 @@ def test_inverse_depth_of_a_plane_is_exact_between_pixels():
 
 def test_features_spread_over_the_image_and_know_their_depth():
     depth, intensity = _wall(np.eye(4))
-    extract = FeatureExtractor(CAMERA, SparseConfig(features=300))
+    extract = FeatureExtractor(CAMERA, features=300)
     features = extract(intensity.astype(np.uint8), InverseDepth(depth))
     assert 200 < len(features) <= 300
     assert (features.pixels >= 0).all()

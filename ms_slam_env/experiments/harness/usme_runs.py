@@ -167,7 +167,7 @@ def _seen_surface(scene: Scene, poses: Float64, options: dict[str, Any]) -> Floa
     count = int(min(_MOST_VIEWS, max(20, walked[-1] / _VIEW_EVERY_M)))
     picked = np.searchsorted(walked, np.linspace(0.0, walked[-1], count))
     sensor = RGBDSensor(scene, xtion(_VIEW_SIZE), noise="none")
-    reach = float(options.get("depth_cutoff_m", 4.0))
+    reach = float(options.get("depth_cutoff_m", 8.0))
     voxel = voxel_m(scene.name)
     clouds = []
     for index in np.unique(picked):

@@ -1,4 +1,4 @@
-"""ORB features of a frame with their depth, and small patches that are registered in another.
+"""Small patches around features, and their registration in another image.
 
 ORB's corners lie on whole pixels of their level, and come and go. A patch is warped as the motion
 and its surface demand and then shifted until it fits (Lucas and Kanade; the warp as in SVO, Forster
@@ -8,7 +8,6 @@ do not add up from keyframe to keyframe.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,14 +18,7 @@ from numpy.typing import NDArray
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.base import Float32, Float64
 from ms_slam_env.slam.rows import Rows
-from ms_slam_env.slam.sparse.config import SparseConfig
 
-SCALE = 1.2  # between levels of the pyramid, as in ORB-SLAM
-_EDGE_PX = 8  # of the magnified image; ORB itself continues the image by reflection
-_CANDIDATES = 2  # corners found per corner kept
-_CELLS = (8, 6)  # across and down, in which corners are kept in equal numbers
-_SLOPE_PX = 2.0  # half the distance over which a slope is measured
-_EDGE_PER_M = 0.03  # a step of inverse depth between neighbours that is an edge, 1/m
 _HALF = 3  # pixels on each side of the patch's centre
 _MARGIN = 6.0  # pixels to the border
 _ITERATIONS = 4
@@ -36,119 +28,6 @@ _LEAST_NOISE = 1.0  # grey levels
 _SMALLEST_GRADIENT = 1e-2  # keeps blank patches solvable; nothing else feels it
 _LEAST_SIGMA_PX = 0.2  # what warping as a plane, and by a pose not yet exact, leaves
 _LARGEST_SIGMA_PX = 0.7  # a patch that fixes its place less well is on an edge, or blank
-
-
-@dataclass(frozen=True)
-class Features(Rows):
-    """Features of one image."""
-
-    pixels: Float64  # (N, 2) float64 positions (u, v)
-    inverse_depth: Float64  # (N,) float64, 1/m; 0 = not known
-    descriptors: NDArray[np.uint64]  # (N, 4) uint64, the 256 bits of ORB
-    # (N,) float64 error of the position, in units of that of a corner of the full image: pixels of
-    # the image along a pixel of the level that it was found on.
-    scale: Float64
-
-    def points(self, intrinsics: Intrinsics) -> Float64:
-        """Points (N, 3) in the camera frame; NaN where the depth is not known."""
-        known = self.inverse_depth > 0
-        depth = np.where(known, 1.0 / np.where(known, self.inverse_depth, 1.0), np.nan)
-        return intrinsics.rays_at(self.pixels) * depth[:, None]
-
-
-class FeatureExtractor:
-    """Finds and describes corners evenly over the image."""
-
-    def __init__(self, intrinsics: Intrinsics, config: SparseConfig) -> None:
-        self._count = config.features
-        self._shape = intrinsics.shape
-        self._magnify = max(1, round(config.detection_width / intrinsics.width))
-        self._orb = cv2.ORB.create(
-            nfeatures=_CANDIDATES * config.features,
-            scaleFactor=SCALE,
-            nlevels=config.levels,
-            edgeThreshold=_EDGE_PX,
-            fastThreshold=config.fast_threshold,
-        )
-
-    def __call__(self, grey: NDArray[np.uint8], inverse_depth: InverseDepth) -> Features:
-        """Features of an image (H, W) uint8 with its inverse depth."""
-        n = self._magnify
-        size = (n * grey.shape[1], n * grey.shape[0])
-        image = cv2.resize(grey, size, interpolation=cv2.INTER_CUBIC) if n > 1 else grey
-        found = self._spread(self._orb.detect(image, None))
-        found, described = self._orb.compute(image, found)
-        if described is None or len(found) == 0:
-            none = np.zeros(0)
-            return Features(np.zeros((0, 2)), none, np.zeros((0, 4), dtype=np.uint64), none)
-        # A pixel of the image covers n x n of the magnified one; centres lie at integers.
-        corners = np.asarray(cv2.KeyPoint.convert(found), dtype=np.float64)
-        pixels = (corners + 0.5) / n - 0.5
-        scale = SCALE ** np.array([corner.octave for corner in found], dtype=np.float64)
-        return Features(
-            pixels,
-            inverse_depth.at(pixels),
-            np.ascontiguousarray(described).view(np.uint64),
-            np.maximum(scale / n, 1.0),
-        )
-
-    def _spread(self, corners: Sequence[cv2.KeyPoint]) -> Sequence[cv2.KeyPoint]:
-        """The strongest corners of every cell of the image, ``features`` in all."""
-        if len(corners) <= self._count:
-            return corners
-        across, down = _CELLS
-        size = np.array([self._shape[1], self._shape[0]]) * self._magnify
-        cell = (np.asarray(cv2.KeyPoint.convert(corners)) / size * [across, down]).astype(np.int64)
-        cell_of = cell[:, 1] * across + cell[:, 0]
-        strength = np.array([corner.response for corner in corners])
-        order = np.lexsort((-strength, cell_of))
-        first = np.searchsorted(cell_of[order], np.arange(across * down))
-        rank = np.empty(len(corners), dtype=np.int64)
-        rank[order] = np.arange(len(corners)) - first[cell_of[order]]
-        kept = np.sort(np.argsort(rank, kind="stable")[: self._count])
-        return [corners[index] for index in kept]
-
-
-class InverseDepth:
-    """The inverse depth of an image, smoothed over 3x3 pixels, for points between pixels.
-
-    The inverse depth of a plane is linear in the image, so the mean is that of the centre.
-
-    Args:
-        depth: (H, W) float32 metres; 0 = no reading.
-    """
-
-    def __init__(self, depth: Float32) -> None:
-        known = (depth > 0).astype(np.float32)
-        inverse = np.divide(known, depth, out=np.zeros_like(known), where=depth > 0)
-        border = cv2.BORDER_CONSTANT
-        count = cv2.boxFilter(known, -1, (3, 3), normalize=False, borderType=border)
-        total = cv2.boxFilter(inverse, -1, (3, 3), normalize=False, borderType=border)
-        kernel = np.ones((3, 3), dtype=np.uint8)
-        largest = cv2.dilate(inverse, kernel)
-        smallest = cv2.erode(np.where(depth > 0, inverse, np.float32(1e3)), kernel)
-        smooth = (count >= 5) & (largest - smallest < 2 * _EDGE_PER_M)
-        self._mean = np.where(smooth, total / np.maximum(count, 1), np.float32(0))
-        self._smooth = smooth.astype(np.float32)
-
-    def at(self, pixels: Float64) -> Float64:
-        """Inverse depth (N,) in 1/m at pixels (N, 2); 0 at edges and holes."""
-        if len(pixels) == 0:
-            return np.zeros(0)
-        u, v = pixels.astype(np.float32).T[:, None]
-        border = cv2.BORDER_REPLICATE
-        value = cv2.remap(self._mean, u, v, cv2.INTER_LINEAR, borderMode=border)[0]
-        whole = cv2.remap(self._smooth, u, v, cv2.INTER_LINEAR, borderMode=border)[0]
-        return np.where(whole > 0.999, value, 0.0).astype(np.float64)
-
-    def slope(self, pixels: Float64) -> Float64:
-        """Change (N, 2) of inverse depth from pixel to pixel, across and down; 0 at edges."""
-        slopes = []
-        for step in np.eye(2) * _SLOPE_PX:
-            before, after = self.at(pixels - step), self.at(pixels + step)
-            known = (before > 0) & (after > 0)
-            slopes.append(np.where(known, after - before, 0.0) / (2 * _SLOPE_PX))
-        return np.stack(slopes, axis=1)
 
 
 @dataclass(frozen=True)

@@ -12,15 +12,15 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert
 from ms_slam_env.slam.base import Float64
-from ms_slam_env.slam.sparse.config import SparseConfig
-from ms_slam_env.slam.sparse.matching import Int64
-from ms_slam_env.slam.sparse.pose import (
+from ms_slam_env.slam.feature_matching import Int64
+from ms_slam_env.slam.point_poses import (
     CHI2_PIXEL,
     CHI2_PIXEL_AND_DEPTH,
     Sightings,
     orthonormal,
     residuals,
 )
+from ms_slam_env.slam.sparse.config import SparseConfig
 from ms_slam_env.slam.sparse.sparse_map import SparseMap
 
 _BASELINE_M = 0.1  # of the imagined second camera; the result does not depend on it

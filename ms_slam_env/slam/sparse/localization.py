@@ -16,17 +16,12 @@ from ms_slam_env.slam.alignment_check import (
     check_alignment,
 )
 from ms_slam_env.slam.base import Float64
+from ms_slam_env.slam.feature_matching import Int64, match_anywhere, match_near
+from ms_slam_env.slam.features import Features, InverseDepth
+from ms_slam_env.slam.point_poses import Sightings, pose_from_matches, refine_pose
 from ms_slam_env.slam.rows import join
 from ms_slam_env.slam.sparse.config import SparseConfig
-from ms_slam_env.slam.sparse.features import (
-    Features,
-    InverseDepth,
-    Patches,
-    Templates,
-    find_patches,
-)
-from ms_slam_env.slam.sparse.matching import Int64, match_anywhere, match_near
-from ms_slam_env.slam.sparse.pose import Sightings, pose_from_matches, refine_pose
+from ms_slam_env.slam.sparse.features import Patches, Templates, find_patches
 from ms_slam_env.slam.sparse.sparse_map import SparseMap
 from ms_slam_env.slam.tracking_template import Attempt
 

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from ms_slam_env.geometry import invert, relative_angle
 from ms_slam_env.slam.base import Float64
+from ms_slam_env.slam.feature_matching import most_alike
+from ms_slam_env.slam.point_poses import orthonormal
 from ms_slam_env.slam.sparse.config import SparseConfig
 from ms_slam_env.slam.sparse.local_mapping import load_gtsam
 from ms_slam_env.slam.sparse.localization import Fix, LiveFrame, Localizer
-from ms_slam_env.slam.sparse.matching import most_alike
-from ms_slam_env.slam.sparse.pose import orthonormal
 from ms_slam_env.slam.sparse.sparse_map import SparseMap
 from ms_slam_env.slam.state import Stateful
 

@@ -13,8 +13,9 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, transform_points
 from ms_slam_env.slam.alignment_check import DepthImage
 from ms_slam_env.slam.base import Float32, Float64
-from ms_slam_env.slam.sparse.features import Features, InverseDepth, Templates, cut
-from ms_slam_env.slam.sparse.matching import Int64, thumbnail
+from ms_slam_env.slam.feature_matching import Int64, thumbnail
+from ms_slam_env.slam.features import Features, InverseDepth
+from ms_slam_env.slam.sparse.features import Templates, cut
 from ms_slam_env.slam.state import Saved
 
 _TRIED_FRAMES = 8  # frames after which a point that is hardly ever found again is dropped

@@ -16,12 +16,12 @@ from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.geometry import relative_angle
 from ms_slam_env.slam.alignment_check import DepthImage
 from ms_slam_env.slam.base import BorrowedMap, Float64
+from ms_slam_env.slam.feature_matching import most_alike, thumbnail
+from ms_slam_env.slam.features import FeatureExtractor, InverseDepth
 from ms_slam_env.slam.sparse.config import SparseConfig
-from ms_slam_env.slam.sparse.features import FeatureExtractor, InverseDepth
 from ms_slam_env.slam.sparse.local_mapping import adjust_around, load_gtsam
 from ms_slam_env.slam.sparse.localization import Fix, LiveFrame, Localizer, keyframe_features
 from ms_slam_env.slam.sparse.loop_closure import LoopCloser
-from ms_slam_env.slam.sparse.matching import most_alike, thumbnail
 from ms_slam_env.slam.sparse.sparse_map import Keyframe, SparseMap
 from ms_slam_env.slam.state import Saved
 from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
@@ -93,7 +93,10 @@ class SparseSlam(BorrowedMap, FrameByFrameSlam[LiveFrame, Fix]):
         load_gtsam()
         self.intrinsics = intrinsics
         self.config = config or SparseConfig()
-        self._extract = FeatureExtractor(intrinsics, self.config)
+        kept = ("features", "levels", "fast_threshold", "detection_width")
+        self._extract = FeatureExtractor(
+            intrinsics, **{name: getattr(self.config, name) for name in kept}
+        )
         self._dense = DenseMap(intrinsics, self.config)
         super().__init__(intrinsics)
 

@@ -12,9 +12,11 @@ from ms_slam_env._warp import wp
 from ms_slam_env.geometry import invert
 from ms_slam_env.slam.alignment_check import (
     AcceptanceThresholds,
+    AlignmentStatistics,
     DeviceStatistics,
     DeviceThresholds,
     TrackingStatus,
+    evaluate_alignment,
     evaluate_on_device,
 )
 from ms_slam_env.slam.base import Float64
@@ -225,9 +227,29 @@ class Alignment:
         """Which envs (B,) have a pose that is accepted."""
         return self.status == TrackingStatus.OK
 
+    @property
+    def uncertain(self) -> NDArray[np.bool_]:
+        """Which envs (B,) have a pose that is doubtful."""
+        return self.status == TrackingStatus.UNCERTAIN
+
+    def status_under(self, thresholds: AcceptanceThresholds, env: int) -> TrackingStatus:
+        """What other thresholds say of an env's alignment."""
+        found = AlignmentStatistics(*self.statistics[env].tolist())
+        return TrackingStatus(evaluate_alignment(found, thresholds))
+
     def with_status(self, where: NDArray[np.bool_], status: TrackingStatus) -> Alignment:
         """The same with another status for the envs ``where`` (B,)."""
         return replace(self, status=np.where(where, status, self.status))
+
+    def doubtful_at(self, poses: Float64, photometry: NDArray[Any]) -> Alignment:
+        """Uncertain ones at other poses (B, 4, 4), which the map says nothing about."""
+        return replace(
+            self,
+            T_world_live=poses,
+            status=np.full_like(self.status, TrackingStatus.UNCERTAIN),
+            photometry=photometry,
+            covariance=np.zeros_like(self.covariance),
+        )
 
     def seen_from(self, T_world_model: Float64) -> Alignment:
         """The same, relative to other poses (B, 4, 4) of the model view."""
@@ -240,6 +262,30 @@ class Alignment:
             return np.where(where.reshape(-1, *[1] * (own.ndim - 1)), others, own)
 
         return Alignment(*map(picked, vars(self).values(), vars(other).values()))
+
+
+DOUBT_M, DOUBT_RAD = 0.03, 0.02
+"""Standard deviations that doubt adds to a pose, per axis."""
+
+
+def is_nearly_accepted(alignment: Alignment, env: int, config: AcceptanceConfig) -> bool:
+    """Whether a refused alignment deserves a closer look: by somewhat laxer thresholds."""
+    doubted = config.doubted
+    thresholds = AcceptanceThresholds(
+        matches=config.points,
+        overlap=config.overlap,
+        inlier_ratio=min(doubted.inliers, config.inliers),
+        depth_conflict_ratio=max(doubted.conflicts, config.conflicts),
+        photometric_inlier_ratio=min(doubted.alike, config.alike),
+        cost=max(doubted.cost, config.cost),
+        sigma_m=config.sigma,
+    )
+    return alignment.status_under(thresholds, env) == TrackingStatus.OK
+
+
+def with_doubt(covariance: Float64) -> Float64:
+    """Covariance (6, 6) of a pose that is uncertain."""
+    return covariance + np.diag([DOUBT_M**2] * 3 + [DOUBT_RAD**2] * 3)
 
 
 def accept_any_fit(alignment: Alignment) -> Alignment:

@@ -59,6 +59,28 @@ class LoopConfig(Checked):
 
 
 @dataclass(frozen=True)
+class DoubtConfig(Checked):
+    """When a frame that is refused is compared with the map's view from where it was found.
+
+    There it is accepted, uncertain or refused for good; see
+    ``alignment_check.status_on_appeal``.
+
+    Attributes:
+        inliers: least share of the matched points that are inliers.
+        alike: least share of the textured points that are photometric inliers.
+        conflicts: largest share of the matched points whose depth conflicts.
+        cost: largest mean truncated cost of the visible points, in [0, 3].
+        longest: frames in a row that may be uncertain; after them tracking is lost.
+    """
+
+    inliers: float = bounded(0.55, 0.0, 1.0)
+    alike: float = bounded(0.55, 0.0, 1.0)
+    conflicts: float = bounded(0.3, 0.0, 1.0)
+    cost: float = bounded(1.7, 0.0, 3.0)
+    longest: int = bounded(10, 0, 1_000_000)
+
+
+@dataclass(frozen=True)
 class AcceptanceConfig(Checked):
     """When a pixel counts for an alignment with the map, and when a frame's alignment is accepted.
 
@@ -80,6 +102,7 @@ class AcceptanceConfig(Checked):
         cost: largest mean truncated cost of the visible points, in [0, 3].
         sigma: largest standard deviation (metres, radians) of the worst direction that the view
             constrains.
+        doubted: laxer values, of frames that are looked at once more.
     """
 
     inlier_sigmas: float = bounded(4.0, 0.1, 100.0)
@@ -93,6 +116,7 @@ class AcceptanceConfig(Checked):
     conflicts: float = bounded(0.15, 0.0, 1.0)
     cost: float = bounded(1.4, 0.0, 3.0)
     sigma: float = bounded(0.04, 1e-6, 10.0)
+    doubted: DoubtConfig = field(default_factory=DoubtConfig)
 
 
 @dataclass(frozen=True)
@@ -138,7 +162,8 @@ class SurfelConfig(Checked):
     """Parameters of tracking, fusion and prediction.
 
     Attributes:
-        depth_cutoff_m: readings beyond are ignored, [0, 10].
+        depth_cutoff_m: readings beyond are ignored, [0, 10]; those with more than 48 mm of noise,
+            by default beyond 4 m, count the less the more noise they have.
         icp_rgb_weight: weight w of the photometric term against the geometric one, [0, 1]: 0 is
             geometry alone, 1 photometry alone; ``normal_equations`` has the exact cost.
         confidence_threshold: observations after which a surfel is stable, [0, 12].
@@ -187,7 +212,7 @@ class SurfelConfig(Checked):
             "none": the world is taken to be still.
     """
 
-    depth_cutoff_m: float = bounded(4.0, 0.0, 10.0)
+    depth_cutoff_m: float = bounded(8.0, 0.0, 10.0)
     icp_rgb_weight: float = bounded(0.1, 0.0, 1.0)
     confidence_threshold: float = bounded(10.0, 0.0, 12.0)
     iterations: tuple[int, ...] = (4, 5, 10)

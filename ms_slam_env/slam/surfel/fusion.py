@@ -31,6 +31,7 @@ from ms_slam_env.slam.surfel.surfels import (
 )
 
 COARSER = wp.constant(1.5)  # a reading with a radius this much larger refines nothing (Keller)
+FULL_WEIGHT_SIGMA_M = 0.048  # readings with more noise weigh less; the default's at 4 m
 STEEPEST = wp.constant(0.3)  # cosine of the view angle below which radii no longer grow
 
 
@@ -43,6 +44,7 @@ class FusionParameters:
     coverage_px: float  # a surfel this close to a pixel covers it
     radius_px: float  # radius of a new surfel, in pixels of the view that made it
     max_confidence: float  # where confidence, the weight of the past, stops growing
+    full_m: float  # readings further away weigh less, by their variance
 
 
 @wp.struct
@@ -204,6 +206,8 @@ for (int k = 0; k < n; ++k) {
     const float cosine = -(lx[k] * x + ly[k] * y + lz[k] * z) / sqrtf(x * x + y * y + z * z);
     const float steep = cosine > STEEPEST ? cosine : STEEPEST;
     const float live_radius = parameters.radius_px * z / (fx * steep);
+    const float nearness = z > parameters.full_m ? parameters.full_m / z : 1.0f;
+    alpha[k] *= nearness * nearness * nearness * nearness;
     const float agreement = lx[k] * N[3 * k] + ly[k] * N[3 * k + 1] + lz[k] * N[3 * k + 2];
     const float squared = lx[k] * lx[k] + ly[k] * ly[k] + lz[k] * lz[k];
     const bool hit = total[k] > 0.25f, agrees = agreement > parameters.min_cosine;
@@ -311,6 +315,13 @@ def reading_radius(z: float, n: wp.vec3, vertex: wp.vec3, focal: float, radius_p
     return radius_px * z / (focal * wp.max(cosine, STEEPEST))
 
 
+@wp.func
+def range_weight(z: float, full_m: float):
+    """Weight of a reading at depth z: the inverse of its variance, which grows with z^4."""
+    nearness = wp.min(full_m / z, 1.0)
+    return nearness * nearness * nearness * nearness
+
+
 def radial_weights(height: int, width: int) -> NDArray[np.float32]:
     """Gaussian (H, W) of the distance to the centre over half the diagonal (Keller, 4.1)."""
     v, u = np.mgrid[:height, :width]
@@ -361,7 +372,9 @@ def add_surfels(
                     put(surfels.color, b, slot, fetch(frame.color, image + pixel))
                     radius = reading_radius(z, n, p, camera.focal[0], parameters.radius_px)
                     put(surfels.radius, b, slot, radius)
-                    put(surfels.confidence, b, slot, frame.weight[b] * fetch(frame.radial, pixel))
+                    weight = frame.weight[b] * fetch(frame.radial, pixel)
+                    weight *= range_weight(z, parameters.full_m)
+                    put(surfels.confidence, b, slot, weight)
                     put(surfels.created, b, slot, frame.time[b])
                     put(surfels.seen, b, slot, frame.time[b])
                 else:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env._warp import wp
 from ms_slam_env.geometry import relative_angle
-from ms_slam_env.slam.alignment_check import TrackingStatus
+from ms_slam_env.slam.alignment_check import DISPUTED, TrackingStatus, status_on_appeal
 from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.state import Saved
 from ms_slam_env.slam.surfel.acceptance import (
@@ -18,6 +18,7 @@ from ms_slam_env.slam.surfel.acceptance import (
     accept_any_fit,
     acceptance_thresholds,
     geometric_thresholds,
+    is_nearly_accepted,
 )
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer
 from ms_slam_env.slam.surfel.motion_mask import MotionMask
@@ -31,12 +32,13 @@ from ms_slam_env.slam.surfel.pipeline import Pipeline
 from ms_slam_env.slam.surfel.pose_hypotheses import (
     NUM_FIRST,
     NUM_HYPOTHESES,
+    UNMOVED,
     damped,
     relocalization_hypotheses,
     tracking_hypotheses,
 )
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
-from ms_slam_env.slam.surfel.relocalization import Images, Relocalization
+from ms_slam_env.slam.surfel.relocalization import Images, Relocalization, measure_consistency
 from ms_slam_env.slam.surfel.rendering import ModelView
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 
@@ -55,8 +57,9 @@ class CameraStates(Saved):
     started: NDArray[np.bool_]  # (B,) whether a frame has been taken
     lost: NDArray[np.int32]  # (B,) frames since tracking was lost
     time: NDArray[np.int32]  # (B,) frames taken
+    doubted: NDArray[np.int32]  # (B,) frames in a row whose pose is uncertain
 
-    saved = ("poses", "motions", "photometry", "started", "lost", "time")
+    saved = ("poses", "motions", "photometry", "started", "lost", "time", "doubted")
 
     @classmethod
     def at_rest(cls, batch: int) -> CameraStates:
@@ -64,7 +67,8 @@ class CameraStates(Saved):
         identity = np.tile(np.eye(4), (batch, 1, 1))
         zeros = np.zeros(batch, dtype=np.int32)
         started = np.zeros(batch, dtype=bool)
-        return cls(identity, identity.copy(), same_exposure(batch), started, zeros, zeros.copy())
+        exposure, counts = same_exposure(batch), (zeros.copy() for _ in range(3))
+        return cls(identity, identity.copy(), exposure, started, *counts)
 
     def reset(self, env: int, pose: ArrayLike) -> None:
         """Start one env anew at a pose (4, 4)."""
@@ -74,6 +78,7 @@ class CameraStates(Saved):
         self.started[env] = False
         self.lost[env] = 0
         self.time[env] = 0
+        self.doubted[env] = 0
 
     def accept(self, env: int, alignment: Alignment, least_scale: float) -> None:
         """Move on to where the frame was tracked."""
@@ -84,6 +89,7 @@ class CameraStates(Saved):
         is_degenerate = alignment.statistics[env]["degenerate_directions"] > 0
         self.motions[env] = damped(motion) if is_degenerate else motion
         self.lost[env] = 0
+        self.doubted[env] = self.doubted[env] + 1 if alignment.uncertain[env] else 0
         self.photometry[env] = next_photometry(
             self.photometry[env],
             alignment.photometry[env],
@@ -95,6 +101,7 @@ class CameraStates(Saved):
         """Stay where the frame was not tracked."""
         self.motions[env] = np.eye(4)
         self.lost[env] += 1
+        self.doubted[env] = 0
 
 
 class Localizer:
@@ -102,6 +109,7 @@ class Localizer:
 
     Attributes:
         invalid_frames: tells frames with nothing to track in them.
+        last_frames: whose features lead to a frame that is not found near the expected pose.
     """
 
     def __init__(
@@ -125,6 +133,8 @@ class Localizer:
         """Look at frames in this way from now on."""
         self._tracker = pipeline.tracker
         self._config = pipeline.config
+        self.last_frames = pipeline.last_frames
+        self.last_frames.forget(slice(None))
         self.forget_view()
 
     def forget_view(self) -> None:
@@ -163,7 +173,9 @@ class Localizer:
         if self._motion_mask.find(*self._trusted(alignment, expected)).any():
             alignment = self._track(invalid, guesses)
         alignment = self._doubt(alignment, expected, invalid, guesses)
-        if not self._config.refuse_bad_fits:
+        if self._config.refuse_bad_fits:
+            alignment = self._search_by_features(self._appeal(alignment, frames), frames)
+        else:
             alignment = accept_any_fit(alignment)
         if guesses is not None:
             alignment = self._search_at_guess(alignment, guesses)
@@ -238,6 +250,64 @@ class Localizer:
         again = self._align(states.poses, near, thresholds, geometry_only(states.photometry))
         return alignment.replace(failed & again.tracked, again)
 
+    def _appeal(
+        self, alignment: Alignment, frames: Images, where: NDArray[np.bool_] | None = None
+    ) -> Alignment:
+        """Lay frames that are nearly accepted upon the map's view from where they were found.
+
+        So are those that are accepted after uncertain ones: what follows a wrong pose fits it.
+        """
+        states, acceptance = self._states, self._config.acceptance
+        appealed = self._failed(alignment) & np.isin(alignment.status, DISPUTED)
+        for env in np.flatnonzero(appealed):
+            appealed[env] = is_nearly_accepted(alignment, int(env), acceptance)
+        asked = (appealed | (alignment.tracked & (states.doubted > 0))) & (states.lost == 0)
+        if where is not None:
+            asked &= where
+        poses, cutoff_m = alignment.T_world_live, self._config.depth_cutoff_m
+        for env, found in measure_consistency(frames, poses, asked, self, cutoff_m).items():
+            status = status_on_appeal(found)
+            if not appealed[env]:
+                is_refuted = status == TrackingStatus.PHOTOMETRIC_MISMATCH
+                status = TrackingStatus.UNCERTAIN if is_refuted else TrackingStatus.OK
+            if (
+                status == TrackingStatus.UNCERTAIN
+                and states.doubted[env] >= acceptance.doubted.longest
+            ):
+                status = TrackingStatus.PHOTOMETRIC_MISMATCH
+            alignment.status[env] = status
+        return alignment
+
+    def _search_by_features(self, alignment: Alignment, frames: Images) -> Alignment:
+        """Align the envs that failed from where features put them.
+
+        A pose that many features all over the image speak for is kept, uncertain, where the map
+        does not bear it out.
+        """
+        states, found = self._states, {}
+        origins = states.poses.copy()
+        for env in np.flatnonzero(self._failed(alignment)):
+            images = frames.color[env], frames.depth[env]
+            pose = self.last_frames.find(int(env), *images, self._config.depth_cutoff_m)
+            if pose is not None:
+                origins[env], found[int(env)] = pose
+        if not found:
+            return alignment
+        where = np.isin(np.arange(len(origins)), list(found))
+        again = self.align_from(
+            origins, np.tile(UNMOVED, (len(origins), 1, 1, 1)), self.strict_thresholds()
+        )
+        again = self._appeal(again, frames, where)
+        taken = where & (again.tracked | (again.uncertain & ~alignment.uncertain))
+        alignment = alignment.replace(taken, again.seen_from(states.poses))
+        alone = np.zeros(len(origins), dtype=bool)
+        for env in np.flatnonzero(self._failed(alignment) & ~alignment.uncertain & where):
+            longest = self._config.acceptance.doubted.longest
+            may_doubt = states.lost[env] == 0 and states.doubted[env] < longest
+            alone[env] = may_doubt and found[int(env)].is_strong
+        there = again.doubtful_at(origins, states.photometry)
+        return alignment.replace(alone, there.seen_from(states.poses))
+
     def _search_at_guess(self, alignment: Alignment, guesses: Float64) -> Alignment:
         """Align the envs that failed with the view from their guess, under stricter thresholds.
 
@@ -256,7 +326,7 @@ class Localizer:
         """Give the envs that failed more hypotheses, under stricter thresholds."""
         states = self._states
         for attempt in range(1, 1 + RETRIES):
-            failed = self._failed(alignment)
+            failed = self._failed(alignment) & ~alignment.uncertain
             if not failed.any():
                 break
             hypotheses = np.stack(
@@ -296,6 +366,7 @@ class Localizer:
         return acceptance_thresholds(self._config.acceptance, self._strict, self._states.lost)
 
     def _failed(self, alignment: Alignment) -> NDArray[np.bool_]:
+        """Which envs (B,) may be searched for: also those whose pose is uncertain."""
         is_blank = alignment.status == TrackingStatus.BLANK
         return self._states.started & ~alignment.tracked & ~is_blank
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.alignment_check import (
+    AlignmentStatistics,
     is_photometrically_consistent,
     measure_photometric_consistency,
 )
@@ -53,6 +54,22 @@ class FrameAligner(Protocol):
 
     def render(self, poses: Float64) -> ModelView:
         """The maps as seen from ``poses`` (B, 4, 4)."""
+
+
+def measure_consistency(
+    frames: Images, poses: Float64, wanted: Bool, aligner: FrameAligner, cutoff_m: float
+) -> dict[int, AlignmentStatistics]:
+    """How the frames of the envs ``wanted`` (B,) agree with the maps' views from ``poses``."""
+    if not wanted.any():
+        return {}
+    view = aligner.render(np.where(wanted[:, None, None], poses, np.eye(4)))
+    intensity, depth = view.intensity.numpy(), view.vertices.numpy()[..., 2]
+    return {
+        int(env): measure_photometric_consistency(
+            frames.color[env], frames.depth[env], intensity[env], depth[env], cutoff_m
+        )
+        for env in np.flatnonzero(wanted)
+    }
 
 
 class Relocalization(Saved):
@@ -125,6 +142,7 @@ ROUNDS = 3  # frames until the same ones are tried again
 REFINEMENTS = 3  # alignments with the view from the pose found so far
 HOPELESS_COST = 2.45  # an alignment with a keyframe's view that costs more is no start
 GOOD_COST = 1.6  # with one that costs less the other keyframes are left untried
+_FARTHEST_TESTED_M = 4.0  # rooms differ in what is near
 _LOOKED_AT = 40  # keyframes among which those tried are chosen
 _STEP_M, _STEP_RAD = 0.03, np.radians(3.0)  # frames between such steps are no new keyframes
 _APART = 0.10, np.radians(10.0)  # two of them differ by at least so much
@@ -164,7 +182,9 @@ class FernRelocalization(Relocalization):
         depth_cutoff_m: float,
         acceptance: AcceptanceConfig | None = None,
     ) -> None:
-        config = FernConfig(far_m=max(depth_cutoff_m, 2 * FernConfig.near_m))
+        config = FernConfig(
+            far_m=min(max(depth_cutoff_m, 2 * FernConfig.near_m), _FARTHEST_TESTED_M)
+        )
         self.databases = [FernDatabase(intrinsics, config) for _ in range(batch)]
         self._cutoff_m = depth_cutoff_m
         acceptance = acceptance or AcceptanceConfig()
@@ -186,15 +206,9 @@ class FernRelocalization(Relocalization):
 
     def verify(self, frames: Images, poses: Float64, found: Bool, aligner: FrameAligner) -> Bool:
         """Those that are like the map's view from there."""
-        if not found.any():
-            return found
-        view = aligner.render(np.where(found[:, None, None], poses, np.eye(4)))
-        intensity, depth = view.intensity.numpy(), view.vertices.numpy()[..., 2]
         verified = found.copy()
-        for env in np.flatnonzero(found):
-            found_there = measure_photometric_consistency(
-                frames.color[env], frames.depth[env], intensity[env], depth[env], self._cutoff_m
-            )
+        seen = measure_consistency(frames, poses, found, aligner, self._cutoff_m)
+        for env, found_there in seen.items():
             verified[env] = is_photometrically_consistent(found_there)
         return verified
 

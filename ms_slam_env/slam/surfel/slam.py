@@ -19,11 +19,11 @@ from numpy.typing import ArrayLike, NDArray
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import check_pose, invert
-from ms_slam_env.slam.alignment_check import MAP_REASONS, TrackingStatus
+from ms_slam_env.slam.alignment_check import MAP_REASONS, AlignmentStatistics, TrackingStatus
 from ms_slam_env.slam.base import Float64, TrackResult
 from ms_slam_env.slam.ferns import Candidate
 from ms_slam_env.slam.state import Saved
-from ms_slam_env.slam.surfel.acceptance import Alignment
+from ms_slam_env.slam.surfel.acceptance import Alignment, with_doubt
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.detached_map import DetachedMap
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer
@@ -39,7 +39,7 @@ from ms_slam_env.slam.surfel.pose_hypotheses import (
     tracking_hypotheses,
 )
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
-from ms_slam_env.slam.surfel.relocalization import Images, make_relocalization
+from ms_slam_env.slam.surfel.relocalization import Images, make_relocalization, measure_consistency
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.tracker import model_stride
 
@@ -49,7 +49,7 @@ FEWEST_READINGS = 0.05  # share of the first frame's pixels that must have depth
 class BatchedSurfelSlam(Saved):
     """The SLAM of B envs in lockstep; each env's results are those it would have alone."""
 
-    saved = ("_invalid_frames", "map", "relocalization", "loops", "motion_mask")
+    saved = ("_invalid_frames", "map", "relocalization", "loops", "motion_mask", "_last_frames")
 
     def __init__(
         self, batch: int, intrinsics: Intrinsics, config: SurfelConfig, device: str = "cpu"
@@ -89,6 +89,7 @@ class BatchedSurfelSlam(Saved):
         self._correct_exposure = pipeline.correct_exposure
         self.map.use(pipeline.map_kernels)
         self._localizer.use(pipeline)
+        self._last_frames = pipeline.last_frames
 
     def reset(self, T_world_camera: ArrayLike | None = None, env: int = 0) -> None:
         """Forget one env; its next frame is taken at ``T_world_camera`` (identity if None)."""
@@ -98,6 +99,7 @@ class BatchedSurfelSlam(Saved):
         self.relocalization.clear(env)
         self.loops.reset(env)
         self.motion_mask.forget(env)
+        self._last_frames.forget(env)
         self._localizer.forget_view()
 
     def track(
@@ -115,7 +117,9 @@ class BatchedSurfelSlam(Saved):
         self._select_surfels(self._states.lost)
         results = self._track(live, frames, guesses)
         self._correct_exposure(live, self._states.photometry)
-        self._fuse(live, frames, np.array([result.tracking_ok for result in results]))
+        known = np.array([result.tracking_ok for result in results])
+        self._last_frames.keep(color, depth, self.poses, known)
+        self._fuse(live, frames, np.array([result.fused for result in results]))
         return self._close_loops(live, frames, results)
 
     def fuse(
@@ -137,7 +141,9 @@ class BatchedSurfelSlam(Saved):
             states.started[env] = states.started[env] or _readings(env, live) >= FEWEST_READINGS
         states.poses = poses
         states.lost[:] = 0
-        self._fuse(live, frames, np.ones(self.batch, dtype=bool))
+        everywhere = np.ones(self.batch, dtype=bool)
+        self._last_frames.keep(color, depth, poses, everywhere)
+        self._fuse(live, frames, everywhere)
         return [
             TrackResult(pose.copy(), True, moving=self.motion_mask.mask(env))
             for env, pose in enumerate(poses)
@@ -168,7 +174,11 @@ class BatchedSurfelSlam(Saved):
     def _move_on(self, env: int, alignment: Alignment) -> TrackResult:
         """Take the pose of a frame that was tracked, else hold the last one."""
         status, states = TrackingStatus(alignment.status[env]), self._states
-        tracked = status == TrackingStatus.OK
+        uncertain = status == TrackingStatus.UNCERTAIN
+        tracked = uncertain or status == TrackingStatus.OK
+        covariance = (
+            with_doubt(alignment.covariance[env]) if uncertain else alignment.covariance[env]
+        )
         relocalised = tracked and bool(states.lost[env])
         if tracked:
             states.accept(env, alignment, self.config.cauchy_rgb)
@@ -182,7 +192,8 @@ class BatchedSurfelSlam(Saved):
             residual_m=float(alignment.statistics[env]["residual_m"]),
             reason=MAP_REASONS[status],
             degenerate_directions=int(alignment.statistics[env]["degenerate_directions"]),
-            covariance=alignment.covariance[env] if tracked else None,
+            covariance=covariance if tracked else None,
+            uncertain=uncertain,
             moving=self.motion_mask.mask(env),
         )
 
@@ -209,9 +220,10 @@ class BatchedSurfelSlam(Saved):
         def similar(env: int, before: int) -> list[Candidate]:
             return self.relocalization.similar(env, frames, before)
 
-        tracked = np.array([result.tracking_ok for result in results])
+        tracked = np.array([result.fused for result in results])
         closed = self.loops.close(live, self.poses, self._states.time - 1, tracked, similar)
         for env in np.flatnonzero(closed):
+            self._last_frames.move(int(env), self.poses[env])
             self.relocalization.move_keyframes(int(env), *self.loops.trajectory(int(env)))
             self.motion_mask.forget(int(env))  # the map and the earlier frames no longer agree
             results[env] = replace(
@@ -248,6 +260,7 @@ class BatchedSurfelSlam(Saved):
         """Move an env's camera by ``T`` (4, 4) of the world."""
         self._states.poses[env] = T @ self._states.poses[env]
         self.motion_mask.forget(env)
+        self._last_frames.move(env, self._states.poses[env])
 
     def last_frame(self, env: int = 0) -> int:
         """Number of an env's last frame."""
@@ -282,6 +295,11 @@ class BatchedSurfelSlam(Saved):
         hypotheses = tracking_hypotheses(np.eye(4))[None]
         thresholds = self._localizer.strict_thresholds()
         return self._localizer.align_from(pose[None], hypotheses, thresholds)
+
+    def consistency(self, frames: Images, poses: Float64) -> AlignmentStatistics:
+        """How the frame agrees with the map's view from ``poses`` (1, 4, 4)."""
+        wanted, cutoff_m = np.ones(1, dtype=bool), self.config.depth_cutoff_m
+        return measure_consistency(frames, poses, wanted, self._localizer, cutoff_m)[0]
 
     def verify(self, frames: Images, poses: Float64) -> bool:
         """Whether the map's view from ``poses`` (1, 4, 4) is like the frame."""

@@ -74,6 +74,7 @@ class MapKernels:
         rule.coverage_px = config.coverage_px
         rule.radius_px = config.surfel_radius_px
         rule.max_confidence = config.max_confidence
+        rule.full_m = math.sqrt(fusion.FULL_WEIGHT_SIGMA_M / config.depth_noise_m)
         shared = [self._camera, rule, self._frame, buffers.workers]
         return [
             self._record(fusion.update_surfels, [buffers.surfels, buffers.visible, *shared]),

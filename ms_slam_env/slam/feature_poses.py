@@ -1,0 +1,110 @@
+"""Where a frame was taken, from the ORB features that it shares with an earlier frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.slam.base import Float32, Float64
+from ms_slam_env.slam.feature_matching import match_anywhere
+from ms_slam_env.slam.features import FeatureExtractor, Features, InverseDepth
+from ms_slam_env.slam.point_poses import Sightings, pose_from_matches, refine_pose
+from ms_slam_env.slam.state import Saved
+
+_HAMMING = 60  # largest distance of matching descriptors, bits of 256
+_ERROR_PX = 2.5  # of a match that RANSAC counts
+_PIXEL_NOISE = 0.7  # of a corner of the finest level, as in ``SparseConfig``
+_INVERSE_DEPTH_NOISE = 0.004  # 1/m
+STRONG_SUPPORT = 30  # matches that a pose explains,
+WIDE_SPREAD = 0.1  # and their standard deviation, share of the image, both across and down
+
+
+@dataclass(frozen=True)
+class FeaturePose:
+    """A pose that features speak for."""
+
+    T_reference_frame: Float64  # (4, 4)
+    inliers: int  # matches that it explains, in the image and in depth
+    spread: float  # the smaller standard deviation of their places, share of the image's size
+
+    @property
+    def is_strong(self) -> bool:
+        """Whether it can stand alone."""
+        return self.inliers >= STRONG_SUPPORT and self.spread >= WIDE_SPREAD
+
+
+def pose_from_features(
+    reference: Features, frame: Features, intrinsics: Intrinsics
+) -> FeaturePose | None:
+    """Pose of a frame relative to another, by PnP and RANSAC, refined with the depths of both.
+
+    None where too few features match. The same features give the same pose, bit for bit.
+    """
+    known = reference.chosen(np.flatnonzero(reference.inverse_depth > 0))
+    a, b = match_anywhere(known.descriptors, frame.descriptors, _HAMMING)
+    points, seen = known.points(intrinsics)[a], frame.chosen(b)
+    found = pose_from_matches(points, seen.pixels, intrinsics, _ERROR_PX)
+    if found is None:
+        return None
+    kept = np.flatnonzero(found[1])
+    points, seen = points[kept], seen.chosen(kept)
+    sightings = Sightings(
+        seen.pixels, seen.inverse_depth, _PIXEL_NOISE * seen.scale, _INVERSE_DEPTH_NOISE
+    )
+    T, inlier = refine_pose(found[0], points, sightings, intrinsics)
+    if not inlier.any():
+        return None
+    size = np.array([intrinsics.width, intrinsics.height])
+    spread = float((seen.pixels[inlier].std(axis=0) / size).min())
+    return FeaturePose(T, int(inlier.sum()), spread)
+
+
+class LastFrames(Saved):
+    """The last frames with a known pose of B envs; features are sought when they are asked for."""
+
+    saved = ("_color", "_depth", "_poses")
+
+    def __init__(self, batch: int, intrinsics: Intrinsics) -> None:
+        self._color = np.zeros((batch, *intrinsics.shape, 3), dtype=np.uint8)
+        self._depth = np.zeros((batch, *intrinsics.shape), dtype=np.float32)
+        self._poses: Float64 = np.full((batch, 4, 4), np.nan)
+        self._intrinsics = intrinsics
+        self._extract = FeatureExtractor(intrinsics)
+
+    def keep(
+        self,
+        color: NDArray[np.uint8],
+        depth: Float32,
+        T_world_camera: Float64,
+        known: NDArray[np.bool_],
+    ) -> None:
+        """Take the frames (B, H, W) of the envs whose poses (B, 4, 4) are ``known`` (B,)."""
+        for own, new in ((self._color, color), (self._depth, depth), (self._poses, T_world_camera)):
+            own[known] = new[known]
+
+    def move(self, env: int, T_world_camera: Float64) -> None:
+        """Put an env's frame elsewhere (4, 4)."""
+        self._poses[env] = T_world_camera
+
+    def forget(self, env: int | slice) -> None:
+        """Have no frame of an env, or of several."""
+        self._poses[env] = np.nan
+
+    def find(
+        self, env: int, color: NDArray[np.uint8], depth: Float32, cutoff_m: float
+    ) -> tuple[Float64, FeaturePose] | None:
+        """Where (4, 4) T_world_camera a frame (H, W) was taken; None if features do not say."""
+        if not np.isfinite(self._poses[env, 0, 0]):
+            return None
+        before = self._features(self._color[env], self._depth[env], cutoff_m)
+        found = pose_from_features(before, self._features(color, depth, cutoff_m), self._intrinsics)
+        return None if found is None else (self._poses[env] @ found.T_reference_frame, found)
+
+    def _features(self, color: NDArray[np.uint8], depth: Float32, cutoff_m: float) -> Features:
+        grey = cv2.cvtColor(np.ascontiguousarray(color), cv2.COLOR_RGB2GRAY)
+        within = np.where(depth <= cutoff_m, depth, np.float32(0))
+        return self._extract(np.asarray(grey), InverseDepth(within))

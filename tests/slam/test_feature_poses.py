@@ -1,0 +1,97 @@
+"""Poses from features against the truth of rendered frames, and doubt where the map disagrees."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from box_scene import BoxScene
+
+from ms_slam_env import slam
+from ms_slam_env.camera import RGBDFrame, xtion
+from ms_slam_env.geometry import invert, look_at, make_pose, relative_angle, so3_exp
+from ms_slam_env.sensor import RGBDSensor
+from ms_slam_env.slam.feature_poses import LastFrames
+
+CAMERA = xtion("160x120")
+TURN = make_pose(so3_exp(np.radians([4.0, 12.0, 3.0])), np.array([0.12, 0.03, 0.06]))
+
+
+EYE = np.array([-0.8, -0.8, 1.2])
+
+
+@pytest.fixture(scope="module")
+def sensor(box_scene: BoxScene) -> RGBDSensor:
+    return RGBDSensor(box_scene, CAMERA, noise="kinect", seed=3)
+
+
+@pytest.fixture(scope="module")
+def start() -> np.ndarray:
+    return look_at(EYE, EYE + np.array([1.0, 0.2, -0.35]))
+
+
+def _kept(frame: RGBDFrame, pose: np.ndarray) -> LastFrames:
+    frames = LastFrames(1, CAMERA)
+    frames.keep(frame.color[None], frame.depth[None], pose[None], np.ones(1, dtype=bool))
+    return frames
+
+
+def test_features_find_a_motion_of_many_frames(sensor, start):
+    before, after = sensor.capture(start, 0), sensor.capture(start @ TURN, 1)
+    found = _kept(before, start).find(0, after.color, after.depth, 8.0)
+    assert found is not None
+    pose, support = found
+    error = invert(start @ TURN) @ pose
+    assert np.linalg.norm(error[:3, 3]) < 0.02
+    assert relative_angle(np.eye(3), error[:3, :3]) < np.radians(1.0)
+    assert support.is_strong
+    again = _kept(before, start).find(0, after.color, after.depth, 8.0)
+    np.testing.assert_array_equal(pose, again[0])
+
+
+def test_another_place_has_no_strong_support(sensor, start):
+    elsewhere = sensor.capture(look_at(EYE, EYE + np.array([-1.0, 0.1, -0.35])), 1)
+    found = _kept(sensor.capture(start, 0), start).find(0, elsewhere.color, elsewhere.depth, 8.0)
+    assert found is None or not found[1].is_strong
+
+
+def test_without_a_frame_features_say_nothing(sensor, start):
+    frame = sensor.capture(start, 0)
+    frames = _kept(frame, start)
+    frames.forget(0)
+    assert frames.find(0, frame.color, frame.depth, 8.0) is None
+
+
+def _walk(sensor, start: np.ndarray, count: int) -> list[tuple[RGBDFrame, np.ndarray]]:
+    step = make_pose(so3_exp(np.radians([0.0, 1.0, 0.0])), np.array([0.01, 0.0, 0.005]))
+    poses = [start]
+    for _ in range(count - 1):
+        poses.append(poses[-1] @ step)
+    return [(sensor.capture(pose, index), pose) for index, pose in enumerate(poses)]
+
+
+def test_a_leap_that_the_motion_model_does_not_expect_is_tracked(sensor, start):
+    backend = slam.make("surfel", CAMERA)
+    backend.reset(start)
+    walk = _walk(sensor, start, 8)
+    for frame, _ in walk:
+        assert backend.track(frame).tracking_ok
+    there = walk[-1][1] @ make_pose(so3_exp(np.radians([9.0, -19.0, 12.0])), [0.15, 0.05, 0.05])
+    result = backend.track(sensor.capture(there, 99))
+    assert result.tracking_ok
+    assert np.linalg.norm(result.T_world_camera[:3, 3] - there[:3, 3]) < 0.03
+
+
+def test_an_uncertain_frame_is_tracked_and_not_fused(sensor, start):
+    """No alignment can meet these rules, so that only features speak for the poses."""
+    rules = {"acceptance": {"inliers": 1.0, "doubted": {"inliers": 1.0}}}
+    backend = slam.make("surfel", CAMERA, **rules)
+    backend.reset(start)
+    walk = _walk(sensor, start, 4)
+    backend.track(walk[0][0])
+    count = len(backend.surface_points())
+    results = [backend.track(frame) for frame, _ in walk[1:]]
+    assert all(result.uncertain and result.tracking_ok and not result.fused for result in results)
+    assert len(backend.surface_points()) == count
+    for result, (_, pose) in zip(results, walk[1:], strict=True):
+        assert np.linalg.norm(result.T_world_camera[:3, 3] - pose[:3, 3]) < 0.02
+        assert np.sqrt(result.covariance[0, 0]) >= 0.03
