@@ -124,21 +124,19 @@ class AcceptanceRoc(Experiment, Checked):
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
         """What each decision makes of right and wrong alignments, and how each feature tells."""
-        decisions = [
+        decisions: list[dict[str, Any]] = [
             {"decision": name, **shares([row["result"] for row in finished(rows)], name)}
             for name in (THRESHOLDS, APPEAL, UNCERTAIN)
         ]
-        features = []
+        features: list[dict[str, Any]] = []
         for name in _names():
             right, wrong = _scores(rows, name)
             if len(right) and len(wrong):
                 area = float(mannwhitneyu(right, wrong).statistic / (len(right) * len(wrong)))
-                limit = float(np.quantile(wrong, 0.99))
-                refused = float((right <= limit).mean())
-                features.append(
-                    {"feature": name, "roc_area": area, "refused_right_at_1_percent": refused}
-                )
-        features.sort(key=lambda line: -line["roc_area"])
+                refused = float((right <= np.quantile(wrong, 0.99)).mean())
+                line = {"feature": name, "roc_area": area, "refused_right_at_1_percent": refused}
+                features.append(line)
+        features.sort(key=lambda line: -float(line["roc_area"]))
         counts = ("right_alignments", "wrong_alignments")
         return [
             make_table(("decision", *counts, "refused_right", "accepted_wrong"), decisions),
@@ -152,8 +150,8 @@ class AcceptanceRoc(Experiment, Checked):
             right, wrong = _scores(rows, name)
             if len(right) and len(wrong):
                 limits = np.quantile(np.concatenate([right, wrong]), np.linspace(0, 1, 200))
-                kept = [[float((x >= limit).mean()) for limit in limits] for x in (wrong, right)]
-                series.append(Series(name, *kept, mode="lines"))
+                x, y = ([float((of >= limit).mean()) for limit in limits] for of in (wrong, right))
+                series.append(Series(name, x, y, mode="lines"))
         results = [row["result"] for row in finished(rows)]
         for name in (THRESHOLDS, APPEAL, UNCERTAIN):
             of = shares(results, name)
@@ -250,7 +248,7 @@ def _scores(rows: Sequence[Row], feature: str) -> tuple[Float64, Float64]:
         for one in row["result"]["features"]
         if one["feature"] == feature
     ]
-    return (
-        np.array([score for one in own for score in one["right_scores"]]),
-        np.array([score for one in own for score in one["wrong_scores"]]),
+    right, wrong = (
+        [v for one in own for v in one[key]] for key in ("right_scores", "wrong_scores")
     )
+    return np.array(right), np.array(wrong)

@@ -69,11 +69,20 @@ class LastFrames(Saved):
     saved = ("_color", "_depth", "_poses")
 
     def __init__(self, batch: int, intrinsics: Intrinsics) -> None:
-        self._color = np.zeros((batch, *intrinsics.shape, 3), dtype=np.uint8)
-        self._depth = np.zeros((batch, *intrinsics.shape), dtype=np.float32)
         self._poses: Float64 = np.full((batch, 4, 4), np.nan)
+        self._depth: Float32 = np.zeros((batch, 0, 0), dtype=np.float32)
+        self._color = np.zeros((batch, 0, 0, 3), dtype=np.uint8)
+        self.use(intrinsics)
+
+    def use(self, intrinsics: Intrinsics) -> None:
+        """Expect frames of a camera; those of another size are forgotten."""
         self._intrinsics = intrinsics
         self._extract = FeatureExtractor(intrinsics)
+        size = (len(self._poses), *intrinsics.shape)
+        if self._depth.shape != size:
+            self._poses[:] = np.nan
+            self._depth = np.zeros(size, dtype=np.float32)
+            self._color = np.zeros((*size, 3), dtype=np.uint8)
 
     def keep(
         self,
@@ -90,8 +99,8 @@ class LastFrames(Saved):
         """Put an env's frame elsewhere (4, 4)."""
         self._poses[env] = T_world_camera
 
-    def forget(self, env: int | slice) -> None:
-        """Have no frame of an env, or of several."""
+    def forget(self, env: int) -> None:
+        """Have no frame of an env."""
         self._poses[env] = np.nan
 
     def find(

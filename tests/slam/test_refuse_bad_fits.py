@@ -45,7 +45,8 @@ def test_the_share_of_inliers_that_is_demanded_is_an_option(inliers: float, fuse
     scene = BoxScene()
     sensor = RGBDSensor(scene, xtion("80x60"), noise="kinect")
     start = scene.sample_start(np.random.default_rng(0))
-    slam = slam_backends.make("surfel", xtion("80x60"), acceptance={"inliers": inliers})
+    rules = {"inliers": inliers, "doubted": {"inliers": inliers}}
+    slam = slam_backends.make("surfel", xtion("80x60"), acceptance=rules)
     slam.reset(start)
     frames = [sensor.capture(start, index=k) for k in range(4)]
     assert [slam.track(frame).fused for frame in frames] == fused

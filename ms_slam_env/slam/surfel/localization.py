@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ms_slam_env._warp import wp
 from ms_slam_env.geometry import relative_angle
-from ms_slam_env.slam.alignment_check import DISPUTED, TrackingStatus, status_on_appeal
+from ms_slam_env.slam.alignment_check import (
+    DISPUTED,
+    AlignmentStatistics,
+    TrackingStatus,
+    status_on_appeal,
+)
 from ms_slam_env.slam.base import Float64
-from ms_slam_env.slam.state import Saved
+from ms_slam_env.slam.feature_poses import LastFrames
 from ms_slam_env.slam.surfel.acceptance import (
     Alignment,
     accept_any_fit,
@@ -20,20 +24,18 @@ from ms_slam_env.slam.surfel.acceptance import (
     geometric_thresholds,
     is_nearly_accepted,
 )
+from ms_slam_env.slam.surfel.camera_states import CameraStates
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer
 from ms_slam_env.slam.surfel.motion_mask import MotionMask
 from ms_slam_env.slam.surfel.photometry import (
     InvalidFrameDetector,
     geometry_only,
-    next_photometry,
-    same_exposure,
 )
 from ms_slam_env.slam.surfel.pipeline import Pipeline
 from ms_slam_env.slam.surfel.pose_hypotheses import (
     NUM_FIRST,
     NUM_HYPOTHESES,
     UNMOVED,
-    damped,
     relocalization_hypotheses,
     tracking_hypotheses,
 )
@@ -45,63 +47,6 @@ from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 CLEARLY_BETTER = 0.9  # ratio of costs
 APART_M, APART_RAD = (0.006, 0.1), np.radians((0.4, 6.0))  # more than noise, less than a jump
 RETRIES = 2  # further searches within a frame whose tracking failed
-
-
-@dataclass
-class CameraStates(Saved):
-    """What is known of the cameras of B envs, between frames."""
-
-    poses: Float64  # (B, 4, 4) T_world_camera
-    motions: Float64  # (B, 4, 4) of the last frame, which predict the next
-    photometry: NDArray[Any]  # (B,) how the live grey values relate to the map's
-    started: NDArray[np.bool_]  # (B,) whether a frame has been taken
-    lost: NDArray[np.int32]  # (B,) frames since tracking was lost
-    time: NDArray[np.int32]  # (B,) frames taken
-    doubted: NDArray[np.int32]  # (B,) frames in a row whose pose is uncertain
-
-    saved = ("poses", "motions", "photometry", "started", "lost", "time", "doubted")
-
-    @classmethod
-    def at_rest(cls, batch: int) -> CameraStates:
-        """Cameras at the identity pose that have seen nothing."""
-        identity = np.tile(np.eye(4), (batch, 1, 1))
-        zeros = np.zeros(batch, dtype=np.int32)
-        started = np.zeros(batch, dtype=bool)
-        exposure, counts = same_exposure(batch), (zeros.copy() for _ in range(3))
-        return cls(identity, identity.copy(), exposure, started, *counts)
-
-    def reset(self, env: int, pose: ArrayLike) -> None:
-        """Start one env anew at a pose (4, 4)."""
-        self.poses[env] = pose
-        self.motions[env] = np.eye(4)
-        self.photometry[env] = same_exposure(1)[0]
-        self.started[env] = False
-        self.lost[env] = 0
-        self.time[env] = 0
-        self.doubted[env] = 0
-
-    def accept(self, env: int, alignment: Alignment, least_scale: float) -> None:
-        """Move on to where the frame was tracked."""
-        self.poses[env] = alignment.T_world_live[env]
-        # Across a gap the motion is not one frame's.
-        motion = np.eye(4) if self.lost[env] else alignment.T_model_live[env]
-        # What a degenerate view leaves open was predicted itself: let it die away.
-        is_degenerate = alignment.statistics[env]["degenerate_directions"] > 0
-        self.motions[env] = damped(motion) if is_degenerate else motion
-        self.lost[env] = 0
-        self.doubted[env] = self.doubted[env] + 1 if alignment.uncertain[env] else 0
-        self.photometry[env] = next_photometry(
-            self.photometry[env],
-            alignment.photometry[env],
-            float(alignment.statistics[env]["term_conflict"]),
-            least_scale,
-        )
-
-    def hold(self, env: int) -> None:
-        """Stay where the frame was not tracked."""
-        self.motions[env] = np.eye(4)
-        self.lost[env] += 1
-        self.doubted[env] = 0
 
 
 class Localizer:
@@ -120,6 +65,7 @@ class Localizer:
         motion_mask: MotionMask,
     ) -> None:
         self.invalid_frames = InvalidFrameDetector(surfel_map.batch)
+        self.last_frames = LastFrames(surfel_map.batch, surfel_map.intrinsics)
         self._states = states
         self._map = surfel_map
         self._relocalization = relocalization
@@ -133,8 +79,7 @@ class Localizer:
         """Look at frames in this way from now on."""
         self._tracker = pipeline.tracker
         self._config = pipeline.config
-        self.last_frames = pipeline.last_frames
-        self.last_frames.forget(slice(None))
+        self.last_frames.use(pipeline.intrinsics)
         self.forget_view()
 
     def forget_view(self) -> None:
@@ -259,24 +204,30 @@ class Localizer:
         """
         states, acceptance = self._states, self._config.acceptance
         appealed = self._failed(alignment) & np.isin(alignment.status, DISPUTED)
-        for env in np.flatnonzero(appealed):
-            appealed[env] = is_nearly_accepted(alignment, int(env), acceptance)
+        for env in np.flatnonzero(appealed).tolist():
+            appealed[env] = is_nearly_accepted(alignment, env, acceptance)
         asked = (appealed | (alignment.tracked & (states.doubted > 0))) & (states.lost == 0)
         if where is not None:
             asked &= where
         poses, cutoff_m = alignment.T_world_live, self._config.depth_cutoff_m
-        for env, found in measure_consistency(frames, poses, asked, self, cutoff_m).items():
-            status = status_on_appeal(found)
-            if not appealed[env]:
-                is_refuted = status == TrackingStatus.PHOTOMETRIC_MISMATCH
-                status = TrackingStatus.UNCERTAIN if is_refuted else TrackingStatus.OK
-            if (
-                status == TrackingStatus.UNCERTAIN
-                and states.doubted[env] >= acceptance.doubted.longest
-            ):
-                status = TrackingStatus.PHOTOMETRIC_MISMATCH
-            alignment.status[env] = status
+        seen = measure_consistency(frames, poses, asked, self, cutoff_m)
+        for number, found in seen.items():
+            alignment.status[number] = self._status_on_appeal(number, found, bool(appealed[number]))
         return alignment
+
+    def _status_on_appeal(
+        self, env: int, found: AlignmentStatistics, was_refused: bool
+    ) -> TrackingStatus:
+        """What becomes of a frame that is laid upon the map's view; doubt does not last for ever.
+
+        One that the thresholds accept is at worst uncertain.
+        """
+        status, longest = status_on_appeal(found), self._config.acceptance.doubted.longest
+        if not was_refused:
+            is_refuted = status == TrackingStatus.PHOTOMETRIC_MISMATCH
+            status = TrackingStatus.UNCERTAIN if is_refuted else TrackingStatus.OK
+        is_over = status == TrackingStatus.UNCERTAIN and self._states.doubted[env] >= longest
+        return TrackingStatus.PHOTOMETRIC_MISMATCH if is_over else status
 
     def _search_by_features(self, alignment: Alignment, frames: Images) -> Alignment:
         """Align the envs that failed from where features put them.

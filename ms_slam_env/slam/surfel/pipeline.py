@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
-from ms_slam_env.slam.feature_poses import LastFrames
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.photometry import ExposureCorrection
 from ms_slam_env.slam.surfel.pose_hypotheses import NUM_HYPOTHESES
@@ -38,7 +37,6 @@ class Pipeline:
     tracker: Tracker  # of the frames against the map's views
     correct_exposure: ExposureCorrection  # of the frames before they are fused
     map_kernels: MapKernels  # over the map
-    last_frames: LastFrames  # with a known pose
 
 
 class PipelineCache:
@@ -71,7 +69,6 @@ class PipelineCache:
             map_kernels=self._map.kernels
             if is_first
             else self._map.make_kernels(intrinsics, config, stride),
-            last_frames=LastFrames(batch, intrinsics),
         )
 
 

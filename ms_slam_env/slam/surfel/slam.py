@@ -24,10 +24,11 @@ from ms_slam_env.slam.base import Float64, TrackResult
 from ms_slam_env.slam.ferns import Candidate
 from ms_slam_env.slam.state import Saved
 from ms_slam_env.slam.surfel.acceptance import Alignment, with_doubt
+from ms_slam_env.slam.surfel.camera_states import CameraStates
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.detached_map import DetachedMap
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer
-from ms_slam_env.slam.surfel.localization import CameraStates, Localizer
+from ms_slam_env.slam.surfel.localization import Localizer
 from ms_slam_env.slam.surfel.loop_closure import make_loop_closure
 from ms_slam_env.slam.surfel.motion_mask import make_motion_mask
 from ms_slam_env.slam.surfel.photometry import is_invalid_frame
@@ -63,6 +64,7 @@ class BatchedSurfelSlam(Saved):
         self.motion_mask = make_motion_mask(batch, intrinsics, config, device)
         self._localizer = Localizer(self._states, self.map, self.relocalization, self.motion_mask)
         self._invalid_frames = self._localizer.invalid_frames
+        self._last_frames = self._localizer.last_frames
         dtypes = (wp.mat44, wp.int32, wp.float32, wp.int32)  # of pose, time, weight and mask
         self._fused = [HostDeviceBuffer(batch, dtype, device) for dtype in dtypes]
         self._use(self._pipelines.get(intrinsics, config))
@@ -89,7 +91,6 @@ class BatchedSurfelSlam(Saved):
         self._correct_exposure = pipeline.correct_exposure
         self.map.use(pipeline.map_kernels)
         self._localizer.use(pipeline)
-        self._last_frames = pipeline.last_frames
 
     def reset(self, T_world_camera: ArrayLike | None = None, env: int = 0) -> None:
         """Forget one env; its next frame is taken at ``T_world_camera`` (identity if None)."""
