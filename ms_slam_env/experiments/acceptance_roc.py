@@ -32,7 +32,6 @@ Float64 = NDArray[np.float64]
 
 RIGHT_M, RIGHT_RAD = 0.02, 0.02
 WRONG_M, WRONG_RAD = 0.05, 0.05
-"""What lies between is counted as neither."""
 WARM_UP = 20  # frames before the first alignment, so that there is a map
 AWAY_M, AWAY_DEG = 0.15, 12.0  # standard deviations of a start that is moved away
 TRACKED, MOVED, ELSEWHERE = "tracked", "moved", "elsewhere"
@@ -156,9 +155,9 @@ class AcceptanceRoc(Experiment, Checked):
         for name in (THRESHOLDS, APPEAL, UNCERTAIN):
             of = shares(results, name)
             series.append(Series(name, [of["accepted_wrong"]], [1 - of["refused_right"]]))
-        panel = Panel("accepted_wrong", "accepted_right", series)
         caption = "Each line: limits on one feature; each point: a decision of the tracker."
-        return [Chart("acceptance_roc", "Right and wrong alignments", caption, [panel])]
+        panels = [Panel("accepted_wrong", "accepted_right", series)]
+        return [Chart("acceptance_roc", "Right and wrong alignments", caption, panels)]
 
 
 def judge(
@@ -169,8 +168,8 @@ def judge(
     slam.show(images)
     alignment = slam.align_near(start)
     pose = alignment.T_world_live[0]
-    away_m = float(np.linalg.norm(pose[:3, 3] - truth[:3, 3]))
-    away_rad = float(relative_angle(pose[:3, :3], truth[:3, :3]))
+    away_m = np.linalg.norm(pose[:3, 3] - truth[:3, 3])
+    away_rad = relative_angle(pose[:3, :3], truth[:3, :3])
     is_right = True if away_m < RIGHT_M and away_rad < RIGHT_RAD else None
     if away_m > WRONG_M or away_rad > WRONG_RAD:
         is_right = False
@@ -242,12 +241,8 @@ def _names() -> list[str]:
 
 
 def _scores(rows: Sequence[Row], feature: str) -> tuple[Float64, Float64]:
-    own = [
-        one
-        for row in finished(rows)
-        for one in row["result"]["features"]
-        if one["feature"] == feature
-    ]
+    every = [one for row in finished(rows) for one in row["result"]["features"]]
+    own = [one for one in every if one["feature"] == feature]
     right, wrong = (
         [v for one in own for v in one[key]] for key in ("right_scores", "wrong_scores")
     )
