@@ -69,6 +69,8 @@ def exit_code(run: Callable[[], int], name: str = "ms-slam") -> int:
         0 success, 1 failure (also of the disk), 2 bad input, 130 after Ctrl-C, 143 after SIGTERM.
     """
     interrupts = Interrupts()
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # names of files need not be text
     try:
         with interrupts, warnings.catch_warnings():
             if not sys.warnoptions:

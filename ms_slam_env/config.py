@@ -17,6 +17,7 @@ T = TypeVar("T")
 
 _RANGE = "range"
 _CHOICES = "choices"
+_SHOWN = 80  # characters of a bad value in a message
 
 
 def bounded(default: T, low: float, high: float) -> T:
@@ -199,9 +200,47 @@ def parse_value(text: str, name: str) -> Any:
         InputError: text that is not YAML.
     """
     try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError:
-        raise InputError(f"option {name!r}: {text!r} is not a YAML value") from None
+        return load_yaml(text)
+    except ValueError:
+        shown = text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
+        raise InputError(f"option {name!r}: {shown!r} is not a YAML value") from None
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML's own, but nothing may be said twice."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        """Refuse aliases, with which ten lines stand for a thousand million."""
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.composer.ComposerError(
+                None, None, "aliases (*name) are not read", self.peek_event().start_mark
+            )
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Refuse a key that is given twice, of which YAML silently keeps the last."""
+        seen = set()
+        for key_node, _ in node.value:
+            key = key_node.value if isinstance(key_node, yaml.ScalarNode) else None
+            if key is not None and key in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"key {key!r} is given twice", key_node.start_mark
+                )
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+def load_yaml(text: str) -> Any:
+    """What YAML ``text`` says: mappings, lists and plain values, without aliases.
+
+    Raises:
+        ValueError: it is no YAML, gives a key twice, is nested too deeply, or has a value that
+            cannot be: a 13th month, a number of thousands of digits; in one line.
+    """
+    try:
+        return yaml.load(text, _Loader)
+    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
+        raise ValueError(" ".join(str(error).split())) from None
 
 
 def parse_named(text: str, kind: str) -> tuple[str, dict[str, Any]]:

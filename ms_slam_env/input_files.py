@@ -5,9 +5,11 @@ A pipe would block, a device never end, and a file of any size fill the memory.
 
 from __future__ import annotations
 
+import json
 import os
 import stat
 from pathlib import Path
+from typing import Any
 
 from ms_slam_env.errors import InputError
 
@@ -64,6 +66,20 @@ def read_text(path: str | Path, kind: str, most_bytes: int = MAX_TEXT_BYTES) -> 
         return read_bytes(path, kind, most_bytes).decode("utf-8")
     except UnicodeDecodeError:
         raise InputError(f"cannot read {kind} {path}: not a text file in UTF-8") from None
+
+
+def read_json(path: str | Path, kind: str, most_bytes: int = MAX_TEXT_BYTES) -> Any:
+    """What a JSON file holds; see `check_file`.
+
+    Raises:
+        InputError: also what is no JSON, is nested too deeply, or has a number of thousands of
+            digits.
+    """
+    text = read_text(path, kind, most_bytes)
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not a JSON file: {str(error).splitlines()[0]}") from None
 
 
 def is_named(path: Path) -> bool:

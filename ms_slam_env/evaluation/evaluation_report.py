@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.evaluation.map_files import MEASURES, MapOptions, evaluate_maps
 from ms_slam_env.evaluation.map_quality import ComparedMap, share_keys
-from ms_slam_env.evaluation.trajectory_charts import error_panel, path_panel
+from ms_slam_env.evaluation.trajectory_charts import error_panel, path_panel, widest_axes
 from ms_slam_env.evaluation.trajectory_files import (
     Matched,
     TrajectoryOptions,
@@ -259,15 +259,17 @@ def map_charts(compared: ComparedMap) -> list[Chart]:
 
 
 def save_map_picture(compared: ComparedMap, path: Path) -> Path:
-    """Draw the map from above, coloured by its error."""
+    """Draw the map along the axis in which it extends least, coloured by its error."""
     figure = figures.new_figure(1, 4.6, 4.2)
     ax = figure.subplots()
     errors_cm = 100 * compared.to_surface
     picked = np.unique(np.linspace(0, len(errors_cm) - 1, _MAX_DOTS).astype(int))
     order = picked[np.argsort(errors_cm[picked])]  # the worst lie on top, so that they are seen
+    a, b = widest_axes(compared.cloud)
+    (unseen,) = {0, 1, 2} - {a, b}
     dots = ax.scatter(
-        compared.cloud[order, 0],
-        compared.cloud[order, 1],
+        compared.cloud[order, a],
+        compared.cloud[order, b],
         c=errors_cm[order],
         s=1,
         linewidths=0,
@@ -277,9 +279,9 @@ def save_map_picture(compared: ComparedMap, path: Path) -> Path:
         rasterized=True,
     )
     figure.colorbar(dots, ax=ax, label="distance to the truth [cm]")
-    ax.set(xlabel="x [m]", ylabel="y [m]")
+    ax.set(xlabel=f"{'xyz'[a]} [m]", ylabel=f"{'xyz'[b]} [m]")
     ax.set_aspect("equal", adjustable="datalim")
-    figures.caption(figure, "Map where it was judged, along z.")
+    figures.caption(figure, f"Map where it was judged, seen along {'xyz'[unseen]}.")
     return figures.save(figure, path)
 
 

@@ -20,8 +20,9 @@ from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.map_quality import ComparedMap, share_keys
 from ms_slam_env.evaluation.seen_surface import seen_surface
-from ms_slam_env.geometry import transform_points
+from ms_slam_env.geometry import MAX_COORDINATE_M, transform_points
 from ms_slam_env.geometry.cloud_registration import CUTOFF_M, REGISTRATIONS
+from ms_slam_env.input_files import MAX_MESH_BYTES, check_file
 from ms_slam_env.metrics.reconstruction import SAMPLES
 from ms_slam_env.sequences.recording import Recording, open_recording, recorded_sequence
 
@@ -147,19 +148,22 @@ def read_surface(path: Path, samples: int, seed: int = 0) -> SurfaceFile:
 
     if path.is_dir():
         return _sequence_surface(open_recording(path), path / "depth_true")
-    if not path.is_file():
-        raise InputError(f"map file {str(path)!r} does not exist")
+    check_file(path, "map file", MAX_MESH_BYTES)
     try:
-        loaded = trimesh.load(path, process=False)
-        if isinstance(loaded, trimesh.Scene):
-            loaded = loaded.to_geometry()
+        with np.errstate(all="ignore"):  # what cannot be is refused below
+            loaded = trimesh.load(path, process=False)
+            if isinstance(loaded, trimesh.Scene):
+                loaded = loaded.to_geometry()
     except Exception as error:  # trimesh raises whatever its many readers raise
         raise InputError(f"map file {str(path)!r} cannot be read: {error}") from None
     vertices = np.asarray(getattr(loaded, "vertices", np.empty((0, 3))), dtype=np.float64)
     if vertices.ndim != 2 or len(vertices) == 0:
         raise InputError(f"map file {str(path)!r} holds no points")
-    if not np.isfinite(vertices).all():
-        raise InputError(f"map file {str(path)!r} holds points that are not finite")
+    if not (np.abs(vertices) <= MAX_COORDINATE_M).all():
+        raise InputError(
+            f"map file {str(path)!r} holds points that are not finite or beyond "
+            f"{MAX_COORDINATE_M:g} m"
+        )
     if not isinstance(loaded, trimesh.Trimesh) or len(loaded.faces) == 0:
         return SurfaceFile(vertices, "cloud")
     if not loaded.area > 0:

@@ -258,7 +258,7 @@ def _tables(result: Mapping[str, Any]) -> list[Table]:
 
 
 def _charts(run: SequenceRun, sequence: Sequence) -> list[Chart]:
-    """Path from above, error over time, cost of every frame."""
+    """Path, error over time, cost of every frame."""
     if len(run) < 2:
         return []
     times, P, Q = _pairs(run, run.estimates, sequence)

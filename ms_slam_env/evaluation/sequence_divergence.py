@@ -21,12 +21,14 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.trajectory_charts import thinned
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.results import Results, write_result_folder
-from ms_slam_env.report.tables import Table, make_table
+from ms_slam_env.report.tables import Table, Value, make_table
 from ms_slam_env.sequences import Sequence as RGBDSequence
+from ms_slam_env.sequences.recording import Recording
 
 Float64 = NDArray[np.float64]
 
 KINDS = ("intensity", "depth")
+_WORST = 3  # frames of each kind that are named
 
 _ABOUT = (
     "How far each frame's histogram of intensity, and of depth, diverges from that of the frame "
@@ -43,12 +45,16 @@ class SequenceDivergence:
         times: (T,) seconds of the later frame of each pair, from the first frame on.
         divergences: (T, 2) intensity, depth, nats; intensity is NaN where there is no colour.
         gaps_s: (T,) seconds between the two frames of each pair.
+        frames: (T,) number, in the whole sequence, of the later frame of each pair.
+        files: (T,) name of its depth image; empty for a rendered sequence.
     """
 
     name: str
     times: Float64
     divergences: Float64
     gaps_s: Float64
+    frames: NDArray[np.int64]
+    files: Sequence[str]
 
     def statistics(self) -> dict[str, dict[str, float | None]]:
         """Of each kind: per frame ``max, mean, variance, std``; ``..._per_s`` those of the rates.
@@ -121,7 +127,14 @@ def sequence_divergence(
     if not sequence.has_color:
         values[:, 0] = np.nan
     times = sequence.timestamps[list(picked)]
-    return SequenceDivergence(sequence.name, times[1:] - times[0], values, np.diff(times))
+    later = np.arange(len(sequence))[::every][1:]
+    recording = sequence.frames
+    files = [
+        recording.entries[k].depth.name if isinstance(recording, Recording) else "" for k in later
+    ]
+    return SequenceDivergence(
+        sequence.name, times[1:] - times[0], values, np.diff(times), later, files
+    )
 
 
 def _with_depth(frames: Iterable[RGBDFrame], name: str) -> Iterator[RGBDFrame]:
@@ -163,6 +176,31 @@ def table(measured: Sequence[SequenceDivergence]) -> Table:
     return make_table(("sequence", "divergence", *keys, "frames"), lines)
 
 
+def worst_table(measured: Sequence[SequenceDivergence]) -> Table:
+    """The frames that diverge most from the one before, by sequence and kind."""
+    lines: list[dict[str, Value]] = [
+        {
+            "sequence": sequence.name,
+            "divergence": kind,
+            "frame": int(sequence.frames[k]),
+            "since_start_s": float(sequence.times[k]),
+            "change": float(sequence.divergences[k, column]),
+            "frame_file": sequence.files[k],
+        }
+        for sequence in measured
+        for column, kind in enumerate(KINDS)
+        for k in _worst(sequence.divergences[:, column])
+    ]
+    columns = ("sequence", "divergence", "frame", "since_start_s", "change", "frame_file")
+    return make_table(columns, lines, "Hardest frames")
+
+
+def _worst(values: Float64) -> list[int]:
+    """Indices of the largest values (T,), the largest first; none of those that are NaN."""
+    order = np.argsort(-values, stable=True)[:_WORST]
+    return [int(k) for k in order if not np.isnan(values[k])]
+
+
 def chart(measured: Sequence[SequenceDivergence]) -> Chart:
     """The divergences over time, a line for each sequence; none of intensity without colour."""
     panels = []
@@ -197,7 +235,7 @@ def write_divergences(
         kind="divergence",
         title="How hard sequences are",
         about=_ABOUT,
-        tables=[table(measured)],
+        tables=[table(measured), worst_table(measured)],
         charts=[chart(measured)],
         content=settings,
         metrics={"sequences": as_metrics(measured)},

@@ -20,14 +20,22 @@ def thinned(count: int) -> NDArray[np.int64]:
     return np.arange(0, count, max(1, -(-count // MOST_POINTS)))
 
 
+def widest_axes(points: Float64) -> tuple[int, int]:
+    """The two axes, in order, along which points (N, 3) extend most: mostly the horizontal ones.
+
+    Which axis is up differs from one data set to the next, and no file says it.
+    """
+    extent = np.nanmax(points, axis=0) - np.nanmin(points, axis=0)
+    a, b = sorted(np.argsort(extent, stable=True)[-2:].tolist())
+    return a, b
+
+
 def path_panel(paths: Mapping[str, Float64]) -> Panel:
     """Positions (N, 3) by name along the two axes along which they extend most, at one scale.
 
     A line is broken where a row is NaN.
     """
-    everything = np.concatenate(list(paths.values()))
-    extent = np.nanmax(everything, axis=0) - np.nanmin(everything, axis=0)
-    a, b = sorted(np.argsort(extent)[-2:].tolist())
+    a, b = widest_axes(np.concatenate(list(paths.values())))
     series = [_line(name, points[:, a], points[:, b]) for name, points in paths.items()]
     return Panel(f"position_{'xyz'[a]}_m", f"position_{'xyz'[b]}_m", series, equal=True)
 

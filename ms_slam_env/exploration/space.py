@@ -7,8 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import yaml
-
+from ms_slam_env.config import load_yaml
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.exploration.parameters import Choice, Float, Integer, Parameter
 from ms_slam_env.slam import check_parameters
@@ -191,8 +190,8 @@ def _parse_values(name: str, text: str, default: Any) -> Parameter:
 
 def _scalar(name: str, text: str) -> Any:
     try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError:
+        value = load_yaml(text)
+    except ValueError:
         value = []
     if value is not None and not isinstance(value, (str, int, float, bool)):
         raise InputError(f"parameter {name!r}: {text!r} is not one value")

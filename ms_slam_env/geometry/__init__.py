@@ -1,6 +1,7 @@
 """Rigid motions: SO(3) and SE(3) maps, quaternions, pose checks."""
 
 from ms_slam_env.geometry.pose import (
+    MAX_COORDINATE_M,
     check_pose,
     invert,
     look_at,
@@ -13,6 +14,7 @@ from ms_slam_env.geometry.pose import (
 from ms_slam_env.geometry.so3 import Float64, adjoint, hat, se3_exp, se3_log, so3_exp, so3_log
 
 __all__ = [
+    "MAX_COORDINATE_M",
     "Float64",
     "adjoint",
     "check_pose",

@@ -9,6 +9,9 @@ from scipy.spatial.transform import Rotation
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry.so3 import Float64
 
+MAX_COORDINATE_M = 1e9
+"""Places farther from the origin than this are mistakes, whose squares lose all precision."""
+
 _IDENTITY = np.eye(4)
 
 
@@ -16,8 +19,9 @@ def check_pose(T: ArrayLike, name: str = "pose") -> Float64:
     """Return ``T`` as float64 (4, 4) after checking that it is a rigid motion.
 
     Raises:
-        InputError: not numbers, wrong shape, a value that is not finite, or a rotation part that
-            is not orthonormal to 1e-4 with determinant +1.
+        InputError: not numbers, wrong shape, a value that is not finite, a place beyond
+            `MAX_COORDINATE_M`, or a rotation part that is not orthonormal to 1e-4 with
+            determinant +1.
     """
     try:
         matrix = np.asarray(T, dtype=np.float64)
@@ -27,6 +31,8 @@ def check_pose(T: ArrayLike, name: str = "pose") -> Float64:
         raise InputError(f"{name} must have shape (4, 4), got {matrix.shape}")
     if not np.isfinite(matrix).all():
         raise InputError(f"{name} holds a value that is not finite")
+    if not np.abs(matrix[:3, 3]).max() <= MAX_COORDINATE_M:
+        raise InputError(f"{name} is farther than {MAX_COORDINATE_M:g} m from the origin")
     R = matrix[:3, :3]
     is_rigid = (  # written out: np.allclose costs more than all the rest
         (np.abs(R @ R.T - _IDENTITY[:3, :3]) < 1e-4).all()

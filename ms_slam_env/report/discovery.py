@@ -11,9 +11,9 @@ from ms_slam_env.report.results import Results, read_results
 
 PICTURES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".gif": "image/gif"}
 _TEXTS = (".yaml", ".yml", ".md", ".txt", ".csv")
-_MAX_RESULT_BYTES = 200_000_000
-_MAX_PICTURE_BYTES = 4_000_000
-_MAX_TEXT_BYTES = 100_000
+MAX_PICTURE_BYTES = 4_000_000
+MAX_TEXT_BYTES = 100_000
+_MAX_PICTURES_BYTES = 100_000_000  # of one folder: the page is one file in memory
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def find_results(folder: Path) -> tuple[list[FoundResult], list[NotShown]]:
         own: dict[Path, Results] = {}
         for path in (path for path in paths if path.suffix == ".json"):
             try:
-                own[path] = _read(path)
+                own[path] = read_results(path)
             except InputError as error:
                 reason = str(error).removeprefix(str(path)).lstrip(": ")
                 absent.append(NotShown(path.relative_to(folder).as_posix(), reason))
@@ -85,17 +85,6 @@ def find_results(folder: Path) -> tuple[list[FoundResult], list[NotShown]]:
     return found, absent
 
 
-def _read(path: Path) -> Results:
-    """The result in a file.
-
-    Raises:
-        InputError: too large, or not a result.
-    """
-    if path.stat().st_size > _MAX_RESULT_BYTES:
-        raise InputError(f"{path} has more than {_MAX_RESULT_BYTES / 1e6:.0f} MB")
-    return read_results(path)
-
-
 def _neighbours(
     results: Mapping[Path, Results], paths: Sequence[Path]
 ) -> dict[Path, tuple[list[Path], list[Path], list[Path]]]:
@@ -103,14 +92,17 @@ def _neighbours(
     found: dict[Path, tuple[list[Path], list[Path], list[Path]]]
     found = {path: ([], [], []) for path in results}
     drawn = {chart.name for result in results.values() for chart in result.charts}
+    left = _MAX_PICTURES_BYTES
     for path in paths:
         suffix = path.suffix.lower()
         is_table = suffix == ".md" and path.stem.startswith("table")
         is_picture = suffix in PICTURES and path.stem not in drawn
         if not is_picture and (suffix not in _TEXTS or is_table):
             continue
-        most = _MAX_PICTURE_BYTES if is_picture else _MAX_TEXT_BYTES
-        kind = 2 if path.stat().st_size > most else 0 if is_picture else 1
+        most = MAX_PICTURE_BYTES if is_picture else MAX_TEXT_BYTES
+        size = path.stat().st_size
+        left -= size if is_picture and size <= most else 0
+        kind = 2 if size > most or left < 0 else 0 if is_picture else 1
         owner = max(results, key=lambda result: _likeness(result.stem, path.stem))
         found[owner][kind].append(path)
     return found

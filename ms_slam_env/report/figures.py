@@ -27,6 +27,7 @@ _LOOKS: dict[str, dict[str, Any]] = {
 _LONG_NAME = 30  # letters; legends of longer ones would leave the panels no room beside them
 
 
+@matplotlib.rc_context({"text.parse_math": False})  # a dollar in a name is a dollar
 def save_charts(charts: Iterable[Chart], out: Path) -> list[Path]:
     """Draw each chart into folder ``out`` under its name; return the paths."""
     return [save(draw(chart), out / f"{chart.name}.png") for chart in charts]

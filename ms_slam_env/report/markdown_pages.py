@@ -21,6 +21,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.input_files import read_text
 from ms_slam_env.output_files import write_text
 from ms_slam_env.report.results import RESULTS, Results, made_by, read_results
 from ms_slam_env.report.tables import Table
@@ -43,10 +44,7 @@ def update_pages(pages: Iterable[Path], results: Path, write: bool = True) -> li
     """
     changed = []
     for page in pages:
-        try:
-            before = page.read_text(encoding="utf-8")
-        except OSError as error:
-            raise InputError(f"cannot read page {page}: {error.strerror}") from None
+        before = read_text(page, "page")
         after = with_tables(before, results, str(page))
         if after != before:
             changed.append(page)

@@ -20,6 +20,25 @@
     });
   }
 
+  // A table that is wider than the page says how many of its columns are out of sight.
+  for (const box of document.querySelectorAll(".scroll")) {
+    const note = document.createElement("p");
+    note.className = "more";
+    note.hidden = true;
+    box.before(note);
+    const say = () => {
+      const right = box.getBoundingClientRect().right + 1;
+      const out = [...box.querySelectorAll("thead th")]
+        .filter((head) => head.getBoundingClientRect().right > right + 4).length;
+      note.hidden = box.scrollWidth <= box.clientWidth;
+      note.textContent = out ? `${out} more column${out > 1 ? "s" : ""} to the right \u2192` : "";
+      if (out) box.dataset.more = out;
+      else delete box.dataset.more;
+    };
+    box.addEventListener("scroll", say, { passive: true });
+    new ResizeObserver(say).observe(box);
+  }
+
   function key(cell) {
     if (cell.dataset.n !== undefined) return Number(cell.dataset.n);
     const text = cell.textContent.trim();
@@ -136,7 +155,7 @@
   // Contents: closed on a narrow screen; the section in sight is marked.
   const contents = document.querySelector("nav details");
   if (contents) {
-    if (!matchMedia("(min-width: 70rem)").matches) contents.open = false;
+    if (!matchMedia("(min-width: 92rem)").matches) contents.open = false;
     const links = new Map(
       [...contents.querySelectorAll("a")].map((link) => [link.getAttribute("href").slice(1), link]),
     );

@@ -14,10 +14,18 @@ from typing import Any
 
 from ms_slam_env import __version__
 from ms_slam_env.errors import InputError
+from ms_slam_env.input_files import read_bytes
 from ms_slam_env.metrics.registry import metric
 from ms_slam_env.output_files import check_out_file, write_text
 from ms_slam_env.report.charts import Chart
-from ms_slam_env.report.discovery import PICTURES, FoundResult, NotShown, find_results
+from ms_slam_env.report.discovery import (
+    MAX_PICTURE_BYTES,
+    MAX_TEXT_BYTES,
+    PICTURES,
+    FoundResult,
+    NotShown,
+    find_results,
+)
 from ms_slam_env.report.plotly_charts import plots_of
 from ms_slam_env.report.records import to_plain
 from ms_slam_env.report.results import Results
@@ -152,7 +160,8 @@ def _section(found: FoundResult, anchor: str, is_alone: bool) -> str:
     parts += [_pictures(found.pictures)] if found.pictures else []
     parts += [_rows(results, f"{anchor}-rows")] if results.rows else []
     parts += [
-        _text(path.name, path.read_text(encoding="utf-8", errors="replace")) for path in found.texts
+        _text(path.name, read_bytes(path, "text", MAX_TEXT_BYTES).decode(errors="replace"))
+        for path in found.texts
     ]
     content = json.dumps(to_plain(results.content), indent=1, ensure_ascii=False)
     if results.content and len(content) <= _MAX_CONTENT:
@@ -225,7 +234,10 @@ def _cell(value: Value, key: str) -> str:
         shown = number * metric(key).scale
         sign = "-" if shown < 0 else ""
         mark = f' class="n" data-n="{f"{sign}Infinity" if math.isinf(shown) else repr(shown)}"'
-    return f"<td{mark}>{escape(format_value(value, key))}</td>"
+    text = escape(format_value(value, key))
+    if isinstance(value, Interval):  # the interval may stand below its value
+        text = f"<span>{text.replace(' [', '</span> <span>[')}</span>"
+    return f"<td{mark}>{text}</td>"
 
 
 def _meanings(table: Table) -> str:
@@ -314,7 +326,7 @@ def _pictures(paths: Sequence[Path]) -> str:
     images = "\n".join(
         f'<figure><img loading="lazy" alt="{escape(path.name)}" '
         f'src="data:{PICTURES[path.suffix.lower()]};base64,'
-        f'{base64.b64encode(path.read_bytes()).decode()}">'
+        f'{base64.b64encode(read_bytes(path, "picture", MAX_PICTURE_BYTES)).decode()}">'
         f"<figcaption>{escape(path.name)}</figcaption></figure>"
         for path in paths
     )

@@ -11,7 +11,6 @@ Whatever has a kind and tables is shown by ``ms-slam report``, which knows nothi
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from types import NoneType
 from typing import Any
 
 from ms_slam_env.errors import InputError
+from ms_slam_env.input_files import read_json
 from ms_slam_env.metrics.registry import RESULTS_VERSION, RESULTS_VERSIONS, check_keys
 from ms_slam_env.output_files import result_folder, write_text
 from ms_slam_env.report.charts import Chart, chart_from_json
@@ -28,6 +28,7 @@ from ms_slam_env.report.tables import Table, table_from_json
 
 RESULTS = "results.json"
 TABLE = "table.md"
+_MAX_BYTES = 200_000_000
 
 
 @dataclass(frozen=True)
@@ -163,12 +164,7 @@ def read_results(path: Path) -> Results:
     Raises:
         InputError: no such file, not a result, or keys that the registry does not know.
     """
-    try:
-        content = from_plain(json.loads(path.read_text(encoding="utf-8")))
-    except OSError as error:
-        raise InputError(f"cannot read result {path}: {error.strerror}") from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not a JSON file: {str(error).splitlines()[0]}") from None
+    content = from_plain(read_json(path, "result", _MAX_BYTES))
     if not is_result(content):
         raise InputError(f"{path} is not a result of ms-slam: it has no kind and tables")
     try:

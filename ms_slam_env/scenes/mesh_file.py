@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from ms_slam_env.errors import InputError
+from ms_slam_env.input_files import MAX_MESH_BYTES, check_file
 from ms_slam_env.scenes import mesh_cache
 from ms_slam_env.scenes.base import Float64, Rng, TexturedMesh
 from ms_slam_env.scenes.builder import Geometry
@@ -55,10 +56,12 @@ def load_soup(path: Path) -> Soup:
     Raises:
         InputError: no such file, not readable as a mesh, or without a triangle.
     """
-    if not path.is_file():
+    if not path.exists():
         raise InputError(f"mesh file {str(path)!r} does not exist")
+    check_file(path, "mesh file", MAX_MESH_BYTES)
     try:
-        parts = trimesh.load_scene(path).dump()
+        with np.errstate(all="ignore"):  # what cannot be is refused below
+            parts = trimesh.load_scene(path).dump()
     except Exception as error:  # the loaders of the many formats raise anything
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"mesh file {str(path)!r} cannot be read: {reason}") from error
@@ -69,6 +72,10 @@ def load_soup(path: Path) -> Soup:
         if not isinstance(part, trimesh.Trimesh) or len(part.faces) == 0:
             continue
         triangles = np.asarray(part.vertices, dtype=np.float64)[part.faces]
+        if not (np.abs(triangles[np.isfinite(triangles)]) <= _MAX_COORDINATE_M).all():
+            raise InputError(
+                f"mesh file {str(path)!r} reaches farther than {_MAX_COORDINATE_M:g} m"
+            )
         area = np.linalg.norm(face_cross(triangles), axis=1)
         keep = np.isfinite(triangles).all((1, 2)) & (area > 1e-12)
         uv, image = _appearance(part)
@@ -187,6 +194,7 @@ def _plain(rgb: Any) -> NDArray[np.uint8]:
 
 _OF_MESH = ("vertices", "faces", "uv", "face_texture", "face_label", "irradiance")
 _MAX_EDGE_M = 0.3
+_MAX_COORDINATE_M = 1e4  # of a place that a camera moves in
 _LAMPS = 10
 _KEY = 0.2
 _FACING_M = 0.06

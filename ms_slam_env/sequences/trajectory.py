@@ -10,7 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import Float64, check_pose, pose_from_quaternion, quaternion_from_pose
+from ms_slam_env.geometry import (
+    MAX_COORDINATE_M,
+    Float64,
+    check_pose,
+    pose_from_quaternion,
+    quaternion_from_pose,
+)
 from ms_slam_env.input_files import read_text
 from ms_slam_env.output_files import write_text
 
@@ -18,6 +24,8 @@ Int64 = NDArray[np.int64]
 
 MAX_DIFFERENCE_S = 0.02
 """Timestamps further apart do not belong together (the tolerance of the TUM tools)."""
+
+_MAX_TIME_S = 1e20  # nanoseconds since 1970 are taken too, as they stand
 
 _FIELDS = "timestamp tx ty tz qx qy qz qw"
 
@@ -57,7 +65,11 @@ def _parse(line: str, where: str) -> Sequence[float]:
         raise InputError(f"{where}: expected the 8 numbers '{_FIELDS}', got {line.strip()!r}")
     if not np.isfinite(numbers).all():
         raise InputError(f"{where}: a number is not finite")
-    if abs(np.linalg.norm(numbers[4:]) - 1.0) > 1e-2:
+    if max(map(abs, numbers[1:4])) > MAX_COORDINATE_M or abs(numbers[0]) > _MAX_TIME_S:
+        raise InputError(
+            f"{where}: a position beyond {MAX_COORDINATE_M:g} m or a time beyond {_MAX_TIME_S:g} s"
+        )
+    if max(map(abs, numbers[4:])) > 2 or abs(np.linalg.norm(numbers[4:]) - 1.0) > 1e-2:
         raise InputError(f"{where}: the quaternion {numbers[4:]} is not of unit length")
     return numbers
 

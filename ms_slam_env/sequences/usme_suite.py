@@ -26,6 +26,7 @@ from ms_slam_env import __version__, scenes
 from ms_slam_env.camera import xtion
 from ms_slam_env.config import parse_named
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.input_files import read_json
 from ms_slam_env.scenes import Scene
 from ms_slam_env.sequences import (
     HandheldPath,
@@ -275,10 +276,9 @@ def check_folder(folder: Path, image_size: str, seed: int, frames_scale: float) 
     file = folder / DESCRIPTION
     if not file.is_file():
         raise InputError(f"{folder} holds no finished sequence; ms-slam usme make writes it")
-    try:
-        found = json.loads(file.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise InputError(f"cannot read {file}: {error}") from None
+    found = read_json(file, "description")
+    if not isinstance(found, dict):
+        raise InputError(f"{file} describes no sequence")
     for name, value in wanted.items():
         if found.get(name) != value:
             raise InputError(

@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
+from ms_slam_env.input_files import read_json
 from ms_slam_env.interrupts import kept
 from ms_slam_env.output_files import write_bytes, write_text
 from ms_slam_env.sequences.rendering import RenderedSequence
@@ -117,10 +118,7 @@ def _begin(partial: Path, content: dict[str, Any]) -> None:
 
 
 def _read(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"cannot read {path}: {error}") from None
+    return read_json(path, "description")
 
 
 def _write_frame(

@@ -11,13 +11,15 @@ from typing import Any
 import yaml
 
 from ms_slam_env.camera import Intrinsics, parse_image_size
-from ms_slam_env.config import Checked, bounded, from_dict
+from ms_slam_env.config import Checked, bounded, from_dict, load_yaml
 from ms_slam_env.errors import InputError
+from ms_slam_env.input_files import read_text
 from ms_slam_env.output_files import write_text
 from ms_slam_env.slam.base import SlamBackend
 from ms_slam_env.slam.registry import check_parameters, make_backend
 
 SUFFIXES = (".yaml", ".yml")
+_MAX_BYTES = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -97,15 +99,11 @@ def read_configuration(path: str | Path) -> SlamConfiguration:
         InputError: no such file, no YAML, an unknown or repeated key, or a bad value; one line that
             names the file and the key.
     """
+    text = read_text(path, "configuration", _MAX_BYTES)
     try:
-        with Path(path).open(encoding="utf-8") as file:
-            content = yaml.load(file, _Loader)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: not a text file in UTF-8") from None
-    except yaml.YAMLError as error:
-        raise InputError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
+        content = load_yaml(text)
+    except ValueError as error:
+        raise InputError(f"{path}: not YAML: {error}") from None
     if not isinstance(content, Mapping):
         fields = ", ".join(field.name for field in dataclasses.fields(SlamConfiguration))
         raise InputError(f"{path}: holds no mapping of {fields}")
@@ -145,19 +143,3 @@ def _plain(value: Any) -> Any:
     if hasattr(value, "tolist"):  # a number or an array of NumPy
         return value.tolist()
     return value
-
-
-class _Loader(yaml.SafeLoader):
-    """Refuses a key that is given twice, of which YAML's own loader silently keeps the last."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Construct the mapping of ``node``."""
-        seen = set()
-        for key_node, _ in node.value:
-            key = key_node.value if isinstance(key_node, yaml.ScalarNode) else None
-            if key is not None and key in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"key {key!r} is given twice", key_node.start_mark
-                )
-            seen.add(key)
-        return super().construct_mapping(node, deep)

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
+import os
+import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -87,7 +91,8 @@ def test_fewer_frames_diverge_more(folder):
 
 def test_rates_follow_the_time_between_frames():
     values = np.array([[2.0, 1.0], [6.0, 1.0]])
-    found = SequenceDivergence("s", np.array([1.0, 4.0]), values, np.array([1.0, 3.0]))
+    times, gaps = np.array([1.0, 4.0]), np.array([1.0, 3.0])
+    found = SequenceDivergence("s", times, values, gaps, np.array([1, 2]), ["", ""])
     assert found.statistics()["intensity"]["mean_per_s"] == 2.0
     assert found.statistics()["intensity"]["max_per_s"] == 2.0
 
@@ -99,3 +104,28 @@ def test_bad_input(folder, capsys):
     assert "a divergence needs two" in capsys.readouterr().err
     with pytest.raises(InputError, match="every must be"):
         sequence_divergence(open_sequence(folder), every=0)
+
+
+def test_the_hardest_frames_are_named(folder, tmp_path, capsys):
+    sequence = open_sequence(folder)
+    assert main(["divergence", str(folder), "--every", "2", "--out", str(tmp_path)]) == 0
+    content = json.loads((tmp_path / "divergence.json").read_text())
+    values = np.array(content["sequences"][0]["depth_divergence"])
+    rows = [row for row in content["tables"][1]["rows"] if row["divergence"] == "depth"]
+    assert [row["frame"] for row in rows] == (2 * (1 + np.argsort(-values))).tolist()
+    assert [row["change"] for row in rows] == sorted(values, reverse=True)
+    names = [sequence.frames.entries[row["frame"]].depth.name for row in rows]
+    assert [row["frame_file"] for row in rows] == names
+    assert names[0] in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["a$b$c", r"$\frac{", "p|q", os.fsdecode(b"x\xff")])
+def test_any_name_of_a_folder_will_do(folder, tmp_path, monkeypatch, name):
+    place = tmp_path / name
+    shutil.copytree(folder, place)
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), "utf-8", "strict"))
+    assert main(["divergence", str(place), "--out", str(tmp_path / "out")]) == 0
+    sys.stdout.flush()
+    assert (tmp_path / "out/divergence.png").is_file()
+    content = json.loads((tmp_path / "out/divergence.json").read_text())
+    assert content["sequences"][0]["sequence"] == name

@@ -246,7 +246,10 @@ def test_manages_frames(sequence, tmp_path, capsys):
         (["run", "SEQUENCE", "--image-size", "3x2"], "unknown image size '3x2'"),
         (["run", "SEQUENCE", "--frame-management", "some"], "'some'; valid choices: none, regular"),
         (["run", "SEQUENCE", "--frame-management", "divergence,x=1"], "frame_management.x"),
-        (["run", "SEQUENCE", "--config", "no.yaml"], "no.yaml: cannot be read: No such file"),
+        (
+            ["run", "SEQUENCE", "--config", "no.yaml"],
+            "cannot read configuration no.yaml: No such file",
+        ),
     ],
 )
 def test_bad_input_is_one_line(arguments, message, sequence, tmp_path, capsys):

@@ -83,7 +83,7 @@ def test_a_recorded_specification_can_be_run_again():
         ({"image_size": "1x1"}, "unknown image size"),
         ({"scenes": ("mars",)}, "unknown scene"),
         ({"thresholds": (0.1,)}, "thresholds"),
-        ({"configurations": ("a.yaml", "b.yaml")}, "a.yaml: cannot be read"),
+        ({"configurations": ("a.yaml", "b.yaml")}, "cannot read configuration a.yaml"),
     ],
 )
 def test_bad_options(fields, message):

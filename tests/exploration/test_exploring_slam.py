@@ -236,7 +236,7 @@ def test_a_grid_measures_each_point_once(sequences, tmp_path):
         (["--held-out", "."], "is no RGB-D sequence"),
         (["--held-out", "table:1002"], "sequence table:1002 is explored and held out"),
         (["--trials", "0"], "trials = 0 must be at least 1"),
-        (["--config", "no.yaml"], "no.yaml: cannot be read"),
+        (["--config", "no.yaml"], "cannot read configuration no.yaml"),
         (["--clock", "sundial"], "valid choices: processor, wall"),
         (["--frames", "3"], "frames = 3 is outside"),
         (["--image-size", "3x3"], "unknown image size '3x3'"),

@@ -22,7 +22,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.metrics.registry import RESULTS_VERSION, metric
 from ms_slam_env.report.charts import Chart, Guide, Panel, Series
 from ms_slam_env.report.discovery import find_results
-from ms_slam_env.report.page import page
+from ms_slam_env.report.page import page, write_report
 from ms_slam_env.report.plotly_charts import PALETTE, plots_of
 from ms_slam_env.report.results import read_results, write_results
 from ms_slam_env.report.statistics import Interval
@@ -158,7 +158,7 @@ def test_the_page_shows_tables_with_what_columns_mean(tmp_path: Path) -> None:
     for part in ("About it.", "A note.", "By planner", "ATE [mm]", "table [%]", "Made by"):
         assert part in text
     assert escape(metric("ate_m").explanation) in text
-    assert '<td class="n" data-n="12.3">12.3 [10.0, 20.0]</td>' in text
+    assert '<td class="n" data-n="12.3"><span>12.3</span> <span>[10.0, 20.0]</span></td>' in text
     assert '<td class="n" data-n="Infinity">never</td>' in text
     assert "<td>-</td>" in text
 
@@ -384,3 +384,32 @@ def test_out_that_is_a_folder_and_missing_plotly_are_said(
     monkeypatch.setitem(sys.modules, "plotly.offline", None)
     assert main(["report", str(tmp_path)]) == 2
     assert "pip install ms-slam-env[report]" in capsys.readouterr().err
+
+
+def test_only_regular_files_of_the_folder_are_read(tmp_path: Path) -> None:
+    """A pipe would block, a device never end, a link show a file from elsewhere."""
+    folder = tmp_path / "results"
+    write_results(folder / "results.json", "k", "mine", "")
+    (tmp_path / "secret.txt").write_text("secret")
+    (tmp_path / "secret.json").write_text((folder / "results.json").read_text())
+    (folder / "link.txt").symlink_to(tmp_path / "secret.txt")
+    (folder / "other.json").symlink_to(tmp_path / "secret.json")
+    (folder / "zero.png").symlink_to("/dev/zero")
+    (folder / "gone.json").symlink_to(tmp_path / "gone.json")
+    for name in ("a.txt", "b.json", "c.png"):
+        os.mkfifo(folder / name)
+    found, _ = find_results(folder)
+    assert [(one.path.name, one.pictures, one.texts) for one in found] == [("results.json", [], [])]
+    assert "secret" not in write_report(folder).read_text()
+    with pytest.raises(InputError, match="not a regular file"):
+        read_results(folder / "b.json")
+
+
+def test_pictures_of_a_folder_are_bounded_together(tmp_path: Path) -> None:
+    write_results(tmp_path / "results.json", "k", "mine", "")
+    for number in range(26):
+        with (tmp_path / f"p{number:02d}.png").open("wb") as file:
+            file.truncate(4_000_000)
+    (found,), absent = find_results(tmp_path)
+    assert len(found.pictures) == 25
+    assert [missing.name for missing in absent] == ["p25.png"]

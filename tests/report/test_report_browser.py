@@ -15,6 +15,7 @@ from PIL import Image
 from ms_slam_env.report.charts import Chart, Guide, Panel, Series
 from ms_slam_env.report.page import write_report
 from ms_slam_env.report.results import write_results
+from ms_slam_env.report.statistics import Interval
 from ms_slam_env.report.tables import Column, make_table
 
 pytest.importorskip("plotly")
@@ -217,3 +218,38 @@ def test_a_phone_scrolls_tables_not_the_page(browser: Any, report: Path) -> None
     assert (width, inner, too_wide) == (390, 390, 0)
     assert ground == "rgb(20, 24, 28)"
     assert phone.problems == []
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_columns_out_of_sight_are_counted(browser: Any, tmp_path: Path, width: int) -> None:
+    names = ("path", "ate", "ate_max", "rpe", "ate_mean", "ate_median", "ate_std")
+    keys = [f"{name}_m" for name in names]
+    row = dict.fromkeys(keys, Interval(0.001234, 0.000123, 0.01234))
+    wide = [Column(f"{k}{n}", k) for n in range(3) for k in keys]
+    tables = [
+        make_table(["sequence", *keys], [{"sequence": "living_room:2000:kinect", **row}]),
+        make_table(
+            ["sequence", *wide],
+            [{"sequence": "x", **{c.name: row[c.key] for c in wide}}],
+        ),
+    ]
+    write_results(tmp_path / "results.json", "k", "wide", "", tables=tables)
+    page = Visit(browser, write_report(tmp_path), viewport={"width": width, "height": 800})
+    found = page.page.evaluate(
+        "[...document.querySelectorAll('.scroll')].map((box) => ["
+        "[...box.querySelectorAll('th')].filter((h) => h.getBoundingClientRect().right > "
+        "box.getBoundingClientRect().right + 5).length, box.previousSibling.textContent])"
+    )
+    page.page.locator(".scroll").nth(1).evaluate("(box) => { box.scrollLeft = 1e6; }")
+    page.page.wait_for_selector(".scroll:not([data-more]) >> nth=0")
+    page.page.wait_for_timeout(100)
+    at_the_end = page.page.locator(".more").nth(1).text_content()
+    page.context.close()
+    (fits, first), (out, second) = found
+    if width == 1280:  # eight columns of values with intervals
+        assert (fits, first) == (0, "")
+    else:
+        assert first == f"{fits} more columns to the right →"
+    assert out > 3
+    assert second == f"{out} more columns to the right →"
+    assert at_the_end == ""

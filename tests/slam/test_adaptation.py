@@ -238,7 +238,7 @@ def test_the_change_may_be_counted_per_second(frames):
         ({"name": "magic"}, "unknown adaptation.name 'magic'; valid choices: none, divergence"),
         ({"name": "agent", "speed": 1}, "unknown option of AgentConfig 'adaptation.speed'"),
         ({"name": "agent", "configurations": "fast.yaml"}, "must be a list of files"),
-        ({"name": "agent", "configurations": ["no.yaml", {}]}, "no.yaml: cannot be read"),
+        ({"name": "agent", "configurations": ["no.yaml", {}]}, "cannot read configuration no.yaml"),
         ({"name": "agent", "configurations": [{}]}, "must be at least two"),
         ({"name": "agent", "configurations": [{}] * 9}, "at most 8"),
         ({"name": "agent", "configurations": [1, 2]}, r"configurations\[0\] = 1 must be"),

@@ -1,5 +1,7 @@
 """SLAM configurations as YAML files: what is written is read back, and bad files say why."""
 
+import os
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -70,7 +72,7 @@ def test_an_environment_takes_a_file(tmp_path):
     assert ActiveSlamEnv(slam_config=path, image_size="160x120").config.image_size == "160x120"
     with pytest.raises(InputError, match=r"slam = 'surfel' but .* configures 'odometry'"):
         ActiveSlamEnv(slam_config=path, slam="surfel")
-    with pytest.raises(InputError, match=r"nowhere\.yaml: cannot be read"):
+    with pytest.raises(InputError, match=r"cannot read configuration .*nowhere\.yaml"):
         ActiveSlamEnv(slam_config="nowhere.yaml")
 
 
@@ -112,8 +114,34 @@ def test_a_bad_file_is_one_line_that_names_it(content, message, tmp_path):
 
 def test_files_that_cannot_be_read(tmp_path):
     for path in (tmp_path / "missing.yaml", tmp_path):
-        with pytest.raises(InputError, match="cannot be read"):
+        with pytest.raises(InputError, match="cannot read"):
             read_configuration(path)
     (tmp_path / "picture.yaml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match="not a text file"):
         read_configuration(tmp_path / "picture.yaml")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (f"threads: {'9' * 5000}\n", "not YAML: .*digits"),
+        ("about: {when: 2020-13-45}\n", "not YAML: .*month"),
+        (
+            "a: &a [x, x]\nb: &b [*a, *a]\nabout: {c: [*b, *b]}\n",
+            r"not YAML: aliases \(\*name\) are not read",
+        ),
+        (f"about: {'[' * 5000}\n", "not YAML"),
+    ],
+)
+def test_what_only_seems_to_be_yaml_is_one_line(tmp_path, text, message):
+    path = tmp_path / "slam.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message) as caught:
+        read_configuration(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_pipe_is_no_configuration(tmp_path):
+    os.mkfifo(tmp_path / "slam.yaml")
+    with pytest.raises(InputError, match="not a regular file"):
+        read_configuration(tmp_path / "slam.yaml")

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import Float64, make_pose
+from ms_slam_env.input_files import MAX_TEXT_BYTES, read_bytes
 from ms_slam_env.robot.arm.chain import Chain, separate_pairs
 
 Int32 = NDArray[np.int32]
@@ -94,7 +95,8 @@ def _compile(model: str, path: Path) -> mujoco.MjModel:
             f"arm.model {model!r}: no such file; valid choices: {', '.join(ARM_MODELS)}, "
             "or the path of an MJCF file"
         )
-    if path.suffix == ".urdf" or _ROBOT.search(path.read_text(errors="replace")):
+    text = read_bytes(path, "arm model", MAX_TEXT_BYTES).decode(errors="replace")
+    if path.suffix == ".urdf" or _ROBOT.search(text):
         raise InputError(
             f"arm {path} is a URDF; an MJCF is needed: load the file in MuJoCo, save it with "
             "mujoco.mj_saveLastXML, and add position actuators and a camera site"
