@@ -93,7 +93,8 @@ class LastFrames(Saved):
     ) -> None:
         """Take the frames (B, H, W) of the envs whose poses (B, 4, 4) are ``known`` (B,)."""
         for own, new in ((self._color, color), (self._depth, depth), (self._poses, T_world_camera)):
-            own[known] = new[known]
+            for env in np.flatnonzero(known):
+                own[env] = new[env]
 
     def move(self, env: int, T_world_camera: Float64) -> None:
         """Put an env's frame elsewhere (4, 4)."""
