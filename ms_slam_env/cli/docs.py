@@ -17,14 +17,14 @@ _PAGES = ("README.md", "BENCHMARK.md")
 
 @dataclass(frozen=True)
 class Arguments:
-    """Write the tables of a clone's Markdown pages from its committed results.
+    """Write the tables of a clone's Markdown pages, and those beside its results, from the results.
 
     A table stands between <!-- results: FOLDER table=0 columns=planner,ate_m --> and
     <!-- end -->; FOLDER is one of docs/results.
     """
 
     pages: tyro.conf.Positional[tuple[Path, ...]] = ()
-    """Pages; by default README.md, BENCHMARK.md and those in docs."""
+    """Pages; by default README.md, BENCHMARK.md, those in docs, and the tables beside results."""
     root: Path = Path()
     """Root of the clone."""
     check: bool = False
@@ -34,12 +34,14 @@ class Arguments:
 def main(arguments: Sequence[str]) -> int:
     """Write the tables, or check them, and print the pages that were out of date."""
     args = parse(Arguments, arguments, "ms-slam docs")
-    from ms_slam_env.report.markdown_pages import update_pages
+    from ms_slam_env.report.markdown_pages import update_pages, update_tables
 
     pages = args.pages or pages_of(args.root)
     if not pages:
         raise InputError(f"{args.root} holds no pages: neither {' nor '.join(_PAGES)}")
-    changed = update_pages(pages, args.root / "docs" / "results", write=not args.check)
+    results = args.root / "docs" / "results"
+    changed = [] if args.pages else update_tables(results, write=not args.check)
+    changed += update_pages(pages, results, write=not args.check)
     for page in changed:
         print(f"{page}: {'out of date' if args.check else 'written'}")
     if args.check and changed:

@@ -23,7 +23,8 @@ from pathlib import Path
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.input_files import read_text
 from ms_slam_env.output_files import write_text
-from ms_slam_env.report.results import RESULTS, Results, made_by, read_results
+from ms_slam_env.report.discovery import find_results
+from ms_slam_env.report.results import RESULTS, TABLE, Results, made_by, read_results
 from ms_slam_env.report.tables import Table
 
 _START = re.compile(r"^<!-- results: (?P<what>.*) -->$")
@@ -50,6 +51,27 @@ def update_pages(pages: Iterable[Path], results: Path, write: bool = True) -> li
             changed.append(page)
             if write:
                 write_text(page, after)
+    return changed
+
+
+def update_tables(results: Path, write: bool = True) -> list[Path]:
+    """Write the tables that lie beside results; return those that were out of date.
+
+    They say how old their figures are, which changes with the code.
+
+    Raises:
+        InputError: a folder without results.
+    """
+    changed = []
+    found, _ = find_results(results)
+    for result in found:
+        alone = sum(other.path.parent == result.path.parent for other in found) == 1
+        path = result.path.with_name(TABLE if alone else f"{result.path.stem}.md")
+        text = result.results.as_markdown()
+        if not path.is_file() or read_text(path, "table") != text:
+            changed.append(path)
+            if write:
+                write_text(path, text)
     return changed
 
 

@@ -37,6 +37,13 @@ def test_a_table_is_written_between_its_comments(clone: Path) -> None:
     expected = PAGE.format("x columns=ate_m,planner rows=2", table)
     assert (clone / "README.md").read_text() == expected
     assert main([*arguments, "--check"]) == 0
+    beside = clone / "docs/results/x/table.md"
+    now = beside.read_text()
+    beside.write_text("older\n")
+    assert main([*arguments, "--check"]) == 1
+    assert beside.read_text() == "older\n"
+    assert main(arguments) == 0
+    assert beside.read_text() == now
 
 
 def test_age_and_command_stand_with_the_table(clone: Path) -> None:
