@@ -1,6 +1,8 @@
 """Fixtures shared by all tests."""
 
+import importlib
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from box_scene import BoxScene
@@ -9,6 +11,20 @@ from hypothesis import settings
 # The same examples on every run: a failure says something about the change that shows it.
 settings.register_profile("repeatable", derandomize=True)
 settings.load_profile("repeatable")
+
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def pytest_configure() -> None:
+    """Refuse to test another checkout than this one, as an environment that two share would."""
+    for name in ("ms_slam_env", "ms_slam_agents", "ms_slam_baselines"):
+        found = Path(next(iter(importlib.import_module(name).__path__))).resolve()
+        if ROOT not in found.parents:
+            raise pytest.UsageError(
+                f"{name} would be tested from {found}, these tests are of {ROOT}: install this "
+                "checkout (make install), or put it on PYTHONPATH under these three names"
+            )
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -21,12 +21,12 @@ from ms_slam_env.parallel import limit_threads, thread_environment
 from ms_slam_env.report.charts import Chart, scatter
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished, make_table
-from ms_slam_env.scenes import ROOMS
+from ms_slam_env.scenes import PUBLISHED_ROOMS
 from ms_slam_env.sequences import HandheldPath, check_sequence
 
 DEFAULT_SEQUENCES = (
     "living_room:2000:none",
-    *(f"{scene}:2000" for scene in ROOMS),
+    *(f"{scene}:2000" for scene in PUBLISHED_ROOMS),
     *(
         f"living_room:2000:kinect+{name}"
         for name in (

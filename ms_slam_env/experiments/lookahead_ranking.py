@@ -29,7 +29,7 @@ from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished, make_table, summary
 from ms_slam_env.robot import CAMERA_RADIUS_M, NUM_ROTATIONS
 from ms_slam_env.robot.action_primitives import decompose
-from ms_slam_env.scenes import ROOMS
+from ms_slam_env.scenes import PUBLISHED_ROOMS
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sensor.scene_cache import get_scene
@@ -102,7 +102,7 @@ class LookaheadRanking(Experiment):
     measured and predicted.
     """
 
-    scenes: tuple[str, ...] = ROOMS
+    scenes: tuple[str, ...] = PUBLISHED_ROOMS
     """Names of scenes, or mesh files."""
     seeds: str = "validation"
     """Split that the seeds come from; the defaults read from the result may not use test seeds."""

@@ -34,7 +34,7 @@ from ms_slam_env.report.charts import Chart, Panel, interval_series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.statistics import median_interval
 from ms_slam_env.report.tables import Table, Value, finished, format_value, make_table, summary
-from ms_slam_env.scenes import ROOMS, Scene
+from ms_slam_env.scenes import PUBLISHED_ROOMS, Scene
 from ms_slam_env.scenes.registry import check_name
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.surfel.config import RELOCALISATIONS
@@ -72,7 +72,7 @@ class Relocalization(Experiment, Checked):
     where any pose is wrong.
     """
 
-    scenes: tuple[str, ...] = ROOMS
+    scenes: tuple[str, ...] = PUBLISHED_ROOMS
     """Names of scenes; the maps take them in turns."""
     sizes: tuple[str, ...] = ("160x120", "320x240")
     """Image sizes."""

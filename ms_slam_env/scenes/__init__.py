@@ -1,10 +1,19 @@
 """Textured, lit scenes by name and seed (rooms, a hall, streets), and mesh files by path."""
 
 from ms_slam_env.scenes.base import Scene, TexturedMesh
-from ms_slam_env.scenes.registry import LARGE_SCENES, ROOMS, SCENES, SEED_SPLITS, make, split_of
+from ms_slam_env.scenes.registry import (
+    LARGE_SCENES,
+    PUBLISHED_ROOMS,
+    ROOMS,
+    SCENES,
+    SEED_SPLITS,
+    make,
+    split_of,
+)
 
 __all__ = [
     "LARGE_SCENES",
+    "PUBLISHED_ROOMS",
     "ROOMS",
     "SCENES",
     "SEED_SPLITS",

@@ -284,7 +284,7 @@ def test_use_before_reset_says_so():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"scene": "kitchen"}, "valid choices: living_room"),
+        ({"scene": "no-such-scene"}, "valid choices: living_room"),
         ({"scene": None}, "scene = None must be a name or several"),
         ({"scene": ()}, "must be a name or several"),
         ({"slam": "orb"}, "valid choices: .*surfel"),

@@ -40,7 +40,7 @@ ROWS = [
         ("sequences", ("table:x",), "neither a folder nor scene:seed"),
         ("sequences", ("table:1:fog",), "'fog'; valid choices: kinect"),
         ("sequences", ("table:1:none+fog",), "'fog'; valid choices: .*rolling-shutter"),
-        ("sequences", ("attic:1",), "valid choices: living_room"),
+        ("sequences", ("no-such-scene:1",), "valid choices: living_room"),
         ("sequences", (), "Compare.sequences is empty"),
         ("backends", ("lidar",), "valid choices: surfel"),
         ("backends", ("surfel,icp",), "'icp' is not option=value"),

@@ -62,6 +62,6 @@ def test_one_line_a_setting_that_has_states():
 
 def test_bad_arguments_are_refused():
     with pytest.raises(InputError, match="living_room"):
-        LookaheadRanking(scenes=("kitchen",)).specs()
+        LookaheadRanking(scenes=("no-such-scene",)).specs()
     with pytest.raises(InputError, match="states"):
         LookaheadRanking(states=0).specs()

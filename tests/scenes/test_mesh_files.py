@@ -139,7 +139,7 @@ def _single_line(error: pytest.ExceptionInfo) -> str:
 
 def test_an_unknown_name_lists_the_scenes_and_mentions_mesh_files():
     with pytest.raises(InputError) as error:
-        scenes.make("kitchen")
+        scenes.make("no-such-scene")
     message = _single_line(error)
     assert all(name in message for name in scenes.SCENES)
     assert ".glb" in message

@@ -72,7 +72,7 @@ def test_the_path_is_named_or_that_of_the_command() -> None:
         ("table:1:motion-blur,fog=1", "motion-blur.fog"),
         ("table:1:motion-blur,fog", "'fog' is not option=value"),
         ("table:1:uneven,frames=1", "UnevenPath.frames = 1 is outside"),
-        ("attic:1", "valid choices: living_room"),
+        ("no-such-scene:1", "valid choices: living_room"),
     ],
 )
 def test_bad_names_are_refused_in_one_line(text: str, message: str) -> None:
