@@ -79,6 +79,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
         (r"\(\.\./BENCHMARK\.md", f"({up}benchmark.md"),
         (r"\(\.\./CHANGELOG\.md", f"({up}changelog.md"),
         (r"\(\.\./SECURITY\.md", f"({up}security.md"),
+        (r"\(\.\./CONTRIBUTING\.md", f"({up}contributing.md"),
         (r"\(\.\./README\.md", f"({up}index.md"),
         (r"\(\.\./notebooks/", f"({up}notebooks/"),
         (r"(\(results/[^)]*/)table\.md", r"\1index.md"),
@@ -93,8 +94,8 @@ def on_page_content(html: str, **_: Any) -> str:
 
 
 def _root_pages() -> Iterator[tuple[str, str]]:
-    """BENCHMARK.md, CHANGELOG.md and SECURITY.md as pages beside those of docs/."""
-    for name in ("BENCHMARK", "CHANGELOG", "SECURITY"):
+    """BENCHMARK.md and other texts of the root as pages beside those of docs/."""
+    for name in ("BENCHMARK", "CHANGELOG", "CONTRIBUTING", "SECURITY"):
         text = (ROOT / f"{name}.md").read_text(encoding="utf-8")
         text = re.sub(r"\(docs/", "(", text).replace("(README.md", "(index.md")
         yield f"{name.lower()}.md", re.sub(r"\(CHANGELOG\.md", "(changelog.md", text)

@@ -15,7 +15,8 @@ from ms_slam_env.cli import COMMANDS
 from ms_slam_env.experiments.harness import experiment_names
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = [ROOT / "README.md", ROOT / "BENCHMARK.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+AT_ROOT = [ROOT / f"{name}.md" for name in ("README", "BENCHMARK", "CONTRIBUTING")]
+PAGES = [*AT_ROOT, *sorted((ROOT / "docs").glob("*.md"))]
 FILE = re.compile(r"`((?:ms_slam_env|baselines|agents|tests|docs|notebooks)/[\w./-]*)`")
 LINK = re.compile(r"\]\((?!https?:)([^)#\s]*)(?:#([^)\s]*))?\)")
 
