@@ -8,7 +8,6 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
-import tomllib
 
 from ms_slam_env import scenes, slam
 from ms_slam_env.cli import COMMANDS
@@ -18,8 +17,10 @@ from ms_slam_env.report.results import read_results
 from ms_slam_env.sequences.perturbations import PERTURBATIONS
 
 ROOT = Path(__file__).resolve().parents[2]
-PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
-PLANNERS = tuple(PYPROJECT["project"]["entry-points"]["ms_slam_env.planners"])
+_PYPROJECT = (ROOT / "pyproject.toml").read_text()
+_SECTION = re.search(r'entry-points\."ms_slam_env.planners"\]\n(.*?)\n\n', _PYPROJECT, re.DOTALL)
+assert _SECTION
+PLANNERS = re.findall(r"^([\w-]+) = ", _SECTION[1], re.MULTILINE)
 COMMITTED = [
     path
     for path in sorted((ROOT / "docs" / "results").glob("*/results.json"))
