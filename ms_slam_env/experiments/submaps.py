@@ -19,7 +19,7 @@ from ms_slam_env.evaluation.submaps import submap_errors, submap_measures, subma
 from ms_slam_env.experiments.harness.episodes import seed_list
 from ms_slam_env.experiments.harness.experiment import Experiment
 from ms_slam_env.experiments.harness.interruptions import FOREIGN, map_path
-from ms_slam_env.geometry import make_pose, relative_angle, so3_exp
+from ms_slam_env.geometry import invert, relative_angle, so3_exp
 from ms_slam_env.metrics import ate_rmse
 from ms_slam_env.report.charts import Chart, Panel, interval_series
 from ms_slam_env.report.records import Row
@@ -38,7 +38,8 @@ COLUMNS = (
     *("final_ate_unaligned_m", "submap_ate_m", "cpu_ms_median"),
 )
 WRONG_M, WRONG_DEG = 0.05, 5.0
-_OFFSET_M, _OFFSET_DEG = 0.05, 5.0  # of the second pass from the first
+TURN_DEG, STEP_DEG = 150.0, 3.0  # away from the end of the mapped stretch, and a frame's share
+DARK_DEG = 60.0  # of which are not seen
 _OTHER_SEED = 500  # added to a scene's seed for the scene that looks alike and is another
 
 
@@ -60,15 +61,15 @@ class SubmapsSpec:
 class SubmapsExperiment(Experiment, Checked):
     """Lost cameras that go on: submaps, where they are joined, and what that is worth
 
-    The camera maps a stretch of a path. Return: it jumps ahead to where it has not been, and comes
-    back over the mapped stretch. Dark: the images are black while it moves on, then it turns back.
-    Foreign: it goes on in another scene of the same kind, and anything joined is wrong.
+    The camera maps a stretch of a path. Return: suddenly it looks the other way, 150 degrees from
+    there, turns back and goes back over half of the stretch. Dark: it turns there and back, and
+    sees nothing for the first 60 degrees. Foreign: it goes on in another scene of the same kind,
+    and anything joined is wrong.
     """
 
     scenes: tuple[str, ...] = ("living_room", "corridor")
     """Names of scenes; the maps take them in turns. Corridors repeat themselves."""
     size: str = "160x120"
-    """Image size."""
     settings: tuple[str, ...] = KINDS
     """Kinds of interruption."""
     variants: tuple[str, ...] = SUBMAPS
@@ -77,9 +78,9 @@ class SubmapsExperiment(Experiment, Checked):
     """Maps, each of its own seed."""
     jumps: int = bounded(10, 1, 1000)
     """Foreign places after each map; of the other settings there is one a map."""
-    map_frames: int = bounded(80, 20, 100_000)
-    """Length of the stretch that is mapped; the other stretch is as long."""
-    after: int = bounded(40, 5, 100_000)
+    map_frames: int = bounded(60, 20, 100_000)
+    """Length of the stretch that is mapped."""
+    after: int = bounded(30, 10, 100_000)
     """Frames in a foreign place."""
     seeds: str = "validation"
     """Split that the seeds come from; a default read from them may not use the test seeds."""
@@ -98,7 +99,6 @@ class SubmapsExperiment(Experiment, Checked):
             for one in given:
                 if one not in valid:
                     raise unknown(name, one, valid)
-        xtion(self.size)
         common = (self.settings, self.variants, self.jumps, self.map_frames, self.after)
         return [
             SubmapsSpec(self.scenes[index % len(self.scenes)], seed, self.size, *common)
@@ -110,21 +110,21 @@ class SubmapsExperiment(Experiment, Checked):
         """Map a stretch with every variant, and put each through every interruption."""
         scene = scenes.make(spec.scene, spec.seed)
         intrinsics = xtion(spec.size)
-        path = map_path(scene, 2 * spec.map_frames, spec.seed)
-        mapped = path[: spec.map_frames]
-        frames = _record(scene, intrinsics, spec.seed, 0, mapped)
+        path = map_path(scene, spec.map_frames, spec.seed)
+        frames = _record(scene, intrinsics, spec.seed, 0, path)
         interruptions = _interruptions(spec, scene, intrinsics, path)
         attempts = []
         for variant in spec.variants:
             backend = slam.make("surfel", intrinsics, submaps=variant)
-            run_sequence(backend, frames, start=path[0])
+            mapping = run_sequence(backend, frames, start=path[0])
             state = backend.get_state()
+            drift = mapping.estimates[-1] @ invert(path[-1])  # where the camera comes back to
             for one in interruptions:
                 if variant == "off" and one.truth is None:
                     continue  # it joins nothing
                 backend.set_state(state)
                 run = run_sequence(backend, one.frames, reset=False)
-                figures = _measure(run, one, len(frames))
+                figures = _measure(run, one, len(frames), drift)
                 attempts.append({"setting": one.setting, "variant": variant, **figures})
         return {"attempts": attempts}
 
@@ -163,19 +163,16 @@ class Interruption:
 def _interruptions(
     spec: SubmapsSpec, scene: Scene, intrinsics: Intrinsics, path: Float64
 ) -> list[Interruption]:
-    half, rng = spec.map_frames, np.random.default_rng([spec.seed, 7])
-    beside = path @ _small_motion(rng)
+    """A camera that has come to the end of ``path`` (N, 4, 4) goes on otherwise."""
+    away, hidden = np.arange(0, TURN_DEG, STEP_DEG), int(DARK_DEG / STEP_DEG)
+    back = np.concatenate([_turned(path[-1], away[::-1]), path[: len(path) // 2 : -1]])
+    paths = {RETURN: (back, 0), DARK: (np.concatenate([_turned(path[-1], away), back]), hidden)}
     found = []
-    if RETURN in spec.kinds:
-        poses = beside[: half // 4 : -1]
-        frames = _record(scene, intrinsics, spec.seed, 10_000, poses)
-        found.append(Interruption(RETURN, frames, 0, poses))
-    if DARK in spec.kinds:
-        turn = half + half // 2
-        frames = _record(scene, intrinsics, spec.seed, 20_000, beside[turn:0:-1])
-        black = [RGBDFrame(np.zeros_like(frames[0].color), np.zeros_like(frames[0].depth))]
-        poses = np.concatenate([path[half:turn], beside[turn:0:-1]])
-        found.append(Interruption(DARK, black * (turn - half) + frames, turn - half, poses))
+    for number, (setting, (poses, black)) in enumerate(paths.items(), start=1):
+        if setting in spec.kinds:
+            frames = _record(scene, intrinsics, spec.seed, 10_000 * number, poses)
+            frames[:black] = [_black(frame) for frame in frames[:black]]
+            found.append(Interruption(setting, frames, black, poses))
     if FOREIGN in spec.kinds:
         for seed in range(spec.seed + _OTHER_SEED, spec.seed + _OTHER_SEED + spec.jumps):
             other = scenes.make(spec.scene, seed)
@@ -184,10 +181,16 @@ def _interruptions(
     return found
 
 
-def _small_motion(rng: np.random.Generator) -> Float64:
-    turn, step = rng.normal(size=3), rng.normal(size=3)
-    turn *= np.radians(_OFFSET_DEG) * rng.random() / np.linalg.norm(turn)
-    return make_pose(so3_exp(turn), step * _OFFSET_M * rng.random() / np.linalg.norm(step))
+def _turned(pose: Float64, degrees: Float64) -> Float64:
+    """Poses (N, 4, 4) of a camera that turns about the vertical, stepping aside a little."""
+    turned = np.repeat(pose[None], len(degrees), axis=0)
+    turned[:, :3, :3] = [so3_exp([0, 0, angle]) @ pose[:3, :3] for angle in np.radians(degrees)]
+    turned[:, 2, 3] += 0.001 * degrees
+    return turned
+
+
+def _black(frame: RGBDFrame) -> RGBDFrame:
+    return RGBDFrame(np.zeros_like(frame.color), np.zeros_like(frame.depth), frame.timestamp)
 
 
 def _record(
@@ -197,12 +200,8 @@ def _record(
     return [sensor.capture(pose, first + index) for index, pose in enumerate(poses)]
 
 
-def _black(frame: RGBDFrame) -> RGBDFrame:
-    return RGBDFrame(np.zeros_like(frame.color), np.zeros_like(frame.depth))
-
-
-def _measure(run: SequenceRun, one: Interruption, mapped: int) -> dict[str, Any]:
-    """What came of an interruption after ``mapped`` frames."""
+def _measure(run: SequenceRun, one: Interruption, mapped: int, drift: Float64) -> dict[str, Any]:
+    """What came of an interruption after ``mapped`` frames, whose map has a ``drift`` (4, 4)."""
     joints = [k for k, result in enumerate(run.results) if result.submaps_joined]
     figures = {
         **submap_measures(run),
@@ -214,7 +213,7 @@ def _measure(run: SequenceRun, one: Interruption, mapped: int) -> dict[str, Any]
     numbers, poses = run.backend.corrected_trajectory()
     final = run.estimates
     final[numbers[numbers >= mapped] - mapped] = poses[numbers >= mapped]
-    errors = [_error(run.estimates[k], one.truth[k]) for k in joints]
+    errors = [_error(run.estimates[k], drift @ one.truth[k]) for k in joints]
     anchored = np.flatnonzero(run.anchored[one.black :])
     return {
         **figures,

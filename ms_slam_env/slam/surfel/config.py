@@ -133,9 +133,9 @@ class SubmapConfig(Checked):
         step_deg: or this far turned, unless ``interval`` frames lie between.
         agreement_m: they agree if they put the camera no further apart,
         agreement_deg: and turn it no further.
-        guess_sigma_m: standard deviation of each coordinate of a guessed pose at which a submap
-            starts, given by the caller; without one, by every frame that was lost,
-        guess_sigma_deg: and of its rotation about each axis.
+        guess_sigma_m: standard deviation of each coordinate of the pose at which a submap starts,
+            as the caller guessed it,
+        guess_sigma_deg: and of its rotation about each axis; larger where there is no guess.
     """
 
     after: int = bounded(5, 1, 1_000_000)

@@ -18,19 +18,28 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.camera import RGBDFrame
-from ms_slam_env.geometry import invert
+from ms_slam_env.geometry import invert, se3_exp, se3_log
 from ms_slam_env.slam.base import Float64, TrackResult, Views
 from ms_slam_env.slam.map_fit import FitConfig, measure_fit, why_not_believed
 from ms_slam_env.slam.state import Saved
 from ms_slam_env.slam.submaps import SubmapLedger, Submaps, one_submap
 from ms_slam_env.slam.surfel.config import SubmapConfig
 from ms_slam_env.slam.surfel.detached_map import DetachedMap
-from ms_slam_env.slam.surfel.pose_hypotheses import damped, is_within
+from ms_slam_env.slam.surfel.pose_hypotheses import is_within
 from ms_slam_env.slam.surfel.relocalization import Images
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.view_prediction import mean_pose
 
+CARRIED_ON = 0.95
+"""From frame to frame, of the last motion, which is all that is known of a lost camera.
+
+On hand-held paths, lr kt3 and the walk with a HoloLens it put the camera after 5 frames 2 to 4
+times, after 10 frames 1.7 to 2.6 times closer to where it was than standing still; 0.8 and 1 did
+worse on some.
+"""
+UNFORESEEN = 0.3
+"""Standard deviation of a coordinate of that pose, in last motions, by every frame carried on."""
 _FIT = FitConfig(queries=8)
 
 
@@ -82,8 +91,8 @@ class AtlasSubmaps(NoSubmaps):
         self._search = JointSearch()
         self._present = 0
         self._refused = 0  # frames in a row that showed something and were not tracked
-        self._motion = np.eye(4)  # expected of the next frame
-        self._expected = np.eye(4)  # where it takes a camera that is lost
+        self._motion = np.eye(4)  # of the last tracked frame
+        self._expected = np.eye(4)  # (4, 4) where that takes a camera that is lost
 
     @property
     def _config(self) -> SubmapConfig:
@@ -144,8 +153,8 @@ class AtlasSubmaps(NoSubmaps):
     def _after_refusal(
         self, frames: Images, guess: ArrayLike | None, result: TrackResult
     ) -> TrackResult:
-        self._motion = damped(self._motion)
-        self._expected = self._expected @ self._motion
+        share = CARRIED_ON ** self._slam.frames_lost()
+        self._expected = self._expected @ se3_exp(share * se3_log(self._motion))
         if guess is not None:
             self._expected = np.array(guess, dtype=np.float64)
         if not self._slam.shows_something(frames):
@@ -158,11 +167,12 @@ class AtlasSubmaps(NoSubmaps):
     def _link(self, is_guessed: bool) -> Float64:
         """Covariance (6, 6) of where the camera is expected."""
         rules = self._config
-        sigma_m, sigma_rad = rules.guess_sigma_m, np.radians(rules.guess_sigma_deg)
+        sigmas = np.repeat([rules.guess_sigma_m, np.radians(rules.guess_sigma_deg)], 3)
         if not is_guessed:
-            frames = self._slam.frames_lost()
-            sigma_m, sigma_rad = sigma_m * frames, sigma_rad * frames
-        return np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3)
+            twist = se3_log(self._motion).reshape(2, 3)
+            speeds = np.repeat(np.linalg.norm(twist, axis=1), 3)
+            sigmas = np.hypot(sigmas, UNFORESEEN * self._slam.frames_lost() * speeds)
+        return np.diag(sigmas**2)
 
     def _start(self, frames: Images, link: Float64) -> TrackResult:
         """Put the map aside and start another with this frame."""
