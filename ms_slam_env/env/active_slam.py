@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from functools import cached_property, partial
 from typing import Any, NamedTuple
@@ -103,8 +104,9 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
     A free pose of the scene, drawn from the seed; SLAM starts at the true pose with one frame.
 
     ## End
-    Terminated when tracking was lost for ``lost_patience`` consecutive steps; truncated by the time
-    limit (``max_episode_steps`` of ``gym.make``, 150 by default).
+    Terminated when tracking was lost for ``lost_patience`` consecutive steps, or when for
+    ``away_patience`` steps the camera was lost or in submaps that are not joined to the first;
+    truncated by the time limit (``max_episode_steps`` of ``gym.make``, 150 by default).
 
     ## Info
     ``T_world_camera``, ``T_world_camera_estimate`` (4, 4); ``pose_covariance`` (6, 6) of the
@@ -112,7 +114,9 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
     SLAM gave none (at the start, while lost, by another backend or source of the pose);
     ``pose_error`` m; ``ate`` running RMSE of the pose error over all frames, m, no alignment;
     ``divergence`` (2,) intensity and depth between the last frames of this step and the one
-    before, nats; ``tracking_ok``; ``reward_terms``; ``action_mask`` (n,) bool; ``mapped_area`` m2;
+    before, nats; ``tracking_ok``; ``submap``, 0 for the first and those joined to it: in
+    another one ``tracking_ok`` is true and the pose as unsure as ``pose_covariance`` says;
+    ``reward_terms``; ``action_mask`` (n,) bool; ``mapped_area`` m2;
     ``mapped_share`` of the surface that opens into free space, [0, 1]; ``time`` simulated seconds;
     ``energy`` mechanical work of the motion so far, J; ``scene``, ``scene_seed``.
     No clock: timings are in ``env.unwrapped.timings``. Where the agent chooses it:
@@ -233,7 +237,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
             motion = self.embodiment.move(episode.action)
         error_before = episode.pose_error
         new_surface = self._track_motion(motion)
-        lost_for_good = episode.steps_lost >= self.config.lost_patience
+        lost_for_good = self._lost_share() >= 1
         outcome = Outcome(
             divergence=episode.divergence,
             pose_error_growth_m=episode.pose_error - error_before,
@@ -285,6 +289,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         if frame is None:
             state = episode.tracking_ok, episode.inlier_fraction
             result = self._pose_source.handle_dropped_frame(seen, *state)
+            result = dataclasses.replace(result, submap=episode.frames[-1].submap)
             episode.record(seen, result, np.zeros(2))
             return 0.0
         with self.timings.stage("slam"):
@@ -327,13 +332,20 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
                     divergence=episode.divergence / maxima,
                     tracking_ok=episode.tracking_ok,
                     inlier_fraction=episode.inlier_fraction,
-                    lost_share=min(1.0, episode.steps_lost / self.config.lost_patience),
+                    lost_share=min(1.0, self._lost_share()),
                     motion=episode.action,
                     motion_mask=self.embodiment.action_masks(),
                     configuration=self._actions.configuration,
                     lookahead=lambda: self.lookahead() / maxima,
                 )
             )
+
+    def _lost_share(self) -> float:
+        """How much of the patience with a lost camera is used up; 1 or more ends the episode."""
+        lost, away = self.episode.steps_lost, self.episode.steps_away
+        if lost < away:  # in a submap, or lost after one
+            return max(lost / self.config.lost_patience, away / self.config.away_patience)
+        return lost / self.config.lost_patience
 
     def _info(self) -> dict[str, Any]:
         info = {

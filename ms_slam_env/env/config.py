@@ -150,6 +150,9 @@ class EnvConfig(Checked):
         step_m: translation of a motion, metres.
         step_rad: rotation of a motion, radians.
         lost_patience: steps that tracking may stay lost before the episode ends.
+        away_patience: steps that the camera may be in submaps that are not joined to the first
+            before it ends, lost or not: where it started is known no longer. For SLAM that starts
+            no submaps, ``lost_patience`` decides.
         divergence: how divergence is measured.
         lookahead: how candidates are predicted.
         targets: motion-and-structure parameters and thresholds.
@@ -174,6 +177,7 @@ class EnvConfig(Checked):
     step_m: float = bounded(0.12, 0, 1)
     step_rad: float = bounded(math.radians(12), 0, math.pi / 2)
     lost_patience: int = bounded(10, 1, 1_000_000)
+    away_patience: int = bounded(50, 1, 1_000_000)
     divergence: DivergenceConfig = field(default_factory=DivergenceConfig)
     lookahead: LookaheadConfig = field(default_factory=LookaheadConfig)
     targets: TargetConfig = field(default_factory=TargetConfig)

@@ -28,6 +28,7 @@ class FrameRecord:
         T_world_camera_estimate: (4, 4) as estimated when it was current.
         tracking_ok: whether tracking held.
         processed: whether SLAM has seen it.
+        submap: that it is in, 0 for the first and those joined to it by then.
         time_s: simulated seconds since the start.
         divergence: (2,) from the frame before, nats.
         pose_error: distance between the true and the estimated position, metres.
@@ -38,6 +39,7 @@ class FrameRecord:
     T_world_camera_estimate: Float64
     tracking_ok: bool
     processed: bool
+    submap: int
     time_s: float
     divergence: Float64
     pose_error: float
@@ -59,6 +61,8 @@ class Episode:
         energy_j: mechanical work of the motion so far.
         action: index of the last motion; 0 before the first.
         steps_lost: consecutive steps that tracking has been lost.
+        steps_away: consecutive steps that the camera has not been tracked in the first submap or
+            one joined to it.
         tracking_ok, inlier_fraction: SLAM's word on the last frame.
         frames: (N) everything that is kept of each.
         divergences_of_steps: (S + 1) of the start, zero, and of each step, (2,) nats.
@@ -76,6 +80,7 @@ class Episode:
     energy_j: float = 0.0
     action: int = 0
     steps_lost: int = 0
+    steps_away: int = 0
     tracking_ok: bool = True
     inlier_fraction: float = 1.0
     squared_error_sum: float = 0.0
@@ -94,7 +99,7 @@ class Episode:
         self, frame: RGBDFrame | None, T_true: Float64, T_kinematic: Float64, time_s: float
     ) -> FrameObservation:
         """What is known of a moment; where no frame was delivered the last one is still there."""
-        before = self.frames[-1] if self.frames else None
+        before = self._last_known()
         T_last_kinematic = before.T_world_camera_kinematic if before else T_kinematic
         return FrameObservation(
             frame=frame or replace(self.last_frame, timestamp=time_s),
@@ -103,6 +108,11 @@ class Episode:
             T_previous_camera_kinematic=invert(T_last_kinematic) @ T_kinematic,
             T_world_previous_estimate=before.T_world_camera_estimate if before else T_true,
         )
+
+    def _last_known(self) -> FrameRecord | None:
+        """The last frame that was tracked, from which motion is counted on; else the last."""
+        tracked = (frame for frame in reversed(self.frames) if frame.tracking_ok)
+        return next(tracked, self.frames[-1] if self.frames else None)
 
     def record(self, seen: FrameObservation, result: TrackResult, divergence: Float64) -> None:
         """Append what one frame brought; ``divergence`` (2,) is from the frame before."""
@@ -113,6 +123,7 @@ class Episode:
             T_world_camera_estimate=result.T_world_camera.copy(),
             tracking_ok=result.tracking_ok,
             processed=result.processed,
+            submap=result.submap,
             time_s=seen.frame.timestamp,
             divergence=divergence,
             pose_error=float(np.linalg.norm(off)),
@@ -134,6 +145,8 @@ class Episode:
         self.step_histograms = self.histograms
         self.energy_j += energy_j
         self.steps_lost = 0 if self.tracking_ok else self.steps_lost + 1
+        is_anchored = self.tracking_ok and self.frames[-1].submap == 0
+        self.steps_away = 0 if is_anchored else self.steps_away + 1
 
     def copy(self) -> Episode:
         """An independent copy; what was recorded never changes and is shared."""
@@ -183,6 +196,7 @@ class Episode:
             "ate": self.ate,
             "divergence": self.divergence.copy(),
             "tracking_ok": self.tracking_ok,
+            "submap": self.frames[-1].submap,
             "reward_terms": dict(self.reward_terms),
             "time": self.frames[-1].time_s,
             "energy": self.energy_j,

@@ -65,7 +65,8 @@ class RobotKnowledge:
         divergence: (2,) of the last two live frames, in units of (M_I, M_D).
         tracking_ok: SLAM's own word on its last frame.
         inlier_fraction: share of pixels that the alignment explained.
-        lost_share: consecutive steps lost, as a share of the patience.
+        lost_share: consecutive steps lost, or away from the first submap, as a share of the
+            patience.
         motion: the last motion as an index of the 49, of the 7 rotations alone where the
             translation is fixed, also where it was blocked; 0 before the first.
         motion_mask: (n,) which motions are possible now.

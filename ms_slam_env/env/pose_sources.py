@@ -22,8 +22,9 @@ class FrameObservation:
         frame: the live frame.
         T_world_camera: (4, 4) the truth.
         T_world_camera_kinematic: (4, 4) by forward kinematics, which start at the true start pose.
-        T_previous_camera_kinematic: (4, 4) motion since the frame before, by forward kinematics.
-        T_world_previous_estimate: (4, 4) estimate at the frame before.
+        T_previous_camera_kinematic: (4, 4) motion since the last tracked frame, by forward
+            kinematics: while tracking is lost it adds up.
+        T_world_previous_estimate: (4, 4) estimate at the last tracked frame.
     """
 
     frame: RGBDFrame

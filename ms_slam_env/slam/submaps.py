@@ -10,7 +10,7 @@ number of the older.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,9 @@ def one_submap() -> Submaps:
     return Submaps(one, one.copy(), np.full(1, -1, dtype=np.int32), np.zeros((1, 6, 6)))
 
 
+_OF_SUBMAPS = ("first_frames", "joined_to", "joined_at", "links", "starts")
+
+
 @dataclass
 class SubmapLedger(Saved):
     """Submaps of one camera and the path through those after the first; empty until then."""
@@ -58,10 +61,7 @@ class SubmapLedger(Saved):
     labels: list[int] = field(default_factory=list)
     poses: list[Float64] = field(default_factory=list)
 
-    saved: ClassVar[tuple[str, ...]] = (
-        *("first_frames", "joined_to", "joined_at", "links", "starts"),
-        *("frames", "labels", "poses"),
-    )
+    saved: ClassVar[tuple[str, ...]] = (*_OF_SUBMAPS, "frames", "labels", "poses")
 
     @property
     def has_several(self) -> bool:
@@ -138,6 +138,18 @@ class SubmapLedger(Saved):
             for k, size in zip(inner, sizes, strict=True)
             if self.joined_to[k] == k and k != newer
         }
+
+    def get_state(self) -> dict[str, Any]:
+        """Everything but the first submap, of which all is known."""
+        state = super().get_state()
+        return state | {name: state[name][1:] for name in _OF_SUBMAPS}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state."""
+        first = SubmapLedger()
+        super().set_state(
+            state | {name: getattr(first, name) + state[name] for name in _OF_SUBMAPS}
+        )
 
     def summary(self) -> Submaps:
         """The submaps as arrays."""

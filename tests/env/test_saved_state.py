@@ -234,6 +234,14 @@ def test_a_fresh_environment_goes_on_without_a_reset():
     assert here[1:4] == there[1:4]
 
 
+def test_a_slam_that_closes_loops_goes_on_from_its_state():
+    options = {**OPTIONS, "slam_config": {"loop_closure": "deformation"}}
+    played = after_steps(gym.make("MSActiveSLAM-FreeCamera-v0", **options).unwrapped, 2)
+    fresh = gym.make("MSActiveSLAM-FreeCamera-v0", **options)
+    fresh.unwrapped.load_state(played.save_state())
+    np.testing.assert_array_equal(fresh.step(8)[0], played.step(8)[0])
+
+
 def test_the_time_limit_counts_the_steps_of_the_episode_loaded():
     env = gym.make("MSActiveSLAM-FreeCamera-v0", max_episode_steps=4, **OPTIONS)
     env.reset(seed=0)

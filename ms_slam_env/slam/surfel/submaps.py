@@ -307,18 +307,18 @@ class JointSearch(Saved):
     saved = ("_label", "_votes", "_frame", "_pose", "_looks")
 
     def __init__(self) -> None:
-        self._label = -1  # of the map put aside; -1: nothing was found yet
+        self._label: int | None = None  # of the map put aside; None: nothing was found yet
         self._votes: list[Float64] = []  # (4, 4) T_other_present of each look
-        self._frame = -(10**9)  # of the last look
+        self._frame: int | None = None  # of the last look
         self._pose = np.eye(4)  # (4, 4) in the present map at the last look
         self._looks = 0  # in vain, since the map was lost
 
     def is_due(self, frame: int, pose: Float64, rules: SubmapConfig) -> bool:
         """Whether it is time for a look; the next one that may agree is from another place."""
-        if frame - self._frame >= rules.interval:
+        if self._frame is None or frame - self._frame >= rules.interval:
             return True
         moved = not is_within(pose, self._pose, rules.step_m, np.radians(rules.step_deg))
-        return self._label >= 0 and moved
+        return self._label is not None and moved
 
     def look(
         self,
@@ -337,7 +337,7 @@ class JointSearch(Saved):
         self._frame, self._pose = frame, pose.copy()
         other, found = self._find(pose, frames, detached, finder, rules)
         if other is None or found is None:
-            self._label, self._votes = -1, []
+            self._label, self._votes = None, []
             self._looks += 1
             return None
         T_other_present = found @ invert(pose)
@@ -349,7 +349,7 @@ class JointSearch(Saved):
         if len(self._votes) < rules.looks:
             return None
         mean = mean_pose(np.stack(self._votes) @ pose)
-        self._label, self._votes = -1, []
+        self._label, self._votes = None, []
         return other, mean @ invert(pose)
 
     def _find(

@@ -35,8 +35,8 @@ class TrajectoryHistory(Saved):
     anchor_times: list[Float64] = field(default_factory=list)  # (ANCHORS,) when those were created
     # relative constraints of the loops closed.
     joined: Constraints = field(default_factory=no_constraints)
-    # the frame at which a loop was found that waits to be confirmed, -1: there is none.
-    found: int = -1
+    # the frame at which a loop was found that waits to be confirmed, None: there is none.
+    found: int | None = None
     # (4, 4) of the world about the camera, which would have closed it.
     correction: Float64 = field(default_factory=lambda: np.eye(4))
 
@@ -61,10 +61,10 @@ class TrajectoryHistory(Saved):
         A registration that slides along a surface comes out differently from frame to frame. If
         not, this one waits to be confirmed.
         """
-        is_recent = self.found >= 0 and self.last - self.found <= memory
+        is_recent = self.found is not None and self.last - self.found <= memory
         difference = motion_size(invert(self.correction @ pose) @ corrected)
         if is_recent and difference <= agreement_m:
-            self.found = -1
+            self.found = None
             return True
         self.found, self.correction = self.last, corrected @ invert(pose)
         return False
@@ -89,7 +89,7 @@ class TrajectoryHistory(Saved):
             poses=[T @ pose for pose in self.poses],
             anchors=[transform_points(T, points) for points in self.anchors],
             joined=replace(joined, sources=sources, targets=targets),
-            found=-1,
+            found=None,
         )
 
     def merged(self, other: TrajectoryHistory) -> TrajectoryHistory:
