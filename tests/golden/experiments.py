@@ -300,6 +300,14 @@ def relocalization(_: Path) -> Any:
     return Relocalization.run(spec)
 
 
+@experiment("submaps", CHAOTIC)
+def submaps(_: Path) -> Any:
+    from ms_slam_env.experiments.submaps import SubmapsExperiment, SubmapsSpec
+
+    spec = SubmapsSpec("table", 1000, "80x60", ("return",), ("atlas",), 1, 20, 10)
+    return SubmapsExperiment.run(spec)
+
+
 @experiment("loop_closure", CHAOTIC)
 def loop_closure(_: Path) -> Any:
     from ms_slam_env.experiments.loop_closure import LoopClosure, LoopSpec

@@ -193,7 +193,7 @@ class AtlasSubmaps(NoSubmaps):
     def _after_tracking(self, frames: Images, result: TrackResult) -> TrackResult:
         frame, pose = self._slam.last_frame(), result.T_world_camera
         self._ledger.record(frame, self._present, pose)
-        if not self._search.is_due(frame, pose, self._config):
+        if result.uncertain or not self._search.is_due(frame, pose, self._config):
             return result
         if self._finder is None:
             self._finder = MapFinder(self._slam)
