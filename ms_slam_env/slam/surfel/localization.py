@@ -139,14 +139,15 @@ class Localizer:
     ) -> Alignment:
         """Ask of poses off the ``expected`` ones whether the camera or what it sees has moved.
 
-        In front of a wall the pose follows whatever passes by, and then nothing seems to move.
-        Seen from the expected pose it does; without it the grey values must fit clearly better.
+        In front of a wall the pose follows whatever passes by, and then nothing seems to move. So
+        these are aligned once more without all that is new in view; if it was that which drew the
+        pose along, what is left fits clearly better.
         """
         doubtful = self._motion_mask.can_doubt & alignment.tracked & (self._states.lost == 0)
         doubtful &= self._states.started & _is_apart(alignment.T_world_live, expected)
         if not doubtful.any():
             return alignment
-        moving = doubtful & self._motion_mask.find(expected, doubtful)
+        moving = doubtful & self._motion_mask.find(expected, doubtful, strict=True)
         if not moving.any():
             return alignment
         again = self._track(invalid, guesses)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
+from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.surfel.device import fetch, put
 
 PAST = wp.constant(6)  # earlier frames that the live one is compared with
@@ -27,6 +28,18 @@ class Grid:
     focal: wp.vec2
     centre: wp.vec2
     sigma: float  # tolerance at 1 m, grows with depth squared
+
+
+def make_grid(intrinsics: Intrinsics, columns: int, sigma: float) -> Grid:
+    """A grid of about so many columns; ``sigma`` is its tolerance at 1 m."""
+    stride = max(1, round(intrinsics.width / columns))
+    small = intrinsics.every_nth(stride)
+    grid = Grid()
+    grid.stride, grid.width, grid.height = stride, small.width, small.height
+    grid.live_width, grid.live_height = intrinsics.width, intrinsics.height
+    grid.focal, grid.centre = wp.vec2(small.fx, small.fy), wp.vec2(small.cx, small.cy)
+    grid.sigma = sigma
+    return grid
 
 
 @wp.func
@@ -146,7 +159,7 @@ def find_vanished(
 ):
     """Mark where the live frame looks through a point of an earlier frame."""
     b, k, v = wp.tid()
-    if age[b, k] == UNUSED:
+    if age[b, k] != OLD:  # since then it has gone far enough to tell
         return
     pixels = grid.height * grid.width
     row = (b * PAST + k) * pixels + v * grid.width

@@ -11,6 +11,8 @@ to frame.
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -32,12 +34,12 @@ from ms_slam_env.slam.surfel.motion_evidence import (
     SUPPORTED,
     UNUSED,
     VANISHED,
-    Grid,
     carry_log_odds,
     enlarge,
     find_appeared,
     find_vanished,
     hide,
+    make_grid,
     sample_depth,
 )
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
@@ -55,9 +57,10 @@ COS_CREASE = 0.8  # of the angle between neighbouring normals, likewise
 FEWEST = 12  # pixels of the grid that prove a piece to be moving
 SHARE_APPEARED, SHARE_VANISHED = 0.3, 0.6  # of a piece's pixels for and against
 NEIGHBOURS = 0.3  # share of the pixels around that must have appeared too
+SHARE_NEW = 0.7  # of the pixels of a piece that is taken for new
 SHARE_KNOWN = 0.1  # of its pixels that an earlier frame saw
 FOR, AGAINST, FORGETTING = 2.0, 0.7, 0.15  # log-odds of an observation
-LEAST, MOST = 2.0, 4.0  # log-odds at which they end
+MOST = 4.0  # log-odds at which they end; the least is 0
 MASKED = 0.5  # log-odds above which a pixel is masked
 CHANGED = 0.01  # share of the pixels whose new mask makes an alignment worth repeating
 _RIM = np.ones((3, 3), dtype=np.uint8)
@@ -90,8 +93,10 @@ class MotionMask(Saved):
         Where that is not known, ``is_known`` (B,), nothing is masked.
         """
 
-    def find(self, T_world_live: Float64, is_known: Bool) -> Bool:
+    def find(self, T_world_live: Float64, is_known: Bool, strict: bool = False) -> Bool:
         """Look for what moves in the frames, taken at poses (B, 4, 4).
+
+        If ``strict``, all that no earlier frame but the last few has seen is taken for moving.
 
         Returns:
             (B,) whether so much is new in the mask that the frame should be aligned again.
@@ -120,7 +125,7 @@ class GeometricMotionMask(MotionMask):
 
     saved = (
         *("_past_depth", "_past_nearest", "_past_poses", "_count"),
-        *("_odds", "_depth_before", "_pose_before"),
+        *("_odds", "_depth_before", "_pose_before", "_moved"),
     )
 
     def __init__(
@@ -131,7 +136,7 @@ class GeometricMotionMask(MotionMask):
 
     def resize(self, intrinsics: Intrinsics) -> None:
         """See the base class."""
-        self._grid = grid = _grid(intrinsics, self._sigma)
+        self._grid = grid = make_grid(intrinsics, COLUMNS, self._sigma)
         self._largest_step = STEP_PER_M * grid.stride * 160 / intrinsics.width
         batch, device = self._batch, self._device
         shape = (grid.height, grid.width)
@@ -157,6 +162,11 @@ class GeometricMotionMask(MotionMask):
         self._count = np.zeros(batch, dtype=np.int32)  # frames since the env was forgotten
         self._live_odds = np.zeros((batch, *shape), dtype=np.float32)
         self._live_pose = self._pose_before
+        self._moved = np.zeros(batch, dtype=bool)  # whether anything did in the last frames
+        self._moves_now = np.zeros(batch, dtype=bool)  # and does in the live ones
+        self._is_marked = True  # whether ``LiveFrame.moving`` may hold a mask
+        self._seen: LiveFrame | None = None  # whose launches are recorded
+        self._looked: Float64 | None = None  # what the mask at hand was found with
 
     def forget(self, env: int) -> None:
         """See the base class."""
@@ -164,24 +174,26 @@ class GeometricMotionMask(MotionMask):
 
     def expect(self, live: LiveFrame, T_world_live: Float64, is_known: Bool) -> None:
         """See the base class."""
-        grid, rows = self._grid, (self._batch, self._grid.height)
-        self._live = live
-        flat = [live.depth.flatten(), live.raw_depth.flatten()]
-        sampled = [self._flat(self._depth), self._flat(self._nearest)]
-        self._launches.launch("sample", sample_depth, lambda: (rows, [*flat, grid, *sampled]))
-        self._to_before.write(invert(self._pose_before) @ T_world_live)
-        before = [self._flat(self._depth_before), self._flat(self._odds), self._to_before.array]
-        carried = self._flat(self._carried)
-        self._launches.launch(
-            "carry", carry_log_odds, lambda: (rows, [sampled[0], *before, grid, carried])
-        )
-        odds = self._carried.read()
-        odds[~is_known | (self._count == 0)] = 0.0
+        if self._seen is not live:
+            self._launches.clear()
+        self._seen = self._live = live
+        self._launches.launch("sample", sample_depth, self._sampling)
+        self._looked = None
         self._pieces: dict[int, Pieces] = {}
+        self._prior = self._carry(T_world_live, is_known & (self._count > 0))
+        self._mask_by(self._prior, T_world_live)
+
+    def _carry(self, T_world_live: Float64, is_known: Bool) -> Float32:
+        """Log-odds (B, h, w) of the last frames at the new ones; 0 where nothing moved."""
+        if not self._moved[is_known].any():
+            return np.zeros_like(self._live_odds)
+        self._to_before.write(invert(self._pose_before) @ T_world_live)
+        self._launches.launch("carry", carry_log_odds, self._carrying)
+        odds = self._carried.read()
+        odds[~(is_known & self._moved)] = 0.0
         for env in map(int, np.flatnonzero((odds > MASKED).any(axis=(1, 2)))):
             odds[env] = self._pieces_of(env).filled(odds[env], MASKED)
-        self._prior = odds
-        self._mask_by(odds, T_world_live)
+        return odds
 
     def _pieces_of(self, env: int) -> Pieces:
         """Pieces of the live frame of an env, cut when they are first asked for."""
@@ -192,8 +204,12 @@ class GeometricMotionMask(MotionMask):
             self._pieces[env] = Pieces(depth, normals, self._largest_step, COS_CREASE)
         return self._pieces[env]
 
-    def find(self, T_world_live: Float64, is_known: Bool) -> Bool:
+    def find(self, T_world_live: Float64, is_known: Bool, strict: bool = False) -> Bool:
         """See the base class."""
+        looked = np.concatenate([T_world_live.ravel(), is_known, [strict]])
+        if self._looked is not None and np.array_equal(looked, self._looked):
+            return np.zeros(self._batch, dtype=bool)
+        self._looked = looked
         before = self._masked.read() > 0
         odds = self._prior.copy()
         found = self._compare(T_world_live)
@@ -201,7 +217,9 @@ class GeometricMotionMask(MotionMask):
             is_still = (found[env] & SUPPORTED) > 0
             change = np.where(is_still, -AGAINST, -FORGETTING)
             change[self._moves(env, found[env])] = FOR
-            odds[env] = np.clip(odds[env] + change, -LEAST, MOST)
+            odds[env] = np.clip(odds[env] + change, 0.0, MOST)
+            if strict:
+                odds[env][self._is_new(env, is_still)] = MOST
         self._mask_by(odds, T_world_live)
         return ((odds > MASKED) & ~before).mean(axis=(1, 2)) > CHANGED
 
@@ -221,30 +239,50 @@ class GeometricMotionMask(MotionMask):
         moves = pieces.where(appeared, against, SHARE_APPEARED, least)
         return moves | pieces.where(vanished, against, SHARE_VANISHED, least) | appeared
 
+    def _is_new(self, env: int, is_still: Bool) -> Bool:
+        """Pieces (h, w) of which hardly a pixel was there in an old frame."""
+        pieces = self._pieces_of(env)
+        least = np.full(pieces.count, FEWEST - 1.0)
+        return pieces.where(~is_still, is_still, SHARE_NEW, least)
+
     def _compare(self, T_world_live: Float64) -> NDArray[np.int32]:
         """Evidence (B, h, w) of the live frames, taken at poses (B, 4, 4)."""
-        grid, rows = self._grid, (self._batch, self._grid.height)
         to_past = invert(self._past_poses) @ T_world_live[:, None]
         self._to_past.write(to_past)
         self._from_past.write(invert(to_past))
         self._age.write(self._ages())
-        shared = [self._age.array, grid, self._flat(self._found)]
-        live = [self._flat(self._depth), self._flat(self._nearest)]
-        past = [self._flat(self._past_nearest), self._flat(self._past_depth)]
-        self._launches.launch(
-            "appeared",
-            find_appeared,
-            lambda: (rows, [live[0], *past, self._to_past.array, *shared]),
-        )
-        self._launches.launch(
-            "vanished",
-            find_vanished,
-            lambda: (
-                (rows[0], PAST, rows[1]),
-                [live[1], past[1], self._from_past.array, *shared],
-            ),
-        )
+        self._launches.launch("appeared", find_appeared, self._appearing)
+        self._launches.launch("vanished", find_vanished, self._vanishing)
         return self._found.read()
+
+    # Threads and arguments of the kernels, as ``KernelLaunchCache`` records them.
+
+    @property
+    def _rows(self) -> tuple[int, int]:
+        return self._batch, self._grid.height
+
+    def _sampling(self) -> tuple[tuple[int, ...], list[Any]]:
+        live = [self._live.depth.flatten(), self._live.raw_depth.flatten()]
+        return self._rows, [*live, self._grid, *_flat(self._depth, self._nearest)]
+
+    def _carrying(self) -> tuple[tuple[int, ...], list[Any]]:
+        images = _flat(self._depth, self._depth_before, self._odds)
+        return self._rows, [*images, self._to_before.array, self._grid, *_flat(self._carried)]
+
+    def _appearing(self) -> tuple[tuple[int, ...], list[Any]]:
+        images = _flat(self._depth, self._past_nearest, self._past_depth)
+        poses = [self._to_past.array, self._age.array]
+        return self._rows, [*images, *poses, self._grid, *_flat(self._found)]
+
+    def _vanishing(self) -> tuple[tuple[int, ...], list[Any]]:
+        images, batch = _flat(self._nearest, self._past_depth), self._batch
+        poses = [self._from_past.array, self._age.array]
+        threads = (batch, PAST, self._grid.height)
+        return threads, [*images, *poses, self._grid, *_flat(self._found)]
+
+    def _enlarging(self) -> tuple[tuple[int, ...], list[Any]]:
+        rows = (self._batch, self._grid.live_height)
+        return rows, [*_flat(self._masked), self._grid, self._live.moving.flatten()]
 
     def _ages(self) -> NDArray[np.int32]:
         """``UNUSED``, ``RECENT`` or ``OLD`` for each (B, PAST) of the earlier frames."""
@@ -256,52 +294,60 @@ class GeometricMotionMask(MotionMask):
     def _mask_by(self, odds: Float32, T_world_live: Float64) -> None:
         """Mask the live frames at poses (B, 4, 4) by log-odds (B, h, w), with a rim of a pixel."""
         self._live_odds, self._live_pose = odds, T_world_live
-        self._masked.write([cv2.dilate((each > MASKED).astype(np.uint8), _RIM) for each in odds])
+        is_masked = odds > MASKED
+        self._moves_now = is_masked.any(axis=(1, 2))
+        if self._moves_now.any():
+            is_masked = np.array([cv2.dilate(each.astype(np.uint8), _RIM) for each in is_masked])
+        self._masked.write(is_masked)
 
     def hide(self, view: ModelView, T_world_model: Float64) -> bool:
         """See the base class."""
-        if not (self._live_odds > MASKED).any():
+        if not self._moves_now.any():
             return False
         self._from_model.write(invert(self._live_pose) @ T_world_model)
         images = [
             image.reshape((self._batch, -1))
             for image in (view.vertices, view.normals, view.intensity)
         ]
-        mask = [self._flat(self._masked), self._grid]
-        inputs = [self._from_model.array, *mask, *images]
+        inputs = [self._from_model.array, *_flat(self._masked), self._grid, *images]
         wp.launch(hide, images[0].shape, inputs, device=self._device)
         return True
 
     def remember(self, live: LiveFrame, T_world_live: Float64, good: Bool) -> None:
         """See the base class."""
-        rows = (self._batch, self._grid.live_height)
-        inputs = [self._flat(self._masked), self._grid, live.moving.flatten()]
-        self._launches.launch("enlarge", enlarge, lambda: (rows, inputs))
-        odds, depths = self._odds.read(), self._depth_before.read()
-        past = self._past_depth.read(), self._past_nearest.read()
-        depth, nearest = self._depth.read(), self._nearest.read()
-        for env in np.flatnonzero(good):
-            odds[env], depths[env] = self._live_odds[env], depth[env]
-            self._pose_before[env] = T_world_live[env]
-            if self._count[env] % INTERVAL == 0:
-                slot = self._count[env] // INTERVAL % PAST
-                past[0][env, slot], past[1][env, slot] = depth[env], nearest[env]
-                self._past_poses[env, slot] = T_world_live[env]
-            self._count[env] += 1
-        for buffer, values in zip(
-            (self._odds, self._depth_before, self._past_depth, self._past_nearest),
-            (odds, depths, *past),
-            strict=True,
-        ):
-            buffer.write(values)
+        if self._is_marked or self._moves_now.any():
+            self._launches.launch("enlarge", enlarge, self._enlarging)
+        self._is_marked = bool(self._moves_now.any())
+        is_due = self._count % INTERVAL == 0
+        due = good & is_due
+        if due.any():
+            slots = self._count // INTERVAL % PAST
+            self._past_poses[due, slots[due]] = T_world_live[due]
+            _store(self._past_depth, due, slots, self._depth)
+            _store(self._past_nearest, due, slots, self._nearest)
+        self._pose_before[good] = T_world_live[good]
+        self._moved[good] = self._moves_now[good]
+        if self._moved.any():
+            odds, depths = self._odds.read(), self._depth_before.read()
+            odds[good], depths[good] = self._live_odds[good], self._depth.read()[good]
+            self._odds.write(odds)
+            self._depth_before.write(depths)
+        self._count[good] += 1
 
     def mask(self, env: int) -> Bool | None:
         """See the base class."""
         return self._masked.read()[env] > 0
 
-    @staticmethod
-    def _flat(buffer: HostDeviceBuffer) -> wp.array:
-        return buffer.array.flatten()
+
+def _flat(*buffers: HostDeviceBuffer) -> list[wp.array]:
+    return [buffer.array.flatten() for buffer in buffers]
+
+
+def _store(past: HostDeviceBuffer, due: Bool, slots: NDArray[Any], live: HostDeviceBuffer) -> None:
+    """Put the images of the envs that are due into their slots."""
+    images = past.read()
+    images[due, slots[due]] = live.read()[due]
+    past.write(images)
 
 
 def make_motion_mask(
@@ -311,14 +357,3 @@ def make_motion_mask(
     if config.motion_mask == "none":
         return MotionMask(batch, intrinsics, device)
     return GeometricMotionMask(batch, intrinsics, config, device)
-
-
-def _grid(intrinsics: Intrinsics, sigma: float) -> Grid:
-    stride = max(1, round(intrinsics.width / COLUMNS))
-    small = intrinsics.every_nth(stride)
-    grid = Grid()
-    grid.stride, grid.width, grid.height = stride, small.width, small.height
-    grid.live_width, grid.live_height = intrinsics.width, intrinsics.height
-    grid.focal, grid.centre = wp.vec2(small.fx, small.fy), wp.vec2(small.cx, small.cy)
-    grid.sigma = sigma
-    return grid
