@@ -159,11 +159,13 @@ class GeometricMotionMask(MotionMask):
         self._launches = KernelLaunchCache(device)
         self._past_poses = np.tile(np.eye(4), (batch, PAST, 1, 1))
         self._pose_before = np.tile(np.eye(4), (batch, 1, 1))
-        self._count = np.zeros(batch, dtype=np.int32)  # frames since the env was forgotten
+        self._count: NDArray[np.int32] = np.zeros(
+            batch, dtype=np.int32
+        )  # frames since the env was forgotten
         self._live_odds = np.zeros((batch, *shape), dtype=np.float32)
         self._live_pose = self._pose_before
-        self._moved = np.zeros(batch, dtype=bool)  # whether anything did in the last frames
-        self._moves_now = np.zeros(batch, dtype=bool)  # and does in the live ones
+        self._moved: Bool = np.zeros(batch, dtype=bool)  # whether anything did in the last frames
+        self._moves_now: Bool = np.zeros(batch, dtype=bool)  # and does in the live ones
         self._is_marked = True  # whether ``LiveFrame.moving`` may hold a mask
         self._seen: LiveFrame | None = None  # whose launches are recorded
         self._looked: Float64 | None = None  # what the mask at hand was found with
@@ -295,7 +297,7 @@ class GeometricMotionMask(MotionMask):
         """Mask the live frames at poses (B, 4, 4) by log-odds (B, h, w), with a rim of a pixel."""
         self._live_odds, self._live_pose = odds, T_world_live
         is_masked = odds > MASKED
-        self._moves_now = is_masked.any(axis=(1, 2))
+        self._moves_now = np.asarray(is_masked.any(axis=(1, 2)))
         if self._moves_now.any():
             is_masked = np.array([cv2.dilate(each.astype(np.uint8), _RIM) for each in is_masked])
         self._masked.write(is_masked)
@@ -318,8 +320,8 @@ class GeometricMotionMask(MotionMask):
         if self._is_marked or self._moves_now.any():
             self._launches.launch("enlarge", enlarge, self._enlarging)
         self._is_marked = bool(self._moves_now.any())
-        is_due = self._count % INTERVAL == 0
-        due = good & is_due
+        is_due: Bool = self._count % INTERVAL == 0
+        due: Bool = good & is_due
         if due.any():
             slots = self._count // INTERVAL % PAST
             self._past_poses[due, slots[due]] = T_world_live[due]
