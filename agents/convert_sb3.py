@@ -14,6 +14,7 @@ import json
 import math
 import pickle
 import re
+import warnings
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -94,7 +95,7 @@ def convert(archive: Path) -> PolicyFile:
 
 
 _BROKEN = (
-    *(zipfile.BadZipFile, pickle.UnpicklingError, RuntimeError, NotImplementedError, EOFError),
+    *(zipfile.BadZipFile, RuntimeError, NotImplementedError, EOFError),
     *(KeyError, ValueError, TypeError, AttributeError, IndexError, OverflowError, RecursionError),
 )
 """What the readers of broken archives raise."""
@@ -150,5 +151,10 @@ def _member(members: zipfile.ZipFile, name: str) -> bytes:
 
 
 def _tensors(members: zipfile.ZipFile, name: str) -> dict[str, Any]:
-    found = torch.load(io.BytesIO(_member(members, name)), map_location="cpu", weights_only=True)
-    return dict(found)
+    data = io.BytesIO(_member(members, name))
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return dict(torch.load(data, map_location="cpu", weights_only=True))
+    except pickle.UnpicklingError:  # its text recommends to load the file without that guard
+        raise InputError(f"{name} holds something else than tensors") from None
