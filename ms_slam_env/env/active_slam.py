@@ -30,13 +30,7 @@ from ms_slam_env.env.observations import (
 from ms_slam_env.env.pose_sources import POSE_SOURCES
 from ms_slam_env.env.rendering import draw_moment
 from ms_slam_env.env.reward import Outcome, reward_terms
-from ms_slam_env.env.state import (
-    check_episode,
-    check_like,
-    check_parts,
-    check_same_settings,
-    is_open,
-)
+from ms_slam_env.env.state import check_episode, check_parts, check_same_settings
 from ms_slam_env.errors import InputError, UnreachableError, unknown
 from ms_slam_env.geometry import check_pose, invert
 from ms_slam_env.robot import Embodiment, MotionResult
@@ -46,6 +40,7 @@ from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sensor.scene_cache import get_scene, get_sensor
 from ms_slam_env.sequences.perturbations.base import Perturbation
 from ms_slam_env.slam.base import SlamBackend, TrackResult, Views
+from ms_slam_env.slam.state_check import check_like, is_open
 from ms_slam_env.timings import Timings
 
 Float64 = NDArray[np.float64]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.state import Stateful
+from ms_slam_env.slam.state_check import check_like
+from ms_slam_env.slam.state_file import read_state, write_state
 from ms_slam_env.slam.submaps import Submaps, one_submap
 
 Float32 = NDArray[np.float32]
@@ -96,9 +100,15 @@ class Views:
 
 
 class SlamBackend(Stateful):
-    """Estimates the camera's pose from RGB-D frames and keeps a map that it can render."""
+    """Estimates the camera's pose from RGB-D frames and keeps a map that it can render.
+
+    Attributes:
+        intrinsics: of every frame.
+        config: the parameters, a dataclass; None for a backend that has none.
+    """
 
     intrinsics: Intrinsics
+    config: Any = None
 
     @abstractmethod
     def reset(self, T_world_camera: ArrayLike | None = None) -> None:
@@ -172,6 +182,75 @@ class SlamBackend(Stateful):
     def submaps(self) -> Submaps:
         """The submaps, as they hang together now; one where a backend starts no others."""
         return one_submap()
+
+    @property
+    def needs_color(self) -> bool:
+        """Whether depth alone is not enough to track at all."""
+        return False
+
+    @property
+    def frames_counted(self) -> int:
+        """Number of the next frame as ``corrected_trajectory`` and ``submaps`` count them.
+
+        0 by a backend that corrects no poses.
+        """
+        return 0
+
+    def mark_lost(self) -> None:
+        """The camera may be anywhere in the map: seek the next frame as one after lost tracking.
+
+        A backend that has no other way than that leaves this as it is.
+        """
+
+    def save(self, path: str | Path) -> None:
+        """Write map and pose to a file, whole or not at all; `load` reads it.
+
+        Raises:
+            OSError: nothing can be written there.
+        """
+        config = None if self.config is None else asdict(self.config)
+        about = {
+            "backend": type(self).__name__,
+            "intrinsics": asdict(self.intrinsics),
+            "config": config,
+        }
+        write_state(Path(path), about, self.get_state())
+
+    def load(self, path: str | Path, lost: bool = True) -> None:
+        """Take the map from a file that `save` of such a backend wrote, and go on mapping in it.
+
+        Args:
+            path: of the file.
+            lost: whether the camera is somewhere else by now, so that the next frame is sought in
+                the map; False goes on bit-exactly from where the camera was when it was saved.
+
+        Raises:
+            InputError: no such file, damaged, of another version, backend or camera, or of a
+                configuration that keeps other things; the backend is as it was.
+        """
+        about, state = read_state(Path(path))
+        _check_origin(self, about, path)
+        own = self.get_state()
+        try:
+            self.reset()
+            check_like(state, self.get_state(), "map")
+            self.set_state(state)
+        except Exception as error:  # whatever a part makes of what only looks like its state
+            self.set_state(own)
+            reason = str(error) if isinstance(error, InputError) else repr(error)
+            raise InputError(f"{path} does not fit this backend: {reason}") from None
+        if lost:
+            self.mark_lost()
+
+
+def _check_origin(backend: SlamBackend, about: Mapping[str, Any], path: str | Path) -> None:
+    """Refuse the map of another backend or camera."""
+    name = type(backend).__name__
+    if about.get("backend") != name:
+        raise InputError(f"{path} holds a map of {about.get('backend')}, not of {name}")
+    own, saved = asdict(backend.intrinsics), about.get("intrinsics")
+    if saved != own:
+        raise InputError(f"{path} holds a map of another camera: {saved}, not {own}")
 
 
 def check_views(poses: ArrayLike, scale: float) -> Float64:

@@ -114,6 +114,7 @@ class OdometrySlam(BorrowedMap, FrameByFrameSlam[DepthImage, _Placed]):
     """Keyframe odometry through OpenCV, its keyframes fused into a surfel map."""
 
     saved = (*FrameByFrameSlam.saved, "_map")
+    also_saved = ("key", "last")
 
     def __init__(self, intrinsics: Intrinsics, config: OdometryConfig | None = None) -> None:
         self.config = config or OdometryConfig()

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping
 from copy import deepcopy
 from typing import Any, ClassVar
+
+from ms_slam_env.errors import InputError
 
 
 class Stateful(ABC):
@@ -23,19 +26,43 @@ class Saved(Stateful):
     """An object whose state is the values of the attributes that ``saved`` names.
 
     Arrays, plain values and lists of them are copied. What is ``Stateful``, or a list of such,
-    gives its own state and takes it back.
+    gives its own state and takes it back. ``also_saved`` names what a subclass adds to the state by
+    itself.
     """
 
     saved: ClassVar[tuple[str, ...]] = ()
+    also_saved: ClassVar[tuple[str, ...]] = ()
 
     def get_state(self) -> dict[str, Any]:
         """Copies of the attributes, by their names without a leading underscore."""
-        return {name.lstrip("_"): _state_of(getattr(self, name)) for name in self.saved}
+        return {_key(name): _state_of(getattr(self, name)) for name in self.saved}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Take the attributes from a state."""
+        """Take the attributes from a state.
+
+        Raises:
+            InputError: the state lacks some, as that of something else does; nothing has changed.
+        """
+        check_has(state, (*map(_key, self.saved), *self.also_saved), type(self).__name__)
         for name in self.saved:
-            setattr(self, name, _restored(getattr(self, name), state[name.lstrip("_")]))
+            setattr(self, name, _restored(getattr(self, name), state[_key(name)]))
+
+
+def check_has(state: Any, names: Iterable[str], kind: str) -> None:
+    """Refuse as a state of a ``kind`` what lacks one of ``names``.
+
+    Raises:
+        InputError: naming the kind and what is missing.
+    """
+    if not isinstance(state, Mapping):
+        raise InputError(f"a {type(state).__name__} is no state of {kind}")
+    missing = [name for name in names if name not in state]
+    if missing:
+        raise InputError(f"this is no state of {kind}: it lacks {', '.join(missing)}")
+
+
+def _key(attribute: str) -> str:
+    return attribute.lstrip("_")
 
 
 def _state_of(value: Any) -> Any:

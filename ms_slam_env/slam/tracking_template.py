@@ -104,6 +104,11 @@ class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
         self._miss(frame, prepared)
         return self._lose(reason, statistics)
 
+    def mark_lost(self) -> None:
+        """Seek the next frame as one after lost tracking; see ``SlamBackend``."""
+        self._motion = np.eye(4)
+        self._lost = self._has_map
+
     def fuse(self, frame: RGBDFrame, T_world_camera: ArrayLike) -> TrackResult:
         """Fuse ``frame`` into the map at a known pose (4, 4), without tracking."""
         self.intrinsics.check_image(frame.depth, "frame")
@@ -129,8 +134,7 @@ class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
 
     def _lose(self, reason: str, statistics: AlignmentStatistics) -> TrackResult:
         """Hold the pose and the map."""
-        self._motion = np.eye(4)
-        self._lost = self._has_map
+        self.mark_lost()
         figures = statistics.inlier_ratio, statistics.residual_m
         return TrackResult(self._pose.copy(), False, False, *figures, reason)
 

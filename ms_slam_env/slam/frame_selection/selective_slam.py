@@ -7,6 +7,7 @@ from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.geometry import check_pose, invert, se3_exp, se3_log
 from ms_slam_env.slam.base import BorrowedMap, Float64, SlamBackend, TrackResult
-from ms_slam_env.slam.state import Saved, Stateful
+from ms_slam_env.slam.state import Saved, Stateful, check_has
+from ms_slam_env.slam.state_check import check_like, check_mapping
 from ms_slam_env.slam.submaps import Submaps
 
 
@@ -111,6 +113,7 @@ class SelectiveSlam(Saved, BorrowedMap):
     """
 
     saved = ("backend", "_filter", "_prediction", "_frames")
+    also_saved = ("last", "processed", "dropped", "offsets")
 
     def __init__(
         self,
@@ -225,6 +228,32 @@ class SelectiveSlam(Saved, BorrowedMap):
         joined = np.where(own.joined_at >= 0, counted[own.joined_at], -1).astype(np.int32)
         return replace(own, first_frames=counted[own.first_frames], joined_at=joined)
 
+    @property
+    def frames_counted(self) -> int:
+        """Number of the next frame, with the dropped ones."""
+        return self._frames
+
+    @property
+    def needs_color(self) -> bool:
+        """Whether the backend needs it."""
+        return self.backend.needs_color
+
+    def mark_lost(self) -> None:
+        """Show the backend the next frame, and let it seek it in the map."""
+        self._last = None
+        self.backend.mark_lost()
+
+    def save(self, path: str | Path) -> None:
+        """Write the backend's map; the filter is no part of it."""
+        self.backend.save(path)
+
+    def load(self, path: str | Path, lost: bool = True) -> None:
+        """Take the backend's map from a file; the filter begins anew."""
+        self.backend.load(path, lost)
+        self._forget()
+        self._frames = self.backend.frames_counted
+        self._processed = list(range(self._frames))
+
     def corrected_trajectory(self) -> tuple[NDArray[np.int32], Float64]:
         """Frames (N,), counted since ``reset`` with the dropped ones, and their poses (N, 4, 4).
 
@@ -257,10 +286,21 @@ class SelectiveSlam(Saved, BorrowedMap):
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state of the same backend behind the same filter."""
+        check_has(state, self.also_saved, type(self).__name__)
+        if state["last"] is not None:
+            _check_result(state["last"])
         super().set_state(state)
         self._last = None if state["last"] is None else TrackResult(**_copied(state["last"]))
         self._processed = state["processed"].tolist()
         self._offsets = dict(zip(state["dropped"].tolist(), state["offsets"].copy(), strict=True))
+
+
+def _check_result(last: Any) -> None:
+    """Refuse what has not the fields of a ``TrackResult``."""
+    check_mapping(last, "last")
+    like = vars(TrackResult(np.eye(4), True, covariance=np.zeros((6, 6))))
+    without = last.get("covariance") is None
+    check_like(last, {**like, "covariance": None} if without else like, "last")
 
 
 def _copied(values: dict[str, Any]) -> dict[str, Any]:

@@ -56,6 +56,7 @@ class SparseMap(Saved):
     """Keyframes, points, and which keyframe sees which point."""
 
     saved = ("positions", "descriptors", "hosts", "host_features", "alive", "_tried", "_found")
+    also_saved = ("keyframes",)
 
     def __init__(self, intrinsics: Intrinsics) -> None:
         self.intrinsics = intrinsics

@@ -101,6 +101,11 @@ class SparseSlam(BorrowedMap, FrameByFrameSlam[LiveFrame, Fix]):
         super().__init__(intrinsics)
 
     @property
+    def needs_color(self) -> bool:
+        """Corners are found in colour."""
+        return True
+
+    @property
     def _has_map(self) -> bool:
         return bool(self._map.keyframes)
 

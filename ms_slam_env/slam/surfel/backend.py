@@ -12,6 +12,7 @@ from ms_slam_env.camera.frame import reduce_color, reduce_depth
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose
 from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult, Views, check_views
+from ms_slam_env.slam.state import check_has
 from ms_slam_env.slam.submaps import Submaps
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.relocalization import Images
@@ -139,11 +140,21 @@ class SurfelSlam(SlamBackend):
         """The submaps, as they hang together now."""
         return self._submaps.summary()
 
+    @property
+    def frames_counted(self) -> int:
+        """Number of the next frame, as trajectory and submaps count them."""
+        return self._slam.last_frame() + 1
+
+    def mark_lost(self) -> None:
+        """Seek the next frame in the map, near the last pose and at keyframes like it."""
+        self._slam.mark_lost()
+
     def get_state(self) -> dict[str, Any]:
         """Everything needed to go on bit-exactly, as NumPy arrays."""
         return self._slam.get_state() | {"submaps": self._submaps.get_state()}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state that ``get_state`` returned."""
+        check_has(state, ("submaps",), type(self).__name__)
         self._slam.set_state(state)
         self._submaps.set_state(state["submaps"])

@@ -22,7 +22,7 @@ from ms_slam_env.geometry import check_pose, invert
 from ms_slam_env.slam.alignment_check import MAP_REASONS, AlignmentStatistics, TrackingStatus
 from ms_slam_env.slam.base import Float64, TrackResult
 from ms_slam_env.slam.ferns import Candidate
-from ms_slam_env.slam.state import Saved
+from ms_slam_env.slam.state import Saved, check_has
 from ms_slam_env.slam.surfel.acceptance import Alignment, with_doubt
 from ms_slam_env.slam.surfel.camera_states import CameraStates
 from ms_slam_env.slam.surfel.config import SurfelConfig
@@ -31,7 +31,7 @@ from ms_slam_env.slam.surfel.device import HostDeviceBuffer
 from ms_slam_env.slam.surfel.localization import Localizer
 from ms_slam_env.slam.surfel.loop_closure import make_loop_closure
 from ms_slam_env.slam.surfel.motion_mask import make_motion_mask
-from ms_slam_env.slam.surfel.photometry import is_invalid_frame
+from ms_slam_env.slam.surfel.photometry import is_invalid_frame, same_exposure
 from ms_slam_env.slam.surfel.pipeline import Pipeline, PipelineCache, check_change
 from ms_slam_env.slam.surfel.pose_hypotheses import (
     check_guesses,
@@ -267,6 +267,13 @@ class BatchedSurfelSlam(Saved):
         """Number of an env's last frame."""
         return int(self._states.time[env]) - 1
 
+    def mark_lost(self, env: int = 0) -> None:
+        """Seek an env's next frame in its map, whatever the light is by now."""
+        if self._states.started[env]:
+            self._states.hold(env)
+            self._states.photometry[env] = same_exposure(1)[0]
+            self.motion_mask.forget(env)
+
     def motion(self, env: int = 0) -> Float64:
         """Motion (4, 4) that is expected of an env's next frame."""
         return self._states.motions[env].copy()
@@ -319,6 +326,7 @@ class BatchedSurfelSlam(Saved):
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state of a SLAM of the same batch, intrinsics and configuration."""
+        check_has(state, ("map",), "SurfelSlam")
         self.map.check_fits(state["map"])
         self._states.set_state(state)
         super().set_state(state)

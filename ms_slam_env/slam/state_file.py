@@ -1,0 +1,133 @@
+"""States on disk: arrays in an NPZ file, everything else as JSON beside them; nothing is executed.
+
+A state is nested mappings, lists and tuples of arrays and plain values. Its arrays stand in the
+archive under numbers; ``tree.json`` says where each belongs.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.errors import InputError
+from ms_slam_env.input_files import MAX_MESH_BYTES, check_file
+from ms_slam_env.output_files import write_bytes
+
+FORMAT, VERSION = "ms_slam_env map", 1
+MAX_UNPACKED_BYTES = 4 * MAX_MESH_BYTES
+_TREE = "tree.json"
+_CONTAINERS = {"list": list, "tuple": tuple}
+_BROKEN = (
+    *(OSError, EOFError, ValueError, KeyError, TypeError, IndexError, AttributeError),
+    *(NotImplementedError, RecursionError, MemoryError, OverflowError, RuntimeError),
+    *(zipfile.BadZipFile, zlib.error),
+)
+"""Whatever the readers of zip archives, of JSON and of arrays raise at what is none."""
+
+
+def write_state(path: Path, about: Mapping[str, Any], state: Mapping[str, Any]) -> None:
+    """Write a state, whole or not at all.
+
+    Args:
+        path: of the file.
+        about: what the state is of, in JSON's types.
+        state: as ``Stateful.get_state`` returns it.
+    """
+    arrays: list[NDArray[Any]] = []
+    tree = _packed(state, arrays)
+    header = {"format": FORMAT, "version": VERSION, "about": about, "state": tree}
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        archive.writestr(zipfile.ZipInfo(_TREE), json.dumps(header), zipfile.ZIP_DEFLATED)
+        for index, array in enumerate(arrays):
+            with archive.open(zipfile.ZipInfo(_name(index)), "w", force_zip64=True) as file:
+                np.lib.format.write_array(file, array, allow_pickle=False)
+    write_bytes(path, data.getvalue())
+
+
+def read_state(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Read what `write_state` wrote.
+
+    Returns:
+        What the state is of, and the state.
+
+    Raises:
+        InputError: no such file, none of these, of another version, or damaged; one line.
+    """
+    check_file(path, "map", MAX_MESH_BYTES)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(info.file_size for info in archive.infolist()) > MAX_UNPACKED_BYTES:
+                raise InputError(f"larger than {MAX_UNPACKED_BYTES / 1e9:.0f} GB once unpacked")
+            header = json.loads(archive.read(_TREE))
+            _check_version(header)
+            state = _unpacked(header["state"], lambda index: _read_array(archive, index))
+            return dict(header["about"]), dict(state)
+    except InputError as error:
+        raise InputError(f"cannot read map {path}: {error}") from None
+    except _BROKEN as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"cannot read map {path}: damaged, or no map ({reason})") from None
+
+
+def _check_version(header: Mapping[str, Any]) -> None:
+    if header["format"] != FORMAT:
+        raise InputError(f"it is a file of {header['format']!r}, not of {FORMAT!r}")
+    if header["version"] != VERSION:
+        raise InputError(f"it has version {header['version']!r}; this program reads {VERSION}")
+
+
+def _name(index: int) -> str:
+    return f"{index}.npy"
+
+
+def _packed(value: Any, arrays: list[NDArray[Any]]) -> Any:
+    """``value`` in JSON's types; its arrays, and numbers of NumPy, are added to ``arrays``."""
+    if isinstance(value, (np.ndarray, np.generic)):
+        kind = "array" if isinstance(value, np.ndarray) else "number"
+        arrays.append(np.asarray(value))
+        return {kind: len(arrays) - 1}
+    if isinstance(value, Mapping):
+        return {"mapping": {str(name): _packed(one, arrays) for name, one in value.items()}}
+    for container, made in _CONTAINERS.items():
+        if isinstance(value, made):
+            return {container: [_packed(one, arrays) for one in value]}
+    return value
+
+
+def _unpacked(tree: Any, array: Callable[[int], NDArray[Any]]) -> Any:
+    if not isinstance(tree, dict):
+        return tree
+    ((kind, content),) = tree.items()
+    if kind == "array":
+        return array(content)
+    if kind == "number":
+        return array(content)[()]
+    if kind == "mapping":
+        return {name: _unpacked(one, array) for name, one in content.items()}
+    return _CONTAINERS[kind](_unpacked(one, array) for one in content)
+
+
+def _read_array(archive: zipfile.ZipFile, index: int) -> NDArray[Any]:
+    """One array, whose header must say how long it really is."""
+    with archive.open(_name(index)) as file:
+        version = np.lib.format.read_magic(file)
+        readers = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }
+        shape, is_fortran, dtype = readers[version](file)
+        data = file.read()
+    if dtype.hasobject or len(data) != math.prod(shape) * dtype.itemsize:
+        raise ValueError(f"{_name(index)} is not the array that it says")
+    flat = np.frombuffer(bytearray(data), dtype=dtype)
+    return flat.reshape(shape, order="F" if is_fortran else "C")
