@@ -5,6 +5,7 @@ from ms_slam_env.slam.configuration import (
     SlamConfiguration,
     is_file_name,
     make,
+    open_map,
     read_configuration,
     write_configuration,
 )
@@ -20,6 +21,7 @@ __all__ = [
     "check_parameters",
     "is_file_name",
     "make",
+    "open_map",
     "read_configuration",
     "write_configuration",
 ]

@@ -34,6 +34,7 @@ class TrackResult:
         relocalised: whether this frame ended a period of lost tracking.
         inlier_fraction: share of the frame's valid pixels that the alignment explained.
         residual_m: RMS point-to-plane residual of the inliers, metres.
+        overlap: share of the frame's readings that land on the view that it was aligned with.
         reason: why tracking failed, in words; empty when it did not.
         loop_closed: whether this frame closed a loop: the map was bent, and the pose jumped by the
             drift that was taken back.
@@ -63,6 +64,7 @@ class TrackResult:
     degenerate_directions: int = 0
     covariance: Float64 | None = None
     uncertain: bool = False
+    overlap: float = 1.0
 
     @property
     def fused(self) -> bool:

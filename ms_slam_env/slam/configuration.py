@@ -16,7 +16,8 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.input_files import read_text
 from ms_slam_env.output_files import write_text
 from ms_slam_env.slam.base import SlamBackend
-from ms_slam_env.slam.registry import check_parameters, make_backend
+from ms_slam_env.slam.registry import backend_name, check_parameters, make_backend
+from ms_slam_env.slam.state_file import read_about
 
 SUFFIXES = (".yaml", ".yml")
 _MAX_BYTES = 1_000_000
@@ -85,6 +86,33 @@ def make(
         configuration = read_configuration(name)
         name, params = configuration.slam, merged(configuration.slam_config, params)
     return make_backend(name, intrinsics, params)
+
+
+def open_map(path: str | Path, lost: bool = True, **params: Any) -> SlamBackend:
+    """Make the backend that wrote a map, for the same camera, and let it go on in the map.
+
+    Args:
+        path: of a file that ``SlamBackend.save`` wrote.
+        lost: whether the camera is somewhere else by now; see ``SlamBackend.load``.
+        params: of the backend, before those that it had.
+
+    Raises:
+        InputError: as ``SlamBackend.load``; the map of a backend that is not ours; a parameter that
+            is unknown, or with which the map does not fit.
+    """
+    about = read_about(Path(path))
+    made_of: dict[str, Any] = {key: about.get(key) for key in ("intrinsics", "config")}
+    for key, value in made_of.items():
+        if not isinstance(value, Mapping):
+            raise InputError(f"{path} does not say its {key}")
+    try:
+        name = backend_name(about.get("backend"))
+        intrinsics = from_dict(Intrinsics, made_of["intrinsics"], "intrinsics")
+        made = make_backend(name, intrinsics, merged(made_of["config"], params))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    made.load(path, lost)
+    return made
 
 
 def is_file_name(name: object) -> bool:

@@ -219,14 +219,14 @@ class OdometrySlam(BorrowedMap, FrameByFrameSlam[DepthImage, _Placed]):
         """Pose and motion, the images that frames are aligned with, and the map."""
         return super().get_state() | {
             "key": _save(self._key),
-            "last": "key" if self._last is self._key else _save(self._last),
+            "last": None if self._last is self._key else _save(self._last),
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state of a backend of the same intrinsics and configuration."""
         super().set_state(state)
         self._key = self._restore(state["key"])
-        self._last = self._key if state["last"] == "key" else self._restore(state["last"])
+        self._last = self._key if state["last"] is None else self._restore(state["last"])
 
     def _restore(self, saved: dict[str, Any] | None) -> _Placed | None:
         if saved is None:

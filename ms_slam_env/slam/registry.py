@@ -61,6 +61,18 @@ def make_backend(name: object, intrinsics: Intrinsics, params: Mapping[str, Any]
     return made
 
 
+def backend_name(cls_name: object) -> str:
+    """Name of our backend whose class has this name.
+
+    Raises:
+        InputError: none of ours has.
+    """
+    names = {entry.backend: name for name, entry in _OWN.items()}
+    if cls_name not in names:
+        raise unknown("SLAM backend", cls_name, names)
+    return names[str(cls_name)]
+
+
 def check_parameters(name: object, params: object) -> Any:
     """Refuse what ``make_backend`` would refuse, without making a backend.
 

@@ -11,7 +11,8 @@ import json
 import math
 import zipfile
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +64,20 @@ def read_state(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     Raises:
         InputError: no such file, none of these, of another version, or damaged; one line.
     """
+    with _opened(path) as (archive, header):
+        state = _unpacked(header["state"], lambda index: _read_array(archive, index))
+        return dict(header["about"]), dict(state)
+
+
+def read_about(path: Path) -> dict[str, Any]:
+    """What the state in a file is of; see `read_state`."""
+    with _opened(path) as (_, header):
+        return dict(header["about"])
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[zipfile.ZipFile, Mapping[str, Any]]]:
+    """The archive and its header; whatever goes wrong with either is one error."""
     check_file(path, "map", MAX_MESH_BYTES)
     try:
         with zipfile.ZipFile(path) as archive:
@@ -70,8 +85,7 @@ def read_state(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
                 raise InputError(f"larger than {MAX_UNPACKED_BYTES / 1e9:.0f} GB once unpacked")
             header = json.loads(archive.read(_TREE))
             _check_version(header)
-            state = _unpacked(header["state"], lambda index: _read_array(archive, index))
-            return dict(header["about"]), dict(state)
+            yield archive, header
     except InputError as error:
         raise InputError(f"cannot read map {path}: {error}") from None
     except _BROKEN as error:

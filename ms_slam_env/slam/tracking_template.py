@@ -130,13 +130,15 @@ class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
         self._extend(frame, prepared, attempt)
         found = attempt.statistics
         figures = found.inlier_ratio, found.residual_m
-        return TrackResult(self._pose.copy(), True, relocalised, *figures)
+        return TrackResult(self._pose.copy(), True, relocalised, *figures, overlap=found.overlap)
 
     def _lose(self, reason: str, statistics: AlignmentStatistics) -> TrackResult:
         """Hold the pose and the map."""
         self.mark_lost()
         figures = statistics.inlier_ratio, statistics.residual_m
-        return TrackResult(self._pose.copy(), False, False, *figures, reason)
+        return TrackResult(
+            self._pose.copy(), False, False, *figures, reason, overlap=statistics.overlap
+        )
 
     @property
     @abstractmethod

@@ -168,7 +168,7 @@ class BatchedSurfelSlam(Saved):
         pose = self.poses[env].copy()
         if _readings(env, live) < FEWEST_READINGS:
             reason = "the first frame has too few depth readings"
-            return TrackResult(pose, False, inlier_fraction=0.0, reason=reason)
+            return TrackResult(pose, False, inlier_fraction=0.0, reason=reason, overlap=0.0)
         self._states.started[env] = True
         return TrackResult(pose, True, moving=self.motion_mask.mask(env))
 
@@ -195,6 +195,7 @@ class BatchedSurfelSlam(Saved):
             degenerate_directions=int(alignment.statistics[env]["degenerate_directions"]),
             covariance=covariance if tracked else None,
             uncertain=uncertain,
+            overlap=float(alignment.statistics[env]["overlap"]),
             moving=self.motion_mask.mask(env),
         )
 
