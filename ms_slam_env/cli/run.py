@@ -12,6 +12,7 @@ import tyro
 
 from ms_slam_env.command_line import parse
 from ms_slam_env.errors import InputError
+from ms_slam_env.output_files import check_out_file
 
 if TYPE_CHECKING:
     from ms_slam_env.sequences import Sequence as RGBDSequence
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 _PRINTED = (
     *("frames", "processed_frames", "lost_frames"),
     *("cpu_ms_median", "ext_ms", "ext_ms_p95", "mem_peak_mb", "ene_j"),
-    *("path_m", "ate_m", "ate_rad", "rpe_m"),
+    *("path_m", "ate_m", "ate_tracked_m", "tracked_share", "ate_rad", "rpe_m"),
 )
 
 
@@ -56,6 +57,13 @@ class Arguments:
     frame_management: str = "none"
     """Which frames SLAM processes: none (every frame), regular,every=2, divergence,threshold=0.01,
     budget,share=0.5 and so on; the poses of the others are predicted."""
+    map_in: Path | None = None
+    """Go on in the map of this file, which --map-out of another run wrote: the camera is sought in
+    it. Backend and parameters are those of the file."""
+    map_out: Path | None = None
+    """Write the map to this file, to be gone on with."""
+    mesh: bool = False
+    """Write mesh.ply, too: Poisson reconstruction of the map (extra open3d)."""
     out: Path = Path("results/run")
     """Folder of the results."""
 
@@ -68,15 +76,26 @@ def main(arguments: Sequence[str]) -> int:
     from ms_slam_env.parallel import limit_threads
     from ms_slam_env.sequences import open_sequence
     from ms_slam_env.sequences.recording import parse_calibration
-    from ms_slam_env.slam.configuration import SlamConfiguration, merged, read_configuration
+    from ms_slam_env.slam.configuration import (
+        SlamConfiguration,
+        configuration_of_map,
+        merged,
+        read_configuration,
+    )
     from ms_slam_env.slam.frame_selection import parse_frame_selection
 
     management = parse_frame_selection(args.frame_management)
     slam = SlamConfiguration(slam=args.backend or "surfel")
-    if args.config is not None:
-        slam = read_configuration(args.config)
+    if args.config is not None and args.map_in is not None:
+        raise InputError("--config and --map-in both say the backend and its parameters; give one")
+    source = args.config or args.map_in
+    if source is not None:
+        read = read_configuration if args.config else configuration_of_map
+        slam = read(source)
         if args.backend not in (None, slam.slam):
-            raise InputError(f"--backend {args.backend} but {args.config} configures {slam.slam}")
+            raise InputError(f"--backend {args.backend} but {source} is of {slam.slam}")
+    if args.map_out is not None:
+        check_out_file(args.map_out)
     given = None
     if args.intrinsics is not None:
         given = parse_calibration(args.intrinsics.replace(",", " ").split(), "--intrinsics")
@@ -96,12 +115,24 @@ def main(arguments: Sequence[str]) -> int:
     params = merged(slam.slam_config, nested_options(args.params))
     fed = {"keep_every": slam.keep_every, "threads": slam.threads}
     _say_what_is_missing(sequence)
-    result = run_to_folder(sequence, slam.slam, params, args.out, fed, management)
+    result = run_to_folder(
+        sequence,
+        slam.slam,
+        params,
+        args.out,
+        fed,
+        management,
+        map_in=args.map_in,
+        map_out=args.map_out,
+        mesh=args.mesh,
+    )
     for name in _PRINTED:
         if result.get(name) is not None:
             print(f"{name:16} {result[name]:.4g}")
     if result.get("ene_j") is None and "ene_source" in result:
         print(f"{'ene_j':16} {result['ene_source']}")
+    for reason in result["lost_reasons"]:
+        print(f"lost {reason}", file=sys.stderr)
     _refuse_lost(sequence, result["processed_frames"], result["lost_frames"])
     return 0
 

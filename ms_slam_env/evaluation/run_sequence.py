@@ -31,6 +31,7 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
 from ms_slam_env.camera import RGBDFrame
+from ms_slam_env.errors import InputError
 from ms_slam_env.metrics.cost import CostMeter
 from ms_slam_env.metrics.cost.meter import FrameCost
 from ms_slam_env.sequences.sequence import Sequence
@@ -100,12 +101,18 @@ class SequenceRun:
         self._total: int | None = len(frames) if isinstance(frames, Sized) else None
         self._progress = progress
         if isinstance(frames, Sequence):
+            if backend.needs_color and not frames.has_color:
+                raise InputError(
+                    f"sequence {frames.name} has no colour, without which {type(backend).__name__} "
+                    "tracks nothing; the backend surfel tracks depth alone"
+                )
             self._true_poses = frames.poses
             start = frames.start if start is None else start
             frames = frames.frames
         self._frames = iter(frames)
         if reset:
             backend.reset(start)
+        self._counted = backend.frames_counted  # of earlier sessions
 
     def __iter__(self) -> Iterator[Step]:
         """Track frame after frame."""
@@ -185,10 +192,11 @@ class SequenceRun:
     def corrected(self) -> Float64 | None:
         """(N, 4, 4) T_world_camera as the map has them now; None if the SLAM corrects none."""
         frames, poses = self.backend.corrected_trajectory()
-        if not len(frames):
+        own = np.asarray(frames) >= self._counted
+        if not own.any():
             return None
         final = self.estimates
-        final[np.asarray(frames)] = poses
+        final[np.asarray(frames)[own] - self._counted] = poses[own]
         return final
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict
@@ -13,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import metrics, slam
+from ms_slam_env.evaluation.mesh_export import MESH, check_open3d, write_mesh
+from ms_slam_env.evaluation.run_files import COSTS, frame_costs, write_frames, write_ply
 from ms_slam_env.evaluation.run_sequence import SequenceRun
 from ms_slam_env.evaluation.submaps import (
     paths_by_submap,
@@ -21,10 +22,17 @@ from ms_slam_env.evaluation.submaps import (
     submap_numbers,
     write_submaps,
 )
-from ms_slam_env.evaluation.trajectory_charts import error_panel, path_panel, thinned
+from ms_slam_env.evaluation.tracking_diagnosis import (
+    REFUSED,
+    RefusedFrame,
+    alignment_chart,
+    lost_reasons,
+    lost_table,
+)
+from ms_slam_env.evaluation.trajectory_charts import error_panel, marked_panel, path_panel
 from ms_slam_env.geometry import invert
-from ms_slam_env.output_files import growing_file, result_folder, write_bytes, write_text
-from ms_slam_env.report.charts import Chart, Panel, Series
+from ms_slam_env.output_files import growing_file, result_folder, write_bytes
+from ms_slam_env.report.charts import Chart, Panel
 from ms_slam_env.report.results import write_results
 from ms_slam_env.report.tables import Table, make_table
 from ms_slam_env.sequences import Sequence, associate
@@ -47,7 +55,16 @@ SUBMAPS = "submaps.csv"
 _ABOUT = "A SLAM backend over a sequence: its path, its error, what each frame cost."
 _TABLES = {
     "Frames and trajectory": (
-        *("frames", "processed_frames", "lost_frames", "path_m", "ate_m", "ate_max_m", "ate_rad"),
+        *(
+            "frames",
+            "processed_frames",
+            "lost_frames",
+            "path_m",
+            "ate_m",
+            "ate_tracked_m",
+            "tracked_share",
+        ),
+        *("ate_max_m", "ate_rad"),
         *("ate_unaligned_m", "rpe_m", "rpe_rad", "final_ate_m", "final_rpe_m"),
     ),
     "Submaps": ("submaps", "joined_submaps", "unjoined_share", "joined_ate_m", "submap_ate_m"),
@@ -56,8 +73,6 @@ _TABLES = {
         *("mem_mb", "mem_peak_mb", "ene_j", "ene_frame_j", "ene_source"),
     ),
 }
-_COSTS = ("frame_cpu_ms", "frame_ext_ms", "frame_mem_mb", "frame_ene_j")
-"""Metrics of one frame, as `frame_costs` gives them."""
 
 
 def run_to_folder(
@@ -67,11 +82,16 @@ def run_to_folder(
     out: Path,
     fed: Mapping[str, Any] | None = None,
     selection: FrameSelectionConfig | None = None,
+    map_in: Path | None = None,
+    map_out: Path | None = None,
+    mesh: bool = False,
 ) -> dict[str, Any]:
     """Track every frame of ``sequence`` and write what came of it to ``out``.
 
     Those that ``selection`` drops are not processed; their poses are predicted.
-    SLAM starts at the true pose of the first frame where that is known, else at the identity.
+    SLAM starts at the true pose of the first frame where that is known, else at the identity; or
+    somewhere in the map of file ``map_in``, which it goes on with. In the end the map is written to
+    ``map_out`` to be gone on with, and as a ``mesh`` to ``mesh.ply``.
     While it runs, the trajectory so far stands in ``trajectory.incomplete.txt``. At the end that
     becomes ``trajectory.txt``, beside ``map.ply``, ``frames.csv`` with what every frame cost and,
     last, ``metrics.json``, which also says how the frames were ``fed`` to the backend. Where it
@@ -82,30 +102,41 @@ def run_to_folder(
     so.
 
     Returns:
-        the metrics in ``metrics.json``.
+        the metrics in ``metrics.json``, and ``lost_reasons``, lines that say why frames were lost.
 
     Raises:
-        InputError: a bad option, or an image that cannot be read.
+        InputError: a bad option, a map that cannot be gone on with, or an image that cannot be
+            read.
         OSError: a file that cannot be written.
     """
+    if mesh:
+        check_open3d()
     meter = metrics.CostMeter(str(params.get("device", "cpu")))
     selection = selection or EveryFrameConfig()
     system = selection.manage(slam.make(backend, sequence.intrinsics, **params))
-    run = SequenceRun(system, sequence, meter=meter, progress=sequence.name)
+    if map_in is not None:
+        system.load(map_in)
+    run = SequenceRun(system, sequence, meter=meter, progress=sequence.name, reset=map_in is None)
     content = _about(sequence, backend, params, fed or {}, selection)
-    for old in (METRICS, TRAJECTORY, CORRECTED, TRUTH, MAP, FRAMES, SUBMAPS):
+    content["map_in"] = None if map_in is None else str(map_in)
+    refused = RefusedFrame(has_map=map_in is not None)
+    for old in (METRICS, TRAJECTORY, CORRECTED, TRUTH, MAP, MESH, FRAMES, SUBMAPS, REFUSED):
         (out / old).unlink(missing_ok=True)
     try:
         with growing_file(out / UNFINISHED) as add:
             add(TRAJECTORY_HEADER)
             for step in run:
                 add(trajectory_line(step.frame.timestamp, step.result.T_world_camera))
-        result = _write(run, sequence, out, {"complete": True, **content})
+                refused.look(run, step)
+        if map_out is not None:
+            system.save(map_out)
+        result = _write(run, sequence, out, {"complete": True, **content}, refused, mesh)
     except BaseException as error:
         stopped = isinstance(error, KeyboardInterrupt)
         content["error"] = str(error) or type(error).__name__
         with suppress(OSError):  # a disk that is full: the poses so far are all there is
-            _write(run, sequence, out, {"complete": False, "interrupted": stopped, **content})
+            unfinished = {"complete": False, "interrupted": stopped, **content}
+            _write(run, sequence, out, unfinished, refused, mesh=False)
             if stopped:
                 error.args = (f"{len(run)} of {len(sequence)} frames are kept in {out}",)
         raise
@@ -114,7 +145,12 @@ def run_to_folder(
 
 
 def _write(
-    run: SequenceRun, sequence: Sequence, out: Path, content: Mapping[str, Any]
+    run: SequenceRun,
+    sequence: Sequence,
+    out: Path,
+    content: Mapping[str, Any],
+    refused: RefusedFrame,
+    mesh: bool,
 ) -> dict[str, Any]:
     """Write what is known of a run, finished or not; return its metrics."""
     result: dict[str, Any] = {}
@@ -122,19 +158,24 @@ def _write(
         if content["complete"]:
             write_bytes(folder / TRAJECTORY, (out / UNFINISHED).read_bytes())
             result |= _write_finished(run, sequence, folder)
+            if mesh:
+                write_mesh(folder / MESH, run.backend)
         result |= measure(run, sequence)
+        reasons = lost_reasons(run)
+        why = {"lost_reasons": [str(reason) for reason in reasons]}
+        refused.save(folder / REFUSED)
         write_frames(folder / FRAMES, run)
         write_results(
             folder / METRICS,
             kind="run",
             title=f"{content['backend']} over {sequence.name}",
             about=_ABOUT,
-            tables=_tables(result),
+            tables=[*_tables(result), *([lost_table(reasons)] if reasons else [])],
             charts=_charts(run, sequence),
-            content=content,
+            content={**content, **why},
             metrics=result,
         )
-    return result
+    return result | why
 
 
 def _write_finished(run: SequenceRun, sequence: Sequence, folder: Path) -> dict[str, Any]:
@@ -195,7 +236,16 @@ def measure(run: SequenceRun, sequence: Sequence) -> dict[str, Any]:
         **submap_measures(run),
         **run.meter.summary(),
         **trajectory_errors(run, run.estimates, sequence),
+        **_tracked_errors(run, sequence),
     }
+
+
+def _tracked_errors(run: SequenceRun, sequence: Sequence) -> dict[str, Any]:
+    """``tracked_share`` of the frames, and ``ate_tracked_m`` of those alone where there are two."""
+    share = {"tracked_share": 1.0 - run.lost}
+    times, P, Q = _pairs(run, run.estimates, sequence)
+    ok = run.tracking_ok[np.isin(run.timestamps, times)]
+    return share | ({"ate_tracked_m": metrics.ate_rmse(P[ok], Q[ok])} if ok.sum() > 1 else {})
 
 
 def trajectory_errors(run: SequenceRun, poses: Float64, sequence: Sequence) -> dict[str, Any]:
@@ -281,77 +331,12 @@ def _charts(run: SequenceRun, sequence: Sequence) -> list[Chart]:
         caption = "Distance from the true position after SE(3) alignment."
         panel = error_panel("position_error_m", times - run.timestamps[0], {"estimate": distance})
         found.append(Chart("error", "Error over time", caption, [panel]))
+    found.append(alignment_chart(run))
     caption = "The frames for which SLAM had no pose are marked."
     return [*found, Chart("cost", "Cost of every frame", caption, _cost_panels(run))]
 
 
 def _cost_panels(run: SequenceRun) -> list[Panel]:
     costs, lost = frame_costs(run), np.flatnonzero(~run.tracking_ok)
-    picked = thinned(len(run))
-    panels = []
-    for key in _COSTS:
-        values = costs[key]
-        if not np.isfinite(values).any():
-            continue
-        series = [Series("all", picked.tolist(), values[picked].tolist(), mode="lines")]
-        if len(lost):
-            shown = lost[thinned(len(lost))]
-            series.append(Series("lost", shown.tolist(), values[shown].tolist(), mode="markers"))
-        panels.append(Panel("frame", key, series))
-    return panels
-
-
-# -- Files -------------------------------------------------------------------------------------
-
-
-def frame_costs(run: SequenceRun) -> dict[str, Float64]:
-    """What each frame (N,) cost, by key; NaN where it cannot be had.
-
-    The cost of a frame that was interrupted before it was recorded is left out.
-    """
-    costs = run.costs[: len(run)]
-    values = [(1e3 * cost.cpu_s, 1e3 * cost.ext_s, cost.mem_mb, cost.joules) for cost in costs]
-    return dict(zip(_COSTS, np.array(values, dtype=np.float64).reshape(-1, 4).T, strict=True))
-
-
-def write_frames(path: Path, run: SequenceRun) -> None:
-    """Write what every frame cost and whether it was tracked as CSV; what is unknown is empty."""
-    costs = frame_costs(run)
-    columns = [costs[f"frame_{name}"] for name in ("ext_ms", "cpu_ms", "mem_mb", "ene_j")]
-    lines = ["timestamp,tracking_ok,ext_ms,cpu_ms,mem_mb,ene_j"]
-    for timestamp, ok, *values in zip(run.timestamps, run.tracking_ok, *columns, strict=True):
-        words = ["" if math.isnan(value) else f"{value:.3f}" for value in values]
-        lines.append(",".join([f"{timestamp:.6f}", str(int(ok)), *words]))
-    write_text(path, "\n".join(lines) + "\n")
-
-
-_PLY_NAMES = {
-    "color": ("red", "green", "blue"),
-    "normal": ("nx", "ny", "nz"),
-}
-_PLY_TYPES = {"u1": "uchar", "f4": "float"}
-
-
-def write_ply(
-    path: Path, points: NDArray[np.float64], attributes: dict[str, NDArray[np.generic]]
-) -> None:
-    """Write points (M, 3) and what is known of each, by name: (M,) or (M, 3) arrays, binary PLY.
-
-    ``color`` is uint8, everything else 32-bit floats.
-    """
-    columns = {name: np.asarray(points[:, k], "<f4") for k, name in enumerate("xyz")}
-    for name, values in attributes.items():
-        kind = "u1" if name == "color" else "<f4"
-        for k, column in enumerate(np.atleast_2d(values.T)):
-            columns[_PLY_NAMES.get(name, (name,))[k]] = column.astype(kind)
-    table = np.empty(len(points), dtype=[(name, c.dtype) for name, c in columns.items()])
-    for name, column in columns.items():
-        table[name] = column
-    lines = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {len(points)}",
-        *(f"property {_PLY_TYPES[c.dtype.str[1:]]} {name}" for name, c in columns.items()),
-        "end_header",
-    ]
-    write_bytes(path, "\n".join(lines).encode() + b"\n" + table.tobytes())
+    known = [key for key in COSTS if np.isfinite(costs[key]).any()]
+    return [marked_panel(key, costs[key], lost) for key in known]

@@ -45,6 +45,16 @@ def error_panel(key: str, times: Float64, errors: Mapping[str, Float64]) -> Pane
     return Panel("since_start_s", key, [_line(name, times, e) for name, e in errors.items()])
 
 
+def marked_panel(key: str, values: Float64, lost: NDArray[np.int64]) -> Panel:
+    """Metric ``key`` (N,) over the frames; those numbered in ``lost`` (K,) are marked."""
+    picked = thinned(len(values))
+    series = [Series("all", picked.tolist(), values[picked].tolist(), mode="lines")]
+    if len(lost):
+        shown = lost[thinned(len(lost))]
+        series.append(Series("lost", shown.tolist(), values[shown].tolist(), mode="markers"))
+    return Panel("frame", key, series)
+
+
 def _line(name: str, x: Float64, y: Float64) -> Series:
     picked = thinned(len(x))
     return Series(name, x[picked].tolist(), y[picked].tolist(), mode="lines")

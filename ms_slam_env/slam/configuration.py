@@ -100,19 +100,33 @@ def open_map(path: str | Path, lost: bool = True, **params: Any) -> SlamBackend:
         InputError: as ``SlamBackend.load``; the map of a backend that is not ours; a parameter that
             is unknown, or with which the map does not fit.
     """
-    about = read_about(Path(path))
-    made_of: dict[str, Any] = {key: about.get(key) for key in ("intrinsics", "config")}
-    for key, value in made_of.items():
-        if not isinstance(value, Mapping):
-            raise InputError(f"{path} does not say its {key}")
-    try:
-        name = backend_name(about.get("backend"))
-        intrinsics = from_dict(Intrinsics, made_of["intrinsics"], "intrinsics")
-        made = make_backend(name, intrinsics, merged(made_of["config"], params))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+    intrinsics = _part(read_about(Path(path)), "intrinsics", path)
+    saved = configuration_of_map(path)
+    camera = from_dict(Intrinsics, intrinsics, f"{path}: intrinsics")
+    made = make_backend(saved.slam, camera, merged(saved.slam_config, params))
     made.load(path, lost)
     return made
+
+
+def configuration_of_map(path: str | Path) -> SlamConfiguration:
+    """Backend and parameters that wrote a map.
+
+    Raises:
+        InputError: no such file, no map, or the map of a backend that is not ours.
+    """
+    about = read_about(Path(path))
+    try:
+        name = backend_name(about.get("backend"))
+        return SlamConfiguration(name, dict(_part(about, "config", path)))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _part(about: Mapping[str, Any], key: str, path: str | Path) -> Mapping[str, Any]:
+    part = about.get(key)
+    if not isinstance(part, Mapping):
+        raise InputError(f"{path} does not say its {key}")
+    return part
 
 
 def is_file_name(name: object) -> bool:

@@ -185,8 +185,9 @@ def check_plain(value: Any, like: Any, where: str) -> None:
     kind = next(kind for kind in _KINDS if isinstance(like, kind))
     if not isinstance(value, kind) or (kind is not _KINDS[0] and isinstance(value, _KINDS[0])):
         raise wrong(where, f"is a {type(value).__name__}, not a {type(like).__name__}")
-    if kind is numbers.Integral and not 0 <= value < _MOST:
-        raise wrong(where, f"is {value}, outside [0, {_MOST})")
+    low = min(0, like) if kind is numbers.Integral else 0  # where there may be none, -1 says so
+    if kind is numbers.Integral and not low <= value < _MOST:
+        raise wrong(where, f"is {value}, outside [{low}, {_MOST})")
     if kind is _KINDS[2] and not np.isfinite(value):
         raise wrong(where, f"is {value}, not finite")
 

@@ -21,7 +21,7 @@ from ms_slam_env.camera import xtion
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.map_files import evaluate_maps
-from ms_slam_env.evaluation.run_to_folder import write_ply
+from ms_slam_env.evaluation.run_files import write_ply
 from ms_slam_env.evaluation.trajectory_files import (
     TrajectoryOptions,
     absolute_key,

@@ -95,7 +95,7 @@ def test_writes_trajectory_map_and_metrics(sequence, tmp_path, capsys):
     written = json.loads((out / "metrics.json").read_text())
     assert written["complete"]
     assert (written["kind"], written["results_version"]) == ("run", RESULTS_VERSION)
-    assert [chart["name"] for chart in written["charts"]] == ["path", "error", "cost"]
+    assert [chart["name"] for chart in written["charts"]] == ["path", "error", "alignment", "cost"]
     assert [table["title"] for table in written["tables"]] == ["Frames and trajectory", "Cost"]
     assert (written["frames"], written["lost_frames"], len(times)) == (FRAMES, 0, FRAMES)
     assert written["ate_m"] == pytest.approx(ate_rmse(poses, truth), abs=1e-6)
@@ -104,7 +104,13 @@ def test_writes_trajectory_map_and_metrics(sequence, tmp_path, capsys):
     assert 0 < written["ext_ms_median"] <= written["ext_ms_p95"] <= written["ext_ms_max"]
     assert written["ene_source"].startswith("cpu: ")
     header, *rows = (out / "frames.csv").read_text().splitlines()
-    assert header == "timestamp,tracking_ok,ext_ms,cpu_ms,mem_mb,ene_j"
+    assert header == (
+        "timestamp,tracking_ok,ext_ms,cpu_ms,mem_mb,ene_j,"
+        "inlier_fraction,overlap,residual_m,degenerate_directions,reason"
+    )
+    assert written["ate_tracked_m"] == written["ate_m"]
+    assert written["tracked_share"] == 1
+    assert written["lost_reasons"] == []
     assert [float(row.split(",")[0]) for row in rows] == pytest.approx(times)
     assert np.mean([float(row.split(",")[2]) for row in rows]) == pytest.approx(
         written["ext_ms"], abs=1e-3

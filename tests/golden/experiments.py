@@ -436,7 +436,7 @@ def duplicate_objects(_: Path) -> Any:
 @experiment("map_evaluation", EXACT)
 def map_evaluation(folder: Path) -> Any:
     from ms_slam_env.evaluation.map_files import MapOptions, evaluate_maps
-    from ms_slam_env.evaluation.run_to_folder import write_ply
+    from ms_slam_env.evaluation.run_files import write_ply
 
     rng = np.random.default_rng(0)
     truth = rng.uniform(0, 1, (4000, 3)) * (1, 1, 0.3)

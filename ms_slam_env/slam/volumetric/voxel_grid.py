@@ -25,8 +25,8 @@ _FRAGMENT_PX = 16  # edge of the pieces in which Open3D draws its blocks
 _SMOOTH_PX = 1.5  # width of the filter of cast depth
 
 
-def load_open3d() -> Any:
-    """Open3D, its messages below errors silenced.
+def load_open3d(what: str = "the volumetric backend") -> Any:
+    """Open3D, which ``what`` needs, its messages below errors silenced.
 
     Raises:
         InputError: it, or a system library that it needs, is not installed.
@@ -35,7 +35,7 @@ def load_open3d() -> Any:
         import open3d
     except (ImportError, OSError) as error:
         raise InputError(
-            "the volumetric backend needs Open3D (pip install 'ms-slam-env[open3d]') and, on "
+            f"{what} needs Open3D (pip install 'ms-slam-env[open3d]') and, on "
             f"Debian and Ubuntu, libgl1, libx11-6 and libgomp1 (apt-get install): {error}"
         ) from error
     open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
