@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env import metrics
 from ms_slam_env.config import Checked, bounded, chosen
-from ms_slam_env.errors import InputError
+from ms_slam_env.errors import InputError, InputWarning
 from ms_slam_env.input_files import read_text
 from ms_slam_env.metrics.relative import DELTA_UNITS, PAIRINGS, TOLERANCE
 from ms_slam_env.metrics.trajectory import ALIGNMENTS
@@ -23,6 +24,10 @@ from ms_slam_env.sequences import associate, read_trajectory
 Float64 = NDArray[np.float64]
 
 _GAP_INTERVALS = 3.0
+_LEAST_SHARE = 0.5  # of the poses of the shorter trajectory
+_MOST_EXTENT = 3.0  # times as far as the other
+_LEAST_SPREAD_M = 0.02  # of a truth that stands still nothing more can be said
+_MOST_SPREAD = 0.7  # an alignment explains less than half of the variance of the positions
 _FRAME_COLUMNS = ("timestamp", "tracking_ok")
 _ALIGNED = {"se3": "ate", "sim3": "ate_sim3", "none": "ate_unaligned"}
 """Metric of the absolute error by alignment."""
@@ -119,6 +124,9 @@ def match_files(estimate: Path, truth: Path, options: TrajectoryOptions) -> Matc
         )
     raw, true = poses[first], true_poses[second]
     alignment = metrics.find_alignment(raw, true, options.align)
+    share = len(first) / min(len(times), len(true_times))
+    for complaint in complaints(alignment.poses(raw), true, share):
+        warnings.warn(f"{truth} may be of another recording: {complaint}", InputWarning, 2)
     gap_s = options.gap_s
     if gap_s is None:
         gap_s = _GAP_INTERVALS * float(np.median(np.diff(times)))
@@ -134,6 +142,36 @@ def match_files(estimate: Path, truth: Path, options: TrajectoryOptions) -> Matc
         alignment=alignment,
         unmatched=len(times) - len(first),
     )
+
+
+def complaints(aligned: Float64, truth: Float64, share: float) -> list[str]:
+    """What speaks against two trajectories being of one recording.
+
+    Args:
+        aligned: (N, 4, 4) estimate after alignment.
+        truth: (N, 4, 4) at the same times.
+        share: of the poses of the shorter trajectory, those that correspond.
+    """
+    found = []
+    if share < _LEAST_SHARE:
+        found.append(f"only {share:.0%} of the poses of the shorter trajectory correspond in time")
+    centred = truth[:, :3, 3] - truth[:, :3, 3].mean(axis=0)
+    spread_m = float(np.sqrt((centred**2).sum(axis=1).mean()))
+    if spread_m < _LEAST_SPREAD_M:
+        return found
+    extents = [float(np.linalg.norm(np.ptp(poses[:, :3, 3], axis=0))) for poses in (aligned, truth)]
+    small, large = sorted(extents)
+    if large > _MOST_EXTENT * small:
+        found.append(
+            f"the estimate extends over {extents[0]:.3g} m, the truth over {extents[1]:.3g} m"
+        )
+    error_m = metrics.ate_rmse(aligned, truth, align="none")
+    if error_m > _MOST_SPREAD * spread_m:
+        found.append(
+            f"the aligned estimate is {error_m:.3g} m off where the true positions themselves lie "
+            f"{spread_m:.3g} m around their mean"
+        )
+    return found
 
 
 def _tracked(

@@ -49,7 +49,8 @@ MAP_METRICS = (
     "map_points",
 )
 METRICS = (
-    *("ate_m", "ate_max_m", "ate_unaligned_m", "rpe_m", "rpe_rad", "lost_share"),
+    *("ate_m", "ate_tracked_m", "ate_max_m", "ate_unaligned_m", "rpe_m", "rpe_rad"),
+    "lost_share",
     *("map_error_median_m", "f_score_2cm", "cpu_ms_median", "cpu_ms_p95", "ext_ms_median"),
     *("mem_peak_mb", "ene_frame_j"),
 )
@@ -164,10 +165,13 @@ class Compare(Experiment, Checked):
         run = run_sequence(system, given, meter=costs)
         estimates = run.estimates
         ate = metrics.ate_statistics(estimates, given.poses)
+        ok = run.tracking_ok
+        tracked = metrics.ate_rmse(estimates[ok], given.poses[ok]) if ok.sum() > 1 else None
         return {
             "frames": len(estimates),
             "path_m": metrics.path_length(given.poses),
             "ate_m": ate.rmse,
+            "ate_tracked_m": tracked,
             "ate_max_m": ate.max,
             "ate_unaligned_m": metrics.ate_rmse(estimates, given.poses, align="none"),
             "rpe_m": metrics.rpe_rmse(estimates, given.poses),
@@ -243,5 +247,10 @@ def _columns(cells: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _note(cells: Sequence[Mapping[str, Any]]) -> str:
-    note = f"{MEDIAN.capitalize()}: over the sequences that every backend finished."
-    return note if any("error" in cell for cell in cells) else ""
+    """Over how many sequences the medians are, and which of them are left out."""
+    names = list(dict.fromkeys(cell["sequence"] for cell in cells))
+    failed = [n for n in names if any(c["sequence"] == n and "error" in c for c in cells)]
+    note = f"{MEDIAN.capitalize()}: over {len(names) - len(failed)} of {len(names)} sequences"
+    if not failed:
+        return f"{note}."
+    return f"{note}, those that every backend finished; not {', '.join(failed)}."

@@ -164,6 +164,35 @@ def test_lengths_of_segments_are_free(tmp_path: Path) -> None:
     assert [drift["length_m"] for drift in result["drift_by_length"]] == [0.5, 2.0]
 
 
+def test_a_truth_of_another_recording_is_complained_about(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    estimate, truth = write_pair(tmp_path)
+    assert main(["evaluate", estimate, truth]) == 0
+    assert capsys.readouterr().err == ""
+    times, poses = read_trajectory(Path(truth))
+    others = {
+        "only 33% of the poses": (times + 4.0, poses),
+        "the truth over": (times, _moved(poses, 20 * poses[:, :3, 3])),
+        "around their mean": (
+            times,
+            _moved(poses, np.random.default_rng(1).uniform(-1, 1, (COUNT, 3))),
+        ),
+    }
+    for complaint, other in others.items():
+        write_trajectory(tmp_path / "other.txt", *other)
+        assert main(["evaluate", estimate, str(tmp_path / "other.txt")]) == 0
+        said = capsys.readouterr().err
+        assert "other.txt may be of another recording" in said
+        assert complaint in said
+
+
+def _moved(poses: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    moved = poses.copy()
+    moved[:, :3, 3] = positions
+    return moved
+
+
 def test_gaps_are_lost_segments(tmp_path: Path) -> None:
     keep = np.ones(COUNT, dtype=bool)
     keep[40:60] = False  # 59 is the last one lost: 21 intervals of 0.05 s without a pose

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +97,7 @@ def test_medians_leave_out_what_a_backend_failed_on() -> None:
     failed = next(line for line in lines if "error" in line)
     assert (failed["sequence"], failed["error"]) == ("c:1", "RuntimeError: no")
     assert "every backend finished" in table.note
+    assert re.search(r"over \d of \d sequences, .* not ", table.note)
     (chart,) = Compare().charts(ROWS)
     assert [series.name for series in chart.panels[0].series] == ["one", "two"]
 
