@@ -123,6 +123,8 @@ def trajectory_summary(found: Found, options: TrajectoryOptions) -> str:
             values = zip(_STATISTICS, statistic_keys(key), strict=True)
             shown = "  ".join(f"{name} {found[of]:.6f}" for name, of in values)
             lines.append(f"{key.split('_')[0].upper()} [{key.split('_')[-1]}]  {shown}")
+    if found["tracked_share"] is not None:
+        lines.append(f"of tracked frames alone: {found['tracked_share']:.1%} of the poses")
     if found["gaps"]:
         reason = found.get("robustness_reason") or f"{found['robustness']:.6f}"
         lines.append(f"lost in {_gaps(found)}; robustness error {reason}")
@@ -139,6 +141,8 @@ def trajectory_tables(found: Found, options: TrajectoryOptions) -> list[Table]:
         f"{options.align} (scale {found['scale']:.6f}); relative errors over {options.delta} "
         f"{options.delta_unit} ({options.pairs} pairs)."
     )
+    if found["tracked_share"] is not None:
+        note += f" Of tracked frames alone: {found['tracked_share']:.1%} of the poses."
     statistics = [
         {"statistic": name, **{key: found.get(statistic_keys(key)[k]) for key in errors}}
         for k, name in enumerate(_STATISTICS)

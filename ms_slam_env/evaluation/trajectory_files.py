@@ -95,6 +95,7 @@ class Matched:
         gaps: (K, 2) last time before and first after each gap.
         alignment: that was found.
         unmatched: poses of the estimate without a true one near enough in time.
+        tracked_share: of the estimate's poses; None where nothing says which were tracked.
     """
 
     times: Float64
@@ -106,6 +107,7 @@ class Matched:
     gaps: Float64
     alignment: metrics.Alignment
     unmatched: int
+    tracked_share: float | None = None
 
 
 def match_files(estimate: Path, truth: Path, options: TrajectoryOptions) -> Matched:
@@ -114,7 +116,8 @@ def match_files(estimate: Path, truth: Path, options: TrajectoryOptions) -> Matc
     Raises:
         InputError: a file that cannot be read, fewer than two poses in common, no alignment.
     """
-    times, poses, was_lost = _tracked(*read_trajectory(estimate), options.frames)
+    given = read_trajectory(estimate)
+    times, poses, was_lost = _tracked(*given, options.frames)
     true_times, true_poses = read_trajectory(truth)
     first, second = associate(times, true_times, options.max_difference_s)
     if len(first) < 2:
@@ -141,6 +144,7 @@ def match_files(estimate: Path, truth: Path, options: TrajectoryOptions) -> Matc
         gaps=np.stack([times[jumps], times[jumps + 1]], axis=1),
         alignment=alignment,
         unmatched=len(times) - len(first),
+        tracked_share=None if options.frames is None else len(times) / len(given[0]),
     )
 
 
@@ -244,6 +248,7 @@ def measure_matched(matched: Matched, options: TrajectoryOptions) -> dict[str, A
     return {
         "poses": count,
         "unmatched_poses": matched.unmatched,
+        "tracked_share": matched.tracked_share,
         "scale": matched.alignment.scale,
         "path_m": metrics.path_length(matched.truth),
         "estimate_path_m": metrics.path_length(matched.raw),

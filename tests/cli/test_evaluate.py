@@ -225,9 +225,12 @@ def test_frames_that_a_run_lost_are_gaps(tmp_path: Path) -> None:
     frames = tmp_path / "frames.csv"
     rows = [f"{t:.6f},{int(k not in (50, 51, 52, 80))},1.5" for k, t in enumerate(times)]
     frames.write_text("\n".join(["timestamp,tracking_ok,ext_ms", *rows]))
-    assert evaluate_files(*map(Path, pair))["ate_max_m"] > 1
+    everything = evaluate_files(*map(Path, pair))
+    assert everything["ate_max_m"] > 1
+    assert everything["tracked_share"] is None
     result = evaluate([*pair, "--frames", str(frames)], tmp_path / "out")
     assert result["poses"] == COUNT - 4
+    assert result["tracked_share"] == pytest.approx(1 - 4 / COUNT)
     assert result["ate_max_m"] < 1e-6
     robustness = result
     assert (robustness["gaps"], robustness["tracked_pieces"]) == (2, 3)
