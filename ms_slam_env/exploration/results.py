@@ -27,6 +27,7 @@ _SHOWN = ("ate_m", "ate_max_m", "ext_ms", "mem_mb", "energy_j", "map_error_mm")
 _PARAMETERS_DRAWN = 4
 
 Shares = Mapping[str, Mapping[str, float]]
+_TRIALS_PER_PARAMETER = 10
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,14 @@ class Explored:
             {"parameter": name, **{o: shares[name] for o, shares in self.importance.items()}}
             for name in by_importance(self.importance)
         ]
-        return make_table(("parameter", *columns), lines, "Importance of the parameters")
+        trials, title = len(self.points), "Importance of the parameters"
+        note = f"From {trials} trials."
+        if trials < _TRIALS_PER_PARAMETER * len(lines):
+            note = (
+                f"From {trials} trials of {len(lines)} parameters, too few to rank them by: with "
+                f"less than {_TRIALS_PER_PARAMETER} trials a parameter chance may decide the order."
+            )
+        return make_table(("parameter", *columns), lines, title, note)
 
     def charts(self) -> list[Chart]:
         """Pareto front, hypervolume, importance, error over parameters, held-out sequences."""
