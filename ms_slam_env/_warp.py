@@ -1,25 +1,51 @@
 """NVIDIA Warp, initialised once: quiet, forward kernels only."""
 
+import atexit
 import os
+import shutil
+import tempfile
+import warnings
 
 import warp as wp
+
+from ms_slam_env.errors import InputWarning
 
 wp.config.log_level = wp.LOG_ERROR
 wp.config.enable_backward = False
 
 
-def _init_quietly() -> None:
+def _init_quietly() -> OSError | None:
     """Initialise; without a GPU the native library warns on file descriptor 2, at every start."""
     saved = os.dup(2)
     try:
         with open(os.devnull, "w") as nowhere:
             os.dup2(nowhere.fileno(), 2)
-            wp.init()
+            return _init()
     finally:
         os.dup2(saved, 2)
         os.close(saved)
 
 
-_init_quietly()
+def _init() -> OSError | None:
+    """Initialise; where no kernels can be kept they go into a passing folder. Return why not."""
+    try:
+        wp.init()
+    except OSError as error:
+        passing = tempfile.mkdtemp(prefix="ms_slam_env-")
+        atexit.register(shutil.rmtree, passing, ignore_errors=True)
+        wp.config.kernel_cache_dir = passing
+        wp.init()
+        return error
+    return None
+
+
+_refused = _init_quietly()
+if _refused is not None:
+    warnings.warn(
+        f"compiled kernels cannot be kept: {_refused.filename}: {_refused.strerror}; they are "
+        "compiled anew each time unless WARP_CACHE_PATH names a folder to write to",
+        InputWarning,
+        stacklevel=2,
+    )
 
 __all__ = ["wp"]

@@ -7,7 +7,7 @@ import inspect
 import numbers
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeVar, get_origin, get_type_hints
+from typing import Any, TypeGuard, TypeVar, get_origin, get_type_hints
 
 import yaml
 
@@ -123,11 +123,16 @@ def from_dict(cls: type[T], values: Mapping[str, Any], path: str = "") -> T:
         elif isinstance(value, str) and value in names:
             value = names[value]
         elif (nested and not isinstance(value, hint)) or (
-            get_origin(hint) is dict and not isinstance(value, Mapping)
+            get_origin(hint) is dict and not is_options(value)
         ):
             raise _no_mapping(where, value, hint, names)
         arguments[key] = value
     return cls(**arguments)
+
+
+def is_options(value: object) -> TypeGuard[Mapping[str, Any]]:
+    """Whether ``value`` can stand for options: a mapping of names to anything."""
+    return isinstance(value, Mapping) and all(isinstance(key, str) for key in value)
 
 
 def _names(hint: type) -> Mapping[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -102,3 +103,17 @@ def test_ci_runs_the_tests() -> None:
     script = ROOT / ".ci" / "run"
     assert script.stat().st_mode & 0o111
     assert re.search(r"^exec make .*test$", script.read_text(), re.MULTILINE)
+
+
+def test_kernels_need_no_place_to_be_kept() -> None:
+    """As in a home that cannot be written."""
+    code = "from ms_slam_env._warp import wp; print(wp.config.kernel_cache_dir)"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "WARP_CACHE_PATH": "/dev/null/nowhere"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "InputWarning: compiled kernels cannot be kept: /dev/null" in done.stderr
+    assert not Path(done.stdout.strip()).exists(), "it is removed in the end"

@@ -153,7 +153,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
                 f"unknown render_mode {render_mode!r}; valid choices: None, rgb_array "
                 "(render() returns a picture; no window is opened)"
             )
-        if embodiment not in EMBODIMENTS:
+        if not isinstance(embodiment, str) or embodiment not in EMBODIMENTS:
             raise unknown("embodiment", embodiment, EMBODIMENTS)
         if agent_configures_slam:
             options.setdefault("adaptation", "agent")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from ms_slam_env.config import is_options
 from ms_slam_env.env.active_slam import ActiveSlamEnv
 from ms_slam_env.env.config import EnvConfig
 from ms_slam_env.errors import InputError, unknown
@@ -36,7 +37,10 @@ def _make_perturbed(
     Raises:
         InputError: an unknown option, or a value out of range.
     """
-    strength = dict(perturbation or {})
+    given = {} if perturbation is None else perturbation
+    if not is_options(given):
+        raise InputError(f"perturbation = {perturbation!r} must be a mapping of options of {name}")
+    strength = dict(given)
     if name == "fast-motion":
         return ActiveSlamEnv(**_hurried(strength, options))
     env = ActiveSlamEnv(**options)

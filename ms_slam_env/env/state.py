@@ -61,12 +61,18 @@ def check_same_settings(saved: Any, own: Mapping[str, Any]) -> None:
     """
     check_mapping(saved, "settings")
     for name, value in own.items():
-        same_type = type(saved.get(name)) is type(value)
-        if not same_type or bool(saved[name] != value):
+        if type(saved.get(name)) is not type(value) or not _is_equal(saved[name], value):
             raise InputError(
                 f"the state was saved with {name} = {saved.get(name)!r}, "
                 f"this environment has {value!r}"
             )
+
+
+def _is_equal(saved: Any, own: Any) -> bool:
+    try:
+        return bool(saved == own)
+    except (ValueError, TypeError):  # an array where none belongs
+        return False
 
 
 def check_episode(

@@ -7,6 +7,7 @@ poses.
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,7 @@ from ms_slam_env.geometry import MAX_COORDINATE_M, transform_points
 from ms_slam_env.geometry.cloud_registration import CUTOFF_M, REGISTRATIONS
 from ms_slam_env.input_files import MAX_MESH_BYTES, check_file
 from ms_slam_env.metrics.reconstruction import SAMPLES
+from ms_slam_env.scenes.mesh_queries import check_geometry
 from ms_slam_env.sequences.recording import Recording, open_recording, recorded_sequence
 
 Float64 = NDArray[np.float64]
@@ -146,7 +148,7 @@ def read_surface(path: Path, samples: int, seed: int = 0) -> SurfaceFile:
     """
     import trimesh
 
-    if path.is_dir():
+    if os.path.isdir(path):
         return _sequence_surface(open_recording(path), path / "depth_true")
     check_file(path, "map file", MAX_MESH_BYTES)
     try:
@@ -154,10 +156,12 @@ def read_surface(path: Path, samples: int, seed: int = 0) -> SurfaceFile:
             loaded = trimesh.load(path, process=False)
             if isinstance(loaded, trimesh.Scene):
                 loaded = loaded.to_geometry()
+            if getattr(loaded, "vertices", None) is not None:
+                check_geometry(loaded)
     except Exception as error:  # trimesh raises whatever its many readers raise
         raise InputError(f"map file {str(path)!r} cannot be read: {error}") from None
     vertices = np.asarray(getattr(loaded, "vertices", np.empty((0, 3))), dtype=np.float64)
-    if vertices.ndim != 2 or len(vertices) == 0:
+    if len(vertices) == 0:
         raise InputError(f"map file {str(path)!r} holds no points")
     if not (np.abs(vertices) <= MAX_COORDINATE_M).all():
         raise InputError(

@@ -15,11 +15,13 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ms_slam_env.errors import InputError, InputWarning
+from ms_slam_env.input_files import is_named, read_bytes
 from ms_slam_env.output_files import append_line, write_text
 
 Row = dict[str, Any]
 T = TypeVar("T")
 
+_MAX_BYTES = 2**30
 _INFINITE = {math.inf: "Infinity", -math.inf: "-Infinity"}
 _FROM_TEXT = {text: number for number, text in _INFINITE.items()}
 
@@ -52,11 +54,11 @@ class RecordFile:
         """Rows by key, in the order of their first appearance.
 
         Raises:
-            InputError: the file holds something else.
+            InputError: no regular file, larger than 1 GiB, or it holds something else.
         """
-        if not self.path.exists():
+        if not is_named(self.path):
             return {}
-        data = self.path.read_bytes()
+        data = read_bytes(self.path, "results", _MAX_BYTES)
         complete, _, cut_short = data.rpartition(b"\n")
         if cut_short:
             warnings.warn(
@@ -69,7 +71,7 @@ class RecordFile:
             try:
                 row = from_plain(json.loads(line))
                 rows[row["key"]] = row
-            except (ValueError, TypeError, KeyError) as error:
+            except (ValueError, TypeError, KeyError, RecursionError) as error:
                 raise InputError(f"{self.path}, line {number}, is not a result") from error
         return rows
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,7 +21,7 @@ from ms_slam_env.scenes.base import Float64, Rng, TexturedMesh
 from ms_slam_env.scenes.builder import Geometry
 from ms_slam_env.scenes.free_space import VOXEL_M, Enclosed, FreeSpace
 from ms_slam_env.scenes.lighting import Lamp, Lighting, auto_exposure, light_mesh, linear_to_srgb
-from ms_slam_env.scenes.mesh_queries import RayCaster, face_cross, sample_surface
+from ms_slam_env.scenes.mesh_queries import RayCaster, check_geometry, face_cross, sample_surface
 from ms_slam_env.scenes.mesh_scene import MeshScene, unit_rows
 
 _GREY = np.array([190, 190, 190], np.uint8)
@@ -56,12 +57,14 @@ def load_soup(path: Path) -> Soup:
     Raises:
         InputError: no such file, not readable as a mesh, or without a triangle.
     """
-    if not path.exists():
+    if not os.path.exists(path):
         raise InputError(f"mesh file {str(path)!r} does not exist")
     check_file(path, "mesh file", MAX_MESH_BYTES)
     try:
         with np.errstate(all="ignore"):  # what cannot be is refused below
             parts = trimesh.load_scene(path).dump()
+            for part in parts:
+                check_geometry(part)
     except Exception as error:  # the loaders of the many formats raise anything
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"mesh file {str(path)!r} cannot be read: {reason}") from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -80,7 +81,7 @@ def check_name(name: object) -> None:
         InputError: listing the valid choices.
     """
     if is_mesh_file(name):
-        if not Path(str(name)).is_file():
+        if not os.path.isfile(str(name)):
             raise InputError(f"mesh file {str(name)!r} does not exist")
     elif isinstance(name, str) and ":" not in name and name not in POINT.names():
         raise POINT.unknown(name, (f"the path of a mesh file ({', '.join(MESH_SUFFIXES)})",))

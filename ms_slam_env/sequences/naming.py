@@ -15,6 +15,7 @@ What is left out is Kinect noise, the path that the command has for its sequence
 from __future__ import annotations
 
 import dataclasses
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -98,9 +99,9 @@ def parse_sequence(text: str | Path) -> SequenceName | Path:
         InputError: neither; an unknown word (the message lists what may stand there), or a bad
             option. Scenes are checked where they are made, or by `check_sequence`.
     """
-    if Path(text).is_dir():
+    if os.path.isdir(text):  # unlike Path.is_dir it takes a name too long for what is no folder
         return Path(text)
-    parts = re.fullmatch(r"(.+?):(\d+)(?::(.*))?", str(text))
+    parts = re.fullmatch(r"(.+?):(\d{1,18})(?::(.*))?", str(text))
     if parts is None:
         raise InputError(f"sequence {str(text)!r} {_GRAMMAR}")
     scene, seed, words = parts.groups()

@@ -11,7 +11,7 @@ from importlib import import_module
 from typing import Any
 
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.config import from_dict
+from ms_slam_env.config import from_dict, is_options
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.extension import ExtensionPoint, check_options
 from ms_slam_env.slam.base import SlamBackend
@@ -83,7 +83,7 @@ def check_parameters(name: object, params: object) -> Any:
         InputError: unknown backend, unknown parameter or value out of range.
     """
     entry = POINT.find(name)
-    if not isinstance(params, Mapping) or not all(isinstance(key, str) for key in params):
+    if not is_options(params):
         raise InputError(f"slam_config = {params!r} must be a mapping of options")
     options = dict(params)
     if not isinstance(entry, BackendEntry):

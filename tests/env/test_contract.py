@@ -313,6 +313,8 @@ def test_use_before_reset_says_so():
         ({"split": "exam"}, "valid choices: train, validation, test"),
         ({"step_m": float("nan")}, "step_m = nan is outside"),
         ({"render_mode": "human"}, "valid choices: None, rgb_array"),
+        ({"embodiment": {}}, "unknown embodiment '{}'; valid choices: arm"),
+        ({"slam_config": {7: 1}}, "slam_config = {7: 1} must be a mapping of options"),
         ({"embodiment": "boat"}, "unknown embodiment 'boat'; valid choices: arm, arm-kinematic"),
         ({"slam": ["surfel"]}, "valid choices: .*surfel"),
         ({"slam_config": {"device": "tpu"}}, "unknown device 'tpu'; valid choices: cpu"),

@@ -202,6 +202,12 @@ def test_bad_perturbations_are_refused(name, options, message) -> None:
         Perturbed(ActiveSlamEnv("free", **OPTIONS), name, **options)
 
 
+@pytest.mark.parametrize("strength", [0.5, "x", [1], {7: 1}])
+def test_a_strength_that_is_no_mapping_is_refused(strength) -> None:
+    with pytest.raises(InputError, match="must be a mapping of options of motion-blur"):
+        gymnasium.make("MSActiveSLAM-FreeCamera-MotionBlur-v0", perturbation=strength, **OPTIONS)
+
+
 def test_other_environments_are_refused() -> None:
     with pytest.raises(InputError, match="not CartPole"):
         Perturbed(gymnasium.make("CartPole-v1"), "motion-blur")

@@ -161,6 +161,21 @@ def test_a_state_without_a_part_is_refused_by_its_name(played, part):
     assert same(env.save_state(), before)
 
 
+def test_settings_of_arrays_are_other_settings(played):
+    env, before, earlier, _ = played.values()
+    for name in earlier["settings"]:
+        for value in (np.zeros(2), [np.zeros(2)]):
+            state = {**earlier, "settings": {**earlier["settings"], name: value}}
+            with pytest.raises(InputError, match=f"saved with {name} = "):
+                env.load_state(state)
+    camera = copy.deepcopy(earlier["settings"])
+    owner = next(value for value in camera.values() if hasattr(value, "__dataclass_fields__"))
+    object.__setattr__(owner, next(iter(owner.__dataclass_fields__)), np.zeros(2))
+    with pytest.raises(InputError, match="this environment has"):
+        env.load_state({**earlier, "settings": camera})
+    assert same(env.save_state(), before)
+
+
 @pytest.mark.parametrize("state", [None, 3, [], "state", {}])
 def test_what_is_no_state_is_refused(played, state):
     with pytest.raises(InputError, match="state"):

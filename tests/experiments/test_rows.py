@@ -168,6 +168,26 @@ def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
         RecordFile(path).load()
 
 
+def test_records_that_are_no_file_are_refused(tmp_path: Path) -> None:
+    """A pipe would be read for ever, a device has no end, and nesting has one."""
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "zero").symlink_to("/dev/zero")
+    (tmp_path / "lost").symlink_to(tmp_path / "nowhere")
+    for name in ("pipe", "zero", "lost"):
+        with pytest.raises(InputError, match="cannot read results"):
+            RecordFile(tmp_path / name).load()
+    (tmp_path / "deep").write_text("[" * 100_000 + "\n")
+    with pytest.raises(InputError, match="line 1, is not a result"):
+        RecordFile(tmp_path / "deep").load()
+
+
+def test_a_row_without_word_of_an_error_is_made_again(tmp_path: Path) -> None:
+    RecordFile(tmp_path / RECORDS).append({"key": spec_key(Square(3))})
+    (row,) = run_all([Square(3)], square, tmp_path, workers=1)
+    assert row["error"] is None
+    assert row["result"] is not None
+
+
 def test_the_last_row_of_a_key_counts(tmp_path: Path) -> None:
     records = RecordFile(tmp_path / "a.jsonl")
     for value in (1, 2):

@@ -7,6 +7,7 @@ from PIL import Image
 
 from ms_slam_env import scenes
 from ms_slam_env.errors import InputError
+from ms_slam_env.evaluation.map_files import read_surface
 from ms_slam_env.scenes.free_space import FreeSpace, Holding
 from ms_slam_env.scenes.mesh_file import load_soup, split_long_edges
 from ms_slam_env.scenes.mesh_queries import sample_surface
@@ -170,3 +171,18 @@ def test_bad_mesh_files_are_refused(tmp_path):
     with pytest.raises(InputError) as error:
         scenes.make(empty)
     _single_line(error)
+
+
+@pytest.mark.parametrize("read", [load_soup, lambda path: read_surface(path, 10)])
+def test_what_is_no_mesh_inside_a_mesh_file_is_refused(tmp_path, read):
+    """trimesh takes faces of vertices that are not there, and vertices of one number."""
+    data = trimesh.creation.box().export(file_type="ply")
+    first_face = data.index(b"end_header") + len(b"end_header\n") + 8 * 12 + 1
+    (tmp_path / "a.ply").write_bytes(
+        data[:first_face] + (2**30).to_bytes(4, "little") + data[first_face + 4 :]
+    )
+    with pytest.raises(InputError, match=r"a face has a vertex beyond the 8 that|is out of bounds"):
+        read(tmp_path / "a.ply")
+    (tmp_path / "b.obj").write_text("v -1.0000")
+    with pytest.raises(InputError, match=r"b\.obj"):
+        read(tmp_path / "b.obj")

@@ -65,6 +65,8 @@ def test_the_path_is_named_or_that_of_the_command() -> None:
     [
         ("table", "sequence 'table' is neither a folder nor scene:seed"),
         ("table:x", "neither a folder nor scene:seed"),
+        ("table:" + "9" * 5000, "neither a folder nor scene:seed"),
+        ("table:1:" + "x" * 5000, "unknown part of sequence"),
         ("table:1:2:3", "unknown part of sequence .* .2:3.; valid choices: kinect"),
         ("table:1:fog", "'fog'; valid choices: kinect, range, none, .*rolling-shutter, .*handheld"),
         ("table:1:uneven+steady", "'steady'; valid choices"),

@@ -99,6 +99,18 @@ def test_the_grid_grows_when_its_blocks_are_used_up():
     np.testing.assert_array_equal(small.predict(POSE[None]).depth, large.predict(POSE[None]).depth)
 
 
+def test_frames_without_a_reading_within_reach_are_taken():
+    """Open3D gives up on them."""
+    backend = slam.make("volumetric", CAMERA, voxel_m=VOXEL_M)
+    shape = (CAMERA.height, CAMERA.width)
+    color = np.full((*shape, 3), 99, np.uint8)
+    for metres in (0.0, 1e-6, 12.0, 1e4):
+        backend.reset(POSE)
+        result = backend.track(RGBDFrame(color, np.full(shape, metres, np.float32)))
+        assert np.isfinite(result.T_world_camera).all()
+        assert len(backend.surface_points()) == 0
+
+
 def test_open3d_can_align_too():
     backend = _mapped(3, aligner="open3d")
     moved = POSE @ make_pose(so3_exp([0.0, 0.005, 0.0]), [0.005, 0.0, 0.005])

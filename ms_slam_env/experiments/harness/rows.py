@@ -58,7 +58,7 @@ def run_all(
     check_out_folder(out)
     records = RecordFile(out / RECORDS)
     keys = [spec_key(spec) for spec in specs]
-    rows = {key: row for key, row in records.load().items() if row["error"] is None}
+    rows = {key: row for key, row in records.load().items() if row.get("error", "") is None}
     todo = {key: spec for key, spec in zip(keys, specs, strict=True) if key not in rows}
     done = len(set(keys)) - len(todo)
     if done:

@@ -107,9 +107,15 @@ class VoxelGrid(Stateful):
         depth_image, color_image = self.image(depth), self.image(color)
         extrinsic = self.tensor(invert(pose))
         limits = (DEPTH_SCALE, self.config.depth_cutoff_m, self.config.truncation_voxels)
-        blocks = self._grid.compute_unique_block_coordinates(
-            depth_image, camera_matrix(self, self.intrinsics), extrinsic, *limits
-        )
+        camera = camera_matrix(self, self.intrinsics)
+        try:
+            blocks = self._grid.compute_unique_block_coordinates(
+                depth_image, camera, extrinsic, *limits
+            )
+        except RuntimeError as error:  # of the few pixels that it looks at none is within reach
+            if "No block is touched" not in str(error):
+                raise
+            return
         matrix = camera_matrix(self, self.intrinsics, self._reading_shift_px)
         self._grid.integrate(blocks, depth_image, color_image, matrix, matrix, extrinsic, *limits)
         self._forget_derived()

@@ -1,0 +1,229 @@
+"""Entry points that read files: recordings, images, trajectories, meshes, calibrations."""
+
+from __future__ import annotations
+
+import io
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from fuzzing import Entry
+from mutations import Files, mutated_folder, mutated_text, write_files
+from PIL import Image
+
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.camera.image_files import read_color, read_depth
+from ms_slam_env.evaluation.map_files import read_surface
+from ms_slam_env.evaluation.trajectory_files import TrajectoryOptions, evaluate_files
+from ms_slam_env.scenes.mesh_file import load_soup
+from ms_slam_env.sequences import open_sequence, read_trajectory
+from ms_slam_env.sequences.recording import parse_calibration
+
+WIDTH, HEIGHT, FRAMES = 16, 12, 4
+K = Intrinsics(15.0, 15.0, 7.5, 5.5, WIDTH, HEIGHT)
+CALIBRATION = "15 15 7.5 5.5 16 12 5000\n"
+
+
+def image(kind: str, number: int, suffix: str = "PNG") -> bytes:
+    """A small image of colour or depth as a file."""
+    rng = np.random.default_rng(number)
+    if kind == "depth":
+        pixels = rng.integers(4000, 9000, (HEIGHT, WIDTH)).astype(np.uint16)
+    else:
+        pixels = rng.integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, suffix)
+    return stream.getvalue()
+
+
+def trajectory(seed: int = 0) -> bytes:
+    """A trajectory of twelve poses in the TUM format."""
+    rng = np.random.default_rng(seed)
+    lines = ["# timestamp tx ty tz qx qy qz qw"]
+    for k in range(12):
+        q = np.array([0.01 * k, 0.02 * k, 0.0, 1.0])
+        numbers = [k / 30, *(0.1 * k * np.arange(1, 4) + rng.normal(0, 1e-3, 3)), *q]
+        numbers[4:] = list(q / np.linalg.norm(q))
+        lines.append(" ".join(f"{number:.9f}" for number in numbers))
+    return ("\n".join(lines) + "\n").encode()
+
+
+@cache
+def tum() -> Files:
+    """A recording in the TUM layout."""
+    files = {"intrinsics.txt": CALIBRATION.encode(), "groundtruth.txt": trajectory()}
+    for kind, name in (("color", "rgb"), ("depth", "depth")):
+        files |= {f"{name}/{k}.png": image(kind, k) for k in range(FRAMES)}
+        lines = [f"{k / 30:.6f} {name}/{k}.png" for k in range(FRAMES)]
+        files[f"{name}.txt"] = ("\n".join(lines) + "\n").encode()
+    return files
+
+
+@cache
+def icl_nuim() -> Files:
+    """A recording in the layout of ICL-NUIM."""
+    lines = [f"{k} depth/{k}.png {k} rgb/{k}.png" for k in range(FRAMES)]
+    images = {name: data for name, data in tum().items() if name.endswith(".png")}
+    poses = b"\n".join(
+        b"%d %s" % (k, line.split(b" ", 1)[1])
+        for k, line in enumerate(trajectory().splitlines()[1:])
+    )
+    return {
+        **images,
+        "associations.txt": "\n".join(lines).encode(),
+        "livingRoom.gt.freiburg.txt": poses,
+        "intrinsics.txt": b"15 -15 7.5 5.5 16 12 5000\n",
+    }
+
+
+@cache
+def seven_scenes() -> Files:
+    """A recording in the layout of 7-Scenes."""
+    files = {"intrinsics.txt": b"15 15 7.5 5.5 16 12 1000\n"}
+    for k in range(FRAMES):
+        pose = np.eye(4)
+        pose[:3, 3] = 0.01 * k
+        rows = "\n".join(" ".join(f"{v:.7e}" for v in row) for row in pose)
+        files |= {
+            f"frame-{k:06d}.color.jpg": image("color", k, "JPEG"),
+            f"frame-{k:06d}.depth.png": image("depth", k),
+            f"frame-{k:06d}.pose.txt": rows.encode(),
+        }
+    return files
+
+
+@cache
+def plain() -> Files:
+    """A recording as folders of images."""
+    images = {name: data for name, data in tum().items() if name.endswith(".png")}
+    times = "\n".join(f"{k / 30}" for k in range(FRAMES)).encode()
+    return {**images, "intrinsics.txt": CALIBRATION.encode(), "times.txt": times}
+
+
+def call_recording(files: Files, folder: Path) -> None:
+    """Open a recording and decode all of it."""
+    write_files(files, folder / "s")
+    sequence = open_sequence(folder / "s")
+    times = sequence.timestamps
+    assert np.isfinite(times).all()
+    assert (np.diff(times) > 0).all()
+    known = sequence.poses[sequence.known]
+    assert np.abs(known[:, :3, :3] @ known[:, :3, :3].swapaxes(1, 2) - np.eye(3)).max(initial=0) < 1
+    shape = sequence.intrinsics.shape
+    for frame in sequence.frames:
+        assert frame.color.shape == (*shape, 3)
+        assert frame.depth.shape == shape
+        assert np.isfinite(frame.depth).all()
+
+
+def call_image(files: Files, folder: Path) -> None:
+    """Decode images of both kinds."""
+    write_files(files, folder)
+    for name in files:
+        if "depth" in name:
+            assert read_depth(folder / name, K).shape == K.shape
+        else:
+            assert read_color(folder / name, K).shape == (*K.shape, 3)
+
+
+def images() -> Files:
+    """An image of each kind and format."""
+    return {
+        **{f"color.{s.lower()}": image("color", 0, s) for s in ("PNG", "JPEG", "TIFF", "PPM")},
+        **{f"depth.{s.lower()}": image("depth", 0, s) for s in ("PNG", "TIFF", "PPM")},
+    }
+
+
+def one_image(files: Files, rng: np.random.Generator) -> Files:
+    """A mutation of one of them alone."""
+    name = sorted(files)[rng.integers(len(files))]
+    return mutated_folder({name: files[name]}, rng)
+
+
+def call_trajectory(files: Files, folder: Path) -> None:
+    """Read a trajectory."""
+    write_files(files, folder)
+    times, poses = read_trajectory(folder / "a.txt")
+    assert poses.shape == (len(times), 4, 4)
+    assert np.isfinite(poses).all()
+    assert np.isfinite(times).all()
+    assert (np.diff(times) > 0).all()
+
+
+@cache
+def two_trajectories() -> Files:
+    """An estimate, the truth, and which frames were tracked."""
+    frames = ["timestamp,tracking_ok,cpu_ms", *(f"{k / 30:.6f},{int(k != 5)},1" for k in range(12))]
+    return {"a.txt": trajectory(1), "b.txt": trajectory(2), "f.csv": "\n".join(frames).encode()}
+
+
+def call_evaluate(files: Files, folder: Path) -> None:
+    """Compare two trajectories."""
+    write_files(files, folder)
+    options = TrajectoryOptions(frames=str(folder / "f.csv"))
+    found = evaluate_files(folder / "a.txt", folder / "b.txt", options)
+    assert 0 <= found["ate_m"] < np.inf
+    assert found["poses"] >= 2
+
+
+@cache
+def meshes() -> Files:
+    """A box in the formats that are documented."""
+    box = trimesh.creation.box((2.0, 3.0, 1.0))
+    cloud = trimesh.PointCloud(np.random.default_rng(0).normal(size=(40, 3)))
+    made = {f"box.{kind}": box.export(file_type=kind) for kind in ("ply", "obj", "glb", "stl")}
+    made["cloud.ply"] = cloud.export(file_type="ply")
+    made["text.ply"] = box.export(file_type="ply", encoding="ascii")
+    return {n: data.encode() if isinstance(data, str) else data for n, data in made.items()}
+
+
+def call_surface(files: Files, folder: Path) -> None:
+    """Read a map file."""
+    write_files(files, folder)
+    for name in files:
+        points = read_surface(folder / name, 50).points
+        assert points.ndim == 2
+        assert points.shape[1] == 3
+        assert len(points)
+        assert np.isfinite(points).all()
+
+
+def call_mesh(files: Files, folder: Path) -> None:
+    """Read a scene's mesh file."""
+    write_files(files, folder)
+    for name in files:
+        if name.startswith("cloud"):
+            continue
+        soup = load_soup(folder / name)
+        assert soup.corners.shape[1:] == (3, 3)
+        assert np.isfinite(soup.corners).all()
+        assert len(soup.uv) == len(soup.texture) == len(soup.corners)
+
+
+def call_calibration(data: bytes, folder: Path) -> None:
+    """Read intrinsics."""
+    words = data.decode("utf-8", errors="replace").split()
+    intrinsics = parse_calibration(words, "--intrinsics").intrinsics
+    assert 1 <= intrinsics.width <= 4096
+    assert 1 <= intrinsics.height <= 4096
+    assert np.isfinite(intrinsics.rays_at([[0.0, 0.0]])).all()
+
+
+def _of_folder(name: str, seed: Any, call: Any, mutate: Any = mutated_folder) -> Entry:
+    return Entry(name, seed, mutate, call)
+
+
+ENTRIES = [
+    *(
+        _of_folder(seed.__name__.replace("_", "-"), seed, call_recording)
+        for seed in (tum, icl_nuim, seven_scenes, plain)
+    ),
+    _of_folder("image", images, call_image, one_image),
+    _of_folder("trajectory", lambda: {"a.txt": trajectory()}, call_trajectory),
+    _of_folder("evaluate", two_trajectories, call_evaluate),
+    _of_folder("surface", meshes, call_surface, one_image),
+    _of_folder("mesh", meshes, call_mesh, one_image),
+    Entry("calibration", CALIBRATION.encode, mutated_text, call_calibration),
+]
