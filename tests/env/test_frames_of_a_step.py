@@ -9,6 +9,7 @@ from ms_slam_env.errors import InputError, UnreachableError
 from ms_slam_env.geometry import invert, make_pose, so3_exp
 from ms_slam_env.metrics import ate_rmse
 from ms_slam_env.robot import FreeCamera, MotionResult
+from ms_slam_env.slam.surfel.localization import Localizer
 
 OPTIONS = {"scene": "living_room", "scene_seed": 0, "step_m": 0.06, "step_rad": 0.06}
 FRAMES = 3
@@ -126,6 +127,8 @@ def test_kinematic_guess_saves_a_jump_that_tracking_loses(monkeypatch):
     def exact(scene, config, timings):  # without an arm, and its kinematics without an error
         return FreeCamera(scene, config.step_m, config.step_rad)
 
+    # Features would find the jump alone.
+    monkeypatch.setattr(Localizer, "_search_by_features", lambda self, alignment, frames: alignment)
     monkeypatch.setitem(EMBODIMENTS, "exact", EmbodimentType(49, exact, lambda config: None))
     big = {**OPTIONS, "step_m": 0.4, "step_rad": 0.5}
     errors = {}

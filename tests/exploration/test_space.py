@@ -13,7 +13,7 @@ from ms_slam_env.slam.configuration import SlamConfiguration
 def test_the_paper_has_three_parameters():
     space = make_space(["paper"])
     assert space.defaults() == {
-        "depth_cutoff_m": 4.0,
+        "depth_cutoff_m": 8.0,
         "icp_rgb_weight": 0.1,
         "confidence_threshold": 10.0,
     }
@@ -47,7 +47,7 @@ def test_values_go_where_they_belong():
 def test_ranges_as_text():
     space = make_space(
         [
-            "depth_cutoff_m=1:5",
+            "depth_cutoff_m=1:9",
             "points_per_level=100:9000:log",
             "loop_closure=none,deformation",
             "icp_angle_deg=10:80",
@@ -55,7 +55,7 @@ def test_ranges_as_text():
         ]
     )
     assert space.parameters == {
-        "depth_cutoff_m": Float(1, 5),
+        "depth_cutoff_m": Float(1, 9),
         "points_per_level": Integer(100, 9000, log=True),
         "loop_closure": Choice(("none", "deformation")),
         "icp_angle_deg": Float(10, 80),
@@ -79,7 +79,7 @@ def test_a_range_holds_what_lies_in_it(low, size, value):
         (["iterations.7"], "unknown parameter 'iterations.7'"),
         (["loops.speed=1:2"], "unknown parameter 'loops.speed'"),
         (["lateral_noise_px"], "parameter 'lateral_noise_px' needs a range, as in lateral_noise_p"),
-        (["depth_cutoff_m=5:9"], "'depth_cutoff_m' starts at 4.0, which is not one of 5 to 9"),
+        (["depth_cutoff_m=5:7"], "'depth_cutoff_m' starts at 8.0, which is not one of 5 to 7"),
         (["depth_cutoff_m=5:1"], "range 5.0:1.0 holds no values"),
         (["depth_cutoff_m=0:5:log"], "holds no values"),
         (["depth_cutoff_m=1:5:exp"], "'1:5:exp' is not low:high or low:high:log"),
