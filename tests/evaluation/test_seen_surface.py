@@ -8,14 +8,14 @@ import numpy as np
 
 from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.evaluation.seen_surface import seen_surface
-from ms_slam_env.sensor.noise import RangeNoise
+from ms_slam_env.sensor.noise import NoiseConfig
 from ms_slam_env.sequences import Sequence
 from ms_slam_env.slam.surfel import SurfelConfig
 
 
 def test_the_true_surface_reaches_as_far_as_the_sensor_and_slam_looks_farther():
     reach = inspect.signature(seen_surface).parameters["cutoff_m"].default
-    assert reach == RangeNoise().max_range_m <= SurfelConfig().depth_cutoff_m
+    assert reach == NoiseConfig().max_range_m <= SurfelConfig().depth_cutoff_m
 
 
 def test_seen_surface_of_a_plane() -> None:
