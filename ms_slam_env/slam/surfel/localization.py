@@ -44,6 +44,7 @@ from ms_slam_env.slam.surfel.relocalization import Images, Relocalization, measu
 from ms_slam_env.slam.surfel.rendering import ModelView
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 
+MOSTLY_MOVING = 0.6  # share of the readings: rather the pose is wrong, or too little is left
 CLEARLY_BETTER = 0.9  # ratio of costs
 APART_M, APART_RAD = (0.006, 0.1), np.radians((0.4, 6.0))  # more than noise, less than a jump
 RETRIES = 2  # further searches within a frame whose tracking failed
@@ -118,6 +119,9 @@ class Localizer:
         if self._motion_mask.find(*self._trusted(alignment, expected)).any():
             alignment = self._track(invalid, guesses)
         alignment = self._doubt(alignment, expected, invalid, guesses)
+        self._motion_mask.find(*self._trusted(alignment, expected))
+        is_most = alignment.tracked & (self._motion_mask.share() > MOSTLY_MOVING)
+        alignment = alignment.with_status(is_most, TrackingStatus.GEOMETRIC_MISMATCH)
         if self._config.refuse_bad_fits:
             alignment = self._search_by_features(self._appeal(alignment, frames), frames)
         else:

@@ -152,12 +152,16 @@ def find_appeared(
 def find_vanished(
     nearest: wp.array(dtype=wp.float32),
     past_depth: wp.array(dtype=wp.float32),
+    masked: wp.array(dtype=wp.int32),  # (B * h * w), of the live frames as far as is known
     T_live_past: wp.array2d(dtype=wp.mat44),  # (B, PAST)
     age: wp.array2d(dtype=wp.int32),  # (B, PAST)
     grid: Grid,
     found: wp.array(dtype=wp.int32),
 ):
-    """Mark where the live frame looks through a point of an earlier frame."""
+    """Mark where the live frame looks through a point of an earlier frame.
+
+    What was known to move has left its place anyway: that says nothing of what it has uncovered.
+    """
     b, k, v = wp.tid()
     if age[b, k] != OLD:  # since then it has gone far enough to tell
         return
@@ -165,14 +169,16 @@ def find_vanished(
     row = (b * PAST + k) * pixels + v * grid.width
     u = int(0)
     while u < grid.width:
-        z = fetch(past_depth, row + u)
+        moved = fetch(past_depth, row + u) < 0.0
+        z = wp.abs(fetch(past_depth, row + u))
         if z > 0.0:
             q = times(T_live_past[b, k], point(u, v, z, grid))
             at = place(q, grid)
             if at >= 0:
                 i = b * pixels + at
                 behind = fetch(nearest, i) - q[2]
-                if behind > tolerance(q[2], grid) and behind < RECEDED_M:
+                is_through = behind > tolerance(q[2], grid) and behind < RECEDED_M
+                if is_through and (not moved or fetch(masked, i) != 0):
                     put(found, i, fetch(found, i) | VANISHED)
         u += 1
 

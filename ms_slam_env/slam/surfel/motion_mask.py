@@ -57,6 +57,7 @@ COS_CREASE = 0.8  # of the angle between neighbouring normals, likewise
 FEWEST = 12  # pixels of the grid that prove a piece to be moving
 SHARE_APPEARED, SHARE_VANISHED = 0.3, 0.6  # of a piece's pixels for and against
 NEIGHBOURS = 0.3  # share of the pixels around that must have appeared too
+NEAR = 0.8  # of the median depth
 SHARE_NEW = 0.7  # of the pixels of a piece that is taken for new
 SHARE_KNOWN = 0.1  # of its pixels that an earlier frame saw
 FOR, AGAINST, FORGETTING = 2.0, 0.7, 0.15  # log-odds of an observation
@@ -112,6 +113,10 @@ class MotionMask(Saved):
 
     def remember(self, live: LiveFrame, T_world_live: Float64, good: Bool) -> None:
         """Mask ``live``; take it as seen from poses (B, 4, 4), where that is ``good`` (B,)."""
+
+    def share(self) -> Float64:
+        """Share (B,) of the readings that are masked."""
+        return np.zeros(self._batch)
 
     def mask(self, env: int) -> Bool | None:
         """Every n-th row and column (h, w) of an env's mask; None if nothing is ever masked."""
@@ -221,7 +226,8 @@ class GeometricMotionMask(MotionMask):
             change[self._moves(env, found[env])] = FOR
             odds[env] = np.clip(odds[env] + change, 0.0, MOST)
             if strict:
-                odds[env][self._is_new(env, is_still)] = MOST
+                is_new = self._is_new(env, is_still) if self._has_old(env) else self._is_near(env)
+                odds[env][is_new] = MOST
         self._mask_by(odds, T_world_live)
         return ((odds > MASKED) & ~before).mean(axis=(1, 2)) > CHANGED
 
@@ -246,6 +252,16 @@ class GeometricMotionMask(MotionMask):
         pieces = self._pieces_of(env)
         least = np.full(pieces.count, FEWEST - 1.0)
         return pieces.where(~is_still, is_still, SHARE_NEW, least)
+
+    def _has_old(self, env: int) -> bool:
+        return bool(self._count[env] > NEW * INTERVAL)
+
+    def _is_near(self, env: int) -> Bool:
+        """Pieces (h, w) clearly nearer than half of the image: the first frames tell no more."""
+        pieces, depth = self._pieces_of(env), self._depth.read()[env]
+        is_near = depth < NEAR * np.median(depth[depth > 0]) if (depth > 0).any() else depth > 0
+        is_near &= depth > 0
+        return pieces.where(is_near, ~is_near, 0.5, np.full(pieces.count, FEWEST - 1.0))
 
     def _compare(self, T_world_live: Float64) -> NDArray[np.int32]:
         """Evidence (B, h, w) of the live frames, taken at poses (B, 4, 4)."""
@@ -277,7 +293,7 @@ class GeometricMotionMask(MotionMask):
         return self._rows, [*images, *poses, self._grid, *_flat(self._found)]
 
     def _vanishing(self) -> tuple[tuple[int, ...], list[Any]]:
-        images, batch = _flat(self._nearest, self._past_depth), self._batch
+        images, batch = _flat(self._nearest, self._past_depth, self._masked), self._batch
         poses = [self._from_past.array, self._age.array]
         threads = (batch, PAST, self._grid.height)
         return threads, [*images, *poses, self._grid, *_flat(self._found)]
@@ -325,8 +341,10 @@ class GeometricMotionMask(MotionMask):
         if due.any():
             slots = self._count // INTERVAL % PAST
             self._past_poses[due, slots[due]] = T_world_live[due]
-            _store(self._past_depth, due, slots, self._depth)
-            _store(self._past_nearest, due, slots, self._nearest)
+            depth = self._depth.read()
+            depth[self._masked.read() > 0] *= -1.0  # of what moves
+            _store(self._past_depth, due, slots, depth)
+            _store(self._past_nearest, due, slots, self._nearest.read())
         self._pose_before[good] = T_world_live[good]
         self._moved[good] = self._moves_now[good]
         if self._moved.any():
@@ -335,6 +353,12 @@ class GeometricMotionMask(MotionMask):
             self._odds.write(odds)
             self._depth_before.write(depths)
         self._count[good] += 1
+
+    def share(self) -> Float64:
+        """See the base class."""
+        is_read = self._depth.read() > 0
+        masked = (self._live_odds > MASKED) & is_read
+        return np.asarray(masked.sum(axis=(1, 2)) / np.maximum(is_read.sum(axis=(1, 2)), 1))
 
     def mask(self, env: int) -> Bool | None:
         """See the base class."""
@@ -345,10 +369,10 @@ def _flat(*buffers: HostDeviceBuffer) -> list[wp.array]:
     return [buffer.array.flatten() for buffer in buffers]
 
 
-def _store(past: HostDeviceBuffer, due: Bool, slots: NDArray[Any], live: HostDeviceBuffer) -> None:
+def _store(past: HostDeviceBuffer, due: Bool, slots: NDArray[Any], live: Float32) -> None:
     """Put the images of the envs that are due into their slots."""
     images = past.read()
-    images[due, slots[due]] = live.read()[due]
+    images[due, slots[due]] = live[due]
     past.write(images)
 
 
