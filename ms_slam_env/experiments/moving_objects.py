@@ -39,7 +39,7 @@ KEYS = (
 )
 MOVING, STILL = "moving", "still"
 _WARM_UP = 5  # frames left out of the timing
-_SHOWN, _PER_ROW, _ENLARGED = 12, 6, 2  # frames of the picture, and how large
+_SHOWN, _PER_ROW = 12, 6  # frames of the picture
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,8 @@ class MovingObjectsExperiment(Experiment, Checked):
             return
         most = max(moving, key=lambda row: row["result"]["moving_share"])["spec"]["sequence"]
         spec = MovingObjectsSpec(most, (), self.image_size, self.frames)
-        cv2.imwrite(str(out / "mask.png"), _picture(_rendered(spec))[..., ::-1])
+        compression = [cv2.IMWRITE_PNG_COMPRESSION, 9]
+        cv2.imwrite(str(out / "mask.png"), _picture(_rendered(spec))[..., ::-1], compression)
 
 
 def _rendered(spec: MovingObjectsSpec) -> RenderedSequence:
@@ -198,8 +199,4 @@ def _picture(sequence: RenderedSequence) -> np.ndarray:
             image[where] = image[where] // 2 + np.array(color, dtype=np.uint8) // 2
         tiles.append(cv2.copyMakeBorder(image, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=(255,) * 3))
     rows = [np.hstack(tiles[k : k + _PER_ROW]) for k in range(0, _SHOWN, _PER_ROW)]
-    return np.asarray(
-        cv2.resize(
-            np.vstack(rows), None, fx=_ENLARGED, fy=_ENLARGED, interpolation=cv2.INTER_NEAREST
-        )
-    )
+    return np.vstack(rows)

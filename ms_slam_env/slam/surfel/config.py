@@ -208,7 +208,7 @@ class SurfelConfig(Checked):
             one where that is seen again; "off": it waits. Of several cameras in lockstep each
             waits.
         submap_rules: parameters of the former.
-        motion_mask: "geometric": what moves is neither tracked nor mapped, see ``motion_mask``;
+        motion_mask: "geometric": what moves is neither tracked nor mapped, see ``free_space_mask``;
             "none": the world is taken to be still.
     """
 

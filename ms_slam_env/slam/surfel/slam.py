@@ -28,9 +28,9 @@ from ms_slam_env.slam.surfel.camera_states import CameraStates
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.detached_map import DetachedMap
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer
+from ms_slam_env.slam.surfel.free_space_mask import make_motion_mask
 from ms_slam_env.slam.surfel.localization import Localizer
 from ms_slam_env.slam.surfel.loop_closure import make_loop_closure
-from ms_slam_env.slam.surfel.motion_mask import make_motion_mask
 from ms_slam_env.slam.surfel.photometry import is_invalid_frame, same_exposure
 from ms_slam_env.slam.surfel.pipeline import Pipeline, PipelineCache, check_change
 from ms_slam_env.slam.surfel.pose_hypotheses import (
