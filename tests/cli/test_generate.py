@@ -98,6 +98,8 @@ def interrupted(frames, index):
     return take(frames, index)
 
 RenderedFrames.__getitem__ = interrupted
+# A test run in the background of a shell was told to ignore it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 sys.exit(main(sys.argv[1:]))
 """
 
