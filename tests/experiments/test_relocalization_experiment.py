@@ -82,6 +82,8 @@ def test_interruptions_satisfy_their_setting(box_scene, path, space, name):
 class ScriptedSlam:
     """Answers with the results that it was given, one a frame; black frames have none."""
 
+    frames_counted = 0
+
     def __init__(self, results: list[TrackResult | None]) -> None:
         self.results = list(results)
 
