@@ -8,6 +8,7 @@ import numpy as np
 from ms_slam_baselines.view_goals import distance_in_steps, draw_goals
 from numpy.typing import NDArray
 
+from ms_slam_env.config import check_range
 from ms_slam_env.env import Planner
 from ms_slam_env.mapping import (
     OccupancyGrid,
@@ -21,6 +22,10 @@ if TYPE_CHECKING:
 
 Float64 = NDArray[np.float64]
 
+_RANGES = {
+    **{"goals": (3, 10_000), "radius_m": (0.1, 100), "cost": (0, 100), "replan": (1, 10_000)},
+    **{"overlap": (0, 1), "information": (0, 1e9), "own_gain": (0, 1000), "cell_m": (0.02, 1)},
+}
 _NEAR_M = 0.5  # readings nearer than this are few: the next step may leave none
 _NEAR_SHARE = 0.1
 _KEPT_AWAY = 0.7  # steps from where tracking was lost
@@ -52,6 +57,9 @@ class NextBestView(Planner):
         information: about a view's weakest direction, 1/m^2 a pixel of it; see `_KEPT`.
         own_gain: steps that the best view on the way is worth.
         cell_m: edge of a cell of the occupancy grid.
+
+    Raises:
+        InputError: an option out of its range.
     """
 
     recovers = True
@@ -72,9 +80,11 @@ class NextBestView(Planner):
         cell_m: float = 0.1,
     ) -> None:
         super().__init__(env, seed)
-        self.goals, self.radius_m, self.cost, self.replan = int(goals), radius_m, cost, int(replan)
+        self.goals, self.radius_m, self.cost, self.replan = goals, radius_m, cost, replan
         self.overlap, self.information, self.own_gain = overlap, information, own_gain
         self.cell_m = cell_m
+        for name, (low, high) in _RANGES.items():
+            check_range(self, name, low, high)
         self.steps = env.config.step_m, env.config.step_rad
 
     def reset(self) -> None:
@@ -85,7 +95,7 @@ class NextBestView(Planner):
         self.lost_at = np.zeros((0, 4, 4))
         """Poses (N, 4, 4) at which tracking was lost."""
 
-    def undo(self, action: int) -> None:
+    def lost_by(self, action: int) -> None:
         """Keep away from where tracking was lost: the estimate is held, the motion was made."""
         there = self.env.candidate_poses()[action]
         self.lost_at = np.concatenate([self.lost_at, there[None]])

@@ -47,8 +47,8 @@ class Planner(ABC):
     def act(self, observation: Any, info: dict[str, Any]) -> int:
         """Return the next action, given what ``reset`` or ``step`` last returned."""
 
-    def undo(self, action: int) -> None:  # noqa: B027 -- most planners learn nothing from it
-        """Be told that tracking was lost by an action, which is about to be undone."""
+    def lost_by(self, action: int) -> None:  # noqa: B027 -- most planners learn nothing from it
+        """Be told that its last action lost tracking; SLAM holds the pose from before it."""
 
 
 class Recovering(Planner):
@@ -66,6 +66,7 @@ class Recovering(Planner):
     def reset(self) -> None:
         """Nothing was done yet."""
         self.made: list[int] = []
+        self.was_tracked = False
         self.planner.reset()
 
     def act(self, observation: Any, info: dict[str, Any]) -> int:
@@ -73,8 +74,11 @@ class Recovering(Planner):
         if info["tracking_ok"] or not self.made:
             action = self.planner.act(observation, info)
             self.made = [*self.made[1 - _REMEMBERED :], action]
+            self.was_tracked = info["tracking_ok"]
             return action
-        self.planner.undo(self.made[-1])
+        if self.was_tracked:  # the motions undone after the first lost nothing
+            self.planner.lost_by(self.made[-1])
+        self.was_tracked = False
         undone = opposite(self.made.pop(), self.env.action_masks().size)
         return undone if self.env.action_masks()[undone] else 0
 

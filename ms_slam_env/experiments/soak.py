@@ -75,7 +75,12 @@ class Soak(Experiment, Checked):
             for info, is_first, *numbers in _steps(env, spec):
                 episodes += is_first
                 memory_mb.append(resident_mb() or np.nan)
-                bad += [where for where in not_finite({"info": info, "step": numbers})]
+                covariance = info["pose_covariance"]  # infinite where SLAM gave none, never NaN
+                known = {
+                    **info,
+                    "pose_covariance": np.where(np.isposinf(covariance), 0, covariance),
+                }
+                bad += not_finite({"info": known, "step": numbers})
         finally:
             env.close()
         half = len(memory_mb) // 2

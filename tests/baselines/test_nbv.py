@@ -9,6 +9,8 @@ from ms_slam_baselines.nbv import NextBestView
 from ms_slam_baselines.view_goals import distance_in_steps, draw_goals
 
 import ms_slam_env  # noqa: F401 -- registers the environments
+from ms_slam_env.env.planners import make_planner
+from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at, make_pose, relative_angle, so3_exp
 from ms_slam_env.mapping import view_information
 
@@ -75,6 +77,15 @@ def test_where_no_motion_can_be_followed_all_possible_ones_are_allowed(episode):
     poses = planner.env.candidate_poses()
     planner.lost_at = poses
     np.testing.assert_array_equal(planner.admissible(poses), planner.env.action_masks())
+
+
+@pytest.mark.parametrize(
+    "option", ["goals=0", "radius_m=-1", "replan=0", "overlap=1.5", "cell_m=.nan", "cost=much"]
+)
+def test_options_out_of_range_are_one_line(episode, option):
+    name = option.partition("=")[0]
+    with pytest.raises(InputError, match=rf"NextBestView\.{name} = .* is outside \["):
+        make_planner(f"nbv,{option}", episode[2].env)
 
 
 def test_distances_are_those_of_each_pose():

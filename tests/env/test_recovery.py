@@ -17,6 +17,10 @@ class Counting(Planner):
 
     def reset(self):
         self.last = 0
+        self.losses = []
+
+    def lost_by(self, action):
+        self.losses.append(action)
 
     def act(self, observation, info):
         self.last += 1
@@ -51,6 +55,14 @@ def test_lost_motions_are_undone_newest_first_until_tracking_holds():
     assert planner.act(None, OK) == 4
     assert [planner.act(None, LOST) for _ in range(2)] == [opposite(4), opposite(1)]
     assert planner.act(None, LOST) == 5  # nothing left to undo
+
+
+def test_a_planner_is_told_of_the_action_that_lost_tracking_and_of_no_other():
+    planner = recovering()
+    for info in (OK, OK, LOST, LOST, OK, LOST, LOST, LOST, LOST):
+        planner.act(None, info)
+    # 1 and 2 made, 2 lost, both undone; 3 made, lost, undone; 4, 5 and 6 made while lost.
+    assert planner.planner.losses == [2, 3]
 
 
 def test_what_is_blocked_is_not_done():
