@@ -1,5 +1,7 @@
 """One way to name a sequence, for all commands: the folder of a recording, or a generated one.
 
+``FOLDER[,FOLDER ...]`` is a recording, in one part or several that follow each other.
+
 ``scene:seed[:word[+word ...]]``: a scene (a name or a mesh file), the seed of scene, path, noise
 and perturbations, then in any order the noise of the sensor, the path of the camera and what
 perturbs the frames, each with options if it has any::
@@ -41,6 +43,7 @@ from ms_slam_env.sequences.paths import (
 )
 from ms_slam_env.sequences.perturbations import POINT, Perturbation, make_perturbation
 from ms_slam_env.sequences.recording import Calibration, open_recording
+from ms_slam_env.sequences.recording.parts import part_folders
 from ms_slam_env.sequences.recording.recording import Registration, recorded_sequence
 from ms_slam_env.sequences.rendering import render_sequence
 from ms_slam_env.sequences.sequence import Sequence
@@ -99,7 +102,7 @@ def parse_sequence(text: str | Path) -> SequenceName | Path:
         InputError: neither; an unknown word (the message lists what may stand there), or a bad
             option. Scenes are checked where they are made, or by `check_sequence`.
     """
-    if os.path.isdir(text):  # unlike Path.is_dir it takes a name too long for what is no folder
+    if all(os.path.isdir(folder) for folder in part_folders(text)):
         return Path(text)
     parts = re.fullmatch(r"(.+?):(\d{1,18})(?::(.*))?", str(text))
     if parts is None:

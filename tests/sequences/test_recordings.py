@@ -13,7 +13,7 @@ from PIL import Image
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import make_pose, so3_exp
-from ms_slam_env.sequences import associate, write_trajectory
+from ms_slam_env.sequences import associate, open_sequence, write_trajectory
 from ms_slam_env.sequences.recording import open_recording, parse_calibration
 from ms_slam_env.sequences.recording.listings import flip_y
 
@@ -412,3 +412,51 @@ def test_a_cropped_recording_shows_the_middle(tum):
     assert np.abs(reduced.color - part).max() <= 0.5
     with pytest.raises(InputError, match=r"valid choices: native, 8x12\+crop"):
         recording.at_size("8x12")
+
+
+def test_parts_follow_each_other(tum, tmp_path):
+    again = shutil.copytree(tum, tmp_path / "again")
+    whole = open_recording(f"{tum},{again}")
+    one = open_recording(tum)
+    assert len(whole) == 6
+    np.testing.assert_allclose(np.diff(whole.timestamps), 1 / 30, atol=1e-6)
+    np.testing.assert_array_equal(whole.frame(4).depth, one.frame(1).depth)
+    np.testing.assert_allclose(whole.truth, np.concatenate([one.truth, one.truth]))
+    np.testing.assert_allclose(np.diff(whole.truth_times), 1 / 30, atol=1e-6)
+    sequence = open_sequence(f"{tum},{again}", "16x12")
+    np.testing.assert_allclose(sequence.poses, whole.truth)
+
+
+def test_parts_whose_times_go_on_keep_them(tum, tmp_path):
+    later = shutil.copytree(tum, tmp_path / "later")
+    for name in ("rgb.txt", "depth.txt", "groundtruth.txt"):
+        lines = (later / name).read_text().splitlines()
+        moved = [
+            line
+            if line.startswith("#")
+            else f"{float(line.split()[0]) + 5} {line.split(' ', 1)[1]}"
+            for line in lines
+        ]
+        (later / name).write_text("\n".join(moved))
+    whole = open_recording(f"{tum},{later}")
+    np.testing.assert_allclose(whole.timestamps[3:] - whole.timestamps[:3], 5)
+    np.testing.assert_allclose(whole.truth_times[3:] - whole.truth_times[:3], 5)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            lambda folder: (folder / "intrinsics.txt").write_text("31 30 15.5 11.5 32 24 1000"),
+            "source",
+        ),
+        (lambda folder: (folder / "groundtruth.txt").unlink(), "only one has a true trajectory"),
+        (lambda folder: (folder / "depth.txt").write_text(""), "lists no image"),
+        (shutil.rmtree, "no sequence at"),
+    ],
+)
+def test_parts_that_do_not_fit_are_refused(tum, tmp_path, change, said):
+    other = shutil.copytree(tum, tmp_path / "other")
+    change(other)
+    with pytest.raises(InputError, match=said):
+        open_recording(f"{tum},{other}")

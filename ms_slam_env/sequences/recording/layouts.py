@@ -29,6 +29,7 @@ from ms_slam_env.sequences.recording.listings import (
     read_matrix,
     rows,
 )
+from ms_slam_env.sequences.recording.parts import join_parts, part_folders
 from ms_slam_env.sequences.recording.recording import Entry, Recording, Registration
 from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S, associate, read_trajectory
 from ms_slam_env.sequences.writing import DESCRIPTION, UNFINISHED
@@ -219,7 +220,7 @@ def open_recording(
     """Open a recorded sequence; images are read later, frame by frame.
 
     Args:
-        path: its folder.
+        path: its folder, or the folders of its parts in order, joined by commas (`join_parts`).
         layout: ``auto`` or one of ``LAYOUTS``.
         intrinsics: of the images on disk, with the scale of the depth images or without; by
             default those of ``intrinsics.txt`` in the folder, else the published ones of the
@@ -230,8 +231,11 @@ def open_recording(
 
     Raises:
         InputError: no such folder or layout, a sequence that was not written to its end,
-            intrinsics missing, a listing that does not parse.
+            intrinsics missing, a listing that does not parse, parts that do not fit together.
     """
+    parts = part_folders(path)
+    if len(parts) > 1:
+        return join_parts([open_recording(part, layout, intrinsics, register) for part in parts])
     folder = Path(path).resolve()
     if not folder.is_dir():
         raise InputError(f"no sequence at {path}: not a folder")
