@@ -3,6 +3,7 @@
 from ms_slam_env.mapping.expected_gain import expected_gain
 from ms_slam_env.mapping.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from ms_slam_env.mapping.reachability import reachable_positions
+from ms_slam_env.mapping.surroundings import surrounding_occupancy
 from ms_slam_env.mapping.view_information import view_information
 
 __all__ = [
@@ -12,5 +13,6 @@ __all__ = [
     "OccupancyGrid",
     "expected_gain",
     "reachable_positions",
+    "surrounding_occupancy",
     "view_information",
 ]

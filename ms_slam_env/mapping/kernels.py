@@ -116,3 +116,32 @@ def sum_information(
             J = vec6(n[0], n[1], n[2], turn[0], turn[1], turn[2])
             H += wp.outer(J, J)
     sums[view, v] = H
+
+
+@wp.kernel
+def count_states(
+    log_odds: wp.array3d(dtype=wp.int8),
+    rotation: wp.mat33,  # from blocks to cells
+    start: wp.vec3,  # corner of the first block, in cells
+    samples: int,  # along an edge of a block
+    shares: wp.array4d(dtype=float),
+):
+    """Shares of free (0) and occupied (1) places in each block."""
+    i, j, k = wp.tid()
+    shape = wp.vec3i(log_odds.shape[0], log_odds.shape[1], log_odds.shape[2])
+    edge = 1.0 / float(samples)
+    free = wp.int32(0)
+    occupied = wp.int32(0)
+    for a in range(samples):
+        for b in range(samples):
+            for c in range(samples):
+                place = wp.vec3(float(a) + 0.5, float(b) + 0.5, float(c) + 0.5) * edge
+                at = start + rotation * (wp.vec3(float(i), float(j), float(k)) + place)
+                cell = _cell(at, shape)
+                if cell[0] >= 0:
+                    state = wp.int32(log_odds[cell[0], cell[1], cell[2]])
+                    free += wp.where(state < 0, 1, 0)
+                    occupied += wp.where(state > 0, 1, 0)
+    places = float(samples * samples * samples)
+    shares[0, i, j, k] = float(free) / places
+    shares[1, i, j, k] = float(occupied) / places
