@@ -16,6 +16,9 @@ def test_steps_are_spread_over_all_environments_in_turn():
     assert sum(spec.steps for spec in specs) >= 1_000_000
     assert [spec.env_id for spec in specs[: len(IDS)]] == list(IDS)
     assert [spec.piece for spec in specs] == sorted(spec.piece for spec in specs)
+    steps = {env_id: sum(spec.steps for spec in specs if spec.env_id == env_id) for env_id in IDS}
+    assert steps["MSActiveSLAM-v0"] * 10 == steps["MSActiveSLAM-FreeCamera-v0"]
+    assert min(steps.values()) > 5000
 
 
 def test_places_that_are_not_finite_are_found():
