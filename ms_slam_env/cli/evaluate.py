@@ -34,7 +34,10 @@ class Arguments:
     ] = None
     """True trajectory."""
     align: str = "se3"
-    """Alignment for ATE: se3, sim3 (relative errors are then of the scaled estimate) or none."""
+    """Alignment for ATE: se3, sim3 (relative errors are then of the scaled estimate), yaw (rotation
+    about the world's z axis and translation), origin (first pose onto first) or none."""
+    align_first: int | None = None
+    """Align by so many poses from the start alone (se3, sim3, yaw)."""
     delta: float = 1
     """How far apart the poses of a relative error are."""
     delta_unit: str = "frames"
@@ -54,7 +57,8 @@ class Arguments:
     """An estimate without poses for longer was lost in between; by default three times the median
     interval."""
     frames: Path | None = None
-    """frames.csv of ms-slam run: leave out the poses of frames that were not tracked."""
+    """frames.csv of ms-slam run: leave out the poses of frames that were not tracked. One that lies
+    beside ESTIMATE leaves none out, but adds the error of tracked frames alone."""
     map: Path | None = None
     """Estimated map."""
     true_map: Path | None = None
@@ -111,6 +115,7 @@ def _trajectory_options(args: Arguments) -> TrajectoryOptions:
 
     return TrajectoryOptions(
         align=args.align,
+        align_first=args.align_first,
         delta=args.delta,
         delta_unit=args.delta_unit,
         pairs=args.pairs,

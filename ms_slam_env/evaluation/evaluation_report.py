@@ -115,7 +115,7 @@ def trajectory_summary(found: Found, options: TrajectoryOptions) -> str:
     """Lines for a terminal."""
     unit = "" if options.delta_unit == "frames" else f" {options.delta_unit}"
     lines = [
-        f"{found['poses']} poses, alignment {options.align}, delta {options.delta}{unit}"
+        f"{found['poses']} poses, alignment {_alignment(options)}, delta {options.delta}{unit}"
         + (f", scale {found['scale']:.6f}" if options.align == "sim3" else "")
     ]
     for key in _errors(options):
@@ -124,7 +124,7 @@ def trajectory_summary(found: Found, options: TrajectoryOptions) -> str:
             shown = "  ".join(f"{name} {found[of]:.6f}" for name, of in values)
             lines.append(f"{key.split('_')[0].upper()} [{key.split('_')[-1]}]  {shown}")
     if found["tracked_share"] is not None:
-        lines.append(f"of tracked frames alone: {found['tracked_share']:.1%} of the poses")
+        lines.append(_of_tracked(found, options))
     if found["gaps"]:
         reason = found.get("robustness_reason") or f"{found['robustness']:.6f}"
         lines.append(f"lost in {_gaps(found)}; robustness error {reason}")
@@ -138,11 +138,11 @@ def trajectory_tables(found: Found, options: TrajectoryOptions) -> list[Table]:
         f"{found['poses']} poses over {found['duration_s']:.3f} s and "
         f"{found['path_m']:.3f} m, timestamps at most {options.max_difference_s:g} s apart "
         f"({found['unmatched_poses']} poses of the estimate have no true one); alignment "
-        f"{options.align} (scale {found['scale']:.6f}); relative errors over {options.delta} "
+        f"{_alignment(options)} (scale {found['scale']:.6f}); relative errors over {options.delta} "
         f"{options.delta_unit} ({options.pairs} pairs)."
     )
     if found["tracked_share"] is not None:
-        note += f" Of tracked frames alone: {found['tracked_share']:.1%} of the poses."
+        note += f" {_of_tracked(found, options).capitalize()}."
     statistics = [
         {"statistic": name, **{key: found.get(statistic_keys(key)[k]) for key in errors}}
         for k, name in enumerate(_STATISTICS)
@@ -183,15 +183,32 @@ def trajectory_charts(matched: Matched, options: TrajectoryOptions) -> list[Char
         if errors is not None:
             line = _broken(np.stack([times, errors], axis=1), matched.piece)
             panels.append(error_panel(key, line[:, 0], {"estimate": line[:, 1]}))
-    caption = f"After alignment ({options.align}); lines are broken where the estimate was lost."
+    caption = (
+        f"After alignment ({_alignment(options)}); lines are broken where the estimate was lost."
+    )
     return [Chart("trajectory", "Path and error", caption, panels)]
 
 
 def _errors(options: TrajectoryOptions) -> tuple[str, ...]:
     return (
-        *(absolute_key(options.align, unit) for unit in ("m", "rad")),
+        *(absolute_key(options, unit) for unit in ("m", "rad")),
         *("rpe_m", "rpe_rad"),
     )
+
+
+def _alignment(options: TrajectoryOptions) -> str:
+    return options.align + (
+        "" if options.align_first is None else f" by the first {options.align_first} poses"
+    )
+
+
+def _of_tracked(found: Found, options: TrajectoryOptions) -> str:
+    """What is known of the frames that were tracked."""
+    share = f"{found['tracked_share']:.1%} of the poses"
+    if options.frames is not None:
+        return f"of tracked frames alone: {share}"
+    error = found["ate_tracked_m"]
+    return f"tracked: {share}" + ("" if error is None else f", ATE of these {error:.6f} m")
 
 
 def _broken(line: Float64, piece: NDArray[np.int64]) -> Float64:

@@ -18,7 +18,7 @@ from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.errors import InputError, InputWarning
 from ms_slam_env.input_files import read_text
 from ms_slam_env.metrics.relative import DELTA_UNITS, PAIRINGS, TOLERANCE
-from ms_slam_env.metrics.trajectory import ALIGNMENTS
+from ms_slam_env.metrics.trajectory import ALIGNMENTS, check_first
 from ms_slam_env.sequences import associate, read_trajectory
 
 Float64 = NDArray[np.float64]
@@ -29,8 +29,12 @@ _MOST_EXTENT = 3.0  # times as far as the other
 _LEAST_SPREAD_M = 0.02  # of a truth that stands still nothing more can be said
 _MOST_SPREAD = 0.7  # an alignment explains less than half of the variance of the positions
 _FRAME_COLUMNS = ("timestamp", "tracking_ok")
-_ALIGNED = {"se3": "ate", "sim3": "ate_sim3", "none": "ate_unaligned"}
-"""Metric of the absolute error by alignment."""
+_BESIDE = "frames.csv"  # of ms-slam run, in the folder of the estimate
+_ALIGNED = {
+    **{"se3": "ate", "sim3": "ate_sim3", "yaw": "ate_yaw"},
+    **{"origin": "ate_origin", "none": "ate_unaligned"},
+}
+"""Metric of the absolute error by alignment with all poses."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +42,9 @@ class TrajectoryOptions(Checked):
     """How two trajectories are compared.
 
     Attributes:
-        align: ``se3``, ``sim3`` or ``none``. With ``sim3`` relative errors are those of the
-            estimate after scaling, too.
+        align: ``se3``, ``sim3``, ``yaw``, ``origin`` or ``none``, see ``metrics.find_alignment``.
+            With ``sim3`` relative errors are those of the estimate after scaling, too.
+        align_first: least squares over so many of the first poses that correspond; None for all.
         delta: how far apart the poses of a relative error are.
         delta_unit: ``frames``, ``m`` along the true path, or ``s``.
         pairs: ``all`` or ``consecutive``, see ``metrics.pose_pairs``.
@@ -50,10 +55,12 @@ class TrajectoryOptions(Checked):
         gap_s: an estimate without poses for longer was lost in between; None for three times the
             median interval.
         frames: ``frames.csv`` of ``ms-slam run``: the poses of frames that were not tracked, which
-            it writes too, are left out, and there is a gap wherever one was.
+            it writes too, are left out, and there is a gap wherever one was. Without it, one that
+            lies beside the estimate leaves none out, but adds the error of tracked frames alone.
     """
 
     align: str = chosen("se3", *ALIGNMENTS)
+    align_first: int | None = bounded(None, 1, 1_000_000_000)
     delta: float = 1
     delta_unit: str = chosen("frames", *DELTA_UNITS)
     pairs: str = chosen("all", *PAIRINGS)
@@ -67,6 +74,7 @@ class TrajectoryOptions(Checked):
     def __post_init__(self) -> None:
         """Refuse what cannot be."""
         super().__post_init__()
+        check_first(self.align, self.align_first)
         if self.delta_unit == "frames" and float(self.delta).is_integer():
             object.__setattr__(self, "delta", int(self.delta))
 
@@ -95,7 +103,8 @@ class Matched:
         gaps: (K, 2) last time before and first after each gap.
         alignment: that was found.
         unmatched: poses of the estimate without a true one near enough in time.
-        tracked_share: of the estimate's poses; None where nothing says which were tracked.
+        tracked: (N,) whether the frame was tracked; None where nothing says it.
+        tracked_share: of all poses of the estimate; None likewise.
     """
 
     times: Float64
@@ -107,6 +116,7 @@ class Matched:
     gaps: Float64
     alignment: metrics.Alignment
     unmatched: int
+    tracked: NDArray[np.bool_] | None = None
     tracked_share: float | None = None
 
 
@@ -116,8 +126,14 @@ def match_files(estimate: Path, truth: Path, options: TrajectoryOptions) -> Matc
     Raises:
         InputError: a file that cannot be read, fewer than two poses in common, no alignment.
     """
-    given = read_trajectory(estimate)
-    times, poses, was_lost = _tracked(*given, options.frames)
+    times, poses = read_trajectory(estimate)
+    tracked = _tracked(estimate, times, options.frames)
+    share_tracked = None if tracked is None else float(tracked.mean())
+    was_lost = np.zeros(len(times), dtype=bool)
+    if options.frames is not None and tracked is not None:
+        kept = np.flatnonzero(tracked)
+        was_lost = np.diff(kept, prepend=kept[0] - 1) > 1
+        times, poses, tracked = times[kept], poses[kept], tracked[kept]
     true_times, true_poses = read_trajectory(truth)
     first, second = associate(times, true_times, options.max_difference_s)
     if len(first) < 2:
@@ -126,9 +142,10 @@ def match_files(estimate: Path, truth: Path, options: TrajectoryOptions) -> Matc
             f"(at most {options.max_difference_s} s apart); at least 2 are needed"
         )
     raw, true = poses[first], true_poses[second]
-    alignment = metrics.find_alignment(raw, true, options.align)
+    alignment = metrics.find_alignment(raw, true, options.align, options.align_first)
     share = len(first) / min(len(times), len(true_times))
-    for complaint in complaints(alignment.poses(raw), true, share):
+    best = metrics.find_alignment(raw, true, "sim3" if options.align == "sim3" else "se3")
+    for complaint in complaints(best.poses(raw), true, share):
         warnings.warn(f"{truth} may be of another recording: {complaint}", InputWarning, 2)
     gap_s = options.gap_s
     if gap_s is None:
@@ -144,7 +161,8 @@ def match_files(estimate: Path, truth: Path, options: TrajectoryOptions) -> Matc
         gaps=np.stack([times[jumps], times[jumps + 1]], axis=1),
         alignment=alignment,
         unmatched=len(times) - len(first),
-        tracked_share=None if options.frames is None else len(times) / len(given[0]),
+        tracked=None if tracked is None else tracked[first],
+        tracked_share=share_tracked,
     )
 
 
@@ -152,7 +170,7 @@ def complaints(aligned: Float64, truth: Float64, share: float) -> list[str]:
     """What speaks against two trajectories being of one recording.
 
     Args:
-        aligned: (N, 4, 4) estimate after alignment.
+        aligned: (N, 4, 4) estimate after the best alignment.
         truth: (N, 4, 4) at the same times.
         share: of the poses of the shorter trajectory, those that correspond.
     """
@@ -178,40 +196,48 @@ def complaints(aligned: Float64, truth: Float64, share: float) -> list[str]:
     return found
 
 
-def _tracked(
-    times: Float64, poses: Float64, frames: str | None
-) -> tuple[Float64, Float64, NDArray[np.bool_]]:
-    """Times and poses of the frames that were tracked, and whether one before each was not."""
-    if frames is None:
-        return times, poses, np.zeros(len(times), dtype=bool)
-    lost = lost_times(Path(frames))
-    kept = ~np.isin(np.rint(1e6 * times), np.rint(1e6 * lost))  # both are written to microseconds
-    if kept.sum() < 2:
-        raise InputError(f"{frames} leaves {kept.sum()} tracked poses; at least 2 are needed")
-    index = np.flatnonzero(kept)
-    return times[kept], poses[kept], np.diff(index, prepend=index[0] - 1) > 1
+def _tracked(estimate: Path, times: Float64, frames: str | None) -> NDArray[np.bool_] | None:
+    """Whether the frame of each pose (N,) was tracked; None where nothing says it."""
+    path = estimate.parent / _BESIDE if frames is None else Path(frames)
+    if frames is None and not path.is_file():
+        return None
+    try:
+        return tracked_at(path, times)
+    except InputError as error:
+        if frames is not None:
+            raise
+        warnings.warn(f"left aside: {error}", InputWarning, 2)
+    return None
 
 
-def lost_times(path: Path) -> Float64:
-    """Timestamps (K,) of the frames that were not tracked, from ``frames.csv`` of ``ms-slam run``.
+def tracked_at(path: Path, times: Float64) -> NDArray[np.bool_]:
+    """Whether the frames at ``times`` (N,) were tracked, from ``frames.csv`` of ``ms-slam run``.
 
     Raises:
-        InputError: a file that cannot be read, or of another form; the message names file and line.
+        InputError: a file that cannot be read, of another form (the message names file and line)
+            or of other frames; fewer than two that were tracked.
     """
     reader = csv.DictReader(read_text(path, "frames").splitlines())
     if not set(_FRAME_COLUMNS) <= set(reader.fieldnames or ()):
         raise InputError(f"{path}, line 1: expected columns {', '.join(_FRAME_COLUMNS)}")
-    lost = []
+    known: dict[int, bool] = {}
     for row in reader:
         try:
-            timestamp, ok = float(row["timestamp"]), {"0": False, "1": True}[row["tracking_ok"]]
-        except (TypeError, ValueError, KeyError):
+            microseconds = round(1e6 * float(row["timestamp"]))  # both are written to these
+            known[microseconds] = {"0": False, "1": True}[row["tracking_ok"]]
+        except (TypeError, ValueError, OverflowError, KeyError):
             raise InputError(
                 f"{path}, line {reader.line_num}: expected a timestamp and tracking_ok 0 or 1"
             ) from None
-        if not ok:
-            lost.append(timestamp)
-    return np.array(lost)
+    found = [known.get(round(1e6 * t)) for t in times]
+    if None in found:
+        t = times[found.index(None)]
+        raise InputError(f"{path} is of other frames: it has none at {t:.6f} s")
+    if sum(map(bool, found)) < 2:
+        raise InputError(
+            f"{path} leaves {sum(map(bool, found))} tracked poses; at least 2 are needed"
+        )
+    return np.array(found, dtype=bool)
 
 
 def evaluate_files(
@@ -236,7 +262,8 @@ def measure_matched(matched: Matched, options: TrajectoryOptions) -> dict[str, A
         ``poses`` and ``unmatched_poses`` of the estimate; ``ate_m`` (RMSE),
         ``ate_mean_m``, ``ate_median_m``, ``ate_std_m``, ``ate_min_m``, ``ate_max_m``, and the same
         of ``ate_rad`` (None where the path is a line), ``rpe_m`` and ``rpe_rad``; with another
-        alignment than SE(3) ``ate_sim3_m`` or ``ate_unaligned_m`` in the place of ``ate_m``;
+        alignment than SE(3) by all poses the key of `absolute_key` in the place of ``ate_m``;
+        ``tracked_share`` and, after SE(3), ``ate_tracked_m`` where it is known what was tracked;
         ``scale`` of the alignment, ``path_m``, ``duration_s``, ``pieces`` (the same statistics by
         piece), ``drift_by_length`` (of sub-trajectories), robustness (USME equations 9 and 10 over
         gaps in time) and initialisation (12 and 13).
@@ -249,6 +276,7 @@ def measure_matched(matched: Matched, options: TrajectoryOptions) -> dict[str, A
         "poses": count,
         "unmatched_poses": matched.unmatched,
         "tracked_share": matched.tracked_share,
+        "ate_tracked_m": _tracked_error(matched, options),
         "scale": matched.alignment.scale,
         "path_m": metrics.path_length(matched.truth),
         "estimate_path_m": metrics.path_length(matched.raw),
@@ -305,12 +333,22 @@ def _named(
     return {of: float(convert(v)) for of, v in zip(statistic_keys(key), values, strict=True)}
 
 
-def absolute_key(align: str, unit: str) -> str:
-    """Key of the absolute error: ``ate_m``, ``ate_sim3_m`` or ``ate_unaligned_m``; ``unit`` m, rad.
+def absolute_key(options: TrajectoryOptions, unit: str) -> str:
+    """Key of the absolute error, ``unit`` m or rad; one key means one alignment.
 
-    One key means one alignment.
+    ``ate_m``, ``ate_sim3_m``, ``ate_yaw_m``, ``ate_origin_m`` or ``ate_unaligned_m``;
+    ``ate_first_m`` after an alignment by the first poses, as the options say.
     """
-    return f"{_ALIGNED[align]}_{unit}"
+    name = _ALIGNED[options.align] if options.align_first is None else "ate_first"
+    return f"{name}_{unit}"
+
+
+def _tracked_error(matched: Matched, options: TrajectoryOptions) -> float | None:
+    """ATE in metres of the tracked frames, aligned by themselves; None where it is not known."""
+    ok = matched.tracked
+    if ok is None or ok.sum() < 2 or absolute_key(options, "m") != "ate_m":
+        return None
+    return metrics.ate_rmse(matched.raw[ok], matched.truth[ok])
 
 
 def _absolute_statistics(
@@ -318,7 +356,7 @@ def _absolute_statistics(
 ) -> dict[str, float | None]:
     found: dict[str, float | None] = {}
     for unit, errors in zip(("m", "rad"), absolute(matched), strict=True):
-        key = absolute_key(options.align, unit)
+        key = absolute_key(options, unit)
         found |= {key: None} if errors is None else _named(key, metrics.statistics_of(errors[part]))
     return found
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.geometry import Float64
+from ms_slam_env.geometry import Float64, invert, so3_exp
 from ms_slam_env.geometry.point_clouds import umeyama
 
 P = ParamSpec("P")
@@ -171,7 +171,10 @@ def _filled(values: Float64, name: str) -> Float64:
     return values
 
 
-ALIGNMENTS = ("se3", "sim3", "none")
+ALIGNMENTS = ("se3", "sim3", "yaw", "origin", "none")
+"""Best rigid motion; with scale; turned about z alone; first pose onto first; as it is."""
+FITTED = ("se3", "sim3", "yaw")
+"""Those that are found by least squares, from all poses or the first few."""
 
 
 @dataclass(frozen=True)
@@ -202,48 +205,97 @@ class Alignment:
         return aligned
 
 
-def find_alignment(estimate: ArrayLike, truth: ArrayLike, align: str = "se3") -> Alignment:
+def find_alignment(
+    estimate: ArrayLike, truth: ArrayLike, align: str = "se3", first: int | None = None
+) -> Alignment:
     """Best alignment of positions, in the sense of least squares (Umeyama, PAMI 1991).
 
+    ``yaw`` leaves rotation about the world's z axis and translation open, as a camera with an
+    inertial unit does (Zhang, Scaramuzza, "A tutorial on quantitative trajectory evaluation",
+    IROS 2018); ``origin`` lays the first pose onto the true one.
+
     Args:
-        estimate: T_world_camera (N, 4, 4), or positions (N, 3).
+        estimate: T_world_camera (N, 4, 4), or positions (N, 3), which do not do for ``origin``.
         truth: likewise, corresponding by row.
-        align: ``se3`` (best rigid motion), ``sim3`` (and scale) or ``none``.
+        align: ``se3`` (best rigid motion), ``sim3`` (and scale), ``yaw``, ``origin`` or ``none``.
+        first: least squares over so many poses from the start alone; None for all.
 
     Raises:
         InputError: wrong shapes, no poses, lengths that differ, NaN, unknown alignment; ``sim3``
-            of an estimate that stands still.
+            of an estimate that stands still; ``first`` of an alignment without least squares.
     """
     if align not in ALIGNMENTS:
         raise unknown("alignment", align, ALIGNMENTS)
-    positions, true_positions = check_pair(estimate, truth, need_poses=False)
+    check_first(align, first)
+    own, true = check_pair(estimate, truth, need_poses=align == "origin")
     if align == "none":
         return Alignment(np.eye(3), np.zeros(3), 1.0, unique=True)
+    if align == "origin":
+        T_truth_estimate = true[0] @ invert(own[0])
+        return Alignment(T_truth_estimate[:3, :3], T_truth_estimate[:3, 3], 1.0, unique=True)
+    positions, true_positions = own[:first], true[:first]
+    if align == "yaw":
+        return _yaw_alignment(positions, true_positions)
     R, t, scale = umeyama(positions, true_positions, with_scale=align == "sim3")
+    spread = np.linalg.svd(_covariance(positions, true_positions), compute_uv=False)
+    return Alignment(R, t, scale, unique=_stands_out(float(spread[1]), float(spread[0])))
+
+
+def check_first(align: str, first: int | None) -> None:
+    """Refuse a number of poses to align by that ``align`` cannot use."""
+    if first is None:
+        return
+    check_count(first, "first")
+    if align not in FITTED:
+        raise InputError(f"only {', '.join(FITTED)} align by the first poses, not {align}")
+
+
+def _covariance(positions: Float64, true_positions: Float64) -> Float64:
+    """Sum (3, 3) of true times estimated positions, each around its mean."""
     centred = true_positions - true_positions.mean(axis=0)
-    spread = np.linalg.svd(centred.T @ (positions - positions.mean(axis=0)), compute_uv=False)
-    return Alignment(R, t, scale, unique=bool(spread[1] > 1e-12 * max(spread[0], 1e-12)))
+    return centred.T @ (positions - positions.mean(axis=0))
+
+
+def _stands_out(value: float, size: float) -> bool:
+    """Whether ``value`` is more than what rounding leaves of numbers of this size."""
+    return bool(value > 1e-12 * max(size, 1e-12))
+
+
+def _yaw_alignment(positions: Float64, true_positions: Float64) -> Alignment:
+    """Least squares over rotations about z and translations; the angle has a closed form."""
+    S = _covariance(positions, true_positions)
+    sine, cosine = S[1, 0] - S[0, 1], S[0, 0] + S[1, 1]
+    R = so3_exp([0.0, 0.0, np.arctan2(sine, cosine)])
+    t = true_positions.mean(axis=0) - R @ positions.mean(axis=0)
+    return Alignment(
+        R, t, 1.0, unique=_stands_out(float(np.hypot(sine, cosine)), float(np.linalg.norm(S)))
+    )
 
 
 def absolute_errors(
-    estimate: ArrayLike, truth: ArrayLike, align: str = "se3", kind: str = "translation"
+    estimate: ArrayLike,
+    truth: ArrayLike,
+    align: str = "se3",
+    kind: str = "translation",
+    first: int | None = None,
 ) -> Float64:
     """Errors (N,) of the poses after alignment of the positions, USME equation (1).
 
     Args:
         estimate: T_world_camera (N, 4, 4); positions (N, 3) do for ``translation``.
         truth: likewise, corresponding by row.
-        align: ``se3`` (best rigid motion), ``sim3`` (and scale) or ``none``.
+        align: ``se3`` (best rigid motion), ``sim3`` (and scale), ``yaw``, ``origin`` or ``none``.
         kind: ``translation``, metres, or ``rotation``, radians.
+        first: aligned by so many poses from the start alone; None for all.
 
     Raises:
         InputError: as `find_alignment`; an unknown kind; ``rotation`` after an alignment whose
             rotation is open, because the positions lie on a line.
     """
     check_kind(kind)
+    found = find_alignment(estimate, truth, align, first)
     if kind == "rotation":
         poses, true_poses = check_pair(estimate, truth)
-        found = find_alignment(poses, true_poses, align)
         if not found.unique:
             raise InputError(
                 "positions on a line leave the alignment of orientations open; align='none' works"
@@ -251,7 +303,6 @@ def absolute_errors(
         relative = np.swapaxes(true_poses[:, :3, :3], 1, 2) @ found.poses(poses)[:, :3, :3]
         return rotation_angles(relative)
     positions, true_positions = check_pair(estimate, truth, need_poses=False)
-    found = find_alignment(positions, true_positions, align)
     return np.linalg.norm(found.positions(positions) - true_positions, axis=1)
 
 

@@ -13,6 +13,7 @@ import trimesh
 from evo.core import metrics as evo_metrics
 from evo.core import sync
 from evo.core.units import Unit
+from evo.main_ape import ape
 from evo.tools import file_interface
 from PIL import Image
 
@@ -69,7 +70,7 @@ def one_line(text: str) -> str:
     return lines[0]
 
 
-@pytest.mark.parametrize("align", ["se3", "sim3", "none"])
+@pytest.mark.parametrize("align", ["se3", "sim3", "origin", "none"])
 @pytest.mark.parametrize(
     ("options", "unit", "delta", "every"),
     [
@@ -82,11 +83,14 @@ def test_statistics_are_those_of_evo(
     tmp_path: Path, align: str, options: dict, unit: Unit, delta: float, every: bool
 ) -> None:
     pair = write_pair(tmp_path, scale=1.5 if align == "sim3" else 1.0)
-    result = evaluate_files(*map(Path, pair), TrajectoryOptions(align, tolerance=0.2, **options))
+    chosen = TrajectoryOptions(align, tolerance=0.2, **options)
+    result = evaluate_files(*map(Path, pair), chosen)
     truth, estimate = sync.associate_trajectories(
         *(file_interface.read_tum_trajectory_file(pair[k]) for k in (1, 0)), max_diff=0.02
     )
-    if align != "none":
+    if align == "origin":
+        estimate.align_origin(truth)
+    elif align != "none":
         estimate.align(truth, correct_scale=align == "sim3")
     assert result["scale"] == pytest.approx(1 / 1.5 if align == "sim3" else 1.0, abs=0.01)
     relations = {
@@ -96,11 +100,49 @@ def test_statistics_are_those_of_evo(
     for name, relation in relations.items():
         ape = evo_metrics.APE(relation)
         rpe = evo_metrics.RPE(relation, delta, unit, 0.2, every, pairs_from_reference=True)
-        for key, metric in ((absolute_key(align, name), ape), (f"rpe_{name}", rpe)):
+        for key, metric in ((absolute_key(chosen, name), ape), (f"rpe_{name}", rpe)):
             metric.process_data((truth, estimate))
             found = metric.get_all_statistics()
             for statistic, of in zip(STATISTICS, statistic_keys(key), strict=True):
                 assert result[of] == pytest.approx(found[statistic], abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "flags"),
+    [
+        (["--align", "origin"], {"align_origin": True}),
+        (["--align-first", "30"], {"align": True, "n_to_align": 30}),
+        (
+            ["--align", "sim3", "--align-first", "30"],
+            {"align": True, "correct_scale": True, "n_to_align": 30},
+        ),
+    ],
+)
+def test_alignments_are_those_of_evos_command(
+    tmp_path: Path, options: list[str], flags: dict[str, Any]
+) -> None:
+    pair = write_pair(tmp_path, scale=1.5 if "sim3" in options else 1.0)
+    result = evaluate([*pair, *options], tmp_path / "out")
+    truth, estimate = sync.associate_trajectories(
+        *(file_interface.read_tum_trajectory_file(pair[k]) for k in (1, 0)), max_diff=0.02
+    )
+    found = ape(truth, estimate, evo_metrics.PoseRelation.translation_part, **flags).stats
+    name = "ate_origin_m" if "origin" in options else "ate_first_m"
+    for statistic, of in zip(STATISTICS, statistic_keys(name), strict=True):
+        assert result[of] == pytest.approx(found[statistic], abs=1e-9)
+
+
+def test_the_alignment_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pair = write_pair(tmp_path)
+    out = tmp_path / "out"
+    result = evaluate([*pair, "--align", "yaw", "--align-first", "40"], out)
+    assert "alignment yaw by the first 40 poses" in capsys.readouterr().out
+    assert "alignment yaw by the first 40 poses" in (out / "table.md").read_text()
+    assert (result["config"]["align"], result["config"]["align_first"]) == ("yaw", 40)
+    upright = evaluate([*pair, "--align", "yaw"], out)
+    estimate, truth = (read_trajectory(Path(path))[1] for path in pair)
+    assert upright["ate_yaw_m"] == pytest.approx(metrics.ate_rmse(estimate, truth, "yaw"))
+    assert "ate_m" not in upright
 
 
 def test_files_and_options_are_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -227,15 +269,47 @@ def test_frames_that_a_run_lost_are_gaps(tmp_path: Path) -> None:
     frames.write_text("\n".join(["timestamp,tracking_ok,ext_ms", *rows]))
     everything = evaluate_files(*map(Path, pair))
     assert everything["ate_max_m"] > 1
-    assert everything["tracked_share"] is None
+    assert everything["poses"] == COUNT
+    assert everything["ate_tracked_m"] < 1e-6
     result = evaluate([*pair, "--frames", str(frames)], tmp_path / "out")
     assert result["poses"] == COUNT - 4
-    assert result["tracked_share"] == pytest.approx(1 - 4 / COUNT)
+    assert result["tracked_share"] == everything["tracked_share"] == pytest.approx(1 - 4 / COUNT)
     assert result["ate_max_m"] < 1e-6
     robustness = result
     assert (robustness["gaps"], robustness["tracked_pieces"]) == (2, 3)
     assert robustness["lost_s"] == pytest.approx(4 * 0.05 + 2 * 0.05)
     assert robustness["robustness"] == pytest.approx(0, abs=1e-6)
+
+
+def test_frames_beside_the_estimate_say_what_was_tracked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pair, frames = write_pair(tmp_path), tmp_path / "frames.csv"
+    times, poses = read_trajectory(Path(pair[0]))
+    _, truth = truth_path()
+    assert evaluate_files(*map(Path, pair))["tracked_share"] is None
+    ok = np.arange(COUNT) % 4 > 0
+    rows = [f"{t:.6f},{int(was)}" for t, was in zip(times, ok, strict=True)]
+    frames.write_text("\n".join(["timestamp,tracking_ok", *rows]))
+    capsys.readouterr()
+    result = evaluate(pair, tmp_path / "out")
+    assert (result["poses"], result["tracked_share"], result["gaps"]) == (COUNT, 0.75, 0)
+    assert result["ate_tracked_m"] == pytest.approx(metrics.ate_rmse(poses[ok], truth[ok]))
+    assert result["ate_m"] == pytest.approx(metrics.ate_rmse(poses, truth))
+    said = capsys.readouterr().out
+    assert f"tracked: 75.0% of the poses, ATE of these {result['ate_tracked_m']:.6f} m" in said
+    assert "Tracked: 75.0% of the poses" in (tmp_path / "out" / "table.md").read_text()
+    scaled = evaluate_files(*map(Path, pair), TrajectoryOptions("sim3"))
+    assert (scaled["tracked_share"], scaled["ate_tracked_m"]) == (0.75, None)
+    # One that is of other frames, or no table of ours, is left aside with a word.
+    for lines, word in ((rows[:-1], "is of other frames"), (["a,b"], "line 1: expected columns")):
+        head = ["timestamp,tracking_ok"] if len(lines) > 1 else []
+        frames.write_text("\n".join([*head, *lines]))
+        assert main(["evaluate", *pair]) == 0
+        shown = capsys.readouterr()
+        assert "left aside" in shown.err
+        assert word in shown.err
+        assert "tracked" not in shown.out
 
 
 def test_bad_frames_are_one_line_and_code_2(
@@ -291,6 +365,8 @@ def test_two_poses_and_a_camera_that_stands_still(tmp_path: Path) -> None:
         (["--segment-lengths-m", "-1"], "> 0 m"),
         (["--tolerance", "nan"], "tolerance = nan is outside"),
         (["--gap-s", "-1"], "gap_s = -1.0 is outside"),
+        (["--align", "origin", "--align-first", "3"], "se3, sim3, yaw align by the first poses"),
+        (["--align-first", "0"], "align_first = 0 is outside"),
         (["--map", "map.ply"], "maps are given as --map ESTIMATE --true-map GROUNDTRUTH"),
     ],
 )

@@ -8,10 +8,12 @@ from evo.core import metrics as evo_metrics
 from evo.core.trajectory import PosePath3D
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import least_squares
 
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import invert, make_pose, se3_exp
+from ms_slam_env.geometry import invert, make_pose, se3_exp, so3_exp
 from ms_slam_env.metrics import absolute_errors, ate_rmse, ate_statistics, find_alignment
+from ms_slam_env.metrics.trajectory import ALIGNMENTS
 
 STATISTICS = ("rmse", "mean", "median", "std", "min", "max")
 RELATIONS = {
@@ -38,15 +40,25 @@ def drifting(seed: int, length: int = 50, scale: float = 1.0) -> tuple[np.ndarra
     seed=st.integers(0, 10_000),
     length=st.integers(5, 60),
     scale=st.floats(0.2, 4.0),
-    align=st.sampled_from(["se3", "sim3", "none"]),
+    align=st.sampled_from(["se3", "sim3", "origin", "none"]),
+    first=st.none() | st.integers(4, 80),
     kind=st.sampled_from(list(RELATIONS)),
 )
-def test_equals_evo(seed: int, length: int, scale: float, align: str, kind: str) -> None:
+def test_equals_evo(
+    seed: int, length: int, scale: float, align: str, first: int | None, kind: str
+) -> None:
     estimate, truth = drifting(seed, length, scale)
     paths = [PosePath3D(poses_se3=list(poses)) for poses in (truth, estimate)]
-    if align != "none":
-        R, t, s = paths[1].align(paths[0], correct_scale=align == "sim3")
+    if align in ("origin", "none"):
+        first = None
+    if align == "origin":
+        paths[1].align_origin(paths[0])
         found_alignment = find_alignment(estimate, truth, align)
+        np.testing.assert_allclose(found_alignment.poses(estimate), paths[1].poses_se3, atol=1e-9)
+    elif align != "none":
+        few = -1 if first is None else min(first, length)
+        R, t, s = paths[1].align(paths[0], correct_scale=align == "sim3", n=few)
+        found_alignment = find_alignment(estimate, truth, align, first)
         assert found_alignment.scale == pytest.approx(s, abs=1e-9)
         np.testing.assert_allclose(found_alignment.R, R, atol=1e-9)
         np.testing.assert_allclose(found_alignment.t, t, atol=1e-9)
@@ -54,13 +66,42 @@ def test_equals_evo(seed: int, length: int, scale: float, align: str, kind: str)
     metric = evo_metrics.APE(RELATIONS[kind])
     metric.process_data(tuple(paths))
     expected = metric.get_all_statistics()
-    found = ate_statistics(estimate, truth, align, kind)
+    found = ate_statistics(estimate, truth, align, kind, first)
     for name in STATISTICS:
         assert getattr(found, name) == pytest.approx(expected[name], abs=1e-9)
-    assert ate_rmse(estimate, truth, align, kind) == found.rmse
-    np.testing.assert_allclose(
-        absolute_errors(estimate, truth, align, kind), metric.error, atol=1e-9
-    )
+    assert ate_rmse(estimate, truth, align, kind, first) == found.rmse
+    errors = absolute_errors(estimate, truth, align, kind, first)
+    np.testing.assert_allclose(errors, metric.error, atol=1e-9)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10_000), first=st.none() | st.integers(3, 30))
+def test_yaw_alignment_is_the_best_that_a_search_finds(seed: int, first: int | None) -> None:
+    estimate, truth = drifting(seed, 30)
+    moved = make_pose(so3_exp([0, 0, seed % 7 - 3.0]), [1, -2, 3]) @ estimate
+    found = find_alignment(moved, truth, "yaw", first)
+    assert (found.scale, found.unique) == (1.0, True)
+    np.testing.assert_allclose(found.R[2], [0, 0, 1], atol=1e-15)
+    own, true = moved[:first, :3, 3], truth[:first, :3, 3]
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        return ((own @ so3_exp([0, 0, x[0]]).T + x[1:]) - true).ravel()
+
+    starts = ([angle, 0.0, 0.0, 0.0] for angle in (-2.0, 0.0, 2.0))
+    searched = min((least_squares(residuals, x) for x in starts), key=lambda best: best.cost)
+    errors = absolute_errors(moved, truth, "yaw", first=first)[:first]
+    assert 0.5 * (errors**2).sum() == pytest.approx(searched.cost, rel=1e-6)
+
+
+def test_yaw_alignment_leaves_a_tilt_that_se3_takes_away() -> None:
+    _, truth = drifting(2)
+    tilted = make_pose(so3_exp([0.1, 0, 0]), [0, 0, 1]) @ truth
+    turned = make_pose(so3_exp([0, 0, 2.5]), [0, 0, 1]) @ truth
+    assert ate_rmse(tilted, truth) < 1e-9 < 1e-2 < ate_rmse(tilted, truth, "yaw")
+    assert ate_rmse(turned, truth, "yaw", "rotation") < 1e-9
+    upright = truth.copy()
+    upright[:, :2, 3] = 0.0
+    assert not find_alignment(upright, upright, "yaw").unique
 
 
 def test_a_rotated_camera_errs_by_that_angle_alone() -> None:
@@ -122,7 +163,7 @@ WRONG = st.one_of(
 
 
 @settings(max_examples=80, deadline=None)
-@given(wrong=WRONG, align=st.sampled_from(["se3", "sim3", "none"]), swap=st.booleans())
+@given(wrong=WRONG, align=st.sampled_from(ALIGNMENTS), swap=st.booleans())
 def test_wrong_poses_are_one_clear_error(wrong: object, align: str, swap: bool) -> None:
     good = drifting(0, 6)[1]
     pair = (good, wrong) if swap else (wrong, good)
@@ -133,11 +174,17 @@ def test_wrong_poses_are_one_clear_error(wrong: object, align: str, swap: bool) 
 
 def test_wrong_options() -> None:
     estimate, truth = drifting(0, 6)
-    with pytest.raises(InputError, match="valid choices: se3, sim3, none"):
+    with pytest.raises(InputError, match="valid choices: se3, sim3, yaw, origin, none"):
         ate_rmse(estimate, truth, "affine")
     with pytest.raises(InputError, match="valid choices: translation, rotation"):
         ate_rmse(estimate, truth, kind="both")
     with pytest.raises(InputError, match="must correspond"):
         ate_rmse(estimate[1:], truth)
+    with pytest.raises(InputError, match="se3, sim3, yaw align by the first poses, not origin"):
+        ate_rmse(estimate, truth, "origin", first=3)
+    with pytest.raises(InputError, match="first must be an integer >= 1"):
+        ate_rmse(estimate, truth, first=0)
+    with pytest.raises(InputError, match=r"\(N, 4, 4\) poses"):
+        ate_rmse(estimate[:, :3, 3], truth[:, :3, 3], "origin")
     with pytest.raises(InputError, match=r"\(N, 4, 4\) poses"):
         ate_rmse(estimate[:, :3, 3], truth, kind="rotation")
