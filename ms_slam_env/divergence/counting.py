@@ -14,7 +14,7 @@ from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.divergence import kernels
 from ms_slam_env.divergence.config import DivergenceConfig
-from ms_slam_env.divergence.sphere import TABLE_SIZE, cell_weights, dither_offsets
+from ms_slam_env.divergence.sphere import MAP_SIZE, bin_directions, bins_near
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import Float64
 
@@ -94,11 +94,15 @@ class HistogramCounter:
         ]
         reach_px = math.tan(math.radians(config.normal_reach_deg)) * intrinsics.fx
         self._radius = max(1, round(reach_px))
-        self._cell_weights = cell_weights(config.inclinations, float(config.alpha_deg))
         self._grouping = grouping_matrix(config.bins, float(config.smoothing))
-        self._dither: Any = wp.array(
-            dither_offsets(*intrinsics.shape), dtype=wp.vec2, device=device
-        )
+        directions = bin_directions(config.inclinations)
+        near = bins_near(config.inclinations, float(config.alpha_deg))
+        self._bins = len(directions)
+        self._cos_alpha = math.cos(math.radians(config.alpha_deg))
+        self._sphere: list[Any] = [
+            wp.array(directions.astype(np.float32), dtype=wp.vec3, device=device),
+            wp.array(near, dtype=wp.int32, device=device),
+        ]
         self._buffers: dict[int, tuple[Any, Any, Any]] = {}  # by batch size
 
     def histograms(self, intensity: Any, depth: Any, normals: Any | None = None) -> Histograms:
@@ -166,20 +170,20 @@ class HistogramCounter:
         ]
 
     def _buffer(self, batch: int) -> tuple[Any, Any, Any]:
-        """Return counters of grey levels and cells, set to zero, and room for inverse depth."""
+        """Return counters of grey levels, sums by row, both zero, and room for inverse depth."""
         if batch not in self._buffers:
             levels_shape = (batch, self._windows * 256)
-            cells_shape = (batch, self._windows * TABLE_SIZE**2)
+            sums_shape = (batch * self.intrinsics.height * self._windows * self._bins,)
             images_shape = (batch, *self.intrinsics.shape)
             self._buffers[batch] = (
                 wp.zeros(levels_shape, dtype=wp.int32, device=self._device),
-                wp.zeros(cells_shape, dtype=wp.int32, device=self._device),
+                wp.zeros(sums_shape, dtype=wp.float32, device=self._device),
                 wp.empty(images_shape, dtype=wp.float32, device=self._device),
             )
-        levels, cells, inverse = self._buffers[batch]
+        levels, sums, inverse = self._buffers[batch]
         levels.zero_()
-        cells.zero_()
-        return levels, cells, inverse
+        sums.zero_()
+        return levels, sums, inverse
 
     def _inverse(self, depth: Any, out: Any) -> Any:
         """Inverse depth (B, h, w), written to ``out``."""
@@ -190,32 +194,39 @@ class HistogramCounter:
         """Run a kernel with one thread per row of the images ``inputs[0]``."""
         wp.launch(kernel, dim=inputs[0].shape[:2], inputs=inputs, device=self._device)
 
-    def _count(self, intensity: Any, depth: Any, normals: Any | None) -> tuple[Int32, Int32]:
-        """Counts (B, W, 256) of grey levels and (B, W, TABLE_SIZE ** 2) of directions."""
+    def _count(self, intensity: Any, depth: Any, normals: Any | None) -> tuple[Int32, Float64]:
+        """Counts (B, W, 256) of grey levels and sums (B, W, L) of the weights of normals, (9)."""
         batch = intensity.shape[0]
-        levels, cells, inverse = self._buffer(batch)
+        levels, sums, inverse = self._buffer(batch)
         only_with_depth = int(self.config.intensity_pixels == "with-depth")
         self._launch(
             kernels.count_intensity, [intensity, depth, only_with_depth, *self._grid, levels]
         )
-        tail = [self._dither, *self._grid, TABLE_SIZE, cells]
+        tail = [
+            *self._grid,
+            *self._sphere,
+            MAP_SIZE,
+            self._cos_alpha,
+            self._windows * self._bins,
+            sums,
+        ]
         if normals is None:
             inverse = self._inverse(depth, inverse)
-            self._launch(kernels.count_depth_normals, [inverse, *self._camera(), *tail])
+            self._launch(kernels.weigh_depth_normals, [inverse, *self._camera(), *tail])
         else:
-            self._launch(kernels.count_given_normals, [normals, *tail])
+            self._launch(kernels.weigh_given_normals, [normals, *tail])
+        weights = sums.numpy().reshape(batch, self.intrinsics.height, -1).sum(
+            axis=1, dtype=np.float64
+        ) / (1 - self._cos_alpha)
         return (
             levels.numpy().reshape(batch, self._windows, 256),
-            cells.numpy().reshape(batch, self._windows, TABLE_SIZE**2),
+            weights.reshape(batch, self._windows, self._bins),
         )
 
-    def _normalised(self, levels: Int32, cells: Int32) -> Histograms:
-        """Histograms of raw counts, the sums of equation (9) by one matrix product."""
+    def _normalised(self, levels: Int32, weights: Float64) -> Histograms:
+        """Histograms of raw counts and of the sums of equation (9)."""
         pseudo_count = self.config.pseudo_count
-        batch, windows = levels.shape[:2]
-        sums = cells.reshape(batch * windows, -1).astype(np.float32) @ self._cell_weights
-        normals = sums.reshape(batch, windows, -1).astype(np.float64)
         return Histograms(
             intensity=normalise(levels @ self._grouping, pseudo_count),
-            normals=normalise(normals, pseudo_count),
+            normals=normalise(weights, pseudo_count),
         )

@@ -1,9 +1,9 @@
 """Counting kernels: one pass over the pixels of a batch of frames.
 
-Counts are integers, so the result does not depend on the order in which a GPU adds them. One
-thread takes one image row: on the CPU, where threads run one after the other, the call of a
-thread costs more than a pixel does. The spatial window of pixel (v, u) is ``row_window[v] +
-column_window[u]``.
+Grey levels are counted in integers and the weights of normals are summed by rows, so the result
+does not depend on the order in which a GPU adds them. One thread takes one image row: on the CPU,
+where threads run one after the other, the call of a thread costs more than a pixel does. The
+spatial window of pixel (v, u) is ``row_window[v] + column_window[u]``.
 """
 
 from __future__ import annotations
@@ -81,12 +81,8 @@ def normal_at(
 
 
 @wp.func
-def direction_cell(n: wp.vec3, dither: wp.vec2, size: int):
-    """Cell of direction ``n`` (any length but 0) in an octahedral map with -z at its centre.
-
-    The direction lies between four cell centres. ``dither`` in [0, 1)^2 picks one of them with
-    the frequency of its weight in bilinear interpolation.
-    """
+def direction_cell(n: wp.vec3, size: int):
+    """Cell of direction ``n`` (any length but 0) in an octahedral map with -z at its centre."""
     half = 0.5 * float(size)
     scale = half / (wp.abs(n[0]) + wp.abs(n[1]) + wp.abs(n[2]))
     x = n[0] * scale
@@ -95,11 +91,27 @@ def direction_cell(n: wp.vec3, dither: wp.vec2, size: int):
         folded_x = (half - wp.abs(y)) * wp.sign(x)
         y = (half - wp.abs(x)) * wp.sign(y)
         x = folded_x
-    # Cell k has its centre at k + 0.5. Adding 1 before truncation and taking it off after keeps
-    # truncation a floor down to -1.
-    column = int(x + half + dither[0] + 0.5) - 1
-    row = int(y + half + dither[1] + 0.5) - 1
-    return wp.clamp(row, 0, size - 1) * size + wp.clamp(column, 0, size - 1)
+    row = wp.clamp(int(y + half), 0, size - 1)
+    return row * size + wp.clamp(int(x + half), 0, size - 1)
+
+
+@wp.func
+def add_weights(
+    n: wp.vec3,
+    directions: wp.array(dtype=wp.vec3),
+    near: wp.array2d(dtype=wp.int32),
+    size: int,
+    cos_alpha: float,
+    first: int,
+    sums: wp.array(dtype=wp.float32),
+):
+    """Add the weights (8) of direction ``n``, times 1 - cos(alpha), to the bins from ``first``."""
+    cell = direction_cell(n, size)
+    inverse = 1.0 / wp.length(n)
+    for k in range(1, near[cell, 0] + 1):
+        index = near[cell, k]
+        cosine = wp.dot(n, directions[index]) * inverse
+        sums[first + index] += wp.max(cosine - cos_alpha, 0.0)
 
 
 @wp.kernel
@@ -123,52 +135,60 @@ def count_intensity(
 
 
 @wp.kernel
-def count_depth_normals(
+def weigh_depth_normals(
     inverse: wp.array3d(dtype=wp.float32),
     focal: wp.vec2,
     centre: wp.vec2,
     radius: int,
     edge_threshold: float,
-    dither: wp.array2d(dtype=wp.vec2),
     row_window: wp.array(dtype=wp.int32),
     column_window: wp.array(dtype=wp.int32),
+    directions: wp.array(dtype=wp.vec3),
+    near: wp.array2d(dtype=wp.int32),
     size: int,
-    counts: wp.array2d(dtype=wp.int32),
+    cos_alpha: float,
+    per_row: int,
+    sums: wp.array(dtype=wp.float32),
 ):
-    """Add the normals of a row of pixels to the cells (B, windows * size^2) of its frame."""
+    """Sum the weights of the normals of a row of pixels, (B, H, windows * bins), equation (9)."""
     b, v = wp.tid()
     height = inverse.shape[1]
     width = inverse.shape[2]
     if v < radius or v >= height - radius:
         return
     window_row = row_window[v]
+    first_of_row = (b * height + v) * per_row
     for u in range(radius, width - radius):
         n = normal_at(inverse, b, v, u, radius, edge_threshold, focal, centre)
         if wp.dot(n, n) > 0.0:
             window = window_row + column_window[u]
-            cell = direction_cell(n, dither[v, u], size)
-            wp.atomic_add(counts, b, window * size * size + cell, 1)
+            first = first_of_row + window * directions.shape[0]
+            add_weights(n, directions, near, size, cos_alpha, first, sums)
 
 
 @wp.kernel
-def count_given_normals(
+def weigh_given_normals(
     normals: wp.array3d(dtype=wp.vec3),
-    dither: wp.array2d(dtype=wp.vec2),
     row_window: wp.array(dtype=wp.int32),
     column_window: wp.array(dtype=wp.int32),
+    directions: wp.array(dtype=wp.vec3),
+    near: wp.array2d(dtype=wp.int32),
     size: int,
-    counts: wp.array2d(dtype=wp.int32),
+    cos_alpha: float,
+    per_row: int,
+    sums: wp.array(dtype=wp.float32),
 ):
-    """Add given normals of a row of pixels to the cells (B, windows * size^2) of its frame."""
+    """Sum the weights of given normals of a row of pixels, (B, H, windows * bins), (9)."""
     b, v = wp.tid()
     width = normals.shape[2]
     window_row = row_window[v]
+    first_of_row = (b * normals.shape[1] + v) * per_row
     for u in range(width):
         n = normals[b, v, u]
         if wp.dot(n, n) > 0.0:
             window = window_row + column_window[u]
-            cell = direction_cell(n, dither[v, u], size)
-            wp.atomic_add(counts, b, window * size * size + cell, 1)
+            first = first_of_row + window * directions.shape[0]
+            add_weights(n, directions, near, size, cos_alpha, first, sums)
 
 
 @wp.kernel

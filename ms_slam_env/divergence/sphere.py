@@ -9,10 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.geometry import Float64
 
-Float32 = NDArray[np.float32]
-
-TABLE_SIZE = 80
-"""Cells along one side of the octahedral map of directions."""
+MAP_SIZE = 32
+"""Cells along one side of the octahedral map of directions; even, so that no fold cuts a cell."""
+_ROUNDING_RAD = 1e-3  # more than single precision moves a direction across an edge of a cell
 
 
 @lru_cache(maxsize=32)
@@ -49,37 +48,42 @@ def bin_weights(normals: ArrayLike, directions: ArrayLike, alpha_rad: float) -> 
     return np.maximum(cosine - np.cos(alpha_rad), 0.0) / (1.0 - np.cos(alpha_rad))
 
 
-def cell_directions() -> Float64:
-    """Unit vectors (TABLE_SIZE ** 2, 3) at the cell centres of the octahedral map.
+def octahedral_directions(x: ArrayLike, y: ArrayLike) -> Float64:
+    """Unit vectors (..., 3) at points of the octahedral map, x and y (...) in [-1, 1].
 
     The map has -z at its centre, where the normals that a camera sees are (z forward).
     """
-    axis = (np.arange(TABLE_SIZE) + 0.5) * 2 / TABLE_SIZE - 1
-    y, x = np.meshgrid(axis, axis, indexing="ij")
+    x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     z = np.abs(x) + np.abs(y) - 1
     fold = np.maximum(z, 0)  # the outer four triangles of the square are the folded half z > 0
     directions = np.stack([x - np.sign(x) * fold, y - np.sign(y) * fold, z], axis=-1)
-    directions = directions.reshape(-1, 3)
-    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    return directions / np.linalg.norm(directions, axis=-1, keepdims=True)
 
 
 @lru_cache(maxsize=16)
-def cell_weights(inclinations: int, alpha_deg: float) -> Float32:
-    """Weights (TABLE_SIZE ** 2, L) of (8) at the cell centres, for N and alpha."""
-    weights = bin_weights(
-        cell_directions(), bin_directions(inclinations), float(np.deg2rad(alpha_deg))
-    ).astype(np.float32)
-    weights.flags.writeable = False
-    return weights
+def bins_near(inclinations: int, alpha_deg: float) -> NDArray[np.int32]:
+    """Bins (MAP_SIZE ** 2, 1 + K) in which a direction in a cell of the octahedral map has weight.
 
-
-def dither_offsets(height: int, width: int) -> Float32:
-    """Offsets (height, width, 2) in [0, 1), evenly spread over any patch of the image.
-
-    Source: the two-dimensional low-discrepancy sequence R2 (Roberts, "The unreasonable
-    effectiveness of quasirandom sequences", 2018), its two steps along rows and columns.
+    Of each cell first how many, then which. The lists only save looking at bins whose weight (8)
+    is zero anyway.
     """
-    v, u = np.mgrid[:height, :width].astype(np.float64)
-    a, b = 0.7548776662466927, 0.5698402909980532
-    offsets = np.stack([u * a + v * b, u * b + v * (1 - a)], axis=-1) % 1.0
-    return np.minimum(offsets, 0.999999).astype(np.float32)  # float32 could round up to 1
+    edges = np.linspace(-1, 1, MAP_SIZE + 1)
+    corners = octahedral_directions(*np.meshgrid(edges, edges))
+    middle = (edges[1:] + edges[:-1]) / 2
+    centres = octahedral_directions(*np.meshgrid(middle, middle))
+    # Lines on the map are great circles: the farthest point of a cell is one of its corners.
+    all_corners = [corners[i : i + MAP_SIZE, j : j + MAP_SIZE] for i in (0, 1) for j in (0, 1)]
+    radius = np.max([_angle((c * centres).sum(axis=-1)) for c in all_corners], axis=0).ravel()
+    away = _angle(centres.reshape(-1, 3) @ bin_directions(inclinations).T)
+    is_near = away < radius[:, None] + np.deg2rad(alpha_deg) + _ROUNDING_RAD
+    count = is_near.sum(axis=1)
+    lists = np.zeros((len(count), 1 + count.max()), dtype=np.int32)
+    lists[:, 0] = count
+    for row, near in zip(lists, is_near, strict=True):
+        row[1 : 1 + near.sum()] = np.flatnonzero(near)
+    lists.flags.writeable = False
+    return lists
+
+
+def _angle(cosine: Float64) -> Float64:
+    return np.arccos(np.clip(cosine, -1, 1))

@@ -28,7 +28,10 @@ from ms_slam_env.report.tables import Grouping, Table, finished, make_table
 
 RANKED_BY = "f_score_5cm"
 """Standing still loses it by recall, getting lost by precision."""
-HEADLINE = ("f_score_5cm", "f_score_2cm", "rcm", "ate_m", "lost", "path_length_m", "decision_ms")
+HEADLINE = (
+    *("f_score_5cm", "f_score_2cm", "rcm", "ate_m", "lost"),
+    *("violations", "path_length_m", "decision_ms"),
+)
 DETAILS = ("ate_max_m", "rpe_m", "rer_m", "mapped_area_m2", "M_I", "M_D", "return")
 _PANELS = ("f_score_5cm", "rcm", "ate_m", "path_length_m")
 _FLOOR_M = 5e-5  # errors below are drawn here on logarithmic axes

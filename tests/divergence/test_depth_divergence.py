@@ -1,6 +1,7 @@
 """Equations (6) to (10) against a direct loop, and the computation of normals."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +13,10 @@ from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.divergence import DivergenceConfig, depth_divergence, make_divergence
 from ms_slam_env.divergence.sphere import bin_directions, bin_weights
 from ms_slam_env.errors import InputError
+from ms_slam_env.sequences.recording import open_recording
 
 CAMERA = xtion("80x60")
+LR_KT3 = Path(__file__).resolve().parents[3] / "shared/data/icl_nuim/lr_kt3_depth"
 
 
 def plane_depth(normal, distance=2.0):
@@ -75,10 +78,10 @@ def test_number_of_bins_follows_equation_7():
     np.testing.assert_allclose(np.linalg.norm(bin_directions(4), axis=1), 1)
 
 
-def exact_divergence(current, previous, config=None):
+def exact_divergence(current, previous, config=None, camera=CAMERA):
     """(10) from the normals of the library and exact weights."""
     config = config or DivergenceConfig.paper()
-    normals = make_divergence(config, CAMERA).normals(np.stack([current, previous]))
+    normals = make_divergence(config, camera).normals(np.stack([current, previous]))
     histograms = []
     for frame in normals.astype(float):
         valid = frame[np.linalg.norm(frame, axis=2) > 0]
@@ -90,11 +93,37 @@ def exact_divergence(current, previous, config=None):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_grid_of_directions_is_close_to_exact_weights(seed):
-    current, previous = room_depth(seed), room_depth(seed + 100)
-    exact = exact_divergence(current, previous)
-    assert exact > 0.01
-    assert depth_divergence(current, previous, CAMERA) == pytest.approx(exact, rel=0.02, abs=1e-3)
+@pytest.mark.parametrize("config", [DivergenceConfig.paper(), DivergenceConfig()])
+def test_divergence_is_that_of_exact_weights(seed, config):
+    current = room_depth(seed)
+    noise = np.random.default_rng(seed).normal(0, 3e-4, current.shape).astype(np.float32)
+    for previous in (room_depth(seed + 100), current + noise):  # far apart, and nearly the same
+        expected = exact_divergence(current, previous, config)
+        found = make_divergence(config, CAMERA).histograms(
+            np.zeros((2, *current.shape)), np.stack([current, previous])
+        )
+        assert entropy(*found.normals[:, 0]) == pytest.approx(expected, rel=1e-3, abs=1e-12)
+    assert depth_divergence(current, previous, CAMERA) == pytest.approx(
+        exact_divergence(current, previous), rel=1e-3, abs=0
+    )
+
+
+@pytest.mark.parametrize(("N", "alpha_deg"), [(2, 90.0), (4, 45.0), (8, 30.0), (32, 5.0)])
+def test_no_bin_is_left_out_anywhere_on_the_sphere(N, alpha_deg):
+    """Directions of all kinds: along the axes, on the folds of the map of directions, any."""
+    rng = np.random.default_rng(N)
+    axes = np.stack(np.meshgrid(*[[-1.0, 0, 1]] * 3), axis=-1).reshape(-1, 3)
+    directions = np.concatenate([rng.normal(size=(4000, 3)), axes[(axes != 0).any(axis=1)]])
+    directions[:500, 2] *= 1e-3
+    config = DivergenceConfig(inclinations=N, alpha_deg=alpha_deg)
+    normals = np.zeros((1, *CAMERA.shape, 3), np.float32)
+    normals.reshape(-1, 3)[: len(directions)] = directions
+    nothing = np.zeros((1, *CAMERA.shape), np.float32)
+    found = make_divergence(config, CAMERA).histograms(nothing, nothing, normals).normals[0, 0]
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    weights = bin_weights(directions, bin_directions(N), math.radians(alpha_deg))
+    expected = weights.sum(axis=0) + config.pseudo_count
+    np.testing.assert_allclose(found, expected / expected.sum(), rtol=1e-3)
 
 
 @settings(max_examples=25, deadline=None)
@@ -186,3 +215,14 @@ def test_bad_depth_is_refused(bad):
         depth_divergence(bad, room_depth(1), CAMERA)
     with pytest.raises(InputError, match="depth"):
         depth_divergence(room_depth(1), bad, CAMERA)
+
+
+@pytest.mark.skipif(not LR_KT3.exists(), reason="needs the ICL-NUIM depth of lr kt3")
+def test_real_frames_have_the_divergence_of_exact_weights():
+    """Of one pair a table of weights, dithered, was 16 % off."""
+    recording = open_recording(LR_KT3)
+    depths = [frame.depth for frame in recording.every(10)[:4]]
+    for current, previous in zip(depths[1:], depths[:-1], strict=True):
+        expected = exact_divergence(current, previous, camera=recording.intrinsics)
+        found = depth_divergence(current, previous, recording.intrinsics)
+        assert found == pytest.approx(expected, rel=1e-3, abs=0)

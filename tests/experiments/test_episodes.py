@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from ms_slam_env.experiments.harness.episodes import (
     EpisodeSpec,
     make_env,
     parse_options,
+    play,
     run_episode,
 )
 from ms_slam_env.experiments.planners import DETAILS, HEADLINE
@@ -37,6 +39,18 @@ def test_result_has_every_reported_metric(result: dict[str, Any]) -> None:
     assert all(np.isfinite(result[key]) for key in (*HEADLINE, *DETAILS))
     assert result["steps"] == len(result["ate_over_time"]) == 4
     assert result["rcm"] == result["recall_5cm"]
+
+
+def test_violations_are_the_frames_beyond_the_permitted_maxima() -> None:
+    env = make_env(SPEC)
+    play(env, make_planner("random", env.unwrapped, SPEC.seed), SPEC.seed)
+    met = env.unwrapped.episode.divergences[1:]  # type: ignore[attr-defined]
+    M_I, M_D = (float(np.sort(column)[-2]) for column in met.T)  # one frame beyond each
+    beyond = {int(np.argmax(column)) for column in met.T}
+    limits = {"targets": {"M_I": M_I, "M_D": M_D}}
+    assert run_episode(replace(SPEC, options=limits))["violations"] == len(beyond) / len(met)
+    nothing = {"targets": {"M_I": 100.0, "M_D": 100.0}}
+    assert run_episode(replace(SPEC, options=nothing))["violations"] == 0
 
 
 def test_same_spec_same_result(result: dict[str, Any]) -> None:

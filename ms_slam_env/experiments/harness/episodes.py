@@ -206,12 +206,14 @@ def measure_trajectory(world: ActiveSlamEnv) -> dict[str, Any]:
 
     ``ate_m`` (RMSE) and ``ate_max_m`` after SE(3) alignment, ``ate_unaligned_m`` with the common
     start as the only tie, ``rpe_m`` and ``rpe_rad`` per step, ``path_length_m`` of the true
-    trajectory, ``M_I`` and ``M_D`` (equations 11 and 12), and ``lost``: SLAM reported lost tracking
+    trajectory, ``M_I`` and ``M_D`` (equations 11 and 12), ``violations`` (share of the frames after
+    the first that exceed the environment's M_I or M_D), and ``lost``: SLAM reported lost tracking
     at some step, or was off by more than ``LOST_ERROR_M`` without noticing.
     """
     truth, estimate = world.episode.trajectory_truth, world.episode.trajectory_estimate
     aligned = metrics.ate_statistics(estimate, truth)
-    maxima = world.episode.divergences.max(axis=0)
+    divergences = world.episode.divergences[1:]
+    maxima = divergences.max(axis=0)
     return {
         "ate_m": aligned.rmse,
         "ate_max_m": aligned.max,
@@ -221,6 +223,7 @@ def measure_trajectory(world: ActiveSlamEnv) -> dict[str, Any]:
         "path_length_m": metrics.path_length(truth),
         "M_I": float(maxima[0]),
         "M_D": float(maxima[1]),
+        "violations": float((divergences > world.config.targets.maxima).any(axis=1).mean()),
         "lost": bool(world.episode.pose_errors.max() > LOST_ERROR_M),
     }
 
