@@ -8,22 +8,21 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from ms_slam_env.config import Checked, bounded, from_dict
-from ms_slam_env.errors import InputError
+from ms_slam_env.env.observations import POINT as OBSERVATIONS
+from ms_slam_env.errors import InputError, unknown
 
 
 @dataclass(frozen=True)
-class Args(Checked):
-    """Train a camera-motion policy with PPO; these options are the command line.
+class Problem(Checked):
+    """Where a policy is trained and judged.
 
     Attributes:
         out: folder for everything the run writes.
-        resume: go on from ``out/latest.safetensors``; options that are not given are those of the
-            run so far.
-        algorithm: PPO over the actions that are not blocked, or over all of them.
+        resume: go on with the run in ``out``.
         env_id: id of the environment.
         embodiment: what carries the camera; None: what the id says.
-        observation: ``features``, as environments have it by default, or ``lookahead``, which shows
-            the agent what the greedy planner sees and takes longer.
+        observation: a variant by name; `lookahead` shows the agent what the greedy planner
+            sees, `map` what is known of space around it, and both take longer than `features`.
         scenes: trained and validated on, with training and validation seeds.
         scene_seeds: seeds of each scene, from the split's first; a scene takes seconds to build.
         episode_steps: time limit of an episode.
@@ -31,15 +30,51 @@ class Args(Checked):
         step_deg: rotation of a motion; None: the environment's default.
         num_envs: parallel environments, one process and one thread each.
         seed: of network, training episodes and sampling.
+        eval_episodes: validation episodes, the same at each evaluation, with the same random
+            numbers.
+        deterministic_eval: evaluate the most probable action instead of sampling.
+    """
+
+    out: Path = Path("runs/policy")
+    resume: bool = False
+    env_id: str = "MSActiveSLAM-FreeCamera-v0"
+    embodiment: str | None = None
+    observation: str = "features"
+    scenes: tuple[str, ...] = ("living_room", "corridor", "table")
+    scene_seeds: int = bounded(4, 1, 100_000)
+    episode_steps: int = bounded(150, 1, 100_000)
+    step_m: float | None = None
+    step_deg: float | None = None
+    num_envs: int = bounded(2, 1, 100_000)
+    seed: int = 0
+    eval_episodes: int = bounded(24, 1, 100_000)
+    deterministic_eval: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range, and training nowhere."""
+        super().__post_init__()
+        if not self.scenes:
+            raise InputError("Args.scenes names no scene")
+        if self.observation not in OBSERVATIONS.names():  # a policy file names no module
+            raise unknown("observation", self.observation, OBSERVATIONS.names())
+
+
+@dataclass(frozen=True)
+class Args(Problem):
+    """Train a camera-motion policy with PPO; these options are the command line.
+
+    Attributes:
+        resume: go on from ``out/latest.safetensors``; options that are not given are those of the
+            run so far.
+        init: policy file to begin with, as of ``ms-slam train imitation``; its network and
+            normalisation, not its steps.
+        algorithm: PPO over the actions that are not blocked, or over all of them.
         total_timesteps: environment steps, all runs of a resumed training together.
         minutes: stop this run after training for so much wall-clock time; evaluations and the
             episodes of the references come on top. None: by steps alone.
         eval_every: environment steps between evaluations; 0: only first and last.
-        eval_episodes: validation episodes, the same at each evaluation, with the same random
-            numbers.
         references: play the validation episodes with random walk, standing still and the greedy
             planner too, before training.
-        deterministic_eval: evaluate the most probable action instead of sampling.
         n_steps: steps of each environment between updates; fewer where ``total_timesteps`` leaves
             fewer.
         batch_size: of the gradient steps.
@@ -53,24 +88,12 @@ class Args(Checked):
     """
 
     out: Path = Path("runs/sb3")
-    resume: bool = False
+    init: Path | None = None
     algorithm: Literal["maskable_ppo", "ppo"] = "maskable_ppo"
-    env_id: str = "MSActiveSLAM-FreeCamera-v0"
-    embodiment: str | None = None
-    observation: Literal["features", "lookahead"] = "features"
-    scenes: tuple[str, ...] = ("living_room", "corridor", "table")
-    scene_seeds: int = bounded(4, 1, 100_000)
-    episode_steps: int = bounded(150, 1, 100_000)
-    step_m: float | None = None
-    step_deg: float | None = None
-    num_envs: int = bounded(2, 1, 100_000)
-    seed: int = 0
     total_timesteps: int = bounded(200_000, 2, 1_000_000_000)
     minutes: float | None = bounded(None, 0, 1_000_000)
     eval_every: int = bounded(10_000, 0, 1_000_000_000)
-    eval_episodes: int = bounded(24, 1, 100_000)
     references: bool = True
-    deterministic_eval: bool = False
     n_steps: int = bounded(512, 2, 1_000_000)  # advantages of one sample have no spread
     batch_size: int = bounded(128, 2, 1_000_000)
     n_epochs: int = bounded(8, 1, 1000)
@@ -80,12 +103,6 @@ class Args(Checked):
     ent_coef: float = bounded(0.003, 0, 1)
     clip_range: float = bounded(0.2, 0, 1)
     hidden: int = bounded(128, 1, 4096)
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range, and training nowhere."""
-        super().__post_init__()
-        if not self.scenes:
-            raise InputError("Args.scenes names no scene")
 
 
 KEPT = ("algorithm", "env_id", "embodiment", "observation", "step_m", "step_deg", "hidden")

@@ -28,7 +28,7 @@ from ms_slam_env.report.records import build, to_plain
 Tensors = dict[str, NDArray[Any]]
 Shapes = dict[str, tuple[int, ...]]
 
-ALGORITHMS = ("maskable_ppo", "ppo")
+ALGORITHMS = ("maskable_ppo", "ppo", "imitation")
 VERSION = 1
 STEP = "optimizer.step"
 MOMENTS = ("exp_avg", "exp_avg_sq")  # of Adam, each of its parameter's shape
@@ -37,7 +37,7 @@ _TEXT = "ms_slam_policy"
 _LARGEST_FILE = 2**30  # bytes
 _LARGEST_LAYER = 100_000
 _MOST_LAYERS = 16
-_ENV_ID = re.compile(r"[\w-]+")  # gym.make imports what stands before a colon
+_NAME = re.compile(r"[\w-]+")  # what stands before a colon would be imported
 _ENV_OPTIONS = {"embodiment": str, "step_m": (int, float), "step_rad": (int, float)}
 
 
@@ -90,8 +90,9 @@ class Metadata:
         """
         if self.algorithm not in ALGORITHMS:
             raise unknown("algorithm", self.algorithm, ALGORITHMS)
-        if not _ENV_ID.fullmatch(self.env_id):
-            raise InputError(f"env_id {self.env_id!r} is no name of an environment")
+        for name in ("env_id", "observation"):
+            if not _NAME.fullmatch(getattr(self, name)):
+                raise InputError(f"{name} {getattr(self, name)!r} is no name")
         for name, value in self.env_options.items():
             if name not in _ENV_OPTIONS:
                 raise unknown("option of env_options", name, _ENV_OPTIONS)

@@ -18,7 +18,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import gymnasium as gym
@@ -26,7 +26,7 @@ import torch
 from ms_slam_agents import convert_sb3
 from ms_slam_agents.evaluation import FixedEpisodes, references
 from ms_slam_agents.learning_curve import Curve, read_curve
-from ms_slam_agents.options import KEPT, Args, resumed
+from ms_slam_agents.options import KEPT, Args, Problem, resumed
 from ms_slam_agents.policy_file import PolicyFile, read_policy
 from ms_slam_agents.sb3_state import ALGORITHMS, Model, restore, whole_batches
 from ms_slam_agents.supervisor import LATEST, Supervisor
@@ -50,7 +50,7 @@ VALIDATION_SEED = 1_000_000  # of the first validation episode; training draws f
 # -- Environments ------------------------------------------------------------------------------
 
 
-def make_env(args: Args, split: str, seeds: Sequence[int]) -> gym.Env[Any, Any]:
+def make_env(args: Problem, split: str, seeds: Sequence[int]) -> gym.Env[Any, Any]:
     """Build one environment; with ``seeds`` it plays those episodes only."""
     if multiprocessing.parent_process() is not None:  # in a worker Ctrl-C is the main's to answer
         signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -68,14 +68,14 @@ def make_env(args: Args, split: str, seeds: Sequence[int]) -> gym.Env[Any, Any]:
     return FixedEpisodes(env, seeds) if seeds else env
 
 
-def env_options(args: Args) -> dict[str, Any]:
+def env_options(args: Problem) -> dict[str, Any]:
     """Options of the environment that a policy depends on, where not the environment's own."""
     step_rad = None if args.step_deg is None else math.radians(args.step_deg)
     options = {"embodiment": args.embodiment, "step_m": args.step_m, "step_rad": step_rad}
     return {name: value for name, value in options.items() if value is not None}
 
 
-def make_venv(args: Args, split: str, seeds: Sequence[int] = ()) -> VecEnv:
+def make_venv(args: Problem, split: str, seeds: Sequence[int] = ()) -> VecEnv:
     """Build the parallel environments; the episodes ``seeds`` are dealt out to them in turn."""
     num_envs = min(args.num_envs, len(seeds)) if seeds else args.num_envs
 
@@ -115,7 +115,26 @@ def make_model(args: Args, venv: VecEnv, file: PolicyFile | None) -> Model:
     )
     if file:
         restore(model, file)
+    elif args.init:
+        restore(model, begun(args))
     return model
+
+
+def begun(args: Args) -> PolicyFile:
+    """The policy to begin with, as if it had no steps.
+
+    Raises:
+        InputError: no policy, or one of another network or problem.
+    """
+    assert args.init
+    file = read_policy(args.init).without_optimizer()
+    known = file.metadata
+    for name, own in (("env_id", args.env_id), ("observation", args.observation)):
+        if getattr(known, name) != own:
+            raise InputError(f"{args.init} is for {name} {getattr(known, name)!r}, not {own!r}")
+    if tuple(known.hidden) != (args.hidden, args.hidden):
+        raise InputError(f"{args.init} has layers of {known.hidden}: give --hidden that")
+    return replace(file, metadata=replace(file.metadata, timesteps=0, epochs=0))
 
 
 def rollout_steps(args: Args, num_envs: int, done: int) -> int:
@@ -187,6 +206,8 @@ def train(args: Args) -> int:
     """
     torch.set_num_threads(1)
     file = load_run(args)
+    if args.init and file is None:
+        begun(args)  # refused before anything is written
     try:
         env = make_env(args, "train", ())  # bad options fail here, not in a worker process
     except gym.error.UnregisteredEnv:

@@ -47,6 +47,9 @@ class Planner(ABC):
     def act(self, observation: Any, info: dict[str, Any]) -> int:
         """Return the next action, given what ``reset`` or ``step`` last returned."""
 
+    def instead(self, action: int) -> None:  # noqa: B027 -- most planners see what came of it
+        """Be told that another action was taken than ``act`` returned last."""
+
     def lost_by(self, action: int) -> None:  # noqa: B027 -- most planners learn nothing from it
         """Be told that its last action lost tracking; SLAM holds the pose from before it."""
 
@@ -67,11 +70,19 @@ class Recovering(Planner):
         """Nothing was done yet."""
         self.made: list[int] = []
         self.was_tracked = False
+        self.has_chosen = False
         self.planner.reset()
+
+    def instead(self, action: int) -> None:
+        """Remember the motion that was made, to undo that one."""
+        before = self.made[:-1] if self.has_chosen else [*self.made, self.undoing]
+        self.made = [*before, action]
+        self.planner.instead(action)
 
     def act(self, observation: Any, info: dict[str, Any]) -> int:
         """Undo a motion, or what the planner says."""
-        if info["tracking_ok"] or not self.made:
+        self.has_chosen = info["tracking_ok"] or not self.made
+        if self.has_chosen:
             action = self.planner.act(observation, info)
             self.made = [*self.made[1 - _REMEMBERED :], action]
             self.was_tracked = info["tracking_ok"]
@@ -79,7 +90,8 @@ class Recovering(Planner):
         if self.was_tracked:  # the motions undone after the first lost nothing
             self.planner.lost_by(self.made[-1])
         self.was_tracked = False
-        undone = opposite(self.made.pop(), self.env.action_masks().size)
+        self.undoing = self.made.pop()
+        undone = opposite(self.undoing, self.env.action_masks().size)
         return undone if self.env.action_masks()[undone] else 0
 
 

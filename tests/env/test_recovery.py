@@ -89,3 +89,14 @@ def test_any_planner_takes_the_option_and_only_true_or_false():
         make_planner("random,recovery=7", env)
     with pytest.raises(InputError, match=r"unknown option of planner random.*recovery"):
         make_planner("random,recover=true", env)
+
+
+def test_what_was_done_instead_is_what_is_undone():
+    planner = recovering()
+    assert planner.act(None, OK) == 1
+    planner.instead(7)
+    assert planner.act(None, OK) == 2
+    assert planner.act(None, LOST) == opposite(2)
+    planner.instead(21)  # so 2 was not undone, and 21 comes on top of it
+    undone = [planner.act(None, LOST) for _ in range(3)]
+    assert undone == [opposite(21), opposite(2), opposite(7)]

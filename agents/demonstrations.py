@@ -1,0 +1,136 @@
+"""Episodes in which a planner says what it would do, for a policy to learn from."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from ms_slam_agents.policy import Policy
+from numpy.typing import NDArray
+
+from ms_slam_env.env.planners import make_planner
+from ms_slam_env.errors import InputError
+from ms_slam_env.output_files import write_bytes
+
+_PLANNER, _POLICY = 1, 2  # streams of an episode's seed; the environment draws from the seed itself
+_ARRAYS = {"observations": 2, "masks": 2, "labels": 1, "rewards": 1, "is_tracked": 1}
+
+
+@dataclass(frozen=True)
+class Task:
+    """One episode to be played.
+
+    Attributes:
+        path: the file that it becomes.
+        env_id: of the environment.
+        options: of ``gym.make``, which a process keeps from one episode to the next.
+        seed: of the episode.
+        teacher: a planner, ``NAME,option=value,...``.
+        policy: file of the policy that acts; None: the teacher does.
+        share: of the episode's decisions that are the teacher's where a policy acts.
+    """
+
+    path: Path
+    env_id: str
+    options: tuple[tuple[str, Any], ...]
+    seed: int
+    teacher: str
+    policy: Path | None = None
+    share: float = 0.0
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """What was seen in T steps, and what the teacher would have done.
+
+    Attributes:
+        observations: (T, k) float16.
+        masks: (T, n) bool, the actions that were possible.
+        labels: (T,) the teacher's actions.
+        rewards: (T,) of the actions that were taken.
+        is_tracked: (T,) bool, whether SLAM knew where it was.
+    """
+
+    observations: NDArray[np.float16]
+    masks: NDArray[np.bool_]
+    labels: NDArray[np.int64]
+    rewards: NDArray[np.float32]
+    is_tracked: NDArray[np.bool_]
+
+    def write(self, path: Path) -> None:
+        """Write a compressed NumPy archive, whole or not at all."""
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, **{name: getattr(self, name) for name in _ARRAYS})
+        write_bytes(path, buffer.getvalue())
+
+    @staticmethod
+    def read(path: Path) -> Demonstration:
+        """Read what ``write`` wrote; nothing in the file is executed.
+
+        Raises:
+            InputError: no such file, or another one.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as found:
+                made = Demonstration(**{name: found[name] for name in _ARRAYS})
+            lengths = {len(getattr(made, name)) for name in _ARRAYS}
+            kinds = {name: getattr(made, name).ndim for name in _ARRAYS}
+        except Exception as error:  # whatever a damaged archive makes its readers raise
+            raise InputError(f"{path} is no demonstration: {error}") from None
+        if len(lengths) != 1 or kinds != _ARRAYS:
+            raise InputError(f"{path} is no demonstration: arrays that do not fit each other")
+        return made
+
+    def returns(self, gamma: float) -> NDArray[np.float64]:
+        """Discounted sums (T,) of the rewards from each step on, nothing after the last."""
+        sums = np.zeros(len(self.rewards) + 1)
+        for t in range(len(self.rewards) - 1, -1, -1):
+            sums[t] = self.rewards[t] + gamma * sums[t + 1]
+        return sums[:-1]
+
+
+_ENVS: dict[Any, gym.Env[Any, Any]] = {}
+
+
+def play(task: Task) -> Path:
+    """Play an episode and write it; return its path.
+
+    The teacher is asked at every step and told what was done instead (DAgger's queries of the
+    expert, Ross et al., AISTATS 2011).
+    """
+    key = (task.env_id, task.options)
+    if key not in _ENVS:
+        import ms_slam_env  # noqa: F401 -- registers the ids, in a worker process too
+
+        _ENVS[key] = gym.make(task.env_id, disable_env_checker=True, **dict(task.options))
+    env = _ENVS[key]
+    observation, info = env.reset(seed=task.seed)
+    stream = np.random.default_rng([task.seed, _PLANNER])
+    teacher = make_planner(task.teacher, env.unwrapped, seed=int(stream.integers(2**31)))
+    teacher.reset()
+    policy = Policy.load(task.policy) if task.policy else None
+    rng = np.random.default_rng([task.seed, _POLICY])
+    steps: list[tuple[Any, ...]] = []
+    is_over = False
+    while not is_over:
+        mask, is_tracked = np.array(info["action_mask"], dtype=bool), info["tracking_ok"]
+        label = action = teacher.act(observation, info)
+        if policy and rng.random() >= task.share:
+            action = policy.act(observation, mask, rng)
+            if action != label:
+                teacher.instead(action)
+        seen = np.asarray(observation)
+        observation, reward, terminated, truncated, info = env.step(action)
+        steps.append((seen, mask, label, reward, is_tracked))
+        is_over = terminated or truncated
+    columns = zip(*steps, strict=True)
+    kinds = (np.float16, np.bool_, np.int64, np.float32, np.bool_)
+    arrays: list[Any] = [
+        np.array(column, dtype=kind) for column, kind in zip(columns, kinds, strict=True)
+    ]
+    Demonstration(*arrays).write(task.path)
+    return task.path

@@ -1,0 +1,351 @@
+"""Learn from a planner: behaviour cloning, then DAgger (Ross et al., AISTATS 2011).
+
+    ms-slam train imitation --teacher nbv --observation map --out runs/imitation
+
+In the first round the teacher acts. In later ones the policy does, more and more, and the teacher
+says what it would have done where the policy has come to; the network is fitted to all rounds so
+far: to the teacher's actions, and its value to the returns met. Writes into ``out`` what
+``ms-slam train`` writes, and ``episodes/``; ``ms-slam train --init`` goes on from it with PPO.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from ms_slam_agents.demonstrations import Demonstration, Task, play
+from ms_slam_agents.evaluation import evaluate_policy
+from ms_slam_agents.learning_curve import Curve, read_curve
+from ms_slam_agents.options import Problem
+from ms_slam_agents.policy import CLIP, EPSILON, Policy
+from ms_slam_agents.policy_file import Metadata, PolicyFile, read_policy, write_policy
+from ms_slam_agents.supervisor import BEST, LATEST
+from ms_slam_agents.train_sb3 import VALIDATION_SEED, env_options, make_venv
+from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
+from tqdm import tqdm
+
+from ms_slam_env.command_line import exit_code, parse
+from ms_slam_env.config import bounded
+from ms_slam_env.env.planners import check_planner
+from ms_slam_env.errors import InputError
+from ms_slam_env.parallel import one_thread_unless_set, open_pool, run_each
+from ms_slam_env.report.provenance import provenance
+from ms_slam_env.report.records import to_plain
+from ms_slam_env.report.results import RESULTS
+
+_TRAINING_SEED = 500_000  # of the first episode; far from validation's
+
+
+@dataclass(frozen=True)
+class Args(Problem):
+    """Learn from a planner; these options are the command line.
+
+    Attributes:
+        teacher: a planner, NAME,option=value,...
+        rounds: of episodes and fitting; in the first the teacher acts.
+        episodes: of each round.
+        share: of the decisions that are the teacher's in the second round; half as many in each
+            round after it.
+        epochs: passes over all episodes so far, each round.
+        batch_size: of the gradient steps.
+        learning_rate: of Adam.
+        value_weight: of the error of the value in the loss.
+        gamma: discount factor of the returns.
+        hidden: width of the two hidden layers.
+    """
+
+    out: Path = Path("runs/imitation")
+    teacher: str = "nbv"
+    rounds: int = bounded(5, 1, 1000)
+    episodes: int = bounded(40, 1, 100_000)
+    share: float = bounded(0.5, 0, 1)
+    epochs: int = bounded(10, 1, 1000)
+    batch_size: int = bounded(256, 2, 1_000_000)
+    learning_rate: float = bounded(5e-4, 0, 1)
+    value_weight: float = bounded(0.1, 0, 1000)
+    gamma: float = bounded(0.98, 0, 1)
+    hidden: int = bounded(256, 1, 4096)
+
+
+# -- Episodes ----------------------------------------------------------------------------------
+
+
+def tasks(args: Args, number: int) -> list[Task]:
+    """The episodes of a round, each with a seed of its own."""
+    options = {
+        "max_episode_steps": args.episode_steps,
+        "scene": args.scenes,
+        "split": "train",
+        "num_scene_seeds": args.scene_seeds,
+        "observation": args.observation,
+        **env_options(args),
+    }
+    first = _TRAINING_SEED + args.seed * 100_000 + number * args.episodes
+    return [
+        Task(
+            path=args.out / "episodes" / f"{number:03}_{k:05}.npz",
+            env_id=args.env_id,
+            options=tuple(options.items()),
+            seed=first + k,
+            teacher=args.teacher,
+            policy=args.out / LATEST if number else None,
+            share=args.share / 2 ** (number - 1) if number else 1.0,
+        )
+        for k in range(args.episodes)
+    ]
+
+
+def play_round(args: Args, number: int) -> None:
+    """Play those episodes of a round that are not there yet.
+
+    Raises:
+        InputError: options that the environment or the teacher refuses.
+        RuntimeError: an episode that failed.
+    """
+    missing = {task.path: task for task in tasks(args, number) if not task.path.exists()}
+    if not missing:
+        return
+    (args.out / "episodes").mkdir(parents=True, exist_ok=True)
+    environment = one_thread_unless_set()
+    with open_pool(play, args.num_envs, environment=environment) as pool:
+        for outcome in tqdm(
+            run_each(pool, missing), f"round {number}", len(missing), unit="episode"
+        ):
+            if outcome.error:
+                kind = InputError if outcome.is_bad_input else RuntimeError
+                raise kind(f"episode {outcome.key.name}: {outcome.message or outcome.error}")
+
+
+# -- Fitting -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Means and variances by which observations and returns are normalised, as SB3 does it."""
+
+    mean: Any
+    var: Any
+    count: float
+
+    @classmethod
+    def of(cls, values: Any) -> Moments:
+        """Of the rows of an array."""
+        wide = values.astype(np.float64)
+        return cls(wide.mean(axis=0), wide.var(axis=0), float(len(values)))
+
+    @classmethod
+    def read(cls, file: PolicyFile, name: str) -> Moments:
+        """As ``tensors`` wrote them."""
+        part = file.part(name)
+        return cls(part["mean"], part["var"], float(part["count"]))
+
+    def tensors(self, name: str) -> dict[str, Any]:
+        """For a policy file."""
+        count = np.array(self.count)
+        parts = {"mean": self.mean, "var": self.var, "count": count}
+        return {f"{name}.{part}": np.asarray(v, np.float64) for part, v in parts.items()}
+
+    @property
+    def std(self) -> Any:
+        """Standard deviations, never zero."""
+        return np.sqrt(self.var + EPSILON)
+
+
+class Student:
+    """The network that learns, with its normalisation.
+
+    Args:
+        args: of the training.
+        demonstrations: of the first round, which the normalisation is taken from.
+        file: to go on from.
+    """
+
+    def __init__(
+        self, args: Args, demonstrations: Sequence[Demonstration], file: PolicyFile | None
+    ) -> None:
+        self.args = args
+        first = demonstrations[0]
+        self.inputs, self.actions = first.observations.shape[1], first.masks.shape[1]
+        if file:
+            self.seen, self.returns = (Moments.read(file, n) for n in ("observation", "return"))
+        else:
+            self.seen = Moments.of(np.concatenate([d.observations for d in demonstrations]))
+            sums = np.concatenate([d.returns(args.gamma) for d in demonstrations])
+            self.returns = Moments.of(sums)
+        torch.manual_seed(args.seed)
+        self.network = MaskableActorCriticPolicy(
+            spaces.Box(-np.inf, np.inf, (self.inputs,), np.float32),
+            spaces.Discrete(self.actions),
+            lambda _: args.learning_rate,
+            net_arch=[args.hidden, args.hidden],
+        )
+        self.epochs = file.metadata.epochs if file else 0
+        if file:
+            tensors = {name: torch.from_numpy(v) for name, v in file.part("policy").items()}
+            self.network.load_state_dict(tensors)
+
+    def fit(self, demonstrations: Sequence[Demonstration]) -> dict[str, float]:
+        """Learn from all episodes; return the loss and the share of actions agreed on at last."""
+        args = self.args
+        data = _batches(demonstrations, args, np.random.default_rng([args.seed, self.epochs]))
+        optimizer = torch.optim.Adam(self.network.parameters(), lr=args.learning_rate)
+        said: list[tuple[float, float]] = []
+        for k, (observations, masks, labels, returns) in enumerate(data):
+            optimizer.param_groups[0]["lr"] = args.learning_rate * (1 - k / len(data))
+            scaled = np.clip((observations - self.seen.mean) / self.seen.std, -CLIP, CLIP)
+            values, log_probs, _ = self.network.evaluate_actions(
+                torch.as_tensor(scaled, dtype=torch.float32), torch.as_tensor(labels), masks
+            )
+            target = torch.as_tensor(returns / self.returns.std, dtype=torch.float32)
+            error = torch.mean((values.flatten() - target) ** 2)
+            loss = -log_probs.mean() + args.value_weight * error
+            optimizer.zero_grad()
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+            optimizer.step()
+            said.append((float(loss), float(torch.exp(log_probs).mean())))
+        self.epochs += args.epochs
+        last = said[-max(1, len(said) // args.epochs) :]
+        loss, probability = np.mean(last, axis=0)
+        return {"loss": float(loss), "probability": float(probability)}
+
+    def file(self, timesteps: int, minutes: float) -> PolicyFile:
+        """The policy as it is now."""
+        args = self.args
+        metadata = Metadata(
+            algorithm="imitation",
+            env_id=args.env_id,
+            env_options=env_options(args),
+            observation=args.observation,
+            inputs=self.inputs,
+            hidden=(args.hidden, args.hidden),
+            actions=(self.actions,),
+            timesteps=timesteps,
+            epochs=self.epochs,
+            minutes=minutes,
+            options=to_plain(asdict(args)),
+            provenance=provenance(),
+        )
+        network = {f"policy.{n}": p.numpy() for n, p in self.network.state_dict().items()}
+        moments = self.seen.tensors("observation") | self.returns.tensors("return")
+        return PolicyFile(metadata, network | moments)
+
+
+@dataclass(frozen=True)
+class _batches:
+    """Batches of all steps of all episodes, shuffled anew in each epoch."""
+
+    demonstrations: Sequence[Demonstration]
+    args: Args
+    rng: np.random.Generator
+
+    def __len__(self) -> int:
+        steps = sum(len(d.labels) for d in self.demonstrations)
+        return self.args.epochs * math.ceil(steps / self.args.batch_size)
+
+    def __iter__(self) -> Iterator[tuple[Any, ...]]:
+        parts = [
+            (d.observations, d.masks, d.labels, d.returns(self.args.gamma))
+            for d in self.demonstrations
+        ]
+        observations, masks, labels, returns = map(np.concatenate, zip(*parts, strict=True))
+        for _ in range(self.args.epochs):
+            order = self.rng.permutation(len(labels))
+            for chosen in np.array_split(order, math.ceil(len(order) / self.args.batch_size)):
+                seen = observations[chosen].astype(np.float32)
+                yield seen, masks[chosen], labels[chosen], returns[chosen]
+
+
+# -- Training ----------------------------------------------------------------------------------
+
+
+def load_run(args: Args) -> tuple[PolicyFile | None, int]:
+    """What there is to resume, and the rounds done; None and 0 for a new run.
+
+    Raises:
+        InputError: a new run where there is one already, nothing to resume from, or another one.
+    """
+    path = args.out / LATEST
+    if not args.resume:
+        if path.exists() or (args.out / "episodes").exists():
+            raise InputError(
+                f"{args.out} holds a training run already: add --resume, or change --out"
+            )
+        return None, 0
+    if not path.exists():
+        return None, 0  # interrupted in the first round
+    file = read_policy(path)
+    if file.metadata.algorithm != "imitation":
+        raise InputError(f"{path} is of {file.metadata.algorithm}, not of imitation")
+    for name in ("env_id", "observation", "hidden", "teacher", "episodes", "epochs", "seed"):
+        saved, given = file.metadata.options.get(name), getattr(args, name)
+        if saved != given:
+            raise InputError(f"{path} was trained with {name} {saved!r}, not {given!r}")
+    return file, file.metadata.epochs // args.epochs
+
+
+def train(args: Args) -> int:
+    """Train as ``args`` say; return the exit status.
+
+    Raises:
+        InputError: bad options, or nothing to train.
+        RuntimeError: an episode that failed.
+    """
+    torch.set_num_threads(1)
+    check_planner(args.teacher)
+    file, done = load_run(args)
+    curve = Curve(args.eval_episodes, {}, config=to_plain(asdict(args)))
+    if done and (args.out / RESULTS).is_file():
+        curve = replace(read_curve(args.out / RESULTS), config=curve.config)
+    if done >= args.rounds:
+        raise InputError(f"{args.out} has {done} rounds already: give more than --rounds {done}")
+    seeds = range(VALIDATION_SEED, VALIDATION_SEED + args.eval_episodes)
+    started = time.monotonic() - 60 * curve.minutes
+    for number in range(done, args.rounds):
+        play_round(args, number)
+        paths = [task.path for n in range(number + 1) for task in tasks(args, n)]
+        demonstrations = [Demonstration.read(path) for path in paths]
+        student = Student(args, demonstrations[: args.episodes], file)
+        said = student.fit(demonstrations)
+        steps = sum(len(d.labels) for d in demonstrations)
+        file = student.file(steps, (time.monotonic() - started) / 60)
+        venv = make_venv(args, "validation", seeds)
+        try:
+            scores = evaluate_policy(
+                venv, args.eval_episodes, Policy(file), args.deterministic_eval
+            )
+        finally:
+            venv.close()
+        is_best = scores["return"] > curve.best
+        point = curve.add(steps, file.metadata.minutes, scores)
+        curve.write(args.out)
+        if is_best:
+            write_policy(args.out / BEST, file)
+        write_policy(args.out / LATEST, file)  # last: a round without it is done again
+        print(
+            f"round {number}: {steps} steps, loss {said['loss']:.3f}, the teacher's action has "
+            f"probability {said['probability']:.2f}; validation return {point['return']:.2f}, "
+            f"mapped {point['mapped_area_m2']:.1f} m2, ended early {point['terminated']:.0%}",
+            flush=True,
+        )
+    return 0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; return the exit status: 0, 1 if an episode failed, 2, 130."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    return exit_code(
+        lambda: train(parse(Args, words, "ms-slam train imitation")), "ms-slam train imitation"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,185 @@
+"""Learning from a planner, end to end on a small fake environment whose answer a planner knows."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("sb3_contrib")
+
+from learnable_fake import ENV_ID, NUM_ACTIONS, LearnableFake, read_curve
+from ms_slam_agents import imitation, train_sb3
+from ms_slam_agents.demonstrations import Demonstration, Task, play
+from ms_slam_agents.policy import Policy
+from ms_slam_agents.policy_file import read_policy
+
+from ms_slam_env.env import Planner
+from ms_slam_env.errors import InputError
+
+TEACHER = f"{__name__}:Knowing"
+
+
+class Knowing(Planner):
+    """Knows the right action, and hears what was done instead."""
+
+    instead_of: list = []  # noqa: RUF012 -- the tests look at it
+
+    def act(self, observation, info):
+        self.label = self.env.right
+        return self.label
+
+    def instead(self, action):
+        self.instead_of.append((self.label, action))
+
+
+@pytest.fixture(autouse=True)
+def masks_in_info(monkeypatch):
+    """As our environments have it; and all episodes in this process, which knows the fake."""
+    plain = LearnableFake._info
+    monkeypatch.setattr(
+        LearnableFake,
+        "_info",
+        lambda self, reward: plain(self, reward) | {"action_mask": self.action_masks()},
+    )
+    monkeypatch.setattr(imitation, "open_pool", InThisProcess)
+
+
+class InThisProcess:
+    def __init__(self, run, workers, environment):
+        self.run, self.busy, self.done = run, 0, []
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exception):
+        pass
+
+    @property
+    def idle(self):
+        return 1 - len(self.done)
+
+    def give(self, key, spec):
+        from ms_slam_env.parallel import attempt
+
+        self.done.append(attempt(self.run, key, spec))
+
+    def take(self):
+        done, self.done = self.done, []
+        return done
+
+
+def arguments(out, *extra, rounds=2):
+    options = {
+        "out": out,
+        "env-id": ENV_ID,
+        "teacher": TEACHER,
+        "episodes": 12,
+        "rounds": rounds,
+        "num-envs": 1,
+        "episode-steps": 10,
+        "eval-episodes": 4,
+        "epochs": 30,
+        "batch-size": 16,
+        "learning-rate": 0.01,
+        "hidden": 16,
+    }
+    words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
+    return [*words, *extra]
+
+
+def test_the_policy_does_as_its_teacher(tmp_path, capsys):
+    assert imitation.main(arguments(tmp_path)) == 0
+    curve = read_curve(tmp_path)
+    assert [point["timesteps"] for point in curve.points] == [120, 240]
+    assert curve.points[-1]["return"] > 9  # of 10; random walk gets some 2.5
+    policy = Policy.load(tmp_path / "latest.safetensors")
+    assert policy.metadata.algorithm == "imitation"
+    assert policy.metadata.timesteps == 240
+    for right in range(NUM_ACTIONS):
+        seen = (10 * np.eye(NUM_ACTIONS)[right] + 3).astype(np.float32)
+        assert policy.act(seen, np.ones(NUM_ACTIONS, bool)) == right
+    assert "round 1: 240 steps" in capsys.readouterr().out
+
+
+def test_a_run_that_goes_on_is_the_run_that_never_stopped(tmp_path):
+    imitation.main(arguments(tmp_path / "whole"))
+    imitation.main(arguments(tmp_path / "parts", rounds=1))
+    assert imitation.main(arguments(tmp_path / "parts", "--resume")) == 0
+    whole, parts = (read_policy(tmp_path / p / "latest.safetensors") for p in ("whole", "parts"))
+    for name, value in whole.tensors.items():
+        np.testing.assert_array_equal(parts.tensors[name], value, err_msg=name)
+
+
+def test_later_rounds_are_played_by_the_policy_and_labelled_by_the_teacher(tmp_path):
+    imitation.main(arguments(tmp_path, rounds=1))
+    Knowing.instead_of.clear()
+    task = Task(
+        path=tmp_path / "one.npz",
+        env_id=ENV_ID,
+        options=(("max_episode_steps", 30),),
+        seed=3,
+        teacher=TEACHER,
+        policy=tmp_path / "latest.safetensors",
+    )
+    one = Demonstration.read(play(task))
+    assert all(one.labels == one.observations.argmax(axis=1))
+    wrong = np.flatnonzero(one.rewards == 0)
+    assert [right for right, _ in Knowing.instead_of] == one.labels[wrong].tolist()
+    assert all(right != done for right, done in Knowing.instead_of)
+
+
+def test_returns_are_those_of_a_loop(tmp_path):
+    rng = np.random.default_rng(0)
+    rewards = rng.normal(size=20).astype(np.float32)
+    one = Demonstration(np.zeros((20, 3), np.float16), np.ones((20, 7), bool), *[rewards] * 3)
+    slow = [sum(0.9**i * r for i, r in enumerate(rewards[t:])) for t in range(20)]
+    np.testing.assert_allclose(one.returns(0.9), slow, rtol=1e-6)
+
+
+def test_ppo_goes_on_from_what_was_imitated(tmp_path):
+    assert imitation.main(arguments(tmp_path / "imitated")) == 0
+    words = ["--env-id", ENV_ID, "--out", str(tmp_path / "ppo"), "--hidden", "16"]
+    words += ["--num-envs", "1", "--episode-steps", "10", "--eval-episodes", "4"]
+    words += ["--total-timesteps", "32", "--n-steps", "32", "--no-references"]
+    init = str(tmp_path / "imitated/latest.safetensors")
+    assert train_sb3.main([*words, "--init", init]) == 0
+    points = read_curve(tmp_path / "ppo").points
+    assert points[0]["return"] == read_curve(tmp_path / "imitated").points[-1]["return"]
+    assert points[-1]["return"] > 8
+    words[words.index("16")] = "8"
+    words[words.index(str(tmp_path / "ppo"))] = str(tmp_path / "other")
+    assert train_sb3.main([*words, "--init", init]) == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda out: (out / "latest.safetensors").write_bytes(b"no"), "is not a policy"),
+        (lambda out: next((out / "episodes").iterdir()).write_bytes(b"PK"), "no demonstration"),
+    ],
+)
+def test_damaged_runs_are_one_line(tmp_path, capsys, change, said):
+    imitation.main(arguments(tmp_path, rounds=1))
+    change(tmp_path)
+    assert imitation.main(arguments(tmp_path, "--resume")) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_runs_that_are_not_to_be_gone_on_with_are_refused(tmp_path, capsys):
+    imitation.main(arguments(tmp_path, rounds=1))
+    for words, said in (
+        (arguments(tmp_path), "holds a training run already"),
+        (arguments(tmp_path, "--resume", rounds=1), "has 1 rounds already"),
+        (arguments(tmp_path, "--resume", "--hidden", "32"), "trained with hidden 16, not 32"),
+        (arguments(tmp_path / "new", "--teacher", "nobody"), "unknown planner 'nobody'"),
+        (arguments(tmp_path / "new", "--observation", "x:Y"), "unknown observation 'x:Y'"),
+    ):
+        assert imitation.main(words) == 2
+        assert said in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_what_is_no_demonstration_is_refused(tmp_path):
+    path = tmp_path / "x.npz"
+    for arrays in ({"labels": np.zeros(3)}, {"observations": np.array([{}], dtype=object)}):
+        np.savez(path, **arrays)
+        with pytest.raises(InputError, match="no demonstration"):
+            Demonstration.read(path)
