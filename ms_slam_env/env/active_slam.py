@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping
-from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import slam as slam_backends
-from ms_slam_env.camera import RGBDFrame, intensity_image
-from ms_slam_env.divergence import Histograms, make_divergence
 from ms_slam_env.env.actions import ActionDecoder, MotionActions, MotionAndConfigurationActions
-from ms_slam_env.env.camera_feed import make_camera_feed
-from ms_slam_env.env.config import make_config
+from ms_slam_env.env.camera_feed import CameraFeed, make_camera_feed
+from ms_slam_env.env.config import check_reset, make_config
 from ms_slam_env.env.coverage import CoverageGrid
 from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.env.episode import Episode
@@ -27,35 +23,20 @@ from ms_slam_env.env.observations import (
     RobotKnowledge,
     make_observation,
 )
-from ms_slam_env.env.pose_sources import POSE_SOURCES
 from ms_slam_env.env.rendering import draw_moment
 from ms_slam_env.env.reward import Outcome, reward_terms
-from ms_slam_env.env.state import check_episode, check_parts, check_same_settings
-from ms_slam_env.errors import InputError, UnreachableError, unknown
-from ms_slam_env.geometry import check_pose, invert
-from ms_slam_env.robot import Embodiment, MotionResult
+from ms_slam_env.env.saved_state import load_state, save_state
+from ms_slam_env.env.simulation import Simulation
+from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.geometry import check_pose
+from ms_slam_env.robot import Embodiment
 from ms_slam_env.scenes.base import Scene
-from ms_slam_env.scenes.registry import SceneName
 from ms_slam_env.sensor import RGBDSensor
-from ms_slam_env.sensor.scene_cache import get_scene, get_sensor
 from ms_slam_env.sequences.perturbations.base import Perturbation
-from ms_slam_env.slam.base import SlamBackend, TrackResult, Views
-from ms_slam_env.slam.state_check import check_like, is_open
+from ms_slam_env.slam.base import SlamBackend, Views
 from ms_slam_env.timings import Timings
 
 Float64 = NDArray[np.float64]
-
-
-class World(NamedTuple):
-    """A scene and what an environment has in it."""
-
-    scene: Scene
-    sensor: RGBDSensor
-    embodiment: Embodiment
-    coverage: CoverageGrid
-
-
-_START_TRIES = 10  # a drawn start sees surface in most of its view: one try is nearly always enough
 
 
 class ActiveSlamEnv(gymnasium.Env[Any, Any]):
@@ -161,21 +142,18 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         self.render_mode = render_mode
         self.config = config = make_config(options)
         self.intrinsics = config.camera
-        self._rays = self.intrinsics.rays()
         self.timings = Timings()
 
         backend = slam_backends.make(config.slam, self.intrinsics, **config.slam_config)
         # A step's only frame is not to be dropped unless frame management is asked for.
         adapted = config.adaptation.adapt(backend, drops_frames=False)
         self.slam: SlamBackend = config.frame_management.manage(adapted)
-        self._embodiment_type = EMBODIMENTS[embodiment]
-        self._embodiment_type.check(config)
-        self.camera_feed = make_camera_feed(())
-        self._pose_source = POSE_SOURCES[config.pose]()
-        self._divergence = make_divergence(config.divergence, self.intrinsics)
+        embodiment_type = EMBODIMENTS[embodiment]
+        embodiment_type.check(config)
+        self.simulation = Simulation(config, embodiment_type, self.slam, self.timings)
         self._lookahead = Lookahead(config.lookahead, config.divergence, self.intrinsics)
 
-        num_motions = self._embodiment_type.num_motions
+        num_motions = embodiment_type.num_motions
         self._actions: ActionDecoder = MotionActions(num_motions)
         if agent_configures_slam:
             self._actions = MotionAndConfigurationActions(num_motions, adapted, config.adaptation)
@@ -184,9 +162,6 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         )
         self.action_space = self._actions.space
         self.observation_space = self._observation.space
-        self._episode: Episode | None = None
-        self._place: tuple[SceneName, int] | None = None
-        self._fresh_slam = self.slam.get_state()
         self.on_load: Callable[[int], None] = _nothing
 
     # -- Gymnasium ---------------------------------------------------------------------------
@@ -204,18 +179,15 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
             InputError: a bad option, or a start from where there is nothing to map; the
                 environment must then be reset again before it is used.
         """
-        _check_reset(seed, options)
+        check_reset(seed, options)
         super().reset(seed=seed)
-        self._episode = None  # the world of the old episode may be gone before this one begins
-        name, scene_seed = self.config.draw_scene(self.np_random)
-        self._place = name, scene_seed
-        self.scene, self.sensor, self.embodiment, self.coverage = self._world(name, scene_seed)
+        self.simulation.enter(*self.config.draw_scene(self.np_random))
         start = (options or {}).get("T_world_camera")
         if start is None:
-            self._start_somewhere(name, scene_seed)
+            self.simulation.start_somewhere(self.np_random)
         else:
             start = check_pose(start, "reset option T_world_camera")
-            why = self._start_at(start, name, scene_seed)
+            why = self.simulation.start_at(start, self.np_random)
             if why:
                 raise InputError(f"reset option T_world_camera: {why}")
         return self._observe(), self._info()
@@ -228,10 +200,8 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         """
         episode = self.episode
         episode.action = self._actions.decode(action)
-        with self.timings.stage("move"):
-            motion = self.embodiment.move(episode.action)
         error_before = episode.pose_error
-        new_surface = self._track_motion(motion)
+        made, new_surface = self.simulation.move(episode)
         lost_for_good = self._lost_share() >= 1
         outcome = Outcome(
             divergence=episode.divergence,
@@ -239,7 +209,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
             new_surface_m2=new_surface,
             tracking_ok=episode.tracking_ok,
             lost_for_good=lost_for_good,
-            blocked=not motion.made,
+            blocked=not made,
             configuration_cost=self._actions.configuration_cost,
         )
         episode.reward_terms = reward_terms(outcome, self.config.reward, self.config.targets)
@@ -253,68 +223,6 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         return draw_moment(
             self.episode, self.config.targets, self.slam, self.embodiment, self.scene
         )
-
-    # -- One motion --------------------------------------------------------------------------
-
-    def _track_motion(self, motion: MotionResult) -> float:
-        """Take and track the frames of a motion; return the newly mapped area, m2."""
-        episode = self.episode
-        last = episode.frames[-1]
-        times_s = last.time_s + motion.times_s
-        self.camera_feed.set_trajectory(
-            np.concatenate([[last.time_s], times_s]),
-            np.concatenate([last.T_world_camera[None], motion.T_world_camera]),
-        )
-        kinematics = self._T_world_kinematic @ motion.T_world_camera_kinematic
-        moments = zip(motion.T_world_camera, kinematics, times_s, strict=True)
-        new_surface = sum(self._track_frame(*moment) for moment in moments)
-        divergence = episode.frames[-1].divergence
-        if len(times_s) > 1:
-            with self.timings.stage("divergence"):
-                divergence = self._divergence_from(episode.step_histograms)
-        episode.end_step(divergence, motion.energy_j)
-        return new_surface
-
-    def _track_frame(self, T_true: Float64, T_kinematic: Float64, time_s: float) -> float:
-        """Take, track and measure one frame; return the newly mapped area, m2."""
-        episode = self.episode
-        with self.timings.stage("render"):
-            frame = self.camera_feed.capture(T_true, len(episode.frames), time_s)
-        seen = episode.observe(frame, T_true, T_kinematic, time_s)
-        if frame is None:
-            state = episode.tracking_ok, episode.inlier_fraction
-            result = self._pose_source.handle_dropped_frame(seen, *state)
-            result = dataclasses.replace(result, submap=episode.frames[-1].submap)
-            episode.record(seen, result, np.zeros(2))
-            return 0.0
-        with self.timings.stage("slam"):
-            if episode.frames:
-                result = self._pose_source.locate(self.slam, seen)
-            else:
-                result = self.slam.track(frame)
-        with self.timings.stage("divergence"):
-            grey = intensity_image(frame.color)[None].astype(np.float32)
-            now = self._divergence.histograms(grey, frame.depth[None])
-            before, episode.histograms = episode.histograms, now
-            divergence = self._divergence_from(before)
-        with self.timings.stage("coverage"):
-            new_surface = self._cover(frame, T_true, result)
-        episode.record(seen, result, divergence)
-        return new_surface
-
-    def _divergence_from(self, before: Histograms | None) -> Float64:
-        """(2,) divergence of the last frame from an earlier one; zero from none."""
-        now = self.episode.histograms
-        if before is None or now is None:
-            return np.zeros(2)
-        return self._divergence.divergence(now, before)[0]
-
-    def _cover(self, frame: RGBDFrame, T_true: Float64, result: TrackResult) -> float:
-        """Mark what a frame added to the map; return the newly mapped area, m2."""
-        if not result.fused:
-            return 0.0
-        depths = frame.depth, self.camera_feed.true_depth()
-        return self.coverage.see(*depths, self._rays, T_true, result.T_world_camera)
 
     def _observe(self) -> Any:
         """The observation: what the robot itself knows."""
@@ -353,55 +261,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
             info[CONFIGURATION] = self._actions.configuration
         return info
 
-    # -- The start of an episode -------------------------------------------------------------
-
-    def _world(self, name: SceneName, scene_seed: int) -> World:
-        """A scene and what stands in it."""
-        scene = get_scene(name, scene_seed)
-        sensor = get_sensor(name, scene_seed, self.intrinsics, self.config.noise)
-        robot = self._embodiment_type.build(scene, self.config, self.timings)
-        return World(scene, sensor, robot, CoverageGrid(scene))
-
-    def _here(self) -> World:
-        return World(self.scene, self.sensor, self.embodiment, self.coverage)
-
-    def _start_somewhere(self, name: SceneName, scene_seed: int) -> None:
-        """Begin at the first pose drawn that can be used.
-
-        Raises:
-            InputError: none of some can.
-        """
-        for _ in range(_START_TRIES):
-            why = self._start_at(self.scene.sample_start(self.np_random), name, scene_seed)
-            if not why:
-                return
-        if self.config.arm.base is not None:
-            why += "; give one with reset(options={'T_world_camera': ...})"
-        raise InputError(f"none of {_START_TRIES} drawn start poses can be used, the last: {why}")
-
-    def _start_at(self, start: Float64, name: SceneName, scene_seed: int) -> str:
-        """Put the camera at a pose (4, 4) and take the first frame; return why not, or nothing."""
-        self._episode = None
-        try:
-            self.embodiment.reset(start, self.np_random)
-        except UnreachableError as error:
-            return str(error)
-        noise_seed = int(self.np_random.integers(2**31))
-        self.coverage = CoverageGrid(self.scene)
-        here = self.embodiment.T_world_camera
-        try:
-            self.camera_feed.begin(self.scene, self.sensor, here, noise_seed)
-        except InputError as error:
-            return str(error)
-        self.slam.reset(here)
-        self._T_world_kinematic = here @ invert(self.embodiment.T_world_camera_kinematic)
-        self._episode = Episode(getattr(name, "__name__", str(name)), scene_seed, noise_seed)
-        self._track_frame(here, here, time_s=0.0)
-        self._episode.end_step(np.zeros(2), energy_j=0.0)
-        if self._episode.tracking_ok:
-            return ""
-        self._episode = None
-        return f"too few depth readings there in scene {name}: SLAM has nothing to map"
+    # -- What evaluation may read ------------------------------------------------------------
 
     @property
     def episode(self) -> Episode:
@@ -410,9 +270,35 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         Raises:
             InputError: the environment was not reset.
         """
-        if self._episode is None:
+        episode = self.simulation.episode
+        if episode is None:
             raise InputError("the environment must be reset before it is used: call env.reset()")
-        return self._episode
+        return episode
+
+    @property
+    def scene(self) -> Scene:
+        """Where it is."""
+        return self.simulation.world.scene
+
+    @property
+    def sensor(self) -> RGBDSensor:
+        """The camera in the scene."""
+        return self.simulation.world.sensor
+
+    @property
+    def embodiment(self) -> Embodiment:
+        """What carries the camera."""
+        return self.simulation.world.embodiment
+
+    @property
+    def coverage(self) -> CoverageGrid:
+        """The true surface that was mapped in its place so far."""
+        return self.simulation.world.coverage
+
+    @property
+    def camera_feed(self) -> CameraFeed:
+        """Takes the frames."""
+        return self.simulation.camera_feed
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -457,22 +343,15 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         Raises:
             InputError: one that changes how the camera moves, which is the agent's business.
         """
-        self.camera_feed = make_camera_feed((*self.camera_feed.perturbations, *perturbations))
+        every = (*self.camera_feed.perturbations, *perturbations)
+        self.simulation.camera_feed = make_camera_feed(every)
 
     # -- State -------------------------------------------------------------------------------
 
     def save_state(self) -> dict[str, Any]:
         """Everything needed to go on bit-exactly (the time limit's counter excepted)."""
-        return {
-            "settings": self._settings(),
-            "episode": self.episode.copy(),
-            "slam": self.slam.get_state(),
-            "embodiment": self.embodiment.get_state(),
-            "coverage": self.coverage.get_state(),
-            "camera_feed": self.camera_feed.get_state(),
-            "T_world_kinematic": self._T_world_kinematic.copy(),
-            "random": self.np_random.bit_generator.state,
-        }
+        _ = self.episode  # none yet: say so
+        return save_state(self.simulation, self._settings(), self.np_random)
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Go on from a state that ``save_state`` of an env with the same world and robot returned.
@@ -484,62 +363,8 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
             InputError: options that shape the state differ, or it is not such a state; the
                 environment is as it was.
         """
-        check_parts(state)
-        check_same_settings(state["settings"], self._settings())
-        motions, blank = self._embodiment_type.num_motions, self._blank
-        check_episode(state["episode"], self._episode, blank, self.intrinsics.shape, motions)
-        episode = state["episode"]
-        place = episode.scene, episode.scene_seed
-        world = self._here() if place == self._place else self._world(*place)
-        self._check_state(state, world)
-        self._take_up(state, world)
-        self._place = place
-        self.scene, self.sensor, self.embodiment, self.coverage = world
-        self.coverage.set_state(state["coverage"])
-        self._T_world_kinematic = state["T_world_kinematic"].copy()
-        self.np_random.bit_generator.state = state["random"]
-        self._episode = episode.copy()
-        self.on_load(len(episode.divergences_of_steps) - 1)
-
-    def _check_state(self, state: Mapping[str, Any], world: World) -> None:
-        """Refuse parts of a state that do not belong into a world."""
-        like = {
-            "slam": self._fresh_slam,
-            "embodiment": world.embodiment.get_state(),
-            "coverage": world.coverage.get_state(),
-            "T_world_kinematic": np.eye(4),
-            "random": self.np_random.bit_generator.state,
-            "camera_feed": self.camera_feed.example,
-        }
-        for name, own in like.items():
-            check_like(state[name], own, name)
-        if state["camera_feed"]["noise_seed"] != state["episode"].noise_seed:
-            raise InputError("this is no state to go on from: camera_feed is of another episode")
-
-    def _take_up(self, state: Mapping[str, Any], world: World) -> None:
-        """Give SLAM, camera and robot their states; all or none."""
-        robot, start = world.embodiment, state["episode"].frames[0].T_world_camera
-        undo = [partial(robot.set_state, robot.get_state())]
-        if self._episode is not None and self.camera_feed.has_begun:
-            own = self.camera_feed.get_state(), self.scene, self.sensor
-            began = self._episode.frames[0].T_world_camera
-            undo.append(partial(self.camera_feed.set_state, *own, began))
-        if is_open(self._fresh_slam):
-            undo.append(partial(self.slam.set_state, self.slam.get_state()))
-        try:
-            robot.set_state(state["embodiment"])
-            self.camera_feed.set_state(state["camera_feed"], world.scene, world.sensor, start)
-            self.slam.set_state(state["slam"])
-        except Exception as error:  # whatever a part makes of what only looks like its state
-            for back in undo:
-                back()
-            raise InputError(f"this is no state to go on from: {error!r}") from error
-
-    @cached_property
-    def _blank(self) -> Histograms:
-        """Histograms of a frame with nothing in it."""
-        nothing = np.zeros((1, *self.intrinsics.shape), np.float32)
-        return self._divergence.histograms(nothing, nothing)
+        load_state(self.simulation, state, self._settings(), self.np_random)
+        self.on_load(len(self.episode.divergences_of_steps) - 1)
 
     def _settings(self) -> dict[str, Any]:
         """What two environments must have in common to go on from one state."""
@@ -551,7 +376,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         return {
             "arguments": self._arguments,
             "perturbations": self.camera_feed.perturbations,
-            "state": None if self._episode is None else self.save_state(),
+            "state": None if self.simulation.episode is None else self.save_state(),
         }
 
     def __setstate__(self, pickled: dict[str, Any]) -> None:
@@ -565,16 +390,3 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
 
 def _nothing(steps: int) -> None:
     """What is done at a loaded state where nobody asked for more."""
-
-
-def _check_reset(seed: Any, options: Any) -> None:
-    """Refuse arguments of ``reset`` of the wrong type, and unknown options."""
-    is_seed = isinstance(seed, (int, np.integer)) and not isinstance(seed, bool) and seed >= 0
-    if seed is not None and not is_seed:
-        raise InputError(f"reset(seed={seed!r}): must be an integer >= 0 or None")
-    if options is not None and not isinstance(options, Mapping):
-        raise InputError(f"reset(options={options!r}): must be a mapping or None")
-    unknown_options = set(options or {}) - {"T_world_camera"}
-    if unknown_options:
-        names = sorted(map(str, unknown_options))
-        raise InputError(f"unknown reset option {names}; valid choices: T_world_camera")

@@ -286,3 +286,20 @@ def _read_slam_config(options: Mapping[str, Any]) -> Mapping[str, Any]:
         raise InputError(f"slam = {options['slam']!r} but {given} configures {file.slam!r}")
     size = {} if file.image_size is None else {"image_size": file.image_size}
     return {**size, **options, "slam": file.slam, "slam_config": file.slam_config}
+
+
+def check_reset(seed: Any, options: Any) -> None:
+    """Refuse arguments of ``reset``.
+
+    Raises:
+        InputError: one of the wrong type, or an unknown option.
+    """
+    is_seed = isinstance(seed, (int, np.integer)) and not isinstance(seed, bool) and seed >= 0
+    if seed is not None and not is_seed:
+        raise InputError(f"reset(seed={seed!r}): must be an integer >= 0 or None")
+    if options is not None and not isinstance(options, Mapping):
+        raise InputError(f"reset(options={options!r}): must be a mapping or None")
+    unknown_options = set(options or {}) - {"T_world_camera"}
+    if unknown_options:
+        names = sorted(map(str, unknown_options))
+        raise InputError(f"unknown reset option {names}; valid choices: T_world_camera")

@@ -87,7 +87,7 @@ def test_divergence_of_a_step_compares_the_frames_at_its_ends(slow):
     env.reset(seed=5)
     first = env.episode.last_frame
     *_, info = env.step(7 * 5 + 6)
-    measure = env._divergence
+    measure = env.simulation.divergence
     both = [
         measure.histograms(grey(frame), frame.depth[None])
         for frame in (env.episode.last_frame, first)

@@ -34,7 +34,7 @@ def test_the_mask_of_info_samples_possible_actions(env_id):
     _, info = env.reset(seed=0)
     env.action_space.seed(0)
     mask = info["action_mask"].copy()
-    n = env.unwrapped._embodiment_type.num_motions
+    n = env.unwrapped.simulation.embodiment_type.num_motions
     mask[:n] = False
     mask[[2, 5]] = True
     drawn = {int(np.ravel(env.action_space.sample(mask=mask))[0]) for _ in range(60)}

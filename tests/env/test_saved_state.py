@@ -96,7 +96,7 @@ def same(a, b):
 
 
 def an_action(env, rng):
-    mask = env.action_masks()[: env._embodiment_type.num_motions]
+    mask = env.action_masks()[: env.simulation.embodiment_type.num_motions]
     motion = int(rng.choice(np.flatnonzero(mask)))
     is_pair = isinstance(env.action_space, gym.spaces.MultiDiscrete)
     return np.array([motion, int(rng.integers(3))]) if is_pair else motion

@@ -121,7 +121,7 @@ def test_options_may_name_the_embodiment() -> None:
     options = parse_options(["embodiment=arm-kinematic", "arm.noise=none"])
     assert options == {"embodiment": "arm-kinematic", "arm": {"noise": "none"}}
     env = make_env(EpisodeSpec("random", "table", 1000, "MSActiveSLAM-v0", options=options))
-    assert env.unwrapped._embodiment_type is EMBODIMENTS["arm-kinematic"]
+    assert env.unwrapped.simulation.embodiment_type is EMBODIMENTS["arm-kinematic"]
     for text, message in (
         ("embodiment=boat", "unknown embodiment 'boat'; valid choices: arm, arm-kinematic, free"),
         (

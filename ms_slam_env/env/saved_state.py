@@ -1,0 +1,98 @@
+"""Save the state of a simulation, and go on from one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ms_slam_env.env.simulation import Simulation, World
+from ms_slam_env.env.state import check_episode, check_parts, check_same_settings
+from ms_slam_env.errors import InputError
+from ms_slam_env.slam.state_check import check_like, is_open
+
+
+def save_state(
+    simulation: Simulation, settings: Mapping[str, Any], rng: np.random.Generator
+) -> dict[str, Any]:
+    """Everything needed to go on bit-exactly from within an episode."""
+    assert simulation.episode is not None
+    return {
+        "settings": settings,
+        "episode": simulation.episode.copy(),
+        "slam": simulation.slam.get_state(),
+        "embodiment": simulation.world.embodiment.get_state(),
+        "coverage": simulation.world.coverage.get_state(),
+        "camera_feed": simulation.camera_feed.get_state(),
+        "T_world_kinematic": simulation.T_world_kinematic.copy(),
+        "random": rng.bit_generator.state,
+    }
+
+
+def load_state(
+    simulation: Simulation,
+    state: Mapping[str, Any],
+    settings: Mapping[str, Any],
+    rng: np.random.Generator,
+) -> None:
+    """Go on from a state that `save_state` returned.
+
+    Raises:
+        InputError: it is no such state, or one of other settings; nothing has changed.
+    """
+    check_parts(state)
+    check_same_settings(state["settings"], settings)
+    motions, shape = simulation.embodiment_type.num_motions, simulation.intrinsics.shape
+    check_episode(state["episode"], simulation.episode, simulation.blank, shape, motions)
+    episode = state["episode"]
+    place = episode.scene, episode.scene_seed
+    stays = place == simulation.place
+    world = simulation.world if stays else simulation.world_of(*place)
+    _check_parts_of(state, simulation, world, rng)
+    _take_up(state, simulation, world)
+    simulation.place, simulation.world = place, world
+    world.coverage.set_state(state["coverage"])
+    simulation.T_world_kinematic = state["T_world_kinematic"].copy()
+    rng.bit_generator.state = state["random"]
+    simulation.episode = episode.copy()
+
+
+def _check_parts_of(
+    state: Mapping[str, Any], simulation: Simulation, world: World, rng: np.random.Generator
+) -> None:
+    """Refuse parts of a state that do not belong into a world."""
+    like = {
+        "slam": simulation.fresh_slam,
+        "embodiment": world.embodiment.get_state(),
+        "coverage": world.coverage.get_state(),
+        "T_world_kinematic": np.eye(4),
+        "random": rng.bit_generator.state,
+        "camera_feed": simulation.camera_feed.example,
+    }
+    for name, own in like.items():
+        check_like(state[name], own, name)
+    if state["camera_feed"]["noise_seed"] != state["episode"].noise_seed:
+        raise InputError("this is no state to go on from: camera_feed is of another episode")
+
+
+def _take_up(state: Mapping[str, Any], simulation: Simulation, world: World) -> None:
+    """Give SLAM, camera and robot their states; all or none."""
+    robot, feed, slam = world.embodiment, simulation.camera_feed, simulation.slam
+    start = state["episode"].frames[0].T_world_camera
+    undo = [partial(robot.set_state, robot.get_state())]
+    if simulation.episode is not None and feed.has_begun:
+        own = feed.get_state(), simulation.world.scene, simulation.world.sensor
+        began = simulation.episode.frames[0].T_world_camera
+        undo.append(partial(feed.set_state, *own, began))
+    if is_open(simulation.fresh_slam):
+        undo.append(partial(slam.set_state, slam.get_state()))
+    try:
+        robot.set_state(state["embodiment"])
+        feed.set_state(state["camera_feed"], world.scene, world.sensor, start)
+        slam.set_state(state["slam"])
+    except Exception as error:  # whatever a part makes of what only looks like its state
+        for back in undo:
+            back()
+        raise InputError(f"this is no state to go on from: {error!r}") from error

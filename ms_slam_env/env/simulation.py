@@ -1,0 +1,211 @@
+"""What happens in an episode: the camera is moved, its frames are taken, tracked and measured."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.camera import RGBDFrame, intensity_image
+from ms_slam_env.divergence import Histograms, make_divergence
+from ms_slam_env.env.camera_feed import make_camera_feed
+from ms_slam_env.env.config import EnvConfig
+from ms_slam_env.env.coverage import CoverageGrid
+from ms_slam_env.env.embodiments import EmbodimentType
+from ms_slam_env.env.episode import Episode
+from ms_slam_env.env.pose_sources import POSE_SOURCES
+from ms_slam_env.errors import InputError, UnreachableError
+from ms_slam_env.geometry import invert
+from ms_slam_env.robot import Embodiment, MotionResult
+from ms_slam_env.scenes.base import Scene
+from ms_slam_env.scenes.registry import SceneName
+from ms_slam_env.sensor import RGBDSensor
+from ms_slam_env.sensor.scene_cache import get_scene, get_sensor
+from ms_slam_env.slam.base import SlamBackend, TrackResult
+from ms_slam_env.timings import Timings
+
+Float64 = NDArray[np.float64]
+
+_START_TRIES = 10  # a drawn start sees surface in most of its view: one try is nearly always enough
+
+
+class World(NamedTuple):
+    """A scene and what an environment has in it."""
+
+    scene: Scene
+    sensor: RGBDSensor
+    embodiment: Embodiment
+    coverage: CoverageGrid
+
+
+class Simulation:
+    """A camera on its carrier in a scene, and the SLAM that follows it.
+
+    Args:
+        config: of the environment.
+        embodiment_type: what carries the camera.
+        slam: SLAM, with what selects its frames and changes its configuration.
+        timings: of the stages.
+
+    Attributes:
+        world: scene, sensor, carrier and coverage; there from the first start on.
+        place: name and seed of the scene.
+        camera_feed: takes the frames.
+        divergence: measures it.
+        T_world_kinematic: (4, 4) where the carrier's kinematics have their origin.
+        episode: so far; None before the first and where none could begin.
+    """
+
+    world: World
+    T_world_kinematic: Float64
+
+    def __init__(
+        self,
+        config: EnvConfig,
+        embodiment_type: EmbodimentType,
+        slam: SlamBackend,
+        timings: Timings,
+    ) -> None:
+        self.config, self.embodiment_type = config, embodiment_type
+        self.slam, self.timings = slam, timings
+        self.intrinsics = config.camera
+        self._rays = self.intrinsics.rays()
+        self.camera_feed = make_camera_feed(())
+        self.divergence = make_divergence(config.divergence, self.intrinsics)
+        self._pose_source = POSE_SOURCES[config.pose]()
+        self.place: tuple[SceneName, int] | None = None
+        self.episode: Episode | None = None
+        self.fresh_slam = slam.get_state()
+
+    # -- The start of an episode -------------------------------------------------------------
+
+    def enter(self, name: SceneName, scene_seed: int) -> None:
+        """Go to a scene."""
+        self.episode = None  # the world of the old episode may be gone before this one begins
+        self.place = name, scene_seed
+        self.world = self.world_of(name, scene_seed)
+
+    def world_of(self, name: SceneName, scene_seed: int) -> World:
+        """A scene and what stands in it."""
+        scene = get_scene(name, scene_seed)
+        sensor = get_sensor(name, scene_seed, self.intrinsics, self.config.noise)
+        robot = self.embodiment_type.build(scene, self.config, self.timings)
+        return World(scene, sensor, robot, CoverageGrid(scene))
+
+    def start_somewhere(self, rng: np.random.Generator) -> None:
+        """Begin at the first pose drawn that can be used.
+
+        Raises:
+            InputError: none of some can.
+        """
+        for _ in range(_START_TRIES):
+            why = self.start_at(self.world.scene.sample_start(rng), rng)
+            if not why:
+                return
+        if self.config.arm.base is not None:
+            why += "; give one with reset(options={'T_world_camera': ...})"
+        raise InputError(f"none of {_START_TRIES} drawn start poses can be used, the last: {why}")
+
+    def start_at(self, start: Float64, rng: np.random.Generator) -> str:
+        """Put the camera at a pose (4, 4) and take the first frame; return why not, or nothing."""
+        self.episode = None
+        robot, scene = self.world.embodiment, self.world.scene
+        try:
+            robot.reset(start, rng)
+        except UnreachableError as error:
+            return str(error)
+        noise_seed = int(rng.integers(2**31))
+        self.world = self.world._replace(coverage=CoverageGrid(scene))
+        here = robot.T_world_camera
+        try:
+            self.camera_feed.begin(scene, self.world.sensor, here, noise_seed)
+        except InputError as error:
+            return str(error)
+        self.slam.reset(here)
+        self.T_world_kinematic = here @ invert(robot.T_world_camera_kinematic)
+        assert self.place is not None
+        name, scene_seed = self.place
+        self.episode = Episode(getattr(name, "__name__", str(name)), scene_seed, noise_seed)
+        self._track_frame(self.episode, here, here, time_s=0.0)
+        self.episode.end_step(np.zeros(2), energy_j=0.0)
+        if self.episode.tracking_ok:
+            return ""
+        self.episode = None
+        return f"too few depth readings there in scene {name}: SLAM has nothing to map"
+
+    # -- One motion --------------------------------------------------------------------------
+
+    def move(self, episode: Episode) -> tuple[bool, float]:
+        """Make the episode's motion; was it made, and which area (m2) is newly mapped?"""
+        with self.timings.stage("move"):
+            motion = self.world.embodiment.move(episode.action)
+        return motion.made, self._track_motion(episode, motion)
+
+    def _track_motion(self, episode: Episode, motion: MotionResult) -> float:
+        """Take and track the frames of a motion; return the newly mapped area, m2."""
+        last = episode.frames[-1]
+        times_s = last.time_s + motion.times_s
+        self.camera_feed.set_trajectory(
+            np.concatenate([[last.time_s], times_s]),
+            np.concatenate([last.T_world_camera[None], motion.T_world_camera]),
+        )
+        kinematics = self.T_world_kinematic @ motion.T_world_camera_kinematic
+        moments = zip(motion.T_world_camera, kinematics, times_s, strict=True)
+        new_surface = sum(self._track_frame(episode, *moment) for moment in moments)
+        divergence = episode.frames[-1].divergence
+        if len(times_s) > 1:
+            with self.timings.stage("divergence"):
+                divergence = self._divergence_from(episode, episode.step_histograms)
+        episode.end_step(divergence, motion.energy_j)
+        return new_surface
+
+    def _track_frame(
+        self, episode: Episode, T_true: Float64, T_kinematic: Float64, time_s: float
+    ) -> float:
+        """Take, track and measure one frame; return the newly mapped area, m2."""
+        with self.timings.stage("render"):
+            frame = self.camera_feed.capture(T_true, len(episode.frames), time_s)
+        seen = episode.observe(frame, T_true, T_kinematic, time_s)
+        if frame is None:
+            state = episode.tracking_ok, episode.inlier_fraction
+            result = self._pose_source.handle_dropped_frame(seen, *state)
+            result = dataclasses.replace(result, submap=episode.frames[-1].submap)
+            episode.record(seen, result, np.zeros(2))
+            return 0.0
+        with self.timings.stage("slam"):
+            if episode.frames:
+                result = self._pose_source.locate(self.slam, seen)
+            else:
+                result = self.slam.track(frame)
+        with self.timings.stage("divergence"):
+            grey = intensity_image(frame.color)[None].astype(np.float32)
+            now = self.divergence.histograms(grey, frame.depth[None])
+            before, episode.histograms = episode.histograms, now
+            divergence = self._divergence_from(episode, before)
+        with self.timings.stage("coverage"):
+            new_surface = self._cover(frame, T_true, result)
+        episode.record(seen, result, divergence)
+        return new_surface
+
+    def _divergence_from(self, episode: Episode, before: Histograms | None) -> Float64:
+        """(2,) divergence of the last frame from an earlier one; zero from none."""
+        now = episode.histograms
+        if before is None or now is None:
+            return np.zeros(2)
+        return self.divergence.divergence(now, before)[0]
+
+    def _cover(self, frame: RGBDFrame, T_true: Float64, result: TrackResult) -> float:
+        """Mark what a frame added to the map; return the newly mapped area, m2."""
+        if not result.fused:
+            return 0.0
+        depths = frame.depth, self.camera_feed.true_depth()
+        return self.world.coverage.see(*depths, self._rays, T_true, result.T_world_camera)
+
+    @cached_property
+    def blank(self) -> Histograms:
+        """Histograms of a frame with nothing in it."""
+        nothing = np.zeros((1, *self.intrinsics.shape), np.float32)
+        return self.divergence.histograms(nothing, nothing)
