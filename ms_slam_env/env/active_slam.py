@@ -160,6 +160,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         self._observation = make_observation(
             config.observation, self.intrinsics, num_motions, self._actions.num_configurations
         )
+        self.simulation.carves = self._observation.needs_occupancy
         self.action_space = self._actions.space
         self.observation_space = self._observation.space
         self.on_load: Callable[[int], None] = _nothing
@@ -240,6 +241,8 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
                     motion_mask=self.embodiment.action_masks(),
                     configuration=self._actions.configuration,
                     lookahead=lambda: self.lookahead() / maxima,
+                    candidates=self.candidate_poses,
+                    occupancy=episode.occupancy,
                 )
             )
 

@@ -13,6 +13,7 @@ from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.divergence import Histograms
 from ms_slam_env.env.pose_sources import FrameObservation
 from ms_slam_env.geometry import invert
+from ms_slam_env.mapping import OccupancyGrid
 from ms_slam_env.slam.base import TrackResult
 
 Float64 = NDArray[np.float64]
@@ -72,6 +73,7 @@ class Episode:
         pose_covariance: (6, 6) of the last estimated pose, as ``TrackResult`` has it; None where
             none was estimated: at the start, while lost, or by who does not know it.
         predicted_divergences: (n, 2) of the candidates, once they have been asked for.
+        occupancy: carved from the last frame of each step, where the observation needs it.
     """
 
     scene: str
@@ -92,6 +94,7 @@ class Episode:
     frame: RGBDFrame | None = None
     pose_covariance: Float64 | None = None
     predicted_divergences: Float64 | None = None
+    occupancy: OccupancyGrid | None = None
 
     # -- Writing -----------------------------------------------------------------------------
 
@@ -151,7 +154,8 @@ class Episode:
     def copy(self) -> Episode:
         """An independent copy; what was recorded never changes and is shared."""
         own = {name: copy.copy(getattr(self, name)) for name in _GROWING}
-        return replace(self, **own)
+        occupancy = None if self.occupancy is None else self.occupancy.copy()
+        return replace(self, occupancy=occupancy, **own)
 
     # -- The present -------------------------------------------------------------------------
 

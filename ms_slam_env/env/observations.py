@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.extension import ExtensionPoint
+from ms_slam_env.mapping import OccupancyGrid, expected_gain, surrounding_occupancy
 from ms_slam_env.robot import NUM_ROTATIONS, NUM_TRANSLATIONS, ROTATIONS, TRANSLATIONS
 
 Float32 = NDArray[np.float32]
@@ -48,6 +49,9 @@ _DEPTH_SCALE_M = 4.0
 _DEPTH_CAP = _MAX_DEPTH_M / _DEPTH_SCALE_M
 _GREY_BINS = 16
 _ROWS, _COLUMNS = 6, 8
+_BLOCKS = (((10, 6, 10), 0.4), ((8, 4, 8), 1.2))  # around the camera: how many, edge in metres
+_GAIN_RAYS = (8, 6)
+_GAIN_CAP_M3 = 20.0  # more than a view of 4 m holds
 
 
 _LOW = [-_POSITION_CAP] * 3 + [-1.0] * 6 + [0.0] * (NUM_STATE - 9)
@@ -72,6 +76,8 @@ class RobotKnowledge:
         motion_mask: (n,) which motions are possible now.
         configuration: index of the SLAM configuration in force; 0 where there is only one.
         lookahead: predicts the divergences (n, 2) of the candidates, in units of (M_I, M_D).
+        candidates: the poses (n, 4, 4) that the motions would lead to; the first is the present.
+        occupancy: what is known of space; None where the observation does not need it.
     """
 
     frame: RGBDFrame
@@ -84,12 +90,16 @@ class RobotKnowledge:
     motion_mask: NDArray[np.bool_]
     configuration: int
     lookahead: Callable[[], Float64]
+    candidates: Callable[[], Float64]
+    occupancy: OccupancyGrid | None = None
 
 
 class Observation(ABC):
     """One observation variant."""
 
     space: spaces.Space[Any]
+    needs_occupancy: bool = False
+    """Whether an occupancy grid is to be carved from the frames."""
 
     @abstractmethod
     def build(self, knowledge: RobotKnowledge) -> Any:
@@ -154,6 +164,34 @@ class LookaheadObservation(Observation):
         )
 
 
+class MapObservation(Observation):
+    """``features``, what each motion would gain, and the space around the camera: float32.
+
+    After the features: the gain of each motion (n) as `expected_gain` has it, relative to the
+    largest, and the largest itself, m3; then free and occupied shares of blocks of 0.4 m
+    (2 x 10 x 6 x 10), and of 1.2 m (2 x 8 x 4 x 8), as `surrounding_occupancy` has them.
+    """
+
+    needs_occupancy = True
+
+    def __init__(self, intrinsics: Intrinsics, num_motions: int) -> None:
+        self._intrinsics = intrinsics
+        self._features = FeaturesObservation(intrinsics, num_motions)
+        blocks = sum(2 * int(np.prod(count)) for count, _ in _BLOCKS)
+        highs = [*(1,) * num_motions, _GAIN_CAP_M3, *(1,) * blocks]
+        self.space = _longer(self._features.space, highs)
+
+    def build(self, knowledge: RobotKnowledge) -> Float32:
+        """Return the vector."""
+        grid, poses = knowledge.occupancy, knowledge.candidates()
+        assert grid is not None
+        gain = expected_gain(grid, poses, self._intrinsics, _GAIN_RAYS)
+        most = gain.max()
+        parts = [gain / max(most, 1e-9), [min(most, _GAIN_CAP_M3)]]
+        parts += [surrounding_occupancy(grid, poses[0], *each).ravel() for each in _BLOCKS]
+        return np.concatenate([self._features.build(knowledge), *parts]).astype(np.float32)
+
+
 class WithConfiguration(Observation):
     """Another observation and which of K SLAM configurations is in force, one-hot (K,) float32.
 
@@ -162,6 +200,7 @@ class WithConfiguration(Observation):
 
     def __init__(self, observation: Observation, num_configurations: int) -> None:
         self._observation = observation
+        self.needs_occupancy = observation.needs_occupancy
         self._one_hot = np.eye(num_configurations, dtype=np.float32)
         space = observation.space
         if isinstance(space, spaces.Dict):
@@ -183,6 +222,7 @@ OBSERVATIONS: dict[str, Callable[[Intrinsics, int], Observation]] = {
     "rgbd": RGBDObservation,
     "features": FeaturesObservation,
     "lookahead": LookaheadObservation,
+    "map": MapObservation,
 }
 """Name of the option ``observation`` to variant."""
 

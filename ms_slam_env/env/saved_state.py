@@ -45,7 +45,8 @@ def load_state(
     check_parts(state)
     check_same_settings(state["settings"], settings)
     motions, shape = simulation.embodiment_type.num_motions, simulation.intrinsics.shape
-    check_episode(state["episode"], simulation.episode, simulation.blank, shape, motions)
+    own, blank = simulation.episode, simulation.blank
+    check_episode(state["episode"], own, blank, shape, motions, simulation.carves)
     episode = state["episode"]
     place = episode.scene, episode.scene_seed
     stays = place == simulation.place

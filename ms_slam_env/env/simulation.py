@@ -19,6 +19,7 @@ from ms_slam_env.env.episode import Episode
 from ms_slam_env.env.pose_sources import POSE_SOURCES
 from ms_slam_env.errors import InputError, UnreachableError
 from ms_slam_env.geometry import invert
+from ms_slam_env.mapping import OccupancyGrid
 from ms_slam_env.robot import Embodiment, MotionResult
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.registry import SceneName
@@ -57,6 +58,7 @@ class Simulation:
         divergence: measures it.
         T_world_kinematic: (4, 4) where the carrier's kinematics have their origin.
         episode: so far; None before the first and where none could begin.
+        carves: whether episodes keep an occupancy grid.
     """
 
     world: World
@@ -78,6 +80,7 @@ class Simulation:
         self._pose_source = POSE_SOURCES[config.pose]()
         self.place: tuple[SceneName, int] | None = None
         self.episode: Episode | None = None
+        self.carves = False
         self.fresh_slam = slam.get_state()
 
     # -- The start of an episode -------------------------------------------------------------
@@ -129,8 +132,9 @@ class Simulation:
         assert self.place is not None
         name, scene_seed = self.place
         self.episode = Episode(getattr(name, "__name__", str(name)), scene_seed, noise_seed)
+        self.episode.occupancy = OccupancyGrid() if self.carves else None
         self._track_frame(self.episode, here, here, time_s=0.0)
-        self.episode.end_step(np.zeros(2), energy_j=0.0)
+        self._end_step(self.episode, np.zeros(2), energy_j=0.0)
         if self.episode.tracking_ok:
             return ""
         self.episode = None
@@ -159,8 +163,16 @@ class Simulation:
         if len(times_s) > 1:
             with self.timings.stage("divergence"):
                 divergence = self._divergence_from(episode, episode.step_histograms)
-        episode.end_step(divergence, motion.energy_j)
+        self._end_step(episode, divergence, motion.energy_j)
         return new_surface
+
+    def _end_step(self, episode: Episode, divergence: Float64, energy_j: float) -> None:
+        """Close a step; its last frame is carved where it was tracked."""
+        episode.end_step(divergence, energy_j)
+        if episode.occupancy is not None and episode.tracking_ok:
+            with self.timings.stage("occupancy"):
+                seen = episode.last_frame.depth, episode.T_world_camera_estimate
+                episode.occupancy.integrate(*seen, self.intrinsics)
 
     def _track_frame(
         self, episode: Episode, T_true: Float64, T_kinematic: Float64, time_s: float

@@ -17,6 +17,7 @@ from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.divergence import Histograms
 from ms_slam_env.env.episode import Episode, FrameRecord
 from ms_slam_env.errors import InputError
+from ms_slam_env.mapping import OccupancyGrid
 from ms_slam_env.slam.state_check import (
     check_array,
     check_keys,
@@ -40,6 +41,7 @@ _POSES = ("T_world_camera", "T_world_camera_kinematic", "T_world_camera_estimate
 _COVARIANCE = np.zeros((6, 6))
 _ARRAYS_OF_RECORD = {**dict.fromkeys(_POSES, np.zeros((0, 4, 4))), "divergence": np.zeros((0, 2))}
 _SUM_ERROR = 1e-6  # of a distribution
+_FARTHEST_CELL = 1_000_000  # of an occupancy grid; far from what would overflow
 
 
 def check_parts(state: Any) -> None:
@@ -76,7 +78,12 @@ def _is_equal(saved: Any, own: Any) -> bool:
 
 
 def check_episode(
-    episode: Any, own: Episode | None, histograms: Histograms, shape: tuple[int, int], motions: int
+    episode: Any,
+    own: Episode | None,
+    histograms: Histograms,
+    shape: tuple[int, int],
+    motions: int,
+    carves: bool,
 ) -> None:
     """Refuse an episode that no such environment has recorded.
 
@@ -88,6 +95,7 @@ def check_episode(
         histograms: of any frame.
         shape: (H, W) of the images.
         motions: how many there are.
+        carves: whether it keeps an occupancy grid.
 
     Raises:
         InputError: naming the field and what is wrong with it.
@@ -110,6 +118,10 @@ def check_episode(
     if episode.predicted_divergences is not None:
         like = np.zeros((motions, 2))
         check_array(episode.predicted_divergences, like, "episode.predicted_divergences")
+    if carves != (episode.occupancy is not None):
+        raise wrong("episode.occupancy", "is missing" if carves else "is one too many")
+    if carves:
+        _check_occupancy(episode.occupancy)
 
 
 def _check_all_fields(value: Any, where: str) -> None:
@@ -144,6 +156,23 @@ def _check_histograms(one: Any, like: Histograms) -> None:
         check_array(rows, getattr(like, name), f"{where}.{name}")
         if (rows < 0).any() or (np.abs(rows.sum(axis=-1) - 1) > _SUM_ERROR).any():
             raise wrong(f"{where}.{name}", "are no distributions")
+
+
+def _check_occupancy(grid: Any) -> None:
+    where = "episode.occupancy"
+    if not isinstance(grid, OccupancyGrid):
+        raise wrong(where, f"is a {type(grid).__name__}, not an OccupancyGrid")
+    fresh = OccupancyGrid()
+    check_keys(vars(grid), list(vars(fresh)), where)
+    for name in ("cell_m", "reach_m"):
+        if getattr(grid, name) != getattr(fresh, name):
+            raise wrong(f"{where}.{name}", f"is {getattr(grid, name)}")
+    check_array(grid.first, fresh.first, f"{where}.first")
+    like = np.zeros(np.shape(grid.log_odds), np.int8)
+    if like.ndim != 3 or (np.abs(grid.first) > _FARTHEST_CELL).any():
+        raise wrong(where, "is of another space")
+    for name in ("log_odds", "blanks"):
+        check_array(getattr(grid, name), like, f"{where}.{name}")
 
 
 def _check_steps(divergences: Any) -> None:

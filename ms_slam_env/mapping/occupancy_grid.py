@@ -42,6 +42,13 @@ class OccupancyGrid:
         self.blanks: NDArray[np.int8] = np.zeros((0, 0, 0), dtype=np.int8)
         """(X, Y, Z) in how many frames (at most 100) only rays without a reading crossed a cell."""
 
+    def copy(self) -> OccupancyGrid:
+        """An independent copy."""
+        other = OccupancyGrid(self.cell_m, self.reach_m)
+        other.first = self.first.copy()
+        other.log_odds, other.blanks = self.log_odds.copy(), self.blanks.copy()
+        return other
+
     def cells_of(self, points: Float64) -> Int64:
         """Indices into the arrays (..., 3) of points (..., 3), metres; they may lie outside."""
         return np.floor(points / self.cell_m).astype(np.int64) - self.first
