@@ -14,6 +14,8 @@ from ms_slam_env.mapping.occupancy_grid import OccupancyGrid
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
+_MOST_SAMPLES = 5
+
 
 def surrounding_occupancy(
     grid: OccupancyGrid, T_world_camera: Float64, blocks: tuple[int, int, int], block_m: float
@@ -21,7 +23,8 @@ def surrounding_occupancy(
     """Shares of free and of occupied space in blocks around a camera, (2, X, Y, Z) in [0, 1].
 
     The rest of a block is unknown. Blocks lie along the camera's axes (x right, y down, z forward),
-    as many on either side of it; each is looked at in as many places as leave no cell out.
+    as many on either side of it; each is looked at in as many places as leave no cell out, but no
+    more than five along an edge.
 
     Args:
         grid: what is known.
@@ -29,7 +32,7 @@ def surrounding_occupancy(
         blocks: X, Y, Z, how many along each axis.
         block_m: edge of a block, metres.
     """
-    samples = math.ceil(block_m / grid.cell_m - 1e-9)
+    samples = min(_MOST_SAMPLES, math.ceil(block_m / grid.cell_m - 1e-9))
     corner = -0.5 * block_m * np.array(blocks)
     start = T_world_camera[:3, :3] @ corner + T_world_camera[:3, 3]
     with wp.ScopedDevice("cpu"):
