@@ -27,7 +27,7 @@ class Policy:
 
     ::
 
-        policy = Policy.load("docs/results/train/policy.safetensors")
+        policy = Policy.load("agents/policies/room.safetensors")
         env = policy.make_env(scene="table")
         rng = np.random.default_rng(0)
         observation, info = env.reset(seed=0)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from functools import lru_cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ms_slam_agents.policy import Policy
@@ -14,12 +16,12 @@ if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv
 
 PATH_VARIABLE = "MS_SLAM_POLICY"
-
-_NAMES = {"lookahead": "policy", "features": "policy-features"}  # planners by observation
+SHIPPED = Path(__file__).parent / "policies"
+"""The policies that come with the package, by the task that they were trained for."""
 
 
 class TrainedPolicy(Planner):
-    """A policy trained by ``train_sb3`` on the observation variant ``lookahead``.
+    """A policy trained by ``ms-slam train``, shown the observation that it was trained on.
 
     Args:
         env: the unwrapped environment.
@@ -33,7 +35,7 @@ class TrainedPolicy(Planner):
             or number of actions, or a ``deterministic`` that is no truth value.
     """
 
-    observation = "lookahead"
+    default_path: Path | None = None
 
     def __init__(
         self,
@@ -43,28 +45,31 @@ class TrainedPolicy(Planner):
         deterministic: bool | str = False,
     ) -> None:
         super().__init__(env, seed)
-        path = str(path or os.environ.get(PATH_VARIABLE) or "")
-        if not path:
-            raise InputError(
-                f"planner {_NAMES[self.observation]} needs a policy file: option path=..., "
-                f"or the environment variable {PATH_VARIABLE}"
-            )
+        path = self._path(path)
         self.deterministic = _truth(deterministic)
-        self.policy = Policy.load(path)
-        metadata = self.policy.metadata
-        if metadata.observation != self.observation:
-            right = _NAMES.get(metadata.observation)
-            raise InputError(
-                f"{path!r} was trained on observation {metadata.observation!r}, planner "
-                f"{_NAMES[self.observation]} runs policies trained on {self.observation!r}"
-                + (f": use {right}" if right else "")
-            )
-        if not metadata.epochs:
+        self.policy = _loaded(path, _modified(path))
+        if not self.policy.metadata.epochs:
             raise InputError(f"{path!r} is untrained: its network has had no update")
         try:
             self.policy.check_fits(env)
         except InputError as error:
             raise InputError(f"{path!r}: {error}") from None
+
+    @classmethod
+    def observation_for(cls, path: str | None = None, **options: Any) -> str:
+        """What the policy was trained on."""
+        path = cls._path(path)
+        return _loaded(path, _modified(path)).metadata.observation
+
+    @classmethod
+    def _path(cls, path: str | None) -> str:
+        found = str(path or cls.default_path or os.environ.get(PATH_VARIABLE) or "")
+        if not found:
+            raise InputError(
+                "planner policy needs a policy file: option path=..., "
+                f"or the environment variable {PATH_VARIABLE}"
+            )
+        return found
 
     def act(self, observation: Any, info: dict[str, Any]) -> Any:
         """Draw an unmasked action from the policy's probabilities, or take the most probable.
@@ -75,10 +80,20 @@ class TrainedPolicy(Planner):
         return self.policy.act(observation, self.env.action_masks(), rng)
 
 
-class TrainedFeaturesPolicy(TrainedPolicy):
-    """A policy trained by ``train_sb3`` on the observation variant ``features``."""
+class RoomAgent(TrainedPolicy):
+    """The policy that comes with the package for the task ``room``."""
 
-    observation = "features"
+    default_path = SHIPPED / "room.safetensors"
+
+
+@lru_cache(maxsize=8)
+def _loaded(path: str, modified: float) -> Policy:
+    """A policy file is read once for its observation, and not again for its network."""
+    return Policy.load(path)
+
+
+def _modified(path: str) -> float:
+    return os.stat(path).st_mtime if os.path.isfile(path) else 0.0
 
 
 def _truth(value: bool | str) -> bool:

@@ -32,13 +32,18 @@ class Planner(ABC):
     """
 
     observation: str = "features"
-    """The observation variant that ``act`` expects."""
+    """The observation variant that ``act`` expects, unless ``observation_for`` says otherwise."""
     recovers: bool = False
     """Whether it undoes its last motions while tracking is lost, unless told not to."""
 
     def __init__(self, env: ActiveSlamEnv, seed: int = 0) -> None:
         self.env = env
         self.rng = np.random.default_rng(seed)
+
+    @classmethod
+    def observation_for(cls, **options: Any) -> str:
+        """The observation variant that ``act`` expects with these options."""
+        return cls.observation
 
     def reset(self) -> None:  # noqa: B027 -- most planners keep nothing between episodes
         """Prepare for a new episode; called after the environment's reset."""
@@ -64,7 +69,6 @@ class Recovering(Planner):
     def __init__(self, env: ActiveSlamEnv, planner: Planner) -> None:
         super().__init__(env)
         self.planner = planner
-        self.observation = planner.observation
 
     def reset(self) -> None:
         """Nothing was done yet."""
@@ -121,6 +125,17 @@ def make_planner(text: str, env: Any, seed: int = 0) -> Planner:
     recovery = options.pop(RECOVERY, cls.recovers)
     planner: Planner = cls(env, seed=seed, **options)
     return Recovering(env, planner) if recovery else planner
+
+
+def planner_observation(text: str) -> str:
+    """The observation variant that the planner ``NAME,option=value,...`` is to be shown.
+
+    Raises:
+        InputError: an unknown planner or option, or what the planner refuses.
+    """
+    cls, options = _parsed(text)
+    options.pop(RECOVERY, None)
+    return cls.observation_for(**options)
 
 
 def check_planner(text: str) -> None:

@@ -16,14 +16,15 @@ from learnable_fake import ENV_ID, NUM_ACTIONS, LearnableFake, fake_env
 from ms_slam_agents import policy as policy_module
 from ms_slam_agents.policy import Policy
 from ms_slam_agents.policy_file import Metadata, PolicyFile, read_policy, write_policy
-from ms_slam_agents.policy_planner import TrainedFeaturesPolicy, TrainedPolicy
+from ms_slam_agents.policy_planner import RoomAgent, TrainedPolicy
 from ms_slam_agents.sb3_state import ALGORITHMS, restore, tensors_of
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from ms_slam_env.env.planners import planner_observation
 from ms_slam_env.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
-SHIPPED = ROOT / "docs" / "results" / "train" / "policy.safetensors"
+SHIPPED = ROOT / "agents" / "policies" / "room.safetensors"
 
 
 def make_model(algorithm, seed=0):
@@ -121,7 +122,7 @@ def test_the_planner_draws_by_its_seed_and_respects_the_mask(trained):
 
     def actions(seed, **options):
         env = fake_env(seed=3)
-        planner = TrainedFeaturesPolicy(env, seed, path=str(trained[1]), **options)
+        planner = TrainedPolicy(env, seed, path=str(trained[1]), **options)
         drawn = [planner.act(observation, {}) for observation in observations]
         assert all(env.mask[action] for action in drawn)
         return drawn
@@ -135,22 +136,31 @@ def test_the_planner_refuses_what_it_cannot_run(trained, tmp_path, monkeypatch):
     path = str(trained[1])
     monkeypatch.delenv("MS_SLAM_POLICY", raising=False)
     with pytest.raises(InputError, match="MS_SLAM_POLICY"):
-        TrainedFeaturesPolicy(fake_env())
+        TrainedPolicy(fake_env())
     with pytest.raises(InputError, match="no policy file"):
-        TrainedFeaturesPolicy(fake_env(), path=str(tmp_path / "none"))
-    with pytest.raises(InputError, match=r"planner policy runs .* use policy-features"):
-        TrainedPolicy(fake_env(), path=path)
+        TrainedPolicy(fake_env(), path=str(tmp_path / "none"))
     with pytest.raises(InputError, match="7 actions, the environment has 49"):
-        TrainedFeaturesPolicy(fake_env(49), path=path)
+        TrainedPolicy(fake_env(49), path=path)
     with pytest.raises(InputError, match=r"'features', 7 numbers; .* have shape \(9,\)"):
-        TrainedFeaturesPolicy(fake_env(inputs=9), path=path)
+        TrainedPolicy(fake_env(inputs=9), path=path)
     with pytest.raises(InputError, match="true, false"):
-        TrainedFeaturesPolicy(fake_env(), path=path, deterministic="maybe")
+        TrainedPolicy(fake_env(), path=path, deterministic="maybe")
     write_policy(tmp_path / "fresh", file_of(make_model("ppo")).without_optimizer())
     with pytest.raises(InputError, match="is untrained"):
-        TrainedFeaturesPolicy(fake_env(), path=str(tmp_path / "fresh"))
+        TrainedPolicy(fake_env(), path=str(tmp_path / "fresh"))
     monkeypatch.setenv("MS_SLAM_POLICY", path)
-    assert TrainedFeaturesPolicy(fake_env()).policy.num_actions == NUM_ACTIONS
+    assert TrainedPolicy(fake_env()).policy.num_actions == NUM_ACTIONS
+
+
+def test_a_planner_is_shown_what_its_policy_was_trained_on(trained, monkeypatch):
+    monkeypatch.delenv("MS_SLAM_POLICY", raising=False)
+    assert planner_observation(f"policy,path={trained[1]},deterministic=true") == "features"
+    assert RoomAgent.observation_for(deterministic=True) == "features"
+    assert planner_observation("greedy,recovery=true") == "features"
+    with pytest.raises(InputError, match="MS_SLAM_POLICY"):
+        planner_observation("policy")
+    with pytest.raises(InputError, match="no policy file 'none'"):
+        planner_observation("policy,path=none")
 
 
 def test_the_policy_makes_the_environment_that_fits(trained):
@@ -181,7 +191,7 @@ def test_observations_of_another_environment_are_refused():
 def test_running_a_policy_needs_no_pytorch():
     code = (
         "import sys, numpy as np; from ms_slam_agents.policy import Policy;"
-        "from ms_slam_env.env.planners import PLANNERS; PLANNERS.find('policy-features');"
+        "from ms_slam_env.env.planners import PLANNERS; PLANNERS.find('agent-room');"
         f"policy = Policy.load({str(SHIPPED)!r});"
         "assert not {'torch', 'stable_baselines3', 'sb3_contrib'} & set(sys.modules);"
         "print(policy.act(np.zeros(189), np.ones(49, dtype=bool)))"

@@ -21,7 +21,7 @@ from ms_slam_agents.policy_file import (
     tensor_shapes,
     write_policy,
 )
-from ms_slam_agents.policy_planner import TrainedFeaturesPolicy
+from ms_slam_agents.policy_planner import TrainedPolicy
 from safetensors.numpy import save
 
 from ms_slam_env.cli import main
@@ -191,7 +191,7 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path):
 def test_the_command_line_says_it_in_one_line(tmp_path, capsys):
     path = tmp_path / "policy.safetensors"
     path.write_bytes(as_bytes(words(version=2)))
-    planner = f"policy-features,path={path}"
+    planner = f"policy,path={path}"
     words_ = ["benchmark", "--planners", planner, "--scenes", "table", "--episodes", "1"]
     assert main([*words_, "--steps", "1", "--out", str(tmp_path / "out")]) != 0
     error = capsys.readouterr().err
@@ -230,7 +230,7 @@ def test_no_loading_path_executes_a_pickle(tmp_path, capsys, kind):
     for load in (
         read_policy,
         Policy.load,
-        lambda given: TrainedFeaturesPolicy(None, path=str(given)),
+        lambda given: TrainedPolicy(None, path=str(given)),
     ):
         with pytest.raises(InputError):
             load(path)

@@ -7,7 +7,7 @@ pytest.importorskip("sb3_contrib")
 
 from ms_slam_agents import train_sb3
 from ms_slam_agents.policy import Policy
-from ms_slam_agents.policy_planner import TrainedFeaturesPolicy
+from ms_slam_agents.policy_planner import TrainedPolicy
 
 import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env.errors import InputError
@@ -38,7 +38,7 @@ def test_two_processes_train_a_policy_that_plans(tmp_path):
 
     env = policy.make_env(scene="table", scene_seed=1000)
     assert env.unwrapped.config.step_m == 0.1
-    planner = TrainedFeaturesPolicy(env.unwrapped, path=str(path))  # before the first reset
+    planner = TrainedPolicy(env.unwrapped, path=str(path))  # before the first reset
     observation, info = env.reset(seed=0)
     for _ in range(3):
         action = planner.act(observation, info)
@@ -108,7 +108,7 @@ def test_motion_and_slam_configuration_are_learnt_together(tmp_path, algorithm):
         scene_seed=1000,
         observation="features",
     )
-    planner = TrainedFeaturesPolicy(env.unwrapped, path=str(path))
+    planner = TrainedPolicy(env.unwrapped, path=str(path))
     observation, info = env.reset(seed=0)
     for _ in range(3):
         action = planner.act(observation, info)
@@ -116,7 +116,7 @@ def test_motion_and_slam_configuration_are_learnt_together(tmp_path, algorithm):
         assert info["action_mask"][[action[0], 49 + action[1]]].all()
         observation, _, _, _, info = env.step(action)
     with pytest.raises(InputError, match="chooses among 49 x 3 actions, the environment has 49"):
-        TrainedFeaturesPolicy(
+        TrainedPolicy(
             gym.make("MSActiveSLAM-FreeCamera-v0", scene="table", scene_seed=1000).unwrapped,
             path=str(path),
         )

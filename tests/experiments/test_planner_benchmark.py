@@ -100,8 +100,8 @@ def test_without_rliable_the_rest_is_reported(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_names_are_as_long_as_it_takes_to_tell_planners_apart() -> None:
-    path = "policy-features,path=docs/results/train/policy.zip"
-    assert short_planner_names(["random", path]) == {"random": "random", path: "policy-features"}
+    path = "policy,path=docs/results/train/policy.zip"
+    assert short_planner_names(["random", path]) == {"random": "random", path: "policy"}
     assert short_planner_names(["greedy", "greedy,rho_I=0.3,file=a/b"]) == {
         "greedy": "greedy",
         "greedy,rho_I=0.3,file=a/b": "greedy, rho_I=0.3, file=b",

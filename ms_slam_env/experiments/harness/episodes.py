@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 import ms_slam_env
 from ms_slam_env import metrics, slam
-from ms_slam_env.config import Checked, bounded, chosen, nested_options, parse_named
+from ms_slam_env.config import Checked, bounded, chosen, nested_options
 from ms_slam_env.env import ActiveSlamEnv, Planner
 from ms_slam_env.env.config import make_config
 from ms_slam_env.env.embodiments import EMBODIMENTS
-from ms_slam_env.env.planners import PLANNERS, check_planner, make_planner
+from ms_slam_env.env.planners import check_planner, make_planner, planner_observation
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.evaluation.map_quality import map_quality
 from ms_slam_env.evaluation.map_truth import reference_of, true_surface
@@ -155,7 +155,6 @@ def check_episodes(specs: Sequence[EpisodeSpec]) -> None:
 
 def make_env(spec: EpisodeSpec) -> gym.Env[Any, Any]:
     """The environment of an episode."""
-    planner_type = PLANNERS.find(parse_named(spec.planner, "planner")[0])
     return gym.make(
         spec.env_id,
         max_episode_steps=spec.steps,
@@ -165,7 +164,7 @@ def make_env(spec: EpisodeSpec) -> gym.Env[Any, Any]:
             "scene_seed": spec.seed,
             "step_m": spec.step_m,
             "step_rad": math.radians(spec.step_deg),
-            "observation": planner_type.observation,
+            "observation": planner_observation(spec.planner),
             **spec.options,
         },
     )
