@@ -110,6 +110,7 @@ class GeometricMotionMask(MotionMask):
         )  # frames since the env was forgotten
         self._live_odds = np.zeros((batch, *shape), dtype=np.float32)
         self._live_pose = self._pose_before
+        self._new = np.zeros((batch, *shape), dtype=bool)  # what the last strict look found
         self._moved: Bool = np.zeros(batch, dtype=bool)  # whether anything did in the last frames
         self._moves_now: Bool = np.zeros(batch, dtype=bool)  # and does in the live ones
         self._is_marked = True  # whether ``LiveFrame.moving`` may hold a mask
@@ -167,8 +168,9 @@ class GeometricMotionMask(MotionMask):
             change[self._moves(env, found[env])] = FOR
             odds[env] = np.clip(odds[env] + change, 0.0, MOST)
             if strict:
-                is_new = self._is_new(env, is_still) if self._has_old(env) else self._is_near(env)
-                odds[env][is_new] = MOST
+                young = self.is_young()[env]
+                is_new = self._is_near(env) if young else self._is_new(env, is_still)
+                odds[env][is_new], self._new[env] = MOST, is_new
         self._mask_by(odds, T_world_live)
         return ((odds > MASKED) & ~before).mean(axis=(1, 2)) > CHANGED
 
@@ -194,15 +196,22 @@ class GeometricMotionMask(MotionMask):
         least = np.full(pieces.count, FEWEST - 1.0)
         return pieces.where(~is_still, is_still, SHARE_NEW, least)
 
-    def _has_old(self, env: int) -> bool:
-        return bool(self._count[env] > NEW * INTERVAL)
+    def is_young(self) -> Bool:
+        """See the base class."""
+        return np.asarray(self._count <= NEW * INTERVAL)
 
     def _is_near(self, env: int) -> Bool:
-        """Pieces (h, w) clearly nearer than half of the image: the first frames tell no more."""
-        pieces, depth = self._pieces_of(env), self._depth.read()[env]
-        is_near = depth < NEAR * np.median(depth[depth > 0]) if (depth > 0).any() else depth > 0
-        is_near &= depth > 0
-        return pieces.where(is_near, ~is_near, 0.5, np.full(pieces.count, FEWEST - 1.0))
+        """Where (h, w) something is clearly nearer than half of the image, with a rim."""
+        depth = self._depth.read()[env]
+        if not depth.any():
+            return depth > 0
+        is_near = (depth > 0) & (depth < NEAR * np.median(depth[depth > 0]))
+        opened = cv2.morphologyEx(is_near.astype(np.uint8), cv2.MORPH_OPEN, _RIM)
+        return np.asarray(cv2.dilate(opened, _RIM) > 0)
+
+    def confirm(self, where: Bool) -> None:
+        """See the base class."""
+        self._prior[where] = np.where(self._new[where], MOST, self._prior[where])
 
     def _compare(self, T_world_live: Float64) -> NDArray[np.int32]:
         """Evidence (B, h, w) of the live frames, taken at poses (B, 4, 4)."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env._warp import wp
-from ms_slam_env.geometry import relative_angle
+from ms_slam_env.geometry import invert, relative_angle, se3_log
 from ms_slam_env.slam.alignment_check import (
     DISPUTED,
     AlignmentStatistics,
@@ -45,7 +45,7 @@ from ms_slam_env.slam.surfel.rendering import ModelView
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 
 MOSTLY_MOVING = 0.6  # share of the readings: rather the pose is wrong, or too little is left
-CLEARLY_BETTER = 0.9  # ratio of costs
+CLEARLY_APART = 30.0  # squared Mahalanobis distance; where nothing moves it is below 10
 APART_M, APART_RAD = (0.006, 0.1), np.radians((0.4, 6.0))  # more than noise, less than a jump
 RETRIES = 2  # further searches within a frame whose tracking failed
 
@@ -141,23 +141,26 @@ class Localizer:
         invalid: NDArray[np.bool_],
         guesses: Float64 | None,
     ) -> Alignment:
-        """Ask of poses off the ``expected`` ones whether the camera or what it sees has moved.
+        """Ask whether the camera has moved or what it sees, of the first frames and sudden motion.
 
-        In front of a wall the pose follows whatever passes by, and then nothing seems to move. So
-        these are aligned once more without all that is new in view; if it was that which drew the
-        pose along, what is left fits clearly better.
+        The pose follows whatever is nearest, which is measured best, and then nothing seems to
+        move. So these are aligned once more without all that is near or new in view. If it was
+        that which drew the pose along, the rest puts the camera elsewhere, by more than it errs.
         """
-        doubtful = self._motion_mask.can_doubt & alignment.tracked & (self._states.lost == 0)
-        doubtful &= self._states.started & _is_apart(alignment.T_world_live, expected)
+        states, mask = self._states, self._motion_mask
+        asked = states.started & (states.lost == 0) & ~invalid
+        is_apart = alignment.tracked & _is_apart(alignment.T_world_live, expected)
+        doubtful = mask.can_doubt & asked & (is_apart | mask.is_young())
         if not doubtful.any():
             return alignment
-        moving = doubtful & self._motion_mask.find(expected, doubtful, strict=True)
+        moving = doubtful & mask.find(expected, doubtful, strict=True)
         if not moving.any():
             return alignment
         again = self._track(invalid, guesses)
-        better = again.statistics["cost"] < CLEARLY_BETTER * alignment.statistics["cost"]
-        better &= again.statistics["degenerate_directions"] == 0
-        return alignment.replace(moving & again.tracked & better, again)
+        taken = moving & again.tracked & (again.statistics["degenerate_directions"] == 0)
+        taken &= ~alignment.tracked | _is_refuted(alignment, again)
+        mask.confirm(taken)
+        return alignment.replace(taken, again)
 
     def _trusted(
         self, alignment: Alignment, expected: Float64
@@ -325,6 +328,16 @@ class Localizer:
         """Which envs (B,) may be searched for: also those whose pose is uncertain."""
         is_blank = alignment.status == TrackingStatus.BLANK
         return self._states.started & ~alignment.tracked & ~is_blank
+
+
+def _is_refuted(alignment: Alignment, again: Alignment) -> NDArray[np.bool_]:
+    """Whether (B,) the pose is further from that of a part of the frame than this part errs."""
+    is_worse = alignment.statistics["cost"] > again.statistics["cost"]
+    for env in np.flatnonzero(is_worse):
+        twist = se3_log(invert(again.T_world_live[env]) @ alignment.T_world_live[env])
+        distance = twist @ np.linalg.pinv(again.covariance[env]) @ twist
+        is_worse[env] = distance > CLEARLY_APART
+    return is_worse
 
 
 def _is_apart(poses: Float64, others: Float64) -> NDArray[np.bool_]:

@@ -45,12 +45,20 @@ class MotionMask(Saved):
     def find(self, T_world_live: Float64, is_known: Bool, strict: bool = False) -> Bool:
         """Look for what moves in the frames, taken at poses (B, 4, 4).
 
-        If ``strict``, all that no earlier frame but the last few has seen is taken for moving.
+        If ``strict``, all that no earlier frame but the last few has seen is taken for moving; of an
+        env that ``is_young``, all that is near.
 
         Returns:
             (B,) whether so much is new in the mask that the frame should be aligned again.
         """
         return np.zeros(self._batch, dtype=bool)
+
+    def is_young(self) -> Bool:
+        """Which envs (B,) have seen too little to know what moves."""
+        return np.zeros(self._batch, dtype=bool)
+
+    def confirm(self, where: Bool) -> None:
+        """Believe what the last ``strict`` look found, for the envs ``where`` (B,)."""
 
     def hide(self, view: ModelView, T_world_model: Float64) -> bool:
         """Empty a view of the maps where masked readings lie; whether there are any.
