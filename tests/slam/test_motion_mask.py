@@ -71,6 +71,31 @@ def test_what_moves_does_not_draw_the_pose_along(masked) -> None:
     assert ate_rmse(poses_of(masked[0]), poses) < 0.004
 
 
+def test_what_is_near_and_moves_from_the_start_does_not_draw_the_pose_along() -> None:
+    """The box fills a quarter of the view and is measured ten times as well as the rest."""
+    near = "corridor:1011:kinect+moving-objects,kind=box,count=2"
+    sequence = open_sequence(near, "160x120", path=HandheldPath(300))
+    system = SurfelSlam(sequence.intrinsics, CONFIG)
+    system.reset(sequence.poses[0])
+    results = [system.track(sequence.frames[k]) for k in range(6)]
+    off = np.linalg.norm((poses_of(results) - sequence.poses[:6])[:, :3, 3], axis=1)
+    assert off.max() < 0.01
+    assert results[-1].moving.mean() > 0.15
+
+
+def test_all_is_doubted_at_the_start_and_what_has_been_seen_long_enough_is_not() -> None:
+    intrinsics, frames, poses, _ = recorded(STILL)
+    system = SurfelSlam(intrinsics, CONFIG)
+    system.reset(poses[0])
+    doubts = []
+    for _ in range(18):
+        doubts.append(bool(system._slam.motion_mask.doubts()[0]))
+        system.track(frames[0])
+    assert doubts == [True] * 13 + [False] * 5
+    system.reset(poses[0])
+    assert system._slam.motion_mask.doubts()[0]
+
+
 def test_what_moves_is_not_mapped_and_what_was_is_removed(masked) -> None:
     """The boxes are in view from the first frame on, before they can be known to move."""
     _, _, poses, labels = recorded(MOVING)

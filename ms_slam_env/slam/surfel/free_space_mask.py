@@ -54,11 +54,15 @@ COS_CREASE = 0.8  # of the angle between neighbouring normals, likewise
 FEWEST = 12  # pixels of the grid that prove a piece to be moving
 SHARE_APPEARED, SHARE_VANISHED = 0.3, 0.6  # of a piece's pixels for and against
 NEIGHBOURS = 0.3  # share of the pixels around that must have appeared too
+FIRST = NEW * INTERVAL + 1  # frames that have no old ones
 NEAR = 0.8  # of the median depth
+NEAREST = 0.3  # metres; what is nearer weighs no more
+WEIGHT_NEW = 0.2  # of what is new that can lead a pose astray, share of all
 SHARE_NEW = 0.7  # of the pixels of a piece that is taken for new
 SHARE_KNOWN = 0.1  # of its pixels that an earlier frame saw
 FOR, AGAINST, FORGETTING = 2.0, 0.7, 0.15  # log-odds of an observation
 MOST = 4.0  # log-odds at which they end; the least is 0
+CONFIRMED = 1.2  # log-odds of what has drawn a pose along: seen to move or forgotten soon
 MASKED = 0.5  # log-odds above which a pixel is masked
 CHANGED = 0.01  # share of the pixels whose new mask makes an alignment worth repeating
 _RIM = np.ones((3, 3), dtype=np.uint8)
@@ -71,7 +75,7 @@ class GeometricMotionMask(MotionMask):
 
     saved = (
         *("_past_depth", "_past_nearest", "_past_poses", "_count"),
-        *("_odds", "_depth_before", "_pose_before", "_moved"),
+        *("_odds", "_depth_before", "_pose_before", "_moved", "_alert"),
     )
 
     def __init__(
@@ -108,8 +112,11 @@ class GeometricMotionMask(MotionMask):
         self._count: NDArray[np.int32] = np.zeros(
             batch, dtype=np.int32
         )  # frames since the env was forgotten
+        # Frames to come in which what is new is not believed.
+        self._alert: NDArray[np.int32] = np.full(batch, FIRST, dtype=np.int32)
         self._live_odds = np.zeros((batch, *shape), dtype=np.float32)
         self._live_pose = self._pose_before
+        self._weight_of_new = np.zeros(batch)
         self._new = np.zeros((batch, *shape), dtype=bool)  # what the last strict look found
         self._moved: Bool = np.zeros(batch, dtype=bool)  # whether anything did in the last frames
         self._moves_now: Bool = np.zeros(batch, dtype=bool)  # and does in the live ones
@@ -119,7 +126,7 @@ class GeometricMotionMask(MotionMask):
 
     def forget(self, env: int) -> None:
         """See the base class."""
-        self._count[env] = 0
+        self._count[env], self._alert[env] = 0, FIRST
 
     def expect(self, live: LiveFrame, T_world_live: Float64, is_known: Bool) -> None:
         """See the base class."""
@@ -164,12 +171,13 @@ class GeometricMotionMask(MotionMask):
         found = self._compare(T_world_live)
         for env in map(int, np.flatnonzero(is_known)):
             is_still = (found[env] & SUPPORTED) > 0
+            self._weight_of_new[env] = self._weight_unseen(env, is_still)
             change = np.where(is_still, -AGAINST, -FORGETTING)
             change[self._moves(env, found[env])] = FOR
             odds[env] = np.clip(odds[env] + change, 0.0, MOST)
             if strict:
-                young = self.is_young()[env]
-                is_new = self._is_near(env) if young else self._is_new(env, is_still)
+                is_old = self._count[env] >= FIRST
+                is_new = self._is_new(env, is_still) if is_old else self._is_near(env)
                 odds[env][is_new], self._new[env] = MOST, is_new
         self._mask_by(odds, T_world_live)
         return ((odds > MASKED) & ~before).mean(axis=(1, 2)) > CHANGED
@@ -196,9 +204,17 @@ class GeometricMotionMask(MotionMask):
         least = np.full(pieces.count, FEWEST - 1.0)
         return pieces.where(~is_still, is_still, SHARE_NEW, least)
 
-    def is_young(self) -> Bool:
+    def doubts(self) -> Bool:
         """See the base class."""
-        return np.asarray(self._count <= NEW * INTERVAL)
+        is_due = (self._weight_of_new > WEIGHT_NEW) & (self._count % INTERVAL == 0)
+        return np.asarray((self._alert > 0) | is_due)
+
+    def _weight_unseen(self, env: int, is_still: Bool) -> float:
+        """Share of the unmasked readings that are not ``is_still`` (h, w), as alignments weigh."""
+        depth = self._depth.read()[env]
+        counts = (depth > 0) & (self._masked.read()[env] == 0)
+        weights = np.maximum(depth[counts], NEAREST) ** -4.0
+        return float(weights[~is_still[counts]].sum() / max(weights.sum(), 1e-6))
 
     def _is_near(self, env: int) -> Bool:
         """Where (h, w) something is clearly nearer than half of the image, with a rim."""
@@ -211,7 +227,9 @@ class GeometricMotionMask(MotionMask):
 
     def confirm(self, where: Bool) -> None:
         """See the base class."""
-        self._prior[where] = np.where(self._new[where], MOST, self._prior[where])
+        at_least = np.where(self._new[where], CONFIRMED, 0.0)
+        self._prior[where] = np.maximum(self._prior[where], at_least)
+        self._alert[where] = np.maximum(self._alert[where], INTERVAL)
 
     def _compare(self, T_world_live: Float64) -> NDArray[np.int32]:
         """Evidence (B, h, w) of the live frames, taken at poses (B, 4, 4)."""
@@ -303,6 +321,7 @@ class GeometricMotionMask(MotionMask):
             self._odds.write(odds)
             self._depth_before.write(depths)
         self._count[good] += 1
+        self._alert[good] = np.maximum(self._alert[good] - 1, 0)
 
     def share(self) -> Float64:
         """See the base class."""

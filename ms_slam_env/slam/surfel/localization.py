@@ -141,16 +141,17 @@ class Localizer:
         invalid: NDArray[np.bool_],
         guesses: Float64 | None,
     ) -> Alignment:
-        """Ask whether the camera has moved or what it sees, of the first frames and sudden motion.
+        """Ask whether the camera has moved or what it sees, where that may be confused.
 
-        The pose follows whatever is nearest, which is measured best, and then nothing seems to
-        move. So these are aligned once more without all that is near or new in view. If it was
-        that which drew the pose along, the rest puts the camera elsewhere, by more than it errs.
+        The pose follows what is near, which is measured best, and then nothing seems to move. So
+        where much is new, or the motion sudden, frames are aligned once more without what is new.
+        If it was that which drew the pose along, the rest puts the camera elsewhere, by more than
+        it errs.
         """
         states, mask = self._states, self._motion_mask
         asked = states.started & (states.lost == 0) & ~invalid
         is_apart = alignment.tracked & _is_apart(alignment.T_world_live, expected)
-        doubtful = mask.can_doubt & asked & (is_apart | mask.is_young())
+        doubtful = mask.can_doubt & asked & (is_apart | mask.doubts())
         if not doubtful.any():
             return alignment
         moving = doubtful & mask.find(expected, doubtful, strict=True)

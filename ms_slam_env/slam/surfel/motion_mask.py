@@ -45,16 +45,16 @@ class MotionMask(Saved):
     def find(self, T_world_live: Float64, is_known: Bool, strict: bool = False) -> Bool:
         """Look for what moves in the frames, taken at poses (B, 4, 4).
 
-        If ``strict``, all that no earlier frame but the last few has seen is taken for moving; of an
-        env that ``is_young``, all that is near.
+        If ``strict``, what no earlier frame but the last few has seen is taken for moving; in the
+        first frames, all that is near.
 
         Returns:
             (B,) whether so much is new in the mask that the frame should be aligned again.
         """
         return np.zeros(self._batch, dtype=bool)
 
-    def is_young(self) -> Bool:
-        """Which envs (B,) have seen too little to know what moves."""
+    def doubts(self) -> Bool:
+        """Where (B,) what is new in the frames is enough to lead a pose astray, were it moving."""
         return np.zeros(self._batch, dtype=bool)
 
     def confirm(self, where: Bool) -> None:
