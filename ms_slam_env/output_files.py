@@ -193,7 +193,7 @@ def result_folder(out: Path, marker: str) -> Iterator[Path]:
             target = out / path.relative_to(working)
             _check_kind(target, "file")
             with naming(target):
-                target.parent.mkdir(exist_ok=True)
+                target.parent.mkdir(parents=True, exist_ok=True)
                 os.replace(path, target)
         missing = []
     except OSError as error:

@@ -15,6 +15,7 @@ COMMANDS = {
     "experiment": "run one of the project's experiments, or list them",
     "explore": "search the parameters of a SLAM backend for the best compromises",
     "generate": "render an RGB-D sequence with true poses into a folder",
+    "record": "record episodes of a planner as a dataset for offline learning",
     "report": "turn a folder of results into one HTML page",
     "run": "run a SLAM backend over a recorded RGB-D sequence",
     "train": "train an agent with one of the installed training scripts",

@@ -1,0 +1,193 @@
+"""``ms-slam record``: episodes of a planner as a dataset for offline reinforcement learning."""
+
+from __future__ import annotations
+
+import os
+import re
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from tqdm import tqdm
+
+import ms_slam_env
+from ms_slam_env.command_line import parse
+from ms_slam_env.config import Checked, bounded, chosen, nested_options
+from ms_slam_env.env.planners import check_planner, make_planner, planner_observation
+from ms_slam_env.errors import InputError
+from ms_slam_env.interrupts import kept
+from ms_slam_env.output_files import check_out_folder, result_folder
+from ms_slam_env.report.provenance import provenance
+from ms_slam_env.scenes import SEED_SPLITS
+
+_STREAM = 2  # of an episode's seed, for the planner; the environment draws from the seed itself
+_VARIABLE = "MINARI_DATASETS_PATH"
+_INFOS = (
+    *("action_mask", "tracking_ok", "T_world_camera", "T_world_camera_estimate"),
+    *("divergence", "pose_error", "mapped_share"),
+)
+"""What is kept of ``info`` at every step."""
+
+
+@dataclass(frozen=True)
+class Args(Checked):
+    """Record episodes of a planner as a Minari dataset
+
+    ``minari.load_dataset(NAME)`` finds it where the environment variable MINARI_DATASETS_PATH names
+    the folder ``--out``.
+    """
+
+    planner: str = "nbv"
+    """NAME or module:Class, options appended as in greedy,rho_I=0.3."""
+    env_id: str = chosen("MSActiveSLAM-FreeCamera-v0", *ms_slam_env.ENV_IDS)
+    """Environment."""
+    scenes: tuple[str, ...] = ("living_room", "corridor", "table")
+    """Drawn from in each episode."""
+    seeds: str = chosen("train", *SEED_SPLITS)
+    """Split of the scenes' seeds."""
+    scene_seeds: int = bounded(4, 1, 100_000)
+    """Seeds of each scene, from the split's first."""
+    episodes: int = bounded(10, 1, 1_000_000)
+    """How many."""
+    steps: int = bounded(100, 1, 1_000_000)
+    """Time limit of an episode."""
+    seed: int = bounded(0, 0, 2**31)
+    """Of the first episode; the next ones follow."""
+    observation: str | None = None
+    """What is recorded; by default what the planner is shown."""
+    options: tuple[str, ...] = ()
+    """Further options of the environment, as name=value."""
+    name: str | None = None
+    """Of the dataset; by default PLANNER-v0."""
+    out: Path = field(default=Path("results/record"))
+    """Folder of datasets."""
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range, and a name that Minari does not know as one."""
+        super().__post_init__()
+        if self.name is not None and not re.fullmatch(r"[\w-]+-v\d+", self.name):
+            raise InputError(f"name {self.name!r} is not of the form NAME-v0")
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Record; return the exit code."""
+    args = parse(Args, arguments, "ms-slam record")
+    record(args)
+    return 0
+
+
+def record(args: Args) -> Path:
+    """Play the episodes and write the dataset; return its folder.
+
+    Raises:
+        InputError: Minari is not installed, bad options, or a dataset of this name.
+    """
+    try:
+        import minari  # noqa: F401 -- said here, before any work is done
+    except ImportError:
+        raise InputError("ms-slam record needs Minari: pip install 'ms-slam-env[record]'") from None
+    check_planner(args.planner)
+    check_out_folder(args.out)
+    name = args.name or f"{args.planner.partition(',')[0].replace(':', '-')}-v0"
+    folder = args.out / name
+    if folder.exists():
+        raise InputError(f"{folder} is there already: give another --name, or remove it")
+    env = _environment(args)
+    try:
+        with kept(f"nothing is left in {folder}"), result_folder(args.out, _marker(name)) as made:
+            _write(env, args, name, made)
+    finally:
+        env.close()
+    print(
+        f"{args.episodes} episodes in {folder}; in Python, with MINARI_DATASETS_PATH="
+        f"{args.out.resolve()}: minari.load_dataset({name!r})"
+    )
+    return folder
+
+
+def _environment(args: Args) -> gym.Env[Any, Any]:
+    return gym.make(
+        args.env_id,
+        max_episode_steps=args.steps,
+        disable_env_checker=True,
+        scene=list(args.scenes),
+        split=args.seeds,
+        num_scene_seeds=args.scene_seeds,
+        observation=args.observation or planner_observation(args.planner),
+        **nested_options(args.options),
+    )
+
+
+def _write(env: gym.Env[Any, Any], args: Args, name: str, folder: Path) -> None:
+    """Play the episodes and write them, one after another, as dataset ``name`` below ``folder``."""
+    import minari
+
+    bar = tqdm(range(args.seed, args.seed + args.episodes), "episodes", unit="episode")
+    seeds = iter(bar)
+    with _datasets_in(folder):
+        dataset = minari.create_dataset_from_buffers(
+            name,
+            [_play(env, args, next(seeds))],
+            env=env,
+            algorithm_name=args.planner,
+            description=f"{provenance()['command']}; {args.episodes} episodes of {args.planner} in "
+            f"{args.env_id}, scenes {', '.join(args.scenes)}, {args.seeds} seeds",
+            requirements=[f"ms-slam-env=={ms_slam_env.__version__}"],
+            jpeg_encoding=False,
+        )
+        for seed in seeds:
+            dataset.update_dataset_from_buffer([_play(env, args, seed)])
+
+
+def _play(env: gym.Env[Any, Any], args: Args, seed: int) -> Any:
+    """One episode to its end, as Minari's ``EpisodeBuffer``."""
+    from minari.data_collector import EpisodeBuffer
+
+    observation, info = env.reset(seed=seed)
+    stream = np.random.default_rng([seed, _STREAM])
+    planner = make_planner(args.planner, env.unwrapped, seed=int(stream.integers(2**31)))
+    planner.reset()
+    seen, known, steps = [observation], [info], []
+    is_over = False
+    while not is_over:
+        action = planner.act(observation, info)
+        observation, reward, terminated, truncated, info = env.step(action)
+        seen.append(observation)
+        known.append(info)
+        steps.append((np.asarray(action), reward, terminated, truncated))
+        is_over = terminated or truncated
+    actions, rewards, terminations, truncations = map(list, zip(*steps, strict=True))
+    infos = {key: [np.asarray(each[key]) for each in known] for key in _INFOS}
+    by_part = {key: [each[key] for each in seen] for key in seen[0]} if _has_parts(env) else seen
+    return EpisodeBuffer(
+        None, seed, None, by_part, actions, rewards, terminations, truncations, infos
+    )
+
+
+def _has_parts(env: gym.Env[Any, Any]) -> bool:
+    return isinstance(env.observation_space, gym.spaces.Dict)
+
+
+@contextmanager
+def _datasets_in(folder: Path) -> Iterator[None]:
+    """Let Minari write below ``folder``."""
+    before = os.environ.get(_VARIABLE)
+    os.environ[_VARIABLE] = str(folder.resolve())
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", ".*is set to None", UserWarning)  # the author, ...
+            yield
+    finally:
+        if before is None:
+            del os.environ[_VARIABLE]
+        else:
+            os.environ[_VARIABLE] = before
+
+
+def _marker(name: str) -> str:
+    return f"{name}/data/metadata.json"
