@@ -7,6 +7,8 @@ from typing import Any
 import gymnasium
 from gymnasium.envs.registration import WrapperSpec
 
+from ms_slam_env.tasks import OWN, env_id_of
+
 MAX_EPISODE_STEPS = 150
 
 FOLLOWS_STATES = WrapperSpec("FollowStates", "ms_slam_env.env.wrappers:FollowStates", {})
@@ -51,6 +53,7 @@ def _perturbed() -> dict[str, dict[str, Any]]:
 
 
 _ARGUMENTS = {**_PLAIN, **_perturbed()}
+_TASKS = {env_id_of(name): (name, make()) for name, make in OWN.items()}
 
 ENV_IDS = tuple(_PLAIN)
 """The environments with a camera as good as the sensor."""
@@ -58,16 +61,25 @@ ENV_IDS = tuple(_PLAIN)
 PERTURBED_ENV_IDS = tuple(name for name in _ARGUMENTS if name not in _PLAIN)
 """The same with one imperfection; ``perturbation={...}`` of ``gym.make`` sets its strength."""
 
+TASK_IDS = tuple(_TASKS)
+"""The tasks of the benchmark, each with its scenes, options and length."""
+
 
 def register_all() -> None:
     """Register the ids with Gymnasium; a second call changes nothing."""
     for env_id, arguments in _ARGUMENTS.items():
-        if env_id not in gymnasium.registry:
-            gymnasium.register(
-                env_id,
-                entry_point="ms_slam_env.env.make:make_env",
-                max_episode_steps=MAX_EPISODE_STEPS,
-                disable_env_checker=True,  # for who writes environments; it wants a reset first
-                additional_wrappers=(FOLLOWS_STATES,),
-                kwargs=arguments,
-            )
+        _register(env_id, MAX_EPISODE_STEPS, arguments)
+    for env_id, (name, task) in _TASKS.items():
+        _register(env_id, task.steps, {**_ARGUMENTS[task.env_id], "task": name})
+
+
+def _register(env_id: str, steps: int, arguments: dict[str, Any]) -> None:
+    if env_id not in gymnasium.registry:
+        gymnasium.register(
+            env_id,
+            entry_point="ms_slam_env.env.make:make_env",
+            max_episode_steps=steps,
+            disable_env_checker=True,  # for who writes environments; it wants a reset first
+            additional_wrappers=(FOLLOWS_STATES,),
+            kwargs=arguments,
+        )

@@ -82,7 +82,8 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
     ## End
     Terminated when tracking was lost for ``lost_patience`` consecutive steps, or when for
     ``away_patience`` steps the camera was lost or in submaps that are not joined to the first;
-    truncated by the time limit (``max_episode_steps`` of ``gym.make``, 150 by default).
+    truncated by the time limit (``max_episode_steps`` of ``gym.make``, 150 by default), or when
+    ``seconds`` of simulated time have passed.
 
     ## Info
     ``T_world_camera``, ``T_world_camera_estimate`` (4, 4); ``pose_covariance`` (6, 6) of the
@@ -215,7 +216,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         )
         episode.reward_terms = reward_terms(outcome, self.config.reward, self.config.targets)
         reward = float(sum(episode.reward_terms.values()))
-        return self._observe(), reward, lost_for_good, False, self._info()
+        return self._observe(), reward, lost_for_good, self._time_is_up(), self._info()
 
     def render(self) -> NDArray[np.uint8] | None:
         """One picture that explains the moment, (480, 1120, 3) uint8; None without render mode."""
@@ -252,6 +253,10 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         if lost < away:  # in a submap, or lost after one
             return max(lost / self.config.lost_patience, away / self.config.away_patience)
         return lost / self.config.lost_patience
+
+    def _time_is_up(self) -> bool:
+        seconds = self.config.seconds
+        return seconds is not None and self.episode.frames[-1].time_s >= seconds
 
     def _info(self) -> dict[str, Any]:
         info = {

@@ -28,7 +28,7 @@ from ms_slam_env.slam.adaptation import AdaptationConfig, NoAdaptationConfig
 from ms_slam_env.slam.configuration import is_file_name, read_configuration
 from ms_slam_env.slam.frame_selection import EveryFrameConfig, FrameSelectionConfig
 
-OTHER_OPTIONS = ("embodiment", "render_mode", "max_episode_steps")
+OTHER_OPTIONS = ("embodiment", "render_mode", "task", "max_episode_steps")
 """Options of ``gym.make`` beside the fields of ``EnvConfig``; the last is Gymnasium's own."""
 
 _OF_STATE = (
@@ -153,6 +153,7 @@ class EnvConfig(Checked):
         away_patience: steps that the camera may be in submaps that are not joined to the first
             before it ends, lost or not: where it started is known no longer. For SLAM that starts
             no submaps, ``lost_patience`` decides.
+        seconds: simulated time after which an episode is truncated; None for the steps alone.
         divergence: how divergence is measured.
         lookahead: how candidates are predicted.
         targets: motion-and-structure parameters and thresholds.
@@ -178,6 +179,7 @@ class EnvConfig(Checked):
     step_rad: float = bounded(math.radians(12), 0, math.pi / 2)
     lost_patience: int = bounded(10, 1, 1_000_000)
     away_patience: int = bounded(50, 1, 1_000_000)
+    seconds: float | None = bounded(None, 0.001, 1e9)
     divergence: DivergenceConfig = field(default_factory=DivergenceConfig)
     lookahead: LookaheadConfig = field(default_factory=LookaheadConfig)
     targets: TargetConfig = field(default_factory=TargetConfig)

@@ -10,12 +10,19 @@ from ms_slam_env.env.active_slam import ActiveSlamEnv
 from ms_slam_env.env.config import EnvConfig
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.sequences.perturbations import FastMotion, make_perturbation
+from ms_slam_env.tasks import Task, find_task
 
 _FASTER = 2.0  # of the ids with fast motion, unless their option says otherwise
 
 
-def make_env(perturbed_by: str | None = None, **options: Any) -> ActiveSlamEnv:
-    """Entry point of every id: one environment, ``perturbed_by`` something or not."""
+def make_env(task: Any = None, perturbed_by: str | None = None, **options: Any) -> ActiveSlamEnv:
+    """Entry point of every id: one environment, of a task or of none, perturbed or not.
+
+    Raises:
+        InputError: an unknown task, perturbation or option, or a value out of range.
+    """
+    if task is not None:
+        return _make_for(find_task(task), perturbed_by, **options)
     if perturbed_by is None:
         return ActiveSlamEnv(**options)
     return _make_perturbed(perturbed_by, **options)
@@ -24,6 +31,14 @@ def make_env(perturbed_by: str | None = None, **options: Any) -> ActiveSlamEnv:
 # Without "human" Gymnasium would warn, wrap the environment and fail at the first reset for want of
 # pygame; with it the environment itself is asked, and refuses in one line.
 make_env.metadata = {"render_modes": ["rgb_array", "human"]}  # type: ignore[attr-defined]
+
+
+def _make_for(task: Task, perturbed_by: str | None, **options: Any) -> ActiveSlamEnv:
+    """Build the environment of a task; ``options`` count more than the task's own."""
+    env = make_env(None, perturbed_by, **{"scene": task.scenes, **task.options, **options})
+    for name, strength in task.perturbations.items():
+        env.perturb(make_perturbation(name, strength))
+    return env
 
 
 def _make_perturbed(

@@ -3,55 +3,105 @@
 Precision asks of each map point whether it lies on the true surface, anywhere in the scene.
 Recall and completeness ask how much of a *reference* was mapped. The reference must not depend on
 where a planner went: measured against what it has seen itself, a camera that stands still is
-complete. It is therefore all true surface within ``RADIUS_M`` of the start that can be seen from
-some place that the camera can reach on a straight way of at most ``REACH_M``.
+complete. It is therefore what can be seen from places that the camera can come to: `nearby`, those
+on a straight way of at most ``REACH_M`` from the start; in the whole `scene`; or where an `arm` can
+bring it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.geometry import invert, transform_points
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.mesh_queries import RayCaster
 from ms_slam_env.sensor.scene_cache import get_scene
 
 Float64 = NDArray[np.float64]
+Bool = NDArray[np.bool_]
 
-RADIUS_M = 3.0  # what a first view reaches, in every direction; part of the protocol
+RADIUS_M = 3.0  # what a view reaches, in every direction; part of the protocol
 REACH_M = 1.0
 SURFACE_SPACING_M = 0.01  # half the smaller threshold of the F-score
 REFERENCE_SPACING_M = 0.03
 _VIEWPOINTS = 48
 _CAMERA_RADIUS_M = 0.1
 _OCCLUSION_SLACK = 0.01  # share of the distance by which a sample may lie behind the mesh
+_GRID_M = 0.2  # places of a camera in the whole scene; every third along each axis looks around
+_EVERY = 3
 
 
 @lru_cache(maxsize=2)
-def true_surface(scene: str, scene_seed: int) -> Float64:
-    """The scene's whole surface as points (N, 3) about 1 cm apart."""
-    return get_scene(scene, scene_seed).surface_points(SURFACE_SPACING_M)[0]
+def true_surface(scene: str, scene_seed: int, spacing_m: float = SURFACE_SPACING_M) -> Float64:
+    """The scene's whole surface as points (N, 3), by default about 1 cm apart."""
+    return get_scene(scene, scene_seed).surface_points(spacing_m)[0]
 
 
-@lru_cache(maxsize=2)
-def reference_of(scene: str, scene_seed: int, start: tuple[float, float, float]) -> Float64:
-    """The reference of a scene by name; planners of one episode follow each other."""
-    return reference_surface(get_scene(scene, scene_seed), np.array(start))
+def surface_nearby(scene: Scene, start: Float64) -> Float64:
+    """Points (N, 3) of true surface that a camera starting at ``start`` (3,) could map nearby.
 
-
-def reference_surface(scene: Scene, start: Float64) -> Float64:
-    """Points (N, 3) of true surface that a planner starting at ``start`` (3,) could map."""
+    Nothing farther than ``RADIUS_M`` from the start.
+    """
     points = scene.surface_points(REFERENCE_SPACING_M)[0]
     points = points[np.linalg.norm(points - start, axis=1) <= RADIUS_M]
+    return _in_sight(scene, points, reachable_viewpoints(scene, start), lambda *_: True)
+
+
+def surface_of_scene(scene: Scene, start: Float64) -> Float64:
+    """Points (N, 3) of true surface that a camera starting at ``start`` (3,) could map at all.
+
+    Nothing farther than ``RADIUS_M`` from where it is seen.
+    """
+    points = scene.surface_points(REFERENCE_SPACING_M)[0]
+    eyes = connected_viewpoints(scene, start)
+    return _in_sight(scene, points, eyes, lambda k, of: _is_near(of, eyes[k]))
+
+
+def surface_of_views(scene: Scene, poses: Float64, intrinsics: Intrinsics) -> Float64:
+    """Points (N, 3) of true surface that a camera could map from ``poses`` (K, 4, 4).
+
+    Nothing farther than ``RADIUS_M`` from where it is seen.
+    """
+    points = scene.surface_points(REFERENCE_SPACING_M)[0]
+    half = np.array([intrinsics.width, intrinsics.height]) / 2
+    middle = intrinsics.cx, intrinsics.cy
+    eyes = poses[:, :3, 3]
+
+    def is_in_view(k: int, of: Float64) -> Bool:
+        local = transform_points(invert(poses[k]), of)
+        ahead = local[:, 2] > 0
+        local[~ahead] = (0, 0, 1)
+        inside = (np.abs(intrinsics.project(local) - middle) <= half).all(axis=1)
+        return ahead & inside & _is_near(of, eyes[k])
+
+    return _in_sight(scene, points, eyes, is_in_view)
+
+
+def _is_near(points: Float64, eye: Float64) -> Bool:
+    return np.asarray(np.linalg.norm(points - eye, axis=1) <= RADIUS_M)
+
+
+def _in_sight(
+    scene: Scene, points: Float64, eyes: Float64, looked_at: Callable[[int, Float64], Bool | bool]
+) -> Float64:
+    """Those of ``points`` (N, 3) that nothing hides from one of the ``eyes`` (K, 3).
+
+    Eye number k looks at those that ``looked_at(k, points)`` says.
+    """
     caster = RayCaster(scene.mesh.vertices, scene.mesh.faces)
     visible = np.zeros(len(points), dtype=bool)
-    for viewpoint in reachable_viewpoints(scene, start):
+    for k, eye in enumerate(eyes):
         hidden = np.flatnonzero(~visible)
-        directions = points[hidden] - viewpoint
+        hidden = hidden[np.broadcast_to(looked_at(k, points[hidden]), hidden.shape)]
+        directions = points[hidden] - eye
         # Distances come in units of the direction's length: 1 is the point itself.
-        hit, _ = caster.first_hit(np.broadcast_to(viewpoint, directions.shape), directions)
+        hit, _ = caster.first_hit(np.broadcast_to(eye, directions.shape), directions)
         visible[hidden[hit >= 1 - _OCCLUSION_SLACK]] = True
     return points[visible]
 
@@ -65,3 +115,19 @@ def reachable_viewpoints(scene: Scene, start: Float64) -> Float64:
     ends = start + lengths * directions
     free = [end for end in ends if scene.segment_is_free(start, end, _CAMERA_RADIUS_M)]
     return np.array([start, *free])
+
+
+def connected_viewpoints(scene: Scene, start: Float64) -> Float64:
+    """(K, 3) camera positions all over the free space that ``start`` is in, itself first."""
+    low, high = scene.bounds()
+    first = np.floor((start - low) / _GRID_M)
+    low = start - _GRID_M * first  # the start is a point of the grid
+    shape = tuple((np.floor((high - low) / _GRID_M) + 1).astype(int))
+    cells = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1).reshape(-1, 3)
+    free = scene.clearance(low + _GRID_M * cells) >= _CAMERA_RADIUS_M
+    here = tuple(first.astype(int))
+    space = free.reshape(shape)
+    space[here] = True
+    parts, _ = ndimage.label(space)
+    chosen = (parts == parts[here]).ravel() & ((cells - first) % _EVERY == 0).all(axis=1)
+    return np.concatenate([start[None], low + _GRID_M * cells[chosen]])

@@ -291,7 +291,7 @@ def test_use_before_reset_says_so():
         ({"observation": "pixels"}, "valid choices: rgbd, features, lookahead"),
         (
             {"steps": 3},
-            "'steps'; valid choices: embodiment, render_mode, max_episode_steps, scene, scene_seed",
+            "'steps'; valid choices: embodiment, render_mode, task, max_episode_steps, scene",
         ),
         ({"targets": {"M_X": 1}}, "unknown option of TargetConfig 'targets.M_X'"),
         ({"reward": {"lost": -1}}, r"RewardConfig.lost = -1 is outside \[0"),
