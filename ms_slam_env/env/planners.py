@@ -28,7 +28,8 @@ class Planner(ABC):
 
     Args:
         env: the unwrapped environment.
-        seed: of the planner's own random choices.
+        seed: of the planner's own random choices; an environment that was reset with the same one
+            draws others.
     """
 
     observation: str = "features"
@@ -38,7 +39,8 @@ class Planner(ABC):
 
     def __init__(self, env: ActiveSlamEnv, seed: int = 0) -> None:
         self.env = env
-        self.rng = np.random.default_rng(seed)
+        child = np.random.SeedSequence(seed).spawn(1)[0]  # the environment draws from the parent
+        self.rng = np.random.default_rng(child)
 
     @classmethod
     def observation_for(cls, **options: Any) -> str:

@@ -18,16 +18,15 @@ from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.env.planners import make_planner
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.duplicate_objects import JudgedMap, judge_map, labelled_view
+from ms_slam_env.experiments.harness.episode_scores import LOST_ERROR_M, measure_trajectory
 from ms_slam_env.experiments.harness.episodes import (
     DEFAULT_PLANNERS,
     DEFAULT_STEP_DEG,
     DEFAULT_STEP_M,
-    LOST_ERROR_M,
     EpisodeSpec,
     check_episodes,
     check_names,
     make_env,
-    measure_trajectory,
     parse_options,
     play,
     seed_list,

@@ -17,7 +17,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.map_quality import map_quality
 from ms_slam_env.evaluation.run_sequence import run_sequence
 from ms_slam_env.evaluation.seen_surface import seen_surface
-from ms_slam_env.experiments.harness.episodes import LOST_ERROR_M
+from ms_slam_env.experiments.harness.episode_scores import LOST_ERROR_M
 from ms_slam_env.experiments.harness.experiment import Experiment
 from ms_slam_env.parallel import limit_threads
 from ms_slam_env.report.charts import Chart, Guide, Panel, Series

@@ -12,7 +12,8 @@ from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.run_sequence import run_sequence
 from ms_slam_env.evaluation.sequence_divergence import consecutive_divergences
-from ms_slam_env.experiments.harness.episodes import LOST_ERROR_M, check_names, seed_list
+from ms_slam_env.experiments.harness.episode_scores import LOST_ERROR_M
+from ms_slam_env.experiments.harness.episodes import check_names, seed_list
 from ms_slam_env.experiments.harness.experiment import Experiment
 from ms_slam_env.report.charts import Chart, scatter
 from ms_slam_env.report.records import Row

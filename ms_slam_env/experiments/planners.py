@@ -1,21 +1,32 @@
-"""The planner benchmark: scenes x seeds x planners, every planner from the same start pose."""
+"""The planner benchmark: a task's scenes x seeds x planners, all from the same start poses."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from ms_slam_env.experiments.harness.episode_experiment import DOTS, SteppedExperiment
+from ms_slam_env.experiments.harness.episode_experiment import DOTS, episode_specs
 from ms_slam_env.experiments.harness.episodes import (
-    DEFAULT_PLANNERS,
-    DEFAULT_SCENES,
+    DEFAULT_STEP_DEG,
+    DEFAULT_STEP_M,
+    EpisodeSpec,
+    check_episodes,
+    check_names,
+    run_episode,
+    seed_list,
     short_planner_names,
 )
-from ms_slam_env.report import statistics
+from ms_slam_env.experiments.harness.experiment import Experiment
+from ms_slam_env.experiments.harness.planner_tables import (
+    DETAILS,
+    HEADLINE,
+    RANKED_BY,
+    across_scenes,
+    better_than_each_other,
+    with_losses,
+)
 from ms_slam_env.report.charts import (
     Chart,
     Panel,
@@ -24,138 +35,182 @@ from ms_slam_env.report.charts import (
     scatter,
 )
 from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Grouping, Table, finished, make_table
+from ms_slam_env.report.tables import Grouping, Table, complete_cases, finished
+from ms_slam_env.tasks import OWN, find_task
 
-RANKED_BY = "f_score_5cm"
-"""Standing still loses it by recall, getting lost by precision."""
-HEADLINE = (
-    *("f_score_5cm", "f_score_2cm", "rcm", "ate_m", "lost"),
-    *("violations", "path_length_m", "decision_ms"),
-)
-DETAILS = ("ate_max_m", "rpe_m", "rer_m", "mapped_area_m2", "M_I", "M_D", "return")
-_PANELS = ("f_score_5cm", "rcm", "ate_m", "path_length_m")
+ALL = "all"
+"""Stands for all our tasks."""
+PLANNERS = ("random", "stationary", "greedy", "max-information", "nbv")
+EPISODES, LEADERBOARD_EPISODES = 10, 25
+_PANELS = ("f_score_5cm_area", "f_score_5cm", "ate_m", "path_length_m")
 _FLOOR_M = 5e-5  # errors below are drawn here on logarithmic axes
 
 
 @dataclass(frozen=True)
-class PlannerBenchmark(SteppedExperiment):
+class PlannerBenchmark(Experiment):
     """Planner benchmark
 
     Planners move the camera, a real SLAM estimates its path and maps the scene. A good planner maps
-    much (F-score, completeness) and stays tracked (small ATE, seldom lost).
+    much soon (area under the F-score, completeness), stays tracked (small ATE) and finds back when
+    it is lost.
     """
 
-    planners: tuple[str, ...] = DEFAULT_PLANNERS
+    planners: tuple[str, ...] = PLANNERS
     """NAME or module:Class, options appended as in greedy,rho_I=0.3."""
-    scenes: tuple[str, ...] = DEFAULT_SCENES
-    episodes: int = 10
-    steps: int = 100
+    task: str = "room"
+    """Task: room, home, arm, disturbed or module:function; all: the leaderboard."""
+    scenes: tuple[str, ...] = ()
+    """Names of scenes, or mesh files; by default the task's."""
+    episodes: int | None = None
+    """Seeds for each scene; by default 10, of the leaderboard 25."""
+    steps: int | None = None
+    """Length of an episode; by default the task's."""
     seeds: str = "test"
-    env_id: str = "MSActiveSLAM-FreeCamera-v0"
-    """Environment."""
+    """Split that the seeds come from: train, validation or test."""
+    env_id: str | None = None
+    """Environment; by default the task's."""
+    step_m: float | None = None
+    """Translation of a motion, metres; by default 0.12."""
+    step_deg: float | None = None
+    """Rotation of a motion, degrees; by default 12."""
+    options: tuple[str, ...] = ()
+    """Options of the environment, as in lookahead.reference=live targets.M_I=0.05."""
+
+    unit = rows_key = "episodes"
+    run = staticmethod(run_episode)
+
+    @property
+    def tasks(self) -> Sequence[str]:
+        """The tasks by name."""
+        return tuple(OWN) if self.task == ALL else (self.task,)
+
+    def specs(self) -> list[EpisodeSpec]:
+        """Every episode, task by task."""
+        return [spec for name in self.tasks for spec in self._specs(name)]
+
+    def _specs(self, name: str) -> list[EpisodeSpec]:
+        """The episodes of a task, which says what is not given."""
+        task = find_task(name)
+        step_rad = task.options.get("step_rad", math.radians(DEFAULT_STEP_DEG))
+        usual = {
+            "scenes": task.scenes,
+            "steps": task.steps,
+            "env_id": task.env_id,
+            "step_m": task.options.get("step_m", DEFAULT_STEP_M),
+            "step_deg": round(math.degrees(step_rad), 9),
+        }
+        own = {field.name: getattr(self, field.name) for field in fields(self)}
+        given = {key: value for key, value in own.items() if value not in (None, ())}
+        shared = {"options": (), **usual, **given, "task": name}
+        check_names(self.planners, shared["scenes"])
+        compared = [{"planner": planner} for planner in self.planners]
+        return episode_specs(shared, shared["scenes"], self._seeds, compared)
+
+    @property
+    def _seeds(self) -> list[int]:
+        usual = LEADERBOARD_EPISODES if self.task == ALL else EPISODES
+        return seed_list(self.seeds, usual if self.episodes is None else self.episodes)
+
+    def prepare(self) -> None:
+        """Start one episode of each planner."""
+        check_episodes(self.specs())
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """Over all scenes, across scenes, and for each scene."""
-        headline = Grouping(("planner",), HEADLINE, rank_by=RANKED_BY, count="episodes")
-        details = Grouping(("planner",), (RANKED_BY, *DETAILS), rank_by=RANKED_BY)
-        note = (
-            f"Medians with 95 % bootstrap intervals over episodes of {self.steps} steps of "
-            f"{100 * self.step_m:g} cm / {self.step_deg:g} deg; best F-score first."
-        )
-        tables = [headline.table(rows, note=note), details.table(rows, "Details")]
-        across = across_scenes(rows)
-        tables += [across] if across else []
-        scenes = list(dict.fromkeys(row["spec"]["scene"] for row in rows))
-        if len(scenes) > 1:
-            for scene in scenes:
-                of_scene = [row for row in rows if row["spec"]["scene"] == scene]
-                tables.append(headline.table(of_scene, scene))
-        return tables
+        """For each task over all scenes and across scenes, for one task also for each scene."""
+        by_task = self._by_task(rows)
+        if len(self.tasks) == 1:
+            return _tables(rows, "")
+        return [table for name, of in by_task.items() for table in _tables(of, f"{name}: ")]
+
+    def _by_task(self, rows: Sequence[Row]) -> dict[str, list[Row]]:
+        """Rows of the tasks of which an episode finished."""
+        every = {name: [r for r in rows if r["spec"]["task"] == name] for name in self.tasks}
+        return {name: of for name, of in every.items() if finished(of)}
 
     def charts(self, rows: Sequence[Row]) -> list[Chart]:
-        """Every measure by planner, F-score against ATE, ATE over time."""
-        ranking = Grouping(("planner",), (RANKED_BY,), rank_by=RANKED_BY).table(rows)
-        best = [str(line["planner"]) for line in ranking.rows]
-        label = short_planner_names(best).__getitem__
-        bands = [
-            quartile_band(
-                label(name),
-                [r["result"]["ate_over_time"] for r in finished(rows) if _planner(r) == name],
-                _FLOOR_M,
-            )
-            for name in best
-        ]
-        return [
-            Chart(
-                "planners",
-                "Measures by planner",
-                DOTS,
-                by_group(rows, "planner", _PANELS, ("ate_m",), best, label),
-            ),
-            Chart(
-                "f_score_ate",
-                "F-score against ATE",
-                "One mark an episode.",
-                [scatter(rows, "ate_m", RANKED_BY, "planner", "x", _FLOOR_M, label)],
-            ),
-            Chart(
-                "ate_over_time",
-                "Error over time",
-                "Line: median over episodes; band: between their quartiles.",
-                [Panel("steps", "ate_over_time", bands, "y")],
-            ),
-        ]
+        """Of each task the curve of the F-score, every measure by planner, F-score against ATE."""
+        one = len(self.tasks) == 1
+        by_task = self._by_task(rows).items()
+        return [chart for name, of in by_task for chart in _charts(of, "" if one else name)]
 
     def content(self, rows: Sequence[Row]) -> Mapping[str, Any]:
-        """The seeds, and medians with their intervals by planner."""
+        """The seeds, and medians with their intervals by planner, of one task."""
+        seeds = {"seeds": self._seeds}
+        if len(self.tasks) > 1:
+            return seeds
         grouping = Grouping(("planner",), (*HEADLINE, *DETAILS), rank_by=RANKED_BY)
         lines: Sequence[Mapping[str, Any]] = grouping.table(rows).rows
         return {
-            **super().content(rows),
+            **seeds,
             "summary": {
                 line["planner"]: {key: asdict(line[key]) for key in grouping.keys} for line in lines
             },
         }
 
 
-def _planner(row: Mapping[str, Any]) -> str:
-    return str(row["spec"]["planner"])
-
-
-def score_matrices(rows: Sequence[Row], metric: str = RANKED_BY) -> dict[str, NDArray[np.float64]]:
-    """Scores (episodes, scenes) of each planner that finished an episode in every scene.
-
-    Scenes with more finished episodes than another lose the surplus, as rliable needs a matrix.
-    """
+def _tables(rows: Sequence[Row], prefix: str) -> list[Table]:
+    """The tables of one task; ``prefix`` of their titles."""
+    pairs = complete_cases(rows, ("scene", "seed"), "planner")
+    headline = Grouping(("planner",), HEADLINE, rank_by=RANKED_BY, count="episodes")
+    details = Grouping(("planner",), (RANKED_BY, *DETAILS), rank_by=RANKED_BY)
+    spec = rows[0]["spec"]
+    note = (
+        "Medians with 95 % bootstrap intervals over the episodes that every planner finished, "
+        f"of at most {spec['steps']} steps of {100 * spec['step_m']:g} cm / "
+        f"{spec['step_deg']:g} deg; best F-score first."
+    )
+    title = f"{prefix}over all scenes" if prefix else ""
+    tables = [with_losses(headline.table(pairs, title, note), pairs)]
+    tables.append(details.table(pairs, f"{prefix}Details"))
+    tables += across_scenes(rows, f"{prefix}Across scenes")
+    tables += better_than_each_other(rows, f"{prefix}Better than each other")
     scenes = list(dict.fromkeys(row["spec"]["scene"] for row in rows))
-    matrices = {}
-    for planner in dict.fromkeys(map(_planner, rows)):
-        columns: list[list[float]] = [
-            [
-                row["result"][metric]
-                for row in finished(rows)
-                if (_planner(row), row["spec"]["scene"]) == (planner, scene)
-            ]
-            for scene in scenes
-        ]
-        count = min(map(len, columns))
-        if count:
-            matrices[planner] = np.array([column[:count] for column in columns]).T
-    return matrices
+    if len(scenes) > 1:
+        for scene in scenes:
+            of_scene = [row for row in pairs if row["spec"]["scene"] == scene]
+            tables.append(with_losses(headline.table(of_scene, prefix + scene), of_scene))
+    return tables
 
 
-def across_scenes(rows: Sequence[Row], baseline: str = "random") -> Table | None:
-    """rliable's interquartile mean and probability of improvement; None without rliable."""
-    scores = score_matrices(rows)
-    if not statistics.has_rliable() or not scores:
-        return None
-    means = statistics.interquartile_means(scores)
-    better: dict[str, statistics.Interval] = {}
-    if baseline in scores and len(scores) > 1:
-        better = statistics.improvement_probabilities(scores, baseline)
-    columns = ["planner", "f_score_5cm_iqm", *(["better_than_random"] if better else [])]
-    lines = [
-        {"planner": name, "f_score_5cm_iqm": means[name], "better_than_random": better.get(name)}
-        for name in sorted(means, key=lambda name: -means[name].value)
+def _charts(rows: Sequence[Row], task: str) -> list[Chart]:
+    """The charts of one task, whose name they have if there are several."""
+    ranking = Grouping(("planner",), (RANKED_BY,), rank_by=RANKED_BY).table(rows)
+    best = [str(line["planner"]) for line in ranking.rows]
+    label = short_planner_names(best).__getitem__
+    prefix, title = (f"{task}_", f"{task}: ") if task else ("", "")
+
+    def runs(name: str, key: str) -> list[Any]:
+        return [r["result"][key] for r in finished(rows) if r["spec"]["planner"] == name]
+
+    looks = max((row["result"]["looks_at_steps"] for row in finished(rows)), key=len)
+    curves = [
+        quartile_band(label(name), runs(name, "f_score_5cm_over_steps"), steps=looks)
+        for name in best
     ]
-    return make_table(columns, lines, "Across scenes")
+    errors = [quartile_band(label(name), runs(name, "ate_over_time"), _FLOOR_M) for name in best]
+    return [
+        Chart(
+            f"{prefix}f_score_over_steps",
+            f"{title}F-score over the steps",
+            "Line: median over episodes; band: between their quartiles.",
+            [Panel("looks_at_steps", "f_score_5cm_over_steps", curves)],
+        ),
+        Chart(
+            f"{prefix}planners",
+            f"{title}Measures by planner",
+            DOTS,
+            by_group(rows, "planner", _PANELS, ("ate_m",), best, label),
+        ),
+        Chart(
+            f"{prefix}f_score_ate",
+            f"{title}F-score against ATE",
+            "One mark an episode.",
+            [scatter(rows, "ate_m", RANKED_BY, "planner", "x", _FLOOR_M, label)],
+        ),
+        Chart(
+            f"{prefix}ate_over_time",
+            f"{title}Error over time",
+            "Line: median over episodes; band: between their quartiles.",
+            [Panel("steps", "ate_over_time", errors, "y")],
+        ),
+    ]

@@ -295,10 +295,18 @@ def scatter(
     return Panel(x, y, series, log)
 
 
-def quartile_band(name: str, runs: Sequence[Sequence[float]], floor: float = 0.0) -> Series:
-    """Median over runs at each step and its quartiles; one that ends early keeps its last value."""
+def quartile_band(
+    name: str,
+    runs: Sequence[Sequence[float]],
+    floor: float = 0.0,
+    steps: Sequence[float] | None = None,
+) -> Series:
+    """Median over runs at each step and its quartiles; one that ends early keeps its last value.
+
+    ``steps`` are those of the values of the longest run, by default 1, 2, 3, ...
+    """
     length = max(map(len, runs))
     padded = np.array([[*run, *[run[-1]] * (length - len(run))] for run in runs])
     low, middle, high = np.percentile(np.maximum(padded, floor), [25, 50, 75], axis=0)
-    steps = list(range(1, length + 1))
-    return Series(name, steps, middle.tolist(), low.tolist(), high.tolist(), "lines")
+    at = list(range(1, length + 1) if steps is None else steps[:length])
+    return Series(name, at, middle.tolist(), low.tolist(), high.tolist(), "lines")

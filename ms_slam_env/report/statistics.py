@@ -7,12 +7,15 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import combinations
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 Float64 = NDArray[np.float64]
+Key = TypeVar("Key")
 
 CONFIDENCE = 0.95
 _RESAMPLES = 2000
@@ -112,28 +115,32 @@ def interquartile_means(scores: dict[str, Float64]) -> dict[str, Interval]:
     )
 
 
-def improvement_probabilities(scores: dict[str, Float64], baseline: str) -> dict[str, Interval]:
-    """P(planner scores higher than ``baseline``), averaged across scenes, for the others.
+def improvement_matrix(scores: dict[str, Float64]) -> dict[tuple[str, str], Interval]:
+    """P(one planner scores higher than another), averaged across scenes, of all ordered pairs.
+
+    Equal scores count half, so that both ways of a pair add up to 1.
 
     Args:
         scores: planner to (episodes, scenes).
-        baseline: one of the planners.
     """
-    from rliable import metrics
+    pairs = {(a, b): [scores[a], scores[b]] for a, b in combinations(scores, 2)}
+    found = _rliable_intervals(pairs, _improvement, resamples=_RESAMPLES)
+    ways_back = {(b, a): Interval(1 - of.value, 1 - of.high, 1 - of.low)
+                 for (a, b), of in found.items()}  # fmt: skip
+    return {**found, **ways_back}
 
-    pairs = {name: [score, scores[baseline]] for name, score in scores.items() if name != baseline}
-    return _rliable_intervals(
-        pairs,
-        lambda x, y: np.array([metrics.probability_of_improvement(x, y)]),
-        resamples=_RESAMPLES // 4,  # each is a Mann-Whitney test a scene
-    )
+
+def _improvement(a: Float64, b: Float64) -> Float64:
+    """(1,) rliable's ``probability_of_improvement`` of (m, scenes) over (n, scenes), faster."""
+    more, equal = a[:, None] > b[None], a[:, None] == b[None]
+    return np.array([more.mean() + 0.5 * equal.mean()])
 
 
 def _rliable_intervals(
-    scores: Mapping[str, Float64 | list[Float64]],
+    scores: Mapping[Key, Float64 | list[Float64]],
     aggregate: Callable[..., Float64],
     resamples: int,
-) -> dict[str, Interval]:
+) -> dict[Key, Interval]:
     from rliable import library
 
     with _global_numpy_seed(0), warnings.catch_warnings():

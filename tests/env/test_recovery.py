@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -100,3 +101,15 @@ def test_what_was_done_instead_is_what_is_undone():
     planner.instead(21)  # so 2 was not undone, and 21 comes on top of it
     undone = [planner.act(None, LOST) for _ in range(3)]
     assert undone == [opposite(21), opposite(2), opposite(7)]
+
+
+def test_planner_and_environment_draw_differently_from_one_seed():
+    class Still(Planner):
+        def act(self, observation, info):
+            return 0
+
+    planner = Still(None, 7)
+    drawn = planner.rng.uniform(size=4)
+    of_env, _ = gymnasium.utils.seeding.np_random(7)
+    assert not np.isclose(drawn, of_env.uniform(size=4)).any()
+    np.testing.assert_array_equal(Still(None, 7).rng.uniform(size=4), drawn)

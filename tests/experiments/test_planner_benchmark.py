@@ -10,21 +10,25 @@ import numpy as np
 import pytest
 
 from ms_slam_env.errors import InputError
-from ms_slam_env.experiments import planners
 from ms_slam_env.experiments.harness.episodes import seed_list, short_planner_names
+from ms_slam_env.experiments.harness.planner_tables import DETAILS, HEADLINE, score_matrices
 from ms_slam_env.experiments.harness.running import write_all
-from ms_slam_env.experiments.planners import DETAILS, HEADLINE, PlannerBenchmark, score_matrices
+from ms_slam_env.experiments.planners import PlannerBenchmark
 from ms_slam_env.experiments.step_size import StepSize
 from ms_slam_env.report.records import Row, spec_key
 from ms_slam_env.report.results import read_results
 from ms_slam_env.report.statistics import Interval
+from ms_slam_env.tasks import OWN
 
 CONFIG = PlannerBenchmark(planners=("random", "greedy"), scenes=("table", "wall"), episodes=3)
 
 
 def result(score: float) -> dict[str, Any]:
     metrics: dict[str, Any] = dict.fromkeys((*HEADLINE, *DETAILS), score)
-    return {**metrics, "lost": score < 0.3, "ate_over_time": [0.001, 0.002, score]}
+    curve = {"looks_at_steps": [0, 5], "f_score_5cm_over_steps": [0.1, score]}
+    losses = {"losses": 2, "losses_not_recovered": int(score < 0.3)}
+    over_time = {"ate_over_time": [0.001, 0.002, score]}
+    return {**metrics, **curve, **losses, **over_time, "lost": score < 0.3, "energy_j": 0.0}
 
 
 def rows_of(config: PlannerBenchmark) -> list[Row]:
@@ -54,7 +58,9 @@ def test_best_f_score_comes_first() -> None:
 def test_failed_episodes_do_not_count() -> None:
     rows = rows_of(CONFIG)
     rows[0] = {**rows[0], "result": None, "error": "ValueError: x"}
-    assert "| random | 5 |" in CONFIG.tables(rows)[0].as_markdown()
+    text = CONFIG.tables(rows)[0].as_markdown()
+    assert "| random | 5 |" in text
+    assert "| greedy | 5 |" in text  # in pairs
     assert score_matrices(rows)["random"].shape == (2, 2)
 
 
@@ -83,7 +89,7 @@ def test_results_table_and_figures_are_written(tmp_path: Path) -> None:
     assert table.index("| greedy | 6 |") < table.index("| random | 6 |")
     assert "### wall" in table
     assert "commit abc" in table
-    names = {"planners.png", "f_score_ate.png", "ate_over_time.png"}
+    names = {"f_score_over_steps.png", "planners.png", "f_score_ate.png", "ate_over_time.png"}
     assert names <= {path.name for path in tmp_path.iterdir()}
     again = read_results(tmp_path / "results.json")
     assert [t.as_markdown() for t in again.tables] == [
@@ -93,10 +99,60 @@ def test_results_table_and_figures_are_written(tmp_path: Path) -> None:
 
 
 def test_without_rliable_the_rest_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(planners.statistics, "has_rliable", lambda: False)
+    monkeypatch.setattr("ms_slam_env.report.statistics.has_rliable", lambda: False)
     titles = [table.title for table in CONFIG.tables(rows_of(CONFIG))]
     assert "Across scenes" not in titles
     assert "wall" in titles
+
+
+def test_losses_count_together_and_energy_only_where_something_was_moved() -> None:
+    rows = rows_of(CONFIG)
+    table = CONFIG.tables(rows)[0]
+    columns = [column.name for column in table.columns]
+    assert columns[columns.index("lost") + 1 :][:2] == ["losses", "not_recovered_share"]
+    assert "energy_j" not in columns
+    lines: Any = {line["planner"]: line for line in table.rows}
+    assert lines["random"]["losses"] == 12
+    assert lines["random"]["not_recovered_share"].value == pytest.approx(4 / 12)  # scores .1, .2
+    assert lines["greedy"]["not_recovered_share"].value == 0
+    rows[0]["result"]["energy_j"] = 1.0
+    assert "energy_j" in [column.name for column in CONFIG.tables(rows)[0].columns]
+
+
+def test_every_planner_is_compared_with_every_other() -> None:
+    pytest.importorskip("rliable")
+    (table,) = [t for t in CONFIG.tables(rows_of(CONFIG)) if t.title == "Better than each other"]
+    lines: Any = table.rows
+    assert [line["planner"] for line in lines] == ["greedy", "random"]
+    assert (lines[0]["greedy"], lines[0]["random"].value) == (None, 1.0)
+    assert lines[1]["greedy"].value == 0.0
+
+
+def test_a_task_says_what_is_not_given() -> None:
+    arm = PlannerBenchmark(task="arm", planners=("random",)).specs()
+    assert {spec.env_id for spec in arm} == {"MSActiveSLAM-v0"}
+    assert {spec.scene for spec in arm} == {"window", "table", "wall", "carpet"}
+    assert {spec.steps for spec in arm} == {1800}
+    assert len(arm) == 40
+    few = PlannerBenchmark(task="disturbed", scenes=("table",), steps=7, step_m=0.05, episodes=2)
+    spec = few.specs()[0]
+    assert (spec.task, spec.steps, spec.step_m, spec.step_deg) == ("disturbed", 7, 0.05, 12)
+    assert len(few.specs()) == 2 * len(few.planners)
+
+
+def test_all_tasks_are_the_leaderboard() -> None:
+    board = PlannerBenchmark(task="all", planners=("random", "greedy"), scenes=("table",))
+    specs = board.specs()
+    assert {(spec.task, spec.seed) for spec in specs} == {
+        (task, seed) for task in OWN for seed in range(2000, 2025)
+    }
+    rows = [{"spec": vars(s), "result": result(0.5), "error": None} for s in specs]
+    titles = [table.title for table in board.tables(rows)]
+    assert [title for title in titles if title.endswith("over all scenes")] == [
+        f"{task}: over all scenes" for task in OWN
+    ]
+    assert {chart.name for chart in board.charts(rows)} > {"home_planners", "arm_planners"}
+    assert board.content(rows) == {"seeds": list(range(2000, 2025))}
 
 
 def test_names_are_as_long_as_it_takes_to_tell_planners_apart() -> None:
@@ -126,6 +182,7 @@ def test_every_planner_starts_from_the_same_seeds() -> None:
         ({"planners": ("greedy,rho_I",)}, "not option=value"),
         ({"planners": ("os:path",)}, "not a subclass"),
         ({"planners": ("nowhere:Planner",)}, "cannot be loaded"),
+        ({"task": "rom"}, "unknown task 'rom'; valid choices: room, home, arm, disturbed"),
         ({"scenes": ("mars",)}, "unknown scene 'mars'; valid choices: living_room"),
         ({"scenes": ("missing.glb",)}, "mesh file 'missing.glb' does not exist"),
         ({"scenes": ("pyproject.toml",)}, "unknown scene"),

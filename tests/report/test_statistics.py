@@ -77,14 +77,16 @@ def test_interquartile_mean_is_the_mean_of_the_middle_half() -> None:
     assert interval.low < interval.value < interval.high
 
 
-def test_improvement_probability_counts_pairs() -> None:
-    pytest.importorskip("rliable")
+def test_improvement_probability_is_rliables_and_adds_up_to_one() -> None:
+    metrics = pytest.importorskip("rliable.metrics")
     rng = np.random.default_rng(0)
-    a, b = rng.normal(0.3, 1, (6, 3)), rng.normal(0, 1, (5, 3))
-    expected = np.mean([(a[:, None, k] > b[None, :, k]).mean() for k in range(3)])
-    result = statistics.improvement_probabilities({"a": a, "b": b}, "b")
-    assert list(result) == ["a"]
-    assert result["a"].value == pytest.approx(expected)
+    a, b = np.round(rng.normal(0.3, 1, (6, 3))), np.round(rng.normal(0, 1, (5, 3)))  # ties
+    result = statistics.improvement_matrix({"a": a, "b": b})
+    assert set(result) == {("a", "b"), ("b", "a")}
+    there, back = result["a", "b"], result["b", "a"]
+    assert there.value == pytest.approx(metrics.probability_of_improvement(a, b))
+    assert (there.value + back.value, there.low + back.high) == pytest.approx((1, 1))
+    assert there.low < there.value < there.high
 
 
 def test_rliables_intervals_are_the_same_twice_and_leave_the_global_generator_alone() -> None:
@@ -95,7 +97,7 @@ def test_rliables_intervals_are_the_same_twice_and_leave_the_global_generator_al
     first, second = (
         (
             statistics.interquartile_means(scores),
-            statistics.improvement_probabilities(scores, "b"),
+            statistics.improvement_matrix(scores),
         )
         for _ in range(2)
     )

@@ -24,6 +24,28 @@ DOTS = "Small dots: episodes. Large mark and bar: median and its 95 % interval."
 """Caption of charts by `report.charts.by_group`."""
 
 
+def episode_specs(
+    given: Mapping[str, Any],
+    scenes: Sequence[str],
+    seeds: Sequence[int],
+    compared: Sequence[Mapping[str, Any]],
+) -> list[EpisodeSpec]:
+    """Scenes x seeds x what is compared; ``given`` says the fields that all have.
+
+    Raises:
+        InputError: a value out of range, or an unknown option.
+    """
+    known = {field.name for field in fields(EpisodeSpec)}
+    shared = {name: value for name, value in given.items() if name in known}
+    shared["options"] = parse_options(given["options"])
+    return [
+        EpisodeSpec(**{**shared, "scene": scene, "seed": seed, **different})
+        for scene in scenes
+        for seed in seeds
+        for different in compared
+    ]
+
+
 @dataclass(frozen=True)
 class EpisodeExperiment(Experiment):
     """Scenes x seeds x what is compared, every episode of a seed from the same start pose.
@@ -57,16 +79,9 @@ class EpisodeExperiment(Experiment):
     def specs(self) -> list[EpisodeSpec]:
         """Every episode; those of one scene and seed are neighbours and share its geometry."""
         check_names(self.planners, self.scenes)
-        known = {field.name for field in fields(EpisodeSpec)}
-        own = [field.name for field in fields(self) if field.name in known]
-        shared = {name: getattr(self, name) for name in own}
-        shared["options"] = parse_options(self.options)
-        return [
-            EpisodeSpec(**{**shared, "scene": scene, "seed": seed, **different})
-            for scene in self.scenes
-            for seed in seed_list(self.seeds, self.episodes)
-            for different in self.compared()
-        ]
+        own = {field.name: getattr(self, field.name) for field in fields(self)}
+        seeds = seed_list(self.seeds, self.episodes)
+        return episode_specs(own, self.scenes, seeds, self.compared())
 
     def prepare(self) -> None:
         """Start one episode of each planner."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -15,19 +15,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ms_slam_env
-from ms_slam_env import metrics, slam
+from ms_slam_env import slam
 from ms_slam_env.config import Checked, bounded, chosen, nested_options
 from ms_slam_env.env import ActiveSlamEnv, Planner
 from ms_slam_env.env.config import make_config
 from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.env.planners import check_planner, make_planner, planner_observation
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.evaluation.map_quality import map_quality
-from ms_slam_env.evaluation.map_truth import reference_of, true_surface
+from ms_slam_env.experiments.harness.episode_scores import (
+    MapScores,
+    measure_losses,
+    measure_trajectory,
+)
 from ms_slam_env.registration import ADAPTIVE_ID
 from ms_slam_env.scenes import SEED_SPLITS
 from ms_slam_env.scenes.mesh_file import load_soup
 from ms_slam_env.scenes.registry import check_name, is_mesh_file
+from ms_slam_env.tasks import find_task
 
 Float64 = NDArray[np.float64]
 
@@ -35,7 +39,6 @@ DEFAULT_PLANNERS = ("random", "stationary", "greedy", "max-information")
 DEFAULT_SCENES = ("living_room", "corridor", "table", "wall")
 DEFAULT_STEP_M = 0.12
 DEFAULT_STEP_DEG = 12.0
-LOST_ERROR_M = 0.3  # an estimate this far off is lost even where SLAM does not say so
 
 
 OWN_OPTIONS = (
@@ -52,12 +55,14 @@ class EpisodeSpec(Checked):
     Attributes:
         planner: ``NAME,option=value,...``.
         scene: a scene's name or a mesh file.
-        seed: of the scene, the start pose, the sensor noise and the planner.
+        seed: of the scene, the start pose, the sensor noise and, by way of a child of its own, the
+            planner.
         env_id: one of ``ms_slam_env.ENV_IDS``.
         steps: length of the episode.
         step_m: translation of a motion.
         step_deg: rotation of a motion.
         options: further options of the environment.
+        task: whose are the options that are not given, the perturbations and the reference.
     """
 
     planner: str
@@ -68,6 +73,7 @@ class EpisodeSpec(Checked):
     step_m: float = bounded(DEFAULT_STEP_M, 0, 1)
     step_deg: float = bounded(DEFAULT_STEP_DEG, 0, 90)
     options: dict[str, Any] = field(default_factory=dict)
+    task: str = "room"
 
     def __post_init__(self) -> None:
         """Refuse unknown choices and values out of range."""
@@ -76,6 +82,7 @@ class EpisodeSpec(Checked):
         except InputError as error:
             # Users know the fields as options of a command, not this class.
             raise InputError(str(error).replace("EpisodeSpec.", "")) from None
+        find_task(self.task)
         name = self.planner.partition(",")[0]
         if self.env_id == ADAPTIVE_ID and ":" not in name:
             raise InputError(
@@ -88,7 +95,7 @@ def run_episode(spec: EpisodeSpec) -> dict[str, Any]:
     """Run one episode and measure it.
 
     Returns:
-        the metrics by name, see :func:`measure_trajectory` and :func:`measure_map`, with
+        the metrics by name, see :mod:`.episode_scores`, with
         ``steps``, ``return``, ``decision_ms`` (mean time of a decision), ``ate_over_time``
         (running RMSE after each step, unaligned, metres), ``time_s`` (simulated) and ``energy_j``
         (mechanical work of the motion).
@@ -97,10 +104,13 @@ def run_episode(spec: EpisodeSpec) -> dict[str, Any]:
     try:
         world = cast(ActiveSlamEnv, env.unwrapped)
         planner = make_planner(spec.planner, world, spec.seed)
-        progress = play(env, planner, spec.seed)
+        maps = MapScores(world, spec.scene, spec.seed, find_task(spec.task).reference)
+        progress = play(env, planner, spec.seed, after_step=maps.after_step)
         trajectory = measure_trajectory(world)
         trajectory["lost"] |= progress["lost_steps_share"] > 0
-        return {**progress, **trajectory, **measure_map(world, spec)}
+        planned = spec.steps if progress["terminated"] else progress["steps"]
+        map_scores = maps.result(progress["steps"], planned)
+        return {**progress, **trajectory, **measure_losses(world), **map_scores}
     finally:
         env.close()
 
@@ -165,17 +175,26 @@ def make_env(spec: EpisodeSpec) -> gym.Env[Any, Any]:
             "step_m": spec.step_m,
             "step_rad": math.radians(spec.step_deg),
             "observation": planner_observation(spec.planner),
+            "task": spec.task,
             **spec.options,
         },
     )
 
 
 def play(
-    env: gym.Env[Any, Any], planner: Planner, seed: int, seconds: float = math.inf
+    env: gym.Env[Any, Any],
+    planner: Planner,
+    seed: int,
+    seconds: float = math.inf,
+    after_step: Callable[[int], None] = lambda step: None,
 ) -> dict[str, Any]:
-    """Play one episode to its end, or until ``seconds`` of simulated time have passed."""
+    """Play one episode to its end, or until ``seconds`` of simulated time have passed.
+
+    ``after_step`` is called with 0 after the reset, then with the number of each step after it.
+    """
     observation, info = env.reset(seed=seed)
     planner.reset()
+    after_step(0)
     total, decision_s, lost = 0.0, 0.0, []
     ate: list[float] = []
     over = False
@@ -188,6 +207,7 @@ def play(
         total += float(reward)
         ate.append(round(float(info["ate"]), 6))
         lost.append(not info["tracking_ok"])
+        after_step(len(ate))
     return {
         "steps": len(ate),
         "return": total,
@@ -198,50 +218,6 @@ def play(
         "energy_j": float(info["energy"]),
         "ate_over_time": ate,
     }
-
-
-def measure_trajectory(world: ActiveSlamEnv) -> dict[str, Any]:
-    """Trajectory metrics of the episode just played.
-
-    ``ate_m`` (RMSE) and ``ate_max_m`` after SE(3) alignment, ``ate_unaligned_m`` with the common
-    start as the only tie, ``rpe_m`` and ``rpe_rad`` per step, ``path_length_m`` of the true
-    trajectory, ``M_I`` and ``M_D`` (equations 11 and 12), ``violations`` (share of the frames after
-    the first that exceed the environment's M_I or M_D), and ``lost``: SLAM reported lost tracking
-    at some step, or was off by more than ``LOST_ERROR_M`` without noticing.
-    """
-    truth, estimate = world.episode.trajectory_truth, world.episode.trajectory_estimate
-    aligned = metrics.ate_statistics(estimate, truth)
-    divergences = world.episode.divergences[1:]
-    maxima = divergences.max(axis=0)
-    return {
-        "ate_m": aligned.rmse,
-        "ate_max_m": aligned.max,
-        "ate_unaligned_m": metrics.ate_rmse(estimate, truth, align="none"),
-        "rpe_m": metrics.rpe_rmse(estimate, truth),
-        "rpe_rad": metrics.rpe_rmse(estimate, truth, kind="rotation"),
-        "path_length_m": metrics.path_length(truth),
-        "M_I": float(maxima[0]),
-        "M_D": float(maxima[1]),
-        "violations": float((divergences > world.config.targets.maxima).any(axis=1).mean()),
-        "lost": bool(world.episode.pose_errors.max() > LOST_ERROR_M),
-    }
-
-
-def measure_map(world: ActiveSlamEnv, spec: EpisodeSpec) -> dict[str, float]:
-    """Map metrics, the map placed by its estimated poses; see :mod:`.map_truth` for the truth.
-
-    ``precision_*``, ``recall_*`` and ``f_score_*`` at 2 and 5 cm, ``rcm`` (the recall at 5 cm),
-    ``rer_m`` (RMS distance to the true surface after ICP), ``mapped_area_m2`` (true surface that a
-    tracked frame put less than 5 cm from its place, in faces of 5 cm voxels).
-
-    Judged is the whole map. Surfels that SLAM calls stable were seen in some ten frames: counting
-    only those would reward looking at one place for long.
-    """
-    x, y, z = map(float, world.episode.trajectory_truth[0][:3, 3])
-    surface = true_surface(spec.scene, spec.seed)
-    reference = reference_of(spec.scene, spec.seed, (x, y, z))
-    area = {"mapped_area_m2": world.coverage.mapped_area}
-    return {**map_quality(world.slam.map_points(), surface, reference=reference), **area}
 
 
 def parse_options(texts: Sequence[str]) -> dict[str, Any]:

@@ -1,0 +1,102 @@
+"""Tables that compare planners: losses together, and what rliable says across scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.experiments.harness.episodes import short_planner_names
+from ms_slam_env.report import statistics
+from ms_slam_env.report.records import Row
+from ms_slam_env.report.tables import Column, Table, finished, grouped, make_table
+
+RANKED_BY = "f_score_5cm"
+"""Standing still loses it by recall, getting lost by precision."""
+HEADLINE = (
+    *("f_score_5cm", "f_score_5cm_area", "f_score_2cm", "rcm", "ate_m", "lost"),
+    *("violations", "path_length_m", "energy_j", "decision_ms"),
+)
+DETAILS = ("ate_max_m", "rpe_m", "rer_m", "mapped_area_m2", "M_I", "M_D", "return")
+
+
+def with_losses(table: Table, rows: Sequence[Row]) -> Table:
+    """The table with the losses of each planner's episodes together, and those not recovered.
+
+    Without the energy where nothing with a mass was moved.
+    """
+    results = grouped(rows, ("planner",))
+    lines = []
+    for line in table.rows:
+        of = results[(line["planner"],)]
+        losses = sum(result["losses"] for result in of)
+        for_good = sum(result["losses_not_recovered"] for result in of)
+        share = statistics.share_interval(np.arange(losses) < for_good)
+        lines.append({**line, "losses": losses, "not_recovered_share": share})
+    moved = any(result["energy_j"] > 0 for of in results.values() for result in of)
+    columns = [column for column in table.columns if moved or column.name != "energy_j"]
+    after = 1 + [column.name for column in columns].index("lost")
+    columns[after:after] = [Column("losses"), Column("not_recovered_share")]
+    return replace(table, columns=tuple(columns), rows=tuple(lines))
+
+
+def score_matrices(rows: Sequence[Row], metric: str = RANKED_BY) -> dict[str, NDArray[np.float64]]:
+    """Scores (episodes, scenes) of each planner that finished an episode in every scene.
+
+    Scenes with more finished episodes than another lose the surplus, as rliable needs a matrix.
+    """
+    scenes = list(dict.fromkeys(row["spec"]["scene"] for row in rows))
+    matrices = {}
+    for planner in dict.fromkeys(map(_planner, rows)):
+        columns: list[list[float]] = [
+            [
+                row["result"][metric]
+                for row in finished(rows)
+                if (_planner(row), row["spec"]["scene"]) == (planner, scene)
+            ]
+            for scene in scenes
+        ]
+        count = min(map(len, columns))
+        if count:
+            matrices[planner] = np.array([column[:count] for column in columns]).T
+    return matrices
+
+
+def across_scenes(rows: Sequence[Row], title: str = "") -> list[Table]:
+    """rliable's interquartile means, best first; nothing without rliable."""
+    scores = score_matrices(rows)
+    if not statistics.has_rliable() or not scores:
+        return []
+    means = statistics.interquartile_means(scores)
+    lines = [{"planner": name, "f_score_5cm_iqm": means[name]} for name in _ranked(means)]
+    return [make_table(["planner", "f_score_5cm_iqm"], lines, title)]
+
+
+def better_than_each_other(rows: Sequence[Row], title: str = "") -> list[Table]:
+    """rliable's probability that a line's planner has a better score than a column's.
+
+    Nothing without rliable, or of a single planner.
+    """
+    scores = score_matrices(rows)
+    if not statistics.has_rliable() or len(scores) < 2:
+        return []
+    names = _ranked(statistics.interquartile_means(scores))
+    pairs = statistics.improvement_matrix({name: scores[name] for name in names})
+    label = short_planner_names(names)
+    columns = [Column(name, "improvement", label[name]) for name in names]
+    lines: list[dict[str, Any]] = [
+        {"planner": name, **{other: pairs.get((name, other)) for other in names}} for name in names
+    ]
+    note = "Probability that a line's planner has the better F-score, with 95 % intervals."
+    return [make_table(["planner", *columns], lines, title, note)]
+
+
+def _ranked(means: Mapping[str, statistics.Interval]) -> list[str]:
+    return sorted(means, key=lambda name: -means[name].value)
+
+
+def _planner(row: Mapping[str, Any]) -> str:
+    return str(row["spec"]["planner"])
