@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.experiments.harness.episodes import short_planner_names
 from ms_slam_env.report import statistics
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Column, Table, finished, grouped, make_table
+from ms_slam_env.report.tables import Column, Row, Table, finished, grouped, make_table
 
 RANKED_BY = "f_score_5cm"
 """Standing still loses it by recall, getting lost by precision."""
@@ -71,7 +70,9 @@ def across_scenes(rows: Sequence[Row], title: str = "") -> list[Table]:
     if not statistics.has_rliable() or not scores:
         return []
     means = statistics.interquartile_means(scores)
-    lines = [{"planner": name, "f_score_5cm_iqm": means[name]} for name in _ranked(means)]
+    lines: list[dict[str, Any]] = [
+        {"planner": name, "f_score_5cm_iqm": means[name]} for name in _ranked(means)
+    ]
     return [make_table(["planner", "f_score_5cm_iqm"], lines, title)]
 
 
