@@ -79,6 +79,19 @@ def write_text(path: Path, text: str) -> None:
     write_bytes(path, text.encode("utf-8", errors="replace"))
 
 
+def make_file(path: Path) -> None:
+    """Make an empty file where there is none, for libraries that write it themselves.
+
+    Raises:
+        InputError: ``path`` is a device or the like.
+        OSError: with the name of the file: no space, no right, a read-only disk.
+    """
+    _check_kind(path, "file")
+    with naming(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        os.close(os.open(path, os.O_RDWR | os.O_CREAT, 0o666))
+
+
 @contextmanager
 def growing_file(path: Path) -> Iterator[Callable[[str], None]]:
     """A new text file; what is given adds a line to it, which is there at once.

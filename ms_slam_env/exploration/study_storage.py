@@ -23,7 +23,16 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.exploration.objectives import FAILURE, METRICS, Measured, objective_values
 from ms_slam_env.exploration.settings import ExplorationSettings, make_sampler
 from ms_slam_env.exploration.space import SearchSpace
-from ms_slam_env.output_files import check_out_folder
+from ms_slam_env.exploration.study_check import (
+    DEFAULT,
+    MEASURED,
+    OWNER,
+    REFERENCE,
+    RETRIES,
+    RETRY_OF,
+    check_study,
+)
+from ms_slam_env.output_files import check_out_folder, make_file
 from ms_slam_env.slam.configuration import SlamConfiguration
 
 if TYPE_CHECKING:
@@ -34,14 +43,11 @@ STUDY_FILE, LOCK_FILE = "study.db", "study.lock"
 _NAME = "exploration"
 _MOST_RETRIES = 2  # of a trial whose process died; then its values may be what kills processes
 _LOCK_TIMEOUT_S = 600.0
-_DEFAULT, _OWNER, _RETRY_OF, _RETRIES = "default", "owner", "retry_of", "retries"
 _DISK_ERRORS = {
     "database or disk is full": errno.ENOSPC,
     "disk I/O error": errno.EIO,
     "attempt to write a readonly database": errno.EROFS,
 }  # by SQLite's messages, sqlite3.c
-MEASURED = "measured"
-"""User attribute of a finished trial: everything that its evaluation returned."""
 
 
 class StudyStorage:
@@ -61,7 +67,6 @@ class StudyStorage:
         self.folder, self.space, self.settings = folder, space, settings
         self.owner = process_name()
         check_out_folder(folder)
-        folder.mkdir(parents=True, exist_ok=True)
         with self._alone():
             self.study = self._open()
 
@@ -91,7 +96,7 @@ class StudyStorage:
                 self.settings.sampler, int(seed), self.settings.population
             )
             trial = self.study.ask(self.space.distributions())
-            trial.set_user_attr(_OWNER, self.owner)
+            trial.set_user_attr(OWNER, self.owner)
             return trial
 
     def tell(self, trial: Trial, measured: Measured) -> None:
@@ -104,7 +109,7 @@ class StudyStorage:
     def _tell(self, trial: Trial, measured: Measured) -> None:
         content = {name: _plain(value) for name, value in measured.items()}
         if self.reference() is None:
-            self.study.set_user_attr("reference", self._reference_from(content))
+            self.study.set_user_attr(REFERENCE, self._reference_from(content))
         trial.set_user_attr(MEASURED, content)
         for name in ("M_I", "M_D"):
             trial.set_user_attr(name, content.get(name))
@@ -139,7 +144,7 @@ class StudyStorage:
 
     def reference(self) -> dict[str, float] | None:
         """Where objectives stop to count, by name; None until the default has finished."""
-        return self.study.user_attrs.get("reference")
+        return self.study.user_attrs.get(REFERENCE)
 
     # -- Inside ------------------------------------------------------------------------------
 
@@ -152,32 +157,39 @@ class StudyStorage:
                 "exploration needs Optuna: pip install 'ms-slam-env[explore]'"
             ) from None
         optuna.logging.set_verbosity(optuna.logging.WARNING)
+        make_file(self.folder / STUDY_FILE)
+        with self._checked():
+            storage = RDBStorage(
+                f"sqlite:///{self.folder / STUDY_FILE}", engine_kwargs={"creator": self._connect}
+            )
+            study = optuna.create_study(
+                storage=storage,
+                study_name=_NAME,
+                directions=["minimize"] * len(self.settings.objectives),
+                load_if_exists=True,
+                sampler=optuna.samplers.RandomSampler(),
+            )
+            self._check_settings(study)
+            check_study(study, self.space, self.settings.objectives)
+        if not any(trial.user_attrs.get(DEFAULT) for trial in study.get_trials(deepcopy=False)):
+            study.enqueue_trial(self.space.defaults(), user_attrs={DEFAULT: True})
+        return study
+
+    @contextmanager
+    def _checked(self) -> Iterator[None]:
+        """Let whatever Optuna stumbles over in a file be one line that names it."""
         try:
             with self._disk_errors():
-                storage = RDBStorage(
-                    f"sqlite:///{self.folder / STUDY_FILE}",
-                    engine_kwargs={"creator": self._connect},
-                )
-                study = optuna.create_study(
-                    storage=storage,
-                    study_name=_NAME,
-                    directions=["minimize"] * len(self.settings.objectives),
-                    load_if_exists=True,
-                    sampler=optuna.samplers.RandomSampler(),
-                )
+                yield
         except Exception as error:
-            if isinstance(error, (OSError, MemoryError)):
+            if isinstance(error, (OSError, MemoryError, InputError)):
                 raise
             line = " ".join(str(error).split("\n")[0].split())
             raise InputError(f"{self.folder / STUDY_FILE}: not a study: {line}") from None
-        self._check_settings(study)
-        if not any(trial.user_attrs.get(_DEFAULT) for trial in study.get_trials(deepcopy=False)):
-            study.enqueue_trial(self.space.defaults(), user_attrs={_DEFAULT: True})
-        return study
 
     def _check_settings(self, study: Study) -> None:
         mine = self.settings.fingerprint(self.space)
-        theirs: dict[str, Any] = study.user_attrs.get("settings", {})
+        theirs: Mapping[str, Any] = dict(study.user_attrs.get("settings", {}))
         if not theirs:
             study.set_user_attr("settings", mine)
             study.set_user_attr("objectives", list(self.settings.objectives))
@@ -195,23 +207,23 @@ class StudyStorage:
 
         trials = self.study.get_trials(deepcopy=False)
         for trial in trials:
-            owner = trial.user_attrs.get(_OWNER)
+            owner = trial.user_attrs.get(OWNER)
             # Without an owner: its process died between asking and signing, which happen under the
             # lock that is held here.
             if trial.state == TrialState.RUNNING and (owner is None or not is_alive(owner)):
                 self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
         trials = self.study.get_trials(deepcopy=False)
-        redone = {trial.user_attrs.get(_RETRY_OF) for trial in trials}
+        redone = {trial.user_attrs.get(RETRY_OF) for trial in trials}
         for trial in trials:
-            retries = trial.user_attrs.get(_RETRIES, 0)
-            is_default = bool(trial.user_attrs.get(_DEFAULT))
+            retries = trial.user_attrs.get(RETRIES, 0)
+            is_default = bool(trial.user_attrs.get(DEFAULT))
             given_up = trial.state == TrialState.FAIL and trial.number not in redone
             if given_up and (retries < _MOST_RETRIES or is_default):
                 values = self.space.defaults() if is_default else trial.params
                 if set(values) == set(self.space.parameters):
-                    attributes = {_RETRY_OF: trial.number, _RETRIES: retries + 1}
+                    attributes = {RETRY_OF: trial.number, RETRIES: retries + 1}
                     if is_default:
-                        attributes[_DEFAULT] = True
+                        attributes[DEFAULT] = True
                     self.study.enqueue_trial(values, user_attrs=attributes)
 
     def _reference_from(self, measured: Mapping[str, Any]) -> dict[str, float]:
@@ -242,34 +254,38 @@ class StudyStorage:
     def _alone(self) -> Iterator[None]:
         """Hold the folder's lock; the system drops it when the process dies, however it dies."""
         path = self.folder / LOCK_FILE
-        try:
+        make_file(path)  # here the system says what is wrong; SQLite does not
+        with self._disk_errors(path):
             lock = sqlite3.connect(path, timeout=_LOCK_TIMEOUT_S, isolation_level=None)
-        except sqlite3.OperationalError as error:
-            raise InputError(f"{path}: {error}") from None
         try:
-            try:
+            with self._disk_errors(path):
                 lock.execute("BEGIN EXCLUSIVE")
-            except sqlite3.DatabaseError as error:  # no right to write, or another kind of file
-                raise InputError(f"{path}: {error}") from None
             with self._disk_errors():
                 yield
         finally:
             lock.close()
 
     @contextmanager
-    def _disk_errors(self) -> Iterator[None]:
-        """Let what SQLite says of a disk, through two libraries, be the system's error again."""
+    def _disk_errors(self, path: Path | None = None) -> Iterator[None]:
+        """Let what SQLite says of its file, through two libraries, be one line that names it.
+
+        Raises:
+            OSError: of the disk.
+            InputError: all else that it says: no right to write, another kind of file.
+        """
+        path = path or self.folder / STUDY_FILE
         try:
             yield
         except Exception as error:
             cause: BaseException | None = error
             while cause is not None and not isinstance(cause, sqlite3.Error):
                 cause = cause.__cause__ or cause.__context__
+            if cause is None or isinstance(error, InputError):
+                raise
             number = _DISK_ERRORS.get(str(cause))
             if number is None:
-                raise
-            path = str(self.folder / STUDY_FILE)
-            raise OSError(number, f"{os.strerror(number)} ({cause})", path) from error
+                raise InputError(f"{path}: {str(cause).splitlines()[0]}") from error
+            raise OSError(number, f"{os.strerror(number)} ({cause})", str(path)) from error
 
 
 def _plain(value: Any) -> Any:

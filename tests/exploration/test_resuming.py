@@ -161,14 +161,14 @@ def test_another_exploration_in_the_folder_is_refused(tmp_path):
 
 def test_a_file_that_is_no_study_is_one_clear_line(tmp_path):
     (tmp_path / "study.db").write_text("no database at all, but long enough to be read as one" * 9)
-    with pytest.raises(InputError, match=r"study\.db: not a study") as caught:
+    with pytest.raises(InputError, match=r"study\.db: file is not a database") as caught:
         StudyStorage(tmp_path, fake_space(), ExplorationSettings())
     assert "\n" not in str(caught.value)
 
 
 def test_a_lock_that_cannot_be_taken_is_one_clear_line(tmp_path):
     (tmp_path / "study.lock").mkdir()
-    with pytest.raises(InputError, match=r"study\.lock: unable to open"):
+    with pytest.raises(InputError, match=r"study\.lock is a folder; a file is needed"):
         StudyStorage(tmp_path, fake_space(), ExplorationSettings())
 
 

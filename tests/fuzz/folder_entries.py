@@ -130,7 +130,7 @@ def mutated_study(data: bytes, rng: Rng) -> bytes:
         tables = [name for (name,) in connection.execute(names)]
         for _ in range(rng.integers(1, 4)):
             table = tables[rng.integers(len(tables))]
-            with contextlib.suppress(sqlite3.Error, UnicodeEncodeError):
+            with contextlib.suppress(sqlite3.Error, UnicodeEncodeError, OverflowError):
                 _mutate_table(connection, table, rng)
         connection.commit()
         return connection.serialize()
@@ -264,7 +264,7 @@ def rows() -> Files:
 
 ENTRIES = [
     Entry("policy", policy, mutated_policy, call_policy),
-    Entry("study", study, mutated_study, call_study, in_tests=0),
+    Entry("study", study, mutated_study, call_study),
     Entry("report", results, mutated_results, call_report),
     Entry("records", rows, mutated_folder, call_records),
 ]
