@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ms_slam_env.command_line import parse
+from ms_slam_env.command_line import parse, report_failures
 
 
 @dataclass(frozen=True)
@@ -73,6 +73,7 @@ def main(arguments: Sequence[str]) -> int:
         SlamEvaluator,
         run_exploration,
     )
+    from ms_slam_env.exploration.objectives import FAILURE
     from ms_slam_env.slam.configuration import SlamConfiguration, read_configuration
 
     names = " ".join((*args.objectives, *args.constraints))
@@ -98,4 +99,5 @@ def main(arguments: Sequence[str]) -> int:
     exploration = Exploration(evaluator, settings, args.parameters, base, args.held_out)
     results = run_exploration(exploration, args.out, args.trials, args.workers, args.ray)
     print(results.as_markdown())
-    return 0
+    failed = [row["result"].get(FAILURE) for row in results.rows]
+    return report_failures(failed if all(failed) else [])

@@ -72,6 +72,7 @@ def main(arguments: Sequence[str]) -> int:
     """Run, write, and print what was measured."""
     args = parse(Arguments, arguments, "ms-slam run")
     from ms_slam_env.config import nested_options
+    from ms_slam_env.evaluation.run_sequence import lost_throughout
     from ms_slam_env.evaluation.run_to_folder import run_to_folder
     from ms_slam_env.parallel import limit_threads
     from ms_slam_env.sequences import open_sequence
@@ -115,6 +116,7 @@ def main(arguments: Sequence[str]) -> int:
     params = merged(slam.slam_config, nested_options(args.params))
     fed = {"keep_every": slam.keep_every, "threads": slam.threads}
     _say_what_is_missing(sequence)
+    sequence.check_depth()
     result = run_to_folder(
         sequence,
         slam.slam,
@@ -133,7 +135,9 @@ def main(arguments: Sequence[str]) -> int:
         print(f"{'ene_j':16} {result['ene_source']}")
     for reason in result["lost_reasons"]:
         print(f"lost {reason}", file=sys.stderr)
-    _refuse_lost(sequence, result["processed_frames"], result["lost_frames"])
+    complaint = lost_throughout(result["processed_frames"], result["lost_frames"])
+    if complaint:
+        raise RuntimeError(f"sequence {sequence.name}: {complaint}")
     return 0
 
 
@@ -143,16 +147,3 @@ def _say_what_is_missing(sequence: RGBDSequence) -> None:
         print("no colour: SLAM has depth alone", file=sys.stderr)
     if sequence.true_trajectory() is None:
         print("no true trajectory: errors are not measured", file=sys.stderr)
-
-
-def _refuse_lost(sequence: RGBDSequence, processed: int, lost: int) -> None:
-    """Fail where nothing was tracked beyond the frame that the map began with.
-
-    Raises:
-        RuntimeError: saying so.
-    """
-    if lost < max(1, processed - 1):
-        return
-    if not any(frame.depth.any() for frame in sequence.frames):
-        raise RuntimeError(f"sequence {sequence.name}: no frame has a depth reading")
-    raise RuntimeError(f"sequence {sequence.name}: lost in {lost} of {processed} frames")

@@ -223,6 +223,16 @@ def run_sequence(
     return run
 
 
+def lost_throughout(processed: int, lost: int) -> str:
+    """A complaint where nothing was tracked beyond the frame that the map began with, else empty.
+
+    Args:
+        processed: frames that SLAM has seen.
+        lost: those of them without tracking.
+    """
+    return f"lost in {lost} of {processed} frames" if lost >= max(1, processed - 1) else ""
+
+
 class _Stopwatch:
     """Measures time alone, without the processes' memory and energy that a `CostMeter` reads."""
 

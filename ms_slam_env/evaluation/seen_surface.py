@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics
+from ms_slam_env.errors import InputError
 from ms_slam_env.geometry.point_clouds import voxel_downsample
 from ms_slam_env.sequences import CameraPath, Sequence, open_sequence
 
@@ -27,8 +28,9 @@ def seen_surface(sequence: Sequence, cutoff_m: float = CUTOFF_M) -> Float64:
     true poses, which must be known.
 
     Raises:
-        InputError: no reading at all.
+        InputError: no reading at all, or none up to ``cutoff_m``.
     """
+    sequence.check_depth()
     picked = np.unique(np.linspace(0, len(sequence) - 1, _MOST_VIEWS).astype(np.int64))
     clouds = [
         back_projected(
@@ -36,7 +38,10 @@ def seen_surface(sequence: Sequence, cutoff_m: float = CUTOFF_M) -> Float64:
         )
         for k in picked
     ]
-    return voxel_downsample(np.concatenate(clouds), SURFACE_SPACING_M)
+    cloud = np.concatenate(clouds)
+    if not len(cloud):
+        raise InputError(f"sequence {sequence.name}: no depth reading up to {cutoff_m:g} m")
+    return voxel_downsample(cloud, SURFACE_SPACING_M)
 
 
 def back_projected(
@@ -64,7 +69,8 @@ def open_with_surface(text: str, image_size: str, path: CameraPath) -> SequenceW
     """The sequence that ``text`` names, at ``image_size``; ``path`` is that of rendered ones.
 
     Raises:
-        InputError: a sequence that cannot be made or read, or a recording without truth.
+        InputError: a sequence that cannot be made or read, or a recording without truth or without
+            a depth reading.
     """
     sequence = open_sequence(text, image_size, path=path, with_truth=True)
     surface = seen_surface(sequence)

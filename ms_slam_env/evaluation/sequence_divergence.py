@@ -6,7 +6,7 @@ divergence, such as mean and variance, to the sequence"; "evaluated per unit of 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -123,7 +123,8 @@ def sequence_divergence(
         )
     frames = (sequence.frames[k] for k in tqdm(picked, desc=sequence.name, unit="frame"))
     config, K = config or DivergenceConfig(), sequence.intrinsics
-    values = consecutive_divergences(_with_depth(frames, sequence.name), K, [config])[:, 0]
+    sequence.check_depth()
+    values = consecutive_divergences(frames, K, [config])[:, 0]
     if not sequence.has_color:
         values[:, 0] = np.nan
     times = sequence.timestamps[list(picked)]
@@ -135,16 +136,6 @@ def sequence_divergence(
     return SequenceDivergence(
         sequence.name, times[1:] - times[0], values, np.diff(times), later, files
     )
-
-
-def _with_depth(frames: Iterable[RGBDFrame], name: str) -> Iterator[RGBDFrame]:
-    """The frames; refuse, at their end, those that are all without a depth reading."""
-    has_depth = False
-    for frame in frames:
-        has_depth = has_depth or bool(frame.depth.any())
-        yield frame
-    if not has_depth:
-        raise InputError(f"sequence {name}: no frame has a depth reading")
 
 
 # -- Results -----------------------------------------------------------------------------------

@@ -110,6 +110,7 @@ class Compare(Experiment, Checked):
 
     workers = 1
     fresh_process = True
+    tracks = True
 
     def __post_init__(self) -> None:
         """Refuse what no run could use."""

@@ -73,6 +73,7 @@ class Usme(Experiment, Checked):
 
     workers = 1
     fresh_process = True
+    tracks = True
 
     def __post_init__(self) -> None:
         """Refuse what cannot be rendered."""

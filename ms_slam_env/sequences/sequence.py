@@ -103,6 +103,15 @@ class Sequence:
         """Depth (H, W) in metres of what frame ``index`` shows, as truly as it is known."""
         return self.frames[index].depth
 
+    def check_depth(self) -> None:
+        """Refuse frames that show nothing at all.
+
+        Raises:
+            InputError: no frame has a depth reading.
+        """
+        if not any(frame.depth.any() for frame in self.frames):
+            raise InputError(f"sequence {self.name}: no frame has a depth reading")
+
     def picked(self, indices: NDArray[np.integer]) -> Sequence:
         """The same sequence with the frames of these numbers (M,) only, increasing."""
         frames = tuple(self.frames[int(index)] for index in indices)

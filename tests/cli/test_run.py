@@ -271,7 +271,8 @@ def test_a_sequence_that_shows_nothing_fails_in_words(tmp_path, capsys):
     for index in range(3):
         Image.fromarray(np.zeros((60, 80), np.uint16)).save(folder / f"depth/{index}.png")
     (folder / "intrinsics.txt").write_text("71 71 39.5 29.5 80 60 1000")
-    assert main(["run", str(folder), "--backend", "odometry", "--out", str(tmp_path / "out")]) == 1
+    assert main(["run", str(folder), "--backend", "odometry", "--out", str(tmp_path / "out")]) == 2
+    assert not list((tmp_path / "out").rglob("*"))
     said = capsys.readouterr().err
     assert "no colour: SLAM has depth alone" in said
     assert "no true trajectory: errors are not measured" in said

@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 from large_scenes import SEED
+from PIL import Image
 
 from ms_slam_env import scenes, slam
 from ms_slam_env.cli import main
@@ -86,15 +87,23 @@ def test_make_writes_what_run_reads(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(usme, "limit_threads", lambda _: None)
     monkeypatch.setattr(running, "run_all", run_here)
     ran = ["usme", "run", str(tmp_path / "made"), *few, "--backends", "odometry"]
-    assert main([*ran, "--out", str(tmp_path / "out")]) == 0
-    text = capsys.readouterr().out
+    assert main([*ran, "--out", str(tmp_path / "out")]) == 1  # ten frames of a path for hundreds
+    text, said = capsys.readouterr()
     assert "| room-fast | odometry |" in text
+    assert said.endswith("sequence room-fast, backend odometry: lost in 9 of 10 frames\n")
     content = json.loads((tmp_path / "out/results.json").read_text())
     assert content["rows"][0]["result"]["frames"] >= 5
     assert (tmp_path / "out/usme.png").stat().st_size > 1000
     other = [*ran, "--seed", "7", "--out", str(tmp_path / "other")]
     assert main(other) == 2
     assert "another seed" in capsys.readouterr().err
+    for path in (tmp_path / "made/room-fast/depth").iterdir():
+        Image.fromarray(np.zeros((60, 80), np.uint16)).save(path)
+    (blank,) = usme.Usme(
+        tmp_path / "made", ("odometry",), ("room-fast",), "80x60", SEED, 0.02
+    ).specs()
+    with pytest.raises(InputError, match="sequence room-fast: no frame has a depth reading"):
+        usme_runs.run_usme(blank)
 
 
 @pytest.mark.parametrize(

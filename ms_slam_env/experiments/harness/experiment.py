@@ -24,6 +24,8 @@ class Experiment(ABC):
         workers: processes by default; None: one a core. 1 where times are measured.
         fresh_process: run each row in a process of its own, because peak memory is one number for
             the life of a process.
+        tracks: rows are runs of a backend over a sequence; one that is lost all along is complained
+            about.
         check_rows: how many rows ``--check`` runs again.
     """
 
@@ -31,6 +33,7 @@ class Experiment(ABC):
     rows_key: ClassVar[str] = "rows"
     workers: ClassVar[int | None] = None
     fresh_process: ClassVar[bool] = False
+    tracks: ClassVar[bool] = False
     check_rows: ClassVar[int] = 2
 
     @abstractmethod

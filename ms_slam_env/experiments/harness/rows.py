@@ -11,11 +11,13 @@ from typing import Any
 from tqdm import tqdm
 
 from ms_slam_env.errors import InputError
+from ms_slam_env.evaluation.run_sequence import lost_throughout
 from ms_slam_env.interrupts import kept
 from ms_slam_env.output_files import check_out_folder
 from ms_slam_env.parallel import Outcome, one_thread_unless_set, open_pool, run_each
 from ms_slam_env.report.provenance import git_commit
 from ms_slam_env.report.records import RecordFile, Row, spec_key
+from ms_slam_env.report.tables import finished
 
 RECORDS = "rows.jsonl"
 _NAMING = ("planner", "scene", "sequence", "backend", "seed")  # what a person calls the work by
@@ -94,6 +96,18 @@ def failures(rows: Sequence[Row]) -> list[str]:
         return []
     name_of = names({row["key"]: row["spec"] for row in rows})
     return [f"{name_of[row['key']]}: {row['error']}" for row in failed]
+
+
+def lost_runs(rows: Sequence[Row]) -> list[str]:
+    """The runs over sequences, with ``frames`` and ``lost_share``, that were lost all along."""
+    found = []
+    for row in finished(rows):
+        frames, share = row["result"]["frames"], row["result"]["lost_share"]
+        complaint = lost_throughout(frames, round(share * frames))
+        if complaint:
+            spec = row["spec"]
+            found.append(f"sequence {spec['sequence']}, backend {spec['backend']}: {complaint}")
+    return found
 
 
 def names(specs: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:

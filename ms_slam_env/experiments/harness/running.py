@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ms_slam_env.experiments.harness.experiment import Experiment
-from ms_slam_env.experiments.harness.rows import check_any_finished, failures, run_all
+from ms_slam_env.experiments.harness.rows import check_any_finished, failures, lost_runs, run_all
 from ms_slam_env.report.records import Row, from_plain, to_plain
 from ms_slam_env.report.results import RESULTS, Results, write_result_folder
 
@@ -20,7 +20,7 @@ class Outcome:
 
     Attributes:
         results: as written.
-        failures: errors of the rows that failed, one line each.
+        failures: errors of the rows that failed and complaints of the others, one line each.
     """
 
     results: Results
@@ -55,7 +55,8 @@ def run_experiment(
         environment=experiment.environment(),
     )
     check_any_finished(rows)
-    return Outcome(write_all(experiment, rows, out), failures(rows))
+    wrong = [*failures(rows), *(lost_runs(rows) if experiment.tracks else [])]
+    return Outcome(write_all(experiment, rows, out), wrong)
 
 
 def write_all(experiment: Experiment, rows: Sequence[Row], out: Path) -> Results:

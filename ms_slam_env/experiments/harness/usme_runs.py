@@ -20,7 +20,7 @@ from ms_slam_env.geometry import transform_points
 from ms_slam_env.scenes import Scene
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sequences import RenderedSequence
-from ms_slam_env.sequences.recording import open_recording
+from ms_slam_env.sequences.recording import open_recording, recorded_sequence
 from ms_slam_env.sequences.usme_suite import find, render
 
 Float64 = NDArray[np.float64]
@@ -136,17 +136,19 @@ def _frames(sequence: RenderedSequence, folder: str | None) -> Iterator[RGBDFram
     """The frames, from a folder if there is one.
 
     Raises:
-        InputError: the folder holds another number of frames than the sequence has.
+        InputError: the folder holds another number of frames than the sequence has, or none with a
+            depth reading.
     """
     if folder is None:
         yield from sequence.frames
         return
-    recording = open_recording(Path(folder))
+    recording = recorded_sequence(open_recording(Path(folder)))
     if len(recording) != len(sequence):
         raise InputError(
             f"{folder} holds {len(recording)} frames, but the sequence has {len(sequence)}"
         )
-    yield from recording
+    recording.check_depth()
+    yield from recording.frames
 
 
 def _final_ate(run: SequenceRun, truth: Float64) -> float | None:
