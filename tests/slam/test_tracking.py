@@ -14,17 +14,19 @@ from ms_slam_env.camera import Intrinsics, xtion
 from ms_slam_env.geometry import invert, look_at, relative_angle, se3_exp
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.alignment_check import TrackingStatus
-from ms_slam_env.slam.surfel import normal_equations as ne
+from ms_slam_env.slam.surfel import alignment_arrays as aa
 from ms_slam_env.slam.surfel.acceptance import (
     acceptance_thresholds,
 )
 from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.gauss_newton import weights_of
+from ms_slam_env.slam.surfel.normal_equations import accumulate_normal_equations
 from ms_slam_env.slam.surfel.photometry import same_exposure
 from ms_slam_env.slam.surfel.pose_hypotheses import NUM_HYPOTHESES, tracking_hypotheses
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame, Preprocessor
 from ms_slam_env.slam.surfel.rendering import ModelView
 from ms_slam_env.slam.surfel.solver import reduce_sums
-from ms_slam_env.slam.surfel.tracker import Tracker, weights_of
+from ms_slam_env.slam.surfel.tracker import Tracker
 
 SMALL = Intrinsics(fx=24.0, fy=24.0, cx=15.5, cy=11.5, width=32, height=24)
 T_WORLD_MODEL = look_at([-0.8, -0.8, 1.2], [1.2, 0.1, 0.5])
@@ -34,8 +36,8 @@ LIGHT = same_exposure(1)
 LIGHT["gain"], LIGHT["bias"], LIGHT["scale"], LIGHT["trust"] = 0.9, 9.0, 1.7, 0.6
 
 
-def _weights(icp: float = 1.0, rgb: float = 1.0) -> ne.Weights:
-    weights = ne.Weights()
+def _weights(icp: float = 1.0, rgb: float = 1.0) -> aa.Weights:
+    weights = aa.Weights()
     weights.icp, weights.rgb = icp, rgb
     weights.per_depth_noise = 1 / 0.003
     weights.per_cauchy_icp, weights.per_cauchy_rgb = 0.5, 1.0
@@ -71,21 +73,21 @@ def _synthetic(seed: int = 0) -> dict[str, np.ndarray]:
 
 def _device_sums(data, T, weights, stride=1, columns=1 << 20, light=LIGHT):
     kinds = [wp.vec3, wp.vec3, wp.float32, wp.vec3, wp.vec3, wp.vec3]
-    images = ne.AlignedImages()
+    images = aa.AlignedImages()
     for (name, values), kind in zip(data.items(), kinds, strict=True):
         setattr(images, name, wp.array(values.astype(np.float32), dtype=kind).flatten())
     images.model_size = images.live_size = wp.vec2i(SMALL.width, SMALL.height)
     images.focal, images.centre = wp.vec2(SMALL.fx, SMALL.fy), wp.vec2(SMALL.cx, SMALL.cy)
     columns = min(columns, SMALL.width)
     rows, pieces = -(-SMALL.height // stride), -(-SMALL.width // columns)
-    one = ne.Hypotheses()
+    one = aa.Hypotheses()
     one.pose = wp.array(T[None, None], dtype=wp.mat44d)
-    one.state = wp.array([[ne.RUNNING]], dtype=wp.int32)
-    one.photometry = wp.array(light[:, None], dtype=ne.Photometry)
-    one.partial = wp.zeros((1, 1, rows * pieces, ne.NUM_SUMS), dtype=wp.float32)
-    one.sums = wp.zeros((1, 1, ne.NUM_SUMS), dtype=wp.float64)
+    one.state = wp.array([[aa.RUNNING]], dtype=wp.int32)
+    one.photometry = wp.array(light[:, None], dtype=aa.Photometry)
+    one.partial = wp.zeros((1, 1, rows * pieces, aa.NUM_SUMS), dtype=wp.float32)
+    one.sums = wp.zeros((1, 1, aa.NUM_SUMS), dtype=wp.float64)
     inputs = [images, weights, stride, columns, one]
-    wp.launch(ne.accumulate_normal_equations, dim=(1, 1, rows, pieces), inputs=inputs)
+    wp.launch(accumulate_normal_equations, dim=(1, 1, rows, pieces), inputs=inputs)
     wp.launch(reduce_sums, dim=one.sums.shape, inputs=[one, rows * pieces])
     return one.sums.numpy()[0, 0]
 
@@ -158,8 +160,8 @@ def test_normal_equations_equal_the_loop_over_points(columns):
     sums = _device_sums(data, T, weights, columns=columns)
     H, g, num_icp, num_rgb = _expected_system(data, T, weights)
     assert num_icp > 300
-    assert num_rgb == sums[ne.Sum.TEXTURED]
-    for term, first in enumerate((0, ne.Sum.PHOTOMETRIC_HESSIAN)):
+    assert num_rgb == sums[aa.Sum.TEXTURED]
+    for term, first in enumerate((0, aa.Sum.PHOTOMETRIC_HESSIAN)):
         scale = np.sqrt(np.diag(H[term]))
         actual = np.zeros((6, 6))
         actual[np.triu_indices(6)] = sums[first : first + 21]
@@ -175,12 +177,12 @@ def _expected_counts(data, T, config: SurfelConfig):
     """Places of ``Sum`` whose values are numbers of points, by the rules of ``config``."""
     counts, inverse, rules = Counter(), invert(T), config.acceptance
     for v, u in np.argwhere(data["model_vertices"][..., 2] > 0):
-        counts[ne.Sum.POINTS] += 1
+        counts[aa.Sum.POINTS] += 1
         q = inverse[:3, :3] @ data["model_vertices"][v, u] + inverse[:3, 3]
         x, y = SMALL.project(q)
         if not (0 <= x < SMALL.width - 1 and 0 <= y < SMALL.height - 1):
             continue
-        counts[ne.Sum.VISIBLE] += 1
+        counts[aa.Sum.VISIBLE] += 1
         near = int(y + 0.5), int(x + 0.5)
         live = data["live_vertices"][near]
         gap = abs(live[2] - q[2])
@@ -190,14 +192,14 @@ def _expected_counts(data, T, config: SurfelConfig):
             n = inverse[:3, :3] @ data["model_normals"][v, u]
             angle_deg = np.degrees(np.arccos(n @ data["live_normals"][near]))
             is_near = not is_other and angle_deg < config.icp_angle_deg
-            counts[ne.Sum.MATCHED] += 1
-            counts[ne.Sum.INLIERS] += is_near and abs(n @ (live - q)) < rules.inlier_sigmas * sigma
-            counts[ne.Sum.DEPTH_CONFLICTS] += gap > rules.conflict_sigmas * sigma
+            counts[aa.Sum.MATCHED] += 1
+            counts[aa.Sum.INLIERS] += is_near and abs(n @ (live - q)) < rules.inlier_sigmas * sigma
+            counts[aa.Sum.DEPTH_CONFLICTS] += gap > rules.conflict_sigmas * sigma
         grey, *slope = _bilinear(data["live_gradient"], x, y)
         if not is_other and np.abs(slope).sum() > rules.texture:
             residual = abs(grey - np.clip(data["model_intensity"][v, u], 0, 255))
-            counts[ne.Sum.TEXTURED] += 1
-            counts[ne.Sum.PHOTOMETRIC_INLIERS] += residual < rules.photometric_inlier
+            counts[aa.Sum.TEXTURED] += 1
+            counts[aa.Sum.PHOTOMETRIC_INLIERS] += residual < rules.photometric_inlier
     return counts
 
 
@@ -217,8 +219,8 @@ def test_the_points_that_fit_are_those_that_the_options_name(changed):
     expected = _expected_counts(data, T, config)
     assert {place: sums[place] for place in expected} == expected
     if not changed:
-        assert 0.3 < expected[ne.Sum.INLIERS] / expected[ne.Sum.MATCHED] < 0.8
-        assert 0.3 < expected[ne.Sum.PHOTOMETRIC_INLIERS] / expected[ne.Sum.TEXTURED] < 0.9
+        assert 0.3 < expected[aa.Sum.INLIERS] / expected[aa.Sum.MATCHED] < 0.8
+        assert 0.3 < expected[aa.Sum.PHOTOMETRIC_INLIERS] / expected[aa.Sum.TEXTURED] < 0.9
 
 
 @pytest.mark.parametrize("term", ["icp", "rgb"])
@@ -260,7 +262,7 @@ def test_stride_looks_at_a_chessboard_of_points():
     expected = sum(
         (data["model_vertices"][v, c, 2] > 0).sum() for v, c in zip(rows, columns, strict=True)
     )
-    assert _device_sums(data, np.eye(4), weights, stride=2)[ne.Sum.POINTS] == expected
+    assert _device_sums(data, np.eye(4), weights, stride=2)[aa.Sum.POINTS] == expected
 
 
 class _Pair:
@@ -311,6 +313,20 @@ def test_known_motions_are_recovered(pair, twist):
     assert np.linalg.norm(estimate[:3, 3] - truth[:3, 3]) < 0.006
     assert relative_angle(estimate[:3, :3], truth[:3, :3]) < np.radians(0.3)
     np.testing.assert_allclose(T_WORLD_MODEL @ alignment.T_model_live[0], estimate, atol=1e-12)
+
+
+@pytest.mark.parametrize("twist", [[0.01, 0, 0, 0, 0.01, 0], [-0.1, 0, 0, 0, 0, np.radians(-10)]])
+def test_all_iterations_of_a_level_at_once_are_those_of_single_launches(pair, twist):
+    model, live = pair.live(0, T_WORLD_MODEL), pair.live(1, T_WORLD_MODEL @ se3_exp(twist))
+    assert pair.tracker.gauss_newton.at_once
+    at_once = pair.align(model, live)
+    try:
+        pair.tracker.gauss_newton.at_once = False
+        one_by_one = pair.align(model, live)
+    finally:
+        pair.tracker.gauss_newton.at_once = True
+    for name, values in vars(at_once).items():
+        assert values.tobytes() == getattr(one_by_one, name).tobytes(), name
 
 
 def test_a_frame_without_depth_has_too_few_points(pair):

@@ -20,6 +20,7 @@ from ms_slam_env.slam.alignment_check import (
     evaluate_on_device,
 )
 from ms_slam_env.slam.base import Float64
+from ms_slam_env.slam.surfel.alignment_arrays import Hypotheses, Sum
 from ms_slam_env.slam.surfel.config import AcceptanceConfig
 from ms_slam_env.slam.surfel.degeneracy import (
     eigen,
@@ -29,7 +30,6 @@ from ms_slam_env.slam.surfel.degeneracy import (
     pose_covariance,
     vec6d,
 )
-from ms_slam_env.slam.surfel.normal_equations import Hypotheses, Sum
 from ms_slam_env.slam.surfel.solver import (
     cholesky,
     cholesky_solve,

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.state import Saved
+from ms_slam_env.slam.surfel.alignment_arrays import Photometry
 from ms_slam_env.slam.surfel.device import (
     HostDeviceBuffer,
     KernelLaunchCache,
@@ -23,7 +24,6 @@ from ms_slam_env.slam.surfel.device import (
     put,
     threads_per_row,
 )
-from ms_slam_env.slam.surfel.normal_equations import Photometry
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
 
 Bool = NDArray[np.bool_]

@@ -7,6 +7,16 @@ Lie theory" (2018), equations (172) and (174).
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
+from ms_slam_env.slam.surfel.alignment_arrays import (
+    NUM_SUMS,
+    RESTING,
+    RUNNING,
+    AlignedImages,
+    Hypotheses,
+    Photometry,
+    Sum,
+    Weights,
+)
 from ms_slam_env.slam.surfel.degeneracy import (
     gradient_in_metres,
     in_metres,
@@ -15,19 +25,24 @@ from ms_slam_env.slam.surfel.degeneracy import (
     turning_length,
     vec6d,
 )
-from ms_slam_env.slam.surfel.normal_equations import RESTING, RUNNING, Hypotheses, Photometry, Sum
+from ms_slam_env.slam.surfel.normal_equations import accumulate_row
 
 
-@wp.kernel
-def reduce_sums(hypotheses: Hypotheses, slots: wp.int32):
-    """Add up the partial sums of every active hypothesis, always in the same order."""
-    b, k, i = wp.tid()
-    if hypotheses.state[b, k] != RUNNING:
-        return
+@wp.func
+def reduce_sum(hypotheses: Hypotheses, slots: int, b: int, k: int, i: int):
+    """Add up one of the partial sums of hypothesis k of env b, always in the same order."""
     total = wp.float64(0.0)
     for slot in range(slots):
         total += wp.float64(hypotheses.partial[b, k, slot, i])
     hypotheses.sums[b, k, i] = total
+
+
+@wp.kernel
+def reduce_sums(hypotheses: Hypotheses, slots: int):
+    """Add up the partial sums of every active hypothesis."""
+    b, k, i = wp.tid()
+    if hypotheses.state[b, k] == RUNNING:
+        reduce_sum(hypotheses, slots, b, k, i)
 
 
 @wp.func
@@ -228,6 +243,32 @@ def update_photometry(
     return photometry
 
 
+@wp.func
+def take_step(
+    hypotheses: Hypotheses,
+    damping: wp.float64,
+    smallest_step: wp.float64,
+    least_scale: float,
+    b: int,
+    k: int,
+):
+    """Move hypothesis k of env b where the data constrain it; it rests once it has converged."""
+    sums = hypotheses.sums
+    before = hypotheses.photometry[b, k]
+    hypotheses.photometry[b, k] = update_photometry(sums, b, k, before, least_scale)
+    A, B, g_a, g_b, length = load_terms(sums, b, k)
+    tilted, matched = sums[b, k, Sum.TILTED], sums[b, k, Sum.MATCHED]
+    xi = remapped_step(A, B, g_a + g_b, tilted, matched, damping)
+    for i in range(3, 6):
+        xi[i] = xi[i] / length
+    size = wp.float64(0.0)
+    for i in range(6):
+        size = wp.max(size, wp.abs(xi[i]))
+    hypotheses.pose[b, k] = orthonormalise(hypotheses.pose[b, k] * se3_exp(xi))
+    if size < smallest_step:
+        hypotheses.state[b, k] = RESTING
+
+
 @wp.kernel
 def gauss_newton_step(
     hypotheses: Hypotheses,
@@ -236,22 +277,45 @@ def gauss_newton_step(
     last: wp.int32,  # 1: last iteration of its level, so the next level may go on
     least_scale: wp.float32,
 ):
-    """Move every active hypothesis where the data constrain it; stop those that converged."""
+    """Move every active hypothesis; stop those that converged."""
     b, k = wp.tid()
-    sums = hypotheses.sums
     if hypotheses.state[b, k] == RUNNING:
-        before = hypotheses.photometry[b, k]
-        hypotheses.photometry[b, k] = update_photometry(sums, b, k, before, least_scale)
-        A, B, g_a, g_b, length = load_terms(sums, b, k)
-        tilted, matched = sums[b, k, Sum.TILTED], sums[b, k, Sum.MATCHED]
-        xi = remapped_step(A, B, g_a + g_b, tilted, matched, damping)
-        for i in range(3, 6):
-            xi[i] = xi[i] / length
-        size = wp.float64(0.0)
-        for i in range(6):
-            size = wp.max(size, wp.abs(xi[i]))
-        hypotheses.pose[b, k] = orthonormalise(hypotheses.pose[b, k] * se3_exp(xi))
-        if size < smallest_step:
-            hypotheses.state[b, k] = RESTING
+        take_step(hypotheses, damping, smallest_step, least_scale, b, k)
     if last != 0 and hypotheses.state[b, k] == RESTING:
+        hypotheses.state[b, k] = RUNNING
+
+
+@wp.kernel
+def iterate_at_once(
+    images: AlignedImages,
+    weights: Weights,
+    stride: int,
+    columns: int,
+    hypotheses: Hypotheses,
+    damping: wp.float64,
+    smallest_step: wp.float64,
+    iterations: int,
+    ends_with_sums: int,  # 1: leave the sums at the poses that the last steps led to
+):
+    """All iterations of a level, one thread a hypothesis.
+
+    The same as ``accumulate_normal_equations``, ``reduce_sums`` and ``gauss_newton_step`` in turns,
+    for a CPU: there a launch takes as long as a tenth of the work.
+    """
+    b, k = wp.tid()
+    pieces = (images.model_size[0] + columns - 1) // columns
+    rows = (images.model_size[1] + stride - 1) // stride
+    for iteration in range(iterations + ends_with_sums):
+        is_over = iteration == iterations
+        if is_over and hypotheses.state[b, k] == RESTING:
+            hypotheses.state[b, k] = RUNNING
+        if hypotheses.state[b, k] == RUNNING:
+            for row in range(rows):
+                for piece in range(pieces):
+                    accumulate_row(images, weights, stride, columns, hypotheses, b, k, row, piece)
+            for i in range(NUM_SUMS):
+                reduce_sum(hypotheses, rows * pieces, b, k, i)
+            if not is_over:
+                take_step(hypotheses, damping, smallest_step, weights.least_scale, b, k)
+    if hypotheses.state[b, k] == RESTING:
         hypotheses.state[b, k] = RUNNING

@@ -18,34 +18,21 @@ from ms_slam_env.geometry import invert
 from ms_slam_env.slam.alignment_check import DeviceStatistics, DeviceThresholds
 from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.surfel.acceptance import Alignment, assess_alignment
+from ms_slam_env.slam.surfel.alignment_arrays import OFF, RUNNING
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.degeneracy import mat66d
-from ms_slam_env.slam.surfel.device import HostDeviceBuffer, KernelLaunchCache, threads_per_row
-from ms_slam_env.slam.surfel.normal_equations import (
-    NUM_SUMS,
-    OFF,
-    RUNNING,
-    AlignedImages,
-    Hypotheses,
-    Photometry,
-    Weights,
-    accumulate_normal_equations,
-)
+from ms_slam_env.slam.surfel.device import HostDeviceBuffer, KernelLaunchCache
+from ms_slam_env.slam.surfel.gauss_newton import GaussNewton, HypothesisBuffers
 from ms_slam_env.slam.surfel.photometry import same_exposure
 from ms_slam_env.slam.surfel.pose_hypotheses import NUM_FIRST, expand_hypotheses, select_hypothesis
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
 from ms_slam_env.slam.surfel.pyramid import Level, Pyramid
 from ms_slam_env.slam.surfel.rendering import ModelView
-from ms_slam_env.slam.surfel.solver import gauss_newton_step, reduce_sums
 
 SEARCH_POINTS = 400
 SEARCH_ITERATIONS = 5
 GOOD_SCORE = 0.4  # of a first hypothesis, which makes the other hypotheses needless
 SPARSE = 0.3  # share of the points that all iterations but the last look at
-SMALLEST_STEP = (2.0e-4, 4.0e-4, 1.0e-3)  # metres and radians, per level, finest first
-DAMPING = 1.0e-6
-COARSE_TOLERANCE = 2.5
-DEPTH_REDUNDANCY = 50.0  # see normal_equations
 
 
 def model_stride(intrinsics: Intrinsics, config: SurfelConfig) -> int:
@@ -61,27 +48,6 @@ def model_stride(intrinsics: Intrinsics, config: SurfelConfig) -> int:
 def _point_stride(shape: tuple[int, int], points: float) -> int:
     """Step between rows and columns that picks about so many pixels of an image."""
     return max(1, round((shape[0] * shape[1] / points) ** 0.5))
-
-
-class _HypothesisBuffers:
-    """Host-device buffers of K hypotheses per env."""
-
-    def __init__(self, batch: int, k: int, slots: int, device: str) -> None:
-        self.poses = HostDeviceBuffer((batch, k), wp.mat44d, device)
-        self.states = HostDeviceBuffer((batch, k), wp.int32, device)
-        self.photometry = HostDeviceBuffer((batch, k), Photometry, device)
-        arrays = Hypotheses()
-        arrays.pose, arrays.state = self.poses.array, self.states.array
-        arrays.photometry = self.photometry.array
-        arrays.partial = wp.zeros((batch, k, slots, NUM_SUMS), dtype=wp.float32, device=device)
-        arrays.sums = wp.zeros((batch, k, NUM_SUMS), dtype=wp.float64, device=device)
-        self.arrays, self.shape = arrays, (batch, k)
-        is_cpu = wp.get_device(device).is_cpu
-        self._state_on_host = arrays.state.numpy() if is_cpu else None  # shares the memory
-
-    def running(self) -> bool:
-        """Whether a hypothesis may still move; on a GPU always True: asking would mean waiting."""
-        return self._state_on_host is None or bool((self._state_on_host == RUNNING).any())
 
 
 class Tracker:
@@ -104,7 +70,7 @@ class Tracker:
         self.device = device
         self.batch = batch
         num_levels = len(config.iterations)
-        self._cameras = [intrinsics.scaled(0.5**level) for level in range(num_levels)]
+        cameras = [intrinsics.scaled(0.5**level) for level in range(num_levels)]
         self._live = Pyramid(batch, intrinsics.shape, num_levels, True, device)
         # A level takes the model's image of its own spacing, or else the finest.
         skipped = model_stride.bit_length() - 1
@@ -116,16 +82,15 @@ class Tracker:
         self._model = Pyramid(
             batch, self._model_shapes[0], self._model_level[-1] + 1, False, device
         )
-        self._columns, _ = threads_per_row(1 << 20, device, gpu_columns=32)
-        slots = max(self._slots(level, self._stride(level)) for level in range(num_levels))
-        slots = max(slots, self._slots(num_levels - 1, self._search_stride()))
+        self.gauss_newton = GaussNewton(config, cameras, self._model_shapes, device)
+        passes = [(level, self._stride(level)) for level in range(num_levels)]
+        slots = self.gauss_newton.slots([*passes, (num_levels - 1, self._search_stride())])
 
         # The last of the first is the guess.
-        self._first = _HypothesisBuffers(batch, NUM_FIRST + 1, slots, device)
-        self._more = _HypothesisBuffers(batch, num_hypotheses - NUM_FIRST, slots, device)
-        self._one = _HypothesisBuffers(batch, 1, slots, device)
+        self._first = HypothesisBuffers(batch, NUM_FIRST + 1, slots, device)
+        self._more = HypothesisBuffers(batch, num_hypotheses - NUM_FIRST, slots, device)
+        self._one = HypothesisBuffers(batch, 1, slots, device)
         self._launches = KernelLaunchCache(device)
-        self._seen: tuple[LiveFrame | None, ModelView | None] = (None, None)
         self.good_score = GOOD_SCORE
         self._thresholds = HostDeviceBuffer(batch, DeviceThresholds, device)
         self._T_world_model = HostDeviceBuffer(batch, wp.mat44d, device)
@@ -135,8 +100,6 @@ class Tracker:
         self._statistics = HostDeviceBuffer(batch, DeviceStatistics, device)
         self._covariance = HostDeviceBuffer(batch, mat66d, device)
         self._live_levels: list[Level] = []
-        self._model_levels: list[Level] = []
-        self._weights = [weights_of(config, level) for level in range(num_levels)]
 
     def _stride(self, level: int, share: float = 1.0) -> int:
         return _point_stride(self._model_shapes[level], share * self.config.points_per_level)
@@ -144,13 +107,8 @@ class Tracker:
     def _search_stride(self) -> int:
         return _point_stride(self._model_shapes[-1], SEARCH_POINTS)
 
-    def _slots(self, level: int, stride: int) -> int:
-        height, width = self._model_shapes[level]
-        return -(-height // stride) * -(-width // min(self._columns, width))
-
     def set_frame(self, live: LiveFrame) -> None:
         """Build the pyramid of the live frames; ``align`` may then be called several times."""
-        self._expect(live, self._seen[1])
         self._live_levels = self._live.build(live.vertices, live.normals, live.intensity)
 
     def align(
@@ -173,9 +131,9 @@ class Tracker:
                 if no env has one.
             photometry: (B,) ``Photometry`` to start from; exposed like the model if None.
         """
-        self._expect(self._seen[0], model)
         images = self._model.build(model.vertices, model.normals, model.intensity)
-        self._model_levels = [images[index] for index in self._model_level]
+        model_levels = [images[index] for index in self._model_level]
+        self.gauss_newton.set_images(self._live_levels, model_levels)
         self._start_from(hypotheses, T_world_model, guesses)
         self._T_world_model.write(T_world_model)
         self._thresholds.write(thresholds)
@@ -193,12 +151,6 @@ class Tracker:
             photometry=self._one.photometry.read()[:, 0],
             covariance=self._covariance.read(),
         )
-
-    def _expect(self, live: LiveFrame | None, model: ModelView | None) -> None:
-        """Forget the recorded launches if these are not the images that they were made for."""
-        if self._seen[0] is not live or self._seen[1] is not model:
-            self._launches.clear()
-            self._seen = (live, model)
 
     def _start_from(
         self, hypotheses: Float64, T_world_model: Float64, guesses: Float64 | None
@@ -239,22 +191,20 @@ class Tracker:
             lambda: (self.batch, [first.arrays, more.arrays, one.arrays]),
         )
 
-    def _settle(self, state: _HypothesisBuffers) -> None:
+    def _settle(self, state: HypothesisBuffers) -> None:
         """A few steps for every active hypothesis, and the sums at the pose they lead to."""
-        coarsest, stride = len(self._model_levels) - 1, self._search_stride()
-        self._iterate(coarsest, stride, state, SEARCH_ITERATIONS)
-        self._accumulate(coarsest, stride, state)
+        coarsest, stride = len(self._model_level) - 1, self._search_stride()
+        self.gauss_newton.iterate(coarsest, stride, state, SEARCH_ITERATIONS, ends_with_sums=True)
 
     def _refine(self) -> None:
         """Align the one hypothesis from the coarsest level to the finest."""
-        for level in range(len(self._model_levels) - 1, -1, -1):
+        for level in range(len(self._model_level) - 1, -1, -1):
             last = int(level == 0)  # the last iteration sees more points than the others
             count = self.config.iterations[level] - last
-            self._iterate(level, self._stride(level, SPARSE), self._one, count)
+            self.gauss_newton.iterate(level, self._stride(level, SPARSE), self._one, count)
         # The decision is on what the last step starts from, which has all but converged.
-        self._accumulate(0, self._stride(0), self._one)
-        if self.config.iterations[0]:
-            self._step(0, self._one, last=True)
+        step = min(self.config.iterations[0], 1)
+        self.gauss_newton.iterate(0, self._stride(0), self._one, step, ends_with_sums=step == 0)
 
     def _evaluate(self) -> None:
         one, given = self._one, (self._predicted, self._thresholds, self._T_world_model)
@@ -263,74 +213,3 @@ class Tracker:
         self._launches.launch(
             "assess", assess_alignment, lambda: (self.batch, [one.arrays, *arrays])
         )
-
-    def _iterate(self, level: int, stride: int, state: _HypothesisBuffers, count: int) -> None:
-        """At most ``count`` Gauss-Newton iterations at one level; all resting ones wake after."""
-        for iteration in range(count):
-            running = state.running()
-            if running:
-                self._accumulate(level, stride, state)
-            self._step(level, state, last=not running or iteration == count - 1)
-            if not running:
-                break
-
-    def _accumulate(self, level: int, stride: int, state: _HypothesisBuffers) -> None:
-        """Accumulate and reduce the sums of every active hypothesis at one level."""
-        key = (level, stride, id(state))
-        slots = self._slots(level, stride)
-        self._launches.launch(
-            ("accumulate", *key),
-            accumulate_normal_equations,
-            lambda: self._accumulation(level, stride, state),
-        )
-        self._launches.launch(
-            ("reduce", *key), reduce_sums, lambda: ((*state.shape, NUM_SUMS), [state.arrays, slots])
-        )
-
-    def _accumulation(
-        self, level: int, stride: int, state: _HypothesisBuffers
-    ) -> tuple[tuple[int, ...], list[Any]]:
-        """Threads and arguments of ``accumulate_normal_equations``."""
-        camera, model, live = self._cameras[level], self._model_levels[level], self._live_levels
-        height, width = self._model_shapes[level]
-        rows = -(-height // stride)
-        images = AlignedImages()
-        for name in ("vertices", "normals", "intensity"):
-            setattr(images, f"model_{name}", getattr(model, name).flatten())
-        for name in ("vertices", "normals", "gradient"):
-            setattr(images, f"live_{name}", getattr(live[level], name).flatten())
-        images.model_size = wp.vec2i(width, height)
-        images.live_size = wp.vec2i(camera.width, camera.height)
-        images.focal, images.centre = wp.vec2(camera.fx, camera.fy), wp.vec2(camera.cx, camera.cy)
-        inputs = [images, self._weights[level], stride, min(self._columns, width), state.arrays]
-        return (*state.shape, rows, self._slots(level, stride) // rows), inputs
-
-    def _step(self, level: int, state: _HypothesisBuffers, last: bool) -> None:
-        """Move every active hypothesis by one Gauss-Newton step."""
-        smallest = SMALLEST_STEP[min(level, len(SMALLEST_STEP) - 1)]
-        rule = [DAMPING, smallest, int(last), self._weights[level].least_scale]
-        self._launches.launch(
-            ("step", level, last, id(state)),
-            gauss_newton_step,
-            lambda: (state.shape, [state.arrays, *rule]),
-        )
-
-
-def weights_of(config: SurfelConfig, level: int) -> Weights:
-    """Scales and rules of the residuals at a level of the pyramid, 0 the finest."""
-    # Far from the solution large residuals carry the information: coarse levels are tolerant.
-    widening = COARSE_TOLERANCE**level
-    weights = Weights()
-    weights.icp = (1.0 - config.icp_rgb_weight) / DEPTH_REDUNDANCY
-    weights.rgb = config.icp_rgb_weight
-    weights.per_depth_noise = 1.0 / config.depth_noise_m
-    weights.per_cauchy_icp = 1.0 / (config.cauchy_icp * widening)
-    weights.per_cauchy_rgb = 1.0 / (config.cauchy_rgb * widening)
-    weights.grey_variance = config.intensity_noise**2
-    weights.pixel_variance = config.lateral_noise_px**2
-    weights.distance_m = config.icp_distance_m
-    weights.cos_angle = float(np.cos(np.radians(config.icp_angle_deg)))
-    for rule in ("inlier_sigmas", "conflict_sigmas", "texture", "photometric_inlier"):
-        setattr(weights, rule, getattr(config.acceptance, rule))
-    weights.least_scale = config.cauchy_rgb * widening
-    return weights
