@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -175,6 +176,13 @@ def acceptance_thresholds(
     frames of five scenes, hand-held with 4 cm and 2 degrees a frame, whose colour was not
     registered with depth, half of them with exposure jumps, rolling shutter and holes besides.
     """
+    return _acceptance_thresholds(config, tuple(strict.tolist()), tuple(lost.tolist())).copy()
+
+
+@lru_cache(maxsize=64)
+def _acceptance_thresholds(
+    config: AcceptanceConfig, strict: tuple[bool, ...], lost: tuple[int, ...]
+) -> NDArray[Any]:
     least = {"overlap": config.overlap, "inlier_ratio": config.inliers}
     least["photometric_inlier_ratio"] = config.alike
     most = {"depth_conflict_ratio": config.conflicts, "cost": config.cost}
@@ -185,8 +193,8 @@ def acceptance_thresholds(
     for name, value in most.items():
         thresholds[name] = np.where(strict, min(_STRICT[name], value), value)
     thresholds["degenerate_directions"] = np.where(strict, 0, 5)
-    thresholds["motion_m"] = np.minimum(1.0, 0.3 + 0.1 * lost)
-    thresholds["rotation_cos"] = np.cos(np.radians(np.minimum(60.0, 30.0 + 10.0 * lost)))
+    thresholds["motion_m"] = np.minimum(1.0, 0.3 + 0.1 * np.array(lost))
+    thresholds["rotation_cos"] = np.cos(np.radians(np.minimum(60.0, 30.0 + 10.0 * np.array(lost))))
     return thresholds
 
 
@@ -239,6 +247,8 @@ class Alignment:
 
     def with_status(self, where: NDArray[np.bool_], status: TrackingStatus) -> Alignment:
         """The same with another status for the envs ``where`` (B,)."""
+        if not where.any():
+            return self
         return replace(self, status=np.where(where, status, self.status))
 
     def doubtful_at(self, poses: Float64, photometry: NDArray[Any]) -> Alignment:

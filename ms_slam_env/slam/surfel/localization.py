@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env._warp import wp
-from ms_slam_env.geometry import invert, relative_angle, se3_log
+from ms_slam_env.geometry import invert, se3_log
 from ms_slam_env.slam.alignment_check import (
     DISPUTED,
     AlignmentStatistics,
@@ -116,12 +116,10 @@ class Localizer:
         self._motion_mask.expect(live, expected, states.started & (states.lost == 0))
         invalid = self.invalid_frames.find(frames.color, states.started)
         alignment = self._track(invalid, guesses)
-        if self._motion_mask.find(*self._trusted(alignment, expected)).any():
-            alignment = self._track(invalid, guesses)
-        alignment = self._doubt(alignment, expected, invalid, guesses)
-        self._motion_mask.find(*self._trusted(alignment, expected))
-        is_most = alignment.tracked & (self._motion_mask.share() > MOSTLY_MOVING)
-        alignment = alignment.with_status(is_most, TrackingStatus.GEOMETRIC_MISMATCH)
+        if self._motion_mask.can_doubt:
+            alignment = self._mask_moving(alignment, expected, invalid, guesses)
+        if self._is_settled(alignment):
+            return alignment
         if self._config.refuse_bad_fits:
             alignment = self._search_by_features(self._appeal(alignment, frames), frames)
         else:
@@ -133,6 +131,27 @@ class Localizer:
             alignment = self._search_elsewhere(alignment, frames)
         self._motion_mask.find(*self._trusted(alignment, expected))
         return alignment
+
+    def _is_settled(self, alignment: Alignment) -> bool:
+        """Whether every env is tracked, was so before and beyond doubt: nothing more to ask."""
+        states = self._states
+        is_open = states.started & (~alignment.tracked | (states.lost > 0) | (states.doubted > 0))
+        return self._config.refuse_bad_fits and not is_open.any()
+
+    def _mask_moving(
+        self,
+        alignment: Alignment,
+        expected: Float64,
+        invalid: NDArray[np.bool_],
+        guesses: Float64 | None,
+    ) -> Alignment:
+        """Look for what moves, align without it, and refuse a pose by which most would move."""
+        if self._motion_mask.find(*self._trusted(alignment, expected)).any():
+            alignment = self._track(invalid, guesses)
+        alignment = self._doubt(alignment, expected, invalid, guesses)
+        self._motion_mask.find(*self._trusted(alignment, expected))
+        is_most = alignment.tracked & (self._motion_mask.share() > MOSTLY_MOVING)
+        return alignment.with_status(is_most, TrackingStatus.GEOMETRIC_MISMATCH)
 
     def _doubt(
         self,
@@ -151,7 +170,7 @@ class Localizer:
         states, mask = self._states, self._motion_mask
         asked = states.started & (states.lost == 0) & ~invalid
         is_apart = alignment.tracked & _is_apart(alignment.T_world_live, expected)
-        doubtful = mask.can_doubt & asked & (is_apart | mask.doubts())
+        doubtful = asked & (is_apart | mask.doubts())
         if not doubtful.any():
             return alignment
         moving = doubtful & mask.find(expected, doubtful, strict=True)
@@ -195,7 +214,7 @@ class Localizer:
         depth. Geometry must then constrain the pose without help, near to where it is expected.
         """
         states = self._states
-        failed = self._failed(alignment) & (alignment.status == TrackingStatus.PHOTOMETRIC_MISMATCH)
+        failed = states.started & (alignment.status == TrackingStatus.PHOTOMETRIC_MISMATCH)
         if not failed.any():
             return alignment
         near = np.repeat(hypotheses[:, :1], NUM_HYPOTHESES, axis=1)
@@ -344,8 +363,8 @@ def _is_refuted(alignment: Alignment, again: Alignment) -> NDArray[np.bool_]:
 def _is_apart(poses: Float64, others: Float64) -> NDArray[np.bool_]:
     """Which of the poses (B, 4, 4) differ, but not so much that ``others`` tell nothing."""
     step = np.linalg.norm(poses[:, :3, 3] - others[:, :3, 3], axis=1)
-    turn = np.array(
-        [relative_angle(a, b) for a, b in zip(poses[:, :3, :3], others[:, :3, :3], strict=True)]
-    )
+    # The trace of R_other^T R is the sum of the products of all elements.
+    cosine = ((poses[:, :3, :3] * others[:, :3, :3]).sum(axis=(1, 2)) - 1) / 2
+    turn = np.arccos(np.clip(cosine, -1, 1))
     is_more = (step > APART_M[0]) | (turn > APART_RAD[0])
     return is_more & (step < APART_M[1]) & (turn < APART_RAD[1])
