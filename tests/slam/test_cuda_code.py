@@ -28,9 +28,10 @@ MODULES = (
     "solver",
     "splatting",
     "surfel_culling",
+    "surfel_update",
     "view_warping",
 )
-IN_REGISTERS = ("frustum_culling", "fusion", "splatting")
+IN_REGISTERS = ("frustum_culling", "fusion", "splatting", "surfel_update")
 
 
 @pytest.mark.parametrize("name", MODULES)

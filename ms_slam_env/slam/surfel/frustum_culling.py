@@ -359,13 +359,17 @@ class FrustumCuller:
 
     def __call__(self, poses: wp.array, first_env: int = 0, margin_px: float = 0.0) -> None:
         """Fill the list for ``poses`` (envs,) T_world_camera of the envs from ``first_env`` on."""
-        self._buffers.blocks.num_listed.zero_()
+        self.list_blocks(poses, first_env, margin_px)
         self._buffers.visible.count.zero_()
+        self._launches[1].launch()
+
+    def list_blocks(self, poses: wp.array, first_env: int = 0, margin_px: float = 0.0) -> None:
+        """List only the blocks of which a surfel may be seen."""
+        self._buffers.blocks.num_listed.zero_()
         changing = (first_env, poses, margin_px)
         for index, new, old in zip((2, 3, 5), changing, self._arguments, strict=True):
             if new is not old:
                 for launch in self._launches:
                     launch.set_param_at_index(index, new)
         self._arguments = changing
-        for launch in self._launches:
-            launch.launch()
+        self._launches[0].launch()

@@ -14,7 +14,7 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.base import Float64, Views
 from ms_slam_env.slam.state import Stateful
-from ms_slam_env.slam.surfel import fusion, surfel_culling
+from ms_slam_env.slam.surfel import fusion, surfel_culling, surfel_update
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.device import record_launch
 from ms_slam_env.slam.surfel.frustum_culling import FrustumCuller, bound_blocks, set_bounded
@@ -76,8 +76,15 @@ class MapKernels:
         rule.max_confidence = config.max_confidence
         rule.full_m = math.sqrt(fusion.FULL_WEIGHT_SIGMA_M / config.depth_noise_m)
         shared = [self._camera, rule, self._frame, buffers.workers]
+        inputs = [buffers.surfels, buffers.visible, *shared]
+        update = self._record(surfel_update.update_surfels, inputs)
+        if buffers.workers == 1:
+            culled = [buffers.surfels, buffers.blocks, buffers.active, buffers.visible]
+            update = record_launch(
+                surfel_update.cull_and_update, buffers.batch, [*culled, *shared[:3]], buffers.device
+            )
         return [
-            self._record(fusion.update_surfels, [buffers.surfels, buffers.visible, *shared]),
+            update,
             self._record(fusion.add_surfels, [buffers.surfels, buffers.capacity, *shared]),
         ]
 
@@ -115,7 +122,10 @@ class MapKernels:
         self, live: LiveFrame, poses: wp.array, time: wp.array, weight: wp.array, mask: wp.array
     ) -> None:
         """Fuse one frame per env; see ``SurfelMap.fuse``."""
-        self._cull(poses)
+        if self._buffers.workers == 1:
+            self._cull.list_blocks(poses)
+        else:
+            self._cull(poses)
         self._frame.covered.zero_()
         self._buffers.compaction.kept.zero_()
         self._buffers.compaction.expired.zero_()
