@@ -117,21 +117,11 @@ class PlannerBenchmark(Experiment):
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
         """For each task over all scenes and across scenes, for one task also for each scene."""
-        by_task = self._by_task(rows)
-        if len(self.tasks) == 1:
-            return _tables(rows, "")
-        return [table for name, of in by_task.items() for table in _tables(of, f"{name}: ")]
-
-    def _by_task(self, rows: Sequence[Row]) -> dict[str, list[Row]]:
-        """Rows of the tasks of which an episode finished."""
-        every = {name: [r for r in rows if r["spec"]["task"] == name] for name in self.tasks}
-        return {name: of for name, of in every.items() if finished(of)}
+        return [table for task, of in _by_task(rows).items() for table in _tables(of, task)]
 
     def charts(self, rows: Sequence[Row]) -> list[Chart]:
         """Of each task the curve of the F-score, every measure by planner, F-score against ATE."""
-        one = len(self.tasks) == 1
-        by_task = self._by_task(rows).items()
-        return [chart for name, of in by_task for chart in _charts(of, "" if one else name)]
+        return [chart for task, of in _by_task(rows).items() for chart in _charts(of, task)]
 
     def content(self, rows: Sequence[Row]) -> Mapping[str, Any]:
         """The seeds, and medians with their intervals by planner, of one task."""
@@ -148,8 +138,18 @@ class PlannerBenchmark(Experiment):
         }
 
 
-def _tables(rows: Sequence[Row], prefix: str) -> list[Table]:
-    """The tables of one task; ``prefix`` of their titles."""
+def _by_task(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """Rows of the tasks of which an episode finished; of a single one, without its name."""
+    found: dict[str, list[Row]] = {}
+    for row in rows:
+        found.setdefault(row["spec"].get("task", ""), []).append(row)
+    found = {name: of for name, of in found.items() if finished(of)}
+    return found if len(found) > 1 else dict(zip([""], found.values(), strict=False))
+
+
+def _tables(rows: Sequence[Row], task: str) -> list[Table]:
+    """The tables of one task, whose name their titles have if there are several."""
+    prefix = f"{task}: " if task else ""
     pairs = complete_cases(rows, ("scene", "seed"), "planner")
     headline = Grouping(("planner",), HEADLINE, rank_by=RANKED_BY, count="episodes")
     details = Grouping(("planner",), (RANKED_BY, *DETAILS), rank_by=RANKED_BY)

@@ -25,17 +25,19 @@ DETAILS = ("ate_max_m", "rpe_m", "rer_m", "mapped_area_m2", "M_I", "M_D", "retur
 def with_losses(table: Table, rows: Sequence[Row]) -> Table:
     """The table with the losses of each planner's episodes together, and those not recovered.
 
-    Without the energy where nothing with a mass was moved.
+    Without the energy where nothing with a mass was moved. Results of a time when losses were not
+    counted have none.
     """
     results = grouped(rows, ("planner",))
     lines = []
     for line in table.rows:
-        of = results[(line["planner"],)]
-        losses = sum(result["losses"] for result in of)
-        for_good = sum(result["losses_not_recovered"] for result in of)
+        counted = [result for result in results[(line["planner"],)] if "losses" in result]
+        losses = sum(result["losses"] for result in counted)
+        for_good = sum(result["losses_not_recovered"] for result in counted)
         share = statistics.share_interval(np.arange(losses) < for_good)
-        lines.append({**line, "losses": losses, "not_recovered_share": share})
-    moved = any(result["energy_j"] > 0 for of in results.values() for result in of)
+        total = losses if counted else None
+        lines.append({**line, "losses": total, "not_recovered_share": share})
+    moved = any(result.get("energy_j") for of in results.values() for result in of)
     columns = [column for column in table.columns if moved or column.name != "energy_j"]
     after = 1 + [column.name for column in columns].index("lost")
     columns[after:after] = [Column("losses"), Column("not_recovered_share")]
