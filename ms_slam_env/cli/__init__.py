@@ -20,6 +20,7 @@ COMMANDS = {
     "run": "run a SLAM backend over a recorded RGB-D sequence",
     "train": "train an agent with one of the installed training scripts",
     "usme": "make the eight USME sequences, and run SLAM backends over them",
+    "view": "look inside an episode with the Rerun viewer",
 }
 
 

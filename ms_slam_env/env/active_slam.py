@@ -108,7 +108,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
 
     Args:
         embodiment: ``arm`` (with physics), ``arm-kinematic``, ``free`` or ``fixed-translation``.
-        render_mode: None or ``rgb_array``.
+        render_mode: None, ``rgb_array``, or ``human``: every step is shown in the Rerun viewer.
         agent_configures_slam: whether an action has a second part, the SLAM configuration;
             ``adaptation`` is then ``agent``, by name or as a mapping with its options.
         **options: fields of ``EnvConfig``.
@@ -119,7 +119,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
     """
 
     metadata = {  # noqa: RUF012 -- Gymnasium declares it as an instance variable
-        "render_modes": ["rgb_array"],
+        "render_modes": ["rgb_array", "human"],
         "render_fps": 10,
     }
 
@@ -133,7 +133,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise InputError(
                 f"unknown render_mode {render_mode!r}; valid choices: None, rgb_array "
-                "(render() returns a picture; no window is opened)"
+                "(render() returns a picture), human (a viewer is opened)"
             )
         if not isinstance(embodiment, str) or embodiment not in EMBODIMENTS:
             raise unknown("embodiment", embodiment, EMBODIMENTS)
@@ -165,6 +165,9 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         self.action_space = self._actions.space
         self.observation_space = self._observation.space
         self.on_load: Callable[[int], None] = _nothing
+        self.make_view: Callable[[ActiveSlamEnv], Any] | None = None
+        """Makes what shows an episode, step by step; see `rerun_view.EpisodeView`."""
+        self._view: Any = None
 
     # -- Gymnasium ---------------------------------------------------------------------------
 
@@ -192,6 +195,10 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
             why = self.simulation.start_at(start, self.np_random)
             if why:
                 raise InputError(f"reset option T_world_camera: {why}")
+        if self.make_view is not None:
+            self.close()
+            self._view = self.make_view(self)
+            self._view.log()
         return self._observe(), self._info()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -216,11 +223,19 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         )
         episode.reward_terms = reward_terms(outcome, self.config.reward, self.config.targets)
         reward = float(sum(episode.reward_terms.values()))
+        if self._view is not None:
+            self._view.log()
         return self._observe(), reward, lost_for_good, self._time_is_up(), self._info()
 
+    def close(self) -> None:
+        """Close the viewer's connection; the window stays."""
+        if self._view is not None:
+            self._view.close()
+            self._view = None
+
     def render(self) -> NDArray[np.uint8] | None:
-        """One picture that explains the moment, (480, 1120, 3) uint8; None without render mode."""
-        if self.render_mode is None:
+        """One picture that explains the moment, (480, 1120, 3) uint8; None in other modes."""
+        if self.render_mode != "rgb_array":
             return None
         return draw_moment(
             self.episode, self.config.targets, self.slam, self.embodiment, self.scene

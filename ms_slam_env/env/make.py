@@ -8,6 +8,7 @@ from typing import Any
 from ms_slam_env.config import is_options
 from ms_slam_env.env.active_slam import ActiveSlamEnv
 from ms_slam_env.env.config import EnvConfig
+from ms_slam_env.env.rerun_view import EpisodeView
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.sequences.perturbations import FastMotion, make_perturbation
 from ms_slam_env.tasks import Task, find_task
@@ -21,6 +22,13 @@ def make_env(task: Any = None, perturbed_by: str | None = None, **options: Any) 
     Raises:
         InputError: an unknown task, perturbation or option, or a value out of range.
     """
+    env = _make(task, perturbed_by, **options)
+    if env.render_mode == "human":
+        env.make_view = EpisodeView
+    return env
+
+
+def _make(task: Any, perturbed_by: str | None, **options: Any) -> ActiveSlamEnv:
     if task is not None:
         return _make_for(find_task(task), perturbed_by, **options)
     if perturbed_by is None:
@@ -28,14 +36,13 @@ def make_env(task: Any = None, perturbed_by: str | None = None, **options: Any) 
     return _make_perturbed(perturbed_by, **options)
 
 
-# Without "human" Gymnasium would warn, wrap the environment and fail at the first reset for want of
-# pygame; with it the environment itself is asked, and refuses in one line.
+# Gymnasium looks here for the modes before it makes the environment.
 make_env.metadata = {"render_modes": ["rgb_array", "human"]}  # type: ignore[attr-defined]
 
 
 def _make_for(task: Task, perturbed_by: str | None, **options: Any) -> ActiveSlamEnv:
     """Build the environment of a task; ``options`` count more than the task's own."""
-    env = make_env(None, perturbed_by, **{"scene": task.scenes, **task.options, **options})
+    env = _make(None, perturbed_by, **{"scene": task.scenes, **task.options, **options})
     for name, strength in task.perturbations.items():
         env.perturb(make_perturbation(name, strength))
     return env

@@ -41,7 +41,7 @@ def draw_third_person(
     """The picture (size, size, 3), and how many points the map has."""
     points, colors = slam.surface_points(), slam.surface_colors()
     truth, estimate = episode.trajectory_truth, episode.trajectory_estimate
-    arm_points, arm_colors = _arm(embodiment, scene)
+    arm_points, arm_colors = arm_dots(embodiment, scene)
     ceiling = truth[:, 2, 3].max() + _HEADROOM_M
     low = np.flatnonzero(points[:, 2] < ceiling)
     frustum = _frustum(truth[-1])
@@ -70,7 +70,7 @@ def draw_third_person(
     return picture, len(points)
 
 
-def _arm(arm: Embodiment, scene: Scene) -> tuple[Float64, Image]:
+def arm_dots(arm: Embodiment, scene: Scene) -> tuple[Float64, Image]:
     """Shaded dots all over the arm and its column: points (N, 3), colours (N, 3); none without."""
     if not isinstance(arm, ArmEmbodiment):
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)

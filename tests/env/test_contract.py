@@ -312,7 +312,7 @@ def test_use_before_reset_says_so():
         ({"noise": {"axial": 1000}}, r"axial = 1000 is outside \[0, 100\]"),
         ({"split": "exam"}, "valid choices: train, validation, test"),
         ({"step_m": float("nan")}, "step_m = nan is outside"),
-        ({"render_mode": "human"}, "valid choices: None, rgb_array"),
+        ({"render_mode": "ansi"}, "valid choices: None, rgb_array"),
         ({"embodiment": {}}, "unknown embodiment '{}'; valid choices: arm"),
         ({"slam_config": {7: 1}}, "slam_config = {7: 1} must be a mapping of options"),
         ({"embodiment": "boat"}, "unknown embodiment 'boat'; valid choices: arm, arm-kinematic"),
