@@ -61,7 +61,7 @@ WEIGHT_NEW = 0.2  # of what is new that can lead a pose astray, share of all
 SHARE_NEW = 0.7  # of the pixels of a piece that is taken for new
 SHARE_KNOWN = 0.1  # of its pixels that an earlier frame saw
 FOR, AGAINST, FORGETTING = 2.0, 0.7, 0.15  # log-odds of an observation
-MOST = 4.0  # log-odds at which they end; the least is 0
+MOST, LEAST = 4.0, -2.0  # log-odds at which they end
 CONFIRMED = 1.2  # log-odds of what has drawn a pose along: seen to move or forgotten soon
 MASKED = 0.5  # log-odds above which a pixel is masked
 CHANGED = 0.01  # share of the pixels whose new mask makes an alignment worth repeating
@@ -174,7 +174,7 @@ class GeometricMotionMask(MotionMask):
             self._weight_of_new[env] = self._weight_unseen(env, is_still)
             change = np.where(is_still, -AGAINST, -FORGETTING)
             change[self._moves(env, found[env])] = FOR
-            odds[env] = np.clip(odds[env] + change, 0.0, MOST)
+            odds[env] = np.clip(odds[env] + change, LEAST, MOST)
             if strict:
                 is_old = self._count[env] >= FIRST
                 is_new = self._is_new(env, is_still) if is_old else self._is_near(env)
