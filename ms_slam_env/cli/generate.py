@@ -46,7 +46,8 @@ class Arguments:
     path: HandheldPath = field(default_factory=HandheldPath)
     """Seeded hand-held path; not used with --trajectory or --planner."""
     route: tuple[str, ...] = ()
-    """Walk along these places of a street or hall instead, as in SW NW N; A-B is half-way."""
+    """Walk along these places of a street, hall or home instead, as in SW NW N, or hall kitchen;
+    A-B is half-way."""
     trajectory: Path | None = None
     """Camera motion to place into the scene instead (TUM file)."""
     scale: float | None = None

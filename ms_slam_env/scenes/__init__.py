@@ -1,7 +1,8 @@
-"""Textured, lit scenes by name and seed (rooms, a hall, streets), and mesh files by path."""
+"""Textured, lit scenes by name and seed (rooms, homes, a hall, streets), and mesh files by path."""
 
 from ms_slam_env.scenes.base import Scene, TexturedMesh
 from ms_slam_env.scenes.registry import (
+    HOMES,
     LARGE_SCENES,
     PUBLISHED_ROOMS,
     ROOMS,
@@ -12,6 +13,7 @@ from ms_slam_env.scenes.registry import (
 )
 
 __all__ = [
+    "HOMES",
     "LARGE_SCENES",
     "PUBLISHED_ROOMS",
     "ROOMS",

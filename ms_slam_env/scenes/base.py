@@ -58,6 +58,8 @@ class Scene(ABC):
     """How far away the things are, at most, that a hand-held camera looks at."""
     gaze_gap_m: float = 0.05
     """How much of the line of sight to them need not be free, before their surface."""
+    passage_m: float = np.inf
+    """Width of the narrowest passages that ways lead through."""
     lanes: tuple[tuple[Float64, Float64], ...] = ()
     """Straight ways of cars: points (3,) on the ground where each begins and ends."""
 
@@ -77,6 +79,10 @@ class Scene(ABC):
     def segment_is_free(self, start: Float64, end: Float64, radius_m: float) -> bool:
         """Whether a ball of ``radius_m`` moves from ``start`` (3,) to ``end`` (3,) untouched."""
 
+    def way(self, start: Float64, end: Float64) -> Float64:
+        """Points (K, 3) on the ground along which one gets from one place (3,) to another."""
+        return np.stack([start, end])
+
     @abstractmethod
     def sample_start(self, rng: Rng) -> Float64:
         """Draw a start pose T_world_camera (4, 4) in free space with furniture in view."""
@@ -92,11 +98,15 @@ def words(position: Float64) -> str:
 
 
 def floor_height(scene: Scene) -> float:
-    """Height of the floor: of what has that label, of the lowest surface where nothing has."""
+    """Height of the floor, or of the lowest surface where nothing has that label.
+
+    Each room of several has a floor of its own, as "kitchen floor".
+    """
     mesh = scene.mesh
-    if _FLOOR not in mesh.labels:
+    floors = [k for k, name in enumerate(mesh.labels) if name.split(" ")[-1] == _FLOOR]
+    if not floors:
         return float(scene.bounds()[0][2])
-    floor = mesh.faces[mesh.face_label == mesh.labels.index(_FLOOR)]
+    floor = mesh.faces[np.isin(mesh.face_label, floors)]
     return float(mesh.vertices[floor.ravel(), 2].min())
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
@@ -81,11 +81,19 @@ def pick(rng: Rng, materials: Sequence[Material]) -> Material:
 class MeshBuilder:
     """Collects patches; every primitive below is one or more of them."""
 
-    def __init__(self, cell_m: float = 0.1) -> None:
-        """Start empty; flat patches are cut into cells of at most ``cell_m``."""
+    def __init__(self, cell_m: float = 0.1, variety: int | None = None) -> None:
+        """Start empty.
+
+        Args:
+            cell_m: flat patches are cut into cells of at most this size.
+            variety: how many images of a kind are made before they are used again; None: any.
+        """
         self.cell_m = cell_m
+        self.variety = variety
+        self._stocks: dict[str, list[NDArray[np.uint8]]] = {}
         self._pose = np.eye(4)
         self._label = 0
+        self._prefix = ""
         self._patches: list[tuple[NDArray, ...]] = []  # the fields of `Geometry` up to the textures
         self._textures: list[NDArray[np.uint8]] = []
         self._labels: list[str] = []
@@ -101,6 +109,16 @@ class MeshBuilder:
         self._textures.append(image)
         return Material(len(self._textures) - 1, tile_m)
 
+    def stocked(
+        self, rng: Rng, kind: str, make: Callable[[], NDArray[np.uint8]]
+    ) -> NDArray[np.uint8]:
+        """An image that ``make`` makes, or one of its kind that is there (see ``variety``)."""
+        stock = self._stocks.setdefault(kind, [])
+        if self.variety is not None and len(stock) >= self.variety:
+            return stock[int(rng.integers(len(stock)))]
+        stock.append(make())
+        return stock[-1]
+
     def plain(self, rgb: ArrayLike) -> Material:
         """Return a material of one sRGB colour (0 to 255)."""
         colour = np.clip(np.asarray(rgb, dtype=np.float64), 0, 255).astype(np.uint8)
@@ -110,11 +128,19 @@ class MeshBuilder:
     def object(self, name: str) -> Iterator[None]:
         """Give every patch added inside the block the label ``name`` (reused if known)."""
         previous = self._label
+        name = self._prefix + name
         if name not in self._labels:
             self._labels.append(name)
         self._label = self._labels.index(name)
         yield
         self._label = previous
+
+    @contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        """Put ``name`` and a blank before the labels of the objects added inside the block."""
+        previous, self._prefix = self._prefix, f"{self._prefix}{name} "
+        yield
+        self._prefix = previous
 
     @contextmanager
     def frame(self, origin: ArrayLike, yaw: float = 0.0, pitch: float = 0.0) -> Iterator[None]:

@@ -89,6 +89,33 @@ class Panel(Light):
 
 
 @dataclass(frozen=True)
+class RoomLight(Light):
+    """A light of one room of several: what passes through its doors fades away behind them.
+
+    Attributes:
+        light: the source.
+        low: (3,) least corner of its room, metres.
+        high: (3,) greatest corner.
+        reach_m: distance from the room at which nothing is left.
+    """
+
+    light: Light
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+    reach_m: float = 2.0
+
+    def irradiance(self, points: Float64, normals: Float64, rays: RayCaster) -> Float32:
+        """See the base class."""
+        nearest = np.clip(points, self.low, self.high)
+        share = 1.0 - np.linalg.norm(points - nearest, axis=1) / self.reach_m
+        near = np.flatnonzero(share > 0)
+        total = np.zeros((len(points), 3), np.float32)
+        total[near] = self.light.irradiance(points[near], normals[near], rays)
+        total[near] *= share[near, None].astype(np.float32)
+        return total
+
+
+@dataclass(frozen=True)
 class Sun(Light):
     """Parallel light.
 

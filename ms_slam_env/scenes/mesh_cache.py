@@ -1,10 +1,10 @@
-"""Lit meshes kept on disk: what a mesh file becomes takes up to a minute to work out.
+"""Lit meshes kept on disk: what a mesh file or a dwelling becomes takes long to work out.
 
 Entries lie in ``$MS_SLAM_ENV_CACHE``, else in ``ms_slam_env`` below ``$XDG_CACHE_HOME`` or
-``~/.cache``: one file of plain arrays each, named by a hash of what the mesh file holds and of the
-version of the algorithm. The longest unused go when all take more than ``MOST_BYTES``; the folder
-may be deleted at any time. What cannot be read is worked out anew, and a folder that cannot be
-written is done without.
+``~/.cache``: one file of plain arrays each, named by a hash of what it follows from, what the mesh
+file holds or the seed, and of the version of the algorithm. The longest unused go when all take
+more than ``MOST_BYTES``; the folder may be deleted at any time. What cannot be read is worked out
+anew, and a folder that cannot be written is done without.
 """
 
 from __future__ import annotations

@@ -105,8 +105,19 @@ class MeshScene(Scene):
         Points whose front does not open into free space (backs of furniture against a wall,
         insides of boxes) are left out, since no camera can see them.
         """
-        points, face = sample_surface(self.mesh.vertices, self.mesh.faces, spacing_m)
-        corners = self.mesh.vertices[self.mesh.faces].astype(np.float64)
+        return self._open_points(None, spacing_m)
+
+    def _open_points(
+        self, faces: Int32 | None, spacing_m: float, most: float = np.inf
+    ) -> tuple[Float64, Int32]:
+        """Points (N, 3) of some faces, or all, whose front opens into free space; labels (N,)."""
+        mesh = self.mesh
+        chosen = mesh.faces if faces is None else mesh.faces[faces]
+        corners = mesh.vertices[chosen].astype(np.float64)
+        if np.isfinite(most):
+            area = 0.5 * float(np.linalg.norm(face_cross(corners), axis=1).sum())
+            spacing_m = max(spacing_m, (area / most) ** 0.5)
+        points, face = sample_surface(mesh.vertices, chosen, spacing_m)
         tangent = corners[:, 1] - corners[:, 0]
         normal = unit_rows(face_cross(corners))
         tangent = unit_rows(tangent)
@@ -117,7 +128,8 @@ class MeshScene(Scene):
         for aside in (tangent, -tangent, bitangent, -bitangent):
             rest = np.flatnonzero(~visible)
             visible[rest] = self.clearance(before[rest] + _ASIDE_M * aside[face[rest]]) > 0.0
-        return points[visible], self.mesh.face_label[face[visible]]
+        labels = mesh.face_label if faces is None else mesh.face_label[faces]
+        return points[visible], labels[face[visible]]
 
     def __reduce__(self) -> tuple[object, tuple[int]]:
         """Pickle as the recipe: a scene is rebuilt from its maker and seed, bit for bit."""

@@ -14,6 +14,7 @@ from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.city_street import city_street
 from ms_slam_env.scenes.corridor import corridor
 from ms_slam_env.scenes.factory_hall import factory_hall
+from ms_slam_env.scenes.homes.home import home
 from ms_slam_env.scenes.living_room import living_room
 from ms_slam_env.scenes.mesh_file import from_file
 from ms_slam_env.scenes.residential_street import residential_street
@@ -28,13 +29,15 @@ _ROOMS = {
     "carpet": carpet,
 }
 
+_HOMES = {"home": home}
+
 _LARGE = {
     "residential_street": residential_street,
     "city_street": city_street,
     "factory_hall": factory_hall,
 }
 POINT = ExtensionPoint(
-    "scene", "ms_slam_env.scenes", own={**_ROOMS, **_LARGE}, form="module:function"
+    "scene", "ms_slam_env.scenes", own={**_ROOMS, **_HOMES, **_LARGE}, form="module:function"
 )
 
 ROOMS: tuple[str, ...] = tuple(_ROOMS)
@@ -42,6 +45,9 @@ ROOMS: tuple[str, ...] = tuple(_ROOMS)
 
 PUBLISHED_ROOMS = ("living_room", "corridor", "window", "table", "wall", "carpet")
 """Those that published commands take by default; a new room does not widen what they say."""
+
+HOMES: tuple[str, ...] = tuple(_HOMES)
+"""Names of the scenes of several rooms: slow to build the first time (10 s), then kept on disk."""
 
 LARGE_SCENES: tuple[str, ...] = tuple(_LARGE)
 """Names of the streets and the hall: farther than a Kinect sees, slow to build (5 to 12 s)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
@@ -29,6 +30,21 @@ class Window:
 
     along: float
     sill: float
+    width: float
+    height: float
+
+
+@dataclass(frozen=True)
+class Opening:
+    """A doorway in a wall, from the floor up.
+
+    Attributes:
+        along: middle along the wall, as a window's.
+        width: metres.
+        height: metres.
+    """
+
+    along: float
     width: float
     height: float
 
@@ -78,8 +94,12 @@ class Room:
         ceiling: Material,
         windows: dict[int, Window] | None = None,
         skirting: Material | None = None,
+        doorways: Mapping[int, Sequence[Opening]] | None = None,
     ) -> None:
-        """Add floor, ceiling, walls ("wall 0" to "wall 3"), windows and skirting boards."""
+        """Add floor, ceiling, walls ("wall 0" to "wall 3"), windows and skirting boards.
+
+        Windows and doorways of a wall lie beside one another; what fills a doorway is not added.
+        """
         w, d, h = self.size
         with build.object("floor"):
             build.quad((0, 0, 0), (w, 0, 0), (0, d, 0), floor)
@@ -87,28 +107,48 @@ class Room:
             build.quad((0, d, h), (w, 0, 0), (0, -d, 0), ceiling)
         for wall in range(4):
             window = (windows or {}).get(wall)
+            passages = (doorways or {}).get(wall, ())
             with self.at_wall(build, wall):
                 with build.object(f"wall {wall}"):
-                    self._wall(build, self.length(wall), walls[wall], window)
+                    self._wall(build, self.length(wall), walls[wall], window, passages)
                 if window is not None:
                     add_window(build, window)
                 if skirting is not None:
-                    half = self.length(wall) / 2
                     with build.object(f"skirting {wall}"):
-                        build.box((-half, -0.015, 0), (half, 0, 0.08), skirting, "xXYz")
+                        for a, b in _between(self.length(wall), [_hole(one) for one in passages]):
+                            build.box((a, -0.015, 0), (b, 0, 0.08), skirting, "xXYz")
 
     def _wall(
-        self, build: MeshBuilder, length: float, material: Material, window: Window | None
+        self,
+        build: MeshBuilder,
+        length: float,
+        material: Material,
+        window: Window | None,
+        doorways: Sequence[Opening],
     ) -> None:
-        half, h = length / 2, self.size[2]
-        if window is None:
-            pieces = [(-half, half, 0.0, h)]
-        else:
-            a, b = window.along - window.width / 2, window.along + window.width / 2
-            low, high = window.sill, window.sill + window.height
-            pieces = [(-half, a, 0.0, h), (b, half, 0.0, h), (a, b, 0.0, low), (a, b, high, h)]
+        h = self.size[2]
+        holes = [_hole(one) for one in ((window,) if window else ()) + tuple(doorways)]
+        pieces = [(a, b, 0.0, h) for a, b in _between(length, holes)]
+        for a, b, low, high in holes:
+            pieces += [(a, b, 0.0, low)] if low > 0 else []
+            pieces += [(a, b, high, h)]
         for a, b, low, high in pieces:
             build.quad((a, 0, low), (b - a, 0, 0), (0, 0, high - low), material, (a, low))
+
+
+def _hole(opening: Window | Opening) -> tuple[float, float, float, float]:
+    """From where to where along the wall, and from which height to which."""
+    low = opening.sill if isinstance(opening, Window) else 0.0
+    half = opening.width / 2
+    return opening.along - half, opening.along + half, low, low + opening.height
+
+
+def _between(
+    length: float, holes: Sequence[tuple[float, float, float, float]]
+) -> list[tuple[float, float]]:
+    """The pieces of a wall, from where to where, that have no hole in them."""
+    ends = [-length / 2, *(end for hole in sorted(holes) for end in hole[:2]), length / 2]
+    return list(zip(ends[::2], ends[1::2], strict=True))
 
 
 def add_window(build: MeshBuilder, window: Window) -> None:

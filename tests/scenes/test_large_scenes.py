@@ -20,7 +20,7 @@ def scene(request: pytest.FixtureRequest) -> LargeScene:
 
 
 def test_names_are_split_into_rooms_and_large_scenes():
-    assert set(scenes.SCENES) == set(scenes.ROOMS) | set(scenes.LARGE_SCENES)
+    assert set(scenes.SCENES) == set(scenes.ROOMS) | set(scenes.HOMES) | set(scenes.LARGE_SCENES)
     assert not set(scenes.ROOMS) & set(scenes.LARGE_SCENES)
 
 

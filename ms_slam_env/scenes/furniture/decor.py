@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ms_slam_env.scenes.base import Rng
-from ms_slam_env.scenes.builder import MeshBuilder
-from ms_slam_env.scenes.furniture.small_things import glaze
+from ms_slam_env.scenes.builder import Material, MeshBuilder
+from ms_slam_env.scenes.furniture.small_things import glaze, wood
 from ms_slam_env.scenes.textures import fabric, interior, outdoor
 from ms_slam_env.scenes.textures.noise import hsv
 from ms_slam_env.scenes.textures.pictures import picture
@@ -20,7 +20,7 @@ def picture_frame(build: MeshBuilder, rng: Rng, width_m: float, height_m: float,
     border = (
         build.plain(hsv(0.1, 0.1, rng.uniform(0.05, 0.95)))
         if kind < 0.5
-        else build.material(interior.board(rng, size=256), (0.5, 0.5))
+        else wood(build, rng, (0.5, 0.5), 256)
     )
     w, h, b, deep = width_m / 2, height_m / 2, rng.uniform(0.015, 0.045), 0.025
     with build.object(name):
@@ -127,17 +127,72 @@ def door(build: MeshBuilder, rng: Rng, name: str, rgb: np.ndarray) -> None:
     trim = build.plain((228, 224, 214))
     metal = build.plain((150, 148, 140))
     with build.object(name):
-        build.box((-0.425, -0.012, 0), (0.425, 0, 2.05), paint, "zY")
-        for low, high in ((0.15, 0.85), (1.05, 1.9)):
-            for x in (-0.34, 0.03):
-                build.box((x, -0.028, low), (x + 0.31, -0.012, high), paint, "Y")
-                build.box((x + 0.05, -0.034, low + 0.05), (x + 0.26, -0.028, high - 0.05), paint)
-        build.box((0.34, -0.06, 1.0), (0.36, -0.012, 1.02), metal, "Y")
-        build.box((0.26, -0.075, 0.995), (0.37, -0.06, 1.02), metal)
+        _door_face(build, paint, metal)
     with build.object(f"{name} casing"):
-        build.box((-0.52, -0.03, 0), (-0.425, 0, 2.14), trim, "zY")
-        build.box((0.425, -0.03, 0), (0.52, 0, 2.14), trim, "zY")
-        build.box((-0.425, -0.03, 2.05), (0.425, 0, 2.14), trim, "YxX")
+        _casing(build, trim)
+
+
+def _door_face(
+    build: MeshBuilder, paint: Material, metal: Material, is_mirrored: bool = False
+) -> None:
+    """One face of a leaf of 0.85 x 2.05 m, with panels and a handle at high x, or at low x."""
+    build.box((-0.425, -0.012, 0), (0.425, 0, 2.05), paint, "zY")
+    for low, high in ((0.15, 0.85), (1.05, 1.9)):
+        for x in (-0.34, 0.03):
+            build.box((x, -0.028, low), (x + 0.31, -0.012, high), paint, "Y")
+            build.box((x + 0.05, -0.034, low + 0.05), (x + 0.26, -0.028, high - 0.05), paint)
+    stem, lever = (0.34, 0.36), (0.26, 0.37)
+    if is_mirrored:
+        stem, lever = (-0.36, -0.34), (-0.37, -0.26)
+    build.box((stem[0], -0.06, 1.0), (stem[1], -0.012, 1.02), metal, "Y")
+    build.box((lever[0], -0.075, 0.995), (lever[1], -0.06, 1.02), metal)
+
+
+def _casing(build: MeshBuilder, trim: Material, half_m: float = 0.425) -> None:
+    """Frame around a doorway ``2 * half_m`` wide and 2.05 m high, on the wall at y = 0."""
+    wide = half_m + 0.095
+    build.box((-wide, -0.03, 0), (-half_m, 0, 2.14), trim, "zY")
+    build.box((half_m, -0.03, 0), (wide, 0, 2.14), trim, "zY")
+    build.box((-half_m, -0.03, 2.05), (half_m, 0, 2.14), trim, "YxX")
+
+
+def doorway(build: MeshBuilder, rng: Rng, name: str, width_m: float, wall_m: float) -> None:
+    """Lining, casings and threshold of a doorway, the middle of its wall at y = 0, x along it."""
+    trim = build.plain((228, 224, 214))
+    half, deep = width_m / 2, wall_m / 2
+    with build.object(f"{name} casing"):
+        for side in (0, 1):
+            with build.frame((0, (2 * side - 1) * deep, 0), np.pi * side):
+                _casing(build, trim, half)
+        build.quad((-half, -deep, 0), (0, wall_m, 0), (0, 0, 2.05), trim)
+        build.quad((half, deep, 0), (0, -wall_m, 0), (0, 0, 2.05), trim)
+        build.quad((-half, deep, 2.05), (width_m, 0, 0), (0, -wall_m, 0), trim)
+    with build.object(f"{name} threshold"):
+        board = wood(build, rng, (0.5, 0.5), 256)
+        build.quad((-half, -deep, 0), (width_m, 0, 0), (0, wall_m, 0), board)
+
+
+def open_leaf(
+    build: MeshBuilder, rng: Rng, name: str, rgb: np.ndarray, hinge: int, angle_rad: float
+) -> None:
+    """Leaf of 0.85 m that hangs at the origin, open to -y by an angle.
+
+    Closed it would lie along -x (``hinge`` 1) or along x (``hinge`` -1).
+    """
+    paint = build.material(interior.plaster(rng, rgb, 0.8, 256), (1.0, 1.0))
+    metal = build.plain((150, 148, 140))
+    with (
+        build.object(name),
+        build.frame((0, 0, 0), hinge * angle_rad),
+        build.frame((-hinge * 0.425, 0.02, 0.005)),
+    ):
+        for side in (0, 1):
+            with build.frame((0, (2 * side - 1) * 0.008, 0), np.pi * side):
+                _door_face(build, paint, metal, (hinge < 0) == (side == 1))
+        for x in (-0.425, 0.425):
+            away = np.sign(x)
+            build.quad((x, -0.008 * away, 0), (0, 0.016 * away, 0), (0, 0, 2.05), paint)
+        build.quad((-0.425, -0.008, 2.05), (0.85, 0, 0), (0, 0.016, 0), paint)
 
 
 def ceiling_lamp(build: MeshBuilder, width_m: float, depth_m: float, name: str) -> None:

@@ -9,7 +9,8 @@ import numpy as np
 from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import Material, MeshBuilder
 from ms_slam_env.scenes.furniture import small_things
-from ms_slam_env.scenes.textures import fabric, interior, pictures
+from ms_slam_env.scenes.furniture.small_things import wood
+from ms_slam_env.scenes.textures import fabric, pictures
 from ms_slam_env.scenes.textures.noise import hsv
 
 
@@ -31,7 +32,7 @@ def throw_pillow(build: MeshBuilder, rng: Rng, name: str) -> None:
 def sofa(build: MeshBuilder, rng: Rng, width_m: float, seats: int, name: str = "sofa") -> None:
     """Upholstered seat with arms, back, loose cushions and a few throw pillows."""
     cloth = upholstery(build, rng)
-    leg = build.material(interior.board(rng, size=256), (0.4, 0.4))
+    leg = wood(build, rng, (0.4, 0.4), 256)
     depth, arm, seat, back = 0.9, rng.uniform(0.14, 0.22), 0.42, rng.uniform(0.78, 0.9)
     half = width_m / 2
     with build.object(name):
@@ -55,7 +56,7 @@ def sofa(build: MeshBuilder, rng: Rng, width_m: float, seats: int, name: str = "
 
 def chair(build: MeshBuilder, rng: Rng, name: str = "chair") -> None:
     """Wooden chair with a padded seat; stands on its four legs, back at y = 0."""
-    frame_wood = build.material(interior.board(rng, size=256), (0.5, 0.5))
+    frame_wood = wood(build, rng, (0.5, 0.5), 256)
     pad = upholstery(build, rng)
     with build.object(name):
         for x in (-0.21, 0.17):
@@ -115,7 +116,7 @@ def place(
 
 def book_row(build: MeshBuilder, rng: Rng, length_m: float, height_m: float, name: str) -> None:
     """Books standing side by side from x = 0 to at most ``length_m``, spines at -y."""
-    sheet = pictures.spines(rng)
+    sheet = build.stocked(rng, "spines", lambda: pictures.spines(rng))
     pages = build.plain((225, 218, 200))
     slot = 1.0 / pictures.SPINE_SLOTS
     x = 0.0
@@ -145,7 +146,7 @@ def bookshelf(
     name: str = "bookshelf",
 ) -> None:
     """Open shelf of boards; each level holds books, or books and an ornament."""
-    material = build.material(interior.board(rng), (0.8, 0.8))
+    material = wood(build, rng, (0.8, 0.8))
     half, depth, thick = width_m / 2, 0.3, 0.022
     step = (height_m - 0.06 - thick) / shelves
     with build.object(name):
@@ -169,7 +170,7 @@ def bookshelf(
 
 def tv_stand(build: MeshBuilder, rng: Rng, width_m: float) -> float:
     """Low cabinet with two drawers and an open middle; returns the height of its top."""
-    material = build.material(interior.board(rng), (0.9, 0.9))
+    material = wood(build, rng, (0.9, 0.9))
     dark = build.plain((40, 36, 34))
     half, depth, height = width_m / 2, 0.42, rng.uniform(0.4, 0.52)
     with build.object("TV stand"):
@@ -191,7 +192,7 @@ def tv_stand(build: MeshBuilder, rng: Rng, width_m: float) -> float:
 
 def drawers(build: MeshBuilder, rng: Rng, width_m: float, height_m: float, name: str) -> None:
     """Chest of drawers with knobs."""
-    material = build.material(interior.board(rng), (0.8, 0.8))
+    material = wood(build, rng, (0.8, 0.8))
     knob = build.plain((190, 170, 110))
     half, depth, count = width_m / 2, 0.45, max(2, round(height_m / 0.25))
     step = (height_m - 0.1) / count
@@ -209,7 +210,7 @@ def drawers(build: MeshBuilder, rng: Rng, width_m: float, height_m: float, name:
 
 def wall_shelf(build: MeshBuilder, rng: Rng, width_m: float, name: str = "shelf") -> None:
     """Board on two brackets, top at z = 0, with books and an ornament on it."""
-    material = build.material(interior.board(rng, size=256), (0.6, 0.6))
+    material = wood(build, rng, (0.6, 0.6), 256)
     half = width_m / 2
     with build.object(name):
         build.box((-half, -0.24, -0.025), (half, 0, 0), material)

@@ -29,6 +29,13 @@ def glaze(build: MeshBuilder, rng: Rng, banded: bool = True) -> Material:
     return build.material(grain(rng, image, (h, w), (0.04, 0.6)))
 
 
+def wood(build: MeshBuilder, rng: Rng, tile_m: tuple[float, float], size: int = 512) -> Material:
+    """Board of some wood, one image of ``size`` pixels over ``tile_m``."""
+    return build.material(
+        build.stocked(rng, f"board {size}", lambda: interior.board(rng, size=size)), tile_m
+    )
+
+
 def cup(build: MeshBuilder, rng: Rng, name: str) -> None:
     """Mug with a handle and coffee, standing at the origin."""
     r, h = rng.uniform(0.035, 0.045), rng.uniform(0.08, 0.11)

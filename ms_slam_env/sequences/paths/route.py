@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -17,6 +18,7 @@ from ms_slam_env.sequences.paths.wandering import RADIUS_M
 _SAMPLE_M = 0.1
 _CORNER_M = 0.9  # width of the filter that rounds corners
 _AHEAD_M = 2.5  # the camera looks at where it will be
+_OF_PASSAGE = (0.25, 1.2, 0.06)  # the most of these two, and of straying, per width of a passage
 _WAVES_M = (5.3, 11.9, 27.1)  # lengths of the sway along the way
 _PACE_PERIODS = (23.0, 51.0, 117.0)  # in frames
 _ATTEMPTS = 20
@@ -29,7 +31,8 @@ class RoutePath(Checked, CameraPath):
     At every instant the camera moves at the pace that whichever of the two speeds permits that is
     reached first: along streets the first, around corners the second. It looks where it goes, a
     little down, swaying to the sides, and keeps no perfectly straight line: where the way leads
-    along a street for the second time it runs a little beside the first.
+    along a street for the second time it runs a little beside the first. Through passages as narrow
+    as doors it keeps to the middle.
 
     Attributes:
         via: names of places (``Scene.places``), or ``A-B`` for the middle between two.
@@ -75,7 +78,7 @@ class RoutePath(Checked, CameraPath):
         corners = _corners(scene, self.via)
         rng = np.random.default_rng([seed, 80])
         for _ in range(_ATTEMPTS):
-            path = self._dense(corners, rng)
+            path = self._dense(corners, scene.passage_m, rng)
             if scene.clearance(path[:, :3, 3]).min() > RADIUS_M:
                 return self._timed(path, rng)
         raise InputError(
@@ -83,17 +86,19 @@ class RoutePath(Checked, CameraPath):
             f"seed {scene.seed}"
         )
 
-    def _dense(self, corners: Float64, rng: np.random.Generator) -> Float64:
+    def _dense(self, corners: Float64, passage_m: float, rng: np.random.Generator) -> Float64:
         """Poses (M, 4, 4) every ``_SAMPLE_M``, speeds left aside."""
-        line = _rounded(corners)
+        most = (_CORNER_M, _AHEAD_M, self.stray_m)
+        corner_m, ahead_m, stray_m = map(min, most, np.multiply(_OF_PASSAGE, passage_m).tolist())
+        line = _rounded(corners, corner_m)
         arc: Float64 = _SAMPLE_M * np.arange(len(line), dtype=np.float64)
-        ahead = np.minimum(np.arange(len(line)) + round(_AHEAD_M / _SAMPLE_M), len(line) - 1)
+        ahead = np.minimum(np.arange(len(line)) + round(ahead_m / _SAMPLE_M), len(line) - 1)
         forward = line[ahead] - line
         last = int(np.argmax(ahead == len(line) - 1))
         forward[last:] = forward[last]
         forward /= np.linalg.norm(forward, axis=1, keepdims=True)
         side = np.stack([-forward[:, 1], forward[:, 0], np.zeros(len(line))], -1)
-        eyes = line + self.stray_m * _wave(arc, rng)[:, None] * side
+        eyes = line + stray_m * _wave(arc, rng)[:, None] * side
         eyes[:, 2] += self.height_m + 0.05 * _wave(arc, rng)
         yaw = np.radians(self.sway_deg) * _wave(arc, rng)
         pitch = np.radians(-self.down_deg + 2.0 * _wave(arc, rng))
@@ -125,22 +130,23 @@ def _corners(scene: Scene, via: tuple[str, ...]) -> Float64:
             if end not in places:
                 raise unknown(f"place of a route in scene {scene.name!r}", end, places)
         points.append(np.mean([places[end] for end in ends], axis=0))
-    return np.stack(points)
+    ways = [scene.way(a, b) for a, b in pairwise(points)]
+    return np.concatenate([*(way[:-1] for way in ways), points[-1][None]])
 
 
-def _rounded(corners: Float64) -> Float64:
+def _rounded(corners: Float64, width_m: float) -> Float64:
     """Points (M, 3) every ``_SAMPLE_M`` or so along the corners (K, 3), which are rounded."""
     lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
     at = np.concatenate([[0.0], np.cumsum(lengths)])
     arc = np.arange(0.0, at[-1], _SAMPLE_M)
     line = np.stack([np.interp(arc, at, corners[:, k]) for k in range(3)], -1)
     # Run straight on beyond both ends, which the filter would pull inwards.
-    margin = round(4 * _CORNER_M / _SAMPLE_M)
+    margin = round(4 * width_m / _SAMPLE_M)
     steps = _SAMPLE_M * np.arange(1, margin + 1)[:, None]
     before = line[0] - steps[::-1] * unit(corners[1] - corners[0])
     after = line[-1] + steps * unit(corners[-1] - corners[-2])
     long = np.concatenate([before, line, after])
-    return gaussian_filter1d(long, _CORNER_M / _SAMPLE_M, axis=0)[margin:-margin]
+    return gaussian_filter1d(long, width_m / _SAMPLE_M, axis=0)[margin:-margin]
 
 
 def _wave(arc: Float64, rng: np.random.Generator) -> Float64:

@@ -1,0 +1,1 @@
+"""Dwellings of several rooms: floor plan, walls with doors and windows, furniture, light."""
