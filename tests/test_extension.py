@@ -32,6 +32,7 @@ from ms_slam_env.metrics import registry
 from ms_slam_env.parallel import open_pool, run_each
 from ms_slam_env.scenes import registry as scene_registry
 from ms_slam_env.sequences import naming, perturbations
+from ms_slam_env.tasks import TASKS
 
 PAGE = Path(__file__).parents[1] / "docs" / "extending.md"
 MODULE = "my_extensions"
@@ -44,6 +45,7 @@ POINTS = {
     "brightness_metrics": registry.POINT,
     "Brightness": EXPERIMENTS,
     "AlwaysForward": PLANNERS,
+    "two_tables": TASKS,
 }
 ENV = {
     "id": "MSActiveSLAM-FreeCamera-v0",

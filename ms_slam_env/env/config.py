@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics, pinhole
-from ms_slam_env.config import Checked, bounded, check_range, chosen, from_dict
+from ms_slam_env.config import Checked, Named, bounded, check_range, chosen, from_dict
 from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.env.observations import POINT as OBSERVATION_POINT
 from ms_slam_env.env.observations import Observation
@@ -80,8 +80,11 @@ class TargetConfig(Checked):
 
 
 @dataclass(frozen=True)
-class RewardConfig(Checked):
+class RewardConfig(Checked, Named):
     """Weights of the reward terms; see :mod:`ms_slam_env.env.reward` for each term.
+
+    ``paper`` stands for what the paper's planner looks at, the distances to the divergence targets,
+    and its measure of success, the trajectory error; it asks for no map.
 
     Attributes:
         intensity_divergence: per M_I of distance to the intensity target.
@@ -103,6 +106,12 @@ class RewardConfig(Checked):
     lost_for_good: float = bounded(10.0, 0, 1e6)
     blocked: float = bounded(0.1, 0, 1e6)
     compute: float = bounded(0.1, 0, 1e6)
+
+    @classmethod
+    def named(cls) -> Mapping[str, RewardConfig]:
+        """The weights by name."""
+        unasked = ("new_surface", "lost", "lost_for_good", "blocked", "compute")
+        return {"default": cls(), "paper": cls(**dict.fromkeys(unasked, 0.0))}
 
 
 @dataclass(frozen=True)
@@ -157,8 +166,9 @@ class EnvConfig(Checked):
         divergence: how divergence is measured.
         lookahead: how candidates are predicted.
         targets: motion-and-structure parameters and thresholds.
-        reward: weights of the reward terms; or a function of a step's ``Outcome``, or its name
-            ``module:function``, that returns a number, or terms by name whose sum is the reward.
+        reward: weights of the reward terms, or ``paper`` for the paper's; or a function of a step's
+            ``Outcome``, or its name ``module:function``, that returns a number, or terms by name
+            whose sum is the reward.
     """
 
     scene: SceneName | tuple[SceneName, ...] = "living_room"
@@ -242,16 +252,22 @@ REWARDS = ExtensionPoint("reward", "ms_slam_env.rewards", form="module:function"
 
 def _reward(given: object) -> RewardConfig | Callable[..., Any]:
     """Weights, or a function."""
+    presets = RewardConfig.named()
+    named = ", ".join(presets)
     if isinstance(given, Mapping):
         return from_dict(RewardConfig, given, "reward")
+    if isinstance(given, str) and given in presets:
+        return presets[given]
     if isinstance(given, RewardConfig):
         return given
     if not isinstance(given, str) and not callable(given):
         weights = ", ".join(field.name for field in dataclasses.fields(RewardConfig))
         raise InputError(
-            f"reward = {given!r} must be a function of an Outcome, module:function, or a mapping "
-            f"of options: {weights}"
+            f"reward = {given!r} must be a function of an Outcome, module:function, {named}, or a "
+            f"mapping of options: {weights}"
         )
+    if isinstance(given, str) and ":" not in given and given not in REWARDS.names():
+        raise REWARDS.unknown(given, presets)
     found: Callable[..., Any] = REWARDS.find(given)
     return found
 

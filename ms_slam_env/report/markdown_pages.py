@@ -8,7 +8,8 @@ Between two comments, each on a line of its own, stands what a result says::
 The first word is a folder of results, whose ``results.json`` is read, or a JSON file in one. The
 options: ``table``, number or title of a table (by default the first); ``columns``, their names (by
 default all); ``where``, a column and the text that it must have, as in ``where=sequence=median``;
-``rows``, at most so many of the first; ``made_by=yes``, the command in a line below.
+``rows``, at most so many of the first; ``made_by=yes``, the command in a line below;
+``optional=yes``, a page may be written before there is such a table.
 Where the result is older than the code, the first of its tables on the page says so above.
 """
 
@@ -29,7 +30,8 @@ from ms_slam_env.report.tables import Table
 
 _START = re.compile(r"^<!-- results: (?P<what>.*) -->$")
 _END = "<!-- end -->"
-_OPTIONS = ("table", "columns", "where", "rows", "made_by")
+_OPTIONS = ("table", "columns", "where", "rows", "made_by", "optional")
+_ABSENT = "*Not run yet.*"
 
 
 def update_pages(pages: Iterable[Path], results: Path, write: bool = True) -> list[Path]:
@@ -120,8 +122,14 @@ def _inserted(what: str, folder: Path, warned: set[Path]) -> str:
             raise unknown("option", option, _OPTIONS)
     path = folder / place
     path = path if path.suffix == ".json" else path / RESULTS
+    may_lack = options.get("optional") == "yes"
+    if may_lack and not path.is_file():
+        return _ABSENT
     results = read_results(path)
-    table = _cut(_chosen(results, options.get("table", "0")), options)
+    which = options.get("table", "0")
+    if may_lack and which not in _tables(results):
+        return _ABSENT
+    table = _cut(_chosen(results, which), options)
     parts = [f"*{results.stale}*\n"] if results.stale and path not in warned else []
     warned.add(path)
     parts.append(table.as_markdown())
@@ -131,12 +139,16 @@ def _inserted(what: str, folder: Path, warned: set[Path]) -> str:
 
 
 def _chosen(results: Results, which: str) -> Table:
-    """The table of a number or title."""
-    tables = {str(n): table for n, table in enumerate(results.tables)}
-    tables |= {table.title: table for table in results.tables if table.title}
+    tables = _tables(results)
     if which not in tables:
         raise unknown("table", which, tables)
     return tables[which]
+
+
+def _tables(results: Results) -> dict[str, Table]:
+    """The tables by number and by title."""
+    tables = {str(n): table for n, table in enumerate(results.tables)}
+    return {**tables, **{table.title: table for table in results.tables if table.title}}
 
 
 def _cut(table: Table, options: dict[str, str]) -> Table:

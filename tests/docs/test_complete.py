@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from ms_slam_env import scenes, slam
+from ms_slam_env import scenes, slam, tasks
 from ms_slam_env.cli import COMMANDS
 from ms_slam_env.env.observations import OBSERVATIONS
 from ms_slam_env.experiments.harness import experiment_class, experiment_names
@@ -36,6 +36,7 @@ COMMITTED = [
         ("scenes", scenes.SCENES),
         ("sequences", PERTURBATIONS),
         ("planners", PLANNERS),
+        ("environments", tasks.OWN),
     ],
 )
 def test_the_page_of_a_kind_names_everything_of_it(page: str, names: Iterable[str]) -> None:

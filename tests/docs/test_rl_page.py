@@ -24,7 +24,7 @@ def test_the_examples_run(monkeypatch: pytest.MonkeyPatch) -> None:
         pytest.importorskip(name)
     monkeypatch.chdir(ROOT)
     sources = [source for _, source in BLOCKS if source]
-    assert len(sources) == 7
+    assert len(sources) == 8
     names: dict[str, Any] = {}
     for source in sources:
         small = re.sub(r"^OPTIONS = .*$", SMALL, source, flags=re.MULTILINE)

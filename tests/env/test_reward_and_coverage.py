@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ms_slam_env.env.config import RewardConfig, TargetConfig
+from ms_slam_env.env.config import EnvConfig, RewardConfig, TargetConfig
 from ms_slam_env.env.coverage import CoverageGrid
 from ms_slam_env.env.reward import Outcome, reward_terms
+from ms_slam_env.errors import InputError
 
 WEIGHTS = RewardConfig()
 TARGETS = TargetConfig(M_I=0.02, M_D=0.04, rho_I=0.5, rho_D=0.25, depth_weight=3.0)
@@ -55,6 +56,29 @@ def test_each_outcome_moves_its_own_term(change, term, sign):
     terms = reward_terms(dataclasses.replace(ON_TARGET, **change), WEIGHTS, TARGETS)
     assert np.sign(terms.pop(term)) == sign
     assert set(terms.values()) == {0.0}
+
+
+def test_the_papers_reward_is_divergence_and_trajectory_error_alone():
+    weights = EnvConfig(reward="paper").reward
+    assert weights == RewardConfig.named()["paper"]
+    bad = dataclasses.replace(
+        ON_TARGET,
+        divergence=np.array([0.03, 0.03]),
+        pose_error_growth_m=0.02,
+        new_surface_m2=3.0,
+        tracking_ok=False,
+        lost_for_good=True,
+        blocked=True,
+        configuration_cost=1.0,
+    )
+    terms = reward_terms(bad, weights, TARGETS)
+    usual = reward_terms(bad, WEIGHTS, TARGETS)
+    asked = {"intensity_divergence", "depth_divergence", "trajectory_error"}
+    assert {name for name, value in terms.items() if value} == asked
+    assert all(terms[name] == usual[name] != 0 for name in asked)
+    assert EnvConfig(reward="default").reward == EnvConfig().reward == WEIGHTS
+    with pytest.raises(InputError, match=r"unknown reward 'papers'; valid choices: .*paper"):
+        EnvConfig(reward="papers")
 
 
 def wall(count=40, spacing=0.05):
