@@ -1,6 +1,7 @@
 """NVIDIA Warp, initialised once: quiet, forward kernels only."""
 
 import atexit
+import errno
 import os
 import shutil
 import tempfile
@@ -8,7 +9,7 @@ import warnings
 
 import warp as wp
 
-from ms_slam_env.errors import InputWarning
+from ms_slam_env.errors import InputError, InputWarning
 
 wp.config.log_level = wp.LOG_ERROR
 wp.config.enable_backward = False
@@ -26,12 +27,27 @@ def _init_quietly() -> OSError | None:
         os.close(saved)
 
 
+def _check_home() -> None:
+    """Refuse a user without a home folder: Warp would make one that is called ``~``.
+
+    Raises:
+        FileNotFoundError: saying so.
+    """
+    told = os.environ.get("WARP_CACHE_PATH") or os.environ.get("XDG_CACHE_HOME")
+    if not told and os.path.expanduser("~") == "~":
+        raise FileNotFoundError(errno.ENOENT, "this user has no home folder", "~")
+
+
 def _init() -> OSError | None:
     """Initialise; where no kernels can be kept they go into a passing folder. Return why not."""
     try:
+        _check_home()
         wp.init()
     except OSError as error:
-        passing = tempfile.mkdtemp(prefix="ms_slam_env-")
+        try:
+            passing = tempfile.mkdtemp(prefix="ms_slam_env-")
+        except OSError as none:
+            raise InputError(f"no place for compiled kernels: {none.strerror}") from None
         atexit.register(shutil.rmtree, passing, ignore_errors=True)
         wp.config.kernel_cache_dir = passing
         wp.init()

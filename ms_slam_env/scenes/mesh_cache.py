@@ -32,11 +32,13 @@ Arrays = dict[str, NDArray[Any]]
 _UNREADABLE = (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile)
 
 
-def folder() -> Path:
-    """Where the entries lie."""
-    own = os.environ.get("MS_SLAM_ENV_CACHE")
-    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(own) if own else Path(base) / "ms_slam_env"
+def folder() -> Path | None:
+    """Where the entries lie; None for a user without a home folder."""
+    own, base = os.environ.get("MS_SLAM_ENV_CACHE"), os.environ.get("XDG_CACHE_HOME")
+    home = os.path.expanduser("~")
+    if not (own or base) and home == "~":
+        return None
+    return Path(own) if own else Path(base or f"{home}/.cache") / "ms_slam_env"
 
 
 def key(arrays: Iterable[NDArray[Any]], more: object) -> str:
@@ -50,7 +52,10 @@ def key(arrays: Iterable[NDArray[Any]], more: object) -> str:
 
 def remembered(name: str, work_out: Callable[[], Arrays]) -> Arrays:
     """The arrays of entry ``name``; worked out, and kept, where it is not there or broken."""
-    path = folder() / f"mesh-{name}.npz"
+    place = folder()
+    if place is None:
+        return work_out()
+    path = place / f"mesh-{name}.npz"
     with suppress(*_UNREADABLE), np.load(path, allow_pickle=False) as stored:
         found = {array: stored[array] for array in stored["names"].tolist()}
         os.utime(path)
