@@ -34,6 +34,8 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, Protocol
 
+from tqdm import tqdm
+
 from ms_slam_env.errors import InputError
 
 _LIBRARIES = ("OMP", "OPENBLAS", "MKL", "NUMEXPR")
@@ -323,6 +325,7 @@ def _environment(variables: Mapping[str, str]) -> Iterator[None]:
 
 def _serve(pipe: Connection, run: Run) -> None:
     """Run what comes through ``pipe``; leave Ctrl-C to the parent, and end when it does."""
+    tqdm.set_lock(threading.RLock())  # its own is a semaphore, left behind by who is terminated
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None

@@ -5,11 +5,14 @@ from __future__ import annotations
 import os
 from typing import Any
 
+from tqdm import tqdm
+
 from ms_slam_env.errors import InputError
 
 
 def work(spec: int) -> dict[str, Any]:
-    """Square ``spec``; below zero it complains, 13 kills the process."""
+    """Square ``spec``, with a bar; below zero it complains, 13 kills the process."""
+    tqdm([spec], disable=True)
     if spec == 13:
         os._exit(3)
     if spec < 0:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -24,6 +26,21 @@ def outcomes(specs: list[int], **options) -> dict[int, Outcome]:
         found = {outcome.key: outcome for outcome in run_each(pool, {spec: spec for spec in specs})}
         assert pool.busy == 0
     return found
+
+
+def test_workers_that_show_bars_leave_no_semaphore_behind() -> None:
+    """Of which multiprocessing would complain at the end of every command."""
+    code = "from test_parallel import outcomes; assert outcomes([2], workers=1)[2].error is None"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    done = subprocess.run(
+        [sys.executable, "-c", f"if __name__ == '__main__':\n {code}"],
+        cwd=Path(__file__).parent,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 @pytest.mark.parametrize("ray_address", [None, "local"])

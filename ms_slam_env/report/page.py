@@ -7,7 +7,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
-from html import escape
+from html import escape as html_escape
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from ms_slam_env.report.discovery import (
     NotShown,
     find_results,
 )
-from ms_slam_env.report.plotly_charts import plots_of
+from ms_slam_env.report.plotly_charts import in_order, plots_of
 from ms_slam_env.report.records import to_plain
 from ms_slam_env.report.results import Results
 from ms_slam_env.report.statistics import Interval
@@ -38,6 +38,11 @@ _POLICY = (
 )  # a browser that reads it loads nothing, whatever a result holds
 _PROVENANCE = ("command", "time", "commit", "python", "versions", "platform", "cpu", "gpu")
 _MAX_CONTENT = 100_000
+
+
+def escape(text: str) -> str:
+    """Text for the page, its letters in their order."""
+    return html_escape(in_order(text))
 
 
 def write_report(folder: Path, out: Path | None = None) -> Path:

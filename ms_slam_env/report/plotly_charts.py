@@ -28,6 +28,13 @@ _SYMBOLS = ("circle", "square", "diamond", "triangle-up", "cross", "star", "hexa
 _DASHES = ("solid", "dash", "dot", "dashdot", "longdash")
 _GUIDE = "#7d8590"
 _LABEL_LENGTH = 34
+_DIRECTIONS = dict.fromkeys([*range(0x202A, 0x202F), *range(0x2066, 0x206A)], "\ufffd")
+_OF_EVERY_OBJECT = {
+    *("constructor", "hasOwnProperty", "isPrototypeOf", "propertyIsEnumerable"),
+    *("toLocaleString", "toString", "valueOf", "__proto__", "__defineGetter__"),
+    *("__defineSetter__", "__lookupGetter__", "__lookupSetter__"),
+}
+"""Names that every object of JavaScript has: as those of a category Plotly takes them for known."""
 
 
 @dataclass(frozen=True)
@@ -66,11 +73,18 @@ def _names(charts: Sequence[Chart]) -> list[str]:
 
 def short(value: Any) -> str:
     """Text that Plotly shows as it is (it takes some tags for markup), long ones cut inside."""
-    plain = " ".join(str(value).split())
+    plain = in_order(" ".join(str(value).split()))
     if len(plain) > _LABEL_LENGTH:
         half = (_LABEL_LENGTH - 1) // 2
         plain = f"{plain[:half]}…{plain[-half:]}"
+    if plain in _OF_EVERY_OBJECT:
+        plain = f"\u200b{plain}"  # not the same name, and shown the same
     return html.escape(plain, quote=False)
+
+
+def in_order(text: str) -> str:
+    """Text without what would show its letters in another order."""
+    return text.translate(_DIRECTIONS)
 
 
 def _shorts(values: Iterable[str]) -> dict[str, str]:

@@ -198,6 +198,39 @@ def test_hostile_text_is_text(visit: Visit) -> None:
     assert visit.page.get_by_text(HOSTILE).count() > 0
 
 
+ODD = (
+    *(
+        "$x^{2}$ $\\frac{a}{",
+        "a|b",
+        "lone \ud800",
+        "\u202egnp.exe",
+        "L" * 3000,
+        "`[x](javascript:0)",
+    ),
+    *("__proto__", "constructor", "<b>&lt;", "\0\x1b[31m", "\u05d0\u05d1"),
+)
+"""Names with a meaning elsewhere: to formulas, tables, text directions, Markdown, JavaScript."""
+
+
+def test_names_with_a_meaning_elsewhere_are_names(browser: Any, tmp_path: Path) -> None:
+    bars = Panel("ate_m", "", [Series("s", [0.1] * len(ODD), ODD, mode="bars")])
+    lines = [Series(name, [0, 1], [0.1, 0.2], mode="lines") for name in ODD]
+    charts = [Chart("b", ODD[0], ODD[3], [bars]), Chart("l", "", "", [Panel("ate_m", "", lines)])]
+    rows = [{"variant": name, "ate_m": 0.1} for name in ODD]
+    folder = tmp_path / ODD[0].replace("/", "") / "a|b"
+    table = make_table(["variant", "ate_m"], rows, ODD[3], ODD[1])
+    write_results(folder / "results.json", ODD[2], ODD[1], ODD[3], [table], charts)
+    visit = Visit(browser, write_report(tmp_path), viewport={"width": 1280, "height": 800})
+    drawn = visit.page.evaluate("document.querySelectorAll('#s1-c0 .bars .point').length")
+    wide = visit.page.evaluate("document.documentElement.scrollWidth")
+    shown = visit.column("#s1-t0", 0)
+    visit.context.close()
+    assert [text for text in visit.problems if "MathJax" not in text] == []
+    assert (drawn, wide) == (len(ODD), 1280)
+    assert len(set(shown)) == len(ODD)
+    assert "\ufffdgnp.exe" in shown
+
+
 def test_a_phone_scrolls_tables_not_the_page(browser: Any, report: Path) -> None:
     phone = Visit(
         browser,
