@@ -21,8 +21,11 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from tqdm import tqdm
 
-Choose = Callable[[NDArray[Any], NDArray[np.bool_], Sequence[np.random.Generator]], Actions]
-"""Observations (B, k), masks (B, n) and a generator an episode to actions (B,) or (B, numbers)."""
+Choose = Callable[
+    [NDArray[Any], NDArray[np.bool_], Sequence[np.random.Generator], NDArray[np.bool_]], Actions
+]
+"""Observations (B, k), masks (B, n), a generator an episode, and which episodes begin (B,), to
+actions (B,) or (B, numbers)."""
 
 _STREAM = 1  # of an episode's seed, for who chooses; the environment draws from the seed itself
 
@@ -72,7 +75,7 @@ def evaluate(
     played = np.zeros(venv.num_envs, dtype=int)
     while len(episodes) < num_episodes:
         masks = np.stack(venv.env_method("action_masks"))
-        actions = choose(observations, masks, rngs)
+        actions = choose(observations, masks, rngs, steps == 0)
         observations, rewards, dones, infos = venv.step(actions)  # type: ignore[assignment]
         returns += rewards
         steps += 1
@@ -106,10 +109,17 @@ def evaluate_policy(
 ) -> dict[str, Any]:
     """``evaluate`` a trained policy that draws its actions, or takes the most probable."""
 
+    memory = policy.empty_memory(venv.num_envs)
+
     def choose(
-        observations: NDArray[Any], masks: NDArray[np.bool_], rngs: Sequence[np.random.Generator]
+        observations: NDArray[Any],
+        masks: NDArray[np.bool_],
+        rngs: Sequence[np.random.Generator],
+        begins: NDArray[np.bool_],
     ) -> Actions:
-        probabilities = policy.probabilities(observations, masks)
+        nonlocal memory
+        memory = policy.remember(observations, np.where(begins[:, None], 0, memory))
+        probabilities = policy.probabilities(observations, masks, memory)
         if deterministic:
             return most_probable(probabilities, policy.parts)
         return sample(probabilities, rngs, policy.parts)
@@ -141,14 +151,14 @@ def references(venv: VecEnv, num_episodes: int) -> dict[str, dict[str, Any]]:
         others = [np.full(len(motions), count - 1) for count in parts[1:]]
         return joined([motions, *others])
 
-    def random_walk(_: Any, masks: NDArray[np.bool_], rngs: Any) -> Actions:
+    def random_walk(_: Any, masks: NDArray[np.bool_], rngs: Any, __: Any) -> Actions:
         uniform = [part / part.sum(axis=1, keepdims=True) for part in split(masks, parts)]
         return sample(np.concatenate(uniform, axis=1), rngs, parts)
 
-    def stationary(_: Any, masks: NDArray[np.bool_], __: Any) -> Actions:
+    def stationary(_: Any, masks: NDArray[np.bool_], *__: Any) -> Actions:
         return whole(np.zeros(len(masks), dtype=np.int64))
 
-    def greedy(_: Any, masks: NDArray[np.bool_], __: Any) -> Actions:
+    def greedy(_: Any, masks: NDArray[np.bool_], *__: Any) -> Actions:
         delta_I, delta_D = np.moveaxis(np.stack(venv.env_method("lookahead")), -1, 0)
         possible = split(masks, parts)[0]
         distance = np.where(possible, distance_to_targets(delta_I, delta_D, targets), np.inf)

@@ -22,12 +22,11 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from ms_slam_agents.demonstrations import Demonstration, Task, play
-from ms_slam_agents.evaluation import evaluate_policy
 from ms_slam_agents.learning_curve import Curve, read_curve
 from ms_slam_agents.options import Problem
-from ms_slam_agents.policy import CLIP, EPSILON, Policy
+from ms_slam_agents.policy import CLIP, EPSILON
 from ms_slam_agents.policy_file import Metadata, PolicyFile, read_policy, write_policy
-from ms_slam_agents.supervisor import BEST, LATEST
+from ms_slam_agents.supervisor import LATEST
 from ms_slam_agents.train_sb3 import VALIDATION_SEED, env_options, make_venv
 from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
 from tqdm import tqdm
@@ -319,16 +318,9 @@ def train(args: Args) -> int:
         file = student.file(steps, (time.monotonic() - started) / 60)
         venv = make_venv(args, "validation", seeds)
         try:
-            scores = evaluate_policy(
-                venv, args.eval_episodes, Policy(file), args.deterministic_eval
-            )
+            point = curve.judge(file, venv, args.out, args.deterministic_eval)
         finally:
             venv.close()
-        is_best = scores["return"] > curve.best
-        point = curve.add(steps, file.metadata.minutes, scores)
-        curve.write(args.out)
-        if is_best:
-            write_policy(args.out / BEST, file)
         write_policy(args.out / LATEST, file)  # last: a round without it is done again
         print(
             f"round {number}: {steps} steps, loss {said['loss']:.3f}, the teacher's action has "

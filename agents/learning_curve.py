@@ -7,7 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ms_slam_agents.evaluation import paired_gain
+from ms_slam_agents.evaluation import evaluate_policy, paired_gain
+from ms_slam_agents.policy import Policy
+from ms_slam_agents.policy_file import PolicyFile, write_policy
+from stable_baselines3.common.vec_env import VecEnv
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.report.charts import Chart, Panel, Series
@@ -15,6 +18,7 @@ from ms_slam_env.report.records import Row
 from ms_slam_env.report.results import RESULTS, Results, read_results, write_result_folder
 from ms_slam_env.report.tables import Table, make_table
 
+BEST = "best.safetensors"
 BASELINE = "random walk"
 POLICY = "policy"
 
@@ -55,6 +59,18 @@ class Curve:
         if BASELINE in self.references:
             point |= paired_gain(point["returns"], self.references[BASELINE]["returns"])
         self.points.append(point)
+        return point
+
+    def judge(
+        self, file: PolicyFile, validation: VecEnv, out: Path, deterministic: bool = False
+    ) -> dict[str, Any]:
+        """Evaluate a policy, add a point, write the curve, and the policy if none was better."""
+        known = file.metadata
+        scores = evaluate_policy(validation, self.episodes, Policy(file), deterministic)
+        if known.epochs and scores["return"] > self.best:
+            write_policy(out / BEST, file)
+        point = self.add(known.timesteps, known.minutes, scores)
+        self.write(out)
         return point
 
     def write(self, out: Path) -> Results:

@@ -21,6 +21,8 @@ Float64 = NDArray[np.float64]
 EPSILON = 1e-8  # keeps observations that never change finite
 CLIP = 10.0  # standard deviations
 
+_GATES = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
+
 
 class Policy:
     """A trained network with its normalisation: observations in, action probabilities out.
@@ -49,11 +51,13 @@ class Policy:
         self.parts = tuple(file.metadata.actions)
         self.num_actions = sum(self.parts)
         network = {name: value.astype(np.float64) for name, value in file.part("policy").items()}
+        self._gates = {name: network[f"memory.{name}"] for name in _GATES if file.metadata.memory}
         layers = range(0, 2 * len(file.metadata.hidden), 2)
         names = [*(f"mlp_extractor.policy_net.{i}" for i in layers), "action_net"]
         self._layers = [(network[f"{n}.weight"].T, network[f"{n}.bias"]) for n in names]
         moments = file.part("observation")
         self._mean, self._std = moments["mean"], np.sqrt(moments["var"] + EPSILON)
+        self.reset()
 
     @classmethod
     def load(cls, path: str | Path) -> Policy:
@@ -64,7 +68,40 @@ class Policy:
         """
         return cls(read_policy(path))
 
-    def probabilities(self, observations: NDArray[Any], masks: NDArray[np.bool_]) -> Float64:
+    def reset(self) -> None:
+        """Begin an episode: what ``act`` remembers is forgotten."""
+        self._memory = self.empty_memory(1)
+
+    def empty_memory(self, rows: int) -> Float64:
+        """The memory (B, M) of ``rows`` episodes that begin; M is 0 for a policy without one."""
+        return np.zeros((rows, self.metadata.memory))
+
+    def remember(self, observations: NDArray[Any], memory: Float64) -> Float64:
+        """The memory (B, M) after observations (B, k): a gated recurrent unit.
+
+        r = s(W_r x + U_r h), z = s(W_z x + U_z h), n = tanh(W_n x + r U_n h), h' = (1 - z) n + z h,
+        biases left out (Cho et al., 2014, in PyTorch's form).
+        """
+        if not self._gates:
+            return memory
+        x = self._scaled(observations)
+        of_x = x @ self._gates["weight_ih"].T + self._gates["bias_ih"]
+        of_h = memory @ self._gates["weight_hh"].T + self._gates["bias_hh"]
+        (r_x, z_x, n_x), (r_h, z_h, n_h) = (np.split(a, 3, axis=1) for a in (of_x, of_h))
+        reset, keep = _sigmoid(r_x + r_h), _sigmoid(z_x + z_h)
+        return (1 - keep) * np.tanh(n_x + reset * n_h) + keep * memory
+
+    def _scaled(self, observations: NDArray[Any]) -> Float64:
+        """As the network saw them in training."""
+        scaled = np.clip((observations - self._mean) / self._std, -CLIP, CLIP)
+        return scaled.astype(np.float32).astype(np.float64)
+
+    def probabilities(
+        self,
+        observations: NDArray[Any],
+        masks: NDArray[np.bool_],
+        memory: Float64 | None = None,
+    ) -> Float64:
         """Probabilities (B, n) of the actions, 0 where ``masks`` (B, n) is false.
 
         Of an action of several numbers, those of each number side by side; each sums to 1.
@@ -72,10 +109,21 @@ class Policy:
         Args:
             observations: (B, k) as the environment returns them, not normalised.
             masks: (B, n) true for permitted actions, at least one a row and number.
+            memory: (B, M) after these observations, as ``remember`` returns it; None: empty.
 
         Raises:
             InputError: observations of another environment or variant, or such masks.
         """
+        self._check(observations, masks)
+        *hidden, (weight, bias) = self._layers
+        memory = self.empty_memory(len(masks)) if memory is None else memory
+        x = np.concatenate([self._scaled(observations), memory], axis=1)
+        for hidden_weight, hidden_bias in hidden:
+            x = np.tanh(x @ hidden_weight + hidden_bias)
+        logits = np.where(masks, x @ weight + bias, -np.inf)
+        return np.concatenate([_softmax(part) for part in split(logits, self.parts)], axis=1)
+
+    def _check(self, observations: NDArray[Any], masks: NDArray[np.bool_]) -> None:
         for name, given, length in (
             ("observations", observations, self.metadata.inputs),
             ("masks", masks, self.num_actions),
@@ -85,13 +133,6 @@ class Policy:
                     f"{name} of shape {np.shape(given)}: the policy expects (B, {length}), "
                     f"as {self.metadata.env_id} with observation={self.metadata.observation!r} has"
                 )
-        scaled = np.clip((observations - self._mean) / self._std, -CLIP, CLIP)
-        *hidden, (weight, bias) = self._layers
-        x = scaled.astype(np.float32).astype(np.float64)  # as the network saw them in training
-        for hidden_weight, hidden_bias in hidden:
-            x = np.tanh(x @ hidden_weight + hidden_bias)
-        logits = np.where(masks, x @ weight + bias, -np.inf)
-        return np.concatenate([_softmax(part) for part in split(logits, self.parts)], axis=1)
 
     def act(
         self,
@@ -99,7 +140,9 @@ class Policy:
         mask: NDArray[np.bool_],
         rng: np.random.Generator | None = None,
     ) -> Any:
-        """One action: an integer, or an array of them where an action has several numbers.
+        """One action, with what was seen since ``reset`` in mind.
+
+        An integer, or an array of them where an action has several numbers.
 
         Args:
             observation: (k,) as the environment returns it.
@@ -109,8 +152,10 @@ class Policy:
         Raises:
             InputError: an observation or a mask of another shape.
         """
-        mask = np.asarray(mask, dtype=bool)
-        probabilities = self.probabilities(np.asarray(observation)[None], mask[None])
+        seen, mask = np.asarray(observation)[None], np.asarray(mask, dtype=bool)
+        self._check(seen, mask[None])
+        self._memory = self.remember(seen, self._memory)
+        probabilities = self.probabilities(seen, mask[None], self._memory)
         if rng is None:
             (action,) = most_probable(probabilities, self.parts)
         else:
@@ -191,6 +236,10 @@ def split(values: NDArray[Any], parts: Sequence[int]) -> list[NDArray[Any]]:
 def joined(numbers: Sequence[Any]) -> Actions:
     """Actions from the choices (B,) of each of their numbers."""
     return np.stack(numbers, axis=1) if len(numbers) > 1 else np.array(numbers[0])
+
+
+def _sigmoid(values: Float64) -> Float64:
+    return np.asarray(0.5 * (1 + np.tanh(0.5 * values)))  # never overflows
 
 
 def _softmax(logits: Float64) -> Float64:

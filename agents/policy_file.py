@@ -28,7 +28,7 @@ from ms_slam_env.report.records import build, to_plain
 Tensors = dict[str, NDArray[Any]]
 Shapes = dict[str, tuple[int, ...]]
 
-ALGORITHMS = ("maskable_ppo", "ppo", "imitation")
+ALGORITHMS = ("maskable_ppo", "ppo", "imitation", "masked_ppo")
 VERSION = 1
 STEP = "optimizer.step"
 MOMENTS = ("exp_avg", "exp_avg_sq")  # of Adam, each of its parameter's shape
@@ -54,6 +54,7 @@ class Metadata:
         inputs: numbers of an observation.
         hidden: widths of the hidden layers, tanh between them.
         actions: choices of each number that an action consists of.
+        memory: width of the recurrent unit before the layers; 0 without one.
         timesteps: environment steps trained.
         epochs: passes over its experience that the network learnt from; 0: it is untrained.
         minutes: wall-clock time trained, evaluations left out.
@@ -71,6 +72,7 @@ class Metadata:
     timesteps: int
     epochs: int
     minutes: float
+    memory: int = 0
     env_options: dict[str, Any] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
@@ -104,6 +106,8 @@ class Metadata:
             many = 0 < len(sizes) <= _MOST_LAYERS
             if not many or not all(0 < size <= _LARGEST_LAYER for size in sizes):
                 raise InputError(f"{name} = {str(sizes)[:80]} are no sizes of layers")
+        if not 0 <= self.memory <= _LARGEST_LAYER:
+            raise InputError(f"memory = {self.memory} is no width")
         counts = (self.timesteps, self.epochs, self.minutes)
         if not all(0 <= count < math.inf for count in counts):
             raise InputError(f"timesteps, epochs, minutes = {counts} are no counts")
@@ -139,8 +143,13 @@ class PolicyFile:
 
 def network_shapes(metadata: Metadata) -> Shapes:
     """Shapes of the network's parameters, by Stable-Baselines3's names, in its order."""
+    width = metadata.memory
     shapes: Shapes = {}
-    sizes = (metadata.inputs, *metadata.hidden)
+    if width:  # three gates one above the other, as PyTorch has them
+        shapes |= {"memory.weight_ih": (3 * width, metadata.inputs)}
+        shapes |= {"memory.weight_hh": (3 * width, width)}
+        shapes |= {"memory.bias_ih": (3 * width,), "memory.bias_hh": (3 * width,)}
+    sizes = (metadata.inputs + width, *metadata.hidden)
     layers = list(zip(sizes[1:], sizes[:-1], strict=True))
     heads = {"action_net": sum(metadata.actions), "value_net": 1}
     for net in ("policy_net", "value_net"):

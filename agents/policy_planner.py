@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ms_slam_agents.policy import Policy
+from ms_slam_agents.policy_file import PolicyFile, read_policy
 
 from ms_slam_env.env import Planner
 from ms_slam_env.errors import InputError
@@ -47,7 +48,7 @@ class TrainedPolicy(Planner):
         super().__init__(env, seed)
         path = self._path(path)
         self.deterministic = _truth(deterministic)
-        self.policy = _loaded(path, _modified(path))
+        self.policy = Policy(_loaded(path, _modified(path)))
         if not self.policy.metadata.epochs:
             raise InputError(f"{path!r} is untrained: its network has had no update")
         try:
@@ -71,6 +72,10 @@ class TrainedPolicy(Planner):
             )
         return found
 
+    def reset(self) -> None:
+        """Nothing was seen yet."""
+        self.policy.reset()
+
     def act(self, observation: Any, info: dict[str, Any]) -> Any:
         """Draw an unmasked action from the policy's probabilities, or take the most probable.
 
@@ -87,9 +92,9 @@ class RoomAgent(TrainedPolicy):
 
 
 @lru_cache(maxsize=8)
-def _loaded(path: str, modified: float) -> Policy:
+def _loaded(path: str, modified: float) -> PolicyFile:
     """A policy file is read once for its observation, and not again for its network."""
-    return Policy.load(path)
+    return read_policy(path)
 
 
 def _modified(path: str) -> float:

@@ -22,9 +22,22 @@ def tensors_of(model: Model) -> Tensors:
     return {
         **{f"policy.{name}": p.numpy() for name, p in model.policy.state_dict().items()},
         **optimizer_tensors(list(model.policy.state_dict()), model.policy.optimizer.state_dict()),
+        **moment_tensors(normalize),
+    }
+
+
+def moment_tensors(normalize: VecNormalize) -> Tensors:
+    """Running moments of observations and returns."""
+    return {
         **_moments("observation", normalize.obs_rms),
         **_moments("return", normalize.ret_rms),
     }
+
+
+def restore_moments(normalize: VecNormalize, file: PolicyFile) -> None:
+    """Put the running moments where they stood when the file was written."""
+    _restore_moments(normalize.obs_rms, file.part("observation"))
+    _restore_moments(normalize.ret_rms, file.part("return"))
 
 
 def optimizer_tensors(parameters: list[str], state: dict[str, Any]) -> Tensors:
@@ -45,22 +58,21 @@ def restore(model: Model, file: PolicyFile) -> None:
     network = {name: torch.from_numpy(value) for name, value in file.part("policy").items()}
     model.policy.load_state_dict(network)
     if file.can_resume:
-        _restore_optimizer(model, file.part("optimizer"), list(network))
-    normalize = _normalize(model)
-    _restore_moments(normalize.obs_rms, file.part("observation"))
-    _restore_moments(normalize.ret_rms, file.part("return"))
+        restore_adam(model.policy.optimizer, file.part("optimizer"), list(network))
+    restore_moments(_normalize(model), file)
     model.num_timesteps = file.metadata.timesteps
     model._n_updates = file.metadata.epochs
 
 
-def _restore_optimizer(model: Model, saved: Tensors, parameters: list[str]) -> None:
-    state = model.policy.optimizer.state_dict()
+def restore_adam(optimizer: torch.optim.Optimizer, saved: Tensors, parameters: list[str]) -> None:
+    """Put Adam where it stood; ``parameters`` are the names in its order."""
+    state = optimizer.state_dict()
     state["state"] = {
         i: {"step": torch.tensor(float(saved["step"]))}
         | {moment: torch.from_numpy(saved[f"{name}.{moment}"]) for moment in MOMENTS}
         for i, name in enumerate(parameters)
     }
-    model.policy.optimizer.load_state_dict(state)
+    optimizer.load_state_dict(state)
 
 
 def _normalize(model: Model) -> VecNormalize:

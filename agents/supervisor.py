@@ -8,10 +8,9 @@ from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
-from ms_slam_agents.evaluation import evaluate_policy
 from ms_slam_agents.learning_curve import BASELINE, Curve
 from ms_slam_agents.options import Args
-from ms_slam_agents.policy import Policy, action_parts
+from ms_slam_agents.policy import action_parts
 from ms_slam_agents.policy_file import Metadata, PolicyFile, write_policy
 from ms_slam_agents.sb3_state import Model, tensors_of, update_on_partial_rollout
 from stable_baselines3.common.callbacks import BaseCallback
@@ -22,7 +21,6 @@ from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import to_plain
 
 LATEST = "latest.safetensors"
-BEST = "best.safetensors"
 
 
 class Supervisor(BaseCallback):
@@ -167,16 +165,10 @@ class Supervisor(BaseCallback):
         started = time.monotonic()
         file = self.policy_file().without_optimizer()
         minutes = file.metadata.minutes
-        scores = evaluate_policy(
-            self.validation, self.args.eval_episodes, Policy(file), self.args.deterministic_eval
-        )
-        if file.metadata.epochs and scores["return"] > self.curve.best:
-            write_policy(self.args.out / BEST, file)
-        point = self.curve.add(self.num_timesteps, minutes, scores)
         self.curve = replace(self.curve, config=file.metadata.options)
-        self.curve.write(self.args.out)
-        for name in scores.keys() - {"returns"}:
-            self.logger.record(f"validation/{name}", scores[name])
+        point = self.curve.judge(file, self.validation, self.args.out, self.args.deterministic_eval)
+        for name in point.keys() - {"returns", "timesteps", "training_min"}:
+            self.logger.record(f"validation/{name}", point[name])
         self._evaluation_s += time.monotonic() - started
         self._bar.write(f"{self.num_timesteps} steps, {minutes:.1f} min: {self._in_words(point)}")
 

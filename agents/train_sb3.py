@@ -68,6 +68,20 @@ def make_env(args: Problem, split: str, seeds: Sequence[int]) -> gym.Env[Any, An
     return FixedEpisodes(env, seeds) if seeds else env
 
 
+def check_problem(args: Problem) -> None:
+    """Refuse what no environment can be made of.
+
+    Raises:
+        InputError: an unknown environment, or options that it refuses.
+    """
+    try:
+        make_env(args, "train", ()).close()
+    except gym.error.UnregisteredEnv:
+        raise unknown("environment", args.env_id, ms_slam_env.ENV_IDS) from None
+    except gym.error.Error as error:
+        raise InputError(f"environment {args.env_id!r} cannot be made: {error}") from None
+
+
 def env_options(args: Problem) -> dict[str, Any]:
     """Options of the environment that a policy depends on, where not the environment's own."""
     step_rad = None if args.step_deg is None else math.radians(args.step_deg)
@@ -208,13 +222,7 @@ def train(args: Args) -> int:
     file = load_run(args)
     if args.init and file is None:
         begun(args)  # refused before anything is written
-    try:
-        env = make_env(args, "train", ())  # bad options fail here, not in a worker process
-    except gym.error.UnregisteredEnv:
-        raise unknown("environment", args.env_id, ms_slam_env.ENV_IDS) from None
-    except gym.error.Error as error:
-        raise InputError(f"environment {args.env_id!r} cannot be made: {error}") from None
-    env.close()
+    check_problem(args)  # here, not in a worker process
     args.out.mkdir(parents=True, exist_ok=True)
     seeds = range(VALIDATION_SEED, VALIDATION_SEED + args.eval_episodes)
     validation = make_venv(args, "validation", seeds)

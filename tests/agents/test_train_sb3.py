@@ -91,7 +91,7 @@ def test_returns_come_in_the_order_of_the_seeds(num_envs):
         env = LearnableFake()
         env.reset(seed=seed)
         expected.append(sum(env.step(0)[1] for _ in range(10)))
-    assert played(num_envs, lambda _, masks, __: np.zeros(len(masks), dtype=np.int64)) == expected
+    assert played(num_envs, lambda _, masks, *__: np.zeros(len(masks), dtype=np.int64)) == expected
 
 
 def test_what_an_episode_draws_depends_on_its_seed_alone():

@@ -1,0 +1,212 @@
+"""PPO of our own: parts against slow versions and PyTorch, learning against Stable-Baselines3."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from learnable_fake import ENV_ID, LearnableFake, arguments, read_curve
+
+pytest.importorskip("sb3_contrib")
+
+from ms_slam_agents import ppo, train_sb3
+from ms_slam_agents.policy import Policy
+from ms_slam_agents.policy_file import Metadata, PolicyFile, read_policy
+
+RECALL_ID = "LearnableRecall-v0"
+
+
+class Recall(LearnableFake):
+    """The right action is what was named two steps before: without a memory nobody knows it."""
+
+    def reset(self, *, seed=None, options=None):
+        self.named = []
+        return super().reset(seed=seed)
+
+    def _next(self):
+        observation = super()._next()
+        self.named.append(self.right)
+        self.right = self.named[max(0, len(self.named) - 3)]
+        self.mask[:] = True
+        return observation
+
+
+gym.register(RECALL_ID, Recall)
+
+
+def words(out, *more, steps=64, env_id=ENV_ID):
+    options = {
+        "out": out,
+        "env-id": env_id,
+        "total-timesteps": steps,
+        "num-envs": 1,
+        "episode-steps": 10,
+        "eval-episodes": 6,
+        "eval-every": 0,
+        "n-steps": 32,
+        "batch-size": 16,
+        "n-epochs": 4,
+        "hidden": 16,
+    }
+    return [w for name, value in options.items() for w in (f"--{name}", str(value))] + [*more]
+
+
+def last_return(out):
+    return read_curve(out).points[-1]["return"]
+
+
+def test_advantages_are_those_of_a_loop_over_their_definition():
+    rng = np.random.default_rng(0)
+    T, B = 12, 3
+    rewards, values = rng.normal(size=(2, T, B))
+    begins = (rng.random((T, B)) < 0.3).astype(float)
+    last, ended = rng.normal(size=B), np.array([0.0, 1.0, 0.0])
+    args = ppo.Args(gamma=0.9, gae_lambda=0.8)
+    empty = torch.zeros(T, B, 0)
+    tensors = [torch.as_tensor(a) for a in (begins, values, rewards)]
+    rollout = ppo.Rollout(
+        empty, empty, tensors[0], empty, empty, empty, tensors[1], tensors[2], empty
+    )
+    rollout.find_advantages(torch.as_tensor(last), torch.as_tensor(ended), args)
+    following = np.concatenate([values[1:], last[None]])
+    over = np.concatenate([begins[1:], ended[None]])
+    errors = rewards + 0.9 * following * (1 - over) - values
+    for b in range(B):
+        for t in range(T):
+            total, weight = 0.0, 1.0
+            for k in range(t, T):
+                total += weight * errors[k, b]
+                weight *= 0.9 * 0.8 * (1 - over[k, b])
+            assert rollout.advantages[t, b] == pytest.approx(total)
+
+
+def test_chunks_hold_consecutive_steps_of_one_environment():
+    steps = torch.arange(7)[:, None] + 100 * torch.arange(2)[None]
+    rollout = ppo.Rollout(*[steps] * 9, advantages=steps)
+    cut = rollout.chunks(3)["seen"]
+    assert sorted(cut.T.tolist()) == [[0, 1, 2], [3, 4, 5], [100, 101, 102], [103, 104, 105]]
+
+
+def policy_of(network, memory):
+    metadata = Metadata("masked_ppo", ENV_ID, "features", 5, (16, 16), (7,), 1, 1, 0.0, memory)
+    tensors = {f"policy.{n}": p.detach().numpy() for n, p in network.named_parameters()}
+    for name, shape in (("observation", (5,)), ("return", ())):
+        tensors |= {f"{name}.mean": np.full(shape, 0.5), f"{name}.var": np.full(shape, 4.0)}
+        tensors |= {f"{name}.count": np.array(9.0)}
+    return Policy(PolicyFile(metadata, tensors))
+
+
+@pytest.mark.parametrize("memory", [0, 8])
+def test_the_policy_in_numpy_is_the_network(memory):
+    torch.manual_seed(0)
+    network = ppo.Network(5, 16, 7, memory)
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, 0, 0.5)
+    policy = policy_of(network, memory)
+    rng = np.random.default_rng(0)
+    own, theirs = policy.empty_memory(4), torch.zeros(4, memory)
+    for _ in range(5):
+        seen, masks = rng.normal(size=(4, 5)), rng.random((4, 7)) < 0.6
+        masks[:, 0] = True
+        own = policy.remember(seen, own)
+        scaled = torch.as_tensor((seen - 0.5) / 2, dtype=torch.float32)
+        theirs = network.remember(scaled, theirs, torch.zeros(4))
+        expected = network(scaled, theirs, torch.as_tensor(masks))[0].exp().detach()
+        np.testing.assert_allclose(policy.probabilities(seen, masks, own), expected, atol=1e-6)
+
+
+def test_act_remembers_until_it_is_reset():
+    torch.manual_seed(0)
+    network = ppo.Network(5, 16, 7, 8)
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, 0, 1.0)
+    policy = policy_of(network, 8)
+    seen, mask = np.ones((40, 5)), np.ones(7, bool)
+    rng = np.random.default_rng(0)
+    seen += rng.normal(size=seen.shape)
+
+    def drawn():
+        policy.reset()
+        return [policy.act(each, mask, np.random.default_rng(1)) for each in seen]
+
+    first = drawn()
+    assert drawn() == first
+    forgetful = []
+    for each in seen:
+        policy.reset()
+        forgetful.append(policy.act(each, mask, np.random.default_rng(1)))
+    assert forgetful != first
+
+
+def test_it_learns_what_needs_no_memory_as_well_as_stable_baselines(tmp_path):
+    assert ppo.main(words(tmp_path / "own", "--learning-rate", "0.01", steps=1280)) == 0
+    more = ("--learning-rate", "0.01", "--no-references")
+    theirs = arguments(tmp_path / "sb3", *more, steps=1280)
+    assert train_sb3.main(theirs) == 0
+    assert last_return(tmp_path / "own") > 8.5
+    assert last_return(tmp_path / "own") > last_return(tmp_path / "sb3") - 1
+
+
+@pytest.mark.slow
+def test_only_a_memory_learns_what_needs_one(tmp_path):
+    more = ("--learning-rate", "0.01", "--n-steps", "256", "--batch-size", "64", "--gamma", "0.5")
+    for memory in (0, 32):
+        own = (*more, "--memory", str(memory), "--chunk", "8")
+        assert ppo.main(words(tmp_path / str(memory), *own, env_id=RECALL_ID, steps=10_240)) == 0
+    assert last_return(tmp_path / "0") < 3.5  # three of ten at most, and one in seven of the rest
+    assert last_return(tmp_path / "32") > last_return(tmp_path / "0") + 2
+
+
+def test_a_memory_is_trained_saved_and_resumed(tmp_path, capsys):
+    more = ("--memory", "8", "--chunk", "4")
+    assert ppo.main(words(tmp_path / "a", *more)) == 0
+    file = read_policy(tmp_path / "a" / "latest.safetensors")
+    assert file.metadata.memory == 8
+    assert file.metadata.timesteps == 64
+    assert file.can_resume
+    assert ppo.main(words(tmp_path / "a", *more, "--resume", steps=128)) == 0
+    assert read_policy(tmp_path / "a" / "latest.safetensors").metadata.timesteps == 128
+    assert [p["timesteps"] for p in read_curve(tmp_path / "a").points] == [0, 64, 128]
+    assert ppo.main(words(tmp_path / "a", "--resume", steps=256)) == 2
+    assert "trained with memory 8, not 0" in capsys.readouterr().err
+
+
+def test_two_runs_of_one_seed_are_one(tmp_path):
+    for name in "ab":
+        assert ppo.main(words(tmp_path / name, "--memory", "4")) == 0
+    a, b = (read_policy(tmp_path / name / "latest.safetensors").tensors for name in "ab")
+    for name, value in a.items():
+        np.testing.assert_array_equal(b[name], value, err_msg=name)
+
+
+def test_the_pull_keeps_it_near_the_policy_that_it_began_with(tmp_path):
+    assert ppo.main(words(tmp_path / "first", "--learning-rate", "0.01", steps=640)) == 0
+    init = ("--init", str(tmp_path / "first" / "latest.safetensors"), "--learning-rate", "0.03")
+    first = Policy.load(tmp_path / "first" / "latest.safetensors")
+    seen = (10 * np.eye(7) + 3).astype(np.float32)
+    masks = np.ones((7, 7), bool)
+    moved = {}
+    for pull in ("0", "20"):
+        more = (*init, "--pull", pull, "--pull-steps", "1000000", "--ent-coef", "0.5")
+        assert ppo.main(words(tmp_path / pull, *more, steps=320)) == 0
+        other = Policy.load(tmp_path / pull / "latest.safetensors")
+        difference = other.probabilities(seen, masks) - first.probabilities(seen, masks)
+        moved[pull] = np.abs(difference).sum()
+    assert moved["20"] < 0.5 * moved["0"]
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (("--init", "nothing"), "no policy file 'nothing'"),
+        (("--resume",), "no policy file"),
+        (("--observation", "x:Y"), "unknown observation 'x:Y'"),
+        (("--memory", "-1"), "memory"),
+        (("--env-id", "No-v0"), "No-v0"),
+    ],
+)
+def test_bad_options_are_one_line_and_write_nothing(tmp_path, capsys, more, said):
+    assert ppo.main(words(tmp_path / "out", *more)) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
