@@ -1,10 +1,16 @@
-"""Experiment (c): where M_I and M_D come from, as in Fig. 3 of Saeedi et al., ICRA 2017."""
+"""Experiment (c): where M_I and M_D come from, as in Figs. 3 and 4 of Saeedi et al., ICRA 2017."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ms_slam_env import metrics, slam
 from ms_slam_env.camera import xtion
@@ -19,8 +25,16 @@ from ms_slam_env.report.charts import Chart, scatter
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Grouping, Table, make_table
 from ms_slam_env.sensor.scene_cache import get_scene
-from ms_slam_env.sequences import handheld_trajectory, render_sequence
+from ms_slam_env.sequences import (
+    handheld_trajectory,
+    icl_nuim,
+    place_trajectory,
+    render_sequence,
+)
 
+Float64 = NDArray[np.float64]
+
+_FINEST = 12  # denominator of an interval: 1.333 is 4/3
 DIVERGENCES = ("M_I", "M_D", "intensity_divergence_mean", "depth_divergence_mean")
 
 
@@ -31,33 +45,59 @@ class SkippingSpec:
     Attributes:
         scene: a scene's name or a mesh file.
         seed: of the scene, the trajectory and the sensor noise.
-        keep_every: every so many frames are kept; 1 keeps all.
-        frames: length of the whole sequence.
+        keep_every: every so many frames one is kept; 1 keeps all, 1.5 drops one in three.
+        frames: length of the whole sequence at most.
         image_size: width x height.
+        motion: ICL-NUIM's that is placed in the scene, such as ``lr_kt1``; empty: hand-held.
+        data: folder that holds it.
     """
 
     scene: str
     seed: int
-    keep_every: int
+    keep_every: float
     frames: int
     image_size: str = "160x120"
+    motion: str = ""
+    data: str = ""
+
+    @property
+    def kept(self) -> NDArray[np.int64]:
+        """Indices of the frames that are kept: floor(k n) for k = 0, 1, 2, ..."""
+        interval = Fraction(self.keep_every).limit_denominator(_FINEST)
+        count = math.ceil(self.frames / interval)
+        return np.array([math.floor(k * interval) for k in range(count)], dtype=np.int64)
+
+    def trajectory(self) -> Float64:
+        """Poses (N, 4, 4) of the frames that are kept."""
+        scene = get_scene(self.scene, self.seed)
+        if self.motion:
+            poses = icl_nuim.read_motion(self.data, self.motion)[1]
+            whole = place_trajectory(scene, poses, self.seed).poses
+        else:
+            whole = handheld_trajectory(scene, self.frames, self.seed)
+        return whole[self.kept[self.kept < len(whole)]]
 
 
 @dataclass(frozen=True)
 class FrameSkipping(Experiment):
     """Divergence against trajectory error when frames are skipped
 
-    Hand-held sequences of which every n-th frame is kept, which makes the divergence between
-    neighbours larger; SLAM runs on what is left. The targets M_I and M_D are read at the largest
-    interval up to which the error stays small and no sequence is lost.
+    Hand-held sequences, or ICL-NUIM's motions, of which every n-th frame is kept, or one in n
+    dropped, which makes the divergence between neighbours larger; SLAM runs on what is left. The
+    targets M_I and M_D are read at the largest interval up to which the error stays small and no
+    sequence is lost.
     """
 
     scenes: tuple[str, ...] = ("living_room", "corridor", "table")
     """Names of scenes, or mesh files."""
-    intervals: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 8, 10, 12)
-    """Every so many frames are kept."""
+    intervals: tuple[float, ...] = (1, 2, 3, 4, 5, 6, 8, 10, 12)
+    """Every so many frames one is kept; 1.5 drops one in three, 1.333 one in four."""
     frames: int = 240
-    """Length of a whole sequence; hand-held, at most 1.5 cm and 1 degree a frame."""
+    """Length of a whole sequence at most; hand-held, at most 1.5 cm and 1 degree a frame."""
+    motions: tuple[str, ...] = ()
+    """Motions of ICL-NUIM in place of hand-held ones, such as lr_kt1 lr_kt2."""
+    data: Path = Path("../shared/data")
+    """Folder that holds icl_nuim/trajectories/lr_kt1.tum.txt and so on."""
     sequences: int = 4
     """Sequences for each scene."""
     seeds: str = "validation"
@@ -71,17 +111,21 @@ class FrameSkipping(Experiment):
         """Refuse intervals that leave no sequence."""
         for interval in self.intervals:
             if not 1 <= interval <= self.frames // 3:
-                raise InputError(f"interval {interval} is outside [1, {self.frames // 3}]")
+                raise InputError(f"interval {interval:g} is outside [1, {self.frames // 3}]")
         if not self.desired_ate_m > 0:
             raise InputError(f"desired_ate_m = {self.desired_ate_m} must be > 0")
 
     def specs(self) -> list[SkippingSpec]:
         """Every sequence at every interval."""
         check_names(("random",), self.scenes)
+        for motion in self.motions:
+            icl_nuim.read_motion(str(self.data), motion)  # refuses what is not there
+        data = str(self.data) if self.motions else ""
         return [
-            SkippingSpec(scene, seed, interval, self.frames)
+            SkippingSpec(scene, seed, interval, self.frames, motion=motion, data=data)
             for scene in self.scenes
             for seed in seed_list(self.seeds, self.sequences)
+            for motion in self.motions or ("",)
             for interval in self.intervals
         ]
 
@@ -89,8 +133,8 @@ class FrameSkipping(Experiment):
     def run(spec: SkippingSpec) -> dict[str, Any]:
         """Render the kept frames, run SLAM on them, and measure divergence and error."""
         scene = get_scene(spec.scene, spec.seed)
-        trajectory = handheld_trajectory(scene, spec.frames, spec.seed)[:: spec.keep_every]
-        sequence = render_sequence(scene, trajectory, xtion(spec.image_size), seed=spec.seed)
+        camera = xtion(spec.image_size)
+        sequence = render_sequence(scene, spec.trajectory(), camera, seed=spec.seed)
         K = sequence.intrinsics
         divergences = consecutive_divergences(sequence.frames, K, [DivergenceConfig()])[:, 0]
         run = run_sequence(slam.make("surfel", K), sequence)
@@ -109,6 +153,9 @@ class FrameSkipping(Experiment):
         """One line an interval, and the targets."""
         note = "Medians (of losses: the share) over sequences with their 95 % intervals."
         lines = by_interval(rows, note)
+        if self.motions:
+            fields = ("motion", "keep_every")
+            return [Grouping(fields, (*DIVERGENCES, "ate_m", "lost")).table(rows, note=note)]
         targets = suggest_targets(lines.rows, self.desired_ate_m)
         wanted = f"For an ATE of {1000 * self.desired_ate_m:g} mm and no sequence lost"
         if targets is None:
@@ -160,5 +207,5 @@ def suggest_targets(
     return {"keep_every": best["keep_every"], **{key: best[key].value for key in DIVERGENCES}}
 
 
-def _every(interval: int) -> str:
-    return "every frame" if interval == 1 else f"every {interval}"
+def _every(interval: float) -> str:
+    return "every frame" if interval == 1 else f"every {interval:g}"

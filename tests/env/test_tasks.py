@@ -23,8 +23,6 @@ def nothing() -> None:
 
 @pytest.mark.parametrize("name", OWN)
 def test_a_task_has_an_id_its_scenes_and_its_length(name):
-    if name == "home" and "home" not in scenes.SCENES:
-        pytest.skip("the scene home is not registered")
     task = find_task(name)
     assert env_id_of(name) in TASK_IDS
     assert gym.spec(env_id_of(name)).max_episode_steps == task.steps

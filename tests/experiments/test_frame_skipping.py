@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from ms_slam_env.errors import InputError
@@ -14,6 +16,7 @@ from ms_slam_env.experiments.frame_skipping import (
     suggest_targets,
 )
 from ms_slam_env.report.statistics import Interval
+from ms_slam_env.sequences import write_trajectory
 
 
 def test_skipping_frames_raises_divergence() -> None:
@@ -22,6 +25,55 @@ def test_skipping_frames_raises_divergence() -> None:
     assert (every["frames"], third["frames"]) == (9, 3)
     assert third["depth_divergence_mean"] > every["depth_divergence_mean"]
     assert 0 < every["ate_m"] < 0.05
+
+
+@pytest.mark.parametrize(
+    ("interval", "kept"),
+    [
+        (1, [0, 1, 2, 3, 4, 5, 6, 7, 8]),
+        (1.5, [0, 1, 3, 4, 6, 7]),
+        (1.333, [0, 1, 2, 4, 5, 6, 8]),
+        (2, [0, 2, 4, 6, 8]),
+        (4, [0, 4, 8]),
+    ],
+)
+def test_an_interval_between_whole_ones_drops_one_in_so_many(
+    interval: float, kept: list[int]
+) -> None:
+    assert SkippingSpec("table", 1000, interval, 9).kept.tolist() == kept
+
+
+def test_motions_are_placed_as_they_were_and_skipped(tmp_path: Path) -> None:
+    poses = np.repeat(np.eye(4)[None], 20, axis=0)
+    poses[:, 0, 3] = 0.01 * np.arange(20)
+    folder = tmp_path / "icl_nuim" / "trajectories"
+    folder.mkdir(parents=True)
+    write_trajectory(folder / "lr_kt1.tum.txt", np.arange(20) / 30, poses)
+    experiment = FrameSkipping(
+        scenes=("table",),
+        sequences=1,
+        intervals=(1, 3),
+        frames=9,
+        motions=("lr_kt1",),
+        data=tmp_path,
+    )
+    whole, third = experiment.specs()
+    steps = np.linalg.norm(np.diff(whole.trajectory()[:, :3, 3], axis=0), axis=1)
+    np.testing.assert_allclose(steps, steps[0], rtol=1e-6)
+    assert len(whole.trajectory()) == 9
+    np.testing.assert_array_equal(third.trajectory(), whole.trajectory()[::3])
+    result = dict.fromkeys((*DIVERGENCES, "ate_m"), 0.1)
+    rows = [
+        {"spec": vars(spec), "error": None, "result": {**result, "lost": False}}
+        for spec in (whole, third)
+    ]
+    (table,) = experiment.tables(rows)
+    assert [(line["motion"], line["keep_every"]) for line in table.rows] == [
+        ("lr_kt1", 1),
+        ("lr_kt1", 3),
+    ]
+    with pytest.raises(InputError, match="lr_kt9"):
+        FrameSkipping(motions=("lr_kt9",), data=tmp_path).specs()
 
 
 def line(interval: int, ate_m: float, lost: float, M: float) -> dict[str, Any]:
