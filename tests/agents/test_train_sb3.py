@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("sb3_contrib")
 
 from learnable_fake import ENV_ID, LearnableFake, arguments, read_curve
-from ms_slam_agents import evaluation, supervisor, train_sb3
+from ms_slam_agents import evaluation, learning_curve, supervisor, train_sb3
 from ms_slam_agents.policy_file import read_policy
 from ms_slam_agents.sb3_state import whole_batches
 from scipy.stats import sem
@@ -95,7 +95,7 @@ def test_returns_come_in_the_order_of_the_seeds(num_envs):
 
 
 def test_what_an_episode_draws_depends_on_its_seed_alone():
-    def random(_, masks, rngs):
+    def random(_, masks, rngs, __):
         return evaluation.sample(masks / masks.sum(axis=1, keepdims=True), rngs)
 
     first = played(1, random)
@@ -242,7 +242,7 @@ def test_evaluations_are_no_training_time(tmp_path, monkeypatch):
         late[0] += 3600.0
         return evaluation.evaluate_policy(*arguments)
 
-    monkeypatch.setattr(supervisor, "evaluate_policy", slow)
+    monkeypatch.setattr(learning_curve, "evaluate_policy", slow)
     clock = SimpleNamespace(monotonic=lambda: time.monotonic() + late[0])
     monkeypatch.setattr(supervisor, "time", clock)
     assert train_sb3.main([*arguments(tmp_path), "--minutes", "20"]) == 0
