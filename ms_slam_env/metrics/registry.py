@@ -26,6 +26,8 @@ RESULTS_VERSIONS = {
     1: "before results had a version: by algorithms and measures that have changed since",
     2: "the algorithms of release 0.1, maps judged against surface as far away as SLAM looks",
     3: "near planes keep their normals, far depth is weighted, doubtful frames are asked twice",
+    4: "normals are weighed exactly, frames beyond doubt are asked once, planners draw from seeds "
+    "of their own",
 }
 """Version to what its algorithms are.
 
