@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ms_slam_env.sequences import Sequence as RGBDSequence
 
 _PRINTED = (
-    *("frames", "processed_frames", "lost_frames"),
+    *("frames", "processed_frames", "lost_frames", "uncertain_frames"),
     *("cpu_ms_median", "ext_ms", "ext_ms_p95", "mem_peak_mb", "ene_j"),
     *("path_m", "ate_m", "ate_tracked_m", "tracked_share", "ate_rad", "rpe_m"),
 )

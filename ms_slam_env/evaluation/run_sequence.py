@@ -175,6 +175,11 @@ class SequenceRun:
         return int(len(self) - self.tracking_ok.sum())
 
     @property
+    def uncertain_frames(self) -> int:
+        """Number of frames that were tracked, but whose pose SLAM doubts."""
+        return sum(result.uncertain for result in self.results)
+
+    @property
     def lost(self) -> float:
         """Share of the frames without tracking."""
         return 1.0 - float(np.mean(self.tracking_ok))

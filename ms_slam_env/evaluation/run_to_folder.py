@@ -59,6 +59,7 @@ _TABLES = {
             "frames",
             "processed_frames",
             "lost_frames",
+            "uncertain_frames",
             "path_m",
             "ate_m",
             "ate_tracked_m",
@@ -223,14 +224,15 @@ def _about(
 def measure(run: SequenceRun, sequence: Sequence) -> dict[str, Any]:
     """Metrics of a run, finished or not; those against the truth only where there is one.
 
-    ``frames``, ``lost_frames``, ``processed_frames``, ``path_m`` of the estimate; what
-    `trajectory_errors` gives; the costs by the names of ``CostMeter.summary``.
+    ``frames``, ``lost_frames``, ``uncertain_frames``, ``processed_frames``, ``path_m`` of the
+    estimate; what `trajectory_errors` gives; the costs by the names of ``CostMeter.summary``.
     """
     if not len(run) or run.meter is None:
         return {"frames": 0}
     return {
         "frames": len(run),
         "lost_frames": run.lost_frames,
+        "uncertain_frames": run.uncertain_frames,
         "processed_frames": int(run.processed.sum()),
         "path_m": metrics.path_length(run.estimates),
         **submap_measures(run),
@@ -241,11 +243,11 @@ def measure(run: SequenceRun, sequence: Sequence) -> dict[str, Any]:
 
 
 def _tracked_errors(run: SequenceRun, sequence: Sequence) -> dict[str, Any]:
-    """``tracked_share`` of the frames, and ``ate_tracked_m`` of those alone where there are two."""
-    share = {"tracked_share": 1.0 - run.lost}
+    """``tracked_share`` of all frames, and ``ate_tracked_m`` where the truth is known."""
     times, P, Q = _pairs(run, run.estimates, sequence)
     ok = run.tracking_ok[np.isin(run.timestamps, times)]
-    return share | ({"ate_tracked_m": metrics.ate_rmse(P[ok], Q[ok])} if ok.sum() > 1 else {})
+    known = metrics.tracked_errors(P, Q, ok) if len(P) > 1 else {}
+    return {**known, "tracked_share": 1.0 - run.lost}
 
 
 def trajectory_errors(run: SequenceRun, poses: Float64, sequence: Sequence) -> dict[str, Any]:

@@ -127,7 +127,11 @@ def match_files(estimate: Path, truth: Path, options: TrajectoryOptions) -> Matc
         InputError: a file that cannot be read, fewer than two poses in common, no alignment.
     """
     times, poses = read_trajectory(estimate)
-    tracked = _tracked(estimate, times, options.frames)
+    tracked = (
+        tracked_beside(estimate, times)
+        if options.frames is None
+        else tracked_at(Path(options.frames), times)
+    )
     share_tracked = None if tracked is None else float(tracked.mean())
     was_lost = np.zeros(len(times), dtype=bool)
     if options.frames is not None and tracked is not None:
@@ -196,16 +200,15 @@ def complaints(aligned: Float64, truth: Float64, share: float) -> list[str]:
     return found
 
 
-def _tracked(estimate: Path, times: Float64, frames: str | None) -> NDArray[np.bool_] | None:
-    """Whether the frame of each pose (N,) was tracked; None where nothing says it."""
-    path = estimate.parent / _BESIDE if frames is None else Path(frames)
-    if frames is None and not path.is_file():
-        return None
+def tracked_beside(estimate: Path, times: Float64) -> NDArray[np.bool_] | None:
+    """Whether the frame of each pose (N,) was tracked, from a ``frames.csv`` beside the file.
+
+    None where there is none; one that is of other frames is left aside with a warning.
+    """
+    path = estimate.parent / _BESIDE
     try:
-        return tracked_at(path, times)
+        return tracked_at(path, times) if path.is_file() else None
     except InputError as error:
-        if frames is not None:
-            raise
         warnings.warn(f"left aside: {error}", InputWarning, 2)
     return None
 

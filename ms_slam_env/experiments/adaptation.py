@@ -43,8 +43,8 @@ ALSO = (
 )
 """Fixed configurations that run too: what others may pick as the best one."""
 METRICS = (
-    *("cpu_ms_mean", "ate_interpolated_m", "ate_m", "processed_share", "lost_share"),
-    *("cpu_quiet_ms", "cpu_violent_ms"),
+    *("cpu_ms_mean", "ate_interpolated_m", "ate_m", "ate_tracked_m", "tracked_share"),
+    *("processed_share", "lost_share", "cpu_quiet_ms", "cpu_violent_ms"),
 )
 _SMALLEST_CHANGE = 1e-4  # nats; what is below is drawn there
 
@@ -175,7 +175,7 @@ def competitors(
 
 def judge(
     backend: SlamBackend, frames: Sequence[RGBDFrame], truth: Float64, violent: NDArray[np.bool_]
-) -> tuple[dict[str, float], list[int], list[float]]:
+) -> tuple[dict[str, float | None], list[int], list[float]]:
     """Run a SLAM over N frames with true poses (N, 4, 4); ``violent`` (N,) says which are.
 
     Returns:
@@ -202,6 +202,7 @@ def judge(
         "ate_interpolated_m": ate.rmse,
         "ate_interpolated_max_m": ate.max,
         "ate_m": metrics.ate_rmse(online, truth),
+        **metrics.tracked_errors(online, truth, run.tracking_ok),
         "processed_share": float(processed.mean()),
         "lost_share": float(np.mean(~run.tracking_ok)),
     }

@@ -44,7 +44,7 @@ FRAME_RATE_HZ = 30  # no motion is shorter than a frame of the fastest camera
 MOST_VIEWS = 200  # of an episode's frames, evenly picked: the verdict costs some 3 s
 METRICS = (
     *("success", "success_tracked", "lost", "lost_frames_share", "mapped_area_m2", "ate_m"),
-    *("worst_apart_share", "path_length_m", "energy_j", "steps"),
+    *("ate_tracked_m", "tracked_share", "worst_apart_share", "path_length_m", "energy_j", "steps"),
 )
 ACTIVE, BASELINE = "greedy", "random"
 PAPER = {"carpet": f"{BASELINE} 0 of 10, {ACTIVE} 5 of 10"}

@@ -32,8 +32,8 @@ from ms_slam_env.slam.frame_selection import (
 )
 
 METRICS = (
-    *("processed_share", "ate_m", "ate_processed_m", "f_score_2cm", "astray", "lost_share"),
-    *("cpu_ms_mean", "filter_cpu_ms"),
+    *("processed_share", "ate_m", "ate_tracked_m", "tracked_share", "ate_processed_m"),
+    *("f_score_2cm", "astray", "lost_share", "cpu_ms_mean", "filter_cpu_ms"),
 )
 _PAIRED = {"ate_m": -1, "ate_processed_m": -1, "f_score_2cm": 1}  # 1: more is better
 _PANELS = ("ate_m", "ate_processed_m", "f_score_2cm", "cpu_ms_mean")
@@ -160,6 +160,7 @@ def measure(
         "processed_share": float(kept.mean()),
         "lost_share": run.lost,
         "ate_m": metrics.ate_rmse(estimate, truth),
+        **metrics.tracked_errors(estimate, truth, run.tracking_ok),
         "ate_processed_m": metrics.ate_rmse(estimate[kept], truth[kept]),
         "largest_error_processed_m": float(errors.max()),
         "astray": bool(errors.max() > LOST_ERROR_M),

@@ -142,6 +142,7 @@ class FrameSkipping(Experiment):
         return {
             "frames": len(sequence),
             "ate_m": metrics.ate_rmse(run.estimates, sequence.poses),
+            **metrics.tracked_errors(run.estimates, sequence.poses, run.tracking_ok),
             "lost": bool(worst > LOST_ERROR_M or run.lost_frames),
             "M_I": float(divergences[:, 0].max()),
             "M_D": float(divergences[:, 1].max()),
@@ -179,7 +180,8 @@ class FrameSkipping(Experiment):
 
 def by_interval(rows: Sequence[Row], note: str = "") -> Table:
     """Medians with intervals and share of lost sequences, a line an interval."""
-    grouping = Grouping(("keep_every",), (*DIVERGENCES, "ate_m", "lost"), rank_by="keep_every")
+    keys = (*DIVERGENCES, "ate_m", "ate_tracked_m", "tracked_share", "lost")
+    grouping = Grouping(("keep_every",), keys, rank_by="keep_every")
     return grouping.table(rows, note=note)
 
 

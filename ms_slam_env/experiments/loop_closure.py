@@ -23,11 +23,11 @@ from ms_slam_env.experiments.harness.experiment import Experiment
 from ms_slam_env.experiments.pictures.loop_maps import MapView, map_view, save_picture
 from ms_slam_env.geometry import invert
 from ms_slam_env.geometry.point_clouds import voxel_downsample
-from ms_slam_env.metrics import ate_rmse, path_length
+from ms_slam_env.metrics import ate_rmse, path_length, tracked_errors
 from ms_slam_env.metrics.registry import metric
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Table, finished, make_table, summary
+from ms_slam_env.report.tables import Table, finished, make_table, measured, summary
 from ms_slam_env.sensor import NoiseConfig
 from ms_slam_env.sequences import render_sequence
 from ms_slam_env.sequences.loop_paths import PATHS, returning_path
@@ -52,6 +52,7 @@ METRICS = (
     *("map_error_capped_rms_m", "lost_frames", "surfels", "cpu_ms_mean", "cpu_ms_max"),
     *("closed_loops", "wrong_closures"),
 )
+TRACKED = ("ate_tracked_m", "tracked_share")
 GAPS = ("before_m", "after_m")  # between new and old map
 NOISES: dict[str, str | NoiseConfig] = {
     "kinect": "kinect",
@@ -122,7 +123,7 @@ class LoopClosure(Experiment):
         config = replace(options, loop_closure=spec.closure)
         system = BatchedSurfelSlam(1, camera, config)
         system.reset(truth[0])
-        estimate, spent, lost = np.empty_like(truth), [], 0
+        estimate, spent, tracked = np.empty_like(truth), [], []
         closures: list[Closure] = []
         views: tuple[MapView, MapView] | None = None
         for k, frame in enumerate(sequence.frames):
@@ -134,7 +135,7 @@ class LoopClosure(Experiment):
             result = system.track(frame.color[None], frame.depth[None])[0]
             spent.append(1000 * (time.process_time() - start))
             estimate[k] = result.T_world_camera
-            lost += not result.tracking_ok
+            tracked.append(result.tracking_ok)
             if result.loop_closed:
                 # Without the closure the camera had gone on as it truly did.
                 unclosed = previous @ invert(truth[k - 1]) @ truth[k]
@@ -154,12 +155,13 @@ class LoopClosure(Experiment):
             "path_m": path_length(truth),
             "ate_unaligned_m": ate_rmse(estimate, truth, align="none"),
             "ate_m": ate_rmse(estimate, truth),
+            **tracked_errors(estimate, truth, tracked),
             "final_ate_unaligned_m": ate_rmse(final, truth, align="none"),
             "final_ate_m": ate_rmse(final, truth),
             "end_error_m": float(error_m[-1]),
             "largest_error_m": float(error_m.max()),
             **map_quality(system.map.points(stable=False), surface, ("map_error_capped_rms_m",)),
-            "lost_frames": lost,
+            "lost_frames": tracked.count(False),
             "closed_loops": len(closures),
             "closures": [asdict(closure) for closure in closures],
             "wrong_closures": sum(closure.is_wrong for closure in closures),
@@ -186,10 +188,11 @@ class LoopClosure(Experiment):
         lines: list[dict[str, Any]] = [
             {"sequence": LoopSpec(**row["spec"]).name(), "image_size": row["spec"]["size"],
              "loop_closure": row["spec"]["closure"], **_medians(row["result"]["closures"], GAPS),
-             **{key: row["result"][key] for key in METRICS}}
+             **{key: row["result"].get(key) for key in (*METRICS, *TRACKED)}}
             for row in finished(rows)
         ]  # fmt: skip
-        columns = ["sequence", "image_size", "loop_closure", *METRICS, *GAPS]
+        shown = (*METRICS, *measured(TRACKED, rows), *GAPS)
+        columns = ["sequence", "image_size", "loop_closure", *shown]
         pairs = pairs_of(rows)
         medians: list[dict[str, Any]] = [
             {

@@ -34,8 +34,8 @@ DEFAULT_SEQUENCES = (
 )
 """Rooms in which boxes or people move, and some in which nothing does."""
 KEYS = (
-    *("lost_share", "ate_m", "ate_max_m", "mask_precision", "mask_recall", "mask_iou"),
-    *("mask_false_share", "cpu_ms_median"),
+    *("lost_share", "ate_m", "ate_max_m", "ate_tracked_m", "tracked_share"),
+    *("mask_precision", "mask_recall", "mask_iou", "mask_false_share", "cpu_ms_median"),
 )
 MOVING, STILL = "moving", "still"
 _WARM_UP = 5  # frames left out of the timing
@@ -108,6 +108,7 @@ class MovingObjectsExperiment(Experiment, Checked):
                     "backend": text,
                     "lost_share": run.lost,
                     "ate_m": ate.rmse,
+                    **metrics.tracked_errors(run.estimates, sequence.poses, run.tracking_ok),
                     "ate_max_m": ate.max,
                     "cpu_ms_median": float(np.median(run.cpu_ms[_WARM_UP:])),
                     **({} if found is None else mask_measures(found, true, is_read)),
@@ -120,21 +121,22 @@ class MovingObjectsExperiment(Experiment, Checked):
     def tables(self, rows: Sequence[Row]) -> list[Table]:
         """Medians where something moves and where nothing does, then every run."""
         lines = _lines(rows)
+        keys = [key for key in KEYS if any(key in line for line in lines)]
         medians = []
         for setting in (MOVING, STILL):
             for backend in dict.fromkeys(line["backend"] for line in lines):
                 own = [x for x in lines if (x["setting"], x["backend"]) == (setting, backend)]
                 if own:
-                    cells = {key: summary(own, key) for key in KEYS if any(key in x for x in own)}
+                    cells = {key: summary(own, key) for key in keys if any(key in x for x in own)}
                     worst = max(line["ate_m"] for line in own)
                     medians.append(
                         {"setting": setting, "backend": backend, **cells, "worst_ate_m": worst}
                     )
-        columns = ("setting", "backend", *KEYS[:2], "worst_ate_m", *KEYS[3:])
+        columns = ("setting", "backend", *keys[:2], "worst_ate_m", *keys[3:])
         note = "Medians over the sequences with 95 % intervals, and the largest ATE of one."
         return [
             make_table(columns, medians, note=note),
-            make_table(("sequence", "backend", "moving_share", *KEYS), lines, "Every run"),
+            make_table(("sequence", "backend", "moving_share", *keys), lines, "Every run"),
         ]
 
     def charts(self, rows: Sequence[Row]) -> list[Chart]:

@@ -26,13 +26,25 @@ from ms_slam_env.experiments.harness.teams import (
 )
 from ms_slam_env.experiments.pictures.team_maps import save_picture
 from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Column, Grouping, Table, finished, flattened, make_table
+from ms_slam_env.report.tables import (
+    Column,
+    Grouping,
+    Table,
+    finished,
+    flattened,
+    make_table,
+    measured,
+)
 from ms_slam_env.scenes.registry import check_name
 from ms_slam_env.sensor.noise import noise_config
 from ms_slam_env.slam.map_merging import MergeConfig
 
 _MERGED = ("merged", "wrong_merge")
-_BESIDE = {"team_ate_m": "ate_m", "team_rpe_m": "rpe_m", **{f"f_score_{n}cm": "" for n in (2, 5)}}
+_BESIDE = {
+    **{"team_ate_m": "ate_m", "team_ate_tracked_m": "ate_tracked_m", "tracked_share": ""},
+    "team_rpe_m": "rpe_m",
+    **{f"f_score_{n}cm": "" for n in (2, 5)},
+}
 """Measures of a team and, where of another name, of a robot alone."""
 _PAIR = (
     *("scene", "seed", "setting", "pair", *_MERGED, "merge_refusal", "hypotheses"),
@@ -146,15 +158,17 @@ class MultiRobot(Experiment, Checked):
 def _teams(rows: Sequence[Row]) -> Table:
     """Every team, and beside each measure the mean of its robots alone."""
     columns: list[Column | str] = ["scene", "seed", "setting", "robots", "merged_robots"]
-    for key, own in _BESIDE.items():
-        columns += [key, Column(f"alone_{key}", own or key, "robots alone")]
+    beside = {key: _BESIDE[key] or key for key in measured(tuple(_BESIDE), rows)}
+    for key, own in beside.items():
+        columns += [key, Column(f"alone_{key}", own, "robots alone")]
     columns += ["task_time_s", "mean_path_m"]
     lines = []
     for row in finished(rows):
         result = row["result"]
         line = {**row["spec"], **result}
-        for key, own in _BESIDE.items():
-            line[f"alone_{key}"] = float(np.mean([one[own or key] for one in result["alone"]]))
+        for key, own in beside.items():
+            alone = [one[own] for one in result["alone"] if one[own] is not None]
+            line[f"alone_{key}"] = float(np.mean(alone)) if alone else None
         lines.append(line)
     names = [column.name if isinstance(column, Column) else column for column in columns]
     lines = [{name: line[name] for name in names} for line in lines]

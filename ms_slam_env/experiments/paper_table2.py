@@ -26,7 +26,10 @@ PAPER_CUTS = {
     },
 }
 """By how much active SLAM cuts the errors of random walk in the paper's table."""
-METRICS = ("ate_m", "rer_m", "rcm", "path_length_m", "rcm_tracked", "lost")
+METRICS = (
+    *("ate_m", "ate_tracked_m", "tracked_share", "rer_m", "rcm", "path_length_m"),
+    *("rcm_tracked", "lost"),
+)
 _CUTS = ("ate_cut", "ate_cut_paper", "rer_cut", "rer_cut_paper")
 
 

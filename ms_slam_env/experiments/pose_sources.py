@@ -13,11 +13,21 @@ from ms_slam_env.experiments.harness.episodes import parse_options
 from ms_slam_env.report.charts import Chart, by_group
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.statistics import Interval, relative_cut
-from ms_slam_env.report.tables import Grouping, Table, complete_cases, grouped, make_table
+from ms_slam_env.report.tables import (
+    Grouping,
+    Table,
+    complete_cases,
+    grouped,
+    make_table,
+    measured,
+)
 
 REFERENCE = "slam"
 """The source that the others are compared with, episode by episode."""
-METRICS = ("ate_m", "ate_unaligned_m", "rpe_m", "f_score_2cm", "f_score_5cm", "rcm", "lost")
+METRICS = (
+    *("ate_m", "ate_tracked_m", "tracked_share", "ate_unaligned_m", "rpe_m"),
+    *("f_score_2cm", "f_score_5cm", "rcm", "lost"),
+)
 EVERYWHERE = "all"
 _DIGITS = 9  # nanometres: what is left of zero after an alignment
 
@@ -97,15 +107,16 @@ def compared(rows: Sequence[Row]) -> list[Row]:
         {**row, "spec": {**row["spec"], "pose_source": row["spec"]["options"]["pose"]}}
         for row in rows
     ]
+    known = measured(METRICS, rows)
     common = complete_cases(named, ("planner", "scene", "seed"), "pose_source")
     return [
-        {**row, "result": {key: _rounded(row["result"][key]) for key in METRICS}}
+        {**row, "result": {key: _rounded(row["result"][key]) for key in known}}
         for row in sorted(common, key=lambda row: (row["spec"]["scene"], row["spec"]["seed"]))
     ]
 
 
-def _rounded(value: float | bool) -> float | bool:
-    return value if isinstance(value, bool) else round(value, _DIGITS)
+def _rounded(value: float | bool | None) -> float | bool | None:
+    return value if isinstance(value, bool) or value is None else round(value, _DIGITS)
 
 
 def _ratio(

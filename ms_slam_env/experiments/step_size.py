@@ -12,7 +12,8 @@ from ms_slam_env.report.charts import Chart, over_field
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Grouping, Table
 
-METRICS = ("lost", "ate_m", "f_score_5cm", "rcm")
+METRICS = ("lost", "ate_m", "ate_tracked_m", "tracked_share", "f_score_5cm", "rcm")
+_PANELS = ("lost", "ate_m", "f_score_5cm", "rcm")
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,6 @@ class StepSize(EpisodeExperiment):
     def charts(self, rows: Sequence[Row]) -> list[Chart]:
         """One panel a metric, one line a planner."""
         label = short_planner_names(row["spec"]["planner"] for row in rows).__getitem__
-        panels = over_field(rows, "step_deg", METRICS, "planner", log=("ate_m",), label=label)
+        panels = over_field(rows, "step_deg", _PANELS, "planner", log=("ate_m",), label=label)
         caption = "Mark: median over episodes (losses: their share); band: its 95 % interval."
         return [Chart("step_size", "Measures over the step size", caption, panels)]

@@ -20,20 +20,20 @@ from ms_slam_env.experiments.harness.usme_runs import UsmeSpec, run_usme
 from ms_slam_env.parallel import limit_threads, thread_environment
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Table, finished, make_table
+from ms_slam_env.report.tables import Table, finished, make_table, measured
 from ms_slam_env.sequences.usme_suite import (
     NAMES,
     SUITE,
-    check_folder,
     find,
+    made_with,
 )
 
 Float64 = NDArray[np.float64]
 
 TABLES: Mapping[str, tuple[str, ...]] = {
     "Accuracy": (
-        *("path_m", "ate_m", "ate_max_m", "final_ate_m", "end_error_m", "end_error_share"),
-        *("rpe_m", "rpe_rad"),
+        *("path_m", "ate_m", "ate_tracked_m", "tracked_share", "ate_max_m", "final_ate_m"),
+        *("end_error_m", "end_error_share", "rpe_m", "rpe_rad"),
     ),
     "Map": (
         *("map_points", "c2c_mean_m", "c2c_std_m", "hausdorff_directed_m", "recall_near"),
@@ -49,6 +49,10 @@ TABLES: Mapping[str, tuple[str, ...]] = {
 }
 
 
+_OPTIONS: Mapping[str, Any] = {"image_size": "160x120", "seed": 2000, "frames_scale": 1.0}
+"""What a sequence without a folder is made with, unless told otherwise."""
+
+
 @dataclass(frozen=True)
 class Usme(Experiment, Checked):
     """SLAM backends over the eight sequences of the USME framework
@@ -61,15 +65,15 @@ class Usme(Experiment, Checked):
     """Folder that ms-slam usme make wrote; without it every frame is rendered when it is needed."""
     backends: tuple[str, ...] = ("surfel", "odometry")
     """NAME, parameters appended as in surfel,loop_closure=deformation."""
-    sequences: tuple[str, ...] = NAMES
-    """Their names."""
-    image_size: str = "160x120"
-    """Such as 160x120."""
-    seed: int = bounded(2000, 0, 2**32 - 1)
-    """Of scenes, paths, noise and perturbations."""
-    frames_scale: float = bounded(1.0, 0.002, 10.0)
+    sequences: tuple[str, ...] = ()
+    """Their names; by default all, or those that the folder holds."""
+    image_size: str | None = None
+    """Such as 160x120; by default that of the folder, or this."""
+    seed: int | None = bounded(None, 0, 2**32 - 1)
+    """Of scenes, paths, noise and perturbations; by default that of the folder, or 2000."""
+    frames_scale: float | None = bounded(None, 0.002, 10.0)
     """Share of the frames that the same paths take: 0.5 halves the work and doubles the camera's
-    speed."""
+    speed; by default that of the folder, or 1."""
 
     workers = 1
     fresh_process = True
@@ -78,7 +82,7 @@ class Usme(Experiment, Checked):
     def __post_init__(self) -> None:
         """Refuse what cannot be rendered."""
         super().__post_init__()
-        check_suite(self.sequences, self.image_size)
+        check_suite(self.sequences or NAMES, self.image_size or _OPTIONS["image_size"])
 
     def environment(self) -> Mapping[str, str]:
         """One thread a run."""
@@ -93,21 +97,30 @@ class Usme(Experiment, Checked):
         """
         for text in self.backends:
             slam.check_parameters(*parse_named(text, "backend"))
-        if self.folder is not None:
-            for name in self.sequences:
-                check_folder(self.folder / name, self.image_size, self.seed, self.frames_scale)
+        made = {name: self._options(name) for name in self._names()}
         return [
-            UsmeSpec(
-                sequence=sequence,
-                backend=backend,
-                image_size=self.image_size,
-                seed=self.seed,
-                frames_scale=self.frames_scale,
-                folder=None if self.folder is None else str(self.folder / sequence),
-            )
-            for sequence in self.sequences
+            UsmeSpec(sequence, backend, **options)
+            for sequence, options in made.items()
             for backend in self.backends
         ]
+
+    def _names(self) -> tuple[str, ...]:
+        """The sequences: those asked for, those that the folder holds, or all."""
+        if self.sequences or self.folder is None:
+            return self.sequences or NAMES
+        return tuple(name for name in NAMES if (self.folder / name).is_dir()) or NAMES
+
+    def _options(self, name: str) -> dict[str, Any]:
+        """What a sequence is made with, as its folder says where there is one."""
+        folder = None if self.folder is None else self.folder / name
+        made = _OPTIONS if folder is None else made_with(folder)
+        for key, value in made.items():
+            asked = getattr(self, key)
+            if folder is not None and asked not in (None, value):
+                words = key.replace("_", " ")
+                raise InputError(f"{folder} was made with another {words}: {value}, not {asked}")
+        asked_for = {key: getattr(self, key) for key in made if getattr(self, key) is not None}
+        return {**made, **asked_for, "folder": None if folder is None else str(folder)}
 
     @staticmethod
     def run(spec: UsmeSpec) -> dict[str, Any]:
@@ -131,7 +144,8 @@ class Usme(Experiment, Checked):
             if entry.name in names
         ]
         tables = [make_table(list(entries[0]), entries, "Sequences")]
-        for title, keys in TABLES.items():
+        for title, family in TABLES.items():
+            keys = measured(family, rows)
             lines = [
                 {
                     **{name: row["spec"][name] for name in ("sequence", "backend")},

@@ -83,7 +83,8 @@ class SlamEvaluator(Checked):
         """Measure ``configuration`` on one sequence.
 
         Returns:
-            ``ate_m`` (RMSE, SE(3)-aligned), ``ate_max_m``, ``ext_ms`` (median time of a processed
+            ``ate_m`` (RMSE, SE(3)-aligned), ``ate_tracked_m`` and ``tracked_share`` of the tracked
+            frames, ``ate_max_m``, ``ext_ms`` (median time of a processed
             frame), ``load_ms`` (mean time by all frames, those left out included), ``mem_mb`` (peak
             of the SLAM's own), ``energy_j`` (a processed frame), ``map_error_mm``, ``lost`` (share
             of the processed frames), ``M_I``, ``M_D`` (largest divergences between processed
@@ -123,6 +124,7 @@ class SlamEvaluator(Checked):
         row: Row = {
             "frames": len(run),
             "ate_m": ate.rmse,
+            **metrics.tracked_errors(run.estimates, truth, run.tracking_ok),
             "ate_max_m": ate.max,
             "ext_ms": ext_ms,
             "load_ms": ext_ms * len(run) / len(given.frames),
@@ -142,7 +144,8 @@ class SlamEvaluator(Checked):
 def summarise(rows: Sequence[Row]) -> Row:
     """One row for all sequences: means, but the largest of maxima and memory; any failure."""
     largest = ("ate_max_m", "mem_mb", "lost", "M_I", "M_D")
-    means = ("ate_m", "ext_ms", "load_ms", "energy_j", "map_error_mm")
+    errors = ("ate_m", "ate_tracked_m", "tracked_share", "map_error_mm")
+    means = (*errors, "ext_ms", "load_ms", "energy_j")
     result: Row = {}
     for name in (*means, *largest):
         values = [row.get(name) for row in rows]

@@ -18,7 +18,7 @@ from ms_slam_env.exploration.front import (
     importances,
     points_of,
 )
-from ms_slam_env.exploration.held_out import DEFAULT, compare_held_out
+from ms_slam_env.exploration.held_out import DEFAULT, compare_configurations
 from ms_slam_env.exploration.results import ABOUT, TITLE, Explored
 from ms_slam_env.exploration.settings import ExplorationSettings
 from ms_slam_env.exploration.space import make_space
@@ -125,7 +125,7 @@ def write_exploration(exploration: Exploration, storage: StudyStorage, out: Path
         reference,
         hypervolume_history(points, reference, objectives).tolist(),
         importances(storage),
-        _held_out(exploration, storage, points, chosen, out),
+        *_compared(exploration, storage, points, chosen, out),
     )
     return write_result_folder(
         out,
@@ -158,20 +158,29 @@ def write_exploration(exploration: Exploration, storage: StudyStorage, out: Path
     )
 
 
-def _held_out(
+def _compared(
     exploration: Exploration,
     storage: StudyStorage,
     points: list[Point],
     chosen: dict[str, Point],
     out: Path,
-) -> list[dict[str, Any]]:
-    """The default, the chosen configurations and the rest of the front on held-out sequences."""
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """The default, the chosen and the rest of the front on held-out sequences.
+
+    Then default and chosen, measured again on the explored ones.
+    """
     known = {point.number for point in chosen.values()}
     others = {f"trial {p.number}": p for p in points if p.on_front and p.number not in known}
-    configurations = {DEFAULT: storage.space.base} | {
-        name: storage.space.configuration(point.params) for name, point in (chosen | others).items()
-    }
-    return compare_held_out(exploration.evaluator, configurations, exploration.held_out, out)
+
+    def compared(of: dict[str, Point], sequences: tuple[str, ...], file: str) -> Any:
+        made = {name: storage.space.configuration(point.params) for name, point in of.items()}
+        made = {DEFAULT: storage.space.base, **made}
+        return compare_configurations(exploration.evaluator, made, sequences, out / file)
+
+    return (
+        compared(chosen | others, exploration.held_out, "held_out.jsonl"),
+        compared(chosen, exploration.evaluator.sequences, "again.jsonl"),
+    )
 
 
 def _configuration(

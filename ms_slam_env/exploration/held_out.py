@@ -1,4 +1,8 @@
-"""The chosen configurations against the default, on sequences that the exploration never saw."""
+"""The chosen configurations against the default, side by side on the same sequences.
+
+On those that the exploration never saw, and once more on its own: a configuration that was measured
+once may be the best by chance.
+"""
 
 from __future__ import annotations
 
@@ -29,15 +33,15 @@ class _Run:
     sequence: str
 
 
-def compare_held_out(
+def compare_configurations(
     evaluator: SlamEvaluator,
     configurations: Mapping[str, SlamConfiguration],
     sequences: Sequence[str],
-    out: Path,
+    path: Path,
 ) -> list[dict[str, Any]]:
     """Run every configuration on every sequence, in turn, so that none has a quieter machine.
 
-    Runs that are on disk already are not repeated.
+    Runs that are in the file ``path`` already are not repeated.
 
     Returns:
         a line for each configuration: the keys of ``COMPARED`` (means over the sequences), with
@@ -45,7 +49,7 @@ def compare_held_out(
         ``failed_runs`` and ``sequences_count``. Sequences on which either failed have no part in
         means and ratios.
     """
-    records = RecordFile(out / "held_out.jsonl")
+    records = RecordFile(path)
     done = records.load()
     rows: dict[str, list[Row]] = {name: [] for name in configurations}
     for sequence in sequences:

@@ -47,7 +47,7 @@ FAILURE = "failure"
 """Key of an evaluation under which it says, in words, why it measured less than it should."""
 
 
-OTHERS = ("M_I", "M_D", "frames", FAILURE)
+OTHERS = ("M_I", "M_D", "ate_tracked_m", "tracked_share", "frames", FAILURE)
 """What else an evaluation may return, under the registry's own names."""
 
 

@@ -25,6 +25,7 @@ ABOUT = (
 )
 _SHOWN = ("ate_m", "ate_max_m", "ext_ms", "mem_mb", "energy_j", "map_error_mm")
 _PARAMETERS_DRAWN = 4
+_MEANS = "Means over the sequences."
 
 Shares = Mapping[str, Mapping[str, float]]
 _TRIALS_PER_PARAMETER = 10
@@ -43,7 +44,8 @@ class Explored:
         reference: where each objective stops to count.
         hypervolume: after each trial, as a share of the box up to the reference.
         importance: by objective, the share of each parameter.
-        held_out: lines of ``compare_held_out``.
+        held_out: lines of ``compare_configurations`` on sequences that it never saw.
+        again: the same of the default and the chosen on its own sequences.
     """
 
     objectives: Sequence[str]
@@ -55,6 +57,7 @@ class Explored:
     hypervolume: Sequence[float]
     importance: Shares
     held_out: Sequence[Mapping[str, Any]]
+    again: Sequence[Mapping[str, Any]]
 
     def rows(self) -> list[dict[str, Any]]:
         """One a trial."""
@@ -75,7 +78,10 @@ class Explored:
         """The default, the chosen configurations and the front; held-out runs; importances."""
         found = [self._configurations()]
         if self.held_out:
-            found.append(self._held_out())
+            found.append(self._ratios_table(self.held_out, "Held-out sequences", _MEANS))
+        if self.again:
+            title = "Default and chosen, measured again"
+            found.append(self._ratios_table(self.again, title, f"{_MEANS} {self._by_chance()}"))
         if self.importance:
             found.append(self._importance())
         return found
@@ -86,7 +92,7 @@ class Explored:
         shown = [p for p in self.points if p.on_front or p.number in purposes]
         shown.sort(key=lambda point: point.measured.get(cost) or 0.0)
         measured = [as_metrics(point.measured, self.clock) for point in shown]
-        keys = [*(key_of(name, self.clock) for name in _SHOWN), *OTHERS[:2]]
+        keys = [*(key_of(name, self.clock) for name in _SHOWN), *OTHERS[:4]]
         lines: list[dict[str, Any]] = [
             {
                 "trial": point.number,
@@ -119,13 +125,28 @@ class Explored:
             f"hypervolume {volume} of the box up to {box}."
         )
 
-    def _held_out(self) -> Table:
+    def _ratios_table(self, lines: Sequence[Mapping[str, Any]], title: str, note: str) -> Table:
         columns: list[Column | str] = ["configuration"]
         for name in COMPARED:
             key = key_of(name, self.clock)
             columns += [key, Column(f"{key}_ratio", "ratio_to_default", "of default's")]
-        return make_table((*columns, "failed_runs", "sequences_count"), self.held_out,
-                          "Held-out sequences", "Means over the sequences.")  # fmt: skip
+        return make_table((*columns, "failed_runs", "sequences_count"), lines, title, note)
+
+    def _by_chance(self) -> str:
+        """Which of the chosen may be better than the default by chance alone."""
+        if max(line["sequences_count"] for line in self.again) < 2:
+            return "Of one sequence: whether chance made a difference is not known."
+        lines = {line["configuration"]: line for line in self.again}
+        doubtful = []
+        for purpose, objective in zip(("most_accurate", "fastest"), self.objectives, strict=False):
+            point, name = self.chosen.get(purpose), purpose.replace("_", " ")
+            if point is None or point.is_default or objective not in COMPARED:
+                continue
+            key = key_of(objective, self.clock)
+            if not lines[name][f"{key}_ratio"].high < 1:
+                doubtful.append(f"{name} ({metric(key).heading})")
+        found = f"it may have here: {', '.join(doubtful)}" if doubtful else "here it does not"
+        return f"Where a ratio's 95 % interval contains 1 chance may have made it; {found}."
 
     def _importance(self) -> Table:
         columns = [Column(name, "importance", self._heading(name)) for name in self.importance]

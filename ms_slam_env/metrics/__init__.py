@@ -57,6 +57,7 @@ from ms_slam_env.metrics.trajectory import (
     find_alignment,
     path_length,
     statistics_of,
+    tracked_errors,
 )
 
 __all__ = [
@@ -114,6 +115,7 @@ __all__ = [
     "task_time",
     "team_ate",
     "team_rpe",
+    "tracked_errors",
     "tracked_segments",
     "tracking_robustness",
     "umeyama",

@@ -316,3 +316,25 @@ def ate_statistics(errors: Float64) -> ErrorStatistics:
 def ate_rmse(errors: Float64) -> float:
     """Root mean square of the `absolute_errors` (m or rad), USME (2); takes their arguments."""
     return statistics_of(errors).rmse
+
+
+def tracked_errors(
+    estimate: ArrayLike, truth: ArrayLike, tracked: ArrayLike
+) -> dict[str, float | None]:
+    """What belongs beside an ATE, which contains the poses that are held while tracking is lost.
+
+    Args:
+        estimate: T_world_camera (N, 4, 4), or positions (N, 3).
+        truth: likewise, corresponding by row.
+        tracked: (N,) bool, whether the frame was tracked.
+
+    Returns:
+        ``tracked_share`` of the frames, and ``ate_tracked_m`` (RMSE) of those alone, after SE(3)
+        alignment by themselves; None with fewer than two.
+    """
+    own, true = check_pair(estimate, truth, need_poses=False)
+    ok = np.asarray(tracked, dtype=bool)
+    return {
+        "ate_tracked_m": ate_rmse(own[ok], true[ok]) if ok.sum() > 1 else None,
+        "tracked_share": float(ok.mean()),
+    }

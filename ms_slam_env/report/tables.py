@@ -162,7 +162,13 @@ class Grouping:
         if self.rank_by:
             lines.sort(key=lambda line: _rank(line[self.rank_by], metric(self.rank_by).better))
         counted = (self.count,) if self.count else ()
-        return make_table((*self.by, *counted, *self.keys), lines, title, note)
+        return make_table((*self.by, *counted, *measured(self.keys, rows)), lines, title, note)
+
+
+def measured(keys: Sequence[str], rows: Iterable[Row]) -> tuple[str, ...]:
+    """The metrics without those that came after all finished rows were measured."""
+    results = [row["result"] for row in finished(rows)]
+    return tuple(key for key in keys if not results or any(key in one for one in results))
 
 
 def finished(rows: Iterable[Row]) -> list[Row]:

@@ -14,7 +14,7 @@ those of a game engine, its depth is exact; ours are procedural and smaller, the
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -240,6 +240,9 @@ def describe(
     }
 
 
+_OPTIONS: Mapping[str, Any] = {"image_size": str, "seed": int, "frames_scale": (int, float)}
+
+
 def make_suite(
     out: Path,
     names: Iterable[str] = NAMES,
@@ -266,21 +269,21 @@ def make_suite(
     return folders
 
 
-def check_folder(folder: Path, image_size: str, seed: int, frames_scale: float) -> None:
-    """Refuse a folder that is not the sequence of these options.
+def made_with(folder: Path) -> dict[str, Any]:
+    """The ``image_size``, ``seed`` and ``frames_scale`` that a sequence's folder was made with.
 
     Raises:
-        InputError: it holds none, or another one.
+        InputError: it holds none, or one of another suite or version.
     """
-    wanted = json.loads(json.dumps(describe(folder.name, image_size, seed, frames_scale)))
     file = folder / DESCRIPTION
     if not file.is_file():
         raise InputError(f"{folder} holds no finished sequence; ms-slam usme make writes it")
     found = read_json(file, "description")
-    if not isinstance(found, dict):
+    named = found if isinstance(found, dict) else {}
+    options: dict[str, Any] = {name: named.get(name) for name in _OPTIONS}
+    if not all(isinstance(options.get(name), kinds) for name, kinds in _OPTIONS.items()):
         raise InputError(f"{file} describes no sequence")
-    for name, value in wanted.items():
+    for name, value in json.loads(json.dumps(describe(folder.name, **options))).items():
         if found.get(name) != value:
-            raise InputError(
-                f"{folder} was made with another {name.replace('_', ' ')}, see its {DESCRIPTION}"
-            )
+            raise InputError(f"{folder} was made with another {name}, see its {DESCRIPTION}")
+    return options

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from box_scene import BoxScene
@@ -9,10 +11,11 @@ from box_scene import BoxScene
 from ms_slam_env import slam
 from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.evaluation.run_sequence import SequenceRun, run_sequence
+from ms_slam_env.evaluation.run_to_folder import measure
 from ms_slam_env.geometry import look_at
 from ms_slam_env.metrics import CostMeter
 from ms_slam_env.sequences import Sequence, render_sequence
-from ms_slam_env.slam.base import SlamBackend
+from ms_slam_env.slam.base import SlamBackend, TrackResult
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +46,19 @@ def test_records_what_a_loop_by_hand_gives(sequence: Sequence, backend: SlamBack
     assert (run.cpu_ms > 0).all()
     assert (run.wall_ms > 0).all()
     np.testing.assert_array_equal(run.backend.surface_points(), by_hand.surface_points())
+
+
+def test_frames_whose_pose_is_doubted_are_counted_as_tracked_and_as_uncertain(
+    sequence: Sequence, backend: SlamBackend
+) -> None:
+    doubted = [sequence.timestamps[k] for k in (1, 4)]
+
+    def track(frame: RGBDFrame) -> TrackResult:
+        return replace(backend.track(frame), uncertain=frame.timestamp in doubted)
+
+    run = run_sequence(backend, sequence, track=track, meter=CostMeter())
+    found = measure(run, sequence)
+    assert (found["uncertain_frames"], found["lost_frames"], found["tracked_share"]) == (2, 0, 1.0)
 
 
 def test_a_meter_made_before_slam_measures_every_frame(sequence: Sequence) -> None:

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
 from ms_slam_env.experiments import compare
-from ms_slam_env.experiments.compare import METRICS, PEERS, Compare, CompareSpec, medians
+from ms_slam_env.experiments.compare import PEERS, Compare
+from ms_slam_env.experiments.harness.compare_runs import CompareSpec
+from ms_slam_env.experiments.harness.compare_tables import METRICS, comparison_tables
+from ms_slam_env.geometry import invert, se3_exp
+from ms_slam_env.metrics import ate_rmse
+from ms_slam_env.report.statistics import median_interval, share_interval
+from ms_slam_env.sequences import read_trajectory, write_trajectory
 
 
 def row(sequence: str, backend: str, cpu_ms: float | None, error: str | None = None, **more: Any):
@@ -47,6 +53,10 @@ ROWS = [
         ("backends", ("surfel,icp",), "'icp' is not option=value"),
         ("image_sizes", ("3x3",), "valid choices"),
         ("frames", 1, "outside"),
+        ("trajectories", ("orb",), "'orb' are not NAME=FILE"),
+        ("trajectories", ("orb=one.txt",), "of several sequences the file needs {sequence}"),
+        ("trajectories", ("surfel={sequence}.txt",), "must differ"),
+        ("reference", "orb", "unknown reference 'orb'; valid choices: surfel"),
         ("threads", 0, "outside"),
     ],
 )
@@ -86,20 +96,98 @@ def test_a_run_from_the_command_line(
     }
 
 
+def test_the_trajectory_of_a_backend_has_the_numbers_of_the_backend(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small = ["--scene", "table", "--path.frames", "20", "--image-size", "80x60"]
+    dark = ["--perturbations", "black-frames,start=12,length=3"]
+    folders = [str(tmp_path / name) for name in ("lit", "dark")]
+    for folder, options in zip(folders, ([], dark), strict=True):
+        assert main(["generate", *small, *options, "--out", folder]) == 0
+        out = tmp_path / "runs" / Path(folder).name
+        assert main(["run", folder, "--backend", "odometry", "--out", str(out)]) == 0
+    files = f"{tmp_path}/runs/{{sequence}}/trajectory.txt"
+    command = ["compare", "--sequences", *folders, "--image-sizes", "80x60", "--backends"]
+    few = f"few={tmp_path}/{{sequence}}.txt"
+    command += ["odometry", "--trajectories", f"outside={files}", few]
+    # A system that gives poses of tracked frames only, in a world of its own, and fails on one.
+    times, poses = read_trajectory(tmp_path / "runs" / "lit" / "trajectory.txt")
+    moved = se3_exp([1, 2, 3, 0.3, 0.2, 0.1]) @ poses
+    write_trajectory(tmp_path / "lit.txt", times[3:15], moved[3:15])
+    capsys.readouterr()
+    assert main([*command, "--out", str(tmp_path / "out")]) == 1
+    assert "dark.txt" in capsys.readouterr().err
+    rows = json.loads((tmp_path / "out" / "results.json").read_text())["rows"]
+    found = {(row["spec"]["backend"], row["spec"]["sequence"]): row["result"] for row in rows}
+    for folder in folders:
+        own, outside = found["odometry", folder], found["outside", folder]
+        for key in ("frames", "path_m", "tracked_share", "lost_share"):
+            assert outside[key] == own[key], key
+        for key in ("ate_m", "ate_tracked_m", "ate_max_m", "ate_unaligned_m", "rpe_m", "rpe_rad"):
+            assert outside[key] == pytest.approx(own[key], abs=1e-6), key
+        assert "cpu_ms_median" not in outside
+    assert found["odometry", folders[1]]["lost_share"] > 0
+    part = found["few", folders[0]]
+    truth = read_trajectory(Path(folders[0]) / "groundtruth.txt")[1]
+    assert part["tracked_share"] == 12 / 20
+    assert part["ate_tracked_m"] == pytest.approx(ate_rmse(poses[3:15], truth[3:15]), abs=1e-6)
+    held = np.concatenate([[poses[3]] * 3, poses[3:15], [poses[14]] * 5])
+    assert part["ate_m"] == pytest.approx(ate_rmse(held, truth), abs=1e-6)
+    first = ate_rmse(truth[3] @ invert(held[3]) @ held, truth, align="none")
+    assert part["ate_unaligned_m"] == pytest.approx(first, abs=1e-6)
+
+
+def test_a_system_without_any_trajectory_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--sequences", "table:1", "--trajectories", f"orb={tmp_path}/{{sequence}}.txt"]
+    assert main(["compare", *options, "--out", str(tmp_path / "out")]) == 2
+    assert f"no trajectory of orb: {tmp_path}/table:1.txt" in capsys.readouterr().err
+
+
 def test_medians_leave_out_what_a_backend_failed_on() -> None:
-    (table,) = Compare().tables(ROWS)
+    table, _ = Compare().tables(ROWS)
     lines = [line for line in table.rows if line["sequence"] != "median"]
     assert [line["cpu_ms_median"] for line in lines if line["backend"] == "one"] == [1, 4, 100]
-    assert [(line["backend"], line["cpu_ms_median"]) for line in medians(lines)] == [
-        ("one", 2.5),
-        ("two", 5.0),
-    ]
+    medians = {line["backend"]: line for line in table.rows if line["sequence"] == "median"}
+    for name, values in (("one", [1, 4]), ("two", [4, 6])):
+        assert medians[name]["cpu_ms_median"] == median_interval(values)
     failed = next(line for line in lines if "error" in line)
     assert (failed["sequence"], failed["error"]) == ("c:1", "RuntimeError: no")
-    assert "every backend finished" in table.note
-    assert re.search(r"over \d of \d sequences, .* not ", table.note)
+    assert "over 2 of 3 sequences" in table.note
+    assert "not c:1 (two: RuntimeError: no)" in table.note
     (chart,) = Compare().charts(ROWS)
     assert [series.name for series in chart.panels[0].series] == ["one", "two"]
+
+
+def test_a_median_over_fewer_sequences_says_so() -> None:
+    rows = [row(f"{k}:1", name, 1.0) for k in "abc" for name in ("one", "two")]
+    rows[1]["result"]["ate_tracked_m"] = None
+    table, differences = Compare().tables(rows)
+    assert "two's ATE, tracked frames over 2" in table.note
+    (line,) = differences.rows
+    assert line["sequences_count"] == 3
+
+
+def test_differences_are_of_the_same_sequences() -> None:
+    ate = {"one": [1.0, 2.0, 4.0, 9.0], "two": [0.5, 2.5, 3.0, 7.0]}
+    rows = [
+        row(f"{k}:1", name, 1.0, ate_m=value)
+        for name, values in ate.items()
+        for k, value in enumerate(values)
+    ]
+    rows.append(row("4:1", "one", 1.0, ate_m=-100.0))
+    rows.append(row("4:1", "two", None, "RuntimeError: no"))
+    for reference, other, sign in (("", "two", 1), ("two", "one", -1)):
+        _, differences = comparison_tables(rows, reference or "one")
+        assert differences.title == f"160x120: differences from {reference or 'one'}"
+        (line,) = differences.rows
+        more = [sign * (b - a) for a, b in zip(*ate.values(), strict=True)]
+        assert (line["backend"], line["sequences_count"]) == (other, 4)
+        assert line["ate_m_more"] == median_interval(more)
+        wins = sum(value < 0 for value in more)
+        assert line["better_share"] == share_interval([True] * wins + [False] * (4 - wins))
+        assert "ATE, difference [mm]" in differences.as_markdown()
 
 
 def test_energy_has_a_column_where_a_machine_counts_it() -> None:

@@ -13,6 +13,7 @@ from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
 from ms_slam_env.experiments import usme
 from ms_slam_env.experiments.harness import running, usme_runs
+from ms_slam_env.sequences.usme_suite import NAMES
 
 make_scene = cache(scenes.make)
 
@@ -86,7 +87,7 @@ def test_make_writes_what_run_reads(tmp_path, capsys, monkeypatch):
     assert main(["usme", "make", *few, "--out", str(tmp_path / "made")]) == 0
     monkeypatch.setattr(usme, "limit_threads", lambda _: None)
     monkeypatch.setattr(running, "run_all", run_here)
-    ran = ["usme", "run", str(tmp_path / "made"), *few, "--backends", "odometry"]
+    ran = ["usme", "run", str(tmp_path / "made"), "--backends", "odometry"]
     assert main([*ran, "--out", str(tmp_path / "out")]) == 1  # ten frames of a path for hundreds
     text, said = capsys.readouterr()
     assert "| room-fast | odometry |" in text
@@ -94,16 +95,24 @@ def test_make_writes_what_run_reads(tmp_path, capsys, monkeypatch):
     content = json.loads((tmp_path / "out/results.json").read_text())
     assert content["rows"][0]["result"]["frames"] >= 5
     assert (tmp_path / "out/usme.png").stat().st_size > 1000
-    other = [*ran, "--seed", "7", "--out", str(tmp_path / "other")]
-    assert main(other) == 2
-    assert "another seed" in capsys.readouterr().err
+    spec = content["rows"][0]["spec"]
+    made = (spec["image_size"], spec["seed"], spec["frames_scale"])
+    assert made == ("80x60", SEED, 0.02)
+    for option, message in (
+        (["--seed", "7"], f"another seed: {SEED}, not 7"),
+        (["--frames-scale", "0.5"], "another frames scale: 0.02, not 0.5"),
+        (["--sequences", "city-fast"], "unknown USME sequence"),
+    ):
+        assert main([*ran, *option, "--out", str(tmp_path / "other")]) == 2
+        assert message in capsys.readouterr().err
     for path in (tmp_path / "made/room-fast/depth").iterdir():
         Image.fromarray(np.zeros((60, 80), np.uint16)).save(path)
-    (blank,) = usme.Usme(
-        tmp_path / "made", ("odometry",), ("room-fast",), "80x60", SEED, 0.02
-    ).specs()
+    (blank,) = usme.Usme(tmp_path / "made", ("odometry",)).specs()
     with pytest.raises(InputError, match="sequence room-fast: no frame has a depth reading"):
         usme_runs.run_usme(blank)
+    (tmp_path / "made/room-fast/sequence.json").write_text('{"suite": "usme"}')
+    assert main([*ran, "--out", str(tmp_path / "other")]) == 2
+    assert "describes no sequence" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -127,5 +136,4 @@ def test_bad_input_is_one_line(arguments, message, capsys):
 def test_options_out_of_range_are_refused():
     with pytest.raises(InputError, match="frames_scale"):
         usme.Usme(frames_scale=0.0)
-    with pytest.raises(InputError, match="empty"):
-        usme.Usme(sequences=())
+    assert {spec.sequence for spec in usme.Usme().specs()} == set(NAMES)

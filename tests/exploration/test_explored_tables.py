@@ -6,7 +6,9 @@ from typing import Any, cast
 
 import pytest
 
+from ms_slam_env.exploration.front import Point
 from ms_slam_env.exploration.results import Explored
+from ms_slam_env.report.statistics import Interval
 
 
 @pytest.mark.parametrize(("trials", "is_warned"), [(19, True), (20, False)])
@@ -21,7 +23,53 @@ def test_importances_from_few_trials_say_so(trials: int, is_warned: bool) -> Non
         hypervolume=(),
         importance={"ate_m": {"icp_rgb_weight": 0.7, "depth_cutoff_m": 0.3}},
         held_out=(),
+        again=(),
     )
     note = explored._importance().note
     assert f"From {trials} trials" in note
     assert ("chance" in note) == is_warned
+
+
+def _line(name: str, ate: Interval, time: Interval, sequences: int = 4) -> dict[str, Any]:
+    figures = {"ate_m": 0.01, "cpu_ms_median": 5.0, "load_cpu_ms": 5.0, "load_cpu_ms_ratio": time}
+    ratios = {"ate_m_ratio": ate, "cpu_ms_median_ratio": time}
+    return (
+        {"configuration": name, "sequences_count": sequences, "failed_runs": 0} | figures | ratios
+    )
+
+
+SURE, CHANCE, SAME = Interval(0.5, 0.3, 0.9), Interval(0.9, 0.7, 1.2), Interval(1.0, 1.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("accurate", "fast", "sequences", "said"),
+    [
+        (SURE, SURE, 4, "contains 1 chance may have made it; here it does not."),
+        (CHANCE, SURE, 4, "it may have here: most accurate (ATE)."),
+        (CHANCE, CHANCE, 4, "it may have here: most accurate (ATE), fastest (processor time)."),
+        (SURE, SURE, 1, "Of one sequence: whether chance made a difference is not known."),
+    ],
+)
+def test_what_may_have_won_by_chance_is_named(
+    accurate: Interval, fast: Interval, sequences: int, said: str
+) -> None:
+    point = Point(3, {}, {}, (0.01, 5.0), True, True, False)
+    explored = Explored(
+        objectives=("ate_m", "ext_ms"),
+        clock="processor",
+        parameters=(),
+        points=[],
+        chosen={"fastest": point, "most_accurate": point},
+        reference={},
+        hypervolume=(),
+        importance={},
+        held_out=(),
+        again=[
+            _line("default", SAME, SAME, sequences),
+            _line("fastest", CHANCE, fast, sequences),
+            _line("most accurate", accurate, CHANCE, sequences),
+        ],
+    )
+    _, table = explored.tables()
+    assert said in table.note
+    assert table.rows[0]["configuration"] == "default"

@@ -22,7 +22,7 @@ from ms_slam_env.exploration import (
 from ms_slam_env.exploration import evaluator as evaluator_module
 from ms_slam_env.exploration.evaluator import CLOCKS, summarise
 from ms_slam_env.exploration.grid import Grid
-from ms_slam_env.exploration.held_out import compare_held_out
+from ms_slam_env.exploration.held_out import compare_configurations
 from ms_slam_env.exploration.objectives import METRICS, as_metrics, key_of
 from ms_slam_env.geometry import look_at
 from ms_slam_env.geometry.point_clouds import voxel_downsample
@@ -138,6 +138,17 @@ def test_results_on_disk(explored):
     judged = {str(line["configuration"]).replace(" ", "_") for line in held_out}
     assert judged == {"default", *chosen, *(f"trial_{number}" for number in others)}
     assert held_out[0]["ate_m_ratio"].value == 1.0
+    measured_again: Any = again.tables[2].rows
+    assert again.tables[2].title == "Default and chosen, measured again"
+    assert "Of one sequence" in again.tables[2].note
+    lines = {str(line["configuration"]).replace(" ", "_"): line for line in measured_again}
+    assert set(lines) == {"default", *chosen}
+    # The same frames again: the error is that of the trial, the time is another.
+    by_number = {trial["trial"]: trial for trial in trials}
+    assert lines["default"]["ate_m"] == trials[0]["ate_m"]
+    for name, number in chosen.items():
+        assert lines[name]["ate_m"] == by_number[number]["ate_m"]
+    assert lines["default"]["cpu_ms_median"] != trials[0]["cpu_ms_median"]
     for name in ("pareto.png", "hypervolume.png", "held_out.png", "study.db"):
         assert (out / name).stat().st_size > 0
     assert len(again.charts[0].panels) == 3  # pairs of the three objectives
@@ -181,7 +192,8 @@ def test_held_out_ratios(tmp_path, monkeypatch):
         for name, cutoff in (("default", 4.0), ("fastest", 2.0), ("knee", 1.0))
     }
     evaluator = SlamEvaluator(("table:0",))
-    lines = compare_held_out(evaluator, configurations, ("table:1", "table:2"), tmp_path)
+    file = tmp_path / "runs.jsonl"
+    lines = compare_configurations(evaluator, configurations, ("table:1", "table:2"), file)
     default, fastest, knee = lines
     assert (default["ate_m_ratio"].value, default["cpu_ms_median_ratio"].value) == (1.0, 1.0)
     assert (fastest["ate_m"], fastest["cpu_ms_median"]) == (pytest.approx(0.015), 2.0)
@@ -189,7 +201,7 @@ def test_held_out_ratios(tmp_path, monkeypatch):
     ratio = fastest["cpu_ms_median_ratio"]
     assert ratio.low == ratio.high == pytest.approx(0.25)
     assert (knee["failed_runs"], knee["ate_m"]) == (2, None)
-    assert compare_held_out(evaluator, configurations, (), tmp_path) == []
+    assert compare_configurations(evaluator, configurations, (), file) == []
 
 
 def test_results_have_the_keys_of_the_registry():

@@ -243,7 +243,8 @@ def lookahead_ranking(_: Path) -> Any:
 
 @experiment("compare")
 def compare(_: Path) -> Any:
-    from ms_slam_env.experiments.compare import Compare, CompareSpec
+    from ms_slam_env.experiments.compare import Compare
+    from ms_slam_env.experiments.harness.compare_runs import CompareSpec
 
     text = "table:1000:kinect+exposure-ramp"
     return {

@@ -12,7 +12,13 @@ from scipy.optimize import least_squares
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, make_pose, se3_exp, so3_exp
-from ms_slam_env.metrics import absolute_errors, ate_rmse, ate_statistics, find_alignment
+from ms_slam_env.metrics import (
+    absolute_errors,
+    ate_rmse,
+    ate_statistics,
+    find_alignment,
+    tracked_errors,
+)
 from ms_slam_env.metrics.trajectory import ALIGNMENTS
 
 STATISTICS = ("rmse", "mean", "median", "std", "min", "max")
@@ -141,6 +147,21 @@ def test_a_straight_path_leaves_orientation_open() -> None:
     for few in (line[:1], line[:2]):
         with pytest.raises(InputError, match="on a line"):
             ate_rmse(few, few, "sim3" if len(few) == 2 else "se3", "rotation")
+
+
+def test_tracked_frames_are_aligned_by_themselves() -> None:
+    estimate, truth = drifting(5)
+    tracked = np.arange(len(truth)) % 3 != 0
+    held = estimate.copy()
+    held[~tracked, :3, 3] = estimate[0, :3, 3]
+    found = tracked_errors(held, truth, tracked)
+    assert found == {
+        "ate_tracked_m": ate_rmse(estimate[tracked], truth[tracked]),
+        "tracked_share": tracked.mean(),
+    }
+    assert ate_rmse(held, truth) > 2 * found["ate_tracked_m"]
+    few = tracked_errors(held, truth, np.arange(len(truth)) == 3)
+    assert few == {"ate_tracked_m": None, "tracked_share": 0.02}
 
 
 WRONG = st.one_of(

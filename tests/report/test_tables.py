@@ -75,6 +75,17 @@ def test_an_unknown_key_is_refused_with_similar_ones() -> None:
         make_table(["ate_mm"], [])
 
 
+def test_a_measure_that_came_later_has_no_column_among_older_rows() -> None:
+    old, new = (
+        {"spec": {"planner": name}, "error": None, "result": result}
+        for name, result in (("a", {"ate_m": 0.1}), ("b", {"ate_m": 0.2, "tracked_share": None}))
+    )
+    grouping = Grouping(("planner",), ("ate_m", "tracked_share"))
+    for rows, columns in (([old], ["planner", "ate_m"]), ([], ["planner", *grouping.keys])):
+        assert [column.name for column in grouping.table(rows).columns] == columns
+    assert "| a | 100 [100, 100] | - |" in grouping.table([old, new]).as_markdown()
+
+
 def test_lines_are_ranked_by_the_direction_of_the_metric() -> None:
     rows = [
         {"spec": {"planner": name}, "error": None, "result": {"ate_m": ate, "f_score_5cm": f}}

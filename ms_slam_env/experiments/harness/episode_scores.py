@@ -114,7 +114,8 @@ def _new_reference(world: ActiveSlamEnv, kind: str, start: Float64) -> Float64:
 def measure_trajectory(world: ActiveSlamEnv) -> dict[str, Any]:
     """Trajectory metrics of the episode just played.
 
-    ``ate_m`` (RMSE) and ``ate_max_m`` after SE(3) alignment, ``ate_unaligned_m`` with the common
+    ``ate_m`` (RMSE) and ``ate_max_m`` after SE(3) alignment, ``ate_tracked_m`` and
+    ``tracked_share`` of the tracked frames, ``ate_unaligned_m`` with the common
     start as the only tie, ``rpe_m`` and ``rpe_rad`` per step, ``path_length_m`` of the true
     trajectory, ``M_I`` and ``M_D`` (equations 11 and 12), ``violations`` (share of the frames after
     the first that exceed the environment's M_I or M_D), and ``lost``: SLAM reported lost tracking
@@ -126,6 +127,7 @@ def measure_trajectory(world: ActiveSlamEnv) -> dict[str, Any]:
     maxima = divergences.max(axis=0)
     return {
         "ate_m": aligned.rmse,
+        **metrics.tracked_errors(estimate, truth, world.episode.tracked),
         "ate_max_m": aligned.max,
         "ate_unaligned_m": metrics.ate_rmse(estimate, truth, align="none"),
         "rpe_m": metrics.rpe_rmse(estimate, truth),

@@ -16,8 +16,8 @@ from ms_slam_env.report.tables import Column, Row, Table, finished, grouped, mak
 RANKED_BY = "f_score_5cm"
 """Standing still loses it by recall, getting lost by precision."""
 HEADLINE = (
-    *("f_score_5cm", "f_score_5cm_area", "f_score_2cm", "rcm", "ate_m", "lost"),
-    *("violations", "path_length_m", "energy_j", "decision_ms"),
+    *("f_score_5cm", "f_score_5cm_area", "f_score_2cm", "rcm", "ate_m", "ate_tracked_m"),
+    *("tracked_share", "lost", "violations", "path_length_m", "energy_j", "decision_ms"),
 )
 DETAILS = ("ate_max_m", "rpe_m", "rer_m", "mapped_area_m2", "M_I", "M_D", "return")
 

@@ -273,11 +273,15 @@ def judge_team(
         truths.append(team.truths[k])
         points.append(transform_points(T, team.robots[k].backend.surface_points()))
     ate = metrics.team_ate(estimates, truths)
+    ok = np.concatenate([team.robots[k].tracked for k in members])
+    tracked = metrics.tracked_errors(np.concatenate(estimates), np.concatenate(truths), ok)
     return {
         "pairs": pairs,
         "path_overlaps": team.overlaps,
         "merged_robots": len(members),
         "team_ate_m": ate.rmse,
+        "team_ate_tracked_m": tracked["ate_tracked_m"],
+        "tracked_share": tracked["tracked_share"],
         "team_ate_max_m": ate.max,
         "team_ate_unaligned_m": metrics.team_ate(estimates, truths, "none").rmse,
         "team_rpe_m": metrics.team_rpe(estimates, truths).rmse,
@@ -328,6 +332,7 @@ def _alone(team: Team, k: int) -> dict[str, Any]:
     points = transform_points(truth[0], robot.backend.surface_points())
     return {
         "ate_m": metrics.ate_rmse(robot.estimates, truth),
+        **metrics.tracked_errors(robot.estimates, truth, robot.tracked),
         "ate_unaligned_m": metrics.ate_rmse(truth[0] @ robot.estimates, truth, align="none"),
         "rpe_m": metrics.rpe_rmse(robot.estimates, truth),
         "lost_share": 1.0 - float(robot.tracked.mean()),

@@ -109,6 +109,7 @@ def run_usme(spec: UsmeSpec) -> dict[str, Any]:
         "duration_s": float(seconds[-1] - seconds[0]),
         "path_m": path,
         "ate_m": ate.rmse,
+        **metrics.tracked_errors(poses, truth, tracked),
         "ate_max_m": ate.max,
         "end_error_m": end_error,
         "end_error_share": end_error / path,

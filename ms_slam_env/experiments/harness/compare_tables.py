@@ -1,0 +1,149 @@
+"""Tables of the comparison of SLAM systems: every sequence, medians, differences in pairs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ms_slam_env.metrics.registry import metric
+from ms_slam_env.report.records import Row
+from ms_slam_env.report.statistics import median_interval, share_interval
+from ms_slam_env.report.tables import Column, Table, finished, make_table, summary
+
+METRICS = (
+    *("ate_m", "ate_tracked_m", "tracked_share", "ate_max_m", "ate_unaligned_m"),
+    *("rpe_m", "rpe_rad", "lost_share"),
+    *("map_error_median_m", "f_score_2cm", "cpu_ms_median", "cpu_ms_p95", "ext_ms_median"),
+    *("mem_peak_mb", "ene_frame_j"),
+)
+PAIRED = ("ate_m", "ate_tracked_m", "rpe_m", "tracked_share", "f_score_2cm", "cpu_ms_median")
+"""Measures whose differences from the reference are given."""
+MEDIAN = "median"
+_LONGEST = 100  # characters of a reason
+
+Cell = Mapping[str, Any]
+
+
+def comparison_tables(rows: Sequence[Row], reference: str) -> list[Table]:
+    """Of each image size: every sequence with medians, then differences from ``reference``."""
+    cells = [cell_of(group) for group in groups_of(rows)]
+    tables = []
+    for size in dict.fromkeys(cell["image_size"] for cell in cells):
+        own = [cell for cell in cells if cell["image_size"] == size]
+        tables.append(make_table(_columns(own), [*own, *medians(own)], size, _note(own)))
+        differences = _differences(own, reference)
+        tables += [differences] if differences else []
+    return tables
+
+
+def groups_of(rows: Sequence[Row]) -> list[list[Row]]:
+    """The repeats of each image size, sequence and system."""
+    groups: dict[tuple[str, ...], list[Row]] = {}
+    for row in rows:
+        key = tuple(row["spec"][name] for name in ("image_size", "sequence", "backend"))
+        groups.setdefault(key, []).append(row)
+    return list(groups.values())
+
+
+def cell_of(repeats: Sequence[Row]) -> dict[str, Any]:
+    """Medians over repeats; the error where all failed."""
+    spec = repeats[0]["spec"]
+    text = spec["sequence"]
+    cell: dict[str, Any] = {
+        "image_size": spec["image_size"],
+        "sequence": Path(text).name if "/" in text else text,
+        "backend": spec["backend"],
+    }
+    results = [row["result"] for row in finished(repeats)]
+    if not results:
+        return {**cell, "error": repeats[0]["error"]}
+    known = {key: [r[key] for r in results if r.get(key) is not None] for key in METRICS}
+    return {**cell, **{key: float(np.median(values)) for key, values in known.items() if values}}
+
+
+def medians(cells: Sequence[Cell]) -> list[dict[str, Any]]:
+    """Medians with intervals over the sequences that every system finished, a line for each."""
+    lines = []
+    for backend, own in _complete(cells).items():
+        known = {key: summary(own, key) for key in METRICS if any(key in cell for cell in own)}
+        lines.append({"sequence": MEDIAN, "backend": backend, **known})
+    return lines
+
+
+def _complete(cells: Sequence[Cell]) -> dict[str, list[Cell]]:
+    """By system, the cells of the sequences that every system finished, in one order."""
+    failed = _failed(cells)
+    found: dict[str, list[Cell]] = {}
+    for cell in cells:
+        if cell["sequence"] not in failed:
+            found.setdefault(cell["backend"], []).append(cell)
+    return found
+
+
+def _failed(cells: Sequence[Cell]) -> dict[str, str]:
+    """Sequences that a system did not finish, and why."""
+    reasons: dict[str, list[str]] = {}
+    for cell in cells:
+        if "error" in cell:
+            why = f"{cell['backend']}: {cell['error']}"
+            shown = why if len(why) <= _LONGEST else f"{why[: _LONGEST - 3]}..."
+            reasons.setdefault(cell["sequence"], []).append(shown)
+    return {sequence: "; ".join(texts) for sequence, texts in reasons.items()}
+
+
+def _columns(cells: Sequence[Cell]) -> list[str]:
+    """Of a table; energy only where a machine counts it, errors only where there are some."""
+    shown = [key for key in (*METRICS, "error") if any(key in cell for cell in cells)]
+    return ["sequence", "backend", *shown]
+
+
+def _note(cells: Sequence[Cell]) -> str:
+    """Over how many sequences the medians are, which are left out and why, and which have fewer."""
+    names, failed = {cell["sequence"] for cell in cells}, _failed(cells)
+    note = f"{MEDIAN.capitalize()}: over {len(names) - len(failed)} of {len(names)} sequences"
+    if failed:
+        reasons = ", ".join(f"{name} ({why})" for name, why in failed.items())
+        note += f", those that every backend finished; not {reasons}"
+    fewer = [
+        f"{backend}'s {metric(key).heading} over {known}"
+        for backend, own in _complete(cells).items()
+        for key in METRICS
+        if 0 < (known := sum(key in cell for cell in own)) < len(own)
+    ]
+    note += f"; {', '.join(fewer)}" if fewer else ""
+    return f"{note}. With 95 % bootstrap intervals over the sequences."
+
+
+def _differences(cells: Sequence[Cell], reference: str) -> Table | None:
+    """What each system has more than the reference on the same sequences, and where it is better.
+
+    None where there is nothing to set against each other.
+    """
+    complete = _complete(cells)
+    if reference not in complete or len(complete) < 2:
+        return None
+    base = complete.pop(reference)
+    lines = [_line(backend, own, base) for backend, own in complete.items()]
+    shown = [key for key in PAIRED if any(f"{key}_more" in line for line in lines)]
+    columns = [Column(f"{key}_more", key, f"{metric(key).heading}, difference") for key in shown]
+    title = f"{cells[0]['image_size']}: differences from {reference}"
+    note = (
+        f"Medians of the differences on the same {len(base)} sequences, with 95 % bootstrap "
+        "intervals: where an interval contains 0, chance may have made the difference. Better on: "
+        "share of the sequences with a smaller ATE."
+    )
+    return make_table(["backend", "sequences_count", *columns, "better_share"], lines, title, note)
+
+
+def _line(backend: str, own: Sequence[Cell], base: Sequence[Cell]) -> dict[str, Any]:
+    line: dict[str, Any] = {"backend": backend, "sequences_count": len(own)}
+    for key in PAIRED:
+        pairs = zip(own, base, strict=True)
+        more = [a[key] - b[key] for a, b in pairs if key in a and key in b]
+        if more:
+            line[f"{key}_more"] = median_interval(more)
+    wins = [a["ate_m"] < b["ate_m"] for a, b in zip(own, base, strict=True)]
+    return {**line, "better_share": share_interval(wins)}
