@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import gc
 import importlib.util
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import gymnasium
+import imageio.v3 as iio
 import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.env.active_slam import ActiveSlamEnv
 from ms_slam_env.errors import InputError
+from ms_slam_env.output_files import write_bytes
 from ms_slam_env.sequences.perturbations import make_perturbation
 
 
@@ -83,13 +88,38 @@ class Perturbed(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordCon
 
 
 class RecordVideo(gymnasium.wrappers.RecordVideo):
-    """Gymnasium's wrapper of this name; without MoviePy it says how to install it.
+    """Gymnasium's wrapper of this name, with films written by FFmpeg through imageio.
+
+    Gymnasium writes them with MoviePy, which wants an older Pillow than others can live with.
 
     Raises:
-        InputError: MoviePy, the extra ``video``, is not installed.
+        InputError: imageio-ffmpeg, the extra ``video``, is not installed.
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any], *args: Any, **options: Any) -> None:
-        if importlib.util.find_spec("moviepy") is None:
-            raise InputError("recording videos needs MoviePy: pip install 'ms-slam-env[video]'")
-        super().__init__(env, *args, **options)
+        if importlib.util.find_spec("imageio_ffmpeg") is None:
+            needed = "imageio-ffmpeg: pip install 'ms-slam-env[video]'"
+            raise InputError(f"recording videos needs {needed}")
+        with suppress(gymnasium.error.DependencyNotInstalled):  # its last act is to ask for MoviePy
+            super().__init__(env, *args, **options)
+
+    def stop_recording(self) -> None:
+        """Write the film, and be ready for the next."""
+        frames, self.recorded_frames = self.recorded_frames, []
+        if frames:
+            self._write(Path(self.video_folder, f"{self._video_name}.mp4"), frames)
+        self.recording, self._video_name = False, None
+        if self.gc_trigger and self.gc_trigger(self.episode_id):
+            gc.collect()
+
+    def _write(self, path: Path, frames: list[Any]) -> None:
+        even = [frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2] for frame in frames]
+        film = iio.imwrite(  # the codec wants even numbers of rows and columns
+            "<bytes>",
+            np.stack(even),
+            extension=".mp4",
+            plugin="FFMPEG",
+            fps=self.frames_per_sec,
+            macro_block_size=2,
+        )
+        write_bytes(path, film)

@@ -195,11 +195,8 @@ class LoopClosure(Experiment):
         columns = ["sequence", "image_size", "loop_closure", *shown]
         pairs = pairs_of(rows)
         medians: list[dict[str, Any]] = [
-            {
-                "loop_closure": variant,
-                "recordings": len(pairs),
-                **_medians([p[variant] for p in pairs], METRICS),
-            }
+            {"loop_closure": variant, "recordings": len(pairs),
+             **_medians([p[variant] for p in pairs], METRICS)}
             for variant in VARIANTS
         ]  # fmt: skip
         wins = {key: sum(p["deformation"][key] < p["none"][key] for p in pairs) for key in METRICS}

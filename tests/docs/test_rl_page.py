@@ -6,11 +6,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import pytest
-
-from ms_slam_env.env.wrappers import RecordVideo
-from ms_slam_env.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
 BLOCKS = re.findall(
@@ -30,12 +26,3 @@ def test_the_examples_run(monkeypatch: pytest.MonkeyPatch) -> None:
         small = re.sub(r"^OPTIONS = .*$", SMALL, source, flags=re.MULTILINE)
         exec(compile(small, "docs/rl.md", "exec"), names)
     assert len(names["best"]) == 4
-
-
-def test_a_film_without_moviepy_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    env = gym.make("MSActiveSLAM-FreeCamera-v0", render_mode="rgb_array")
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(
-        InputError, match=r"^recording videos needs MoviePy: pip install 'ms-sl[^\n]*$"
-    ):
-        RecordVideo(env, "films")
