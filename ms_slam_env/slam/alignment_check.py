@@ -12,21 +12,12 @@ from dataclasses import asdict, dataclass, fields, replace
 from enum import IntEnum
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env._warp import wp
-from ms_slam_env.camera import Intrinsics
-from ms_slam_env.geometry import relative_angle
-from ms_slam_env.slam.base import Float32, Float64
 
 FEWEST_READINGS = 0.05  # share of a frame's pixels that must have depth
-_PHOTOMETRIC_LEVELS = 20.0  # largest difference of grey values once their median is taken away
-_LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
-_WINDOW = 11  # pixels of the view; variations over longer distances are shading, not texture
-_SMOOTHING = 3
-_FEWEST_PIXELS = 100
 
 
 class TrackingStatus(IntEnum):
@@ -226,148 +217,6 @@ def evaluate_alignment(statistics: Any, thresholds: Any) -> int:
 evaluate_on_device = wp.func(evaluate_alignment)
 
 
-@dataclass(frozen=True)
-class DepthImage:
-    """A depth image with its intensity, sensed or rendered."""
-
-    depth: Float32  # (H, W) float32 metres; 0 = no reading
-    intensity: Float32  # (H, W) float32 in [0, 255]
-
-    @property
-    def readings(self) -> float:
-        """Share of the pixels that have depth."""
-        return float((self.depth > 0).mean())
-
-
-def measure_alignment(
-    frame: DepthImage,
-    reference: DepthImage,
-    T_reference_frame: Float64,
-    intrinsics: Intrinsics,
-    samples: int = 5000,
-) -> AlignmentStatistics:
-    """Compare a frame with a reference of the same camera by projective association.
-
-    A reading is an inlier within 2 cm + 1 cm/m^2 of the reference's surface, the axial noise of
-    structured light growing with depth squared. About ``samples`` readings are looked at; more
-    than the default do not change the decision.
-    """
-    v, u = np.nonzero(frame.depth > 0)
-    step = max(1, len(v) // samples)
-    v, u = v[::step], u[::step]
-    depth = frame.depth[v, u].astype(np.float64)
-    points = _back_project(u, v, depth, intrinsics)
-    points = points @ T_reference_frame[:3, :3].T + T_reference_frame[:3, 3]
-    ahead = points[:, 2] > 1e-3
-    pixels = np.full((len(points), 2), -1.0)
-    pixels[ahead] = intrinsics.project(points[ahead])
-    column, row = np.clip(np.rint(pixels), -1, 1e6).astype(np.int64).T
-    # The last row and column have no neighbour to take the normal from.
-    seen = (column >= 0) & (column < intrinsics.width - 1)
-    seen &= (row >= 0) & (row < intrinsics.height - 1)
-    seen[seen] = reference.depth[row[seen], column[seen]] > 0
-    motion = AlignmentStatistics(
-        motion_m=float(np.linalg.norm(T_reference_frame[:3, 3])),
-        rotation_cos=float(np.cos(relative_angle(np.eye(3), T_reference_frame[:3, :3]))),
-    )
-    if not seen.any():
-        return motion
-    row, column, points = row[seen], column[seen], points[seen]
-    residual = _distance_to_surface(points, row, column, reference.depth, intrinsics)
-    inlier = residual <= 0.02 + 0.01 * points[:, 2] ** 2
-    difference = frame.intensity[v, u][seen] - reference.intensity[row, column]
-    alike = np.abs(difference - np.median(difference)) <= _PHOTOMETRIC_LEVELS
-    squares = residual[inlier] ** 2
-    return replace(
-        motion,
-        overlap=float(seen.mean()),
-        inlier_ratio=float(inlier.mean()),
-        photometric_inlier_ratio=float(alike.mean()),
-        residual_m=float(np.sqrt(squares.mean())) if inlier.any() else 0.0,
-    )
-
-
-def check_alignment(
-    frame: DepthImage,
-    reference: DepthImage,
-    T_reference_frame: Float64,
-    intrinsics: Intrinsics,
-    thresholds: AcceptanceThresholds,
-    samples: int = 5000,
-) -> tuple[AlignmentStatistics, str]:
-    """What ``measure_alignment`` finds, and why that is not accepted; empty if it is."""
-    found = measure_alignment(frame, reference, T_reference_frame, intrinsics, samples)
-    return found, VIEW_REASONS[evaluate_alignment(found, thresholds)]
-
-
-def _back_project(
-    u: NDArray[np.int64], v: NDArray[np.int64], depth: Float64, intrinsics: Intrinsics
-) -> Float64:
-    """Points (N, 3) of pixels with a depth, camera frame."""
-    return intrinsics.rays_at(np.stack([u, v], axis=1)) * depth[:, None]
-
-
-def _distance_to_surface(
-    points: Float64,
-    row: NDArray[np.int64],
-    column: NDArray[np.int64],
-    depth: Float32,
-    intrinsics: Intrinsics,
-) -> Float64:
-    """Distances (N,) of points to the planes through the pixels and their neighbours."""
-
-    def corner(down: int, right: int) -> Float64:
-        z = depth[row + down, column + right].astype(np.float64)
-        return _back_project(column + right, row + down, z, intrinsics)
-
-    here, right, below = corner(0, 0), corner(0, 1), corner(1, 0)
-    normal = np.cross(right - here, below - here)
-    length = np.linalg.norm(normal, axis=1)
-    flat = (right[:, 2] > 0) & (below[:, 2] > 0) & (length > 0)
-    normal[~flat] = (0.0, 0.0, 1.0)
-    normal[flat] /= length[flat, None]
-    return np.abs(np.einsum("nc,nc->n", points - here, normal))
-
-
-def measure_photometric_consistency(
-    color: NDArray[np.uint8],
-    depth: Float32,
-    view_intensity: Float32,
-    view_depth: Float32,
-    cutoff_m: float,
-) -> AlignmentStatistics:
-    """Lay a frame upon the map's view from its pose, pixel by pixel.
-
-    The tracker explains a frame with a gain and a bias of its own, and self-similar textures fit
-    themselves at many places about as well as noise permits. Here the images are compared once
-    more, without that freedom. A reading is an inlier within 2 cm + 2 cm/m^2 of the view's depth.
-
-    Args:
-        color: (H, W, 3).
-        depth: (H, W) metres; 0 = no reading.
-        view_intensity: (h, w) every n-th row and column of the camera's image.
-        view_depth: (h, w) metres; 0 where the map is empty.
-        cutoff_m: readings beyond are no part of the map.
-    """
-    step = -(-depth.shape[0] // view_depth.shape[0])
-    sensed = depth[::step, ::step]
-    reading = (sensed > 0) & (sensed <= cutoff_m)
-    both = reading & (view_depth > 0)
-    if both.sum() < _FEWEST_PIXELS:
-        return NO_ALIGNMENT
-    grey = color[::step, ::step].astype(np.float32) @ _LUMA
-    tolerance = 0.02 + 0.02 * sensed[both] ** 2
-    one, other = _fine_structure(grey, both), _fine_structure(view_intensity, both)
-    norms = float(np.sqrt((one**2).sum() * (other**2).sum()))
-    return AlignmentStatistics(
-        overlap=float(both.sum() / reading.sum()),
-        inlier_ratio=float((np.abs(view_depth - sensed)[both] <= tolerance).mean()),
-        correlation=float((one * other).sum()) / norms if norms > 0 else 0.0,
-        texture=float(np.sqrt(max((one[both] ** 2).mean(), (other[both] ** 2).mean()))),
-        relief_m=_relief(view_depth, both),
-    )
-
-
 def is_photometrically_consistent(found: AlignmentStatistics) -> bool:
     """Whether a frame and the map's view show the same."""
     textured = found.texture >= LEAST_TEXTURE
@@ -381,25 +230,3 @@ def status_on_appeal(found: AlignmentStatistics) -> TrackingStatus:
         return TrackingStatus.PHOTOMETRIC_MISMATCH
     sure = found.texture >= LEAST_TEXTURE and found.correlation >= CONVINCING_CORRELATION
     return TrackingStatus.OK if sure else TrackingStatus.UNCERTAIN
-
-
-def _relief(depth: Float32, where: NDArray[np.bool_]) -> float:
-    """RMS distance in metres, along the rays, from the plane that fits the depth best.
-
-    The inverse depth of a plane is linear in the image.
-    """
-    v, u = np.nonzero(where)
-    inverse = 1.0 / depth[where].astype(np.float64)
-    places = np.stack([u, v, np.ones_like(u)], axis=1).astype(np.float64)
-    plane = np.linalg.lstsq(places, inverse, rcond=None)[0]
-    residual = (inverse - places @ plane) / inverse**2
-    return float(np.sqrt((residual**2).mean()))
-
-
-def _fine_structure(image: Float32, where: NDArray[np.bool_]) -> Float32:
-    """Image less its local mean, slightly smoothed; 0 outside ``where``."""
-    weight = where.astype(np.float32)
-    window = (_WINDOW, _WINDOW)
-    local = cv2.blur(image * weight, window) / np.maximum(cv2.blur(weight, window), 1e-6)
-    detail = np.where(where, image - local, 0).astype(np.float32)
-    return cv2.blur(detail, (_SMOOTHING, _SMOOTHING)) * weight

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ms_slam_env.slam.alignment_check import DepthImage
+from ms_slam_env.slam.alignment_measures import DepthImage
 from ms_slam_env.slam.base import Float32, Float64
 
 Int64 = NDArray[np.int64]

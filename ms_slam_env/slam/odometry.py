@@ -18,12 +18,8 @@ from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, relative_angle
-from ms_slam_env.slam.alignment_check import (
-    NO_ALIGNMENT,
-    AcceptanceThresholds,
-    DepthImage,
-    check_alignment,
-)
+from ms_slam_env.slam.alignment_check import NO_ALIGNMENT, AcceptanceThresholds
+from ms_slam_env.slam.alignment_measures import DepthImage, check_alignment
 from ms_slam_env.slam.base import BorrowedMap, Float64
 from ms_slam_env.slam.pose_hypotheses import motion_hypotheses
 from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam

@@ -6,7 +6,7 @@ import numpy as np
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import make_pose, so3_exp
-from ms_slam_env.slam.alignment_check import DepthImage, measure_alignment
+from ms_slam_env.slam.alignment_measures import DepthImage, measure_alignment
 from ms_slam_env.slam.base import Float64
 
 TURN_RAD = np.radians(10.0)

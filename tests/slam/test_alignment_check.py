@@ -17,15 +17,14 @@ from ms_slam_env.slam.alignment_check import (
     VIEW_THRESHOLDS,
     AcceptanceThresholds,
     AlignmentStatistics,
-    DepthImage,
     DeviceStatistics,
     DeviceThresholds,
     TrackingStatus,
     evaluate_alignment,
     evaluate_on_device,
-    measure_alignment,
     status_on_appeal,
 )
+from ms_slam_env.slam.alignment_measures import DepthImage, measure_alignment
 from ms_slam_env.slam.pose_hypotheses import motion_hypotheses
 
 CAMERA = Intrinsics(fx=80.0, fy=84.0, cx=39.3, cy=29.8, width=80, height=60)

@@ -10,7 +10,7 @@ from surfel_scenes import WALL_NORMAL, WALL_POINT
 
 from ms_slam_env.camera import intensity_image, xtion
 from ms_slam_env.geometry import invert, make_pose, se3_exp, so3_exp
-from ms_slam_env.slam.alignment_check import DepthImage
+from ms_slam_env.slam.alignment_measures import DepthImage
 from ms_slam_env.slam.feature_matching import (
     hamming_distance,
     match_anywhere,

@@ -9,12 +9,8 @@ from scipy.spatial import cKDTree
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, transform_points
-from ms_slam_env.slam.alignment_check import (
-    NO_ALIGNMENT,
-    AcceptanceThresholds,
-    DepthImage,
-    check_alignment,
-)
+from ms_slam_env.slam.alignment_check import NO_ALIGNMENT, AcceptanceThresholds
+from ms_slam_env.slam.alignment_measures import DepthImage, check_alignment
 from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.feature_matching import Int64, match_anywhere, match_near
 from ms_slam_env.slam.features import Features, InverseDepth

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, transform_points
-from ms_slam_env.slam.alignment_check import DepthImage
+from ms_slam_env.slam.alignment_measures import DepthImage
 from ms_slam_env.slam.base import Float32, Float64
 from ms_slam_env.slam.feature_matching import Int64, thumbnail
 from ms_slam_env.slam.features import Features, InverseDepth

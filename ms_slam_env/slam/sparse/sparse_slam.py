@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.geometry import relative_angle
-from ms_slam_env.slam.alignment_check import DepthImage
+from ms_slam_env.slam.alignment_measures import DepthImage
 from ms_slam_env.slam.base import BorrowedMap, Float64
 from ms_slam_env.slam.feature_matching import most_alike, thumbnail
 from ms_slam_env.slam.features import FeatureExtractor, InverseDepth

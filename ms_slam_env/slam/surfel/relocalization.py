@@ -9,11 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.slam.alignment_check import (
-    AlignmentStatistics,
-    is_photometrically_consistent,
-    measure_photometric_consistency,
-)
+from ms_slam_env.slam.alignment_check import AlignmentStatistics, is_photometrically_consistent
+from ms_slam_env.slam.alignment_measures import measure_photometric_consistency
 from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.ferns import Candidate, FernConfig, FernDatabase, dissimilarities
 from ms_slam_env.slam.state import Saved
