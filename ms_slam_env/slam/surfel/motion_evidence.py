@@ -249,6 +249,14 @@ def enlarge(masked: wp.array(dtype=wp.int32), grid: Grid, image: wp.array(dtype=
     half = grid.stride / 2
     line = wp.min((v + half) / grid.stride, grid.height - 1)
     row = (b * grid.height + line) * grid.width
-    for u in range(grid.live_width):
-        column = wp.min((u + half) / grid.stride, grid.width - 1)
-        image[(b * grid.live_height + v) * grid.live_width + u] = masked[row + column]
+    live_row = (b * grid.live_height + v) * grid.live_width
+    u = int(0)
+    column = int(0)
+    while u < grid.live_width:
+        next_column = wp.min(grid.stride * (column + 1) - half, grid.live_width)
+        next_column = wp.where(column == grid.width - 1, grid.live_width, next_column)
+        value = fetch(masked, row + column)
+        while u < next_column:
+            put(image, live_row + u, value)
+            u += 1
+        column += 1
