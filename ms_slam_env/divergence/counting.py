@@ -152,6 +152,7 @@ class HistogramCounter:
             if type_is_vector and array.shape[3] != 3:
                 raise InputError(f"{name} must be (B, h, w, 3), got {array.shape}")
             array = wp.array(array, dtype=dtype, device=self._device, copy=False)
+        array = array.contiguous()
         if array.shape[1:] != self.intrinsics.shape:
             raise InputError(
                 f"{name} is {array.shape[2]}x{array.shape[1]} but the intrinsics say "

@@ -1,9 +1,11 @@
+# mypy: disable-error-code="empty-body"
 """Counting kernels: one pass over the pixels of a batch of frames.
 
 Grey levels are counted in integers and the weights of normals are summed by rows, so the result
 does not depend on the order in which a GPU adds them. One thread takes one image row: on the CPU,
 where threads run one after the other, the call of a thread costs more than a pixel does. The
-spatial window of pixel (v, u) is ``row_window[v] + column_window[u]``.
+spatial window of pixel (v, u) is ``row_window[v] + column_window[u]``. Inner loops are C++: Warp's
+indexing, with any strides, takes longer than what they compute. So images must be contiguous.
 """
 
 from __future__ import annotations
@@ -11,12 +13,21 @@ from __future__ import annotations
 from ms_slam_env._warp import wp
 
 
+@wp.func_native("""
+for (int u = 0; u < width; ++u) {
+    const float z = depth.data[u];
+    inverse.data[u] = 1.0f / (z > 1.0e-20f ? z : 1.0e-20f);
+}
+""")
+def invert_row(depth: wp.array(dtype=wp.float32), width: int, inverse: wp.array(dtype=wp.float32)):
+    """Inverse depth of a row of pixels."""
+
+
 @wp.kernel
 def invert_depth(depth: wp.array3d(dtype=wp.float32), inverse: wp.array3d(dtype=wp.float32)):
     """Inverse depth in 1/m; where there is no reading, a number too large to be one."""
     b, v = wp.tid()
-    for u in range(depth.shape[2]):
-        inverse[b, v, u] = 1.0 / wp.max(depth[b, v, u], 1.0e-20)
+    invert_row(depth[b, v], depth.shape[2], inverse[b, v])
 
 
 @wp.func
@@ -95,6 +106,28 @@ def direction_cell(n: wp.vec3, size: int):
     return row * size + wp.clamp(int(x + half), 0, size - 1)
 
 
+@wp.func_native("""
+const int* listed = near.data + size_t(cell) * near.shape[1];
+float* out = sums.data + first;
+for (int k = 1; k <= listed[0]; ++k) {
+    const wp::vec3& d = directions.data[listed[k]];
+    const float cosine = (n[0] * d[0] + n[1] * d[1] + n[2] * d[2]) * inverse;
+    out[listed[k]] += cosine > cos_alpha ? cosine - cos_alpha : 0.0f;
+}
+""")
+def add_to_bins(
+    n: wp.vec3,
+    inverse: float,
+    directions: wp.array(dtype=wp.vec3),
+    near: wp.array2d(dtype=wp.int32),
+    cell: int,
+    cos_alpha: float,
+    first: int,
+    sums: wp.array(dtype=wp.float32),
+):
+    """Add the weights of direction ``n``, of length 1 / ``inverse``, to the bins near its cell."""
+
+
 @wp.func
 def add_weights(
     n: wp.vec3,
@@ -106,12 +139,30 @@ def add_weights(
     sums: wp.array(dtype=wp.float32),
 ):
     """Add the weights (8) of direction ``n``, times 1 - cos(alpha), to the bins from ``first``."""
-    cell = direction_cell(n, size)
-    inverse = 1.0 / wp.length(n)
-    for k in range(1, near[cell, 0] + 1):
-        index = near[cell, k]
-        cosine = wp.dot(n, directions[index]) * inverse
-        sums[first + index] += wp.max(cosine - cos_alpha, 0.0)
+    cell, inverse = direction_cell(n, size), 1.0 / wp.length(n)
+    add_to_bins(n, inverse, directions, near, cell, cos_alpha, first, sums)
+
+
+@wp.func_native("""
+const float* grey = intensity.data;
+const float* z = depth.data;
+for (int u = 0; u < width; ++u) {
+    if (only_with_depth && !(z[u] > 0.0f)) continue;
+    int level = (int)(grey[u] + 0.5f);
+    level = level < 0 ? 0 : level > 255 ? 255 : level;
+    wp::atomic_add(counts.data + first + 256 * column_window.data[u] + level, 1);
+}
+""")
+def count_row(
+    intensity: wp.array(dtype=wp.float32),
+    depth: wp.array(dtype=wp.float32),
+    only_with_depth: int,
+    column_window: wp.array(dtype=wp.int32),
+    width: int,
+    first: int,
+    counts: wp.array(dtype=wp.int32),
+):
+    """Count the grey levels of a row of pixels."""
 
 
 @wp.kernel
@@ -125,13 +176,16 @@ def count_intensity(
 ):
     """Add a row of pixels to the grey levels (B, windows * 256) of its frame."""
     b, v = wp.tid()
-    width = intensity.shape[2]
-    window_row = row_window[v]
-    for u in range(width):
-        if only_with_depth == 0 or depth[b, v, u] > 0.0:
-            level = wp.clamp(int(intensity[b, v, u] + 0.5), 0, 255)
-            window = window_row + column_window[u]
-            wp.atomic_add(counts, b, window * 256 + level, 1)
+    first = 256 * row_window[v]
+    count_row(
+        intensity[b, v],
+        depth[b, v],
+        only_with_depth,
+        column_window,
+        intensity.shape[2],
+        first,
+        counts[b],
+    )
 
 
 @wp.kernel

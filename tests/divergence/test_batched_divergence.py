@@ -5,6 +5,7 @@ import pytest
 from scipy.optimize import linprog
 from scipy.stats import wasserstein_distance
 
+from ms_slam_env._warp import wp
 from ms_slam_env.camera import xtion
 from ms_slam_env.config import from_dict
 from ms_slam_env.divergence import (
@@ -214,6 +215,18 @@ def test_sizes_that_do_not_fit_are_refused():
             divergence.histograms(intensity, np.where(depth == depth.max(), bad, depth))
     with pytest.raises(InputError, match="normals"):
         divergence.histograms(intensity, depth, np.zeros((1, 60, 80, 3)))
+
+
+def test_images_on_the_device_need_not_be_contiguous():
+    images = frames(2)
+    divergence = make_divergence(DivergenceConfig(intensity_pixels="with-depth"), CAMERA)
+    expected = divergence.histograms(*images)
+    wide = [wp.array(np.repeat(image, 2, axis=2), dtype=wp.float32) for image in images]
+    strided = [image[:, :, ::2] for image in wide]
+    assert not strided[0].is_contiguous
+    found = divergence.histograms(*strided)
+    np.testing.assert_array_equal(found.intensity, expected.intensity)
+    np.testing.assert_array_equal(found.normals, expected.normals)
 
 
 def test_paper_preset():
