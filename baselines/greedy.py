@@ -8,13 +8,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.env import Planner
-from ms_slam_env.env.config import TargetConfig
+from ms_slam_env.env.config import LookaheadConfig, TargetConfig
+from ms_slam_env.env.lookahead import Lookahead
+from ms_slam_env.errors import unknown
 
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv
 
 Float64 = NDArray[np.float64]
+
+PRESETS = ("environment", "paper")
+PAPER_LOOKAHEAD = LookaheadConfig(reference="live", scale=1.0)
+PAPER_TARGETS = TargetConfig(M_I=0.1, M_D=0.1, rho_I=1.0, rho_D=1.0, depth_weight=1.0)
+"""M_I and M_D as `TargetConfig` has them, but for the paper's histograms
+(``ms-slam experiment frame_skipping --histograms paper``). The paper names no rho and no lambda: at
+1 "the camera moves to the locations where the image will provide maximum allowed information"."""
 
 
 class GreedyDivergence(Planner):
@@ -26,6 +36,9 @@ class GreedyDivergence(Planner):
     Args:
         env: the unwrapped environment; its configured targets are the defaults below.
         seed: unused, the planner draws nothing at random.
+        preset: ``environment`` predicts, compares and aims as the environment is configured;
+            ``paper`` as Algorithm 1 is printed: views of full size against the last live frame,
+            256 bins of all pixels, not smoothed, and targets for this measure.
         rho_I: share of M_I to aim at, in [0, 1].
         rho_D: share of M_D to aim at, in [0, 1].
         depth_weight: lambda, significance of depth over intensity.
@@ -38,21 +51,37 @@ class GreedyDivergence(Planner):
         self,
         env: ActiveSlamEnv,
         seed: int = 0,
+        preset: str = "environment",
         rho_I: float | None = None,
         rho_D: float | None = None,
         depth_weight: float | None = None,
     ) -> None:
         super().__init__(env, seed)
+        if preset not in PRESETS:
+            raise unknown("preset of greedy", preset, PRESETS)
         options = {"rho_I": rho_I, "rho_D": rho_D, "depth_weight": depth_weight}
         given: dict[str, Any] = {k: _number(v) for k, v in options.items() if v is not None}
-        self.targets = replace(env.config.targets, **given)
+        self.predicted = env.lookahead
+        targets = env.config.targets
+        if preset == "paper":
+            self.predicted, targets = self._predicted_as_printed, PAPER_TARGETS
+            self._lookahead = Lookahead(PAPER_LOOKAHEAD, DivergenceConfig.paper(), env.intrinsics)
+        self.targets = replace(targets, **given)
 
     def act(self, observation: Any, info: dict[str, Any]) -> int:
         """Algorithm 1; the loop over candidates, lines 3 to 8, is one batch."""
         T = np.flatnonzero(self.env.action_masks())  # line 2: motions within reach
-        delta_I, delta_D = self.env.lookahead()[T].T  # lines 1 and 3 to 8: predict and compare
+        delta_I, delta_D = self.predicted()[T].T  # lines 1 and 3 to 8: predict and compare
         i_star = np.argmin(distance_to_targets(delta_I, delta_D, self.targets))  # line 9
         return int(T[i_star])  # lines 10 and 11
+
+    def _predicted_as_printed(self) -> Float64:
+        """Divergences (n, 2) of the predicted images from I_t-1 and D_t-1, the last live ones."""
+        here = self.env.episode
+        poses = self.env.candidate_poses()
+        return self._lookahead.divergences(
+            self.env.slam, poses, here.T_world_camera_estimate, here.last_frame
+        )
 
 
 def distance_to_targets(delta_I: Float64, delta_D: Float64, targets: TargetConfig) -> Float64:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ms_slam_env import metrics, slam
 from ms_slam_env.camera import xtion
 from ms_slam_env.divergence import DivergenceConfig
-from ms_slam_env.errors import InputError
+from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.evaluation.run_sequence import run_sequence
 from ms_slam_env.evaluation.sequence_divergence import consecutive_divergences
 from ms_slam_env.experiments.harness.episode_scores import LOST_ERROR_M
@@ -35,6 +35,7 @@ from ms_slam_env.sequences import (
 Float64 = NDArray[np.float64]
 
 _FINEST = 12  # denominator of an interval: 1.333 is 4/3
+HISTOGRAMS = {"default": DivergenceConfig(), "paper": DivergenceConfig.paper()}
 DIVERGENCES = ("M_I", "M_D", "intensity_divergence_mean", "depth_divergence_mean")
 
 
@@ -50,6 +51,7 @@ class SkippingSpec:
         image_size: width x height.
         motion: ICL-NUIM's that is placed in the scene, such as ``lr_kt1``; empty: hand-held.
         data: folder that holds it.
+        histograms: ``default`` or ``paper``, how divergence is measured.
     """
 
     scene: str
@@ -76,6 +78,8 @@ class SkippingSpec:
         else:
             whole = handheld_trajectory(scene, self.frames, self.seed)
         return whole[self.kept[self.kept < len(whole)]]
+
+    histograms: str = "default"
 
 
 @dataclass(frozen=True)
@@ -104,6 +108,8 @@ class FrameSkipping(Experiment):
     """Split that the seeds come from; a default read from them may not use the test seeds."""
     desired_ate_m: float = 0.01
     """Trajectory error for which the targets M_I and M_D are read."""
+    histograms: str = "default"
+    """Settings of the divergence: default, or paper (256 bins, no smoothing, every pixel)."""
 
     unit = rows_key = "sequences"
 
@@ -114,6 +120,8 @@ class FrameSkipping(Experiment):
                 raise InputError(f"interval {interval:g} is outside [1, {self.frames // 3}]")
         if not self.desired_ate_m > 0:
             raise InputError(f"desired_ate_m = {self.desired_ate_m} must be > 0")
+        if self.histograms not in HISTOGRAMS:
+            raise unknown("setting of histograms", self.histograms, HISTOGRAMS)
 
     def specs(self) -> list[SkippingSpec]:
         """Every sequence at every interval."""
@@ -122,7 +130,12 @@ class FrameSkipping(Experiment):
             icl_nuim.read_motion(str(self.data), motion)  # refuses what is not there
         data = str(self.data) if self.motions else ""
         return [
-            SkippingSpec(scene, seed, interval, self.frames, motion=motion, data=data)
+            SkippingSpec(
+                *(scene, seed, interval, self.frames),
+                motion=motion,
+                data=data,
+                histograms=self.histograms,
+            )
             for scene in self.scenes
             for seed in seed_list(self.seeds, self.sequences)
             for motion in self.motions or ("",)
@@ -136,7 +149,8 @@ class FrameSkipping(Experiment):
         camera = xtion(spec.image_size)
         sequence = render_sequence(scene, spec.trajectory(), camera, seed=spec.seed)
         K = sequence.intrinsics
-        divergences = consecutive_divergences(sequence.frames, K, [DivergenceConfig()])[:, 0]
+        measure = HISTOGRAMS[spec.histograms]
+        divergences = consecutive_divergences(sequence.frames, K, [measure])[:, 0]
         run = run_sequence(slam.make("surfel", K), sequence)
         worst = metrics.absolute_errors(run.estimates, sequence.poses, align="none").max()
         return {

@@ -1,11 +1,17 @@
 """The planners in the real environment: valid motions, the criterion met, reproducible."""
 
+from types import SimpleNamespace
+
 import gymnasium as gym
 import numpy as np
 import pytest
 from ms_slam_baselines import GreedyDivergence, MaxInformation, RandomWalk, Stationary
+from ms_slam_baselines.greedy import PAPER_TARGETS
 
 import ms_slam_env  # noqa: F401 -- registers the environments
+from ms_slam_env.divergence import depth_divergence, intensity_divergence
+from ms_slam_env.env.config import TargetConfig
+from ms_slam_env.errors import InputError
 
 PLANNERS = (GreedyDivergence, MaxInformation, RandomWalk, Stationary)
 IDS = ("MSActiveSLAM-FreeCamera-v0", "MSActiveSLAM-FixedTranslation-v0")
@@ -48,6 +54,34 @@ def test_greedy_takes_the_smallest_distance_to_the_targets(env):
         if info["action_mask"][i]
     }
     assert action == min(distances, key=distances.get)
+
+
+def test_the_papers_greedy_is_algorithm_1_with_the_public_divergences(env):
+    """Line by line, one candidate at a time, whatever the environment is configured to measure."""
+    observation, info = env.reset(seed=1)
+    observation, _, _, _, info = env.step(1)
+    world = env.unwrapped
+    planner = GreedyDivergence(world, preset="paper", depth_weight=0.5)
+    live, targets = world.episode.last_frame, PAPER_TARGETS
+    best, smallest = -1, np.inf
+    for i, pose in enumerate(world.candidate_poses()):
+        if not info["action_mask"][i]:
+            continue
+        view = world.slam.predict(pose[None], 1.0)
+        predicted_I = np.floor(view.intensity[0] + 0.5).astype(np.uint8)
+        delta_I = intensity_divergence(predicted_I, live)
+        delta_D = depth_divergence(view.depth[0], live.depth, world.intrinsics)
+        distance = abs(delta_I - targets.M_I) + 0.5 * abs(delta_D - targets.M_D)
+        if distance < smallest:
+            best, smallest = i, distance
+    assert planner.act(observation, info) == best
+    assert planner.targets.M_I != world.config.targets.M_I
+
+
+def test_greedy_names_its_presets():
+    env = SimpleNamespace(lookahead=None, config=SimpleNamespace(targets=TargetConfig()))
+    with pytest.raises(InputError, match=r"preset of greedy 'icra'.*environment, paper"):
+        GreedyDivergence(env, preset="icra")
 
 
 def test_greedy_with_targets_of_zero_stands_still():

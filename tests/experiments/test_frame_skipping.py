@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from ms_slam_env.camera import xtion
+from ms_slam_env.divergence import depth_divergence, intensity_divergence
 from ms_slam_env.errors import InputError
 from ms_slam_env.experiments.frame_skipping import (
     DIVERGENCES,
@@ -16,7 +19,8 @@ from ms_slam_env.experiments.frame_skipping import (
     suggest_targets,
 )
 from ms_slam_env.report.statistics import Interval
-from ms_slam_env.sequences import write_trajectory
+from ms_slam_env.sensor.scene_cache import get_scene
+from ms_slam_env.sequences import handheld_trajectory, render_sequence, write_trajectory
 
 
 def test_skipping_frames_raises_divergence() -> None:
@@ -76,6 +80,18 @@ def test_motions_are_placed_as_they_were_and_skipped(tmp_path: Path) -> None:
         FrameSkipping(motions=("lr_kt9",), data=tmp_path).specs()
 
 
+def test_the_papers_histograms_have_divergences_of_their_own() -> None:
+    experiment = FrameSkipping(("table",), intervals=(3,), frames=9, histograms="paper")
+    found = FrameSkipping.run(replace(experiment.specs()[0], image_size="80x60"))
+    scene = get_scene("table", 1000)
+    poses = handheld_trajectory(scene, 9, 1000)[::3]
+    frames = render_sequence(scene, poses, xtion("80x60"), seed=1000).frames
+    pairs = list(zip(frames[1:], frames[:-1], strict=True))
+    M_I = max(intensity_divergence(*pair) for pair in pairs)
+    M_D = max(depth_divergence(*pair, xtion("80x60")) for pair in pairs)
+    assert (found["M_I"], found["M_D"]) == pytest.approx((M_I, M_D), rel=1e-5)
+
+
 def line(interval: int, ate_m: float, lost: float, M: float) -> dict[str, Any]:
     values = {"ate_m": ate_m, "lost": lost, "M_I": M, "M_D": 2 * M}
     values |= {"intensity_divergence_mean": M / 2, "depth_divergence_mean": M}
@@ -112,7 +128,8 @@ def test_the_targets_stand_in_the_tables(ate_m: float) -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [{"intervals": (0,)}, {"intervals": (81,)}, {"desired_ate_m": 0}]
+    "options",
+    [{"intervals": (0,)}, {"intervals": (81,)}, {"desired_ate_m": 0}, {"histograms": "of-paper"}],
 )
 def test_bad_skipping_options_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(InputError):
