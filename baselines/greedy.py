@@ -21,7 +21,7 @@ Float64 = NDArray[np.float64]
 
 PRESETS = ("environment", "paper")
 PAPER_LOOKAHEAD = LookaheadConfig(reference="live", scale=1.0)
-PAPER_TARGETS = TargetConfig(M_I=0.1, M_D=0.1, rho_I=1.0, rho_D=1.0, depth_weight=1.0)
+PAPER_TARGETS = TargetConfig(M_I=0.19, M_D=0.25, rho_I=1.0, rho_D=1.0, depth_weight=1.0)
 """M_I and M_D as `TargetConfig` has them, but for the paper's histograms
 (``ms-slam experiment frame_skipping --histograms paper``). The paper names no rho and no lambda: at
 1 "the camera moves to the locations where the image will provide maximum allowed information"."""

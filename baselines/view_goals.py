@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
+
+from ms_slam_env.geometry import look_at, make_pose, so3_exp, so3_log
+from ms_slam_env.mapping import OccupancyGrid
 
 Float64 = NDArray[np.float64]
 
@@ -36,3 +40,47 @@ def draw_goals(rng: np.random.Generator, here: Float64, free: Float64, number: i
     poses[:, :3, 2] = forward
     poses[:, :3, 3] = positions
     return poses
+
+
+def poses_between(start: Float64, end: Float64, number: int) -> Float64:
+    """``number`` poses (number, 4, 4) on the straight way to ``end`` (4, 4), the end the last."""
+    turn = so3_log(start[:3, :3].T @ end[:3, :3])
+    shares = np.arange(1, number + 1) / number
+    places = start[:3, 3] + shares[:, None] * (end[:3, 3] - start[:3, 3])
+    turns = [start[:3, :3] @ so3_exp(share * turn) for share in shares]
+    return np.stack([make_pose(R, place) for R, place in zip(turns, places, strict=True)])
+
+
+def frontiers(grid: OccupancyGrid, position: Float64, radius_m: float, least: int = 10) -> Float64:
+    """Middles (K, 3), metres, of the frontiers near a position (3,), the largest first.
+
+    Frontier cells are free and have an unknown neighbour (Yamauchi, CIRA 1997); those that touch,
+    ``least`` at the least, are one frontier.
+    """
+    here, reach = grid.cells_of(position), int(radius_m / grid.cell_m)
+    low = np.clip(here - reach, 0, grid.log_odds.shape)
+    high = np.clip(here + reach + 1, low, grid.log_odds.shape)
+    states = grid.log_odds[tuple(map(slice, low, high))]
+    is_frontier = (states < 0) & ndimage.binary_dilation(states == 0)
+    parts, count = ndimage.label(is_frontier, np.ones((3, 3, 3)))
+    cells = np.argwhere(is_frontier)
+    members = [cells[parts[tuple(cells.T)] == part] for part in range(1, count + 1)]
+    members = sorted((m for m in members if len(m) >= least), key=len, reverse=True)
+    middles = [m[np.argmin(((m - m.mean(axis=0)) ** 2).sum(axis=1))] for m in members]
+    return grid.centres_of(np.array(middles).reshape(-1, 3) + low)
+
+
+def views_of(targets: Float64, free: Float64, here: Float64, away_m: float) -> Float64:
+    """A pose (K, 4, 4) that looks at each target (K, 3) from a position of ``free`` (M, 3).
+
+    About ``away_m`` from the target, rather a near one than a far one from ``here`` (3,); none that
+    looks straight up or down.
+    """
+    poses = []
+    for target in targets:
+        distance = np.linalg.norm(free - target, axis=1)
+        level = np.linalg.norm((free - target)[:, :2], axis=1) > 0.5 * distance
+        way = np.abs(distance - away_m) + 0.5 * np.linalg.norm(free - here, axis=1)
+        if level.any():
+            poses.append(look_at(free[np.argmin(np.where(level, way, np.inf))], target))
+    return np.array(poses).reshape(-1, 4, 4)

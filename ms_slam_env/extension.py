@@ -131,11 +131,28 @@ def check_options(
     Raises:
         InputError: naming the option and listing the valid ones.
     """
-    parameters = inspect.signature(make).parameters.values()
-    if any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in parameters):
+    names = _parameter_names(make)
+    if names is None:
         return
-    taken = [parameter.name for parameter in parameters if parameter.name not in given]
-    taken += list(common)
+    taken = [*(name for name in names if name not in given), *common]
     for option in options:
         if option not in taken:
             raise unknown(f"option of {kind}", option, taken or ("(none)",))
+
+
+def _parameter_names(make: Callable[..., Any]) -> list[str] | None:
+    """What ``make`` takes by name; None for anything.
+
+    What a class takes as ``**options`` is for the class before it in the order of inheritance.
+    """
+    layers: list[Any] = [make]
+    if isinstance(make, type):
+        layers += [vars(base)["__init__"] for base in make.__mro__[1:] if "__init__" in vars(base)]
+    names: list[str] = []
+    for layer in layers:
+        parameters = inspect.signature(layer).parameters.values()
+        own = [p.name for p in parameters if p.kind is not inspect.Parameter.VAR_KEYWORD]
+        names += [name for name in own if name not in ("self", *names)]
+        if len(own) == len(parameters):
+            return names
+    return None

@@ -2,6 +2,7 @@
 
 from ms_slam_env.mapping.expected_gain import expected_gain
 from ms_slam_env.mapping.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from ms_slam_env.mapping.occupancy_map import OccupancyMap
 from ms_slam_env.mapping.reachability import reachable_positions
 from ms_slam_env.mapping.surroundings import surrounding_occupancy
 from ms_slam_env.mapping.view_information import view_information
@@ -11,6 +12,7 @@ __all__ = [
     "OCCUPIED",
     "UNKNOWN",
     "OccupancyGrid",
+    "OccupancyMap",
     "expected_gain",
     "reachable_positions",
     "surrounding_occupancy",

@@ -80,14 +80,17 @@ def sum_unknown(
     while z < reach_m:
         cell = _cell(starts[pose] + z * direction, shape)
         state = wp.int32(0)
-        worth = wp.float32(1.0)
         if cell[0] >= 0:
             state = wp.int32(log_odds[cell[0], cell[1], cell[2]])
-            worth = wp.pow(STILL_BLANK, float(blanks[cell[0], cell[1], cell[2]]))
         if state > 0:
             break
         if state == 0:
-            gain += chance * worth * z * z * dz
+            worth = chance * z * z * dz
+            if cell[0] >= 0:
+                looks = wp.int32(blanks[cell[0], cell[1], cell[2]])
+                if looks > 0:
+                    worth *= wp.pow(STILL_BLANK, float(looks))
+            gain += worth
             chance *= SEEN_THROUGH
         z += dz
     gains[pose, ray] = gain

@@ -6,13 +6,22 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from ms_slam_baselines.nbv import NextBestView
-from ms_slam_baselines.view_goals import distance_in_steps, draw_goals
+from ms_slam_baselines.trackability import SCALE, image_motion, slip_risk
+from ms_slam_baselines.view_goals import (
+    distance_in_steps,
+    draw_goals,
+    frontiers,
+    poses_between,
+    views_of,
+)
 
 import ms_slam_env  # noqa: F401 -- registers the environments
+from ms_slam_env.camera import xtion
 from ms_slam_env.env.planners import make_planner
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at, make_pose, relative_angle, so3_exp
-from ms_slam_env.mapping import view_information
+from ms_slam_env.mapping import FREE, UNKNOWN, OccupancyGrid
+from ms_slam_env.slam.base import Views
 
 STEPS = 0.12, math.radians(12)
 
@@ -52,31 +61,82 @@ def test_one_seed_one_episode(episode):
     assert info["tracking_ok"]
 
 
-def test_admissible_motions_keep_overlap_information_and_distance(episode):
+def test_admissible_motions_keep_overlap_and_distance_and_do_not_risk_much(episode):
     planner = episode[2]
     env = planner.env
     poses = env.candidate_poses()
     found = planner.admissible(poses)
-    views = env.slam.predict(poses, planner.scale)
-    least = [np.linalg.eigvalsh(H).min() for H in view_information(views)]
+    here = env.episode.T_world_camera_estimate
+    seen_from = np.concatenate([here[None], poses])
+    views = env.slam.predict(seen_from, SCALE)
+    shares = [((view > 0) & (view < 0.5)).mean() for view in views.depth]
+    filled = [(view > 0).mean() for view in views.depth]
+    fits = [
+        filled[n] >= min(planner.overlap, filled[0]) and shares[n] <= max(0.1, shares[0])
+        for n in range(len(seen_from))
+    ]
+    risks = slip_risk(views, seen_from)
+    least = min(risk for risk, fit in zip(risks[2:], fits[2:], strict=True) if fit)
     for n, possible in enumerate(env.action_masks()):
-        filled = (views.depth[n] > 0).mean() >= min(planner.overlap, (views.depth[0] > 0).mean())
-        shares = [((views.depth[i] > 0) & (views.depth[i] < 0.5)).mean() for i in (0, n)]
-        apart = shares[1] <= max(0.1, shares[0])
-        assert found[n] == (
-            possible
-            and filled
-            and apart
-            and least[n] >= min(150 * views.depth[0].size, 0.9 * least[0])
-        )
+        follows = risks[n + 1] <= max(planner.risk, 1.3 * least)
+        assert found[n] == (n > 0 and possible and fits[n + 1] and follows)
     assert found.any()
 
 
 def test_where_no_motion_can_be_followed_all_possible_ones_are_allowed(episode):
     planner = episode[2]
     poses = planner.env.candidate_poses()
-    planner.lost_at = poses
+    before, planner.lost_at = planner.lost_at, poses
     np.testing.assert_array_equal(planner.admissible(poses), planner.env.action_masks())
+    planner.lost_at = before
+
+
+def test_where_tracking_was_lost_it_does_not_go_again(episode):
+    planner = episode[2]
+    poses = planner.env.candidate_poses()
+    planner.heading_to = poses[3]
+    planner.lost_by(3)
+    assert planner.goal is None
+    assert not planner.admissible(poses)[3]
+    planner.lost_at = planner.lost_at[:-1]
+
+
+def wall(distance, poses):
+    """What cameras at poses see of the plane z = ``distance``, at 40 x 30 pixels."""
+    K = xtion("160x120").scaled(0.25)
+    directions = np.einsum("nij,vuj->nvui", poses[:, :3, :3], K.rays())
+    depth = (distance - poses[:, 2, 3])[:, None, None] / directions[..., 2]
+    normals = np.broadcast_to(-poses[:, 2, :3][:, None, None], (*depth.shape, 3))
+    images = (0 * depth, depth, normals)
+    return Views(*(np.ascontiguousarray(i, dtype=np.float32) for i in images), K)
+
+
+def test_the_image_moves_by_the_turn_and_by_the_parallax():
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[1, :3, :3] = so3_exp([0, 0.2, 0])
+    poses[2, 0, 3] = 0.12
+    poses[3, 0, 3], poses[3, :3, :3] = 0.12, so3_exp([0, -math.atan(0.12 / 1.5), 0])
+    moved = image_motion(wall(1.5, poses), poses)
+    assert moved[0] == pytest.approx(0, abs=1e-3)
+    assert moved[1] == pytest.approx(0.2, rel=0.05)
+    assert moved[2] == pytest.approx(math.atan(0.12 / 1.5), rel=0.1)
+    assert moved[3] < 0.2 * moved[2]  # turned to the same point again
+    nothing = wall(1.5, poses)
+    nothing.depth[0] = 0
+    assert (image_motion(nothing, poses) == np.pi).all()
+
+
+def test_to_slip_is_likelier_near_a_wall_and_by_large_motions():
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[1, 0, 3], poses[2, 0, 3] = 0.05, 0.3
+    near, far = (slip_risk(wall(distance, poses), poses) for distance in (0.6, 2.5))
+    assert near[0] < near[1] < near[2]
+    assert (far < near).all()
+    corner = wall(2.5, poses)
+    half = corner.normals.shape[2] // 2
+    corner.normals[:, :, :half] = [0.7, 0, -0.7]
+    corner.normals[:, :10] = [0, 0.7, -0.7]
+    assert (slip_risk(corner, poses) < 0.5 * far).all()
 
 
 @pytest.mark.parametrize(
@@ -86,6 +146,13 @@ def test_options_out_of_range_are_one_line(episode, option):
     name = option.partition("=")[0]
     with pytest.raises(InputError, match=rf"NextBestView\.{name} = .* is outside \["):
         make_planner(f"nbv,{option}", episode[2].env)
+
+
+def test_options_of_its_goals_are_known_and_others_are_refused(episode):
+    env = episode[2].env
+    assert make_planner("nbv,recovery=false,replan=3,risk=0.1", env).replan == 3
+    with pytest.raises(InputError, match=r"unknown option of planner nbv 'rish'.*risk.*radius_m"):
+        make_planner("nbv,rish=0.1", env)
 
 
 def test_distances_are_those_of_each_pose():
@@ -110,3 +177,42 @@ def test_goals_are_upright_poses_in_free_space():
     assert (goals[:30, :3, 3] == here[:3, 3]).all()
     assert {tuple(p) for p in goals[30:, :3, 3]} <= {tuple(p) for p in free}
     assert len(draw_goals(rng, here, np.zeros((0, 3)), 90)) == 30
+
+
+def test_the_way_to_a_pose_is_straight_and_even():
+    start = make_pose(so3_exp([0.1, 0.2, -0.3]), [1, 2, 3])
+    end = make_pose(so3_exp([-0.4, 1.1, 0.2]), [0, 2.5, 3])
+    way = poses_between(start, end, 4)
+    np.testing.assert_allclose(way[-1], end, atol=1e-9)
+    whole = relative_angle(start[:3, :3], end[:3, :3])
+    for n, pose in enumerate(way, 1):
+        np.testing.assert_allclose(pose[:3, 3], start[:3, 3] + n / 4 * (end - start)[:3, 3])
+        assert relative_angle(start[:3, :3], pose[:3, :3]) == pytest.approx(n / 4 * whole)
+
+
+def seen_from_origin():
+    grid = OccupancyGrid()
+    K = xtion("80x60")
+    grid.integrate(np.full(K.shape, 2.0, np.float32), np.eye(4), K)
+    return grid
+
+
+def test_frontiers_are_where_free_space_ends_unseen():
+    grid = seen_from_origin()
+    middles = frontiers(grid, np.zeros(3), 2.5, least=1)
+    assert len(middles)
+    steps = grid.cell_m * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]])
+    for middle in middles:
+        assert grid.states_of(middle[None]) == [FREE]
+        around = grid.states_of(middle + np.concatenate([steps, -steps[-1:]]))
+        assert (around == UNKNOWN).any()
+    assert frontiers(OccupancyGrid(), np.zeros(3), 2.5).shape == (0, 3)
+    assert frontiers(grid, np.full(3, 50.0), 2.5).shape == (0, 3)
+
+
+def test_frontiers_are_looked_at_from_free_space_and_not_from_below():
+    free = np.array([[0, 0, 0], [1, 0, 0], [3, 0, 0.2], [2, 0, -3.0]])
+    (view,) = views_of(np.array([[2.0, 0, 0]]), free, np.zeros(3), 1.0)
+    np.testing.assert_allclose(view[:3, 3], [1, 0, 0])
+    np.testing.assert_allclose(view[:3, 2], [1, 0, 0], atol=1e-12)
+    assert views_of(np.array([[2.0, 0, 0]]), free[3:], np.zeros(3), 1.0).shape == (0, 4, 4)

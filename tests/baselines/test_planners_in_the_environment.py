@@ -64,13 +64,11 @@ def test_the_papers_greedy_is_algorithm_1_with_the_public_divergences(env):
     planner = GreedyDivergence(world, preset="paper", depth_weight=0.5)
     live, targets = world.episode.last_frame, PAPER_TARGETS
     best, smallest = -1, np.inf
-    for i, pose in enumerate(world.candidate_poses()):
-        if not info["action_mask"][i]:
-            continue
-        view = world.slam.predict(pose[None], 1.0)
-        predicted_I = np.floor(view.intensity[0] + 0.5).astype(np.uint8)
+    views = world.slam.predict(world.candidate_poses(), 1.0)
+    for i in np.flatnonzero(info["action_mask"]):
+        predicted_I = np.floor(views.intensity[i] + 0.5).astype(np.uint8)
         delta_I = intensity_divergence(predicted_I, live)
-        delta_D = depth_divergence(view.depth[0], live.depth, world.intrinsics)
+        delta_D = depth_divergence(views.depth[i], live.depth, world.intrinsics)
         distance = abs(delta_I - targets.M_I) + 0.5 * abs(delta_D - targets.M_D)
         if distance < smallest:
             best, smallest = i, distance

@@ -66,6 +66,24 @@ def test_a_planner_is_told_of_the_action_that_lost_tracking_and_of_no_other():
     assert planner.planner.losses == [2, 3]
 
 
+def doubtful(sigma_m):
+    return {"tracking_ok": True, "pose_covariance": np.diag([1e-6, sigma_m**2, 1e-6, 1, 1, 1.0])}
+
+
+def test_a_pose_that_slam_doubts_is_left_the_way_it_was_reached():
+    planner = recovering()
+    assert [planner.act(None, doubtful(s)) for s in (0.001, 0.003)] == [1, 2]
+    assert planner.act(None, doubtful(0.02)) == opposite(2)
+    assert planner.act(None, doubtful(0.003)) == 3
+    assert planner.planner.losses == [2]
+
+
+def test_a_slam_that_gives_no_covariance_is_believed():
+    planner = recovering()
+    infinite = {"tracking_ok": True, "pose_covariance": np.diag(np.full(6, np.inf))}
+    assert [planner.act(None, infinite) for _ in range(3)] == [1, 2, 3]
+
+
 def test_what_is_blocked_is_not_done():
     mask = np.ones(49, bool)
     mask[opposite(1)] = False
