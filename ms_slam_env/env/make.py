@@ -41,8 +41,15 @@ make_env.metadata = {"render_modes": ["rgb_array", "human"]}  # type: ignore[att
 
 
 def _make_for(task: Task, perturbed_by: str | None, **options: Any) -> ActiveSlamEnv:
-    """Build the environment of a task; ``options`` count more than the task's own."""
-    env = _make(None, perturbed_by, **{"scene": task.scenes, **task.options, **options})
+    """Build the environment of a task; ``options`` count more than the task's own.
+
+    So do single ones of ``slam_config``; the task's are not for another SLAM.
+    """
+    own: dict[str, Any] = {"scene": task.scenes, **task.options}
+    configured, given = own.pop("slam_config", {}), options.get("slam_config", {})
+    if options.get("slam", "surfel") == "surfel" and is_options(given):
+        options = {**options, "slam_config": {**configured, **given}}
+    env = _make(None, perturbed_by, **{**own, **options})
     for name, strength in task.perturbations.items():
         env.perturb(make_perturbation(name, strength))
     return env

@@ -46,6 +46,8 @@ METRICS = (
     *("success", "success_tracked", "lost", "lost_frames_share", "mapped_area_m2", "ate_m"),
     *("ate_tracked_m", "tracked_share", "worst_apart_share", "path_length_m", "energy_j", "steps"),
 )
+LAMP = {"dim": 0.0, "lamp": 0.3, "speed_m_s": 0.001}
+"""A weak lamp that stands elsewhere in every run: "minor changes in illumination" (the paper)."""
 ACTIVE, BASELINE = "greedy", "random"
 PAPER = {"carpet": f"{BASELINE} 0 of 10, {ACTIVE} 5 of 10"}
 """Successes that the paper's text states; its other bars are in its figure 9 alone."""
@@ -59,11 +61,13 @@ class RunSpec(EpisodeSpec):
         seconds: simulated time after which the run ends.
         rule: when its map has failed.
         picture: where a picture of the judged map goes; empty for none.
+        same_start: whether the run begins where one with the scene's seed begins.
     """
 
     seconds: float = 60.0
     rule: ConsistencyRule = field(default_factory=ConsistencyRule)
     picture: str = ""
+    same_start: bool = False
 
     def __post_init__(self) -> None:
         """Refuse unknown choices and values out of range."""
@@ -101,6 +105,8 @@ class ArmExperiment(Experiment):
     """Split that the seeds come from."""
     options: tuple[str, ...] = ()
     """Options of the environment, as in pose=kinematics."""
+    same_scene: int | None = None
+    """Seed of one scene and start for all runs, which then differ in light, noise and actuation."""
     rule: ConsistencyRule = field(default_factory=ConsistencyRule)
     """When an object counts as present twice."""
     pictures: Path | None = None
@@ -115,7 +121,10 @@ class ArmExperiment(Experiment):
         try:
             world = cast(ActiveSlamEnv, env.unwrapped)
             planner = make_planner(spec.planner, world, spec.seed)
-            played = play(env, planner, spec.seed, spec.seconds)
+            start = None
+            if spec.same_start:
+                start = env.reset(seed=spec.options["scene_seed"])[1]["T_world_camera"]
+            played = play(env, planner, spec.seed, spec.seconds, start=start)
             judged = judge_episode(world, spec.rule)
             if spec.picture and len(judged.points):
                 cameras = world.episode.trajectory_estimate[:, :3, 3]
@@ -137,19 +146,20 @@ class ArmExperiment(Experiment):
         options.setdefault("lost_patience", 1_000_000)
         if self.embodiment is not None:
             options["embodiment"] = self.embodiment
+        if self.same_scene is not None:
+            options |= {"scene_seed": self.same_scene, "perturbed_by": "illumination"}
+            options["perturbation"] = LAMP
+        own = ("env_id", "step_m", "step_deg", "seconds", "rule")
         return [
             RunSpec(
                 planner=planner,
                 scene=scene,
                 seed=seed,
-                env_id=self.env_id,
                 steps=max(1, math.ceil(self.seconds * FRAME_RATE_HZ)),
-                step_m=self.step_m,
-                step_deg=self.step_deg,
                 options=options,
-                seconds=self.seconds,
-                rule=self.rule,
                 picture=self._picture(scene, planner, seed),
+                same_start=self.same_scene is not None,
+                **{name: getattr(self, name) for name in own},
             )
             for scene in self.scenes
             for seed in seed_list(self.seeds, self.episodes)

@@ -44,6 +44,15 @@ def test_options_count_more_than_the_tasks_own():
     assert config.away_patience == find_task("arm").options["away_patience"]
 
 
+def test_the_tasks_slam_is_configured_unless_another_is_asked_for():
+    name = "MSActiveSLAM-Home-v0"
+    room = gym.make(name, **SMALL, slam_config={"submaps": "atlas"}).unwrapped.config.slam_config
+    assert room == {"max_surfels": 2_000_000, "submaps": "atlas"}
+    fewer = gym.make(name, **SMALL, slam_config={"max_surfels": 5000}).unwrapped.config.slam_config
+    assert fewer == {"max_surfels": 5000}
+    assert gym.make(name, **SMALL, slam="odometry").unwrapped.config.slam_config == {}
+
+
 def test_the_arms_task_ends_with_its_time():
     env = gym.make("MSActiveSLAM-Arm-v0", **SMALL, embodiment="arm-kinematic", seconds=0.5)
     env.reset(seed=0)

@@ -8,10 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 import pytest
 
 from ms_slam_env.errors import InputError
-from ms_slam_env.experiments.arm_experiment import METRICS, ArmExperiment, RunSpec, compare
+from ms_slam_env.experiments.arm_experiment import (
+    METRICS,
+    ArmExperiment,
+    RunSpec,
+    compare,
+    judge_episode,
+)
 from ms_slam_env.experiments.duplicate_objects import DuplicateObjects
 from ms_slam_env.metrics.consistency import ConsistencyRule
 from ms_slam_env.metrics.registry import check_keys, metric
@@ -61,6 +68,30 @@ def test_a_run_draws_its_map(tmp_path: Path) -> None:
     assert found["success"]
     assert found["path_length_m"] == 0
     assert cv2.imread(str(tmp_path / "maps" / "table_stationary_0.png")) is not None
+
+
+def test_runs_of_one_scene_differ_in_light_and_noise_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen: list[Any] = []
+
+    def judge(world: Any, rule: Any) -> Any:
+        seen.append((world.episode, world.scene.seed))
+        return judge_episode(world, rule)
+
+    monkeypatch.setattr("ms_slam_env.experiments.arm_experiment.judge_episode", judge)
+    specs = ArmExperiment(
+        ("stationary",), ("table",), 2, seconds=0.1, env_id=FREE, seeds="train", same_scene=1000
+    ).specs()
+    for spec in specs:
+        ArmExperiment.run(spec)
+    (one, seed), (other, same_seed) = seen
+    assert seed == same_seed == 1000
+    assert one.noise_seed != other.noise_seed
+    np.testing.assert_array_equal(one.trajectory_truth, other.trajectory_truth)
+    colours = [episode.last_frame.color.astype(float) for episode in (one, other)]
+    apart = cv2.blur(colours[0], (9, 9)) - cv2.blur(colours[1], (9, 9))
+    assert 0.3 < np.abs(apart).mean() < 30  # other light, the same things
 
 
 def test_the_default_is_the_paper_s_experiment() -> None:

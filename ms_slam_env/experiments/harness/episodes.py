@@ -186,22 +186,25 @@ def play(
     planner: Planner,
     seed: int,
     seconds: float = math.inf,
+    start: Float64 | None = None,
     after_step: Callable[[int], None] = lambda step: None,
 ) -> dict[str, Any]:
     """Play one episode to its end, or until ``seconds`` of simulated time have passed.
 
+    It begins at ``start`` (4, 4) if that is given, else at a pose that the seed draws.
     ``after_step`` is called with 0 after the reset, then with the number of each step after it.
     """
-    observation, info = env.reset(seed=seed)
+    options = None if start is None else {"T_world_camera": start}
+    observation, info = env.reset(seed=seed, options=options)
     planner.reset()
     after_step(0)
     total, decision_s, lost = 0.0, 0.0, []
     ate: list[float] = []
     over = False
     while not over:
-        start = time.perf_counter()
+        began = time.perf_counter()
         action = planner.act(observation, info)
-        decision_s += time.perf_counter() - start
+        decision_s += time.perf_counter() - began
         observation, reward, terminated, truncated, info = env.step(action)
         over = terminated or truncated or info["time"] >= seconds
         total += float(reward)
