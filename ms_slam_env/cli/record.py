@@ -21,7 +21,7 @@ from ms_slam_env.config import Checked, bounded, chosen, nested_options
 from ms_slam_env.env.planners import check_planner, make_planner, planner_observation
 from ms_slam_env.errors import InputError
 from ms_slam_env.interrupts import kept
-from ms_slam_env.output_files import check_out_folder, result_folder
+from ms_slam_env.output_files import check_out_folder, naming, result_folder
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.scenes import SEED_SPLITS
 
@@ -99,7 +99,11 @@ def record(args: Args) -> Path:
         raise InputError(f"{folder} is there already: give another --name, or remove it")
     env = _environment(args)
     try:
-        with kept(f"nothing is left in {folder}"), result_folder(args.out, _marker(name)) as made:
+        with (
+            kept(f"nothing is left in {folder}"),
+            result_folder(args.out, _marker(name)) as made,
+            naming(made / name),
+        ):
             _write(env, args, name, made)
     finally:
         env.close()

@@ -75,8 +75,6 @@ def _play(env: gym.Env[Any, Any], args: Args) -> None:
     planner = make_planner(args.planner, world, args.seed)
     observation, info = env.reset(seed=args.seed)
     planner.reset()
-    if args.save is not None:
-        args.save.parent.mkdir(parents=True, exist_ok=True)
     view = EpisodeView(world, args.save)
     try:
         with kept("the steps so far are shown"):

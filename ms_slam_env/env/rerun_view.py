@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ms_slam_env.env.planners import Planner, Recovering
 from ms_slam_env.env.third_person_view import ESTIMATE_COLOR, TRUE_COLOR, arm_dots
 from ms_slam_env.errors import InputError
+from ms_slam_env.output_files import write_bytes
 from ms_slam_env.robot import describe
 
 if TYPE_CHECKING:
@@ -57,8 +58,10 @@ class EpisodeView:
         self.env = env
         self.step = 0
         self.stream = rerun.RecordingStream(APPLICATION)
-        if path is not None:
-            self.stream.save(path, default_blueprint=self._layout())
+        self.path = path
+        if path is not None:  # through memory: on a full disk Rerun's own file is never finished
+            self.bytes = rerun.binary_stream(self.stream)
+            self.stream.send_blueprint(self._layout())
             return
         try:
             self.stream.spawn(default_blueprint=self._layout())
@@ -66,8 +69,15 @@ class EpisodeView:
             raise InputError(f"Rerun's viewer cannot be opened: {error}") from error
 
     def close(self) -> None:
-        """Write what is left."""
-        self.stream.flush()
+        """Send what is left, and write the file.
+
+        Raises:
+            OSError: with the name of the file.
+        """
+        if self.path is not None:
+            write_bytes(self.path, self.bytes.read() or b"")
+        else:
+            self.stream.flush()
         self.stream.disconnect()
 
     def log(self, planner: Planner | None = None) -> None:

@@ -13,52 +13,15 @@ import pytest
 pytest.importorskip("safetensors")
 
 from ms_slam_agents.policy import Policy
-from ms_slam_agents.policy_file import (
-    STEP,
-    Metadata,
-    PolicyFile,
-    read_policy,
-    tensor_shapes,
-    write_policy,
-)
+from ms_slam_agents.policy_file import STEP, PolicyFile, read_policy, write_policy
 from ms_slam_agents.policy_planner import TrainedPolicy
+from policy_files import METADATA, as_bytes, make_tensors
 from safetensors.numpy import save
 
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
 
-METADATA = Metadata(
-    algorithm="ppo",
-    env_id="MSActiveSLAM-FreeCamera-v0",
-    observation="features",
-    inputs=5,
-    hidden=(4, 3),
-    actions=(7,),
-    timesteps=100,
-    epochs=8,
-    minutes=1.5,
-    env_options={"step_m": 0.1},
-)
-
-
 BIAS = "policy.action_net.bias"
-
-
-def make_tensors(metadata=METADATA, with_optimizer=True):
-    rng = np.random.default_rng(0)
-    shapes = tensor_shapes(metadata, with_optimizer)
-    kind = {True: np.float32, False: np.float64}
-    return {
-        name: np.asarray(rng.uniform(0.1, 1.0, shape), kind[name.startswith("policy")])
-        for name, shape in shapes.items()
-    }
-
-
-def as_bytes(text=None, **tensors):
-    """A file with another text, or with some tensors replaced; None leaves one out."""
-    changed = {k: v for k, v in (make_tensors() | tensors).items() if v is not None}
-    text = json.dumps(asdict(METADATA)) if text is None else text
-    return save(changed, {"ms_slam_policy": text})
 
 
 def words(**changes):

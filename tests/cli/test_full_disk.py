@@ -248,7 +248,46 @@ def test_results_go_into_no_special_file(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["fifo", "wrong"]
 
 
+ONE = "--frames-scale 0.02 --sequences room-fast --image-size 80x60"
+LIMITED = {
+    "record --planner random --scenes table --episodes 1 --steps 2": 100,
+    "view --planner random --scene table --steps 2 --options image_size=80x60": 2000,
+    "compare --sequences table:0:none --frames 10 --backends odometry --image-sizes 80x60": 2000,
+    f"usme make {ONE}": 2000,
+    f"usme run {ONE} --backends odometry": 2000,
+    "train sb3 --scenes table --scene-seeds 1 --episode-steps 2 --total-timesteps 4 --num-envs 1 "
+    "--n-steps 2 --batch-size 2 --eval-episodes 1 --eval-every 0 --no-references": 20_000,
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", LIMITED, ids=lambda command: command[:9].strip())
+def test_a_limit_of_the_system_is_one_line(command: str, tmp_path: Path) -> None:
+    """Processes of their own, whose every file may have so many bytes, those of libraries too."""
+    for start, library in {"train": "sb3_contrib", "record": "minari", "view": "rerun"}.items():
+        if command.startswith(start):
+            pytest.importorskip(library)
+    code = (
+        "import resource, sys; from ms_slam_env.cli import main; size = int(sys.argv[1]); "
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (size, size)); sys.exit(main(sys.argv[2:]))"
+    )
+    out = (
+        ["--save", f"{tmp_path}/a.rrd"] if command.startswith("view") else ["--out", str(tmp_path)]
+    )
+    words = [str(LIMITED[command]), *command.split(), *out]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    (line,) = [line for line in done.stderr.splitlines() if "error: " in line]
+    assert f"error: {tmp_path}" in line
+    assert line.endswith(": File too large")
+    left = {path.name for path in tmp_path.rglob("*")}
+    assert not left & (MARKERS | {"latest.safetensors", "best.safetensors", "a.rrd"})
+
+
 def test_every_command_is_attacked() -> None:
-    """Those not run on a full disk end in the same writers: rows and results, or a sequence."""
-    others = {"benchmark", "compare", "usme", "explore", "train"}
-    assert set(COMMANDS) <= set(RUNS) | others
+    """Those not run here write by the same pieces: rows and results, and a study."""
+    run_here = {command.split()[0] for command in LIMITED}
+    assert set(COMMANDS) <= set(RUNS) | run_here | {"benchmark", "explore"}

@@ -8,7 +8,6 @@ import re
 import sqlite3
 import struct
 import tempfile
-from dataclasses import asdict
 from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
@@ -18,7 +17,6 @@ import file_entries
 import numpy as np
 from fuzzing import Entry
 from ms_slam_agents.policy import Policy
-from ms_slam_agents.policy_file import Metadata, tensor_shapes
 from mutations import (
     PLAIN,
     Files,
@@ -29,7 +27,7 @@ from mutations import (
     mutated_json,
     write_files,
 )
-from safetensors.numpy import save
+from policy_files import as_bytes
 
 from ms_slam_env.exploration import ExplorationSettings, explore, make_space
 from ms_slam_env.exploration.front import choose, hypervolume_history, importances, points_of
@@ -42,30 +40,6 @@ from ms_slam_env.report.tables import make_table
 from ms_slam_env.slam.configuration import SlamConfiguration
 
 # --- policies ----------------------------------------------------------------------------------
-
-METADATA = Metadata(
-    algorithm="ppo",
-    env_id="MSActiveSLAM-FreeCamera-v0",
-    observation="features",
-    inputs=5,
-    hidden=(4, 3),
-    actions=(7,),
-    timesteps=100,
-    epochs=8,
-    minutes=1.5,
-    env_options={"step_m": 0.1},
-)
-
-
-@cache
-def policy() -> bytes:
-    """A policy file that training can go on from."""
-    rng = np.random.default_rng(0)
-    tensors = {
-        name: np.asarray(rng.uniform(0.1, 1, shape), "f4" if name.startswith("policy") else "f8")
-        for name, shape in tensor_shapes(METADATA, True).items()
-    }
-    return save(tensors, {"ms_slam_policy": json.dumps(asdict(METADATA))})
 
 
 def mutated_policy(data: bytes, rng: Rng) -> bytes:
@@ -263,8 +237,8 @@ def rows() -> Files:
 
 
 ENTRIES = [
-    Entry("policy", policy, mutated_policy, call_policy),
-    Entry("study", study, mutated_study, call_study),
+    Entry("policy", as_bytes, mutated_policy, call_policy),
+    Entry("study", study, mutated_study, call_study, in_tests=20),
     Entry("report", results, mutated_results, call_report),
     Entry("records", rows, mutated_folder, call_records),
 ]

@@ -17,6 +17,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+sys.path.append(str(Path(__file__).parents[1]))
+
 from entries import ENTRIES
 from fuzzing import LIMIT_S, attempt
 
