@@ -18,7 +18,7 @@ from ms_slam_env.slam.base import Views
 
 CORRECT_M = 0.05
 """How far from its place surface may be to count."""
-_COMPARED = 8  # goals whose way is predicted
+_COMPARED = 6  # goals whose way is predicted
 _STOPS = 2  # views predicted on a way
 _DRIFT = np.diag([2e-3**2] * 3 + [2e-3**2] * 3)
 """Q: what one motion adds to the covariance, m^2 and rad^2; the RPE of a step in `living_room`."""

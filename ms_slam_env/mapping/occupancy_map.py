@@ -55,8 +55,9 @@ class OccupancyMap:
         if moved or self._in_grid | {number} != present:
             self.grid = OccupancyGrid(self.cell_m, self.reach_m)
             self._in_grid = set()
-        for frame in self._frames:
-            if frame.number in present - self._in_grid:
+        missing = present - self._in_grid
+        for frame in self._frames if len(missing) > 1 else self._frames[-1:]:
+            if frame.number in missing:
                 self.grid.integrate(frame.depth, frame.T_world_camera, intrinsics)
         self._in_grid = present
 
@@ -66,7 +67,9 @@ class OccupancyMap:
         now = dict(zip(numbers.tolist(), poses, strict=True))
         moved = False
         for index, frame in enumerate(self._frames):
-            pose = now.get(frame.number, frame.T_world_camera)
+            pose = now.get(frame.number)
+            if pose is None:
+                continue
             # Each entry of the rotation tells how far the depths along an axis have turned.
             apart = np.abs(pose - frame.T_world_camera)[:3] @ [*[self.reach_m] * 3, 1.0]
             if apart.max() > 0.5 * self.cell_m:
