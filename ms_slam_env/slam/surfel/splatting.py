@@ -261,10 +261,42 @@ def list_hidden(
                     hidden.radius[k, slot] = visible.radius[k, j]
 
 
-@wp.func
-def luma(color: wp.vec3) -> float:
-    """ITU-R BT.601 luma."""
-    return 0.299 * color[0] + 0.587 * color[1] + 0.114 * color[2]
+@wp.func_native("""
+const float* s = (const float*)sums.data + 8 * size_t(first);
+float* __restrict v = (float*)vertices.data + 3 * size_t(first);
+float* __restrict n = (float*)normals.data + 3 * size_t(first);
+float* __restrict c = (float*)color.data + 3 * size_t(first);
+float* __restrict grey = intensity.data + first;
+const float per_column = 1.0f / camera.focal[0];
+for (int u = 0; u < camera.width; ++u, s += 8, v += 3, n += 3, c += 3) {
+    const bool is_covered = s[3] > 0.0f;
+    const float scale = is_covered ? 1.0f / s[3] : 0.0f;
+    const float z = s[7] * scale;
+    v[0] = is_covered ? z * ((float)u - camera.centre[0]) * per_column : 0.0f;
+    v[1] = is_covered ? z * y : 0.0f;
+    v[2] = z;
+    const float length = sqrtf(s[0] * s[0] + s[1] * s[1] + s[2] * s[2]);
+    const float size = length > 0.0f ? length : 1.0f;
+    n[0] = s[0] / size;
+    n[1] = s[1] / size;
+    n[2] = s[2] / size;
+    c[0] = s[4] * scale;
+    c[1] = s[5] * scale;
+    c[2] = s[6] * scale;
+    grey[u] = 0.299f * c[0] + 0.587f * c[1] + 0.114f * c[2];  // ITU-R BT.601 luma
+}
+""")
+def resolve_row(
+    sums: wp.array(dtype=Sums),
+    camera: SplatCamera,
+    y: float,
+    first: int,
+    vertices: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    intensity: wp.array(dtype=wp.float32),
+    color: wp.array(dtype=wp.vec3),
+):
+    """Resolve the row of pixels from ``first`` on, on which the rays have ``y`` at z = 1."""
 
 
 @wp.kernel
@@ -278,21 +310,6 @@ def resolve(
 ) -> None:
     """Divide the sums by their weights; pixels that no disc covers become 0."""
     k, v = wp.tid()
-    row = (k * camera.height + v) * camera.width
     y = (float(v) - camera.centre[1]) / camera.focal[1]
-    per_column = 1.0 / camera.focal[0]
-    for u in range(camera.width):
-        s = sums[row + u]
-        vertex = wp.vec3(0.0, 0.0, 0.0)
-        normal = wp.vec3(0.0, 0.0, 0.0)
-        mean = wp.vec3(0.0, 0.0, 0.0)
-        if s[3] > 0.0:
-            scale = 1.0 / s[3]
-            z = s[7] * scale
-            vertex = wp.vec3(z * (float(u) - camera.centre[0]) * per_column, z * y, z)
-            normal = wp.normalize(wp.vec3(s[0], s[1], s[2]))
-            mean = wp.vec3(s[4], s[5], s[6]) * scale
-        vertices[row + u] = vertex
-        normals[row + u] = normal
-        color[row + u] = mean
-        intensity[row + u] = luma(mean)
+    first = (k * camera.height + v) * camera.width
+    resolve_row(sums, camera, y, first, vertices, normals, intensity, color)
