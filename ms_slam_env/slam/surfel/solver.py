@@ -1,3 +1,4 @@
+# mypy: disable-error-code="empty-body"
 """Sums of a pass to a pose: reduction, 6x6 Cholesky solve and SE(3) update, on the device.
 
 One thread per env and hypothesis, in float64. Source of the exponential: Sola et al., "A micro
@@ -35,6 +36,21 @@ def reduce_sum(hypotheses: Hypotheses, slots: int, b: int, k: int, i: int):
     for slot in range(slots):
         total += wp.float64(hypotheses.partial[b, k, slot, i])
     hypotheses.sums[b, k, i] = total
+
+
+@wp.func_native(
+    f"constexpr int SUMS = {NUM_SUMS};"
+    + """
+const size_t which = size_t(b) * hypotheses.sums.shape[1] + k;
+const float* partial = hypotheses.partial.data + which * hypotheses.partial.shape[2] * SUMS;
+double total[SUMS] = {};
+for (int slot = 0; slot < slots; ++slot, partial += SUMS)
+    for (int i = 0; i < SUMS; ++i) total[i] += (double)partial[i];
+for (int i = 0; i < SUMS; ++i) hypotheses.sums.data[which * SUMS + i] = total[i];
+"""
+)
+def reduce_all_sums(hypotheses: Hypotheses, slots: int, b: int, k: int):
+    """The same for all of them, several at a time."""
 
 
 @wp.kernel
@@ -313,8 +329,7 @@ def iterate_at_once(
             for row in range(rows):
                 for piece in range(pieces):
                     accumulate_row(images, weights, stride, columns, hypotheses, b, k, row, piece)
-            for i in range(NUM_SUMS):
-                reduce_sum(hypotheses, rows * pieces, b, k, i)
+            reduce_all_sums(hypotheses, rows * pieces, b, k)
             if not is_over:
                 take_step(hypotheses, damping, smallest_step, weights.least_scale, b, k)
     if hypotheses.state[b, k] == RESTING:
