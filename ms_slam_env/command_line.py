@@ -85,8 +85,16 @@ def exit_code(run: Callable[[], int], name: str = "ms-slam") -> int:
         if ending is None:
             raise
         code, text = ending
+        _close_bars()
         print(f"{name}: {text}", file=sys.stderr)
         return code
+
+
+def _close_bars() -> None:
+    """End progress bars that an error left open: else they are drawn anew, below its message."""
+    library = sys.modules.get("tqdm")
+    for bar in list(getattr(library.tqdm, "_instances", ())) if library else ():
+        bar.close()
 
 
 def _ending(error: BaseException, stopped: int | None) -> tuple[int, str] | None:

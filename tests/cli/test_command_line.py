@@ -11,8 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tqdm import tqdm
 
 from ms_slam_env.cli import COMMANDS, main
+from ms_slam_env.command_line import exit_code
+from ms_slam_env.errors import InputError
 from ms_slam_env.experiments.harness import running
 from ms_slam_env.experiments.planners import DETAILS, HEADLINE
 from ms_slam_env.geometry import make_pose, so3_exp
@@ -238,3 +241,15 @@ def test_association_is_mutual_and_within_the_limit() -> None:
 def test_association_of_single_timestamps() -> None:
     first, second = associate(np.array([1.0]), np.array([1.0]), 0.0)
     assert (list(first), list(second)) == ([0], [0])
+
+
+def test_the_message_stands_below_the_bars_that_an_error_left_open(capsys):
+    bars = []
+
+    def run():
+        bars.append(tqdm(total=9, desc="frames"))
+        raise InputError("no")
+
+    assert exit_code(run) == 2
+    bars[0].close()
+    assert capsys.readouterr().err.splitlines()[-1] == "ms-slam: error: no"
