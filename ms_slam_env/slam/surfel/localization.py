@@ -45,7 +45,7 @@ from ms_slam_env.slam.surfel.rendering import ModelView
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 
 MOSTLY_MOVING = 0.6  # share of the readings: rather the pose is wrong, or too little is left
-CLEARLY_APART = 30.0  # squared Mahalanobis distance; where nothing moves it is below 10
+CLEARLY_APART = 30.0  # squared Mahalanobis distance; below 20 where nothing leads a pose
 APART_M, APART_RAD = (0.006, 0.1), np.radians((0.4, 6.0))  # more than noise, less than a jump
 RETRIES = 2  # further searches within a frame whose tracking failed
 
