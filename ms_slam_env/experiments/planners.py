@@ -40,7 +40,11 @@ from ms_slam_env.tasks import OWN, find_task
 
 ALL = "all"
 """Stands for all our tasks."""
-PLANNERS = ("random", "stationary", "greedy", "max-information", "nbv")
+PLANNERS = (
+    *("random", "stationary", "greedy", "greedy-limited", "max-information"),
+    *("nbv", "belief", "graph-dopt"),
+)
+"""Those that need no extra."""
 EPISODES, LEADERBOARD_EPISODES = 10, 25
 _PANELS = ("f_score_5cm_area", "f_score_5cm", "ate_m", "path_length_m")
 _FLOOR_M = 5e-5  # errors below are drawn here on logarithmic axes
