@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from ms_slam_env.scenes.base import Rng
@@ -127,18 +129,21 @@ def door(build: MeshBuilder, rng: Rng, name: str, rgb: np.ndarray) -> None:
     trim = build.plain((228, 224, 214))
     metal = build.plain((150, 148, 140))
     with build.object(name):
-        _door_face(build, paint, metal)
+        build.box((-0.425, -0.012, 0), (0.425, 0, 2.05), paint, "zY")
+        _panels_and_handle(build, paint, metal)
     with build.object(f"{name} casing"):
         _casing(build, trim)
 
 
-def _door_face(
+_PANELS_X_M, _PANELS_Z_M = (-0.34, 0.03), ((0.15, 0.85), (1.05, 1.9))
+
+
+def _panels_and_handle(
     build: MeshBuilder, paint: Material, metal: Material, is_mirrored: bool = False
 ) -> None:
-    """One face of a leaf of 0.85 x 2.05 m, with panels and a handle at high x, or at low x."""
-    build.box((-0.425, -0.012, 0), (0.425, 0, 2.05), paint, "zY")
-    for low, high in ((0.15, 0.85), (1.05, 1.9)):
-        for x in (-0.34, 0.03):
+    """What one face of a leaf of 0.85 x 2.05 m has: panels, a handle at high x, or at low x."""
+    for low, high in _PANELS_Z_M:
+        for x in _PANELS_X_M:
             build.box((x, -0.028, low), (x + 0.31, -0.012, high), paint, "Y")
             build.box((x + 0.05, -0.034, low + 0.05), (x + 0.26, -0.028, high - 0.05), paint)
     stem, lever = (0.34, 0.36), (0.26, 0.37)
@@ -188,11 +193,25 @@ def open_leaf(
     ):
         for side in (0, 1):
             with build.frame((0, (2 * side - 1) * 0.008, 0), np.pi * side):
-                _door_face(build, paint, metal, (hinge < 0) == (side == 1))
+                for x, z, wide, high in _stiles_and_rails():
+                    build.quad((x, -0.012, z), (wide, 0, 0), (0, 0, high), paint, (x, z))
+                _panels_and_handle(build, paint, metal, (hinge < 0) == (side == 1))
         for x in (-0.425, 0.425):
             away = np.sign(x)
-            build.quad((x, -0.008 * away, 0), (0, 0.016 * away, 0), (0, 0, 2.05), paint)
-        build.quad((-0.425, -0.008, 2.05), (0.85, 0, 0), (0, 0.016, 0), paint)
+            build.quad((x, -0.02 * away, 0), (0, 0.04 * away, 0), (0, 0, 2.05), paint)
+        build.quad((-0.425, -0.02, 2.05), (0.85, 0, 0), (0, 0.04, 0), paint)
+
+
+def _stiles_and_rails() -> Iterator[tuple[float, float, float, float]]:
+    """Least x and z, width and height of what of a leaf lies beside its panels.
+
+    The light of a surface below a panel is that of the inside of a box, and would show beside it.
+    """
+    for x, end in ((-0.425, -0.34), (-0.03, 0.03), (0.34, 0.425)):
+        yield x, 0.0, end - x, 2.05
+    for x in _PANELS_X_M:
+        for z, end in ((0.0, 0.15), (0.85, 1.05), (1.9, 2.05)):
+            yield x, z, 0.31, end - z
 
 
 def ceiling_lamp(build: MeshBuilder, width_m: float, depth_m: float, name: str) -> None:

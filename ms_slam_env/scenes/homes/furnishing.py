@@ -119,18 +119,24 @@ def _bathroom(of: Furnisher) -> None:
 
 
 def _hall(of: Furnisher) -> None:
-    """Coats, chest of drawers or a narrow shelf, a long rug."""
+    """Coats, chests of drawers, narrow shelves and rugs, one for every few metres."""
     build, rng = of.build, of.rng
     rack = of.arrangement.hang(rng, (1.0, 1.1), 1.3, of.walls(), depth=0.2)
     if rack is not None:
         with of.at(rack, 1.72):
             bedroom.coat_rack(build, rng, 0.95)
-    _chest(of)
-    _put(of, (0.7, 0.32, 2.0), lambda: pieces.bookshelf(build, rng, 0.7, 1.8, 4, "bookshelf"))
     w, d, _ = of.room.size
-    long = min(rng.uniform(2.2, 3.2), max(w, d) - 0.8)
-    with build.frame((w / 2, d / 2, 0), 0.0 if w > d else np.pi / 2):
-        decor.rug(build, rng, long, min(0.8, min(w, d) - 0.5))
+    count = max(1, round(max(w, d) / 4.0))
+    for k in range(count):
+        with build.part(f"{k}"):
+            _chest(of)
+        draw = partial(pieces.bookshelf, build, rng, 0.7, 1.8, 4, f"bookshelf {k}")
+        _put(of, (0.7, 0.32, 2.0), draw)
+        along = (k + 0.5) * max(w, d) / count
+        long = min(rng.uniform(1.8, 2.6), max(w, d) / count - 0.4)
+        place = (along, d / 2, 0) if w > d else (w / 2, along, 0)
+        with build.part(f"{k}"), build.frame(place, 0.0 if w > d else np.pi / 2):
+            decor.rug(build, rng, long, 0.8)
 
 
 _FURNISH: dict[str, Callable[[Furnisher], None]] = {

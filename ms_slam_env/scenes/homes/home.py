@@ -39,9 +39,12 @@ def home(seed: int) -> HomeScene:
 
     Places: the names of the rooms, as "hall", "living", "kitchen", "bedroom2".
     """
-    arrays = mesh_cache.remembered(
-        mesh_cache.key([], (home.__name__, version(), seed)), lambda: worked_out(seed)
-    )
+    name = mesh_cache.key([], (home.__name__, version(), seed))
+    return scene_from(seed, mesh_cache.remembered(name, lambda: worked_out(seed)))
+
+
+def scene_from(seed: int, arrays: mesh_cache.Arrays) -> HomeScene:
+    """The scene of ``seed`` from what is kept of it."""
     textures = tuple(arrays[name] for name in arrays if name.startswith(_TEXTURE))
     mesh = TexturedMesh(
         **{field: arrays[field] for field in _OF_MESH},
