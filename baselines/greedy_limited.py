@@ -26,6 +26,7 @@ Chosen on 310 motions of training seeds in four scenes: with it 19 of 20 diverge
 """
 _FLOOR_NATS = 0.01  # smaller divergences are alike
 _FACTOR = np.log([1.3, 1.3])
+_LEAST = 1.5  # times the least excess, where every motion exceeds the maxima
 _LEARNT = 0.1  # how far one motion moves the logarithm of the factor
 
 
@@ -104,12 +105,15 @@ class GreedyLimited(GoalPlanner):
         return (divergences + empty[:, None] * _EMPTY_NATS)[1:]
 
     def permitted(self, expected: Float64) -> NDArray[np.bool_]:
-        """Which motions (n,) keep to the maxima; the least divergent one if none but to stay."""
+        """Which motions (n,) keep to the maxima.
+
+        If none but to stay, also those that exceed them least: near a surface every motion does.
+        """
         bound = (expected + _FLOOR_NATS) * np.exp(self.log_factor) - _FLOOR_NATS
         excess = (bound / self.env.config.targets.maxima).max(axis=1)
         possible = self.env.action_masks()
         permitted = possible & (excess <= 1)
         if not permitted[1:].any():
             excess = np.where(possible, excess, np.inf)
-            permitted[1 + np.argmin(excess[1:])] = True
+            permitted[1:] = possible[1:] & (excess[1:] <= _LEAST * excess[1:].min())
         return permitted
