@@ -1,4 +1,4 @@
-"""The paper's robot experiment: four settings, an arm, ten runs each; is the map consistent?
+"""The paper's robot experiment, four settings, ten runs each: is the map consistent?
 
 Saeedi et al., ICRA 2017, section VI-C and figure 9.
 """
@@ -46,8 +46,7 @@ METRICS = (
     *("success", "success_tracked", "lost", "lost_frames_share", "mapped_area_m2", "ate_m"),
     *("ate_tracked_m", "tracked_share", "worst_apart_share", "path_length_m", "energy_j", "steps"),
 )
-LAMP = {"dim": 0.0, "lamp": 0.3, "speed_m_s": 0.001}
-"""A weak lamp that stands elsewhere in every run: "minor changes in illumination" (the paper)."""
+LAMP = {"dim": 0.0, "lamp": 0.3, "speed_m_s": 0.001}  # "minor changes in illumination"
 ACTIVE, BASELINE = "greedy", "random"
 PAPER = {"carpet": f"{BASELINE} 0 of 10, {ACTIVE} 5 of 10"}
 """Successes that the paper's text states; its other bars are in its figure 9 alone."""

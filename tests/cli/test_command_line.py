@@ -41,7 +41,7 @@ def one_line(text: str) -> str:
         (["benchmark", "--options", "slam_config.foo=1"], "SurfelConfig 'slam_config.foo'; valid"),
         (["benchmark", "--planners", "policy,path=none.zip"], "no policy file 'none.zip'"),
         (["benchmark", "--planners", "greedy,rho_I=x"], "rho_I = 'x' is outside"),
-        (["benchmark", "--planners", "greedy,foo=1"], "'foo'; valid choices: rho_I"),
+        (["benchmark", "--planners", "greedy,foo=1"], "'foo'; valid choices: preset, rho_I"),
         (["benchmark", "--planners", ":Greedy"], "planner ':Greedy' cannot be loaded"),
         (["benchmark", "--planners", "greedy,rho_I=["], "'[' is not a YAML value"),
         (["benchmark", "--options", "steps=["], "'[' is not a YAML value"),
@@ -133,7 +133,8 @@ def test_failed_episodes_are_code_1_and_stay_in_the_results(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     result = dict.fromkeys((*HEADLINE, *DETAILS), 0.5)
-    finished = {"result": {**result, "ate_over_time": [0.1]}, "error": None}
+    curve = {"looks_at_steps": [0, 5], "f_score_5cm_over_steps": [0.0, 0.5]}
+    finished = {"result": {**result, "ate_over_time": [0.1], **curve}, "error": None}
     monkeypatch.setattr(running, "run_all", made_up_rows(failed(), finished))
     assert main([*TWO_EPISODES, "--out", str(tmp_path)]) == 1
     assert "1 failed, the first: planner random, scene table, seed 2000" in capsys.readouterr().err

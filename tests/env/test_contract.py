@@ -297,7 +297,7 @@ def test_use_before_reset_says_so():
         ({"reward": {"lost": -1}}, r"RewardConfig.lost = -1 is outside \[0"),
         ({"slam_config": {"depth": 1}}, "depth_cutoff_m"),
         ({"slam_config": 3}, "slam_config = 3 must be a mapping"),
-        ({"reward": 3}, "reward = 3 must be a function of an Outcome, module:function, or"),
+        ({"reward": 3}, "reward = 3 must be a function of an Outcome, module:function, default"),
         ({"lookahead": {"view": 1}}, "'lookahead.view'; valid choices: reference, scale"),
         ({"scene_seed": -1}, "scene seed -1 must be an integer >= 0"),
         ({"slam_config": {"depth_cutoff_m": 11}}, r"outside \[0, 10\]"),

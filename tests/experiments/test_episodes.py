@@ -99,6 +99,7 @@ def test_planner_by_module_and_class_takes_options() -> None:
 
     class World:
         config = EnvConfig()
+        lookahead = None
 
     text = "ms_slam_baselines.greedy:GreedyDivergence,rho_I=0.25,depth_weight=2"
     planner: Any = make_planner(text, World())
