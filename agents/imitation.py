@@ -23,7 +23,7 @@ import torch
 from gymnasium import spaces
 from ms_slam_agents.demonstrations import Demonstration, Task, play
 from ms_slam_agents.learning_curve import Curve, read_curve
-from ms_slam_agents.options import Problem
+from ms_slam_agents.options import Problem, check_kept, check_new
 from ms_slam_agents.policy import CLIP, EPSILON
 from ms_slam_agents.policy_file import Metadata, PolicyFile, read_policy, write_policy
 from ms_slam_agents.supervisor import LATEST
@@ -274,20 +274,15 @@ def load_run(args: Args) -> tuple[PolicyFile | None, int]:
     """
     path = args.out / LATEST
     if not args.resume:
-        if path.exists() or (args.out / "episodes").exists():
-            raise InputError(
-                f"{args.out} holds a training run already: add --resume, or change --out"
-            )
+        check_new(args.out, LATEST, "episodes")
         return None, 0
     if not path.exists():
         return None, 0  # interrupted in the first round
     file = read_policy(path)
     if file.metadata.algorithm != "imitation":
         raise InputError(f"{path} is of {file.metadata.algorithm}, not of imitation")
-    for name in ("env_id", "observation", "hidden", "teacher", "episodes", "epochs", "seed"):
-        saved, given = file.metadata.options.get(name), getattr(args, name)
-        if saved != given:
-            raise InputError(f"{path} was trained with {name} {saved!r}, not {given!r}")
+    names = ("env_id", "observation", "hidden", "teacher", "episodes", "epochs", "seed")
+    check_kept(path, file.metadata.options, args, names)
     return file, file.metadata.epochs // args.epochs
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -131,6 +131,41 @@ def resumed(given: Args, saved: Mapping[str, Any]) -> Args:
         if not _is_of(getattr(made, name), hint):
             raise InputError(f"saved option {name} = {getattr(made, name)!r} is of the wrong type")
     return made
+
+
+def check_new(out: Path, *names: str) -> None:
+    """Refuse a new run where files of these names show that there is one already.
+
+    Raises:
+        InputError: there is one.
+    """
+    if any((out / name).exists() for name in names):
+        raise InputError(f"{out} holds a training run already: add --resume, or change --out")
+
+
+def check_kept(path: Path, saved: Mapping[str, Any], args: Problem, names: Iterable[str]) -> None:
+    """Refuse to go on with a run under options that would make it another one.
+
+    Raises:
+        InputError: naming the first option that differs, and both values.
+    """
+    for name in names:
+        if saved.get(name) != getattr(args, name):
+            raise InputError(
+                f"{path} was trained with {name} {saved.get(name)!r}, not {getattr(args, name)!r}"
+            )
+
+
+def check_steps_left(path: Path, done: int, total: int) -> None:
+    """Refuse to go on with a run that has all its steps.
+
+    Raises:
+        InputError: there is nothing left to do.
+    """
+    if done >= total:
+        raise InputError(
+            f"{path} is trained for {done} steps already: give more than --total-timesteps {total}"
+        )
 
 
 def _is_of(value: Any, hint: Any) -> bool:

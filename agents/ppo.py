@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from ms_slam_agents.evaluation import references
 from ms_slam_agents.learning_curve import Curve, read_curve
-from ms_slam_agents.options import Problem
+from ms_slam_agents.options import KEPT, Problem, check_kept, check_new, check_steps_left
 from ms_slam_agents.policy_file import Metadata, PolicyFile, read_policy, write_policy
 from ms_slam_agents.sb3_state import (
     moment_tensors,
@@ -412,7 +412,8 @@ def _first_policy(args: Args, inputs: int, actions: int) -> Network | None:
     """
     if args.init is None:
         return None
-    known = read_policy(args.init).metadata
+    file = read_policy(args.init)
+    known = file.metadata
     for name, own in (("env_id", args.env_id), ("observation", args.observation)):
         if getattr(known, name) != own:
             raise InputError(f"{args.init} is for {name} {getattr(known, name)!r}, not {own!r}")
@@ -423,7 +424,7 @@ def _first_policy(args: Args, inputs: int, actions: int) -> Network | None:
     if not args.pull:
         return None
     first = Network(inputs, args.hidden, actions, 0)
-    first.load_state_dict(_parameters(read_policy(args.init)))
+    first.load_state_dict(_parameters(file))
     return first
 
 
@@ -440,26 +441,15 @@ def load_run(args: Args) -> PolicyFile | None:
     """
     path = args.out / LATEST
     if not args.resume:
-        if path.exists():
-            raise InputError(
-                f"{args.out} holds a training run already: add --resume, or change --out"
-            )
+        check_new(args.out, LATEST)
         return None
     file = read_policy(path)
     known = file.metadata
     if known.algorithm != "masked_ppo":
         raise InputError(f"{path} is of {known.algorithm}, not of masked_ppo")
-    for name in ("env_id", "embodiment", "observation", "step_m", "step_deg", "hidden", "memory"):
-        if known.options.get(name) != getattr(args, name):
-            raise InputError(
-                f"{path} was trained with {name} {known.options.get(name)!r}, "
-                f"not {getattr(args, name)!r}"
-            )
-    if known.timesteps >= args.total_timesteps:
-        raise InputError(
-            f"{path} is trained for {known.timesteps} steps already: "
-            f"give more than --total-timesteps {args.total_timesteps}"
-        )
+    kept_options = {*KEPT, "memory"} - {"algorithm"}
+    check_kept(path, known.options, args, sorted(kept_options))
+    check_steps_left(path, known.timesteps, args.total_timesteps)
     return file
 
 

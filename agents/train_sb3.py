@@ -26,7 +26,15 @@ import torch
 from ms_slam_agents import convert_sb3
 from ms_slam_agents.evaluation import FixedEpisodes, references
 from ms_slam_agents.learning_curve import Curve, read_curve
-from ms_slam_agents.options import KEPT, Args, Problem, resumed
+from ms_slam_agents.options import (
+    KEPT,
+    Args,
+    Problem,
+    check_kept,
+    check_new,
+    check_steps_left,
+    resumed,
+)
 from ms_slam_agents.policy_file import PolicyFile, read_policy
 from ms_slam_agents.sb3_state import ALGORITHMS, Model, restore, whole_batches
 from ms_slam_agents.supervisor import LATEST, Supervisor
@@ -166,24 +174,12 @@ def load_run(args: Args) -> PolicyFile | None:
     """
     path = args.out / LATEST
     if not args.resume:
-        if path.exists():
-            raise InputError(
-                f"{args.out} holds a training run already: add --resume, or change --out"
-            )
+        check_new(args.out, LATEST)
         return None
     file = read_policy(path)
     saved = resumed(args, file.metadata.options)
-    for name in KEPT:
-        if getattr(args, name) != getattr(saved, name):
-            raise InputError(
-                f"{path} was trained with {name} {getattr(saved, name)!r}, "
-                f"not {getattr(args, name)!r}"
-            )
-    if file.metadata.timesteps >= args.total_timesteps:
-        raise InputError(
-            f"{path} is trained for {file.metadata.timesteps} steps already: "
-            f"give more than --total-timesteps {args.total_timesteps}"
-        )
+    check_kept(path, asdict(saved), args, KEPT)
+    check_steps_left(path, file.metadata.timesteps, args.total_timesteps)
     if file.metadata.epochs and not file.can_resume:
         raise InputError(f"{path} has no state of the optimiser to resume from")
     for name, value in asdict(args).items():
