@@ -19,6 +19,7 @@ Ctrl-C ends the caller, which ends the workers; they end too when the caller is 
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import multiprocessing
 import os
@@ -26,7 +27,7 @@ import signal
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -83,16 +84,30 @@ def limit_threads(threads: int) -> None:
 
 @contextmanager
 def limited_threads(threads: int | None) -> Iterator[None]:
-    """Keep the enclosed work on so many cores; None leaves everything as it is."""
+    """Keep the enclosed work on so many cores; None leaves everything as it is.
+
+    OpenCV is told; the threads that other libraries have started already obey the affinity.
+    """
     if threads is None or not _HAS_AFFINITY:
         yield
         return
-    cores = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, sorted(cores)[:threads])
+    import cv2
+
+    before, cores = cv2.getNumThreads(), os.sched_getaffinity(0)
+    cv2.setNumThreads(threads)
+    _set_affinity(sorted(cores)[:threads])
     try:
         yield
     finally:
-        os.sched_setaffinity(0, cores)
+        _set_affinity(cores)
+        cv2.setNumThreads(before)
+
+
+def _set_affinity(cores: Collection[int]) -> None:
+    """Let every thread of this process run on ``cores`` alone."""
+    for task in Path("/proc/self/task").glob("*"):
+        with contextlib.suppress(ProcessLookupError):  # it has ended
+            os.sched_setaffinity(int(task.name), cores)
 
 
 # -- Work --------------------------------------------------------------------------------------

@@ -33,6 +33,7 @@ ONLY_INSIDE_FUNCTIONS = {
     "rerun",
     "rliable",
     "sb3_contrib",
+    "sklearn",
     "stable_baselines3",
     "torch",
 }

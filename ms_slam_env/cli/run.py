@@ -117,17 +117,18 @@ def main(arguments: Sequence[str]) -> int:
     fed = {"keep_every": slam.keep_every, "threads": slam.threads}
     _say_what_is_missing(sequence)
     sequence.check_depth()
-    result = run_to_folder(
-        sequence,
-        slam.slam,
-        params,
-        args.out,
-        fed,
-        management,
-        map_in=args.map_in,
-        map_out=args.map_out,
-        mesh=args.mesh,
-    )
+    with slam.machine():
+        result = run_to_folder(
+            sequence,
+            slam.slam,
+            params,
+            args.out,
+            fed,
+            management,
+            map_in=args.map_in,
+            map_out=args.map_out,
+            mesh=args.mesh,
+        )
     for name in _PRINTED:
         if result.get(name) is not None:
             print(f"{name:16} {result[name]:.4g}")

@@ -21,9 +21,11 @@ from ms_slam_env.evaluation.seen_surface import SequenceWithSurface, open_with_s
 from ms_slam_env.evaluation.sequence_divergence import consecutive_divergences
 from ms_slam_env.exploration.objectives import FAILURE
 from ms_slam_env.metrics.cost import CostMeter
-from ms_slam_env.parallel import limited_threads
+from ms_slam_env.report.records import spec_key
 from ms_slam_env.sequences import HandheldPath, parse_sequence
 from ms_slam_env.slam.configuration import SlamConfiguration
+from ms_slam_env.slam.frame_selection import ChangeConfig
+from ms_slam_env.slam.frame_selection.filters import Change
 
 CLOCKS = {"processor": "cpu_ms_median", "wall": "ext_ms_median"}
 """What execution time is measured by, and the meter's name of it."""
@@ -48,6 +50,7 @@ class SlamEvaluator(Checked):
         clock: of the execution time: ``processor`` counts the time of all threads and not that of
             other programs; ``wall`` is what a GPU needs.
         map_error: whether maps are compared with the true surface, which takes a while.
+        baseline: a configuration whose error on each sequence is the unit of ``ate_worst_ratio``.
 
     Raises:
         InputError: an unknown name, or a value out of range.
@@ -61,6 +64,7 @@ class SlamEvaluator(Checked):
     max_lost: float = bounded(0.02, 0.0, 1.0)
     clock: str = chosen("processor", *CLOCKS)
     map_error: bool = False
+    baseline: SlamConfiguration | None = None
 
     def __post_init__(self) -> None:
         """Refuse what no run could use."""
@@ -73,7 +77,8 @@ class SlamEvaluator(Checked):
 
     def __call__(self, configuration: SlamConfiguration) -> Row:
         """Measure ``configuration`` on every sequence together; see ``summarise``."""
-        return summarise([self.measure(configuration, text) for text in self.sequences])
+        rows = [self.measure(configuration, text) for text in self.sequences]
+        return summarise(rows, [] if self.baseline is None else _baseline_rows(self))
 
     def context(self) -> Row:
         """What decides the figures, to be kept with a study."""
@@ -87,8 +92,9 @@ class SlamEvaluator(Checked):
             frames, ``ate_max_m``, ``ext_ms`` (median time of a processed
             frame), ``load_ms`` (mean time by all frames, those left out included), ``mem_mb`` (peak
             of the SLAM's own), ``energy_j`` (a processed frame), ``map_error_mm``, ``lost`` (share
-            of the processed frames), ``M_I``, ``M_D`` (largest divergences between processed
-            neighbours, nats), ``frames``; None or missing where it cannot be had. ``failure`` in
+            of the processed frames), ``M_I``, ``M_D`` and ``largest_change`` (largest divergences
+            between processed neighbours, nats, the last as adaptation and frame management measure
+            it), ``frames``; None or missing where it cannot be had. ``failure`` in
             words if tracking was lost too often, or SLAM broke down.
 
         Raises:
@@ -98,13 +104,12 @@ class SlamEvaluator(Checked):
         path = HandheldPath(self.frames, speed_m_s=self.speed_m_s, turn_deg_s=self.turn_deg_s)
         given = _load(text, size, path)
         every = configuration.keep_every
-        M_I, M_D = _divergences(text, size, path, every)
-        row: Row = {"sequence": text, "M_I": M_I, "M_D": M_D}
+        row: Row = {"sequence": text, **_divergences(text, size, path, every)}
         _warm_up(
             configuration.slam, size, str(configuration.slam_config.get("device", "cpu")), given
         )
         try:
-            with limited_threads(configuration.threads):
+            with configuration.machine():
                 return {**row, **self._run(configuration, given)}
         except InputError:
             raise
@@ -141,9 +146,13 @@ class SlamEvaluator(Checked):
         return row
 
 
-def summarise(rows: Sequence[Row]) -> Row:
-    """One row for all sequences: means, but the largest of maxima and memory; any failure."""
-    largest = ("ate_max_m", "mem_mb", "lost", "M_I", "M_D")
+def summarise(rows: Sequence[Row], baseline: Sequence[Row] = ()) -> Row:
+    """One row for all sequences: means, but the largest of maxima and memory; any failure.
+
+    ``ate_worst_m`` is the largest error of a sequence, ``ate_worst_ratio`` the largest that a
+    sequence has in units of its ``baseline``.
+    """
+    largest = ("ate_max_m", "mem_mb", "lost", "M_I", "M_D", "largest_change")
     errors = ("ate_m", "ate_tracked_m", "tracked_share", "map_error_mm")
     means = (*errors, "ext_ms", "load_ms", "energy_j")
     result: Row = {}
@@ -152,10 +161,32 @@ def summarise(rows: Sequence[Row]) -> Row:
         known = [value for value in values if value is not None]
         if len(known) == len(rows):
             result[name] = float(np.max(known) if name in largest else np.mean(known))
+    if "ate_m" in result:
+        result["ate_worst_m"] = max(row["ate_m"] for row in rows)
+        if baseline:
+            result["ate_worst_ratio"] = worst_ratio(rows, baseline)
     failures = [f"{row['sequence']}: {row[FAILURE]}" for row in rows if row.get(FAILURE)]
     if failures:
         result[FAILURE] = "; ".join(failures)
     return result
+
+
+def worst_ratio(rows: Sequence[Row], baseline: Sequence[Row]) -> float:
+    """Largest error of a sequence in units of the baseline's on the same; NaN without any."""
+    pairs = [(a.get("ate_m"), b.get("ate_m")) for a, b in zip(rows, baseline, strict=True)]
+    return max((own / its for own, its in pairs if own is not None and its), default=math.nan)
+
+
+_BASELINES: dict[str, list[Row]] = {}
+
+
+def _baseline_rows(evaluator: SlamEvaluator) -> list[Row]:
+    """What ``evaluator``'s baseline measures on its sequences, once in a process."""
+    key = spec_key(evaluator)
+    if key not in _BASELINES:
+        assert evaluator.baseline is not None
+        _BASELINES[key] = [evaluator.measure(evaluator.baseline, s) for s in evaluator.sequences]
+    return _BASELINES[key]
 
 
 @lru_cache(maxsize=64)
@@ -164,14 +195,21 @@ def _load(text: str, size: str, path: HandheldPath) -> SequenceWithSurface:
 
 
 @lru_cache(maxsize=1024)
-def _divergences(text: str, size: str, path: HandheldPath, every: int) -> tuple[float, float]:
-    """Largest intensity and depth divergence between processed neighbours, equations (11), (12)."""
+def _divergences(text: str, size: str, path: HandheldPath, every: int) -> dict[str, float]:
+    """Largest divergences between processed neighbours: equations (11) and (12), and their sum."""
     given = _load(text, size, path)
     frames = given.frames[::every]
     if len(frames) < 2:
         raise InputError(f"sequence {text}: every {every}th of {len(given.frames)} frames is one")
     values = consecutive_divergences(frames, given.intrinsics, [DivergenceConfig()])[:, 0]
-    return float(values[:, 0].max()), float(values[:, 1].max())
+    change = Change(ChangeConfig(), given.intrinsics)
+    changes = []
+    for frame in frames:
+        changes.append(change.measure(frame))
+        change.keep()
+    largest = float(np.max(changes[1:]))
+    return {**dict(zip(("M_I", "M_D"), values.max(axis=0).tolist(), strict=True)),
+            "largest_change": largest}  # fmt: skip
 
 
 _WARM: set[tuple[str, str, str]] = set()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -193,11 +193,4 @@ def _configuration(
         "trial": point.number,
         "measured": {k: v for k, v in point.measured.items() if v is not None},
     }
-    return SlamConfiguration(
-        made.slam,
-        made.slam_config,
-        made.image_size or image_size,
-        made.keep_every,
-        made.threads,
-        about,
-    )
+    return replace(made, image_size=made.image_size or image_size, about=about)

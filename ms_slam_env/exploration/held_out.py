@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ms_slam_env.exploration.evaluator import Row, SlamEvaluator
+from ms_slam_env.exploration.evaluator import Row, SlamEvaluator, worst_ratio
 from ms_slam_env.exploration.objectives import FAILURE, METRICS, key_of
 from ms_slam_env.report.records import RecordFile, spec_key
 from ms_slam_env.report.statistics import bootstrap_interval
@@ -46,8 +46,8 @@ def compare_configurations(
     Returns:
         a line for each configuration: the keys of ``COMPARED`` (means over the sequences), with
         ``_ratio`` the interval of these to the default's, by a bootstrap over the sequences;
-        ``failed_runs`` and ``sequences_count``. Sequences on which either failed have no part in
-        means and ratios.
+        ``worst_ate_ratio``, ``failed_runs`` and ``sequences_count``. Sequences on which
+        either failed have no part in means and ratios.
     """
     records = RecordFile(path)
     done = records.load()
@@ -71,6 +71,7 @@ def _line(name: str, own: Sequence[Row], default: Sequence[Row], clock: str) -> 
         "configuration": name.replace("_", " "),
         "sequences_count": len(own),
         "failed_runs": sum(not _usable(row) for row in own),
+        "worst_ate_ratio": worst_ratio(*zip(*pairs, strict=True)) if pairs else None,
     }
     for compared in COMPARED:
         key, scale = key_of(compared, clock), METRICS[compared].scale

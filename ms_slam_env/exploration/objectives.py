@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,14 +15,16 @@ Measured = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Metric:
-    """A figure of an evaluation; smaller is better.
+    """A figure of an evaluation.
 
     Attributes:
         key: in the registry of metrics, by which results are written.
-        worst: what counts where nothing better is known, in the objective's unit.
+        worst: what counts where nothing better is known, as samplers are told it.
         is_error: whether it says nothing of a run that lost track.
         wall_key: in place of ``key`` where time is measured by the clock.
         scale: from the objective's unit to the registry's.
+        is_larger_better: of what a configuration copes with. All objectives are minimised: samplers
+            are told the reciprocal, which leaves the Pareto front as it is.
     """
 
     key: str
@@ -29,6 +32,13 @@ class Metric:
     is_error: bool
     wall_key: str = ""
     scale: float = 1.0
+    is_larger_better: bool = False
+
+    def told(self, value: float) -> float:
+        """``value`` as samplers are told it, the less the better; and back again."""
+        if not self.is_larger_better:
+            return value
+        return 1.0 / value if value > 0 else self.worst
 
 
 METRICS: dict[str, Metric] = {
@@ -40,14 +50,19 @@ METRICS: dict[str, Metric] = {
     "energy_j": Metric("ene_frame_j", 1e3, False),
     "map_error_mm": Metric("map_error_median_m", 1e3, True, scale=1e-3),
     "lost": Metric("lost_share", 1.0, False),
+    "ate_worst_m": Metric("worst_ate_m", 1.0, True),
+    "ate_worst_ratio": Metric("worst_ate_ratio", 1e3, True),
+    "M_I": Metric("M_I", 1e6, True, is_larger_better=True),
+    "M_D": Metric("M_D", 1e6, True, is_larger_better=True),
 }
-"""What an evaluation can measure; all are minimised."""
+"""What an evaluation can measure and an exploration can want: the least, of the divergences M_I and
+M_D (equations 11 and 12) that a configuration copes with the most."""
 
 FAILURE = "failure"
 """Key of an evaluation under which it says, in words, why it measured less than it should."""
 
 
-OTHERS = ("M_I", "M_D", "ate_tracked_m", "tracked_share", "frames", FAILURE)
+OTHERS = ("ate_tracked_m", "tracked_share", "largest_change", "frames", FAILURE)
 """What else an evaluation may return, under the registry's own names."""
 
 
@@ -69,50 +84,57 @@ def as_metrics(measured: Measured, clock: str) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Constraint:
-    """``metric`` may not exceed ``limit``."""
+    """``metric`` may not exceed ``limit``; with ``at_least`` it may not fall below it."""
 
     metric: str
     limit: float
+    at_least: bool = False
 
     def __str__(self) -> str:
-        return f"{self.metric}<{self.limit:g}"
+        return f"{self.metric}{'>' if self.at_least else '<'}{repr(self.limit).removesuffix('.0')}"
 
     def violation(self, measured: Measured) -> float:
-        """By how much of the limit it is exceeded; 0 or less if it is kept.
+        """By how much of the limit it is broken; 0 or less if it is kept.
 
-        What was not measured exceeds it by as much as the worst value does.
+        What was not measured breaks it by as much as the worst value does.
         """
         value = measured.get(self.metric)
         if value is None or not math.isfinite(value):
-            value = METRICS[self.metric].worst
-        return float((value - self.limit) / (abs(self.limit) or 1.0))
+            value = 0.0 if self.at_least else METRICS[self.metric].worst
+        excess = self.limit - value if self.at_least else value - self.limit
+        return float(excess / (abs(self.limit) or 1.0))
 
 
 def parse_constraint(text: str) -> Constraint:
-    """Read ``metric<limit``.
+    """Read ``metric<limit``; of M_I and M_D, which say how hard a sequence is, ``>`` as well.
 
     Raises:
         InputError: no such form, or an unknown metric.
     """
-    name, sign, limit = text.replace("<=", "<").partition("<")
+    name, sign, limit = [*re.split("([<>])=?", text, maxsplit=1), "", ""][:3]
     name = name.strip()
-    if not sign:
-        raise InputError(f"constraint {text!r} is not metric<limit, as in ate_m<0.01")
-    if name not in METRICS:
+    known = METRICS.get(name)
+    if not sign or (sign == ">" and known is not None and not known.is_larger_better):
+        raise InputError(
+            f"constraint {text!r} is not metric<limit, as in ate_m<0.01, nor M_I>limit or M_D>limit"
+        )
+    if known is None:
         raise unknown("metric of a constraint", name, METRICS)
     try:
         number = float(limit)
     except ValueError:
         number = math.nan
-    if not math.isfinite(number):
-        raise InputError(f"constraint {text!r}: {limit.strip()!r} is not a number")
-    return Constraint(name, number)
+    if not math.isfinite(number) or (sign == ">" and number <= 0):
+        raise InputError(
+            f"constraint {text!r}: {limit.strip()!r} is not a {'positive ' * (sign == '>')}number"
+        )
+    return Constraint(name, number, sign == ">")
 
 
 def objective_values(
     measured: Measured, objectives: Sequence[str], reference: Mapping[str, float]
 ) -> list[float]:
-    """What the sampler is told of each objective: finite, and never above ``reference``.
+    """What the sampler is told of each objective: finite, and never above ``reference`` (told too).
 
     A run that failed counts as the reference in everything that speaks of errors: the trajectory of
     a camera that got lost may lie near the true one by chance. What it took still counts, where it
@@ -123,6 +145,7 @@ def objective_values(
     for name in objectives:
         value = measured.get(name)
         if value is None or not math.isfinite(value) or (failed and METRICS[name].is_error):
-            value = reference[name]
-        values.append(min(float(value), reference[name]))
+            values.append(reference[name])
+        else:
+            values.append(min(METRICS[name].told(float(value)), reference[name]))
     return values

@@ -23,7 +23,10 @@ ABOUT = (
     "error whose cost is not above the default's; knee, farthest below the line between the ends "
     "of the front, on logarithmic axes."
 )
-_SHOWN = ("ate_m", "ate_max_m", "ext_ms", "mem_mb", "energy_j", "map_error_mm")
+_SHOWN = (
+    *("ate_m", "ate_max_m", "ate_worst_m", "ate_worst_ratio", "ext_ms", "mem_mb", "energy_j"),
+    *("map_error_mm", "M_I", "M_D"),
+)
 _PARAMETERS_DRAWN = 4
 _MEANS = "Means over the sequences."
 
@@ -92,7 +95,7 @@ class Explored:
         shown = [p for p in self.points if p.on_front or p.number in purposes]
         shown.sort(key=lambda point: point.measured.get(cost) or 0.0)
         measured = [as_metrics(point.measured, self.clock) for point in shown]
-        keys = [*(key_of(name, self.clock) for name in _SHOWN), *OTHERS[:4]]
+        keys = [*(key_of(name, self.clock) for name in _SHOWN), *OTHERS[:3]]
         lines: list[dict[str, Any]] = [
             {
                 "trial": point.number,
@@ -115,7 +118,10 @@ class Explored:
         return {number: ", ".join(own) for number, own in names.items()}
 
     def _counts(self) -> str:
-        box = ", ".join(f"{name} = {format_number(v, 3)}" for name, v in self.reference.items())
+        box = ", ".join(
+            f"{name} = {format_number(METRICS[name].told(value), 3)}"
+            for name, value in self.reference.items()
+        )
         volume = format_number(self.hypervolume[-1], 3) if self.hypervolume else "-"
         return (
             f"{len(self.points)} finished trials, "
@@ -130,7 +136,8 @@ class Explored:
         for name in COMPARED:
             key = key_of(name, self.clock)
             columns += [key, Column(f"{key}_ratio", "ratio_to_default", "of default's")]
-        return make_table((*columns, "failed_runs", "sequences_count"), lines, title, note)
+        columns += ["worst_ate_ratio", "failed_runs", "sequences_count"]
+        return make_table(columns, lines, title, note)
 
     def _by_chance(self) -> str:
         """Which of the chosen may be better than the default by chance alone."""

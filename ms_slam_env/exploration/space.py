@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 from ms_slam_env.config import load_yaml
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.exploration.availability import why_absent
 from ms_slam_env.exploration.parameters import Choice, Float, Integer, Parameter
 from ms_slam_env.slam import check_parameters
 from ms_slam_env.slam.configuration import SlamConfiguration, merged
+from ms_slam_env.slam.machine import clock_range_mhz
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
@@ -36,9 +38,28 @@ _ALGORITHM: dict[str, Parameter] = {
     "unstable_window": Integer(10, 400, log=True),
 }
 _MOTION: dict[str, Parameter] = {"keep_every": Integer(1, 6)}
+# What a processed frame costs: pyramid, iterations, points, and how fine and how large the map is.
+_FRAME: dict[str, Parameter] = {
+    "pyramid_levels": Integer(1, 3),
+    **{name: _ALGORITHM[name] for name in ("iterations.0", "iterations.1", "iterations.2")},
+    "points_per_level": _ALGORITHM["points_per_level"],
+    "surfel_radius_px": Float(0.5, 2.0),
+    "coverage_px": Float(0.5, 1.0),
+    "bilateral_radius_px": Integer(0, 3),
+    "depth_cutoff_m": _ALGORITHM["depth_cutoff_m"],
+    "unstable_window": _ALGORITHM["unstable_window"],
+    "compaction_interval": Integer(2, 50, log=True),
+}
+_COMPILER: dict[str, Parameter] = {
+    "compiler.optimization_level": Choice((None, 1, 3)),
+    "compiler.fast_math": Choice((False, True)),
+    "compiler.vectorise": Choice((True, False)),
+    "compiler.grid_stride": Choice((True, False)),
+    "compiler.fuse_fp": Choice((True, False)),
+    "compiler.block_dim": Choice((64, 128, 256, 512)),
+}
 _OTHERS: dict[str, Parameter] = {
     "max_confidence": Float(5.0, 500.0, log=True),
-    "compaction_interval": Integer(2, 50, log=True),
     "cauchy_icp": Float(0.5, 10.0, log=True),
     "cauchy_rgb": Float(0.3, 10.0, log=True),
     "intensity_noise": Float(0.2, 10.0, log=True),
@@ -50,17 +71,22 @@ _OTHERS: dict[str, Parameter] = {
     "threads": Choice((1, 2)),
     "device": Choice(("cpu", "cuda")),
 }
-KNOWN: dict[str, Parameter] = {**_ALGORITHM, **_MOTION, **_OTHERS}
+KNOWN: dict[str, Parameter] = {**_ALGORITHM, **_MOTION, **_FRAME, **_OTHERS, **_COMPILER}
 """Parameters of the surfel backend that have a range of their own."""
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "paper": tuple(_PAPER),
     "algorithm": tuple(_ALGORITHM),
-    "machine": ("threads", "device"),
+    "frame": tuple(_FRAME),
+    "compiler": tuple(_COMPILER),
+    "machine": ("threads", "device", "cpu_mhz", "gpu_mhz", "precision"),
 }
-"""Names that stand for several parameters."""
+"""Names that stand for several parameters; those that a machine or a backend has not are left out
+of ``compiler`` and ``machine`` (``availability.why_absent``)."""
 
-_OF_CONFIGURATION = ("image_size", "keep_every", "threads")
+_OF_CONFIGURATION = ("image_size", "keep_every", "threads", "cpu_mhz")
+_LEVELS = "pyramid_levels"
+_COMPILER_PREFIX = "compiler."
 
 
 @dataclass(frozen=True)
@@ -68,7 +94,9 @@ class SearchSpace:
     """Parameters by name, and the configuration that they start from.
 
     Names are those of the backend, with dots for nested ones and for places of a list
-    (``iterations.0``), or ``image_size``, ``keep_every`` and ``threads`` of the configuration.
+    (``iterations.0``), ``pyramid_levels`` for how many of the ``iterations`` count,
+    ``image_size``, ``keep_every``, ``threads`` and ``cpu_mhz`` of the configuration, or
+    ``compiler.`` and an option.
 
     Raises:
         InputError: no parameter, one that the backend does not have, one whose range does not hold
@@ -106,12 +134,18 @@ class SearchSpace:
         Raises:
             InputError: values that the backend refuses.
         """
-        direct = {name: values[name] for name in _OF_CONFIGURATION if name in values}
+        direct: dict[str, Any] = {n: values[n] for n in _OF_CONFIGURATION if n in values}
         params = dict(self.base.slam_config)
+        compiler = dict(self.base.compiler)
         for name, value in values.items():
-            if name not in _OF_CONFIGURATION:
+            if name.startswith(_COMPILER_PREFIX):
+                compiler[name.removeprefix(_COMPILER_PREFIX)] = value
+            elif name not in (*_OF_CONFIGURATION, _LEVELS):
                 params = merged(params, self._nested(name, value, params))
-        return dataclasses.replace(self.base, slam_config=params, **direct)
+        if _LEVELS in values:
+            of_all = default_of("iterations", dataclasses.replace(self.base, slam_config=params))
+            params["iterations"] = list(of_all[: values[_LEVELS]])
+        return dataclasses.replace(self.base, slam_config=params, compiler=compiler, **direct)
 
     def _nested(self, name: str, value: Any, params: dict[str, Any]) -> Any:
         """Options that set ``name``, the other places of its list as in ``params``."""
@@ -136,8 +170,14 @@ def default_of(name: str, base: SlamConfiguration) -> Any:
         return base.slam_config.get("device", "cpu")
     if name in _OF_CONFIGURATION:
         value = getattr(base, name)
+        if value is None and name == "cpu_mhz":
+            return clock_range_mhz()[1]
         return {"image_size": "160x120", "threads": 1}[name] if value is None else value
+    if name == _LEVELS:
+        return len(default_of("iterations", base))
     found: Any = check_parameters(base.slam, base.slam_config)
+    if name.startswith(_COMPILER_PREFIX):
+        found, name = base.compiler_options(), name.removeprefix(_COMPILER_PREFIX)
     for part in name.split("."):
         if part.isdigit() and isinstance(found, tuple) and int(part) < len(found):
             found = found[int(part)]
@@ -155,24 +195,41 @@ def make_space(texts: Sequence[str], base: SlamConfiguration | None = None) -> S
     """The space that texts name: ``NAME``, ``NAME=low:high``, ``NAME=a,b,c``, or a group.
 
     A range of integers stays one where the parameter's value is an integer; ``low:high:log`` makes
-    equal ratios equally likely.
+    equal ratios equally likely. Of a group what this machine or the backend lacks is left out.
 
     Raises:
-        InputError: an unknown parameter, one without a known range, or a range that is none.
+        InputError: an unknown parameter, one that is absent here, one without a known range, or a
+            range that is none.
     """
     base = base or SlamConfiguration()
     parameters: dict[str, Parameter] = {}
     for text in texts:
         name, equals, values = text.partition("=")
-        if equals:
-            parameters[name] = _parse_values(name, values, default_of(name, base))
-            continue
         for member in GROUPS.get(name, (name,)):
-            default_of(member, base)
-            if member not in KNOWN:
+            absent = why_absent(member, base)
+            if absent and name in GROUPS:
+                continue
+            if absent:
+                raise InputError(f"parameter {member!r} is absent: {absent}")
+            default = default_of(member, base)
+            if equals:
+                parameters[member] = _parse_values(member, values, default)
+            elif member == "cpu_mhz":
+                parameters[member] = Integer(*clock_range_mhz())
+            elif member not in KNOWN:
                 raise InputError(f"parameter {member!r} needs a range, as in {member}=1:10")
-            parameters[member] = KNOWN[member]
+            else:
+                parameters[member] = KNOWN[member]
+    if not parameters and texts:
+        raise InputError("; ".join(absences(texts, base)))
     return SearchSpace(parameters, base)
+
+
+def absences(texts: Sequence[str], base: SlamConfiguration) -> list[str]:
+    """Of the groups among ``texts`` what is absent here, and why; a line each."""
+    members = [member for text in texts for member in GROUPS.get(text, ())]
+    found = {member: why_absent(member, base) for member in members}
+    return [f"{member} is absent: {why}" for member, why in found.items() if why]
 
 
 def _parse_values(name: str, text: str, default: Any) -> Parameter:

@@ -235,7 +235,8 @@ class StudyStorage:
             value, worst = measured.get(name, math.nan), METRICS[name].worst
             failed = METRICS[name].is_error and bool(measured.get(FAILURE))
             unusable = value is None or not math.isfinite(value) or failed
-            reference[name] = worst if unusable else (factor * float(value) or worst)
+            told = worst if unusable else METRICS[name].told(float(value))
+            reference[name] = worst if unusable else (factor * told or worst)
         return reference
 
     def _connect(self) -> sqlite3.Connection:

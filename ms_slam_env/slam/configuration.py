@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,9 @@ from ms_slam_env.config import Checked, bounded, from_dict, load_yaml
 from ms_slam_env.errors import InputError
 from ms_slam_env.input_files import read_text
 from ms_slam_env.output_files import write_text
+from ms_slam_env.parallel import limited_threads
 from ms_slam_env.slam.base import SlamBackend
+from ms_slam_env.slam.machine import CompilerOptions, compiled, limited_clock
 from ms_slam_env.slam.registry import backend_name, check_parameters, make_backend
 from ms_slam_env.slam.state_file import read_about
 
@@ -37,6 +40,8 @@ class SlamConfiguration(Checked):
         threads: cores that the backend may use; None for no limit. Where other work shares the
             process, as in an environment, no notice is taken.
         about: where the configuration comes from, such as the trial and what it measured.
+        compiler: options of the kernels' compiler (``CompilerOptions``); like ``threads``.
+        cpu_mhz: highest frequency of the processor; like ``threads``, and None for no limit.
 
     Raises:
         InputError: an unknown backend, parameter or size, or a value out of range.
@@ -48,12 +53,26 @@ class SlamConfiguration(Checked):
     keep_every: int = bounded(1, 1, 1000)
     threads: int | None = bounded(None, 1, 1024)
     about: dict[str, Any] = field(default_factory=dict)
+    compiler: dict[str, Any] = field(default_factory=dict)
+    cpu_mhz: int | None = bounded(None, 1, 100_000)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_parameters(self.slam, self.slam_config)
+        self.compiler_options()
         if self.image_size is not None:
             parse_image_size(self.image_size)
+
+    def compiler_options(self) -> CompilerOptions:
+        """Those of ``compiler`` as such."""
+        return from_dict(CompilerOptions, self.compiler, "compiler")
+
+    @contextmanager
+    def machine(self) -> Iterator[None]:
+        """Compiler, cores and clock as it says for the enclosed work, then as before."""
+        compiler = compiled(self.compiler_options())
+        with compiler, limited_threads(self.threads), limited_clock(self.cpu_mhz):
+            yield
 
     def __str__(self) -> str:
         """In a few words: image size, iterations and the like, share of the frames."""

@@ -106,6 +106,7 @@ def test_several_sequences_make_one_row():
     assert summarise(rows) == {
         "ate_m": pytest.approx(0.2),
         "ate_max_m": 0.2,
+        "ate_worst_m": 0.3,
         "failure": "b: lost",
     }
 

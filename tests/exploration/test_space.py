@@ -6,7 +6,8 @@ from hypothesis import strategies as st
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.exploration import Choice, Float, Integer, make_space
-from ms_slam_env.exploration.space import KNOWN
+from ms_slam_env.exploration.availability import why_absent
+from ms_slam_env.exploration.space import KNOWN, absences
 from ms_slam_env.slam.configuration import SlamConfiguration
 
 
@@ -20,7 +21,8 @@ def test_the_paper_has_three_parameters():
 
 
 def test_every_known_parameter_holds_its_default():
-    space = make_space([name for name in KNOWN if name != "device"])
+    base = SlamConfiguration()
+    space = make_space([name for name in KNOWN if not why_absent(name, base)])
     for name, value in space.defaults().items():
         assert space.parameters[name].contains(value), name
         assert (
@@ -29,6 +31,40 @@ def test_every_known_parameter_holds_its_default():
             ._contains(space.parameters[name].distribution().to_internal_repr(value))
         )
     assert space.configuration(space.defaults()).slam_config["iterations"] == [4, 5, 10]
+
+
+def test_pyramid_levels_leave_out_the_coarsest():
+    space = make_space(["pyramid_levels", "iterations.0", "iterations.2"])
+    assert space.defaults() == {"pyramid_levels": 3, "iterations.0": 4, "iterations.2": 10}
+    values = {"iterations.0": 7, "iterations.2": 1}
+    for levels, left in ((1, [7]), (2, [7, 5]), (3, [7, 5, 1])):
+        made = space.configuration({**values, "pyramid_levels": levels})
+        assert made.slam_config["iterations"] == left
+
+
+def test_the_compiler_is_a_level_of_its_own():
+    space = make_space(["compiler", "points_per_level"])
+    made = space.configuration({"compiler.fast_math": True, "points_per_level": 700})
+    assert made.compiler == {"fast_math": True}
+    assert made.slam_config == {"points_per_level": 700}
+    assert space.defaults()["compiler.optimization_level"] is None
+    assert "compiler.block_dim" not in space.parameters  # of a GPU
+
+
+def test_levels_that_a_backend_lacks_say_so():
+    surfel = SlamConfiguration()
+    lines = absences(["machine", "compiler", "points_per_level"], surfel)
+    assert "threads is absent: Warp runs a kernel on one thread of the CPU, or on a GPU" in lines
+    assert "compiler.block_dim is absent: a CPU runs one thread of a block" in lines
+    assert any(line.startswith("precision is absent") for line in lines)
+    odometry = SlamConfiguration(slam="odometry")  # OpenCV's, which has threads
+    assert list(make_space(["threads"], odometry).parameters) == ["threads"]
+    with pytest.raises(
+        InputError, match="parameter 'threads' is absent: Warp runs a kernel on one"
+    ):
+        make_space(["threads=1,2"], surfel)
+    with pytest.raises(InputError, match=r"backend 'odometry' has no kernels"):
+        make_space(["compiler"], odometry)
 
 
 def test_values_go_where_they_belong():

@@ -1,0 +1,138 @@
+"""How a SLAM is run besides its own parameters: compiler, cores and clock of the processor.
+
+The compiler and hardware levels of the design space (Saeedi et al., ICRA 2017, section II-B).
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from ms_slam_env.config import Checked, bounded
+from ms_slam_env.errors import InputError
+
+_WARP_FLAGS = (
+    "-march=native -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000 "
+    "-mllvm=-slp-recursion-max-depth=4"
+)  # Warp 1.19's own; naming them makes what follows independent of the user's global setting
+# Kernels ask whether readings are finite, so NaN and infinity keep their meaning.
+_FAST_MATH = " -ffast-math -fno-finite-math-only"
+_NO_VECTORS = " -fno-vectorize -fno-slp-vectorize"
+CPU_FREQUENCIES = Path("/sys/devices/system/cpu")
+"""Where Linux keeps the frequencies of the cores."""
+
+
+@dataclass(frozen=True)
+class CompilerOptions(Checked):
+    """How Warp compiles the kernels of SLAM; by default as Warp itself would.
+
+    Attributes:
+        optimization_level: 0 to 3; None for Warp's own, 2 on a CPU and 3 on a GPU.
+        fast_math: arithmetic may be reordered and approximated. Warp passes it on to a GPU's
+            compiler alone; that of the CPU gets Clang's flag of that name.
+        vectorise: several numbers at a time, on a CPU.
+        grid_stride: kernels loop over more threads than the device runs at once.
+        fuse_fp: a product and a sum may be rounded once. On a CPU no bit of a run changed with it.
+        block_dim: threads of a block, on a GPU; a CPU runs one.
+    """
+
+    optimization_level: int | None = bounded(None, 0, 3)
+    fast_math: bool = False
+    vectorise: bool = True
+    grid_stride: bool = True
+    fuse_fp: bool = True
+    block_dim: int = bounded(256, 32, 1024)
+
+    def module_options(self) -> dict[str, Any]:
+        """What Warp calls it: options of a module."""
+        flags = _FAST_MATH * self.fast_math + _NO_VECTORS * (not self.vectorise)
+        return {
+            "optimization_level": self.optimization_level,
+            "fast_math": self.fast_math,
+            "cpu_compiler_flags": _WARP_FLAGS + flags if flags else None,
+            "default_grid_stride": None if self.grid_stride else False,
+            "fuse_fp": self.fuse_fp,
+            "block_dim": self.block_dim,
+        }
+
+
+@contextmanager
+def compiled(options: CompilerOptions) -> Iterator[None]:
+    """Compile the surfel SLAM's kernels with ``options`` where the enclosed work launches them.
+
+    Compiled kernels are kept under a hash that contains the options, so that those of others stay
+    what they are. It holds for the whole process; a SLAM that was made before keeps the kernels
+    that it has launched.
+    """
+    if options == CompilerOptions():
+        yield
+        return
+    from ms_slam_env._warp import wp
+
+    import_module("ms_slam_env.slam.surfel")
+    modules = [
+        wp.get_module(name)
+        for name, module in list(sys.modules.items())
+        if name.startswith("ms_slam_env.slam.")
+        and any(isinstance(value, wp.Kernel) for value in vars(module).values())
+    ]
+    new = options.module_options()
+    before = [{key: module.options[key] for key in new} for module in modules]
+    for module in modules:
+        wp.set_module_options(new, module)
+    try:
+        yield
+    finally:
+        for module, old in zip(modules, before, strict=True):
+            wp.set_module_options(old, module)
+
+
+@contextmanager
+def limited_clock(mhz: int | None, root: Path = CPU_FREQUENCIES) -> Iterator[None]:
+    """Let no core run faster than ``mhz`` during the enclosed work; None leaves the clock alone.
+
+    Raises:
+        InputError: the machine does not let its clock be set.
+    """
+    if mhz is None:
+        yield
+        return
+    why = why_no_clock(root)
+    if why:
+        raise InputError(f"cpu_mhz = {mhz}: {why}")
+    files = sorted(root.glob("cpu[0-9]*/cpufreq/scaling_max_freq"))
+    before = [file.read_text() for file in files]
+    try:
+        for file in files:
+            file.write_text(str(1000 * mhz))
+        yield
+    finally:
+        for file, old in zip(files, before, strict=True):
+            file.write_text(old)
+
+
+def why_no_clock(root: Path = CPU_FREQUENCIES) -> str:
+    """Why the processor's clock cannot be set here; empty where it can."""
+    files = sorted(root.glob("cpu[0-9]*/cpufreq/scaling_max_freq"))
+    if not files:
+        return f"{root} has no cpufreq: the machine keeps its clock to itself"
+    try:
+        for file in files:
+            file.open("r+").close()
+    except OSError as error:
+        return f"{error.filename}: {error.strerror}"
+    return ""
+
+
+def clock_range_mhz(root: Path = CPU_FREQUENCIES) -> tuple[int, int]:
+    """Lowest and highest frequency of the first core."""
+    low, high = (
+        int((root / "cpu0" / "cpufreq" / f"cpuinfo_{end}_freq").read_text()) // 1000
+        for end in ("min", "max")
+    )
+    return low, high
