@@ -1,16 +1,36 @@
-"""How right a closed loop is: where it puts the camera against where the old map says it is."""
+"""How right closed loops are, and how many of those that the truth has.
+
+A loop is right if the pose that it states, of the camera beside an old frame, is within a tolerance
+of the true one. What there was to close: frames that see a view again after having left it.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.evaluation.seen_surface import back_projected
 from ms_slam_env.geometry import Float64, invert, relative_angle
+from ms_slam_env.slam.base import Loop
+
+Int32 = NDArray[np.int32]
+Bool = NDArray[np.bool_]
 
 WRONG_M, WRONG_DEG = 0.05, 3.0
 """A closure is wrong if it leaves new and old map further apart than this."""
+
+SEEN_AGAIN, OUT_OF_SIGHT = 0.5, 0.1
+"""Share of a view's readings that a frame shows: at least this, and at most this."""
+AWAY_S, BREAK_S = 3.0, 1.0
+"""Seconds that a view must have been out of sight; of a break that does not end a revisit."""
+_EVERY = 5  # of the frames one is taken for a view that may be seen again
+_GRID = 8  # every so many rows and columns of it
+_FEWEST = 20  # readings of a view
+_DEPTH_SHARE = 0.05  # difference of depth at which a point is shown
 
 
 @dataclass(frozen=True)
@@ -54,3 +74,104 @@ def judge_closure(
 def _apart(a: Float64, b: Float64) -> tuple[float, float]:
     distance = float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
     return distance, float(np.degrees(relative_angle(a[:3, :3], b[:3, :3])))
+
+
+def find_revisits(
+    depths: NDArray[np.float32],
+    intrinsics: Intrinsics,
+    poses: Float64,
+    times: Float64,
+    reach_m: float,
+) -> Int32:
+    """Which revisit each of N frames is part of; -1: of none.
+
+    A frame revisits an old view if it shows at least half of what that saw: its true readings, seen
+    at their depth. Between the two lie three seconds in which less than a tenth of it was shown.
+    One revisit is a run of such frames, with breaks of up to a second.
+
+    Args:
+        depths: (N, h, w) true depth of the still world, metres; 0 where there is none.
+        intrinsics: of these images.
+        poses: (N, 4, 4) true T_world_camera.
+        times: (N,) seconds.
+        reach_m: readings beyond are left out.
+    """
+    found: Bool = np.zeros(len(poses), dtype=bool)
+    coarse = intrinsics.every_nth(_GRID)
+    for old in range(0, len(poses), _EVERY):
+        points = back_projected(depths[old, ::_GRID, ::_GRID], poses[old], coarse, reach_m)
+        if len(points) >= _FEWEST:
+            shares = _shown(points, depths[old:], intrinsics, poses[old:])
+            found[old:] |= _back(shares, times[old:])
+    return _runs(found, times)
+
+
+def _shown(
+    points: Float64, depths: NDArray[np.float32], intrinsics: Intrinsics, poses: Float64
+) -> Float64:
+    """Share of points (M, 3) that each of N frames shows."""
+    T = invert(poses)
+    seen = np.einsum("nij,mj->nmi", T[:, :3, :3], points) + T[:, None, :3, 3]
+    z = seen[..., 2] = np.maximum(seen[..., 2], 1e-3)  # what is behind falls out of the image
+    pixels = np.rint(intrinsics.project(seen))
+    inside: Bool = np.all((pixels >= 0) & (pixels < (intrinsics.width, intrinsics.height)), axis=-1)
+    column, row = np.moveaxis(np.where(inside[..., None], pixels, 0).astype(np.int64), -1, 0)
+    there = depths[np.arange(len(poses))[:, None], row, column]
+    shares: Float64 = (inside & (np.abs(there - z) <= _DEPTH_SHARE * z)).mean(axis=1)
+    return shares
+
+
+def _back(shares: Float64, times: Float64) -> Bool:
+    """Frames (N,) that show a view again, of which they show ``shares`` (N,), after it was away."""
+    away = shares <= OUT_OF_SIGHT
+    last_here = np.maximum.accumulate(np.where(away, 0, np.arange(len(shares))))
+    left = away & (times - times[last_here] >= AWAY_S)
+    was_left: Bool = np.maximum.accumulate(left)
+    return was_left & (shares >= SEEN_AGAIN)
+
+
+def _runs(found: Bool, times: Float64) -> Int32:
+    """Number (N,) of the run that each of the ``found`` (N,) is in; -1: in none."""
+    numbers = np.full(len(found), -1, dtype=np.int32)
+    frames = np.flatnonzero(found)
+    numbers[frames] = np.cumsum(np.diff(times[frames], prepend=times[frames[:1]]) > BREAK_S)
+    return numbers
+
+
+def loop_measures(
+    loops: Mapping[int, Loop], truth: Float64, revisits: Int32, tolerance_m: float
+) -> dict[str, float | int | None]:
+    """Precision and recall of loops by frame.
+
+    ``loop_precision`` is the share of the loops that are right: the pose that each states is within
+    ``tolerance_m`` and 3 degrees of the true one. ``loop_recall`` is the share of the frames of
+    revisits at which a right one has been stated, then or earlier in the same revisit. None where
+    there is nothing to divide by.
+
+    Args:
+        loops: what was stated, by frame.
+        truth: (N, 4, 4) true T_world_camera.
+        revisits: (N,) of ``find_revisits``.
+        tolerance_m: largest error of a right loop, metres.
+    """
+    right = [frame for frame, loop in loops.items() if _is_right(frame, loop, truth, tolerance_m)]
+    recalled = 0
+    for number in range(revisits.max(initial=-1) + 1):
+        frames = np.flatnonzero(revisits == number)
+        first = min((f for f in right if frames[0] <= f <= frames[-1]), default=frames[-1] + 1)
+        recalled += int((frames >= first).sum())
+    count = int((revisits >= 0).sum())
+    return {
+        "revisits": int(revisits.max(initial=-1)) + 1,
+        "revisiting_frames": count,
+        "stated_loops": len(loops),
+        "closed_loops": sum(loop.bent for loop in loops.values()),
+        "loop_precision": len(right) / len(loops) if loops else None,
+        "loop_recall": recalled / count if count else None,
+    }
+
+
+def _is_right(frame: int, loop: Loop, truth: Float64, tolerance_m: float) -> bool:
+    motion = invert(truth[loop.reference]) @ truth[frame]
+    error_m, error_deg = _apart(motion, loop.T_reference_camera)
+    return error_m <= tolerance_m and error_deg <= WRONG_DEG

@@ -15,9 +15,9 @@ MOST_POINTS = 1000
 """Of a line: more are not told apart on a screen."""
 
 
-def thinned(count: int) -> NDArray[np.int64]:
-    """At most ``MOST_POINTS`` indices of ``count``, evenly spread."""
-    return np.arange(0, count, max(1, -(-count // MOST_POINTS)))
+def thinned(count: int, most: int = MOST_POINTS) -> NDArray[np.int64]:
+    """At most ``most`` indices of ``count``, evenly spread."""
+    return np.arange(0, count, max(1, -(-count // most)))
 
 
 def widest_axes(points: Float64) -> tuple[int, int]:

@@ -42,6 +42,10 @@ TABLES: Mapping[str, tuple[str, ...]] = {
     "Robustness": (
         *("lost_share", "robustness", "relocalisation_s", "initialisation_s", "scale_error"),
     ),
+    "Loops": (
+        *("revisits", "revisiting_frames", "stated_loops", "closed_loops"),
+        *("loop_precision", "loop_recall"),
+    ),
     "Cost": (
         *("frames", "ext_ms", "ext_ms_p95", "cpu_ms_mean", "mem_peak_mb", "ene_frame_j"),
         "ene_source",
@@ -58,12 +62,16 @@ class Usme(Experiment, Checked):
     """SLAM backends over the eight sequences of the USME framework
 
     Four kinds of scenes (streets, factory hall, room), with and without loops, motion blur, moving
-    objects, fast motion and black frames. Every run has a process of its own.
+    objects, fast motion and black frames. Every run has a process of its own. Streets and hall take
+    other parameters than a room, and where something moves surfel has ``motion_mask=geometric``.
     """
 
     folder: tyro.conf.Positional[Path | None] = None
     """Folder that ms-slam usme make wrote; without it every frame is rendered when it is needed."""
-    backends: tuple[str, ...] = ("surfel", "odometry")
+    backends: tuple[str, ...] = (
+        *("surfel", "surfel,loop_closure=deformation"),
+        *("sparse", "volumetric", "odometry"),
+    )
     """NAME, parameters appended as in surfel,loop_closure=deformation."""
     sequences: tuple[str, ...] = ()
     """Their names; by default all, or those that the folder holds."""
@@ -152,23 +160,43 @@ class Usme(Experiment, Checked):
                     **{key: row["result"].get(key) for key in keys},
                 }
                 for row in finished(rows)
+                if title != "Loops" or "loop_recall" in row["result"]
             ]
             tables.append(make_table(("sequence", "backend", *keys), lines, title))
         return tables
 
     def charts(self, rows: Sequence[Row]) -> list[Chart]:
-        """Error and share of lost frames of every backend on every sequence, side by side."""
-        backends = dict.fromkeys(row["spec"]["backend"] for row in finished(rows))
-        panels = []
-        for key in ("ate_m", "lost_share"):
-            series = []
-            for backend in backends:
-                own = [row for row in finished(rows) if row["spec"]["backend"] == backend]
-                values = [row["result"][key] for row in own]
-                names = [row["spec"]["sequence"] for row in own]
-                series.append(Series(backend, values, names, mode="markers"))
-            panels.append(Panel(key, "", series, "x" if key == "ate_m" else ""))
-        return [Chart("usme", "Error and losses", "One mark a run.", panels)]
+        """Errors and losses of every backend on every sequence, and the paths beside the truth."""
+        return [_errors(rows), _paths(rows)]
+
+
+def _errors(rows: Sequence[Row]) -> Chart:
+    backends = dict.fromkeys(row["spec"]["backend"] for row in finished(rows))
+    panels = []
+    for key in ("ate_m", "lost_share"):
+        series = []
+        for backend in backends:
+            own = [row for row in finished(rows) if row["spec"]["backend"] == backend]
+            values = [row["result"][key] for row in own]
+            names = [row["spec"]["sequence"] for row in own]
+            series.append(Series(backend, values, names, mode="markers"))
+        panels.append(Panel(key, "", series, "x" if key == "ate_m" else ""))
+    return Chart("usme", "Error and losses", "One mark a run.", panels)
+
+
+def _paths(rows: Sequence[Row]) -> Chart:
+    """USME's figure 8: every sequence from above."""
+    panels = []
+    for sequence in dict.fromkeys(row["spec"]["sequence"] for row in finished(rows)):
+        own = [row for row in finished(rows) if row["spec"]["sequence"] == sequence]
+        drawn = [(row["spec"]["backend"], row["result"], "path", "lines") for row in own]
+        drawn.append(("truth", own[0]["result"], "true", "dashes"))
+        lines = [
+            Series(name, result[f"{path}_x_m"], result[f"{path}_y_m"], mode=mode)
+            for name, result, path, mode in drawn
+        ]
+        panels.append(Panel("position_x_m", "position_y_m", lines, title=sequence, equal=True))
+    return Chart("paths", "Paths", "From above; not aligned, all start at the truth.", panels)
 
 
 def check_suite(sequences: Sequence[str], image_size: str) -> None:

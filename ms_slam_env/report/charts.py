@@ -14,7 +14,7 @@ from ms_slam_env.report.records import build
 from ms_slam_env.report.statistics import Interval
 from ms_slam_env.report.tables import Row, finished, grouped, summary
 
-MODES = ("lines", "lines+markers", "markers", "dots", "bars")
+MODES = ("lines", "lines+markers", "markers", "dots", "dashes", "bars")
 
 Point = float | int | str | None
 
@@ -29,7 +29,8 @@ class Series:
         y: (n,) the same.
         low: (n,) lower ends of an interval around ``y`` (around ``x`` where ``y`` are names).
         high: (n,) upper ends.
-        mode: ``lines``, ``markers``, ``lines+markers``, ``bars``; ``dots`` are small and pale.
+        mode: ``lines``, ``markers``, ``lines+markers``, ``bars``; ``dots`` are small and pale,
+            ``dashes`` a grey line, such as a truth.
         text: (n,) what each point is, shown on pointing at it.
     """
 
@@ -120,7 +121,7 @@ class Chart:
         name: of the PNG file, without its ending.
         title: above it.
         caption: what the marks are.
-        panels: from left to right.
+        panels: from left to right, in rows of four.
     """
 
     name: str

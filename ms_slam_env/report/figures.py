@@ -20,10 +20,12 @@ from ms_slam_env.report.charts import Chart, Panel, Series
 
 _LOOKS: dict[str, dict[str, Any]] = {
     "lines": {"linestyle": "-"},
+    "dashes": {"linestyle": "--", "color": "0.35", "zorder": 3},
     "lines+markers": {"linestyle": "-", "marker": "o", "markersize": 4},
     "markers": {"linestyle": "", "marker": "o"},
     "dots": {"linestyle": "", "marker": ".", "markersize": 5, "alpha": 0.35},
 }
+_COLUMNS = 4
 _LONG_NAME = 30  # letters; legends of longer ones would leave the panels no room beside them
 
 
@@ -34,21 +36,25 @@ def save_charts(charts: Iterable[Chart], out: Path) -> list[Path]:
 
 
 def draw(chart: Chart) -> Figure:
-    """The chart with its panels side by side and one legend."""
+    """The chart with its panels side by side, in rows of four, and one legend."""
     names = list(dict.fromkeys(s.name for panel in chart.panels for s in panel.series))
     categories = {str(y) for p in chart.panels if not p.y for s in p.series for y in s.y}
     longest = max(map(len, categories), default=0)
     width = 5.2 if len(chart.panels) == 1 else 3.4  # one panel shares its width with the legend
+    columns = min(len(chart.panels), _COLUMNS)
+    rows = -(-len(chart.panels) // _COLUMNS)
     figure = new_figure(
-        len(chart.panels),
-        width + max(0.0, 0.08 * longest - 1.0) / len(chart.panels),
-        max(3.2, 1.2 + 0.4 * len(categories)),
+        columns,
+        width + max(0.0, 0.08 * longest - 1.0) / columns,
+        rows * max(3.2, 1.2 + 0.4 * len(categories)),
     )
-    axes = figure.subplots(1, len(chart.panels), squeeze=False)[0]
-    for ax, panel in zip(axes, chart.panels, strict=True):
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for ax, panel in zip(axes, chart.panels, strict=False):
         _draw_panel(ax, panel, names)
-    for ax in axes[1:]:
-        if categories:
+    for ax in axes[len(chart.panels) :]:
+        ax.remove()
+    for k, ax in enumerate(axes):
+        if categories and k % columns:
             ax.tick_params(labelleft=False)
     handles: dict[str, Any] = {}
     for ax in axes:
@@ -61,7 +67,8 @@ def draw(chart: Chart) -> Figure:
         place: Any = "outside lower left" if is_long else "outside right upper"
         figure.legend(list(named.values()), list(named), loc=place, fontsize="small")
         if is_long:
-            figure.set_size_inches(max(figure.get_figwidth(), 6.0), 3.2 + 0.2 * len(named))
+            height = 3.2 * rows + 0.2 * len(named)
+            figure.set_size_inches(max(figure.get_figwidth(), 6.0), height)
     caption(figure, chart.caption)
     return figure
 
@@ -103,8 +110,8 @@ def _draw_series(
         ax.set_xticks(range(len(x)), [str(value) for value in series.x])
         x = list(places)
     else:
-        ax.plot(x, y, color=color, label=None if series.mode == "dots" else label,
-                **_LOOKS[series.mode])  # fmt: skip
+        look = {"color": color, **_LOOKS[series.mode]}
+        ax.plot(x, y, label=None if series.mode == "dots" else label, **look)
     if not series.low:
         return
     is_flat = not panel.y  # categories on the y axis: the interval is along x

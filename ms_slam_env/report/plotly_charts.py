@@ -207,6 +207,8 @@ def _traces(
         trace |= {"type": "scatter", "mode": series.mode, "marker": marker, "line": line}
     if series.mode == "dots":
         trace |= {"mode": "markers", "opacity": 0.5, "marker": {**trace["marker"], "size": 5}}
+    if series.mode == "dashes":
+        trace |= {"mode": "lines", "line": {"color": _GUIDE, "dash": "dash", "width": 2}}
     along = "x" if categories["y"] else "y"
     if not series.low or categories[along]:
         return [trace]

@@ -23,6 +23,21 @@ Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class Loop:
+    """What a closed loop says: where the camera is beside a place that it had left.
+
+    Attributes:
+        reference: number of an old frame of that place, as ``SlamBackend.frames_counted`` counts.
+        T_reference_camera: (4, 4) pose of the camera in that frame's.
+        bent: whether the map was bent; it is not where all but fits already.
+    """
+
+    reference: int
+    T_reference_camera: Float64
+    bent: bool = True
+
+
+@dataclass(frozen=True)
 class TrackResult:
     """What SLAM says after one frame.
 
@@ -38,6 +53,8 @@ class TrackResult:
         reason: why tracking failed, in words; empty when it did not.
         loop_closed: whether this frame closed a loop: the map was bent, and the pose jumped by the
             drift that was taken back.
+        loop: what that loop says, also of one that all but fitted and bent nothing; None: there was
+            none.
         degenerate_directions: number of directions of the pose, of six, that the view does not
             constrain, as in front of a blank wall; along them the pose is only predicted.
         covariance: (6, 6) of the pose relative to the map, whose own drift is not part of it: of
@@ -77,6 +94,7 @@ class TrackResult:
         return self.degenerate_directions > 0
 
     loop_closed: bool = False
+    loop: Loop | None = None
     processed: bool = True
     submap: int = 0
     submaps_joined: bool = False
@@ -192,11 +210,16 @@ class SlamBackend(Stateful):
 
     @property
     def frames_counted(self) -> int:
-        """Number of the next frame as ``corrected_trajectory`` and ``submaps`` count them.
+        """Number of the next frame as corrected poses, submaps and closed loops count them.
 
-        0 by a backend that corrects no poses.
+        0 by a backend that has none of them.
         """
         return 0
+
+    @property
+    def closes_loops(self) -> bool:
+        """Whether it says so where it comes back to a place (``TrackResult.loop``)."""
+        return False
 
     def mark_lost(self) -> None:
         """The camera may be anywhere in the map: seek the next frame as one after lost tracking.

@@ -160,7 +160,7 @@ def test_places_that_only_look_alike_are_refused() -> None:
     closed = system.loops.close(
         live, system.poses, np.array([60], np.int32), np.array([True]), lambda env, limit: wrong
     )
-    assert not closed.any()
+    assert not closed
     np.testing.assert_array_equal(
         system.map.get_state()["surfels"][0]["position"], before["surfels"][0]["position"]
     )

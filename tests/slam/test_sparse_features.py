@@ -193,7 +193,7 @@ def _map(rng: np.random.Generator) -> SparseMap:
         if k == 1:
             ids[5:] = np.arange(5)
         pose = make_pose(np.eye(3), [0.1 * k, 0, 0])
-        sparse_map.add(Keyframe(pose, k == 0, features, ids, color, intensity, depth))
+        sparse_map.add(Keyframe(pose, k == 0, k, features, ids, color, intensity, depth))
     return sparse_map
 
 

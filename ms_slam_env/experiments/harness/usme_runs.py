@@ -14,14 +14,16 @@ from ms_slam_env import metrics, scenes, slam
 from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.config import parse_named
 from ms_slam_env.errors import InputError
+from ms_slam_env.evaluation.loop_closures import find_revisits, loop_measures
 from ms_slam_env.evaluation.map_quality import ComparedMap
 from ms_slam_env.evaluation.run_sequence import SequenceRun, run_sequence
+from ms_slam_env.evaluation.trajectory_charts import thinned
 from ms_slam_env.geometry import transform_points
 from ms_slam_env.scenes import Scene
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sequences import RenderedSequence
 from ms_slam_env.sequences.recording import open_recording, recorded_sequence
-from ms_slam_env.sequences.usme_suite import find, render
+from ms_slam_env.sequences.usme_suite import UsmeSequence, find, render
 
 Float64 = NDArray[np.float64]
 
@@ -45,6 +47,8 @@ was lost 66 frames into a city street (seed 1000, 160x120), with these never.
 """
 
 _WARM_UP = 5  # frames left out of the timing: buffers grow, kernels are loaded
+_LOOP_VIEW_SIZE = "80x60"  # of the true depth by which places are seen again
+_PATH_POINTS = 200  # of a path, that are drawn
 _VIEW_EVERY_M = 1.5  # along the true path, for the true surface
 _VIEW_SIZE = "320x240"
 _MOST_VIEWS = 150
@@ -80,13 +84,14 @@ def run_usme(spec: UsmeSpec) -> dict[str, Any]:
         equations 1 to 5, the last pose's error over the path, the finished map's poses. Map, after
         outlier removal (6) and ICP: distances, ``hausdorff_directed_m`` (7, what the map has too
         much), ``recall_near``, ``noise_ratio`` (8). Robustness (9 to 11, infinite: never found
-        again). Start (12, 13). Cost: all of ``CostMeter.summary``.
+        again), and of a backend that closes loops all of ``loop_measures``. Start (12, 13). Cost:
+        all of ``CostMeter.summary``. Paths, to be drawn.
     """
     entry = find(spec.sequence)
     scene = scenes.make(entry.scene, spec.seed)
     sequence = render(entry, scene, spec.image_size, spec.frames_scale)
     name, params = parse_named(spec.backend, "backend")
-    options = {**slam_options(entry.scene, name), **params}
+    options = {**slam_options(entry, name), **params}
     costs = metrics.CostMeter(str(options.get("device", "cpu")))
     system = slam.make(name, sequence.intrinsics, **options)
     black: list[bool] = []
@@ -104,6 +109,10 @@ def run_usme(spec: UsmeSpec) -> dict[str, Any]:
     end_error = float(np.linalg.norm(poses[-1, :3, 3] - truth[-1, :3, 3]))
     path = metrics.path_length(truth)
     surface = _seen_surface(scene, sequence.poses, options)
+    loops: dict[str, Any] = {}
+    if system.closes_loops:
+        loops = _loop_measures(run, scene, truth, options)
+    drawn = thinned(len(poses), _PATH_POINTS)
     return {
         "frames": len(poses),
         "duration_s": float(seconds[-1] - seconds[0]),
@@ -125,12 +134,39 @@ def run_usme(spec: UsmeSpec) -> dict[str, Any]:
         "scale_error": start.scale_error,
         **costs.summary(skip=min(_WARM_UP, len(poses) - 1)),
         **map_measures(system.surface_points(), surface, entry.scene),
+        **loops,
+        **_positions("path", poses[drawn]),
+        **_positions("true", truth[drawn]),
     }
 
 
-def slam_options(scene: str, backend: str) -> dict[str, Any]:
-    """Options of ``backend`` in ``scene``; none in rooms."""
-    return dict(LARGE_OPTIONS.get(backend, {})) if scene in scenes.LARGE_SCENES else {}
+def slam_options(sequence: UsmeSequence, backend: str) -> dict[str, Any]:
+    """Options of ``backend``: those of large scenes, and a mask where something moves."""
+    is_large = sequence.scene in scenes.LARGE_SCENES
+    options = dict(LARGE_OPTIONS.get(backend, {})) if is_large else {}
+    if backend == "surfel" and any(t.startswith("moving-objects") for t in sequence.perturbations):
+        options["motion_mask"] = "geometric"
+    return options
+
+
+def _positions(name: str, poses: Float64) -> dict[str, list[float]]:
+    return {f"{name}_{axis}_m": np.round(poses[:, k, 3], 3).tolist() for k, axis in enumerate("xy")}
+
+
+def _loop_measures(
+    run: SequenceRun, scene: Scene, truth: Float64, options: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Precision and recall of the loops of a run, by true views without moving objects."""
+    sensor = RGBDSensor(scene, xtion(_LOOP_VIEW_SIZE), noise="none")
+    depths = np.stack([sensor.ground_truth(pose).depth for pose in truth])
+    seconds = np.array(run.timestamps)
+    revisits = find_revisits(depths, sensor.intrinsics, truth, seconds, _reach_m(options))
+    loops = {k: result.loop for k, result in enumerate(run.results) if result.loop is not None}
+    return dict(loop_measures(loops, truth, revisits, 5 * voxel_m(scene.name)))
+
+
+def _reach_m(options: Mapping[str, Any]) -> float:
+    return float(options.get("depth_cutoff_m", 8.0))
 
 
 def _frames(sequence: RenderedSequence, folder: str | None) -> Iterator[RGBDFrame]:
@@ -170,8 +206,7 @@ def _seen_surface(scene: Scene, poses: Float64, options: dict[str, Any]) -> Floa
     count = int(min(_MOST_VIEWS, max(20, walked[-1] / _VIEW_EVERY_M)))
     picked = np.searchsorted(walked, np.linspace(0.0, walked[-1], count))
     sensor = RGBDSensor(scene, xtion(_VIEW_SIZE), noise="none")
-    reach = float(options.get("depth_cutoff_m", 8.0))
-    voxel = voxel_m(scene.name)
+    reach, voxel = _reach_m(options), voxel_m(scene.name)
     clouds = []
     for index in np.unique(picked):
         view = sensor.ground_truth(poses[index])

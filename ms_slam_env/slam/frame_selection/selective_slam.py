@@ -187,13 +187,16 @@ class SelectiveSlam(Saved, BorrowedMap):
         before, dropped = self._last, self._dropped
         self._processed.append(self._frames)
         self._frames += 1
-        self._last = result
+        self._last = replace(result, loop=None)
         jumped = result.relocalised or result.loop_closed or result.submaps_joined
         moved = False
         if before is not None and before.submap == result.submap:
             moved = before.tracking_ok and result.tracking_ok and not jumped
         self._prediction.observe(result.T_world_camera, dropped + 1, moved)
-        return result
+        if result.loop is None:
+            return result
+        reference = self._processed[result.loop.reference]
+        return replace(result, loop=replace(result.loop, reference=reference))
 
     def _drop(self, known_pose: ArrayLike | None) -> TrackResult:
         """Say what can be said of a frame that is not processed."""
@@ -237,6 +240,11 @@ class SelectiveSlam(Saved, BorrowedMap):
     def needs_color(self) -> bool:
         """Whether the backend needs it."""
         return self.backend.needs_color
+
+    @property
+    def closes_loops(self) -> bool:
+        """Whether the backend does."""
+        return self.backend.closes_loops
 
     def mark_lost(self) -> None:
         """Show the backend the next frame, and let it seek it in the map."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.geometry import invert, relative_angle
-from ms_slam_env.slam.base import Float64
+from ms_slam_env.slam.base import Float64, Loop
 from ms_slam_env.slam.feature_matching import most_alike
 from ms_slam_env.slam.point_poses import orthonormal
 from ms_slam_env.slam.sparse.config import SparseConfig
@@ -71,16 +71,15 @@ class LoopCloser(Stateful):
         self._config = config
         self.edges: list[Edge] = []  # of all loops closed so far
 
-    def close(self, keyframe: int, frame: LiveFrame) -> bool:
-        """Close a loop at the keyframe made of ``frame``; whether there was one."""
+    def close(self, keyframe: int, frame: LiveFrame) -> Loop | None:
+        """Close a loop at the keyframe made of ``frame``; None if there is none."""
         for candidate in self._candidates(keyframe):
             T = self._localizer.by_looks(frame, candidate)
             fix = None if T is None else self._localizer.near(frame, T, candidate)
             if fix is None or self._localizer.verify(fix, frame).reason:
                 continue
-            self._join(keyframe, fix)
-            return True
-        return False
+            return self._join(keyframe, fix)
+        return None
 
     def _candidates(self, keyframe: int) -> list[int]:
         """Old keyframes that look like one and do not see its points already."""
@@ -95,7 +94,7 @@ class LoopCloser(Stateful):
         alike = most_alike(frames[keyframe].thumbnail, looks, _CANDIDATES)
         return [rest[index] for index in alike]
 
-    def _join(self, keyframe: int, fix: Fix) -> None:
+    def _join(self, keyframe: int, fix: Fix) -> Loop:
         """Bend the trajectory so that the loop closes, then let both ends see the same points."""
         frames = self._map.keyframes
         known = frames[fix.reference].T_world_camera
@@ -109,6 +108,7 @@ class LoopCloser(Stateful):
         if is_off:
             self._bend()
         self._share_points(keyframe, fix)
+        return Loop(frames[fix.reference].frame, motion, bool(is_off))
 
     def _bend(self) -> None:
         frames = self._map.keyframes

@@ -28,6 +28,7 @@ class Keyframe:
 
     T_world_camera: Float64  # (4, 4) its pose; optimisation moves it
     known: bool  # whether the pose was given; optimisation leaves it
+    frame: int  # number of the frame
     features: Features  # N features
     point_ids: Int64  # (N,) the point that each shows; -1 = none
     color: NDArray[np.uint8]  # (H, W, 3) uint8
@@ -155,7 +156,7 @@ _OF_FEATURES = ("pixels", "inverse_depth", "descriptors", "scale")
 
 def _save(keyframe: Keyframe) -> dict[str, Any]:
     saved: dict[str, Any] = {name: getattr(keyframe, name).copy() for name in _OF_KEYFRAME}
-    saved["known"] = keyframe.known
+    saved |= {"known": keyframe.known, "frame": keyframe.frame}
     for name in _OF_FEATURES:
         saved[name] = getattr(keyframe.features, name).copy()
     return saved
@@ -164,4 +165,4 @@ def _save(keyframe: Keyframe) -> dict[str, Any]:
 def _restore(saved: dict[str, Any]) -> Keyframe:
     features = Features(**{name: saved[name].copy() for name in _OF_FEATURES})
     own = {name: saved[name].copy() for name in _OF_KEYFRAME}
-    return Keyframe(known=saved["known"], features=features, **own)
+    return Keyframe(known=saved["known"], frame=saved["frame"], features=features, **own)

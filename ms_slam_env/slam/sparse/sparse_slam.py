@@ -8,14 +8,16 @@ neighbours, and close loops. What a frame shows beyond its corners is the busine
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.geometry import relative_angle
 from ms_slam_env.slam.alignment_measures import DepthImage
-from ms_slam_env.slam.base import BorrowedMap, Float64
+from ms_slam_env.slam.base import BorrowedMap, Float64, Loop, TrackResult
 from ms_slam_env.slam.feature_matching import most_alike, thumbnail
 from ms_slam_env.slam.features import FeatureExtractor, InverseDepth
 from ms_slam_env.slam.sparse.config import SparseConfig
@@ -86,7 +88,7 @@ _BESIDE = 2  # keyframes beside the guess in which it is sought
 class SparseSlam(BorrowedMap, FrameByFrameSlam[LiveFrame, Fix]):
     """The sparse SLAM of one camera."""
 
-    saved = (*FrameByFrameSlam.saved, "_reference", "_map", "_loops", "_dense")
+    saved = (*FrameByFrameSlam.saved, "_reference", "_frame", "_map", "_loops", "_dense")
 
     def __init__(self, intrinsics: Intrinsics, config: SparseConfig | None = None) -> None:
         """Start empty at the identity pose."""
@@ -114,7 +116,8 @@ class SparseSlam(BorrowedMap, FrameByFrameSlam[LiveFrame, Fix]):
         return f"fewer than {self.config.least_matches} of the frame's corners match the map"
 
     def _clear(self) -> None:
-        self._reference = 0
+        self._reference = self._frame = 0
+        self._loop: Loop | None = None  # that the frame in hand has closed
         self._map = SparseMap(self.intrinsics)
         self._localizer = Localizer(self._map, self.config)
         self._loops = LoopCloser(self._map, self._localizer, self.config)
@@ -129,6 +132,30 @@ class SparseSlam(BorrowedMap, FrameByFrameSlam[LiveFrame, Fix]):
     def loops_closed(self) -> int:
         """Number of loops closed."""
         return len(self._loops.edges)
+
+    @property
+    def closes_loops(self) -> bool:
+        """Whether they are sought."""
+        return self.config.loops
+
+    @property
+    def frames_counted(self) -> int:
+        """Number of the next frame."""
+        return self._frame
+
+    def track(self, frame: RGBDFrame, T_world_camera_guess: ArrayLike | None = None) -> TrackResult:
+        """Estimate the pose of ``frame`` and extend the map; see ``SlamBackend``."""
+        return self._counted(super().track(frame, T_world_camera_guess))
+
+    def fuse(self, frame: RGBDFrame, T_world_camera: ArrayLike) -> TrackResult:
+        """Make ``frame`` a keyframe at a known pose (4, 4), without tracking."""
+        return self._counted(super().fuse(frame, T_world_camera))
+
+    def _counted(self, result: TrackResult) -> TrackResult:
+        """Count a frame; the result with the loop that it has closed."""
+        loop, self._loop = self._loop, None
+        self._frame += 1
+        return replace(result, loop=loop, loop_closed=loop is not None and loop.bent)
 
     def _prepare(self, frame: RGBDFrame) -> LiveFrame:
         depth = frame.depth.astype(np.float32)
@@ -213,6 +240,7 @@ class SparseSlam(BorrowedMap, FrameByFrameSlam[LiveFrame, Fix]):
         keyframe = Keyframe(
             T_world_camera=self._pose,
             known=known,
+            frame=self._frame,
             features=features,
             point_ids=point_ids,
             color=frame.color.copy(),
@@ -221,7 +249,9 @@ class SparseSlam(BorrowedMap, FrameByFrameSlam[LiveFrame, Fix]):
         )
         self._reference = index = self._map.add(keyframe)
         adjust_around(self._map, index, self.config)
-        if self.config.loops and self._loops.close(index, live.showing(features)):
+        if self.config.loops:
+            self._loop = self._loops.close(index, live.showing(features))
+        if self._loop is not None:
             adjust_around(self._map, index, self.config)
         self._pose = keyframe.T_world_camera.copy()
         self._dense.place(self._map.keyframes)

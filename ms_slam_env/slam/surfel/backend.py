@@ -145,6 +145,11 @@ class SurfelSlam(SlamBackend):
         """Number of the next frame, as trajectory and submaps count them."""
         return self._slam.last_frame() + 1
 
+    @property
+    def closes_loops(self) -> bool:
+        """Whether the map is bent where it comes back to a place."""
+        return self.config.loop_closure != "none"
+
     def mark_lost(self) -> None:
         """Seek the next frame in the map, near the last pose and at keyframes like it."""
         self._slam.mark_lost()

@@ -18,7 +18,8 @@ A closed loop makes the estimated pose jump by the drift that it takes back.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,7 @@ from numpy.typing import NDArray
 from ms_slam_env._warp import wp
 from ms_slam_env.geometry import invert
 from ms_slam_env.slam.alignment_check import TrackingStatus
+from ms_slam_env.slam.base import Loop
 from ms_slam_env.slam.ferns import Candidate
 from ms_slam_env.slam.state import Saved
 from ms_slam_env.slam.surfel.acceptance import Alignment, acceptance_thresholds
@@ -79,12 +81,12 @@ class LoopClosure(Saved):
 
     def close(
         self, live: LiveFrame, poses: Float64, time: Int32, tracked: Bool, similar: SimilarViews
-    ) -> Bool:
-        """Look for loops after the frames ``time`` (B,) were recorded; which envs (B,) closed one.
+    ) -> Mapping[int, Loop]:
+        """Look for loops after the frames ``time`` (B,) were recorded; those closed, by env.
 
         Maps and ``poses`` (B, 4, 4) are corrected in place.
         """
-        return np.zeros(self.batch, dtype=bool)
+        return {}
 
     def trajectory(self, env: int) -> tuple[Int32, Float64]:
         """Fused frames (N,) and their poses (N, 4, 4) as the closures since have moved them.
@@ -219,26 +221,26 @@ class DeformationLoopClosure(LoopClosure):
 
     def close(
         self, live: LiveFrame, poses: Float64, time: Int32, tracked: Bool, similar: SimilarViews
-    ) -> Bool:
+    ) -> Mapping[int, Loop]:
         """Look for loops where it is time to, and close them; see the base class."""
-        closed = np.zeros(self.batch, dtype=bool)
+        found: dict[int, Loop | None] = {}
         due = tracked & (time > self.config.window) & (time % self.config.interval == 0)
         if not due.any():
-            return closed
+            return {}
         self._window.seen_to.assign(time - self.config.window - 1)
         self._registration.set_frame(live)
         near = self._registration.covered(poses, due)
         if near.any():
             there = self._registration.near(poses)
             for env in np.flatnonzero(near & there.tracked):
-                closed[env] = self._close(int(env), poses, there)
+                found[int(env)] = self._close(int(env), poses, there)
                 due[env] = False
         due &= time % self.config.global_interval == 0
         for env in np.flatnonzero(due):
-            closed[env] = self._close_from_keyframes(int(env), poses, similar)
-        return closed
+            found[int(env)] = self._close_from_keyframes(int(env), poses, similar)
+        return {env: loop for env, loop in found.items() if loop is not None}
 
-    def _close_from_keyframes(self, env: int, poses: Float64, similar: SimilarViews) -> bool:
+    def _close_from_keyframes(self, env: int, poses: Float64, similar: SimilarViews) -> Loop | None:
         """Look for the frame where similar ones were taken, and close a loop there."""
         history = self._histories[env]
         for candidate in similar(env, history.last - self.config.window):
@@ -256,27 +258,28 @@ class DeformationLoopClosure(LoopClosure):
             drift = np.linalg.norm(there.T_world_live[env, :3, 3] - poses[env, :3, 3])
             if there.tracked[env] and drift <= allowed_m:
                 return self._close(env, poses, there)
-        return False
+        return None
 
-    def _close(self, env: int, poses: Float64, there: Alignment) -> bool:
-        """Deform map, pose and history of one env; returns whether that was accepted and done."""
+    def _close(self, env: int, poses: Float64, there: Alignment) -> Loop | None:
+        """Deform map, pose and history of one env; returns the loop if it was accepted."""
         history, corrected = self._histories[env], there.T_world_live[env]
+        loop = history.loop_at(corrected, history.last - self.config.window)
         drift = motion_size(invert(poses[env]) @ corrected)
         if drift < self.config.smallest_m:
             self._deformer.join_parts(env, poses[env], history.last)
-            return False
+            return replace(loop, bent=False)
         if drift < SIGNIFICANT * there.statistics["sigma_m"][env] or not history.confirms(
             poses[env], corrected, self.config.agreement_m, 2 * self.config.global_interval
         ):
-            return False
+            return None
         deformed = self._deformer.deform(env, poses[env], corrected, history.joined)
         if deformed is None:
-            return False
+            return None
         deformation, joined = deformed
         history.move(deformation, joined, corrected)
         poses[env] = corrected
         self._deformer.join_parts(env, corrected, history.last)
-        return True
+        return loop
 
     def trajectory(self, env: int) -> tuple[Int32, Float64]:
         """Tracked frames (N,) and their poses (N, 4, 4), moved by the closures since."""

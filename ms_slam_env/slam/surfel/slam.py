@@ -224,13 +224,15 @@ class BatchedSurfelSlam(Saved):
 
         tracked = np.array([result.fused for result in results])
         closed = self.loops.close(live, self.poses, self._states.time - 1, tracked, similar)
-        for env in np.flatnonzero(closed):
-            self._last_frames.move(int(env), self.poses[env])
-            self.relocalization.move_keyframes(int(env), *self.loops.trajectory(int(env)))
-            self.motion_mask.forget(int(env))  # the map and the earlier frames no longer agree
-            results[env] = replace(
-                results[env], T_world_camera=self.poses[env].copy(), loop_closed=True
-            )
+        for env, loop in closed.items():
+            results[env] = replace(results[env], loop=loop)
+            if not loop.bent:
+                continue
+            self._last_frames.move(env, self.poses[env])
+            self.relocalization.move_keyframes(env, *self.loops.trajectory(env))
+            self.motion_mask.forget(env)  # the map and the earlier frames no longer agree
+            pose = self.poses[env].copy()
+            results[env] = replace(results[env], T_world_camera=pose, loop_closed=True)
         return results
 
     # -- Maps that come and go ---------------------------------------------------------------

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.geometry import invert, relative_angle, transform_points
-from ms_slam_env.slam.base import Float64
+from ms_slam_env.slam.base import Float64, Loop
 from ms_slam_env.slam.rows import join
 from ms_slam_env.slam.state import Saved
 from ms_slam_env.slam.surfel.deformation_graph import Constraints, Deformation, no_constraints
@@ -54,6 +54,13 @@ class TrajectoryHistory(Saved):
         self.poses.append(pose.copy())
         self.anchors.append(points)
         self.anchor_times.append(times)
+
+    def loop_at(self, pose: Float64, before: int) -> Loop:
+        """What a camera found at ``pose`` (4, 4) says: the frame ``before`` one that is nearest."""
+        count = max(1, int(np.searchsorted(self.frames, before)))
+        motions = invert(np.stack(self.poses[:count])) @ pose
+        nearest = int(np.argmin([motion_size(T) for T in motions]))
+        return Loop(self.frames[nearest], motions[nearest])
 
     def confirms(self, pose: Float64, corrected: Float64, agreement_m: float, memory: int) -> bool:
         """Whether the last loop found within ``memory`` frames asks for the same correction.
