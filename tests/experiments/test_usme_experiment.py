@@ -13,7 +13,7 @@ from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
 from ms_slam_env.experiments import usme
 from ms_slam_env.experiments.harness import running, usme_runs
-from ms_slam_env.sequences.usme_suite import NAMES
+from ms_slam_env.sequences.usme_suite import NAMES, find
 
 make_scene = cache(scenes.make)
 
@@ -25,16 +25,19 @@ def cheap(monkeypatch):
     monkeypatch.setattr(usme_runs, "_VIEW_SIZE", "80x60")
 
 
-def test_options_of_a_backend_are_those_of_the_scene():
-    assert usme_runs.slam_options("living_room", "surfel") == {}
+def test_options_of_a_backend_are_those_of_the_sequence():
+    assert usme_runs.slam_options(find("room-fast"), "surfel") == {}
     for backend in slam.BACKENDS:
-        options = usme_runs.slam_options("city_street", backend)
+        options = usme_runs.slam_options(find("city-traffic"), backend)
         assert options["depth_cutoff_m"] == 10.0
+        assert options.get("motion_mask") == ("geometric" if backend == "surfel" else None)
+    assert "motion_mask" not in usme_runs.slam_options(find("residential-no-loop"), "surfel")
 
 
 @pytest.mark.usefixtures("cheap")
 def test_one_run_has_every_measure():
-    spec = usme_runs.UsmeSpec("room-fast-black", "surfel", "80x60", SEED, frames_scale=0.12)
+    backend = "surfel,loop_closure=deformation"
+    spec = usme_runs.UsmeSpec("room-fast-black", backend, "80x60", SEED, frames_scale=0.12)
     result = usme_runs.run_usme(spec)
     assert result["frames"] > 30
     assert 0.0 <= result["lost_share"] <= 1.0
@@ -44,11 +47,19 @@ def test_one_run_has_every_measure():
     assert 0.0 <= result["noise_ratio"] < 1.0
     assert result["hausdorff_directed_m"] >= result["c2c_mean_m"] > 0.0
     assert result["ene_source"]
-    row = {"spec": {"sequence": "room-fast-black", "backend": "surfel"}}
+    assert result["revisits"] <= result["revisiting_frames"] < result["frames"]
+    assert len(result["path_x_m"]) == len(result["true_y_m"]) == result["frames"]
+    assert result["true_x_m"][0] == result["path_x_m"][0]  # it starts at the true pose
+    row = {"spec": {"sequence": "room-fast-black", "backend": backend}}
     failed = {**row, "result": None, "error": "InputError: no"}
     tables = usme.Usme().tables([{**row, "result": result, "error": None}, failed])
     assert [table.title for table in tables] == ["Sequences", *usme.TABLES]
-    assert [len(table.rows) for table in tables] == [1] * 5
+    assert [len(table.rows) for table in tables] == [1] * 6
+    _, paths = usme.Usme().charts([{**row, "result": result, "error": None}, failed])
+    assert [series.name for series in paths.panels[0].series] == [backend, "truth"]
+    del result["loop_recall"]  # of a backend that closes no loops nothing is said of them
+    closes_none = usme.Usme().tables([{**row, "result": result, "error": None}])
+    assert [len(table.rows) for table in closes_none] == [1, 1, 1, 1, 0, 1]
     assert tables[0].rows[0]["about"] == "the same with a run of black frames"
 
 

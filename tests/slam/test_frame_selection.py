@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from ms_slam_env.divergence import DivergenceConfig, depth_divergence, intensity
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, look_at, make_pose, se3_exp, se3_log, so3_exp
 from ms_slam_env.sensor import RGBDSensor
-from ms_slam_env.slam.base import SlamBackend, TrackResult, Views
+from ms_slam_env.slam.base import Loop, SlamBackend, TrackResult, Views
 from ms_slam_env.slam.frame_selection import (
     BudgetConfig,
     DivergenceFilterConfig,
@@ -352,6 +353,16 @@ def test_a_dropped_frame_moves_on_as_far_as_the_last_motion():
     after_loop = managed.track(_black())  # the jump of a closed loop is no motion
     assert not after_loop.loop_closed
     np.testing.assert_array_equal(after_loop.T_world_camera, poses[2])
+
+
+def test_a_loop_is_stated_by_the_numbers_of_all_frames():
+    backend = Recorder()
+    first, loop = TrackResult(np.eye(4), True), Loop(1, np.eye(4))
+    backend.answers = [first, first, TrackResult(np.eye(4), True, loop=loop)]
+    managed = make_config("regular", every=2).manage(backend)
+    results = [managed.track(_black()) for _ in range(6)]
+    stated = [(k, result.loop) for k, result in enumerate(results) if result.loop]
+    assert stated == [(4, replace(loop, reference=2))]  # frames 0, 2 and 4 are processed
 
 
 def test_a_stopped_camera_is_not_carried_on(frames):

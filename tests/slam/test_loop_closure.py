@@ -83,6 +83,12 @@ def test_a_drifted_turn_is_closed(turn: tuple[list[RGBDFrame], np.ndarray]) -> N
         closed = result.loop_closed
         last += 1
     estimate = result.T_world_camera
+    loop = result.loop
+    assert loop is not None
+    assert loop.bent
+    assert loop.reference < last - CONFIG.loops.window
+    stated = poses[loop.reference] @ loop.T_reference_camera
+    assert errors(stated, poses[last - 1]) < 0.005
     assert errors(drifted(poses)[last - 1], poses[last - 1]) > 0.02
     assert errors(estimate, poses[last - 1]) < 0.005
     assert relative_angle(estimate[:3, :3], poses[last - 1][:3, :3]) < np.radians(0.3)
@@ -106,6 +112,11 @@ def test_what_is_in_place_is_taken_back_without_a_jump(
         system.fuse(*images(frames, k), poses[k][None])
     results = [system.track(*images(frames, k))[0] for k in range(KNOWN, TURN + 10)]
     assert not any(result.loop_closed for result in results)
+    stated = [(k, result.loop) for k, result in enumerate(results, KNOWN) if result.loop]
+    assert stated
+    for k, loop in stated:
+        assert not loop.bent
+        assert errors(poses[loop.reference] @ loop.T_reference_camera, poses[k]) < 0.005
     unclosed = BatchedSurfelSlam(
         1, CAMERA, replace(CONFIG, loops=LoopConfig(window=20, coverage=1))
     )

@@ -67,12 +67,23 @@ def _errors_m(results: list[slam.TrackResult], poses: np.ndarray) -> np.ndarray:
 def _close(
     circle: tuple[np.ndarray, list[RGBDFrame]], state: dict[str, Any], loops: bool
 ) -> tuple[SparseSlam, np.ndarray]:
-    """The backend after the rest of the turn, and the errors of the frames in it."""
+    """The backend after the rest of the turn, and the errors of the frames in it.
+
+    Every loop is stated by the frame that closed it, as it truly is.
+    """
     poses, frames = circle
     backend = SparseSlam(CAMERA, SparseConfig(loops=loops))
     backend.set_state(state)
     results = [backend.track(frame) for frame in frames[OPEN:]]
     assert all(result.tracking_ok for result in results)
+    stated = [(k, result.loop) for k, result in enumerate(results, OPEN) if result.loop]
+    assert len(stated) == backend.loops_closed
+    for k, loop in stated:
+        assert loop.reference < OPEN
+        error = invert(poses[k]) @ poses[loop.reference] @ loop.T_reference_camera
+        assert np.linalg.norm(error[:3, 3]) < 0.02
+        assert relative_angle(error[:3, :3], np.eye(3)) < np.radians(1.0)
+        assert results[k - OPEN].loop_closed == loop.bent
     return backend, _errors_m(results, poses[OPEN:])
 
 
