@@ -30,7 +30,7 @@ class Series:
         low: (n,) lower ends of an interval around ``y`` (around ``x`` where ``y`` are names).
         high: (n,) upper ends.
         mode: ``lines``, ``markers``, ``lines+markers``, ``bars``; ``dots`` are small and pale,
-            ``dashes`` a grey line, such as a truth.
+            ``dashes`` a broken line of no colour, such as a truth.
         text: (n,) what each point is, shown on pointing at it.
     """
 

@@ -20,7 +20,7 @@ from ms_slam_env.report.charts import Chart, Panel, Series
 
 _LOOKS: dict[str, dict[str, Any]] = {
     "lines": {"linestyle": "-"},
-    "dashes": {"linestyle": "--", "color": "0.35", "zorder": 3},
+    "dashes": {"linestyle": "--", "color": "0.1", "zorder": 3},
     "lines+markers": {"linestyle": "-", "marker": "o", "markersize": 4},
     "markers": {"linestyle": "", "marker": "o"},
     "dots": {"linestyle": "", "marker": ".", "markersize": 5, "alpha": 0.35},
@@ -65,9 +65,10 @@ def draw(chart: Chart) -> Figure:
     if len(named) > 1:
         is_long = max(map(len, named)) > _LONG_NAME
         place: Any = "outside lower left" if is_long else "outside right upper"
-        figure.legend(list(named.values()), list(named), loc=place, fontsize="small")
+        beside = max(1, columns - 1) if is_long else 1
+        figure.legend(list(named.values()), list(named), loc=place, fontsize="small", ncols=beside)
         if is_long:
-            height = 3.2 * rows + 0.2 * len(named)
+            height = 3.2 * rows + 0.2 * -(-len(named) // beside)
             figure.set_size_inches(max(figure.get_figwidth(), 6.0), height)
     caption(figure, chart.caption)
     return figure

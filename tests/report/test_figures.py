@@ -7,6 +7,8 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from ms_slam_env.report import figures
+from ms_slam_env.report.charts import Chart, Panel, Series
+from ms_slam_env.report.plotly_charts import plots_of
 
 
 @pytest.mark.parametrize(
@@ -28,3 +30,18 @@ def test_labels_of_a_logarithmic_axis_are_plain_and_apart(ends, width):
     boxes = sorted((label.get_window_extent() for label in labels), key=lambda box: box.x0)
     gaps = np.array([b.x0 - a.x1 for a, b in itertools.pairwise(boxes)])
     assert (gaps > 2).all()
+
+
+def test_many_panels_stand_in_rows_of_four_and_a_truth_is_dashed():
+    lines = [Series("estimate", [0, 1], [0, 1], mode="lines"),
+             Series("truth", [0, 1], [0, 2], mode="dashes")]  # fmt: skip
+    panels = [Panel("position_x_m", "position_y_m", lines, title=str(k)) for k in range(6)]
+    chart = Chart("paths", "Paths", "", panels)
+    axes = figures.draw(chart).axes
+    assert [ax.get_title() for ax in axes] == [str(k) for k in range(6)]
+    tops = [round(ax.get_subplotspec().rowspan.start) for ax in axes]
+    assert tops == [0, 0, 0, 0, 1, 1]
+    assert [line.get_linestyle() for line in axes[5].lines] == ["-", "--"]
+    estimate, truth = plots_of(chart)[0].data
+    assert (estimate["line"]["dash"], truth["line"]["dash"]) == ("solid", "dash")
+    assert truth["mode"] == "lines"
