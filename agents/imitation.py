@@ -27,7 +27,7 @@ from ms_slam_agents.options import Problem, check_kept, check_new
 from ms_slam_agents.policy import CLIP, EPSILON
 from ms_slam_agents.policy_file import Metadata, PolicyFile, read_policy, write_policy
 from ms_slam_agents.supervisor import LATEST
-from ms_slam_agents.train_sb3 import VALIDATION_SEED, env_options, make_venv
+from ms_slam_agents.train_sb3 import VALIDATION_SEED, env_options, make_venv, problem_options
 from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
 from tqdm import tqdm
 
@@ -79,14 +79,7 @@ class Args(Problem):
 
 def tasks(args: Args, number: int) -> list[Task]:
     """The episodes of a round, each with a seed of its own."""
-    options = {
-        "max_episode_steps": args.episode_steps,
-        "scene": args.scenes,
-        "split": "train",
-        "num_scene_seeds": args.scene_seeds,
-        "observation": args.observation,
-        **env_options(args),
-    }
+    options = problem_options(args, "train")
     first = _TRAINING_SEED + args.seed * 100_000 + number * args.episodes
     return [
         Task(

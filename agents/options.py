@@ -28,6 +28,9 @@ class Problem(Checked):
         episode_steps: time limit of an episode.
         step_m: translation of a motion; None: the environment's default.
         step_deg: rotation of a motion; None: the environment's default.
+        frames_per_action: frames of a motion of an arm; None: as many as arrive while it moves,
+            some ten. With ``--embodiment arm-kinematic --frames-per-action 1`` a step costs little
+            more than the free camera's: a world to train in before the arm itself (``--init``).
         num_envs: parallel environments, one process and one thread each.
         seed: of network, training episodes and sampling.
         eval_episodes: validation episodes, the same at each evaluation, with the same random
@@ -45,6 +48,7 @@ class Problem(Checked):
     episode_steps: int = bounded(150, 1, 100_000)
     step_m: float | None = None
     step_deg: float | None = None
+    frames_per_action: int | None = bounded(None, 1, 1000)
     num_envs: int = bounded(2, 1, 100_000)
     seed: int = 0
     eval_episodes: int = bounded(24, 1, 100_000)

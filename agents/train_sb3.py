@@ -63,17 +63,23 @@ def make_env(args: Problem, split: str, seeds: Sequence[int]) -> gym.Env[Any, An
     if multiprocessing.parent_process() is not None:  # in a worker Ctrl-C is the main's to answer
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         torch.set_num_threads(1)
-    env = gym.make(
-        args.env_id,
-        max_episode_steps=args.episode_steps,
-        disable_env_checker=True,
-        scene=args.scenes,
-        split=split,
-        num_scene_seeds=args.scene_seeds,
-        observation=args.observation,
-        **env_options(args),
-    )
+    env = gym.make(args.env_id, disable_env_checker=True, **problem_options(args, split))
     return FixedEpisodes(env, seeds) if seeds else env
+
+
+def problem_options(args: Problem, split: str) -> dict[str, Any]:
+    """Options of ``gym.make`` for the episodes of a split."""
+    few = args.frames_per_action
+    return {
+        "max_episode_steps": args.episode_steps,
+        "scene": args.scenes,
+        "split": split,
+        "num_scene_seeds": args.scene_seeds,
+        "observation": args.observation,
+        "frame_divergences": False,  # nobody reads them here
+        **({} if few is None else {"arm": {"frames_per_action": few}}),
+        **env_options(args),
+    }
 
 
 def check_problem(args: Problem) -> None:

@@ -1,13 +1,18 @@
-"""NVIDIA Warp, initialised once: quiet, forward kernels only."""
+"""NVIDIA Warp, initialised once: quiet, forward kernels only; launches and arrays used again."""
 
 import atexit
+import ctypes
 import errno
 import os
 import shutil
 import tempfile
 import warnings
+from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.errors import InputError, InputWarning
 
@@ -64,4 +69,103 @@ if _refused is not None:
         stacklevel=2,
     )
 
-__all__ = ["wp"]
+
+class HostDeviceBuffer:
+    """A device array; on a CPU the host works on its memory.
+
+    There ``assign`` and ``numpy`` of a small array cost 5 to 15 microseconds a call, most of it
+    for finding out what the array is; here that is done once.
+
+    Attributes:
+        array: the device array, zeros at first.
+    """
+
+    def __init__(self, shape: int | tuple[int, ...], dtype: Any, device: str) -> None:
+        self.array = wp.zeros(shape, dtype=dtype, device=device)
+        self._memory: NDArray[Any] | None = None
+        if wp.get_device(device).is_cpu:
+            self._memory = self.array.numpy()
+
+    def write(self, values: ArrayLike) -> None:
+        """Set all values."""
+        if self._memory is None:
+            self.array.assign(values)
+        else:
+            np.copyto(self._memory, values)
+
+    def zero(self) -> None:
+        """Set all values to zero."""
+        if self._memory is None:
+            self.array.zero_()
+        else:
+            self._memory.fill(0)
+
+    def look(self) -> NDArray[Any]:
+        """The values until they change; not to be written to."""
+        return self.array.numpy() if self._memory is None else self._memory
+
+    def read(self) -> NDArray[Any]:
+        """A copy of the values."""
+        return self.look().copy()
+
+
+class RecordedLaunch:
+    """A launch to be repeated, whose arguments are packed once.
+
+    Warp's own recorded launch writes them into a structure anew each time: 2.9 microseconds on one
+    core of an AMD EPYC for seven arguments, where the call of the kernel takes 0.15. Only structs
+    are written anew here too, because their fields may have been set since. On a GPU it is Warp's.
+    """
+
+    def __init__(
+        self, kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], device: str
+    ) -> None:
+        """Record; nothing is launched yet."""
+        self._command = wp.launch(kernel, dim=dim, inputs=inputs, device=device, record_cmd=True)
+        self._inputs = list(inputs)
+        self._names = [argument.label for argument in kernel.adj.args]
+        self._is_on_cpu = wp.get_device(device).is_cpu
+        self._packed: Any = None
+        self._structs: dict[str, ctypes.Structure] = {}
+
+    def launch(self) -> None:
+        """Launch."""
+        if not self._is_on_cpu:
+            self._command.launch()
+            return
+        if self._packed is None:
+            self._pack()
+        for name, struct in self._structs.items():
+            setattr(self._packed, name, struct)
+        self._call(*self._pointers)
+
+    def takes(self, name: str) -> bool:
+        """Whether the kernel has an argument of that name."""
+        return name in self._names
+
+    def set_param(self, name: str, value: Any) -> None:
+        """Launch with another argument from now on."""
+        index = self._names.index(name)
+        if self._inputs[index] is value:
+            return
+        self._inputs[index] = value  # which keeps arrays alive
+        self._command.set_param_at_index(index, value)
+        if name in self._structs:
+            self._structs[name] = self._command.params[1 + index]
+        elif self._packed is not None:
+            setattr(self._packed, name, self._command.params[1 + index])
+
+    def _pack(self) -> None:
+        bounds, *values = self._command.params
+        fields = list(zip(self._names, map(type, values), strict=True))
+        self._packed = type("Arguments", (ctypes.Structure,), {"_fields_": fields})(*values)
+        self._structs = {
+            name: value
+            for name, value, given in zip(self._names, values, self._inputs, strict=True)
+            if isinstance(value, ctypes.Structure) and not isinstance(given, wp.array)
+        }
+        self._call = self._command.hooks.forward
+        self._pointers = ctypes.byref(bounds), ctypes.byref(self._packed)
+
+
+__all__ = ["HostDeviceBuffer", "RecordedLaunch", "wp"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env._warp import wp
+from ms_slam_env._warp import HostDeviceBuffer, RecordedLaunch, wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.divergence import kernels
 from ms_slam_env.divergence.config import DivergenceConfig
@@ -19,6 +20,9 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import Float64
 
 Int32 = NDArray[np.int32]
+
+_LARGEST_COPY = 1 << 18
+"""Bytes up to which copying images costs less than telling Warp of them, 20 microseconds each."""
 
 
 @dataclass(frozen=True)
@@ -82,147 +86,63 @@ class HistogramCounter:
         self.config = config
         self.intrinsics = intrinsics
         self._device = device
-        rows, columns = config.windows if config.measure == "windowed-kl" else (1, 1)
-        self._windows = rows * columns
-        height, width = intrinsics.shape
-        self._grid: list[Any] = [
-            wp.array(index.astype(np.int32), dtype=wp.int32, device=device)
-            for index in (
-                np.arange(height) * rows // height * columns,
-                np.arange(width) * columns // width,
-            )
-        ]
-        reach_px = math.tan(math.radians(config.normal_reach_deg)) * intrinsics.fx
-        self._radius = max(1, round(reach_px))
         self._grouping = grouping_matrix(config.bins, float(config.smoothing))
-        directions = bin_directions(config.inclinations)
-        near = bins_near(config.inclinations, float(config.alpha_deg))
-        self._bins = len(directions)
-        self._cos_alpha = math.cos(math.radians(config.alpha_deg))
-        self._sphere: list[Any] = [
-            wp.array(directions.astype(np.float32), dtype=wp.vec3, device=device),
-            wp.array(near, dtype=wp.int32, device=device),
-        ]
-        self._buffers: dict[int, tuple[Any, Any, Any]] = {}  # by batch size
+        self._passes: dict[tuple[int, bool], _CountingPass] = {}  # by batch size, with normals
 
     def histograms(self, intensity: Any, depth: Any, normals: Any | None = None) -> Histograms:
         """Histograms of B frames, all counted in one pass.
 
         Args:
-            intensity: (B, h, w) float32 in [0, 255], NumPy or Warp.
-            depth: (B, h, w) float32 metres, 0 = no reading, NumPy or Warp.
-            normals: (B, h, w, 3) float32, 0 = none, of any other length than 0 (NumPy, or Warp
-                vec3 of shape (B, h, w)); computed from depth if None.
+            intensity: (B, h, w) grey values in [0, 255], NumPy or float32 Warp.
+            depth: (B, h, w) metres, 0 = no reading, NumPy or float32 Warp.
+            normals: (B, h, w, 3), 0 = none, of any other length than 0 (NumPy, or Warp vec3 of
+                shape (B, h, w)); computed from depth if None.
 
         Raises:
             InputError: shapes that do not fit each other or the intrinsics; NaN, infinite or
                 negative depth in a NumPy array.
         """
-        intensity_wp = self._upload(intensity, wp.float32, "intensity")
-        depth_wp = self._upload(depth, wp.float32, "depth")
+        images = {"intensity": intensity, "depth": depth}
+        images |= {} if normals is None else {"normals": normals}
+        shape, *others = (self._checked_shape(image, name) for name, image in images.items())
         if isinstance(depth, np.ndarray) and not (depth.min() >= 0 and depth.max() < np.inf):
             raise InputError("depth holds NaN, infinite or negative values; 0 means no reading")
-        shape = intensity_wp.shape
-        if depth_wp.shape != shape:
-            raise InputError(f"depth {depth_wp.shape} and intensity {shape} differ in shape")
-        if normals is None:
-            counts = self._count(intensity_wp, depth_wp, None)
-        else:
-            normals_wp = self._upload(normals, wp.vec3, "normals")
-            if normals_wp.shape != shape:
-                raise InputError(f"normals {normals_wp.shape} and intensity {shape} do not fit")
-            counts = self._count(intensity_wp, depth_wp, normals_wp)
-        return self._normalised(*counts)
+        if others[0] != shape:
+            raise InputError(f"depth {others[0]} and intensity {shape} differ in shape")
+        if others[-1] != shape:
+            raise InputError(f"normals {others[-1]} and intensity {shape} do not fit")
+        key = shape[0], normals is not None
+        if key not in self._passes:
+            self._passes[key] = _CountingPass(*key, self.config, self.intrinsics, self._device)
+        return self._normalised(*self._passes[key](images))
 
     def normals(self, depth: Any) -> NDArray[np.float32]:
         """Unit normals (B, h, w, 3) towards the camera from depth (B, h, w); 0 where none."""
-        depth_wp = self._upload(depth, wp.float32, "depth")
-        inverse = self._inverse(depth_wp, wp.empty_like(depth_wp))
-        result = wp.empty(depth_wp.shape, dtype=wp.vec3, device=self._device)
-        self._launch(kernels.compute_normals, [inverse, *self._camera(), result])
+        shape = self._checked_shape(depth, "depth")
+        source = _on_device(depth, wp.float32, self._device)
+        inverse = wp.empty_like(source)
+        result = wp.empty(shape, dtype=wp.vec3, device=self._device)
+        camera = _camera_arguments(self.config, self.intrinsics)
+        wp.launch(kernels.invert_depth, shape[:2], [source, inverse], device=self._device)
+        inputs = [inverse, *camera, result]
+        wp.launch(kernels.compute_normals, shape[:2], inputs, device=self._device)
         return result.numpy()
 
-    def _upload(self, array: Any, dtype: Any, name: str) -> Any:
-        """Return ``array`` as a Warp array (B, h, w) on the device; no copy on the CPU."""
-        if not isinstance(array, wp.array):
-            type_is_vector = dtype is wp.vec3
-            array = np.ascontiguousarray(array, dtype=np.float32)
-            if array.ndim != (4 if type_is_vector else 3):
-                raise InputError(f"{name} must have a leading batch axis, got {array.shape}")
-            if type_is_vector and array.shape[3] != 3:
-                raise InputError(f"{name} must be (B, h, w, 3), got {array.shape}")
-            array = wp.array(array, dtype=dtype, device=self._device, copy=False)
-        array = array.contiguous()
-        if array.shape[1:] != self.intrinsics.shape:
+    def _checked_shape(self, array: Any, name: str) -> tuple[int, ...]:
+        """(B, h, w) of images that fit the intrinsics."""
+        shape = tuple(array.shape) if isinstance(array, wp.array) else np.shape(array)
+        if name == "normals" and not isinstance(array, wp.array):
+            if len(shape) != 4 or shape[3] != 3:
+                raise InputError(f"{name} must be (B, h, w, 3), got {shape}")
+            shape = shape[:3]
+        if len(shape) != 3:
+            raise InputError(f"{name} must have a leading batch axis, got {shape}")
+        if shape[1:] != self.intrinsics.shape:
             raise InputError(
-                f"{name} is {array.shape[2]}x{array.shape[1]} but the intrinsics say "
+                f"{name} is {shape[2]}x{shape[1]} but the intrinsics say "
                 f"{self.intrinsics.width}x{self.intrinsics.height}"
             )
-        return array
-
-    def _camera(self) -> list[Any]:
-        """Kernel arguments from focal length to edge threshold."""
-        camera, config = self.intrinsics, self.config
-        return [
-            wp.vec2(camera.fx, camera.fy),
-            wp.vec2(camera.cx, camera.cy),
-            self._radius,
-            config.edge_threshold,
-        ]
-
-    def _buffer(self, batch: int) -> tuple[Any, Any, Any]:
-        """Return counters of grey levels, sums by row, both zero, and room for inverse depth."""
-        if batch not in self._buffers:
-            levels_shape = (batch, self._windows * 256)
-            sums_shape = (batch * self.intrinsics.height * self._windows * self._bins,)
-            images_shape = (batch, *self.intrinsics.shape)
-            self._buffers[batch] = (
-                wp.zeros(levels_shape, dtype=wp.int32, device=self._device),
-                wp.zeros(sums_shape, dtype=wp.float32, device=self._device),
-                wp.empty(images_shape, dtype=wp.float32, device=self._device),
-            )
-        levels, sums, inverse = self._buffers[batch]
-        levels.zero_()
-        sums.zero_()
-        return levels, sums, inverse
-
-    def _inverse(self, depth: Any, out: Any) -> Any:
-        """Inverse depth (B, h, w), written to ``out``."""
-        self._launch(kernels.invert_depth, [depth, out])
-        return out
-
-    def _launch(self, kernel: Any, inputs: list[Any]) -> None:
-        """Run a kernel with one thread per row of the images ``inputs[0]``."""
-        wp.launch(kernel, dim=inputs[0].shape[:2], inputs=inputs, device=self._device)
-
-    def _count(self, intensity: Any, depth: Any, normals: Any | None) -> tuple[Int32, Float64]:
-        """Counts (B, W, 256) of grey levels and sums (B, W, L) of the weights of normals, (9)."""
-        batch = intensity.shape[0]
-        levels, sums, inverse = self._buffer(batch)
-        only_with_depth = int(self.config.intensity_pixels == "with-depth")
-        self._launch(
-            kernels.count_intensity, [intensity, depth, only_with_depth, *self._grid, levels]
-        )
-        tail = [
-            *self._grid,
-            *self._sphere,
-            MAP_SIZE,
-            self._cos_alpha,
-            self._windows * self._bins,
-            sums,
-        ]
-        if normals is None:
-            inverse = self._inverse(depth, inverse)
-            self._launch(kernels.weigh_depth_normals, [inverse, *self._camera(), *tail])
-        else:
-            self._launch(kernels.weigh_given_normals, [normals, *tail])
-        weights = sums.numpy().reshape(batch, self.intrinsics.height, -1).sum(
-            axis=1, dtype=np.float64
-        ) / (1 - self._cos_alpha)
-        return (
-            levels.numpy().reshape(batch, self._windows, 256),
-            weights.reshape(batch, self._windows, self._bins),
-        )
+        return shape
 
     def _normalised(self, levels: Int32, weights: Float64) -> Histograms:
         """Histograms of raw counts and of the sums of equation (9)."""
@@ -231,3 +151,98 @@ class HistogramCounter:
             intensity=normalise(levels @ self._grouping, pseudo_count),
             normals=normalise(weights, pseudo_count),
         )
+
+
+class _CountingPass:
+    """Recorded launches that count B frames, and what they write to."""
+
+    def __init__(
+        self,
+        batch: int,
+        has_normals: bool,
+        config: DivergenceConfig,
+        intrinsics: Intrinsics,
+        device: str,
+    ) -> None:
+        """Record; with ``has_normals`` they are given, else computed from depth."""
+        self._device = device
+        height, width = shape = intrinsics.shape
+        rows, columns = config.windows if config.measure == "windowed-kl" else (1, 1)
+        directions = bin_directions(config.inclinations)
+        self._shape = (batch, height, rows * columns, len(directions))
+        self._cos_alpha = math.cos(math.radians(config.alpha_deg))
+        window_rows = np.arange(height) * rows // height * columns
+        windows = (window_rows, np.arange(width) * columns // width)
+        grid: list[Any] = [wp.array(each, dtype=wp.int32, device=device) for each in windows]
+        near = bins_near(config.inclinations, float(config.alpha_deg))
+        sphere: list[Any] = [
+            wp.array(directions.astype(np.float32), dtype=wp.vec3, device=device),
+            wp.array(near, dtype=wp.int32, device=device),
+        ]
+        per_row = rows * columns * len(directions)
+        self._levels = HostDeviceBuffer((batch, rows * columns * 256), wp.int32, device)
+        self._sums = HostDeviceBuffer((batch * height * per_row,), wp.float32, device)
+        # Small images are copied to buffers of the recorded launches, large ones bound to them.
+        room = (1 if batch * height * width * 4 > _LARGEST_COPY else batch, *shape)
+        dtypes = {"intensity": wp.float32, "depth": wp.float32}
+        dtypes |= {"normals": wp.vec3} if has_normals else {}
+        self._buffers = {
+            name: HostDeviceBuffer(room, each, device) for name, each in dtypes.items()
+        }
+        image = {name: buffer.array for name, buffer in self._buffers.items()}
+        weights = [*grid, *sphere, MAP_SIZE, self._cos_alpha, per_row, self._sums.array]
+        only_with_depth = int(config.intensity_pixels == "with-depth")
+        counted = [image["intensity"], image["depth"], only_with_depth, *grid, self._levels.array]
+        stages: list[tuple[Any, list[Any]]] = [(kernels.count_intensity, counted)]
+        if has_normals:
+            stages.append((kernels.weigh_given_normals, [image["normals"], *weights]))
+        else:
+            inverse = wp.empty((batch, *shape), dtype=wp.float32, device=device)
+            camera = _camera_arguments(config, intrinsics)
+            stages.append((kernels.invert_depth, [image["depth"], inverse]))
+            stages.append((kernels.weigh_depth_normals, [inverse, *camera, *weights]))
+        dim = (batch, height)
+        self._launches = [RecordedLaunch(kernel, dim, inputs, device) for kernel, inputs in stages]
+
+    def __call__(self, images: Mapping[str, Any]) -> tuple[Int32, Float64]:
+        """Counts (B, W, 256) of grey levels and sums (B, W, L) of the weights of normals, (9)."""
+        for name, image in images.items():
+            self._take(name, image)
+        self._levels.zero()
+        self._sums.zero()
+        for launch in self._launches:
+            launch.launch()
+        batch, height, windows, bins = self._shape
+        sums = self._sums.look().reshape(batch, height, -1).sum(axis=1, dtype=np.float64)
+        return (
+            self._levels.look().reshape(batch, windows, 256),
+            (sums / (1 - self._cos_alpha)).reshape(batch, windows, bins),
+        )
+
+    def _take(self, name: str, image: Any) -> None:
+        """Make the launches look at an image."""
+        buffer = self._buffers[name]
+        array = buffer.array
+        if not isinstance(image, wp.array) and array.shape == np.shape(image)[:3]:
+            buffer.write(image)
+        else:
+            array = _on_device(image, array.dtype, self._device)
+        for launch in self._launches:
+            if launch.takes(name):
+                launch.set_param(name, array)
+
+
+def _camera_arguments(config: DivergenceConfig, intrinsics: Intrinsics) -> list[Any]:
+    """Kernel arguments from focal length to edge threshold."""
+    reach_px = math.tan(math.radians(config.normal_reach_deg)) * intrinsics.fx
+    focal = wp.vec2(intrinsics.fx, intrinsics.fy)
+    centre = wp.vec2(intrinsics.cx, intrinsics.cy)
+    return [focal, centre, max(1, round(reach_px)), config.edge_threshold]
+
+
+def _on_device(array: Any, dtype: Any, device: str) -> Any:
+    """A contiguous Warp array; no copy on the CPU where none is needed."""
+    if not isinstance(array, wp.array):
+        array = np.ascontiguousarray(array, dtype=np.float32)
+        array = wp.array(array, dtype=dtype, device=device, copy=False)
+    return array.contiguous()

@@ -164,6 +164,9 @@ class EnvConfig(Checked):
             no submaps, ``lost_patience`` decides.
         seconds: simulated time after which an episode is truncated; None for the steps alone.
         divergence: how divergence is measured.
+        frame_divergences: whether the divergence of every frame from the one before is measured,
+            which evaluation may read; without, only that of each step's last frame, which is what
+            ``info`` and the reward are about: nine of ten measurements less with the arm.
         lookahead: how candidates are predicted.
         targets: motion-and-structure parameters and thresholds.
         reward: weights of the reward terms, or ``paper`` for the paper's; or a function of a step's
@@ -191,6 +194,7 @@ class EnvConfig(Checked):
     away_patience: int = bounded(50, 1, 1_000_000)
     seconds: float | None = bounded(None, 0.001, 1e9)
     divergence: DivergenceConfig = field(default_factory=DivergenceConfig)
+    frame_divergences: bool = True
     lookahead: LookaheadConfig = field(default_factory=LookaheadConfig)
     targets: TargetConfig = field(default_factory=TargetConfig)
     reward: RewardConfig | Callable[..., Any] = field(default_factory=RewardConfig)

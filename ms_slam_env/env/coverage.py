@@ -1,3 +1,4 @@
+# mypy: disable-error-code="empty-body"
 """How much true surface has been mapped where it really is."""
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.geometry import transform_points
+from ms_slam_env._warp import RecordedLaunch, wp
 from ms_slam_env.scenes.base import Scene
 
 Float64 = NDArray[np.float64]
@@ -48,11 +49,11 @@ class Voxels:
             known[voxel_m] = _voxels(scene, voxel_m)
         return known[voxel_m]
 
-    def index(self, points: Float64, voxel_m: float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Voxels of the points (N, 3) that lie in the grid, and which do (N,)."""
+    def index(self, points: Float64, voxel_m: float) -> NDArray[np.int64]:
+        """Voxels of the points (N, 3) that lie in the grid."""
         cells = np.floor((points - self.origin) / voxel_m).astype(np.int64)
         inside = np.all((cells >= 0) & (cells < np.array(self.shape)), axis=1)
-        return np.ravel_multi_index(tuple(cells[inside].T), self.shape), inside
+        return np.ravel_multi_index(tuple(cells[inside].T), self.shape)
 
 
 _VOXELS: WeakKeyDictionary[Scene, dict[float, Voxels]] = WeakKeyDictionary()
@@ -64,8 +65,74 @@ def _voxels(scene: Scene, voxel_m: float) -> Voxels:
     shape = np.ceil((high + 2 * voxel_m - origin) / voxel_m).astype(np.int64) + 1
     voxels = Voxels(origin, tuple(shape.tolist()), np.zeros(int(np.prod(shape)), dtype=bool))
     surface, _ = scene.surface_points(voxel_m / _SAMPLES_A_VOXEL)
-    voxels.reachable[voxels.index(surface, voxel_m)[0]] = True
+    voxels.reachable[voxels.index(surface, voxel_m)] = True
     return voxels
+
+
+@wp.struct
+class VoxelGrid:
+    """A grid of voxels."""
+
+    origin: wp.vec3d
+    shape: wp.vec3i
+    voxel_m: wp.float64
+
+
+# The products of a matrix and a vector are summed in the order of BLAS, with its fused additions
+# where the processor has them, so that they are what NumPy makes of them, bit for bit.
+@wp.func_native("""
+#pragma clang fp contract(off)
+auto product = [](const double* row, const double* p) {
+#pragma clang fp contract(on)
+    return row[2] * p[2] + (row[1] * p[1] + row[0] * p[0]);
+};
+const wp::mat_t<4, 4, double>& T_true = poses.data[0];
+const wp::mat_t<4, 4, double>& T_estimate = poses.data[1];
+for (int i = 0; i < depth.shape[0]; ++i) {
+    const double z = (double)depth.data[i];
+    if (!(z > 0.0)) continue;
+    const double p[3] = {rays.data[3 * i] * z, rays.data[3 * i + 1] * z, rays.data[3 * i + 2] * z};
+    double squared = 0.0;
+    long long flat = 0;
+    bool inside = true;
+    for (int k = 0; k < 3; ++k) {
+        const double at = product(T_true.data[k], p) + T_true.data[k][3];
+        const double off = product(T_estimate.data[k], p) + T_estimate.data[k][3] - at;
+        squared += off * off;
+        const double cell = floor((at - grid.origin[k]) / grid.voxel_m);
+        inside = inside && cell >= 0.0 && cell < (double)grid.shape[k];
+        flat = flat * grid.shape[k] + (inside ? (long long)cell : 0);
+    }
+    if (!inside || !(sqrt(squared) < grid.voxel_m) || mapped.data[flat]) continue;
+    mapped.data[flat] = 1;
+    counts.data[0] += 1;
+    counts.data[1] += reachable.data[flat];
+}
+""")
+def mark_points(
+    depth: wp.array(dtype=wp.float32),
+    rays: wp.array(dtype=wp.float64),
+    poses: wp.array(dtype=wp.mat44d),
+    grid: VoxelGrid,
+    reachable: wp.array(dtype=wp.uint8),
+    mapped: wp.array(dtype=wp.uint8),
+    counts: wp.array(dtype=wp.int32),
+):
+    """Mark what ``mark_seen`` says."""
+
+
+@wp.kernel
+def mark_seen(
+    depth: wp.array(dtype=wp.float32),  # (N,) metres; 0 = nothing
+    rays: wp.array(dtype=wp.float64),  # (3 N,) points at depth 1 m
+    poses: wp.array(dtype=wp.mat44d),  # (2,) true and estimated T_world_camera
+    grid: VoxelGrid,
+    reachable: wp.array(dtype=wp.uint8),  # (voxels,)
+    mapped: wp.array(dtype=wp.uint8),  # (voxels,) in and out
+    counts: wp.array(dtype=wp.int32),  # (2,) voxels mapped, and of those reachable; in and out
+):
+    """Mark the true voxels of points that the estimate puts less than a voxel away; one thread."""
+    mark_points(depth, rays, poses, grid, reachable, mapped, counts)
 
 
 class CoverageGrid:
@@ -76,28 +143,31 @@ class CoverageGrid:
 
     Args:
         scene: gives the bounds.
+        rays: (H, W, 3) points at depth 1 m of the camera's pixels.
         voxel_m: edge of a voxel, metres.
     """
 
-    def __init__(self, scene: Scene, voxel_m: float = 0.05) -> None:
+    def __init__(self, scene: Scene, rays: Float64, voxel_m: float = 0.05) -> None:
         self.voxel_m = voxel_m
-        self._voxels = Voxels.of(scene, voxel_m)
-        self._mapped = np.zeros(len(self._voxels.reachable), dtype=bool)
-
-    def add(self, points_true: Float64, points_estimated: Float64) -> float:
-        """Mark points (N, 3); return the area newly mapped in its true place, square metres."""
-        flat, inside = self._voxels.index(points_true, self.voxel_m)
-        error = np.linalg.norm(points_estimated - points_true, axis=1)[inside]
-        correct = flat[error < self.voxel_m]
-        new = np.unique(correct[~self._mapped[correct]])
-        self._mapped[new] = True
-        return len(new) * self.voxel_m**2
+        self._voxels = voxels = Voxels.of(scene, voxel_m)
+        self._mapped = np.zeros(len(voxels.reachable), dtype=bool)
+        self._counts = np.zeros(2, dtype=np.int32)  # mapped, and of those reachable
+        marked_rays = np.ascontiguousarray(rays[::_STRIDE, ::_STRIDE], dtype=np.float64)
+        self._depth = np.zeros(marked_rays.shape[:2], dtype=np.float32)
+        self._poses = np.zeros((2, 4, 4))
+        grid = VoxelGrid()
+        grid.origin, grid.shape = wp.vec3d(*voxels.origin), wp.vec3i(*voxels.shape)
+        grid.voxel_m = voxel_m
+        seen = [_shared(self._depth.ravel(), wp.float32), _shared(marked_rays.ravel(), wp.float64)]
+        marks = [voxels.reachable.view(np.uint8), self._mapped.view(np.uint8)]
+        arrays = [*(_shared(mark, wp.uint8) for mark in marks), _shared(self._counts, wp.int32)]
+        inputs = [*seen, _shared(self._poses, wp.mat44d), grid, *arrays]
+        self._mark = RecordedLaunch(mark_seen, 1, inputs, "cpu")
 
     def see(
         self,
         depth: NDArray[np.float32],
         true_depth: NDArray[np.float32],
-        rays: Float64,
         T_world_camera: Float64,
         T_world_camera_estimate: Float64,
     ) -> float:
@@ -109,23 +179,20 @@ class CoverageGrid:
         Args:
             depth: (H, W) readings, 0 = none.
             true_depth: (H, W) metres.
-            rays: (H, W, 3) points at depth 1 m.
             T_world_camera: (4, 4).
             T_world_camera_estimate: (4, 4).
         """
         every = slice(None, None, _STRIDE)
-        valid = np.where(depth > 0, true_depth, 0)[every, every]
-        seen = valid > 0
-        points = rays[every, every][seen] * valid[seen][:, None]
-        return self.add(
-            transform_points(T_world_camera, points),
-            transform_points(T_world_camera_estimate, points),
-        )
+        np.multiply(true_depth[every, every], depth[every, every] > 0, out=self._depth)
+        self._poses[0], self._poses[1] = T_world_camera, T_world_camera_estimate
+        before = int(self._counts[0])
+        self._mark.launch()
+        return (int(self._counts[0]) - before) * self.voxel_m**2
 
     @property
     def mapped_area(self) -> float:
         """Area mapped in its true place so far, square metres (one voxel face a voxel)."""
-        return int(np.count_nonzero(self._mapped)) * self.voxel_m**2
+        return int(self._counts[0]) * self.voxel_m**2
 
     @property
     def mapped_share(self) -> float:
@@ -133,8 +200,7 @@ class CoverageGrid:
 
         Reachable is what opens into free space (``Scene.surface_points``), counted in voxels.
         """
-        mapped = np.count_nonzero(self._mapped & self._voxels.reachable)
-        return mapped / max(1, self._voxels.num_reachable)
+        return int(self._counts[1]) / max(1, self._voxels.num_reachable)
 
     def get_state(self) -> dict[str, Any]:
         """The marked voxels, packed."""
@@ -142,5 +208,11 @@ class CoverageGrid:
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state that ``get_state`` returned."""
-        size = self._mapped.size
-        self._mapped = np.unpackbits(state["mapped"], count=size).astype(bool)
+        self._mapped[:] = np.unpackbits(state["mapped"], count=self._mapped.size)
+        reachable = np.count_nonzero(self._mapped & self._voxels.reachable)
+        self._counts[:] = np.count_nonzero(self._mapped), reachable
+
+
+def _shared(array: NDArray[Any], dtype: Any) -> wp.array:
+    """A kernel's view of an array's own memory."""
+    return wp.array(array, dtype=dtype, device="cpu", copy=False)

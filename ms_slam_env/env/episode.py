@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.divergence import Histograms
 from ms_slam_env.env.pose_sources import FrameObservation
+from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert
 from ms_slam_env.mapping import OccupancyGrid
 from ms_slam_env.slam.base import TrackResult
@@ -31,7 +32,7 @@ class FrameRecord:
         processed: whether SLAM has seen it.
         submap: that it is in, 0 for the first and those joined to it by then.
         time_s: simulated seconds since the start.
-        divergence: (2,) from the frame before, nats.
+        divergence: (2,) from the frame before, nats; -1 where that was not measured.
         pose_error: distance between the true and the estimated position, metres.
     """
 
@@ -246,8 +247,15 @@ class Episode:
 
     @property
     def divergences(self) -> Float64:
-        """(N, 2) divergence of each frame from the one before; zero for the first."""
-        return np.stack([frame.divergence for frame in self.frames])
+        """(N, 2) divergence of each frame from the one before; zero for the first.
+
+        Raises:
+            InputError: they were not measured.
+        """
+        measured = np.stack([frame.divergence for frame in self.frames])
+        if (measured < 0).any():
+            raise InputError("the divergence of frames needs frame_divergences=True")
+        return measured
 
     @property
     def step_divergences(self) -> Float64:

@@ -96,7 +96,7 @@ class Simulation:
         scene = get_scene(name, scene_seed)
         sensor = get_sensor(name, scene_seed, self.intrinsics, self.config.noise)
         robot = self.embodiment_type.build(scene, self.config, self.timings)
-        return World(scene, sensor, robot, CoverageGrid(scene))
+        return World(scene, sensor, robot, CoverageGrid(scene, self._rays))
 
     def start_somewhere(self, rng: np.random.Generator) -> None:
         """Begin at the first pose drawn that can be used.
@@ -121,7 +121,7 @@ class Simulation:
         except UnreachableError as error:
             return str(error)
         noise_seed = int(rng.integers(2**31))
-        self.world = self.world._replace(coverage=CoverageGrid(scene))
+        self.world = self.world._replace(coverage=CoverageGrid(scene, self._rays))
         here = robot.T_world_camera
         try:
             self.camera_feed.begin(scene, self.world.sensor, here, noise_seed)
@@ -160,7 +160,11 @@ class Simulation:
         moments = zip(motion.T_world_camera, kinematics, times_s, strict=True)
         new_surface = sum(self._track_frame(episode, *moment) for moment in moments)
         divergence = episode.frames[-1].divergence
-        if len(times_s) > 1:
+        if not self.config.frame_divergences:
+            with self.timings.stage("divergence"):
+                before = episode.step_histograms
+                divergence = self._divergence_of(episode.last_frame, episode, before)
+        elif len(times_s) > 1:
             with self.timings.stage("divergence"):
                 divergence = self._divergence_from(episode, episode.step_histograms)
         self._end_step(episode, divergence, motion.energy_j)
@@ -192,18 +196,26 @@ class Simulation:
                 result = self._pose_source.locate(self.slam, seen)
             else:
                 result = self.slam.track(frame)
-        with self.timings.stage("divergence"):
-            grey = intensity_image(frame.color)[None].astype(np.float32)
-            now = self.divergence.histograms(grey, frame.depth[None])
-            before, episode.histograms = episode.histograms, now
-            divergence = self._divergence_from(episode, before)
+        divergence = np.full(2, -1.0)  # not measured
+        if self.config.frame_divergences or not episode.frames:
+            with self.timings.stage("divergence"):
+                before = episode.histograms
+                divergence = self._divergence_of(frame, episode, before)
         with self.timings.stage("coverage"):
             new_surface = self._cover(frame, T_true, result)
         episode.record(seen, result, divergence)
         return new_surface
 
-    def _divergence_from(self, episode: Episode, before: Histograms | None) -> Float64:
+    def _divergence_of(
+        self, frame: RGBDFrame, episode: Episode, before: Histograms | None
+    ) -> Float64:
         """(2,) divergence of the last frame from an earlier one; zero from none."""
+        grey = intensity_image(frame.color)[None]
+        episode.histograms = self.divergence.histograms(grey, frame.depth[None])
+        return self._divergence_from(episode, before)
+
+    def _divergence_from(self, episode: Episode, before: Histograms | None) -> Float64:
+        """(2,) divergence of the frame measured last from an earlier one; zero from none."""
         now = episode.histograms
         if before is None or now is None:
             return np.zeros(2)
@@ -214,7 +226,7 @@ class Simulation:
         if not result.fused:
             return 0.0
         depths = frame.depth, self.camera_feed.true_depth()
-        return self.world.coverage.see(*depths, self._rays, T_true, result.T_world_camera)
+        return self.world.coverage.see(*depths, T_true, result.T_world_camera)
 
     @cached_property
     def blank(self) -> Histograms:

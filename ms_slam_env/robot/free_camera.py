@@ -67,12 +67,9 @@ class FreeCamera(Embodiment):
         """(49,) whether the camera's ball reaches each target; depends on the translation only."""
         if self._masks is None:
             R, position = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
-            ends = position + self.step_m * TRANSLATION_DIRECTIONS @ R.T
-            free = [
-                index == 0 or self.scene.segment_is_free(position, end, CAMERA_RADIUS_M)
-                for index, end in enumerate(ends)
-            ]
-            self._masks = np.repeat(np.array(free), NUM_ROTATIONS)
+            ends = (position + self.step_m * TRANSLATION_DIRECTIONS @ R.T)[1:]
+            free = self.scene.segments_are_free(position, ends, CAMERA_RADIUS_M)
+            self._masks = np.repeat([True, *free], NUM_ROTATIONS)
         return self._masks.copy()
 
     def move(self, action: int) -> MotionResult:

@@ -12,6 +12,7 @@ from ms_slam_env.geometry import Float64
 
 Float32 = NDArray[np.float32]
 Int32 = NDArray[np.int32]
+Bool = NDArray[np.bool_]
 Rng = np.random.Generator
 
 _FLOOR = "floor"
@@ -78,6 +79,10 @@ class Scene(ABC):
     @abstractmethod
     def segment_is_free(self, start: Float64, end: Float64, radius_m: float) -> bool:
         """Whether a ball of ``radius_m`` moves from ``start`` (3,) to ``end`` (3,) untouched."""
+
+    def segments_are_free(self, start: Float64, ends: Float64, radius_m: float) -> Bool:
+        """Which of ``ends`` (N, 3) a ball of ``radius_m`` reaches from ``start`` (3,), (N,)."""
+        return np.array([self.segment_is_free(start, end, radius_m) for end in ends], dtype=bool)
 
     def way(self, start: Float64, end: Float64) -> Float64:
         """Points (K, 3) on the ground along which one gets from one place (3,) to another."""

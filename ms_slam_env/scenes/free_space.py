@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ms_slam_env.scenes.base import Float32, Float64
+from ms_slam_env.scenes.base import Bool, Float32, Float64
 from ms_slam_env.scenes.mesh_queries import RayCaster
 
 VOXEL_M = 0.05
 _GRID_ERROR = 0.4  # of a voxel
 _MAX_CELLS = 6_000_000
 
-
-Bool = NDArray[np.bool_]
 ComponentRule = Callable[[Bool, Float64, float], Bool]
 """Which voxels (nx, ny, nz) are free, of those that are empty, their origin (3,) and edge."""
 
@@ -124,19 +124,32 @@ class FreeSpace:
         result = trilinear(values.reshape(-1, 2, 2, 2), f)
         return np.where((position == clipped).all(1), result, 0.0)
 
-    def segment_is_free(self, start: Float64, end: Float64, radius_m: float) -> bool:
-        """Whether a ball moves from ``start`` to ``end`` untouched.
+    def segments_are_free(self, start: Float64, ends: Float64, radius_m: float) -> Bool:
+        """Whether a ball moves from ``start`` (3,) to each of ``ends`` (N, 3) untouched, (N,).
 
         The distance to the surface changes by at most the distance walked, so samples ``step``
         apart need a clearance of ``radius_m`` + step / 2, and a part of a voxel more for the
         error of the grid: the answer errs to "no".
         """
-        a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
-        length = float(np.linalg.norm(b - a))
-        steps = max(1, int(np.ceil(length / (0.4 * self.voxel_m))))
-        t = np.linspace(0.0, 1.0, steps + 1)[:, None]
-        slack = 0.5 * length / steps + _GRID_ERROR * self.voxel_m
-        return bool((self.clearance(a + t * (b - a)) > radius_m + slack).all())
+        a = np.asarray(start, dtype=np.float64)
+        ways = np.asarray(ends, dtype=np.float64) - a
+        lengths = [math.sqrt(way.dot(way)) for way in ways]
+        steps = [max(1, math.ceil(length / (0.4 * self.voxel_m))) for length in lengths]
+        samples = [a + _shares(count) * way for count, way in zip(steps, ways, strict=True)]
+        slack = [
+            0.5 * length / count + _GRID_ERROR * self.voxel_m
+            for length, count in zip(lengths, steps, strict=True)
+        ]
+        counts = [count + 1 for count in steps]
+        needed = np.repeat(radius_m + np.array(slack), counts)
+        is_free = self.clearance(np.concatenate(samples)) > needed
+        return np.logical_and.reduceat(is_free, np.cumsum([0, *counts[:-1]]))
+
+
+@lru_cache(maxsize=256)
+def _shares(steps: int) -> Float64:
+    """Shares (steps + 1, 1) of a way at which it is looked at."""
+    return np.linspace(0.0, 1.0, steps + 1)[:, None]
 
 
 _COARSE_M = 0.2

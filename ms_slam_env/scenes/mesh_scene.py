@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from ms_slam_env.geometry import look_at, so3_exp
-from ms_slam_env.scenes.base import Float64, Int32, Rng, Scene, TexturedMesh
+from ms_slam_env.scenes.base import Bool, Float64, Int32, Rng, Scene, TexturedMesh
 from ms_slam_env.scenes.free_space import VOXEL_M, FreeSpace, Holding
 from ms_slam_env.scenes.mesh_queries import RayCaster, face_cross, sample_surface
 
@@ -70,7 +70,11 @@ class MeshScene(Scene):
 
     def segment_is_free(self, start: Float64, end: Float64, radius_m: float) -> bool:
         """See the base class."""
-        return self.free_space.segment_is_free(start, end, radius_m)
+        return bool(self.free_space.segments_are_free(start, end[None], radius_m)[0])
+
+    def segments_are_free(self, start: Float64, ends: Float64, radius_m: float) -> Bool:
+        """See the base class."""
+        return self.free_space.segments_are_free(start, ends, radius_m)
 
     def sample_start(self, rng: Rng) -> Float64:
         """See the base class; the best of the candidates tried if none is perfect."""

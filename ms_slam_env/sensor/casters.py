@@ -10,7 +10,7 @@ import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from ms_slam_env._warp import wp
+from ms_slam_env._warp import RecordedLaunch, wp
 from ms_slam_env.scenes.base import TexturedMesh
 from ms_slam_env.sensor.embree import (
     TILE_HEIGHT,
@@ -56,15 +56,9 @@ class EmbreeRayCaster(RayCaster):
     ) -> Callable[[], None]:
         """See the base class; the arrays live on the CPU."""
         batch, height, width = shape
-        command = wp.launch(
-            cast_tiles,
-            dim=(batch, -(-height // TILE_HEIGHT), -(-width // TILE_WIDTH)),
-            inputs=[self._scene.intersect, self._scene.scene, poses, camera],
-            outputs=[hits],
-            device="cpu",
-            record_cmd=True,
-        )
-        return command.launch
+        tiles = (batch, -(-height // TILE_HEIGHT), -(-width // TILE_WIDTH))
+        inputs = [self._scene.intersect, self._scene.scene, poses, camera, hits]
+        return RecordedLaunch(cast_tiles, tiles, inputs, "cpu").launch
 
 
 class EmbreeSingleRayCaster(RayCaster):
@@ -82,14 +76,8 @@ class EmbreeSingleRayCaster(RayCaster):
         """See the base class; the arrays live on the CPU."""
         origins = wp.zeros(math.prod(shape), dtype=wp.vec3, device="cpu")
         directions = wp.zeros(math.prod(shape), dtype=wp.vec3, device="cpu")
-        generate = wp.launch(
-            generate_rays,
-            dim=shape,
-            inputs=[poses, camera],
-            outputs=[origins, directions],
-            device="cpu",
-            record_cmd=True,
-        )
+        inputs = [poses, camera, origins, directions]
+        generate = RecordedLaunch(generate_rays, shape, inputs, "cpu")
 
         def cast() -> None:
             generate.launch()
@@ -117,15 +105,8 @@ class WarpRayCaster(RayCaster):
         self, poses: wp.array, camera: Pinhole, hits: Hits, shape: tuple[int, int, int]
     ) -> Callable[[], None]:
         """See the base class; the arrays live on the device of the mesh."""
-        command = wp.launch(
-            cast_rays,
-            dim=shape,
-            inputs=[self._mesh.id, poses, camera],
-            outputs=[hits],
-            device=self._device,
-            record_cmd=True,
-        )
-        return command.launch
+        inputs = [self._mesh.id, poses, camera, hits]
+        return RecordedLaunch(cast_rays, shape, inputs, self._device).launch
 
 
 def make_caster(mesh: TexturedMesh, device: str) -> RayCaster:

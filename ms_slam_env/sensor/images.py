@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env._warp import wp
+from ms_slam_env._warp import HostDeviceBuffer, RecordedLaunch, wp
 from ms_slam_env.scenes.base import TexturedMesh
 from ms_slam_env.sensor.bodies import Body
 from ms_slam_env.sensor.casters import RayCaster
@@ -99,13 +99,13 @@ class Images:
         span = span_of(width, device)
         parts = (batch, height, width // span)
         poses = batch * -(-height // int(camera.rows))
-        self._poses = wp.zeros(poses, dtype=wp.mat44, device=device)
-        self._keys = wp.zeros((batch, 2), dtype=wp.uint32, device=device)
+        self._poses = HostDeviceBuffer(poses, wp.mat44, device)
+        self._keys = HostDeviceBuffer((batch, 2), wp.uint32, device)
         self._hits = hits = make_hits(count, device)
         self._shadow = wp.zeros(count, dtype=wp.uint8, device=device)
-        self._color = wp.zeros((count, 3), dtype=wp.uint8, device=device)
-        self._depth = wp.zeros(count, dtype=wp.float32, device=device)
-        self._cast = caster.bind(self._poses, camera, hits, shape)
+        self._color = HostDeviceBuffer((count, 3), wp.uint8, device)
+        self._depth = HostDeviceBuffer(count, wp.float32, device)
+        self._cast = caster.bind(self._poses.array, camera, hits, shape)
         self._exposure = exposure
         self._view = None
         posed = [hits.face, surfaces.normal, surfaces.plane]
@@ -123,35 +123,26 @@ class Images:
             self._surfaces = surfaces = view.surfaces
             posed = [view.posed_face, view.normal, view.plane]
 
-        def shading(shot: float, read: float) -> Any:
-            found = [self._poses, camera, span, hits, surfaces]
-            lookup = [self._keys, tables]
-            return self._record(
-                shade, parts, [*found, exposure, shot, read, *lookup], [self._color]
-            )
+        def shading(shot: float, read: float) -> RecordedLaunch:
+            found = [self._poses.array, camera, span, hits, surfaces]
+            lookup = [self._keys.array, tables]
+            inputs = [*found, exposure, shot, read, *lookup, self._color.array]
+            return RecordedLaunch(shade, parts, inputs, device)
 
         self._shade = shading(noise.shot, noise.read)
         self._shade_ideal = shading(0.0, 0.0)
         self._measure = []
         if noise.shadow:
-            inputs = [hits.t, hits.face, width, depth_noise]
-            self._measure.append(
-                self._record(projector_shadow, batch * height, inputs, [self._shadow])
-            )
-        inputs = [self._poses, camera, span, hits.t, *posed]
-        inputs += [self._shadow, depth_noise, self._keys, tables.normals]
-        self._measure.append(self._record(measure_depth, parts, inputs, [self._depth]))
-
-    def _record(
-        self, kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], outputs: Sequence[Any]
-    ) -> Any:
-        return wp.launch(
-            kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._device, record_cmd=True
-        )
+            inputs = [hits.t, hits.face, width, depth_noise, self._shadow]
+            rows = batch * height
+            self._measure.append(RecordedLaunch(projector_shadow, rows, inputs, device))
+        inputs = [self._poses.array, camera, span, hits.t, *posed]
+        inputs += [self._shadow, depth_noise, self._keys.array, tables.normals, self._depth.array]
+        self._measure.append(RecordedLaunch(measure_depth, parts, inputs, device))
 
     def _look(self, poses: NDArray[np.float64], times_s: NDArray[np.float64] | None) -> None:
         """Find what the images from poses (P, 4, 4) see."""
-        self._poses.assign(poses.astype(np.float32))
+        self._poses.write(poses)
         if self._view is None:
             self._cast()
             return
@@ -159,7 +150,7 @@ class Images:
         self._view.look(self._cast, poses, times)
         exposure = self._exposure * self._view.exposure_factor
         for command in (self._shade, self._shade_ideal):
-            command.set_param_by_name("exposure", exposure)
+            command.set_param("exposure", exposure)
 
     def capture(
         self,
@@ -171,13 +162,13 @@ class Images:
 
         ``times_s`` (P,), of the poses, matters only where something changes.
         """
-        self._keys.assign(keys)
+        self._keys.write(keys)
         self._look(poses, times_s)
         self._shade.launch()
         for command in self._measure:
             command.launch()
-        colors = self._color.numpy().reshape(*self._shape, 3)
-        return colors, self._depth.numpy().reshape(self._shape)
+        colors = self._color.look().reshape(*self._shape, 3)
+        return colors, self._depth.look().reshape(self._shape)
 
     def ideal_colors(
         self, poses: NDArray[np.float64], times_s: NDArray[np.float64] | None = None
@@ -185,7 +176,7 @@ class Images:
         """Noise-free colour (B, H, W, 3) from poses (P, 4, 4) at times (P,)."""
         self._look(poses, times_s)
         self._shade_ideal.launch()
-        return self._color.numpy().reshape(*self._shape, 3)
+        return self._color.look().reshape(*self._shape, 3)
 
     def true_depth(self, moving: bool = True) -> NDArray[np.float32]:
         """True depth (B, H, W) of the last capture, metres; 0 = no surface, or a moving one."""
@@ -202,7 +193,7 @@ class Images:
         """Noise-free colour, depth, normals, labels and points from poses (P, 4, 4)."""
         self._look(poses, times_s)
         self._shade_ideal.launch()
-        count = self._depth.shape[0]
+        count = self._depth.array.shape[0]
         outputs: list[wp.array] = [
             wp.zeros(count, dtype=dtype, device=self._device)
             for dtype in (wp.float32, wp.vec3, wp.int32, wp.vec3)
@@ -210,9 +201,9 @@ class Images:
         wp.launch(
             true_geometry,
             dim=self._shape,
-            inputs=[self._poses, self._camera, self._hits, self._surfaces],
+            inputs=[self._poses.array, self._camera, self._hits, self._surfaces],
             outputs=outputs,
             device=self._device,
         )
-        arrays = [self._color.numpy().copy(), *(array.numpy() for array in outputs)]
+        arrays = [self._color.look().copy(), *(array.numpy() for array in outputs)]
         return [array.reshape(*self._shape, *array.shape[1:]) for array in arrays]

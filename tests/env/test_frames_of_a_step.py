@@ -97,6 +97,28 @@ def test_divergence_of_a_step_compares_the_frames_at_its_ends(slow):
     assert not np.allclose(env.episode.divergences[-1], info["divergence"])
 
 
+def test_frames_within_a_step_need_not_be_compared(slow):
+    """Observation, reward and info are the same; who asks for the rest hears what is missing."""
+    every, few = (
+        ActiveSlamEnv(slow, frame_divergences=measured, **OPTIONS) for measured in (True, False)
+    )
+    (seen, _), (seen_by_few, _) = every.reset(seed=5), few.reset(seed=5)
+    np.testing.assert_array_equal(seen, seen_by_few)
+    for action in (7 * 5 + 6, 0, 7 * 6):
+        observation, reward, *_, info = every.step(action)
+        observation_of_few, reward_of_few, *_, info_of_few = few.step(action)
+        np.testing.assert_array_equal(observation, observation_of_few)
+        assert reward == reward_of_few
+        np.testing.assert_array_equal(info["divergence"], info_of_few["divergence"])
+    assert info["divergence"].all()
+    with pytest.raises(InputError, match="needs frame_divergences=True"):
+        _ = few.episode.divergences
+    twin = ActiveSlamEnv(slow, frame_divergences=False, **OPTIONS)
+    twin.reset(seed=1)
+    twin.load_state(few.save_state())
+    np.testing.assert_array_equal(twin.step(3)[0], few.step(3)[0])
+
+
 def grey(frame):
     from ms_slam_env.camera import intensity_image
 

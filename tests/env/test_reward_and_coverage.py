@@ -8,10 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ms_slam_env.camera import pinhole
 from ms_slam_env.env.config import EnvConfig, RewardConfig, TargetConfig
-from ms_slam_env.env.coverage import CoverageGrid
+from ms_slam_env.env.coverage import CoverageGrid, Voxels
 from ms_slam_env.env.reward import Outcome, reward_terms
 from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import make_pose, so3_exp, transform_points
 
 WEIGHTS = RewardConfig()
 TARGETS = TargetConfig(M_I=0.02, M_D=0.04, rho_I=0.5, rho_D=0.25, depth_weight=3.0)
@@ -81,33 +83,71 @@ def test_the_papers_reward_is_divergence_and_trajectory_error_alone():
         EnvConfig(reward="papers")
 
 
-def wall(count=40, spacing=0.05):
-    """Centres of count x count voxels of the plane x = 1."""
-    a, b = np.meshgrid(np.arange(count) * spacing, np.arange(count) * spacing)
-    return np.stack([np.full(a.size, 1.0), a.ravel() - 1, b.ravel() + 0.01], axis=1)
+RAYS = pinhole("160x120").rays()
+TOWARDS_WALL = make_pose(np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]), (0.0, 0.0, 1.0))
+
+
+def marked_one_by_one(scene, depth, true_depth, T, T_estimate):
+    """Voxels of a frame's true surface that is mapped in its place, pixel by pixel."""
+    voxels, marked = Voxels.of(scene, 0.05), set()
+    for row in range(0, 120, 2):
+        for column in range(0, 160, 2):
+            if depth[row, column] > 0:
+                point = RAYS[row, column] * true_depth[row, column]
+                place = transform_points(T, point)
+                cell = np.floor((place - voxels.origin) / 0.05).astype(int)
+                off = np.linalg.norm(transform_points(T_estimate, point) - place)
+                if off < 0.05 and (cell >= 0).all() and (cell < voxels.shape).all():
+                    marked.add(tuple(cell.tolist()))
+    return voxels, marked
+
+
+def test_what_a_frame_marks_is_what_its_pixels_mark_one_by_one(box_scene):
+    rng = np.random.default_rng(0)
+    grid, marked = CoverageGrid(box_scene, RAYS), set()
+    for _ in range(3):
+        T = TOWARDS_WALL @ make_pose(so3_exp(rng.normal(size=3) * 0.3), rng.normal(size=3) * 0.3)
+        T_estimate = T @ make_pose(so3_exp(rng.normal(size=3) * 0.02), (0.02, 0.0, 0.0))
+        true_depth = rng.uniform(0.5, 4, (120, 160)).astype(np.float32)
+        depth = np.where(rng.random((120, 160)) < 0.3, 0, true_depth).astype(np.float32)
+        voxels, seen = marked_one_by_one(box_scene, depth, true_depth, T, T_estimate)
+        new = len(seen - marked)
+        marked |= seen
+        assert new > 100
+        assert grid.see(depth, true_depth, T, T_estimate) == new * 0.05**2
+    assert grid.mapped_area == len(marked) * 0.05**2
+    reachable = sum(voxels.reachable[np.ravel_multi_index(cell, voxels.shape)] for cell in marked)
+    assert grid.mapped_share == reachable / voxels.num_reachable
+
+
+def wall(grid, T_estimate=TOWARDS_WALL):
+    """Show a wall 1 m ahead, 0.0025 m2 a voxel."""
+    depth = np.ones((120, 160), np.float32)
+    return grid.see(depth, depth, TOWARDS_WALL, T_estimate)
 
 
 def test_area_of_a_wall_counts_once(box_scene):
-    grid = CoverageGrid(box_scene)
-    points = wall()
-    assert grid.add(points, points) == pytest.approx((40 * 0.05) ** 2)
-    assert grid.add(points, points) == 0
-    assert grid.mapped_area == pytest.approx(4.0)
+    grid = CoverageGrid(box_scene, RAYS)
+    width, height = np.ptp(RAYS[..., 0]), np.ptp(RAYS[..., 1])
+    area = wall(grid)
+    assert width * height < area < (width + 0.1) * (height + 0.1)  # voxels it only touches count
+    assert wall(grid) == 0
+    assert grid.mapped_area == pytest.approx(area)
 
 
 def test_surface_mapped_in_the_wrong_place_does_not_count(box_scene):
-    grid = CoverageGrid(box_scene)
-    points = wall()
-    assert grid.add(points, points + np.array([0.06, 0, 0])) == 0
-    assert grid.mapped_area == 0
+    grid = CoverageGrid(box_scene, RAYS)
+    assert wall(grid, TOWARDS_WALL @ make_pose(np.eye(3), (0.06, 0, 0))) == 0
+    assert grid.mapped_area == grid.mapped_share == 0
 
 
 def test_state_round_trip(box_scene):
-    grid, twin = CoverageGrid(box_scene), CoverageGrid(box_scene)
-    grid.add(wall(), wall())
+    grid, twin = CoverageGrid(box_scene, RAYS), CoverageGrid(box_scene, RAYS)
+    wall(grid)
     twin.set_state(grid.get_state())
-    assert twin.mapped_area == grid.mapped_area
-    assert twin.add(wall(), wall()) == 0
+    assert (twin.mapped_area, twin.mapped_share) == (grid.mapped_area, grid.mapped_share)
+    assert twin.mapped_area > 0
+    assert wall(twin) == 0
 
 
 def test_a_camera_at_rest_is_not_paid_for_noise():

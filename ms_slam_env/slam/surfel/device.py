@@ -15,41 +15,15 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
-
-from ms_slam_env._warp import wp
+from ms_slam_env import _warp
+from ms_slam_env._warp import RecordedLaunch, wp
 from ms_slam_env.slam.state import Stateful
 
 Dim = int | Sequence[int]
 
 
-class HostDeviceBuffer(Stateful):
-    """A device array; on a CPU the host works on its memory.
-
-    There ``assign`` and ``numpy`` of a small array cost 5 to 15 microseconds a call, most of it
-    for finding out what the array is; here that is done once.
-
-    Attributes:
-        array: the device array, zeros at first.
-    """
-
-    def __init__(self, shape: int | tuple[int, ...], dtype: Any, device: str) -> None:
-        self.array = wp.zeros(shape, dtype=dtype, device=device)
-        self._memory: NDArray[Any] | None = None
-        if wp.get_device(device).is_cpu:
-            self._memory = self.array.numpy()
-
-    def write(self, values: ArrayLike) -> None:
-        """Set all values."""
-        if self._memory is None:
-            self.array.assign(values)
-        else:
-            np.copyto(self._memory, values)
-
-    def read(self) -> NDArray[Any]:
-        """A copy of the values."""
-        return (self.array.numpy() if self._memory is None else self._memory).copy()
+class HostDeviceBuffer(_warp.HostDeviceBuffer, Stateful):
+    """One that is part of a state."""
 
     def get_state(self) -> dict[str, Any]:
         """The values."""
@@ -69,7 +43,7 @@ class KernelLaunchCache:
 
     def __init__(self, device: str) -> None:
         self._device = device
-        self._commands: dict[Hashable, wp.Launch] = {}
+        self._commands: dict[Hashable, RecordedLaunch] = {}
 
     def clear(self) -> None:
         """Forget all: the arguments have become other objects."""
@@ -85,14 +59,9 @@ class KernelLaunchCache:
         command = self._commands.get(key)
         if command is None:
             dim, inputs = arguments()
-            command = record_launch(kernel, dim, inputs, self._device)
+            command = RecordedLaunch(kernel, dim, inputs, self._device)
             self._commands[key] = command
         command.launch()
-
-
-def record_launch(kernel: Any, dim: Dim, inputs: Sequence[Any], device: str) -> wp.Launch:
-    """A launch to be repeated; nothing is launched yet."""
-    return wp.launch(kernel, dim=dim, inputs=inputs, device=device, record_cmd=True)
 
 
 def threads_per_row(width: int, device: str, gpu_columns: int = 1) -> tuple[int, int]:

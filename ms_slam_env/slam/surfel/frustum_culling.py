@@ -10,10 +10,7 @@ unstable surfel is due for removal.
 
 from __future__ import annotations
 
-from typing import Any
-
-from ms_slam_env._warp import wp
-from ms_slam_env.slam.surfel.device import record_launch
+from ms_slam_env._warp import RecordedLaunch, wp
 from ms_slam_env.slam.surfel.surfels import (
     BLOCK_SIZE,
     CullingBlocks,
@@ -347,14 +344,12 @@ class FrustumCuller:
         self._buffers = buffers
         window = window or any_time(buffers.batch, buffers.device)
         none = wp.zeros(envs, dtype=wp.mat44, device=buffers.device)
-        self._arguments: tuple[Any, ...] = (0, none, 0.0)
-        first_env, poses, margin_px = self._arguments
-        shared = [buffers.surfels, buffers.blocks, first_env, poses, camera, margin_px]
+        shared = [buffers.surfels, buffers.blocks, 0, none, camera, 0.0]
         shared.append(buffers.workers)
         dim, device = (envs, buffers.workers), buffers.device
         self._launches = [
-            record_launch(list_visible_blocks, dim, shared, device),
-            record_launch(cull, dim, [*shared, window, buffers.visible], device),
+            RecordedLaunch(list_visible_blocks, dim, shared, device),
+            RecordedLaunch(cull, dim, [*shared, window, buffers.visible], device),
         ]
 
     def __call__(self, poses: wp.array, first_env: int = 0, margin_px: float = 0.0) -> None:
@@ -366,10 +361,8 @@ class FrustumCuller:
     def list_blocks(self, poses: wp.array, first_env: int = 0, margin_px: float = 0.0) -> None:
         """List only the blocks of which a surfel may be seen."""
         self._buffers.blocks.num_listed.zero_()
-        changing = (first_env, poses, margin_px)
-        for index, new, old in zip((2, 3, 5), changing, self._arguments, strict=True):
-            if new is not old:
-                for launch in self._launches:
-                    launch.set_param_at_index(index, new)
-        self._arguments = changing
+        for launch in self._launches:
+            launch.set_param("first_env", first_env)
+            launch.set_param("poses", poses)
+            launch.set_param("margin_px", margin_px)
         self._launches[0].launch()

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env._warp import wp
+from ms_slam_env._warp import RecordedLaunch, wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.surfel.config import SurfelConfig
@@ -21,7 +21,6 @@ from ms_slam_env.slam.surfel.device import (
     HostDeviceBuffer,
     fetch,
     put,
-    record_launch,
     threads_per_row,
 )
 
@@ -277,7 +276,7 @@ class Preprocessor:
             launch.launch()
         return self.frame
 
-    def _record(self) -> list[wp.Launch]:
+    def _record(self) -> list[RecordedLaunch]:
         """The stages; all buffers stay."""
         frame, config, camera, dim = self.frame, self.config, self.intrinsics, self._dim
         size = [camera.height, camera.width, self._columns]
@@ -296,7 +295,7 @@ class Preprocessor:
             (_filter, [filtered, *size, 1, *rule, *working, inverse]),
             (_surface, [inverse, *size, self._normal_step, edge, *pinhole, *surface]),
         ]
-        return [record_launch(kernel, dim, inputs, self.device) for kernel, inputs in stages]
+        return [RecordedLaunch(kernel, dim, inputs, self.device) for kernel, inputs in stages]
 
 
 def check_images(

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-from ms_slam_env._warp import wp
-from ms_slam_env.slam.surfel.device import fetch, put, record_launch, threads_per_row
+from ms_slam_env._warp import RecordedLaunch, wp
+from ms_slam_env.slam.surfel.device import fetch, put, threads_per_row
 
 EDGE_FRACTION = 0.03  # pixels of a block further behind the front one than this are another surface
 
@@ -139,7 +139,7 @@ class Pyramid:
     ) -> None:
         self._device = device
         self._columns, _ = threads_per_row(shape[1], device)
-        self._launches: list[wp.Launch] = []
+        self._launches: list[RecordedLaunch] = []
         self._levels: list[Level] = []
 
         self._with_gradient = with_gradient
@@ -169,17 +169,17 @@ class Pyramid:
             launch.launch()
         return self._levels
 
-    def _downsampling(self, fine: Level, coarse: Level) -> wp.Launch:
+    def _downsampling(self, fine: Level, coarse: Level) -> RecordedLaunch:
         source = [fine.vertices.flatten(), fine.normals.flatten(), fine.intensity.flatten()]
         target = [coarse.vertices.flatten(), coarse.normals.flatten(), coarse.intensity.flatten()]
         size = fine.vertices.shape[1:]
         inputs = [*source, *size, EDGE_FRACTION, self._columns, *target]
-        return record_launch(_downsample, self._dim(coarse.intensity), inputs, self._device)
+        return RecordedLaunch(_downsample, self._dim(coarse.intensity), inputs, self._device)
 
-    def _differentiation(self, level: Level) -> wp.Launch:
+    def _differentiation(self, level: Level) -> RecordedLaunch:
         size, image = level.intensity.shape[1:], level.intensity
         inputs = [image.flatten(), *size, self._columns, level.gradient.flatten()]
-        return record_launch(_intensity_gradient, self._dim(image), inputs, self._device)
+        return RecordedLaunch(_intensity_gradient, self._dim(image), inputs, self._device)
 
     def _dim(self, image: wp.array) -> tuple[int, int]:
         """Threads of a kernel that writes ``image`` (B, h, w): a piece of a row each."""

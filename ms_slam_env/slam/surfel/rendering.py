@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from ms_slam_env._warp import wp
+from ms_slam_env._warp import RecordedLaunch, wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.surfel import splatting
-from ms_slam_env.slam.surfel.device import record_launch
 from ms_slam_env.slam.surfel.frustum_culling import FrustumCuller
 from ms_slam_env.slam.surfel.surfels import MapBuffers, SeenWindow, SplatCamera, VisibleList
 
@@ -78,10 +77,10 @@ class SplatRenderer:
         self._z_buffer = wp.zeros(pixels, dtype=wp.float32, device=self.device)
         self._sums = wp.zeros(pixels, dtype=splatting.Sums, device=self.device)
         self._culler = FrustumCuller(buffers, envs, self.camera, window)
-        self._splats: dict[tuple[int, int], list[wp.Launch]] = {}
+        self._splats: dict[tuple[int, int], list[RecordedLaunch]] = {}
         images = [a.flatten() for a in (view.vertices, view.normals, view.intensity, view.color)]
         dim, inputs = (envs, intrinsics.height), [self._sums, self.camera, *images]
-        self._resolve = record_launch(splatting.resolve, dim, inputs, self.device)
+        self._resolve = RecordedLaunch(splatting.resolve, dim, inputs, self.device)
 
     def _new_view(self) -> ModelView:
         def image(dtype: Any) -> wp.array:
@@ -106,7 +105,7 @@ class SplatRenderer:
             launch.launch()
         return self.view
 
-    def _record_splats(self, listed: VisibleList, first_env: int) -> list[wp.Launch]:
+    def _record_splats(self, listed: VisibleList, first_env: int) -> list[RecordedLaunch]:
         """The three passes over the surfels of a list."""
         surfels, workers = self._buffers.surfels, self._buffers.workers
         shared = [listed, self.camera, workers, self._buffers.footprints]
@@ -117,7 +116,7 @@ class SplatRenderer:
             (splatting.splat_attributes, [*listed_in, self._z_buffer, self._sums]),
         )
         dim = (self.envs, workers)
-        return [record_launch(kernel, dim, inputs, self.device) for kernel, inputs in passes]
+        return [RecordedLaunch(kernel, dim, inputs, self.device) for kernel, inputs in passes]
 
     def list_hidden(self, hidden: VisibleList) -> None:
         """List the culled surfels that lie well behind the surface that ``splat`` just drew."""

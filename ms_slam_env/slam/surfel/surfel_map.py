@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ms_slam_env._warp import wp
+from ms_slam_env._warp import RecordedLaunch, wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.base import Float64, Views
 from ms_slam_env.slam.state import Stateful
 from ms_slam_env.slam.surfel import fusion, surfel_culling, surfel_update
 from ms_slam_env.slam.surfel.config import SurfelConfig
-from ms_slam_env.slam.surfel.device import record_launch
 from ms_slam_env.slam.surfel.frustum_culling import FrustumCuller, bound_blocks, set_bounded
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
 from ms_slam_env.slam.surfel.rendering import (
@@ -59,14 +58,14 @@ class MapKernels:
         threshold = config.confidence_threshold
         self._bound = [
             self._record(bound_blocks, [*inputs, threshold, buffers.workers]),
-            record_launch(set_bounded, buffers.batch, inputs, buffers.device),
+            RecordedLaunch(set_bounded, buffers.batch, inputs, buffers.device),
         ]
 
-    def _record(self, kernel: Any, inputs: list[Any]) -> wp.Launch:
+    def _record(self, kernel: Any, inputs: list[Any]) -> RecordedLaunch:
         dim = (self._buffers.batch, self._buffers.workers)
-        return record_launch(kernel, dim, inputs, self._buffers.device)
+        return RecordedLaunch(kernel, dim, inputs, self._buffers.device)
 
-    def _record_fusion(self) -> list[wp.Launch]:
+    def _record_fusion(self) -> list[RecordedLaunch]:
         config, buffers = self.config, self._buffers
         rule = fusion.FusionParameters()
         rule.distance_m = config.fusion_distance_m
@@ -80,7 +79,7 @@ class MapKernels:
         update = self._record(surfel_update.update_surfels, inputs)
         if buffers.workers == 1:
             culled = [buffers.surfels, buffers.blocks, buffers.active, buffers.visible]
-            update = record_launch(
+            update = RecordedLaunch(
                 surfel_update.cull_and_update, buffers.batch, [*culled, *shared[:3]], buffers.device
             )
         return [
@@ -88,7 +87,7 @@ class MapKernels:
             self._record(fusion.add_surfels, [buffers.surfels, buffers.capacity, *shared]),
         ]
 
-    def _record_culling(self) -> list[wp.Launch]:
+    def _record_culling(self) -> list[RecordedLaunch]:
         config, buffers = self.config, self._buffers
         rule = surfel_culling.CullingRule()
         rule.capacity = buffers.capacity
@@ -150,7 +149,7 @@ class MapKernels:
         frame.depth, frame.normals = live.depth.flatten(), live.normals.flatten()
         frame.color, frame.moving = live.color.flatten(), live.moving.flatten()
         for launch in (*self._fusion, *self._culling[:2]):
-            launch.set_param_by_name("frame", frame)
+            launch.set_param("frame", frame)
 
 
 class SurfelMap(Stateful):
