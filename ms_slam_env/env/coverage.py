@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -216,3 +217,10 @@ class CoverageGrid:
 def _shared(array: NDArray[Any], dtype: Any) -> wp.array:
     """A kernel's view of an array's own memory."""
     return wp.array(array, dtype=dtype, device="cpu", copy=False)
+
+
+def team_share(grids: Sequence[CoverageGrid]) -> float:
+    """Share of the reachable surface that one of several robots in a scene has mapped, [0, 1]."""
+    voxels = grids[0]._voxels
+    mapped = np.logical_or.reduce([grid._mapped != 0 for grid in grids])
+    return int(np.count_nonzero(mapped & voxels.reachable)) / max(1, voxels.num_reachable)

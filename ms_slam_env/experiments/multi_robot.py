@@ -25,6 +25,7 @@ from ms_slam_env.experiments.harness.teams import (
     place_robots,
 )
 from ms_slam_env.experiments.pictures.team_maps import save_picture
+from ms_slam_env.metrics.registry import metric
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import (
     Column,
@@ -83,6 +84,8 @@ class MultiRobot(Experiment, Checked):
     """Share of the surface a robot sees that one before it must see too."""
     merge: MergeConfig = field(default_factory=MergeConfig)
     """How maps are merged."""
+    server: bool = False
+    """Optimise trajectories and map jointly after merging, and compare."""
     picture: bool = True
     """Draw the map of the first team, which is run once more for it."""
 
@@ -112,6 +115,7 @@ class MultiRobot(Experiment, Checked):
                 self.noise,
                 self.least_overlap,
                 merge=self.merge,
+                server=self.server,
             )
             for setting in self.settings
             for scene in self.scenes
@@ -139,6 +143,7 @@ class MultiRobot(Experiment, Checked):
             sources.table(flattened(pairs, "by_source"), "With guesses of one source alone"),
             _teams(rows),
             make_table(_PAIR, [{**pair["spec"], **pair["result"]} for pair in pairs], "Pairs"),
+            *([_served(rows)] if any("server" in row["result"] for row in finished(rows)) else []),
         ]
 
     def write_pictures(self, rows: Sequence[Row], out: Path) -> None:
@@ -173,3 +178,23 @@ def _teams(rows: Sequence[Row]) -> Table:
     names = [column.name if isinstance(column, Column) else column for column in columns]
     lines = [{name: line[name] for name in names} for line in lines]
     return make_table(columns, lines, "Teams")
+
+
+def _served(rows: Sequence[Row]) -> Table:
+    """Every team before and after the server has optimised it."""
+    before = dict(zip(("between_robots_m", "noise_ratio"),
+                      ("merged_between_robots_m", "merged_noise_ratio"), strict=True))  # fmt: skip
+    keys = ("team_ate_m", "between_robots_m", *(f"f_score_{n}cm" for n in (2, 5)), "noise_ratio")
+    columns: list[Column | str] = ["scene", "seed", "robots", "server_links"]
+    for key in keys:
+        columns += [Column(f"merged_{key}", key, f"{metric(key).heading}, merged"), key]
+    lines = []
+    for row in finished(rows):
+        after = row["result"].get("server")
+        if after is None:
+            continue
+        merged = {**row["result"], **{key: after[of] for key, of in before.items()}}
+        lines.append({**row["spec"], **after, **{f"merged_{key}": merged[key] for key in keys}})
+    return make_table([*columns, "server_cpu_s"], lines, "After the server",
+                      "Merged: laid together by the merge; else after the joint pose graph, the "
+                      "frames fused anew at its poses.")  # fmt: skip

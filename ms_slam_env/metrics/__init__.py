@@ -14,7 +14,14 @@ from ms_slam_env.metrics.consistency import (
 )
 from ms_slam_env.metrics.cost import CostMeter, EnergyCounter, FrameCost, energy_counters
 from ms_slam_env.metrics.initialisation import Initialisation, initialisation, local_scales
-from ms_slam_env.metrics.multi_robot import mean_path_length, task_time, team_ate, team_rpe
+from ms_slam_env.metrics.multi_robot import (
+    inter_robot_errors,
+    inter_robot_rpe,
+    mean_path_length,
+    task_time,
+    team_ate,
+    team_rpe,
+)
 from ms_slam_env.metrics.reconstruction import (
     CloudDistance,
     Completion,
@@ -92,6 +99,8 @@ __all__ = [
     "hausdorff_distance",
     "icp",
     "initialisation",
+    "inter_robot_errors",
+    "inter_robot_rpe",
     "judge_consistency",
     "local_scales",
     "mean_path_length",

@@ -6,18 +6,21 @@ Positioning and Timing 2021, equations (14) to (20).
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ms_slam_env.errors import InputError
-from ms_slam_env.metrics.relative import relative_errors
+from ms_slam_env.geometry import Float64
+from ms_slam_env.metrics.relative import motion_errors, relative_errors
 from ms_slam_env.metrics.trajectory import (
     ErrorStatistics,
     absolute_errors,
     check_kind,
     check_pair,
+    check_times,
     path_length,
     statistics_of,
 )
@@ -61,10 +64,10 @@ def team_rpe(
     unit: str = "frames",
     times: Sequence[ArrayLike] | None = None,
 ) -> ErrorStatistics:
-    """Relative pose error (m or rad) of M robots, USME equations (16) and (17).
+    """Relative pose error (m or rad) of M robots, USME equations (16) and (17), within each robot.
 
-    Every robot's motions over ``delta`` count alike; arguments of `relative_errors`, ``times`` of
-    each robot.
+    Between robots it is `inter_robot_rpe`. Every robot's motions over ``delta`` count alike;
+    arguments of `relative_errors`, ``times`` of each robot.
 
     Raises:
         InputError: no robot, numbers that differ, or as `relative_errors`.
@@ -79,6 +82,69 @@ def team_rpe(
         for k in range(len(truths))
     ]
     return statistics_of(np.concatenate(errors))
+
+
+def inter_robot_errors(
+    estimates: Sequence[ArrayLike],
+    truths: Sequence[ArrayLike],
+    kind: str = "translation",
+    times: Sequence[ArrayLike] | None = None,
+) -> Float64:
+    """Errors (K,) of where each robot is in the frame of each other one, at every common moment.
+
+    The other reading of USME equation (16), whose text we lack: states of different robots are
+    compared. With Q_i, Q_j the true poses of two robots at a moment and P_i, P_j the estimates,
+    E_ij = (Q_i^-1 Q_j)^-1 (P_i^-1 P_j), as in `relative_errors`, where i and j are moments of one
+    robot. No alignment enters, and each pair counts once.
+
+    Args:
+        estimates: M >= 2 trajectories T_world_camera (N_i, 4, 4), one world.
+        truths: likewise.
+        kind: ``translation``, metres, or ``rotation``, radians.
+        times: of each robot (N_i,), seconds, increasing; poses of equal times are compared.
+            Without it those of equal rows, up to the length of the shorter trajectory.
+
+    Raises:
+        InputError: fewer than two robots, numbers or lengths that differ, bad poses or times, no
+            moment that two robots have in common.
+    """
+    _check_team(estimates, truths)
+    check_kind(kind)
+    pairs = [
+        check_pair(estimate, truth, whose=f" of robot {k}")
+        for k, (estimate, truth) in enumerate(zip(estimates, truths, strict=True))
+    ]
+    if len(pairs) < 2:
+        raise InputError("one robot has no pose in the frame of another: at least 2 are needed")
+    if times is None:
+        clocks = [np.arange(len(own)) for own, _ in pairs]
+    elif len(times) != len(pairs):
+        raise InputError(f"{len(pairs)} true trajectories but times of {len(times)} robots")
+    else:
+        clocks = [
+            check_times(t, len(own), f"times of robot {k}")
+            for k, (t, (own, _)) in enumerate(zip(times, pairs, strict=True))
+        ]
+    errors = []
+    for i, j in itertools.combinations(range(len(pairs)), 2):
+        _, first, second = np.intersect1d(clocks[i], clocks[j], return_indices=True)
+        own, true = (np.concatenate([pairs[i][s][first], pairs[j][s][second]]) for s in (0, 1))
+        at = np.arange(len(first))
+        errors.append(motion_errors(own, true, at, at + len(first), kind))
+    found = np.concatenate(errors)
+    if len(found) == 0:
+        raise InputError("no two robots have a moment in common")
+    return found
+
+
+def inter_robot_rpe(
+    estimates: Sequence[ArrayLike],
+    truths: Sequence[ArrayLike],
+    kind: str = "translation",
+    times: Sequence[ArrayLike] | None = None,
+) -> ErrorStatistics:
+    """Statistics of `inter_robot_errors`, whose arguments it takes; the RMSE is USME (17)."""
+    return statistics_of(inter_robot_errors(estimates, truths, kind, times))
 
 
 def task_time(times: Sequence[ArrayLike]) -> float:

@@ -13,6 +13,8 @@ from ms_slam_env.geometry import hat, make_pose, se3_exp, se3_log, so3_exp
 from ms_slam_env.metrics import (
     ate_rmse,
     initialisation,
+    inter_robot_errors,
+    inter_robot_rpe,
     local_scales,
     mean_path_length,
     rpe_rmse,
@@ -148,6 +150,40 @@ def test_one_robot_is_judged_as_before_and_two_in_one_world() -> None:
     apart = [a, se3_exp([1, 0, 0, 0, 0, 0]) @ b]
     assert ate_rmse(apart[1], b) == pytest.approx(0, abs=1e-9)
     assert team_ate(apart, [a, b]).rmse > 0.2
+
+
+def test_a_robot_in_the_frame_of_another() -> None:
+    a, b, c = (winding(40, k) for k in (1, 2, 3))
+    moved = se3_exp([0.0, 0.3, 0.4, 0, 0, 0])
+    # Only the second robot is misplaced: by 0.5 m in the first one's frame and in the third's.
+    errors = inter_robot_errors([a, moved @ b, c], [a, b, c])
+    np.testing.assert_allclose(errors.reshape(3, 40)[[0, 2]], 0.5, atol=1e-9)
+    np.testing.assert_allclose(errors.reshape(3, 40)[1], 0.0, atol=1e-9)
+    # What all are off by together is no error between them, and each against itself is blind to it.
+    assert inter_robot_rpe([moved @ a, moved @ b], [a, b]).rmse == pytest.approx(0, abs=1e-9)
+    assert team_rpe([a, moved @ b], [a, b]).rmse == pytest.approx(0, abs=1e-9)
+    turned = b @ se3_exp([0, 0, 0, 0, 0, 0.2])
+    assert inter_robot_rpe([a, turned], [a, b], "rotation").rmse == pytest.approx(0.2)
+    # By hand at one moment, with the definition written out.
+    P = np.linalg.inv(a[5]) @ (moved @ turned)[5]
+    E = np.linalg.inv(np.linalg.inv(a[5]) @ b[5]) @ P
+    assert inter_robot_errors([a, moved @ turned], [a, b])[5] == pytest.approx(
+        np.linalg.norm(E[:3, 3])
+    )
+
+
+def test_robots_are_compared_at_equal_times() -> None:
+    a, b = winding(40, 1), winding(40, 2)
+    times = [TIMES[:40], TIMES[10:50]]
+    late = b.copy()
+    late[:20] = se3_exp([1.0, 0, 0, 0, 0, 0]) @ late[:20]
+    errors = inter_robot_errors([a, late], [a, b], times=times)
+    np.testing.assert_allclose(errors, [1.0] * 20 + [0.0] * 10, atol=1e-9)
+    assert len(inter_robot_errors([a, b[:7]], [a, b[:7]])) == 7
+    with pytest.raises(InputError, match="no two robots have a moment in common"):
+        inter_robot_errors([a, b], [a, b], times=[TIMES[:40], TIMES[:40] + 100])
+    with pytest.raises(InputError, match="at least 2"):
+        inter_robot_errors([a], [a])
 
 
 def test_time_and_way_of_a_team() -> None:

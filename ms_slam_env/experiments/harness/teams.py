@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import time
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -27,6 +28,7 @@ from ms_slam_env.slam.map_merging import (
     find_hypotheses,
     pose_difference,
 )
+from ms_slam_env.slam.team_server import fuse_team, optimise_team
 
 Float64 = NDArray[np.float64]
 
@@ -61,6 +63,7 @@ class MultiRobotSpec:
         least_overlap: of the surfaces that they see.
         params: of the SLAM.
         merge: how maps are merged.
+        server: whether trajectories and map are optimised after merging, too.
     """
 
     scene: str = "living_room"
@@ -73,6 +76,7 @@ class MultiRobotSpec:
     least_overlap: float = 0.3
     params: dict[str, Any] = field(default_factory=dict)
     merge: MergeConfig = field(default_factory=MergeConfig)
+    server: bool = False
 
 
 @dataclass(frozen=True)
@@ -263,32 +267,72 @@ def judge_team(
         entry = _judge_merge(team, a, b, pair.merge, same_scene)
         about = {"pair": f"{a}-{b}", "same_scene": same_scene}
         pairs.append({**about, **entry, "by_source": by_source})
-    T_first = place_robots(len(team.robots), merges)
+    T_first = {k: team.truths[0][0] @ T for k, T in place_robots(len(team.robots), merges).items()}
     members = list(T_first)
-    T_world_first = team.truths[0][0]
-    estimates, truths, points = [], [], []
-    for k in members:
-        T = T_world_first @ T_first[k]
-        estimates.append(T @ team.robots[k].estimates)
-        truths.append(team.truths[k])
-        points.append(transform_points(T, team.robots[k].backend.surface_points()))
-    ate = metrics.team_ate(estimates, truths)
-    ok = np.concatenate([team.robots[k].tracked for k in members])
-    tracked = metrics.tracked_errors(np.concatenate(estimates), np.concatenate(truths), ok)
+    estimates = [T @ team.robots[k].estimates for k, T in T_first.items()]
+    points = [
+        transform_points(T, team.robots[k].backend.surface_points()) for k, T in T_first.items()
+    ]
+    truths = [team.truths[k] for k in members]
     return {
         "pairs": pairs,
         "path_overlaps": team.overlaps,
         "merged_robots": len(members),
-        "team_ate_m": ate.rmse,
-        "team_ate_tracked_m": tracked["ate_tracked_m"],
-        "tracked_share": tracked["tracked_share"],
-        "team_ate_max_m": ate.max,
-        "team_ate_unaligned_m": metrics.team_ate(estimates, truths, "none").rmse,
-        "team_rpe_m": metrics.team_rpe(estimates, truths).rmse,
+        **team_errors(estimates, truths, [team.robots[k].tracked for k in members]),
         "task_time_s": metrics.task_time([team.times[k] for k in members]),
         "mean_path_m": metrics.mean_path_length(truths),
         **map_quality(np.concatenate(points), team.surface, reference=team.seen),
+        **({"server": serve(team, T_first, spec)} if spec.server else {}),
         "alone": [_alone(team, k) for k in range(len(team.robots)) if k != foreign],
+    }
+
+
+def team_errors(
+    estimates: list[Float64], truths: list[Float64], tracked: list[NDArray[np.bool_]]
+) -> dict[str, Any]:
+    """Errors of the trajectories (N, 4, 4) of a team in one world, by keys of the registry."""
+    ate = metrics.team_ate(estimates, truths)
+    own = metrics.tracked_errors(*map(np.concatenate, (estimates, truths, tracked)))
+    return {
+        "team_ate_m": ate.rmse,
+        "team_ate_tracked_m": own["ate_tracked_m"],
+        "tracked_share": own["tracked_share"],
+        "team_ate_max_m": ate.max,
+        "team_ate_unaligned_m": metrics.team_ate(estimates, truths, "none").rmse,
+        "team_rpe_m": metrics.team_rpe(estimates, truths).rmse,
+    }
+
+
+def serve(team: Team, T_world_map: dict[int, Float64], spec: MultiRobotSpec) -> dict[str, Any]:
+    """The same figures after the server has optimised the trajectories and fused the map anew.
+
+    ``server_cpu_s`` is the processor time of the pose graph, without that of the fusion;
+    ``noise_ratio`` is that of the fused map, ``merged_noise_ratio`` of the maps laid together.
+    """
+    began = time.process_time()
+    made = optimise_team(team.robots, T_world_map)
+    seconds = time.process_time() - began
+    estimates = list(made.trajectories.values())
+    truths = [team.truths[k] for k in made.trajectories]
+    before = [T @ team.robots[k].estimates for k, T in T_world_map.items()]
+    K = team.robots[0].backend.intrinsics
+    fused = fuse_team(slam.make("surfel", K, **spec.params), team.robots, made).surface_points()
+    laid = np.concatenate([
+        transform_points(T, team.robots[k].backend.surface_points())
+        for k, T in T_world_map.items()
+    ])  # fmt: skip
+    several = len(estimates) > 1
+    return {
+        **team_errors(estimates, truths, [team.robots[k].tracked for k in made.trajectories]),
+        "between_robots_m": metrics.inter_robot_rpe(estimates, truths).rmse if several else None,
+        "merged_between_robots_m": (
+            metrics.inter_robot_rpe(before, truths).rmse if several else None
+        ),
+        "server_links": made.links,
+        "server_cpu_s": seconds,
+        "noise_ratio": metrics.noise_ratio(fused),
+        "merged_noise_ratio": metrics.noise_ratio(laid),
+        **map_quality(fused, team.surface, reference=team.seen),
     }
 
 

@@ -1,0 +1,221 @@
+"""The server of a team: one pose graph over the keyframes of all robots, one map of their frames.
+
+Qu, Zhang, Yang, Dong, "USME", Navigation Positioning and Timing 2021, section 4: the back end of
+several robots receives their keyframes, optimises the poses of every robot, and fuses, denoises and
+optimises their maps. The graph has the motion that each robot's SLAM says between its neighbouring
+keyframes, and where keyframes of one robot lie in the map of another, to which they are registered
+(GICP): a map is the mean of many frames, two frames by themselves fit worse.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.camera import Intrinsics, RGBDFrame
+from ms_slam_env.config import Checked, bounded
+from ms_slam_env.geometry import invert, relative_angle, se3_exp, se3_log, transform_points
+from ms_slam_env.geometry.cloud_registration import register_clouds
+from ms_slam_env.geometry.point_clouds import voxel_downsample
+from ms_slam_env.slam.base import SlamBackend
+from ms_slam_env.slam.map_fit import query_frames
+from ms_slam_env.slam.map_hypotheses import RobotRun
+from ms_slam_env.slam.sparse.loop_closure import Edge, optimise_poses
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+_FAR_M = 4.0  # readings beyond are too noisy to be registered
+_VOXEL_M = 0.02
+_FEWEST, _MATCHED = 200, 800  # points that are registered
+_SURE = 5e-4  # metres and radians that a motion is never surer than
+
+
+@dataclass(frozen=True)
+class ServerConfig(Checked):
+    """How the keyframes of a team are joined.
+
+    Attributes:
+        keyframes: of each robot, evenly spread over its tracked frames.
+        agree_m: a keyframe found in another map farther than this from where the merged maps put
+            it,
+        agree_deg: or turned by more, is left out.
+        least_share: share of a keyframe's points that must lie on the other map.
+        cutoff_m: farthest pair of points in the registration.
+        drift: error of the motion between neighbouring keyframes, as a share of it.
+        match_m: error of a keyframe registered in another map, metres,
+        match_rad: and radians.
+    """
+
+    keyframes: int = bounded(30, 2, 1000)
+    agree_m: float = bounded(0.2, 1e-4, 10.0)
+    agree_deg: float = bounded(5.0, 1e-2, 180.0)
+    least_share: float = bounded(0.6, 0.0, 1.0)
+    cutoff_m: float = bounded(0.04, 1e-3, 1.0)
+    drift: float = bounded(0.003, 1e-6, 1.0)
+    match_m: float = bounded(0.01, 1e-6, 1.0)
+    match_rad: float = bounded(0.006, 1e-6, 1.0)
+
+
+@dataclass(frozen=True)
+class TeamEstimate:
+    """What the server made of a team.
+
+    Attributes:
+        trajectories: by robot (N, 4, 4), T_world_camera of all of its frames in the first frame.
+        links: keyframes that were found in the map of another robot.
+    """
+
+    trajectories: Mapping[int, Float64]
+    links: int
+
+
+@dataclass(frozen=True)
+class _Keyframe:
+    """A frame of a robot that stands in the graph."""
+
+    robot: int
+    index: int  # of the frame
+    T_world_camera: Float64  # (4, 4) in the common frame, before
+    cloud: Float64  # (M, 3) in the camera's frame
+
+
+def optimise_team(
+    robots: Sequence[RobotRun],
+    T_world_map: Mapping[int, Float64],
+    config: ServerConfig | None = None,
+) -> TeamEstimate:
+    """Trajectories of robots that agree with what any two of them saw of one place.
+
+    Args:
+        robots: of whom those in ``T_world_map`` are joined.
+        T_world_map: (4, 4) by robot: where the frame of its map lies in the common one. The first
+            keyframe of the first robot stays where it is.
+        config: of the graph.
+    """
+    config = config or ServerConfig()
+    keyframes = [
+        keyframe
+        for k, T in T_world_map.items()
+        for keyframe in _keyframes(k, robots[k], T, config.keyframes)
+    ]
+    poses = np.stack([keyframe.T_world_camera for keyframe in keyframes])
+    own = [
+        _motion(a, b, keyframes, config.drift)
+        for a, b in itertools.pairwise(range(len(keyframes)))
+        if keyframes[a].robot == keyframes[b].robot
+    ]
+    maps = {
+        k: transform_points(T, voxel_downsample(robots[k].backend.surface_points(), _VOXEL_M))
+        for k, T in T_world_map.items()
+    }
+    found = _links(keyframes, maps, config)
+    fixed = np.arange(len(poses)) == 0
+    optimised = optimise_poses(poses, [*own, *found], fixed) if found else poses
+    trajectories = {}
+    for k, T in T_world_map.items():
+        own_keys = [n for n, keyframe in enumerate(keyframes) if keyframe.robot == k]
+        at = np.array([keyframes[n].index for n in own_keys])
+        corrections = np.stack([optimised[n] @ invert(poses[n]) for n in own_keys])
+        trajectories[k] = _carried_along(T @ robots[k].estimates, at, corrections)
+    return TeamEstimate(trajectories, len(found))
+
+
+def fuse_team(
+    backend: SlamBackend, robots: Sequence[RobotRun], estimate: TeamEstimate, every: int = 1
+) -> SlamBackend:
+    """Fuse the tracked frames of all robots into one map, at the poses of the server.
+
+    What only a frame or two show, the backend's own fusion does not take for surface: that is the
+    denoising. Returns the ``backend``.
+    """
+    backend.reset(next(iter(estimate.trajectories.values()))[0])
+    for k, poses in estimate.trajectories.items():
+        for index in np.flatnonzero(robots[k].tracked)[::every]:
+            backend.fuse(robots[k].frames[index], poses[index])
+    return backend
+
+
+def _keyframes(number: int, robot: RobotRun, T: Float64, count: int) -> list[_Keyframe]:
+    K = robot.backend.intrinsics
+    return [
+        _Keyframe(number, index, T @ robot.estimates[index], _cloud(robot.frames[index], K))
+        for index in query_frames(robot, count)
+    ]
+
+
+def _cloud(frame: RGBDFrame, K: Intrinsics) -> Float64:
+    """Points (M, 3) of a frame, in the camera's frame."""
+    near = (frame.depth > 0) & (frame.depth < _FAR_M)
+    points = K.rays()[near] * frame.depth[near][:, None]
+    return voxel_downsample(points, _VOXEL_M) if len(points) else points
+
+
+def _motion(a: int, b: int, keyframes: Sequence[_Keyframe], drift: float) -> Edge:
+    """What SLAM says of the way between neighbouring keyframes of a robot."""
+    T = invert(keyframes[a].T_world_camera) @ keyframes[b].T_world_camera
+    metres, angle = float(np.linalg.norm(T[:3, 3])), relative_angle(np.eye(3), T[:3, :3])
+    return Edge(a, b, T, _SURE + drift * angle, _SURE + drift * metres)
+
+
+def _links(
+    keyframes: Sequence[_Keyframe], maps: Mapping[int, Float64], config: ServerConfig
+) -> list[Edge]:
+    """Relative poses of keyframes of two robots, of which one is registered in the other's map."""
+    found = []
+    for b, seen in enumerate(keyframes):
+        for robot, points in maps.items():
+            if robot == seen.robot:
+                continue
+            T = _registered(seen, points, config)
+            if T is not None:
+                a = _nearest(T, keyframes, robot)
+                motion = invert(keyframes[a].T_world_camera) @ T
+                found.append(Edge(a, b, motion, config.match_rad, config.match_m))
+    return found
+
+
+def _registered(seen: _Keyframe, points: Float64, config: ServerConfig) -> Float64 | None:
+    """T_world_camera (4, 4) by which a keyframe fits a map (M, 3), if it does, near where it is."""
+    moved = transform_points(seen.T_world_camera, seen.cloud)
+    if len(moved) < _FEWEST:
+        return None
+    low, high = moved.min(axis=0) - config.agree_m, moved.max(axis=0) + config.agree_m
+    around = points[((points > low) & (points < high)).all(axis=1)]
+    if len(around) < _FEWEST:
+        return None
+    fit = register_clouds(moved, around, "gicp", config.cutoff_m, _MATCHED)
+    T = fit.T_target_source @ seen.T_world_camera
+    near = fit.share >= config.least_share and _agree(T, seen.T_world_camera, config)
+    return T if near else None
+
+
+def _nearest(T: Float64, keyframes: Sequence[_Keyframe], robot: int) -> int:
+    """The keyframe of a robot taken nearest to a pose (4, 4)."""
+    own = [k for k, keyframe in enumerate(keyframes) if keyframe.robot == robot]
+    away = [np.linalg.norm(se3_log(invert(keyframes[k].T_world_camera) @ T)) for k in own]
+    return own[int(np.argmin(away))]
+
+
+def _agree(T: Float64, expected: Float64, config: ServerConfig) -> bool:
+    off = invert(expected) @ T
+    turned = np.degrees(relative_angle(np.eye(3), off[:3, :3]))
+    return bool(np.linalg.norm(off[:3, 3]) <= config.agree_m and turned <= config.agree_deg)
+
+
+def _carried_along(poses: Float64, at: Int64, corrections: Float64) -> Float64:
+    """Poses (N, 4, 4) moved with the keyframes ``at`` (K,), in between by a share of the motion."""
+    moved = np.empty_like(poses)
+    for k, pose in enumerate(poses):
+        after = int(np.clip(np.searchsorted(at, k, side="right"), 1, max(1, len(at) - 1)))
+        if len(at) == 1:
+            moved[k] = corrections[0] @ pose
+            continue
+        share = np.clip((k - at[after - 1]) / (at[after] - at[after - 1]), 0.0, 1.0)
+        twist = se3_log(invert(corrections[after - 1]) @ corrections[after])
+        moved[k] = corrections[after - 1] @ se3_exp(share * twist) @ pose
+    return moved
