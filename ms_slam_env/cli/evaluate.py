@@ -79,6 +79,8 @@ class Arguments:
     """Of a point in the statistics of outliers."""
     std_ratio: float = 2.0
     """Standard deviations above the mean that make an outlier."""
+    two_sided: bool = False
+    """Points closer together than so many below the mean are outliers, too, as USME has it."""
     out: Path | None = None
     """Folder of the results."""
 
@@ -137,6 +139,7 @@ def _map_options(args: Arguments) -> MapOptions:
         remove_outliers=args.remove_outliers,
         neighbours=args.neighbours,
         std_ratio=args.std_ratio,
+        two_sided=args.two_sided,
         thresholds_m=args.thresholds_m,
         voxel_m=args.voxel_m,
         samples=args.samples,

@@ -64,6 +64,9 @@ class Arguments:
     """Write the map to this file, to be gone on with."""
     mesh: bool = False
     """Write mesh.ply, too: Poisson reconstruction of the map (extra open3d)."""
+    core_watts: float = 10.0
+    """Watts of a busy core, by which energy is estimated from processor time where neither RAPL nor
+    NVML can be read; the estimate has names of its own (ene_model_j)."""
     out: Path = Path("results/run")
     """Folder of the results."""
 
@@ -128,12 +131,14 @@ def main(arguments: Sequence[str]) -> int:
             map_in=args.map_in,
             map_out=args.map_out,
             mesh=args.mesh,
+            core_watts=args.core_watts,
         )
     for name in _PRINTED:
         if result.get(name) is not None:
             print(f"{name:16} {result[name]:.4g}")
     if result.get("ene_j") is None and "ene_source" in result:
         print(f"{'ene_j':16} {result['ene_source']}")
+        print(f"{'ene_model_j':16} {result['ene_model_j']:.4g} ({result['energy_source']})")
     for reason in result["lost_reasons"]:
         print(f"lost {reason}", file=sys.stderr)
     complaint = lost_throughout(result["processed_frames"], result["lost_frames"])

@@ -42,6 +42,7 @@ _ROBUSTNESS = (
     *("robustness_translation_m", "robustness_rotation_rad", "robustness_log_scale"),
     *("initialisation_s", "initialisation_scale", "scale_error"),
 )
+_PRINTED = ("ate_printed_m", "rpe_printed_m", "rpe_printed_median_m")
 _STATISTICS = ("rmse", "mean", "median", "std", "min", "max")
 _SHOWN_M = 0.1  # the farthest threshold of the curves of precision and recall
 _MAX_DOTS = 40_000
@@ -161,6 +162,9 @@ def trajectory_tables(found: Found, options: TrajectoryOptions) -> list[Table]:
         title = "Drift over lengths of the true path"
         keys: list[Column | str] = ["length_m", "sub_trajectories", *drifts]
         tables.append(make_table(keys, found["drift_by_length"], title))
+    printed = (absolute_key(options, "m"), "ate_printed_m", "rpe_m", *_PRINTED[1:])
+    note = "USME's equations (2) and (5) to the letter beside ours; they depend on the origin."
+    tables.append(_one_line(printed, found, "As USME prints it", note))
     shown = [key for key in _ROBUSTNESS if found.get(key) is not None]
     note = f"{_gaps(found)}."
     if found.get("robustness_reason"):

@@ -46,7 +46,8 @@ class MapOptions(Checked):
         cutoff_m: pairs of points farther apart do not count in that.
         remove_outliers: statistically, before everything else, as USME does.
         neighbours: of a point in the statistics of outliers.
-        std_ratio: standard deviations above the mean that make an outlier.
+        std_ratio: standard deviations from the mean that make an outlier.
+        two_sided: points whose neighbours are nearer than that below the mean are outliers, too.
         thresholds_m: for precision, recall and F-score.
         voxel_m: both clouds keep one point a voxel of this side, so that a surface counts by its
             area; 0 keeps all.
@@ -59,6 +60,7 @@ class MapOptions(Checked):
     remove_outliers: bool = False
     neighbours: int = bounded(20, 2, 10_000)
     std_ratio: float = bounded(2.0, 1e-6, 1e6)
+    two_sided: bool = False
     thresholds_m: Sequence[float] = (0.02, 0.05)
     voxel_m: float = bounded(0.01, 0.0, 1e3)
     samples: int = bounded(SAMPLES, 1, 100_000_000)
@@ -89,7 +91,9 @@ def evaluate_maps(
     options = options or MapOptions()
     read = read_surface(estimate, options.samples, options.seed)
     true = read_surface(truth, options.samples, options.seed)
-    inliers = metrics.statistical_inliers(read.points, options.neighbours, options.std_ratio)
+    inliers = metrics.statistical_inliers(
+        read.points, options.neighbours, options.std_ratio, options.two_sided
+    )
     kept = read.points[inliers] if options.remove_outliers else read.points
     if len(kept) == 0:
         raise InputError(f"statistical outlier removal leaves nothing of {estimate}")

@@ -72,6 +72,7 @@ _TABLES = {
     "Cost": (
         *("cpu_ms_median", "cpu_ms_p95", "cpu_ms_max", "ext_ms", "ext_ms_p95", "ext_ms_max"),
         *("mem_mb", "mem_peak_mb", "ene_j", "ene_frame_j", "ene_source"),
+        *("ene_model_j", "ene_model_frame_j", "energy_source"),
     ),
 }
 
@@ -86,13 +87,15 @@ def run_to_folder(
     map_in: Path | None = None,
     map_out: Path | None = None,
     mesh: bool = False,
+    core_watts: float = metrics.CORE_WATTS,
 ) -> dict[str, Any]:
     """Track every frame of ``sequence`` and write what came of it to ``out``.
 
     Those that ``selection`` drops are not processed; their poses are predicted.
     SLAM starts at the true pose of the first frame where that is known, else at the identity; or
     somewhere in the map of file ``map_in``, which it goes on with. In the end the map is written to
-    ``map_out`` to be gone on with, and as a ``mesh`` to ``mesh.ply``.
+    ``map_out`` to be gone on with, and as a ``mesh`` to ``mesh.ply``. ``core_watts`` are those by
+    which energy is estimated where none can be measured.
     While it runs, the trajectory so far stands in ``trajectory.incomplete.txt``. At the end that
     becomes ``trajectory.txt``, beside ``map.ply``, ``frames.csv`` with what every frame cost and,
     last, ``metrics.json``, which also says how the frames were ``fed`` to the backend. Where it
@@ -112,7 +115,7 @@ def run_to_folder(
     """
     if mesh:
         check_open3d()
-    meter = metrics.CostMeter(str(params.get("device", "cpu")))
+    meter = metrics.CostMeter(str(params.get("device", "cpu")), core_watts=core_watts)
     selection = selection or EveryFrameConfig()
     system = selection.manage(slam.make(backend, sequence.intrinsics, **params))
     if map_in is not None:

@@ -17,6 +17,7 @@ from ms_slam_env import metrics
 from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.errors import InputError, InputWarning
 from ms_slam_env.input_files import read_text
+from ms_slam_env.metrics.as_printed import printed_ate, printed_relative_errors
 from ms_slam_env.metrics.relative import DELTA_UNITS, PAIRINGS, TOLERANCE
 from ms_slam_env.metrics.trajectory import ALIGNMENTS, check_first
 from ms_slam_env.sequences import associate, read_trajectory
@@ -266,6 +267,7 @@ def measure_matched(matched: Matched, options: TrajectoryOptions) -> dict[str, A
         ``ate_mean_m``, ``ate_median_m``, ``ate_std_m``, ``ate_min_m``, ``ate_max_m``, and the same
         of ``ate_rad`` (None where the path is a line), ``rpe_m`` and ``rpe_rad``; with another
         alignment than SE(3) by all poses the key of `absolute_key` in the place of ``ate_m``;
+        ``ate_printed_m`` and ``rpe_printed_m`` of USME's equations to the letter;
         ``tracked_share`` and, after SE(3), ``ate_tracked_m`` where it is known what was tracked;
         ``scale`` of the alignment, ``path_m``, ``duration_s``, ``pieces`` (the same statistics by
         piece), ``drift_by_length`` (of sub-trajectories), robustness (USME equations 9 and 10 over
@@ -286,6 +288,7 @@ def measure_matched(matched: Matched, options: TrajectoryOptions) -> dict[str, A
         "duration_s": float(matched.times[-1] - matched.times[0]),
         **_absolute_statistics(matched, slice(None), options),
         **_relative(matched, slice(None), options),
+        **_as_printed(matched, options),
         "pieces": [
             {
                 "start_s": float(matched.times[first] - matched.times[0]),
@@ -379,6 +382,17 @@ def _relative_or_none(matched: Matched, part: slice, options: TrajectoryOptions)
         return _relative(matched, part, options)
     except InputError:
         return {"rpe_m": None, "rpe_rad": None}
+
+
+def _as_printed(matched: Matched, options: TrajectoryOptions) -> dict[str, Any]:
+    """USME's (2), and of its (5) the root mean square and the median, to the letter."""
+    P, Q = matched.estimate, matched.truth
+    relative = printed_relative_errors(P, Q, times=matched.times, **options.relative)
+    return {
+        "ate_printed_m": printed_ate(P, Q, "none").rmse,
+        "rpe_printed_m": metrics.statistics_of(relative).rmse,
+        "rpe_printed_median_m": float(np.median(relative)),
+    }
 
 
 def _robustness(matched: Matched, options: TrajectoryOptions) -> dict[str, Any]:

@@ -48,7 +48,7 @@ TABLES: Mapping[str, tuple[str, ...]] = {
     ),
     "Cost": (
         *("frames", "ext_ms", "ext_ms_p95", "cpu_ms_mean", "mem_peak_mb", "ene_frame_j"),
-        "ene_source",
+        *("ene_source", "ene_model_frame_j", "energy_source"),
     ),
 }
 

@@ -12,7 +12,13 @@ from ms_slam_env.metrics.consistency import (
     distinct_placements,
     judge_consistency,
 )
-from ms_slam_env.metrics.cost import CostMeter, EnergyCounter, FrameCost, energy_counters
+from ms_slam_env.metrics.cost import (
+    CORE_WATTS,
+    CostMeter,
+    EnergyCounter,
+    FrameCost,
+    energy_counters,
+)
 from ms_slam_env.metrics.initialisation import Initialisation, initialisation, local_scales
 from ms_slam_env.metrics.multi_robot import (
     inter_robot_errors,
@@ -49,8 +55,10 @@ from ms_slam_env.metrics.relative import (
     rpe_statistics,
 )
 from ms_slam_env.metrics.robustness import (
+    Relocalisation,
     TrackingRobustness,
     mean_relocalisation_time,
+    relocalisation,
     relocalisation_times,
     tracked_segments,
     tracking_robustness,
@@ -68,6 +76,7 @@ from ms_slam_env.metrics.trajectory import (
 )
 
 __all__ = [
+    "CORE_WATTS",
     "Alignment",
     "CloudDistance",
     "CloudRegistration",
@@ -82,6 +91,7 @@ __all__ = [
     "LabelledView",
     "MapConsistency",
     "ObjectConsistency",
+    "Relocalisation",
     "SightingRule",
     "TrackingRobustness",
     "absolute_errors",
@@ -115,6 +125,7 @@ __all__ = [
     "recall",
     "register_clouds",
     "relative_errors",
+    "relocalisation",
     "relocalisation_times",
     "rer",
     "rpe_rmse",

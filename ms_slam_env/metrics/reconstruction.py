@@ -140,14 +140,15 @@ class CloudDistance:
 
 
 def statistical_inliers(
-    points: ArrayLike, neighbours: int = 20, std_ratio: float = 2.0
+    points: ArrayLike, neighbours: int = 20, std_ratio: float = 2.0, two_sided: bool = False
 ) -> NDArray[np.bool_]:
     """Which of ``points`` (N, 3) a statistical outlier removal keeps, (N,) bool.
 
     USME, section 1.2 (1), after Rusu et al., "Towards 3D point cloud based object maps", 2008: the
     mean distance d of a point to its ``neighbours`` nearest points, itself among them, must be
     below mean(d) + ``std_ratio`` std(d) over the cloud. A point that coincides with all its
-    neighbours is dropped too, as Open3D does.
+    neighbours is dropped too, as Open3D does. USME drops what lies outside mean(d) +- alpha std(d),
+    so also points that lie too close together: ``two_sided``.
 
     Raises:
         InputError: bad points, fewer than 2 neighbours or fewer points than neighbours, a ratio
@@ -159,16 +160,19 @@ def statistical_inliers(
         raise InputError(f"{neighbours} neighbours need as many points, got {len(values)}")
     check_positive(std_ratio, "std_ratio")
     mean = cKDTree(values).query(values, k=neighbours)[0].mean(axis=1)
-    limit = mean.mean() + std_ratio * mean.std(ddof=1)
-    return (mean > 0) & (mean < limit)
+    middle, reach = mean.mean(), std_ratio * mean.std(ddof=1)
+    kept = (mean > 0) & (mean < middle + reach)
+    return kept & (mean > middle - reach) if two_sided else kept
 
 
-def noise_ratio(points: ArrayLike, neighbours: int = 20, std_ratio: float = 2.0) -> float:
+def noise_ratio(
+    points: ArrayLike, neighbours: int = 20, std_ratio: float = 2.0, two_sided: bool = False
+) -> float:
     """Share of ``points`` (N, 3) that `statistical_inliers` drops, USME equation (8): N_n / N_c.
 
     USME removes the irrelevant points by eye; here the filter does, so that a program can.
     """
-    return 1.0 - float(statistical_inliers(points, neighbours, std_ratio).mean())
+    return 1.0 - float(statistical_inliers(points, neighbours, std_ratio, two_sided).mean())
 
 
 def point_spacing(points: ArrayLike) -> float:

@@ -176,10 +176,39 @@ def relocalisation_times(timestamps: ArrayLike, black: ArrayLike, tracked: Array
     return result
 
 
+@dataclass(frozen=True)
+class Relocalisation:
+    """USME equation (11) over runs of black frames, those after which SLAM was never found apart.
+
+    Attributes:
+        mean_s: mean of the times of the runs after which SLAM was found again, seconds; NaN where
+            it was after none.
+        found: number of these runs.
+        never: number of the others, which have no time: no number of seconds stands for them.
+    """
+
+    mean_s: float
+    found: int
+    never: int
+
+
+def relocalisation(timestamps: ArrayLike, black: ArrayLike, tracked: ArrayLike) -> Relocalisation:
+    """Mean of those `relocalisation_times` that there are, and how many there are not.
+
+    Raises:
+        InputError: as there.
+    """
+    times = relocalisation_times(timestamps, black, tracked)
+    found = times[np.isfinite(times)]
+    mean = float(found.mean()) if len(found) else float("nan")
+    return Relocalisation(mean, len(found), len(times) - len(found))
+
+
 def mean_relocalisation_time(timestamps: ArrayLike, black: ArrayLike, tracked: ArrayLike) -> float:
     """Mean of :func:`relocalisation_times`: USME equation 11, (1/N) sum_i (t_e,i - t_s,i), seconds.
 
-    Infinite if SLAM was not found again after one of the runs, NaN without any run.
+    Infinite (written and shown as "never") if SLAM was not found again after one of the runs, NaN
+    without any run; `relocalisation` tells the one from the other.
 
     Raises:
         InputError: as there.

@@ -13,6 +13,11 @@ from ms_slam_env.sequences.paths.base import frame_times
 HEIGHT_M = 1.3
 CLEARANCE_M = 0.35  # free space kept around the camera
 STARTS = 64  # places tried for the middle of a room
+ORBITS_M = (0.9, 0.7, 0.5)
+"""Radii of a path around an object, the first that fits."""
+_OBJECT_M = 0.4  # around the axis of such a path, for its object
+_ORBIT_CLEARANCE_M = 0.15
+_ORBIT_GRID_M = 0.25
 PATHS = ("around", "corridor", "handheld")
 HANDHELD_FRAMES = 600
 OVERLAP_TURNS = 0.3  # how far a path goes on over ground that it has seen
@@ -78,6 +83,51 @@ def along_corridor(scene: Scene, seed: int, step_m: float = 0.02, step_deg: floa
     eyes = np.stack([x, middle + sway, HEIGHT_M + 0 * x], axis=1)
     gaze = np.stack([np.cos(yaw), np.sin(yaw), pitch + 0.1 * np.sin(2 * x)], axis=1)
     return _at_speed(eyes, gaze, step_m, step_deg)
+
+
+def around_object(
+    scene: Scene, seed: int, laps: int = 3, step_m: float = 0.04, step_deg: float = 3.0
+) -> tuple[Float64, int]:
+    """Poses (N, 4, 4) of a camera that orbits what stands in the middle, and the frames of a lap.
+
+    As USME wants it for relocalisation, section 1.3 (2): "steadily around a textured object, a few
+    times". Of the free circles the one around most surface below the camera, at which it looks.
+
+    Args:
+        scene: where.
+        seed: of the direction to start in.
+        laps: turns around it.
+        step_m: largest translation from frame to frame.
+        step_deg: largest rotation from frame to frame.
+
+    Raises:
+        InputError: nothing that the camera could go around.
+    """
+    points = scene.surface_points(0.05)[0]
+    low, high = points.min(axis=0), points.max(axis=0)
+    below = points[(points[:, 2] > low[2] + 0.3) & (points[:, 2] < HEIGHT_M)]
+    turn = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+    circle = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+    best, centre, radius = 0, np.zeros(3), 0.0
+    for x in np.arange(low[0], high[0], _ORBIT_GRID_M):
+        for y in np.arange(low[1], high[1], _ORBIT_GRID_M):
+            inside = int((np.hypot(*(below[:, :2] - [x, y]).T) < _OBJECT_M).sum())
+            if inside <= best:
+                continue
+            middle = np.array([x, y, HEIGHT_M])
+            for r in ORBITS_M:
+                if scene.clearance(middle + r * circle).min() >= _ORBIT_CLEARANCE_M:
+                    best, centre, radius = inside, middle, r
+                    break
+    if best == 0:
+        raise InputError(f"scene {scene.name!r}, seed {scene.seed}, has nothing to go around")
+    near = below[np.hypot(*(below[:, :2] - centre[:2]).T) < _OBJECT_M]
+    target = np.array([*centre[:2], near[:, 2].mean()])
+    begin = np.random.default_rng([seed, 8]).uniform(0, 2 * np.pi)
+    angle = begin + 2 * np.pi * np.linspace(0, 1, 1000)
+    eyes = centre + radius * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    lap = _at_speed(eyes, target - eyes, step_m, step_deg)
+    return np.concatenate([lap] * laps), len(lap)
 
 
 def _at_speed(eyes: Float64, gaze: Float64, step_m: float, step_deg: float) -> Float64:

@@ -163,7 +163,7 @@ def test_files_and_options_are_written(tmp_path: Path, capsys: pytest.CaptureFix
     assert (out / "trajectory.png").stat().st_size > 10_000
     config = result["config"]
     assert (config["delta"], config["delta_unit"], config["max_difference_s"]) == (1, "s", 0.02)
-    assert (result["kind"], len(result["tables"]), len(result["charts"])) == ("evaluation", 4, 1)
+    assert (result["kind"], len(result["tables"]), len(result["charts"])) == ("evaluation", 5, 1)
     assert result["provenance"]["versions"]["numpy"] == np.__version__
     assert f"{result['rpe_m']:.6f}" in capsys.readouterr().out
     _, aligned = read_trajectory(out / "evaluation.estimate.txt")

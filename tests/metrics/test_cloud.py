@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.distance import directed_hausdorff
+from scipy.spatial.distance import cdist, directed_hausdorff
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.metrics import (
@@ -34,6 +34,22 @@ def test_outliers_are_those_of_open3d(neighbours: int, std_ratio: float) -> None
     found = np.flatnonzero(statistical_inliers(points, neighbours, std_ratio))
     np.testing.assert_array_equal(found, np.sort(kept))
     assert 0 < len(found) < len(points)
+
+
+def test_two_sided_removal_drops_what_lies_too_close_as_well() -> None:
+    rng = np.random.default_rng(5)
+    clump = rng.normal([20.0, 0, 0], 1e-3, size=(40, 3))
+    points = np.concatenate([cloud(0), clump, [[23.0, 0, 0]]])
+    d = np.sort(cdist(points, points), axis=1)[:, :10].mean(axis=1)  # the slow, obvious way
+    low, high = (d.mean() + sign * 0.3 * d.std(ddof=1) for sign in (-1, 1))
+    assert low > 0
+    found = statistical_inliers(points, 10, 0.3, two_sided=True)
+    np.testing.assert_array_equal(found, (d > low) & (d < high))
+    one_sided = statistical_inliers(points, 10, 0.3)
+    assert one_sided[400:440].all()
+    assert not found[400:440].any()
+    assert not one_sided[440]
+    assert noise_ratio(points, 10, 0.3, two_sided=True) == 1 - found.mean()
 
 
 def test_noise_ratio_is_the_share_of_far_points() -> None:

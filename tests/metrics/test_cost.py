@@ -300,3 +300,41 @@ def test_work_that_fails_is_no_frame() -> None:
         raise KeyError
     with pytest.raises(InputError, match="0 frames were measured"):
         costs.summary()
+
+
+class _Counted(EnergyCounter):
+    """Takes 2 J a reading."""
+
+    source = "made up"
+
+    def __init__(self) -> None:
+        self._taken = 0.0
+
+    def joules(self) -> float:
+        self._taken += 2.0
+        return self._taken
+
+
+def test_a_model_stands_only_where_nothing_is_measured(monkeypatch) -> None:
+    seconds = iter([0.0, 0.5, 1.0, 1.25])
+    monkeypatch.setattr(meter.time, "process_time", lambda: next(seconds))
+    estimated = CostMeter(counters={"cpu": NoEnergy("no RAPL")}, core_watts=8.0)
+    for _ in range(2):
+        with estimated.frame():
+            pass
+    found = estimated.summary()
+    assert found["ene_j"] is found["ene_cpu_j"] is None
+    assert found["ene_model_j"] == pytest.approx(8.0 * 0.75)
+    assert found["ene_model_frame_j"] == pytest.approx(3.0)
+    assert "not measured" in found["energy_source"]
+    assert "8 W" in found["energy_source"]
+    seconds = iter([0.0, 0.5])
+    monkeypatch.setattr(meter.time, "process_time", lambda: next(seconds))
+    measured = CostMeter(counters={"cpu": _Counted(), "gpu": NoEnergy("no GPU")})
+    with measured.frame():
+        pass
+    found = measured.summary()
+    assert found["ene_j"] == 2.0
+    assert not [key for key in found if "model" in key or key == "energy_source"]
+    with pytest.raises(InputError, match="core_watts"):
+        CostMeter(core_watts=0)

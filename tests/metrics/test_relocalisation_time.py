@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ms_slam_env.errors import InputError
-from ms_slam_env.metrics import mean_relocalisation_time, relocalisation_times
+from ms_slam_env.metrics import mean_relocalisation_time, relocalisation, relocalisation_times
 
 RUN = st.tuples(st.integers(1, 6), st.integers(0, 5), st.integers(1, 4))
 
@@ -39,6 +39,17 @@ def test_never_found_again_is_infinite():
     tracked = [True, False, False, False, False, False, True]
     np.testing.assert_array_equal(relocalisation_times(times, black, tracked), [np.inf, 1.0])
     assert mean_relocalisation_time(times, black, tracked) == np.inf
+
+
+def test_never_is_counted_apart_from_the_times():
+    times = np.arange(13.0)
+    black = np.array([0, 1, 0, 0, 1, 0, 0, 0, 1, 1, 0, 0, 0], dtype=bool)
+    tracked = np.array([1, 0, 0, 0, 0, 0, 1, 1, 0, 0, 0, 0, 1], dtype=bool)
+    found = relocalisation(times, black, tracked)
+    assert (found.mean_s, found.found, found.never) == (1.5, 2, 1)
+    lost = relocalisation(times, black, np.zeros(13, dtype=bool))
+    assert np.isnan(lost.mean_s)
+    assert (lost.found, lost.never) == (0, 3)
 
 
 def test_without_a_chance_there_is_no_time():

@@ -7,9 +7,16 @@ from ms_slam_env.metrics.cost.energy import (
     nvml_counter,
     rapl_counter,
 )
-from ms_slam_env.metrics.cost.meter import CostMeter, FrameCost, forget_peak_memory, memory_mb
+from ms_slam_env.metrics.cost.meter import (
+    CORE_WATTS,
+    CostMeter,
+    FrameCost,
+    forget_peak_memory,
+    memory_mb,
+)
 
 __all__ = [
+    "CORE_WATTS",
     "CostMeter",
     "EnergyCounter",
     "FrameCost",

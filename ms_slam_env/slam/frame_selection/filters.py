@@ -196,33 +196,37 @@ class Change(Stateful):
 
 @dataclass(frozen=True)
 class DivergenceFilterConfig(DroppingConfig):
-    """A frame is dropped if its divergence from the last processed frame is below a threshold.
-
-    The paper compares with the previous frame, under which a slow motion would never be seen: each
-    frame is like the one before it. Changes add up against the last frame that SLAM has seen.
+    """A frame is dropped if its divergence from a reference frame is below a threshold.
 
     Attributes:
         threshold: of the change, nats; 0 drops nothing.
+        reference: ``processed``, the last frame that SLAM has seen, against which changes add up;
+            or ``previous``, the frame before, dropped or not, as the paper words it. Under that a
+            slow motion is never seen: each frame is like the one before it, and ``max_skip`` alone
+            lets one through.
         change: how it is measured.
     """
 
     name: str = field(default="divergence", init=False)
     threshold: float = bounded(0.01, 0, 1e6)
+    reference: str = chosen("processed", "processed", "previous")
     change: ChangeConfig = field(default_factory=ChangeConfig)
 
     def make_filter(self, intrinsics: Intrinsics) -> FrameFilter:
         """The filter for frames of ``intrinsics``."""
-        return DivergenceFilter(self.threshold, Change(self.change, intrinsics))
+        change = Change(self.change, intrinsics)
+        return DivergenceFilter(self.threshold, change, self.reference == "previous")
 
 
 class DivergenceFilter(Saved, FrameFilter):
-    """Admits a frame that differs enough from the last processed one."""
+    """Admits a frame that differs enough from the last processed one, or from the one before."""
 
     saved = ("_change",)
 
-    def __init__(self, threshold: float, change: Change) -> None:
+    def __init__(self, threshold: float, change: Change, from_previous: bool = False) -> None:
         self._threshold = threshold
         self._change = change
+        self._from_previous = from_previous
 
     def reset(self) -> None:
         """Forget the last processed frame."""
@@ -231,6 +235,6 @@ class DivergenceFilter(Saved, FrameFilter):
     def admits(self, frame: RGBDFrame, dropped: int, forced: bool = False) -> bool:
         """Whether its change reaches the threshold."""
         admitted = self._change.measure(frame) >= self._threshold
-        if admitted or forced:
+        if admitted or forced or self._from_previous:
             self._change.keep()
         return admitted
