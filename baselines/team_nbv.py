@@ -60,6 +60,9 @@ class TeamNextBestView(NextBestView):
         InputError: an option out of its range.
     """
 
+    map: Any
+    mates: list[TeamNextBestView]
+
     def __init__(
         self, env: ActiveSlamEnv, seed: int = 0, spread_m: float = 3.0, **options: Any
     ) -> None:
@@ -75,8 +78,8 @@ class TeamNextBestView(NextBestView):
     def reset(self) -> None:
         """Nothing is known yet, nobody is there."""
         super().reset()
-        self.map: Any = SharedMap(self.cell_m)
-        self.mates: list[TeamNextBestView] = []
+        self.map = SharedMap(self.cell_m)
+        self.mates = []
         self.way = np.zeros((0, 3))
         """Positions (N, 3) on the way to the goal."""
 

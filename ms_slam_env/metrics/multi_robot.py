@@ -116,8 +116,9 @@ def inter_robot_errors(
     ]
     if len(pairs) < 2:
         raise InputError("one robot has no pose in the frame of another: at least 2 are needed")
+    clocks: list[Float64]
     if times is None:
-        clocks = [np.arange(len(own)) for own, _ in pairs]
+        clocks = [np.arange(len(own), dtype=np.float64) for own, _ in pairs]
     elif len(times) != len(pairs):
         raise InputError(f"{len(pairs)} true trajectories but times of {len(times)} robots")
     else:

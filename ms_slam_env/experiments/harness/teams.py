@@ -292,7 +292,8 @@ def team_errors(
 ) -> dict[str, Any]:
     """Errors of the trajectories (N, 4, 4) of a team in one world, by keys of the registry."""
     ate = metrics.team_ate(estimates, truths)
-    own = metrics.tracked_errors(*map(np.concatenate, (estimates, truths, tracked)))
+    joined = np.concatenate(estimates), np.concatenate(truths), np.concatenate(tracked)
+    own = metrics.tracked_errors(*joined)
     return {
         "team_ate_m": ate.rmse,
         "team_ate_tracked_m": own["ate_tracked_m"],
