@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 from ms_slam_baselines.team_nbv import TeamNextBestView, Ways, looked_at
 
+from ms_slam_env.camera import xtion
 from ms_slam_env.cli import main
 from ms_slam_env.env.coverage import CoverageGrid, team_share
 from ms_slam_env.experiments.team_mapping import TeamMapping, TeamMappingSpec, nearby_starts
-from ms_slam_env.geometry import make_pose
+from ms_slam_env.geometry import look_at, make_pose
+from ms_slam_env.sensor import RGBDSensor
 
 
 def planner(spread_m: float) -> TeamNextBestView:
@@ -51,14 +53,16 @@ def test_ways_go_around_what_is_not_free() -> None:
 
 
 def test_a_team_has_mapped_what_one_of_it_has(box_scene) -> None:
-    surface = box_scene.surface_points(0.02)[0]
-    left, right = surface[surface[:, 0] < 0], surface[surface[:, 0] >= 0]
-    grids = [CoverageGrid(box_scene), CoverageGrid(box_scene)]
-    for grid, points in zip(grids, (left, right), strict=True):
-        grid.add(points, points)
-    assert team_share(grids[:1]) == grids[0].mapped_share
-    assert 0.3 < grids[0].mapped_share < 0.7
-    assert team_share(grids) > 0.99
+    K = xtion("80x60")
+    sensor = RGBDSensor(box_scene, K, noise="none")
+    grids = [CoverageGrid(box_scene, K.rays()) for _ in range(3)]
+    poses = [look_at([0, 0, 1.2], [x, 1.5, 1.0]) for x in (-1.5, 1.5)]
+    for own, looks in zip(grids, ([0], [1], [0, 1]), strict=True):
+        for k in looks:
+            depth = sensor.ground_truth(poses[k]).depth
+            own.see(depth, depth, poses[k], poses[k])
+    assert team_share(grids[:1]) == grids[0].mapped_share > 0
+    assert team_share(grids[:2]) == grids[2].mapped_share > 1.5 * grids[0].mapped_share
 
 
 def test_robots_start_near_the_first_and_apart(box_scene) -> None:
