@@ -38,7 +38,7 @@ class Arguments:
     config: Path | None = None
     """Configuration file (YAML) to start from; by default the surfel backend's own."""
     sampler: str = "tpe"
-    """random, nsga2, tpe or gp."""
+    """random, nsga2, tpe, gp or forest (random forests, as HyperMapper does)."""
     trials: int = 100
     """Finished trials, those of earlier calls included."""
     seed: int = 0

@@ -17,7 +17,7 @@ from ms_slam_env.exploration import SlamEvaluator, make_space
 from ms_slam_env.exploration.front import hypervolume
 from ms_slam_env.exploration.grid import Grid
 from ms_slam_env.exploration.objectives import FAILURE, objective_values
-from ms_slam_env.exploration.settings import SAMPLERS, make_sampler
+from ms_slam_env.exploration.samplers import SAMPLERS, make_sampler
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.statistics import Interval, bootstrap_interval
@@ -88,7 +88,7 @@ class ExploreSamplers(Checked, Experiment):
     """
 
     samplers: tuple[str, ...] = tuple(SAMPLERS)
-    """random, nsga2, tpe, gp; the first is what the others are compared with."""
+    """random, nsga2, tpe, gp, forest; the first is what the others are compared with."""
     seeds: int = bounded(6, 1, 1000)
     """Studies of each sampler."""
     trials: int = bounded(40, 1, 100_000)

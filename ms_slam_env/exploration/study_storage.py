@@ -21,7 +21,8 @@ import numpy as np
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.exploration.objectives import FAILURE, METRICS, Measured, objective_values
-from ms_slam_env.exploration.settings import ExplorationSettings, make_sampler
+from ms_slam_env.exploration.samplers import make_sampler
+from ms_slam_env.exploration.settings import ExplorationSettings
 from ms_slam_env.exploration.space import SearchSpace
 from ms_slam_env.exploration.study_check import (
     DEFAULT,

@@ -20,8 +20,9 @@ _WARP_FLAGS = (
     "-march=native -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000 "
     "-mllvm=-slp-recursion-max-depth=4"
 )  # Warp 1.19's own; naming them makes what follows independent of the user's global setting
-# Kernels ask whether readings are finite, so NaN and infinity keep their meaning.
-_FAST_MATH = " -ffast-math -fno-finite-math-only"
+# What Clang means by -ffast-math, as its front end spells it, less the assumption that no number is
+# infinite or none: kernels ask whether readings are.
+_FAST_MATH = " -mreassociate -freciprocal-math -fno-signed-zeros -fapprox-func -ffp-contract=fast"
 _NO_VECTORS = " -fno-vectorize -fno-slp-vectorize"
 CPU_FREQUENCIES = Path("/sys/devices/system/cpu")
 """Where Linux keeps the frequencies of the cores."""

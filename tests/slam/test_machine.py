@@ -62,7 +62,7 @@ def test_a_configuration_says_how_it_is_compiled(tmp_path):
     write_configuration(tmp_path / "fast.yaml", given)
     assert read_configuration(tmp_path / "fast.yaml") == given
     with given.machine():
-        assert "-ffast-math" in KERNELS.options["cpu_compiler_flags"]
+        assert "-mreassociate" in KERNELS.options["cpu_compiler_flags"]
     assert KERNELS.options["cpu_compiler_flags"] is None
 
 
@@ -130,9 +130,9 @@ def test_other_options_leave_the_default_as_it_was():
     kept = Path(wp.config.kernel_cache_dir or "") / KERNELS.get_module_identifier(1)
     binaries = {file: file.read_bytes() for file in kept.glob("*.o")}
     assert binaries
-    with compiled(CompilerOptions(optimization_level=1, vectorise=False)):
+    with compiled(CompilerOptions(optimization_level=1, fast_math=True, vectorise=False)):
         other = Path(wp.config.kernel_cache_dir or "") / KERNELS.get_module_identifier(1)
-        np.testing.assert_allclose(normals(), default, atol=1e-5)
+        np.testing.assert_allclose(normals(), default, atol=1e-3)
         assert other != kept
         assert other.is_dir()
     np.testing.assert_array_equal(normals(), default)
