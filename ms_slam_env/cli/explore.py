@@ -61,6 +61,10 @@ class Arguments:
     """Execution time is processor time of all threads, or "wall" time, which a GPU needs."""
     reference_factor: float = 3.0
     """Results worse than so many times the default's count as that."""
+    for_divergence: tuple[float, float] | None = None
+    """M_I and M_D of an application, nats: name the best configuration for them, too."""
+    tolerance: float = 1.2
+    """Times the default's error that this one and the levels of run-time adaptation may have."""
     out: Path = Path("results/explore")
     """Folder of the study and the results."""
 
@@ -98,7 +102,15 @@ def main(arguments: Sequence[str]) -> int:
         reference_factor=args.reference_factor,
         context=evaluator.context(),
     )
-    exploration = Exploration(evaluator, settings, args.parameters, base, args.held_out)
+    exploration = Exploration(
+        evaluator,
+        settings,
+        args.parameters,
+        base,
+        args.held_out,
+        args.for_divergence,
+        args.tolerance,
+    )
     results = run_exploration(exploration, args.out, args.trials, args.workers, args.ray)
     print(results.as_markdown())
     failed = [row["result"].get(FAILURE) for row in results.rows]

@@ -87,6 +87,8 @@ class Adaptation(Experiment, Checked):
     """How the camera is carried."""
     configurations: tuple[Path, ...] = ()
     """YAML files, from fast to robust; none for the default three."""
+    levels: Path | None = None
+    """File of levels that ms-slam explore wrote, in place of configurations and thresholds."""
     thresholds: tuple[float, ...] = DivergenceAdaptationConfig.thresholds
     """Of the change between frames, nats, one between any two configurations."""
     release_share: float = DivergenceAdaptationConfig.release_share
@@ -101,6 +103,7 @@ class Adaptation(Experiment, Checked):
         """What is to be judged."""
         return DivergenceAdaptationConfig(
             configurations=self.configurations or None,
+            levels=self.levels,
             thresholds=self.thresholds,
             release_share=self.release_share,
             dwell_frames=self.dwell_frames,

@@ -8,12 +8,13 @@ from typing import Any
 
 from tqdm import tqdm
 
+from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
+from ms_slam_env.exploration.choices import Limit, as_options, choose, for_divergence, levels_of
 from ms_slam_env.exploration.evaluator import SlamEvaluator
 from ms_slam_env.exploration.explorer import explore
 from ms_slam_env.exploration.front import (
     Point,
-    choose,
     hypervolume_history,
     importances,
     points_of,
@@ -21,16 +22,22 @@ from ms_slam_env.exploration.front import (
 from ms_slam_env.exploration.held_out import DEFAULT, compare_configurations
 from ms_slam_env.exploration.results import ABOUT, TITLE, Explored
 from ms_slam_env.exploration.settings import ExplorationSettings
-from ms_slam_env.exploration.space import make_space
+from ms_slam_env.exploration.space import absences, make_space
 from ms_slam_env.exploration.study_storage import StudyStorage
 from ms_slam_env.metrics.cost import energy_counters
 from ms_slam_env.report.results import Results, write_result_folder
 from ms_slam_env.sequences import check_sequence
-from ms_slam_env.slam.configuration import SlamConfiguration, write_configuration
+from ms_slam_env.slam.configuration import (
+    SlamConfiguration,
+    write_configuration,
+    write_levels,
+)
+
+FOR_DIVERGENCE = "for-divergence"
 
 
 @dataclass(frozen=True)
-class Exploration:
+class Exploration(Checked):
     """What is explored, on what, and how.
 
     Attributes:
@@ -39,6 +46,8 @@ class Exploration:
         parameters: ``NAME``, ``NAME=low:high[:log]``, ``NAME=a,b,c``, or a group of them.
         base: configuration that the exploration starts from, its first trial.
         held_out: sequences that the front and the chosen configurations are judged on.
+        for_divergence: (M_I, M_D) to name a configuration for besides; None for none.
+        tolerance: times the default's error that this one and levels of adaptation may have.
 
     Raises:
         InputError: an unknown name, a value out of range, a sequence that cannot be had, or an
@@ -50,15 +59,20 @@ class Exploration:
     parameters: tuple[str, ...] = ("algorithm",)
     base: SlamConfiguration = field(default_factory=SlamConfiguration)
     held_out: tuple[str, ...] = ()
+    for_divergence: tuple[float, float] | None = None
+    tolerance: float = bounded(1.2, 1.0, 1000.0)
 
     def __post_init__(self) -> None:
         """Refuse what cannot be measured before a study is begun that would keep it."""
+        super().__post_init__()
         for text in (*self.evaluator.sequences, *self.held_out):
             check_sequence(text)
         asked = {*self.settings.objectives}
         asked |= {constraint.metric for constraint in self.settings.parsed_constraints()}
         if "map_error_mm" in asked and not self.evaluator.map_error:
             raise InputError("map_error_mm is not measured: the evaluator has map_error off")
+        if "ate_worst_ratio" in asked and self.evaluator.baseline is None:
+            raise InputError("ate_worst_ratio is not measured: the evaluator has no baseline")
         if "energy_j" in asked:
             reasons = [counter.reason for counter in energy_counters("cpu").values()]
             if all(reasons):
@@ -78,10 +92,12 @@ def run_exploration(
     """Explore until ``trials`` trials have finished, and write what came of it to ``out``.
 
     ``study.db`` (Optuna's, to go on from), ``explore.json``, ``table.md``, ``pareto.png`` and
-    other figures, and the chosen configurations as YAML.
+    other figures, the chosen configurations as YAML, and in ``levels.yaml`` what run-time
+    adaptation and frame management take from the study (``choices.as_options``).
 
     Raises:
-        InputError: bad input, or ``out`` holds another exploration.
+        InputError: bad input, ``out`` holds another exploration, or, when all is written, no trial
+            was measured at the divergence to name a configuration for.
         RuntimeError: worker processes die again and again.
     """
     space = make_space(exploration.parameters, exploration.base)
@@ -109,25 +125,42 @@ def write_exploration(exploration: Exploration, storage: StudyStorage, out: Path
     points = points_of(storage)
     reference = storage.reference() or {}
     chosen = choose(points, objectives)
+    limit = Limit.of(points, objectives, exploration.tolerance)
+    answer = _answer(exploration, points, limit)
+    levels = levels_of(points, limit)
+    size = exploration.evaluator.image_size
+    made = {name: _configuration(storage, point, name, size) for name, point in chosen.items()}
+    # A level is what its parameters can do at a divergence between frames that are all processed.
+    made_levels = [
+        replace(_configuration(storage, point, "level", size), keep_every=1) for point in levels
+    ]
+    options = as_options(levels, made_levels, points)
     files = {name: f"{name.replace('_', '-')}.yaml" for name in chosen}
 
     def write_chosen(folder: Path) -> None:
-        for name, point in chosen.items():
-            made = _configuration(storage, point, name, exploration.evaluator.image_size)
-            write_configuration(folder / files[name], made)
+        for name, configuration in made.items():
+            write_configuration(folder / files[name], configuration)
+        if isinstance(answer, Point):
+            own = replace(_configuration(storage, answer, FOR_DIVERGENCE, size), keep_every=1)
+            write_configuration(folder / f"{FOR_DIVERGENCE}.yaml", own)
+        if options:
+            write_levels(folder / "levels.yaml", options)
 
+    named = chosen | ({FOR_DIVERGENCE: answer} if isinstance(answer, Point) else {})
     explored = Explored(
         objectives,
         exploration.evaluator.clock,
         list(storage.space.parameters),
         points,
-        chosen,
+        named,
         reference,
         hypervolume_history(points, reference, objectives).tolist(),
         importances(storage),
         *_compared(exploration, storage, points, chosen, out),
+        absences(exploration.parameters, exploration.base),
+        [point.number for point in levels] if "adaptation" in options else [],
     )
-    return write_result_folder(
+    results = write_result_folder(
         out,
         "explore.json",
         write_chosen,
@@ -152,10 +185,27 @@ def write_exploration(exploration: Exploration, storage: StudyStorage, out: Path
                 name: {"file": files[name], "trial": point.number, "params": point.params}
                 for name, point in chosen.items()
             },
+            "levels": explored.levels,
+            "for_divergence": answer.number if isinstance(answer, Point) else None,
             "hypervolume": explored.hypervolume,
             "importance": explored.importance,
         },
     )
+    if isinstance(answer, InputError):
+        raise answer
+    return results
+
+
+def _answer(
+    exploration: Exploration, points: list[Point], limit: Limit
+) -> Point | InputError | None:
+    """The configuration for the divergence asked for, or why there is none."""
+    if exploration.for_divergence is None:
+        return None
+    try:
+        return for_divergence(points, *exploration.for_divergence, limit)
+    except InputError as error:
+        return error  # it is raised when what was measured is on disk
 
 
 def _compared(

@@ -1,4 +1,4 @@
-"""Pareto fronts of finished trials: which trials, how much they dominate, and which to choose."""
+"""Pareto fronts of finished trials: which trials, and how much they dominate."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ms_slam_env.exploration.objectives import METRICS
 from ms_slam_env.exploration.study_storage import StudyStorage
 
 Float64 = NDArray[np.float64]
@@ -64,6 +65,18 @@ def points_of(storage: StudyStorage) -> list[Point]:
     ]
 
 
+def front_of(points: Sequence[Point], metrics: Sequence[str]) -> list[Point]:
+    """Those of ``points`` that none beats in ``metrics``, in the order of the last of them."""
+    known = [p for p in points if all(p.measured.get(name) is not None for name in metrics)]
+    told = [[METRICS[name].told(p.measured[name]) for name in metrics] for p in known]
+    values = np.array(told).reshape(len(known), len(metrics))
+    beaten = [
+        bool(np.any(np.all(values <= own, axis=1) & np.any(values < own, axis=1))) for own in values
+    ]
+    best = [p for p, is_beaten in zip(known, beaten, strict=True) if not is_beaten]
+    return sorted(best, key=lambda point: float(point.measured[metrics[-1]]))
+
+
 def hypervolume_history(
     points: Sequence[Point], reference: Mapping[str, float], objectives: Sequence[str]
 ) -> Float64:
@@ -89,44 +102,6 @@ def hypervolume(values: ArrayLike, reference: ArrayLike) -> float:
     corner = np.asarray(reference, dtype=np.float64)
     inside = points[np.all(points < corner, axis=-1)] if len(points) else points
     return float(compute_hypervolume(inside, corner)) if len(inside) else 0.0
-
-
-def choose(points: Sequence[Point], objectives: Sequence[str]) -> dict[str, Point]:
-    """Points of the front by purpose, of the first two objectives (error, cost).
-
-    ``fastest``: the least cost whose error is not above the default's; ``most_accurate``: the least
-    error whose cost is not above the default's; ``knee``: farthest below the line between the two
-    ends of the front, on logarithmic axes. Without a default that finished well, only the knee.
-    """
-    front = sorted((p for p in points if p.on_front), key=lambda point: point.values)
-    if not front:
-        return {}
-    chosen: dict[str, Point] = {}
-    default = next((point for point in points if point.is_default and point.feasible), None)
-    if default is not None:
-        error, cost = default.values[:2]
-        chosen["fastest"] = min(
-            (p for p in front if p.values[0] <= error), key=lambda p: p.values[1], default=default
-        )
-        chosen["most_accurate"] = min(
-            (p for p in front if p.values[1] <= cost), key=lambda p: p.values[0], default=default
-        )
-    chosen["knee"] = front[knee([point.values[:2] for point in front])]
-    return chosen
-
-
-def knee(values: ArrayLike) -> int:
-    """Index of the point of a front (n, 2) that lies farthest below the line between its ends.
-
-    On logarithmic axes, each scaled to the front's extent: "farthest" then means the same whatever
-    the units are.
-    """
-    logs = np.log(np.maximum(np.asarray(values, dtype=np.float64), 1e-12))
-    extent = np.ptp(logs, axis=0)
-    if len(logs) < 3 or not np.all(extent > 0):
-        return int(np.argmin(logs.sum(axis=1)))
-    scaled = (logs - logs.min(axis=0)) / extent
-    return int(np.argmin(scaled.sum(axis=1)))
 
 
 def importances(storage: StudyStorage) -> dict[str, dict[str, float]]:

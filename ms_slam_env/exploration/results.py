@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
 
-from ms_slam_env.exploration.front import Point
+from ms_slam_env.exploration.front import Point, front_of
 from ms_slam_env.exploration.held_out import COMPARED
 from ms_slam_env.exploration.objectives import FAILURE, METRICS, OTHERS, as_metrics, key_of
 from ms_slam_env.metrics.registry import metric
@@ -28,6 +28,7 @@ _SHOWN = (
     *("map_error_mm", "M_I", "M_D"),
 )
 _PARAMETERS_DRAWN = 4
+_RATE = "keep_every"
 _MEANS = "Means over the sequences."
 
 Shares = Mapping[str, Mapping[str, float]]
@@ -49,6 +50,8 @@ class Explored:
         importance: by objective, the share of each parameter.
         held_out: lines of ``compare_configurations`` on sequences that it never saw.
         again: the same of the default and the chosen on its own sequences.
+        absent: parameters of the groups asked for that this machine or the backend lacks; lines.
+        levels: trials that run-time adaptation may switch among, from fast to robust.
     """
 
     objectives: Sequence[str]
@@ -61,6 +64,8 @@ class Explored:
     importance: Shares
     held_out: Sequence[Mapping[str, Any]]
     again: Sequence[Mapping[str, Any]]
+    absent: Sequence[str] = ()
+    levels: Sequence[int] = ()
 
     def rows(self) -> list[dict[str, Any]]:
         """One a trial."""
@@ -113,9 +118,13 @@ class Explored:
         """By number of a trial what it is besides one of the front: fastest and knee, say."""
         names: dict[int, list[str]] = {}
         default = [("default", point) for point in self.points if point.is_default]
-        for name, point in (*default, *self.chosen.items()):
+        of_level = {f"level {k}": self._by_number(n) for k, n in enumerate(self.levels)}
+        for name, point in (*default, *self.chosen.items(), *of_level.items()):
             names.setdefault(point.number, []).append(name.replace("_", " "))
         return {number: ", ".join(own) for number, own in names.items()}
+
+    def _by_number(self, number: int) -> Point:
+        return next(point for point in self.points if point.number == number)
 
     def _counts(self) -> str:
         box = ", ".join(
@@ -129,6 +138,7 @@ class Explored:
             f"{sum(point.feasible for point in self.points)} feasible, "
             f"{sum(point.on_front for point in self.points)} on the front; "
             f"hypervolume {volume} of the box up to {box}."
+            + "".join(f" {line[0].upper()}{line[1:]}." for line in self.absent)
         )
 
     def _ratios_table(self, lines: Sequence[Mapping[str, Any]], title: str, note: str) -> Table:
@@ -176,11 +186,16 @@ class Explored:
         line = Series("hypervolume", trials, list(self.hypervolume), mode="lines")
         found = [
             Chart("pareto", "Pareto front", "One mark a trial.",
-                  [self._front(cost, error) for error, cost in combinations(self.objectives, 2)]),
+                  [self._front(cost, error) for error, cost in self._pairs()]),
             Chart("hypervolume", "Hypervolume over trials",
                   "Share of the box up to the reference that the front so far dominates.",
                   [Panel("trials", "hypervolume", [line])]),
         ]  # fmt: skip
+        rates = sorted({point.params.get(_RATE, 1) for point in self.points})
+        if len(rates) > 1:
+            caption = "Feasible trials that none of the same frame rate beats."
+            panels = [self._by_rate(*pair, rates) for pair in self._pairs()]
+            found.insert(1, Chart("rates", "Fronts of the frame rates", caption, panels))
         if self.importance:
             names = by_importance(self.importance)
             marks = [
@@ -226,6 +241,22 @@ class Explored:
             for name, own in groups.items()
             if own
         ]
+        return Panel(key_of(cost, self.clock), key_of(error, self.clock), series, "xy")
+
+    def _pairs(self) -> list[tuple[str, str]]:
+        return list(combinations(self.objectives, 2))
+
+    def _by_rate(self, error: str, cost: str, rates: Sequence[int]) -> Panel:
+        """The front of each frame rate with the divergence that it makes: Figs. 6 and 7."""
+        series = []
+        for every in rates:
+            own = [p for p in self.points if p.params.get(_RATE, 1) == every and p.feasible]
+            own = front_of(own, (error, cost))
+            if own:
+                x, y = self._values(own, cost), self._values(own, error)
+                M_I = own[0].measured.get("M_I")
+                name = f"every {every}" + (f", M_I {format_number(M_I, 2)}" if M_I else "")
+                series.append(Series(name, x, y, mode="lines+markers"))
         return Panel(key_of(cost, self.clock), key_of(error, self.clock), series, "xy")
 
     def _over(self, parameter: str) -> Panel:

@@ -14,16 +14,14 @@ from ms_slam_env.exploration.parameters import Choice, Float, Integer, Parameter
 from ms_slam_env.slam import check_parameters
 from ms_slam_env.slam.configuration import SlamConfiguration, merged
 from ms_slam_env.slam.machine import clock_range_mhz
+from ms_slam_env.slam.surfel.config import PAPER
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
 
 # Algorithmic parameters of the paper, section IV-A, with its ranges.
-_PAPER: dict[str, Parameter] = {
-    "depth_cutoff_m": Float(0.5, 10.0),  # nothing is nearer than the sensor's 0.5 m
-    "icp_rgb_weight": Float(0.0, 1.0),
-    "confidence_threshold": Float(0.0, 12.0),
-}
+_PAPER: dict[str, Parameter] = {name: Float(low, high) for name, (_, low, high) in PAPER.items()}
+_PAPER["depth_cutoff_m"] = Float(0.5, 10.0)  # nothing is nearer than the sensor's 0.5 m
 _ALGORITHM: dict[str, Parameter] = {
     **_PAPER,
     "iterations.0": Integer(0, 12),

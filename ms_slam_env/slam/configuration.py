@@ -174,6 +174,27 @@ def read_configuration(path: str | Path) -> SlamConfiguration:
         raise InputError(f"{path}: {error}") from None
 
 
+def read_levels(path: str | Path, part: str) -> Mapping[str, Any]:
+    """What a file of levels, which an exploration writes, says of ``part`` of SLAM.
+
+    Raises:
+        InputError: no such file, no YAML, or nothing said of ``part``.
+    """
+    try:
+        content = load_yaml(read_text(path, "levels", _MAX_BYTES))
+    except ValueError as error:
+        raise InputError(f"{path}: not YAML: {error}") from None
+    found = content.get(part) if isinstance(content, Mapping) else None
+    if not isinstance(found, Mapping):
+        raise InputError(f"{path}: says nothing of {part}")
+    return found
+
+
+def write_levels(path: str | Path, content: Mapping[str, Any]) -> None:
+    """Write a file that ``read_levels`` reads."""
+    write_text(Path(path), yaml.safe_dump(_plain(content), sort_keys=False))
+
+
 def write_configuration(path: str | Path, configuration: SlamConfiguration) -> None:
     """Write a file that ``read_configuration`` reads back; defaults that are None are left out."""
     content = {

@@ -1,5 +1,6 @@
 """Explorations of a real backend: what is measured, written, chosen, and refused."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -165,6 +166,35 @@ def test_going_on_keeps_what_is_there(explored, monkeypatch):
     assert after.tables == before.tables
 
 
+def test_the_best_for_a_divergence_is_an_answer(explored, monkeypatch):
+    exploration, out, _ = explored
+    monkeypatch.setattr(SlamEvaluator, "measure", None)  # nothing is left to measure
+    trials = read_results(out / "explore.json").rows
+    M = trials[0]["result"]["M_I"], trials[0]["result"]["M_D"]
+    asked = replace(exploration, for_divergence=M, tolerance=1000.0)
+    run_exploration(asked, out, 4)
+    number = read_results(out / "explore.json").content["for_divergence"]
+    feasible = [t for t in trials if t["result"]["feasible"]]
+    assert number == min(feasible, key=lambda t: t["result"]["cpu_ms_median"])["spec"]["trial"]
+    made = read_configuration(out / "for-divergence.yaml")
+    assert made.about["trial"] == number
+    with pytest.raises(
+        InputError, match=r"no feasible trial was measured at M_I >= 9 and M_D >= 0"
+    ):
+        run_exploration(replace(exploration, for_divergence=(9.0, 0.0)), out, 4)
+
+
+def test_the_worst_sequence_counts(sequences):
+    base = SlamConfiguration()
+    evaluator = SlamEvaluator(sequences, image_size="80x60", baseline=base)
+    assert evaluator(base)["ate_worst_ratio"] == 1.0
+    other = SlamConfiguration(slam_config={"points_per_level": 300})
+    rows = [[evaluator.measure(c, s)["ate_m"] for s in sequences] for c in (other, base)]
+    measured = evaluator(other)
+    assert measured["ate_worst_m"] == max(rows[0])
+    assert measured["ate_worst_ratio"] == max(a / b for a, b in zip(*rows, strict=True))
+
+
 def test_chosen_configurations_are_taken_everywhere(explored, sequences, tmp_path):
     exploration, out, _ = explored
     for name, row in read_results(out / "explore.json").content["chosen"].items():
@@ -242,6 +272,10 @@ def test_a_grid_measures_each_point_once(sequences, tmp_path):
         (["--sampler", "grid"], "valid choices: random, nsga2, tpe, gp"),
         (["--objectives", "ate", "ext_ms"], "unknown objective 'ate'"),
         (["--constraints", "ate_m=1"], "is not metric<limit"),
+        (["--constraints", "ext_ms>1"], "is not metric<limit, as in ate_m<0.01, nor M_I>limit"),
+        (["--parameters", "threads"], "parameter 'threads' is absent: Warp runs a kernel on one"),
+        (["--parameters", "compiler.speed"], "unknown parameter"),
+        (["--tolerance", "0.5"], "tolerance = 0.5 is outside"),
         (["--parameters", "speed"], "unknown parameter 'speed'"),
         (["--sequences", "nowhere"], "sequence 'nowhere' is neither a folder nor"),
         (["--sequences", "nowhere:1000"], "unknown scene 'nowhere'"),
@@ -267,5 +301,7 @@ def test_energy_is_refused_where_there_is_none(sequences):
         pytest.skip("this machine counts energy")
     with pytest.raises(InputError, match="energy_j is not available: "):
         Exploration(SlamEvaluator(sequences), ExplorationSettings(("ate_m", "energy_j")))
+    with pytest.raises(InputError, match="ate_worst_ratio is not measured"):
+        Exploration(SlamEvaluator(sequences), ExplorationSettings(("ate_worst_ratio", "ext_ms")))
     with pytest.raises(InputError, match="map_error_mm is not measured"):
         Exploration(SlamEvaluator(sequences), ExplorationSettings(("ate_m", "map_error_mm")))

@@ -9,13 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ms_slam_env.exploration import ExplorationSettings, explore
+from ms_slam_env.exploration.choices import choose, knee
 from ms_slam_env.exploration.front import (
     Point,
-    choose,
     hypervolume,
     hypervolume_history,
     importances,
-    knee,
     points_of,
 )
 

@@ -30,7 +30,8 @@ from mutations import (
 from policy_files import as_bytes
 
 from ms_slam_env.exploration import ExplorationSettings, explore, make_space
-from ms_slam_env.exploration.front import choose, hypervolume_history, importances, points_of
+from ms_slam_env.exploration.choices import choose
+from ms_slam_env.exploration.front import hypervolume_history, importances, points_of
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.page import write_report
 from ms_slam_env.report.records import RecordFile

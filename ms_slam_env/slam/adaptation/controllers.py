@@ -11,6 +11,7 @@ from abc import ABC, abstractmethod
 from bisect import bisect_right
 from dataclasses import dataclass, field
 from math import inf
+from pathlib import Path
 from typing import Any
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame
@@ -24,7 +25,7 @@ from ms_slam_env.slam.adaptation.adaptive_slam import (
     make_levels,
 )
 from ms_slam_env.slam.base import SlamBackend
-from ms_slam_env.slam.configuration import SlamConfiguration
+from ms_slam_env.slam.configuration import SlamConfiguration, read_levels
 from ms_slam_env.slam.frame_selection import ChangeConfig
 from ms_slam_env.slam.frame_selection.filters import Change
 from ms_slam_env.slam.state import Saved
@@ -153,6 +154,8 @@ class DivergenceAdaptationConfig(SwitchingConfig):
             i-th, configuration i is not good enough. Up at once, as far as needed.
         release_share: of the thresholds, below which the way down is open, (0, 1].
         dwell_frames: down only as far as the largest change of so many frames permits.
+        levels: file that an exploration wrote, whose configurations, thresholds and costs are
+            taken in place of these; None from then on.
         robust_when_lost: the most robust configuration while tracking is lost, and so long after.
         per: the change per ``frame`` or, by the time stamps, per ``second``.
         change: how the change between frames is measured.
@@ -169,11 +172,23 @@ class DivergenceAdaptationConfig(SwitchingConfig):
     robust_when_lost: bool = True
     per: str = chosen("frame", "frame", "second")
     change: ChangeConfig = field(default_factory=ChangeConfig)
+    levels: str | Path | None = None
 
     def __post_init__(self) -> None:
+        if self.levels is not None:
+            self._take(self.levels)
         super().__post_init__()
         wanted = self.num_configurations - 1
         object.__setattr__(self, "thresholds", rising(self.thresholds, "thresholds", wanted))
+
+    def _take(self, levels: str | Path) -> None:
+        """Take configurations, thresholds and costs from a file."""
+        if self.configurations is not None:
+            raise InputError("levels and configurations both say what to switch among; give one")
+        found = read_levels(levels, "adaptation")
+        for name in ("configurations", "thresholds", "costs"):
+            object.__setattr__(self, name, found.get(name))
+        object.__setattr__(self, "levels", None)
 
     def make_controller(self, intrinsics: Intrinsics) -> Controller:
         """The controller for frames of ``intrinsics``."""

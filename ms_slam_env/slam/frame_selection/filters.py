@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import KW_ONLY, dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from ms_slam_env.config import Checked, Family, bounded, chosen
 from ms_slam_env.divergence import DivergenceConfig, Histograms, make_divergence
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.base import SlamBackend
+from ms_slam_env.slam.configuration import read_levels
 from ms_slam_env.slam.frame_selection.selective_slam import PREDICTIONS, FrameFilter, SelectiveSlam
 from ms_slam_env.slam.state import Saved, Stateful
 
@@ -205,12 +207,21 @@ class DivergenceFilterConfig(DroppingConfig):
             slow motion is never seen: each frame is like the one before it, and ``max_skip`` alone
             lets one through.
         change: how it is measured.
+        levels: file that an exploration wrote, whose threshold is taken; None from then on.
     """
 
     name: str = field(default="divergence", init=False)
     threshold: float = bounded(0.01, 0, 1e6)
     reference: str = chosen("processed", "processed", "previous")
     change: ChangeConfig = field(default_factory=ChangeConfig)
+    levels: str | Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.levels is not None:
+            found = read_levels(self.levels, "frame_management")
+            object.__setattr__(self, "threshold", found.get("threshold"))
+            object.__setattr__(self, "levels", None)
+        super().__post_init__()
 
     def make_filter(self, intrinsics: Intrinsics) -> FrameFilter:
         """The filter for frames of ``intrinsics``."""

@@ -157,6 +157,14 @@ SUBMAPS = ("atlas", "off")
 MOTION_MASKS = ("none", "geometric")
 
 
+PAPER: dict[str, tuple[float, float, float]] = {
+    "depth_cutoff_m": (3.0, 0.0, 10.0),
+    "icp_rgb_weight": (0.1, 0.0, 1.0),
+    "confidence_threshold": (10.0, 0.0, 12.0),
+}
+"""Parameters of ElasticFusion with default, lowest and highest value (ICRA 2017, section IV-A)."""
+
+
 @dataclass(frozen=True)
 class SurfelConfig(Checked):
     """Parameters of tracking, fusion and prediction.
@@ -255,6 +263,16 @@ class SurfelConfig(Checked):
                 f"SurfelConfig.iterations = {self.iterations!r} must be 1 to 5 integers in [0, 100]"
             )
         object.__setattr__(self, "iterations", tuple(self.iterations))  # lists come from YAML
+
+    @classmethod
+    def paper(cls) -> SurfelConfig:
+        """ElasticFusion as the paper explores it (ICRA 2017, section IV-A): ``PAPER``'s defaults.
+
+        Its loops are closed by deforming the map. The other parameters have no published value in
+        units of ours and stay as they are; docs/exploration.md goes through them.
+        """
+        published = {name: default for name, (default, _, _) in PAPER.items()}
+        return cls(**published, loop_closure="deformation")  # type: ignore[arg-type]
 
     def capacity(self, columns: int) -> int:
         """Surfels that the map of a camera with images of so many columns has room for."""
