@@ -49,7 +49,7 @@ def read_color(path: Path, intrinsics: Intrinsics) -> NDArray[np.uint8]:
         InputError: no such file, no image of a documented format, one that is damaged, or one that
             has another size than ``intrinsics`` say.
     """
-    return _read(path, "colour image", _COLOR, intrinsics).astype(np.uint8, copy=False)
+    return decode_color(_bytes(path, "colour image"), str(path), intrinsics)
 
 
 def read_depth(path: Path, intrinsics: Intrinsics) -> NDArray[Any]:
@@ -58,16 +58,45 @@ def read_depth(path: Path, intrinsics: Intrinsics) -> NDArray[Any]:
     Raises:
         InputError: as `read_color`; 8 bits, which would be depth in steps of centimetres.
     """
-    return _read(path, "16-bit depth image", _DEPTH, intrinsics)
+    return decode_depth(_bytes(path, "16-bit depth image"), str(path), intrinsics)
 
 
-def _read(path: Path, kind: str, modes: tuple[str, ...], intrinsics: Intrinsics) -> NDArray[Any]:
-    data = io.BytesIO(read_bytes(path, kind, MAX_IMAGE_BYTES))
+def decode_color(data: bytes, name: str, intrinsics: Intrinsics) -> NDArray[np.uint8]:
+    """As `read_color`, of what a file holds; ``name`` is for errors."""
+    return _decode(data, name, "colour image", _COLOR, intrinsics).astype(np.uint8, copy=False)
+
+
+def decode_depth(data: bytes, name: str, intrinsics: Intrinsics) -> NDArray[Any]:
+    """As `read_depth`, of what a file holds; ``name`` is for errors."""
+    return _decode(data, name, "16-bit depth image", _DEPTH, intrinsics)
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image file.
+
+    Raises:
+        InputError: no such file, or no image of a documented format.
+    """
+    try:
+        with Image.open(io.BytesIO(_bytes(path, "image")), formats=_FORMATS) as image:
+            return image.size
+    except _BROKEN as error:
+        raise InputError(f"cannot read {path}: {type(error).__name__}") from None
+
+
+def _bytes(path: Path, kind: str) -> bytes:
+    return read_bytes(path, kind, MAX_IMAGE_BYTES)
+
+
+def _decode(
+    content: bytes, path: str, kind: str, modes: tuple[str, ...], intrinsics: Intrinsics
+) -> NDArray[Any]:
+    data = io.BytesIO(content)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what is wrong with the file is said below
             with Image.open(data, formats=_FORMATS) as image:
-                _check_size(path, image.size, intrinsics)
+                check_size(path, image.size, intrinsics)
                 if image.mode not in modes:
                     raise InputError(f"{path} is not a {kind}: its pixels are {image.mode}")
                 image.load()
@@ -79,7 +108,12 @@ def _read(path: Path, kind: str, modes: tuple[str, ...], intrinsics: Intrinsics)
         raise InputError(f"cannot read {path}: {said}") from None
 
 
-def _check_size(path: Path, size: tuple[int, int], intrinsics: Intrinsics) -> None:
+def check_size(path: str, size: tuple[int, int], intrinsics: Intrinsics) -> None:
+    """Refuse an image ``path`` of another size (width, height) than the intrinsics say.
+
+    Raises:
+        InputError: naming both sizes.
+    """
     if size != (intrinsics.width, intrinsics.height):
         raise InputError(
             f"{path} is {size[0]}x{size[1]} but the intrinsics say "

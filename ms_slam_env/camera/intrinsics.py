@@ -1,13 +1,14 @@
-"""Pinhole intrinsics; pixel centres lie at integers."""
+"""Intrinsics of a pinhole camera, with a lens or without; pixel centres lie at integers."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ms_slam_env.camera.distortion import NO_DISTORTION, Distortion
 from ms_slam_env.errors import InputError
 
 Array = NDArray[np.float64]
@@ -32,9 +33,12 @@ its inverse."""
 class Intrinsics:
     """Pinhole camera: u = fx x / z + cx, v = fy y / z + cy, in pixels.
 
+    With a lens (x, y) / z is bent before (`Distortion.distort`). SLAM and divergence want none:
+    images are straightened first (`ms_slam_env.camera.undistortion`), as recordings are on reading.
+
     Raises:
-        InputError: a side below 1 or above `LARGEST_SIDE` pixels, or focal lengths or a centre
-            that no camera has.
+        InputError: a side below 1 or above `LARGEST_SIDE` pixels, focal lengths or a centre that
+            no camera has, or a lens that folds what the camera without it would see.
     """
 
     fx: float
@@ -43,6 +47,7 @@ class Intrinsics:
     cy: float
     width: int
     height: int
+    distortion: Distortion = NO_DISTORTION
 
     def __post_init__(self) -> None:
         """Refuse values that no camera has."""
@@ -59,11 +64,33 @@ class Intrinsics:
                 f"focal lengths and centre must be at most {LARGEST_NUMBER:g} px, fx, fy at least "
                 f"{1 / LARGEST_NUMBER:g} px: {numbers}"
             )
+        if self.distortion:
+            edges = np.linspace(0, self.width - 1, 17), np.linspace(0, self.height - 1, 17)
+            grid = np.stack(np.meshgrid(*edges), axis=-1)
+            if not self.distortion.is_one_to_one(self.undistorted.rays_at(grid)[..., :2]):
+                raise InputError(f"{self.distortion} folds an image of {self.width}x{self.height}")
 
     @property
     def shape(self) -> tuple[int, int]:
         """(height, width), the shape of an image array."""
         return self.height, self.width
+
+    @property
+    def undistorted(self) -> Intrinsics:
+        """The same camera without a lens."""
+        return replace(self, distortion=NO_DISTORTION) if self.distortion else self
+
+    def check_pinhole(self, what: str) -> None:
+        """Refuse a lens.
+
+        Raises:
+            InputError: naming ``what`` cannot work with one.
+        """
+        if self.distortion:
+            raise InputError(
+                f"{what} needs images without distortion, got {self.distortion}: straighten them "
+                "with ms_slam_env.camera.undistortion and give intrinsics.undistorted"
+            )
 
     def every_nth(self, n: int) -> Intrinsics:
         """Intrinsics of the image that keeps every ``n``-th row and column, from the first on.
@@ -73,7 +100,8 @@ class Intrinsics:
         """
         if n < 1:
             raise InputError(f"n = {n} must be >= 1")
-        return Intrinsics(
+        return replace(
+            self,
             fx=self.fx / n,
             fy=self.fy / n,
             cx=self.cx / n,
@@ -87,7 +115,8 @@ class Intrinsics:
 
         Pixel centres at integers make the image span [-0.5, width - 0.5], hence the half pixels.
         """
-        return Intrinsics(
+        return replace(
+            self,
             fx=self.fx * factor,
             fy=self.fy * factor,
             cx=(self.cx + 0.5) * factor - 0.5,
@@ -100,7 +129,7 @@ class Intrinsics:
         """Intrinsics of the image resampled to ``width`` x ``height``, same field of view."""
         x, y = width / self.width, height / self.height
         centre = (self.cx + 0.5) * x - 0.5, (self.cy + 0.5) * y - 0.5
-        return Intrinsics(self.fx * x, self.fy * y, *centre, width, height)
+        return Intrinsics(self.fx * x, self.fy * y, *centre, width, height, self.distortion)
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Intrinsics:
         """Intrinsics of the part of the image that begins at column ``left`` and row ``top``.
@@ -114,7 +143,7 @@ class Intrinsics:
                 f"images of {self.width}x{self.height} have no part of {width}x{height} from "
                 f"{left}, {top} on"
             )
-        return Intrinsics(self.fx, self.fy, self.cx - left, self.cy - top, width, height)
+        return replace(self, cx=self.cx - left, cy=self.cy - top, width=width, height=height)
 
     def rays(self) -> Array:
         """Viewing rays (height, width, 3) in the camera frame with z = 1."""
@@ -122,9 +151,16 @@ class Intrinsics:
         return self.rays_at(np.stack([u, v], axis=-1))
 
     def rays_at(self, pixels: ArrayLike) -> Array:
-        """Viewing rays (..., 3) with z = 1 through pixels (..., 2), the inverse of ``project``."""
+        """Viewing rays (..., 3) with z = 1 through pixels (..., 2), the inverse of ``project``.
+
+        Raises:
+            InputError: the lens leads no ray in front of the camera to a pixel.
+        """
         u, v = np.moveaxis(np.asarray(pixels, dtype=np.float64), -1, 0)
-        return np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones_like(u)], -1)
+        x, y = (u - self.cx) / self.fx, (v - self.cy) / self.fy
+        if self.distortion:
+            x, y = np.moveaxis(self.distortion.undistort(np.stack([x, y], axis=-1)), -1, 0)
+        return np.stack([x, y, np.ones_like(u)], -1)
 
     @property
     def matrix(self) -> Array:
@@ -134,6 +170,9 @@ class Intrinsics:
     def project(self, points: ArrayLike) -> Array:
         """Pixel coordinates (..., 2) of points (..., 3) of the camera frame with z > 0."""
         p = np.asarray(points, dtype=np.float64)
+        if self.distortion:
+            bent = self.distortion.distort(p[..., :2] / p[..., 2:])
+            return bent * (self.fx, self.fy) + (self.cx, self.cy)
         u = self.fx * p[..., 0] / p[..., 2] + self.cx
         v = self.fy * p[..., 1] / p[..., 2] + self.cy
         return np.stack([u, v], axis=-1)

@@ -28,13 +28,14 @@ _PRINTED = (
 class Arguments:
     """Run a SLAM backend over an RGB-D sequence.
 
-    Layouts: TUM RGB-D, ICL-NUIM, 7-Scenes, or folders depth and rgb with an intrinsics.txt of
-    "fx fy cx cy width height [depth_scale]". Writes trajectory.txt (TUM), map.ply, metrics.json
-    and frames.csv (what each frame cost).
+    Layouts: TUM RGB-D, ICL-NUIM, 7-Scenes, EuRoC and KITTI odometry (depth by stereo matching), ROS
+    bags and MCAP files, or folders depth and rgb with an intrinsics.txt of "fx fy cx cy width
+    height [depth_scale] [radial-tangential k1 k2 p1 p2 k3 | equidistant k1 k2 k3 k4]". Writes
+    trajectory.txt (TUM), map.ply, metrics.json and frames.csv (what each frame cost).
     """
 
     sequence: tyro.conf.Positional[str]
-    """Folder of a recording, or scene:seed[:word[+word ...]] such as
+    """Folder or bag of a recording, or scene:seed[:word[+word ...]] such as
     living_room:2000:kinect+misregistration."""
     config: Path | None = None
     """Configuration file (YAML): backend, parameters, image size, which frames and threads."""
@@ -45,13 +46,16 @@ class Arguments:
     part of that aspect, 160x120+crop=480x360 that part. By default that of the configuration file,
     else "native"."""
     layout: str = "auto"
-    """auto, tum, icl-nuim, 7-scenes or folder."""
+    """auto, tum, icl-nuim, 7-scenes, folder, euroc, kitti or bag."""
     intrinsics: str | None = None
-    """Of the images on disk: "fx fy cx cy width height [depth_scale]"; by default those of
+    """Of the images on disk, as intrinsics.txt has them; by default those of
     intrinsics.txt in the folder, else the published ones of the dataset."""
     register: bool | None = None
     """Bring colour into the depth camera, as an uncalibrated Kinect needs it; by default only for
     7-scenes."""
+    topics: tuple[str, ...] = ()
+    """Topics of a bag, as in depth=/camera/depth/image_rect color=/camera/rgb/image_rect
+    info=/camera/depth/camera_info pose=/vicon/camera; those left out are found by type and name."""
     params: tuple[str, ...] = ()
     """Parameters of the backend, as in icp_rgb_weight=0.2; before those of the file."""
     frame_management: str = "none"
@@ -74,12 +78,12 @@ class Arguments:
 def main(arguments: Sequence[str]) -> int:
     """Run, write, and print what was measured."""
     args = parse(Arguments, arguments, "ms-slam run")
-    from ms_slam_env.config import nested_options
+    from ms_slam_env.config import from_dict, nested_options
     from ms_slam_env.evaluation.run_sequence import lost_throughout
     from ms_slam_env.evaluation.run_to_folder import run_to_folder
     from ms_slam_env.parallel import limit_threads
     from ms_slam_env.sequences import open_sequence
-    from ms_slam_env.sequences.recording import parse_calibration
+    from ms_slam_env.sequences.recording import Topics, parse_calibration
     from ms_slam_env.slam.configuration import (
         SlamConfiguration,
         configuration_of_map,
@@ -110,6 +114,7 @@ def main(arguments: Sequence[str]) -> int:
         layout=args.layout,
         intrinsics=given,
         register=args.register,
+        topics=from_dict(Topics, nested_options(args.topics), "topics"),
     )
     registration = getattr(sequence.frames, "registration", None)
     if registration is not None:

@@ -9,7 +9,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.camera import RGBDFrame
+from ms_slam_env.camera import Distortion, RGBDFrame, xtion
+from ms_slam_env.camera.distortion import NO_DISTORTION
 from ms_slam_env.errors import InputError
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sensor import RGBDSensor
@@ -34,6 +35,11 @@ class CameraFeed(ABC):
     perturbations: tuple[Perturbation, ...] = ()
     example: ClassVar[Mapping[str, Any]] = {"noise_seed": 0}
     """A state, as small as there is."""
+
+    @property
+    def lens(self) -> Distortion:
+        """What bends the frames that are handed on as a pinhole camera's."""
+        return NO_DISTORTION
 
     @property
     def has_begun(self) -> bool:
@@ -210,7 +216,12 @@ class PerturbedFeed(CameraFeed):
 
     def true_depth(self) -> NDArray[np.float32]:
         """See the base class."""
-        return self._camera.sensor.last_true_depth(moving=False)
+        return self._camera.last_true_depth(moving=False)
+
+    @property
+    def lens(self) -> Distortion:
+        """See the base class."""
+        return self._imperfections.optics_of(xtion("80x60")).lens
 
     @property
     def movers(self) -> tuple[Mover, ...]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.camera import RGBDFrame, intensity_image
+from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.divergence import Histograms, make_divergence
 from ms_slam_env.env.camera_feed import make_camera_feed
 from ms_slam_env.env.config import EnvConfig
@@ -31,6 +31,11 @@ from ms_slam_env.timings import Timings
 Float64 = NDArray[np.float64]
 
 _START_TRIES = 10  # a drawn start sees surface in most of its view: one try is nearly always enough
+
+
+@lru_cache(maxsize=4)
+def _rays(intrinsics: Intrinsics) -> Float64:
+    return intrinsics.rays()
 
 
 class World(NamedTuple):
@@ -74,7 +79,6 @@ class Simulation:
         self.config, self.embodiment_type = config, embodiment_type
         self.slam, self.timings = slam, timings
         self.intrinsics = config.camera
-        self._rays = self.intrinsics.rays()
         self.camera_feed = make_camera_feed(())
         self.divergence = make_divergence(config.divergence, self.intrinsics)
         self._pose_source = POSE_SOURCES[config.pose]()
@@ -96,7 +100,7 @@ class Simulation:
         scene = get_scene(name, scene_seed)
         sensor = get_sensor(name, scene_seed, self.intrinsics, self.config.noise)
         robot = self.embodiment_type.build(scene, self.config, self.timings)
-        return World(scene, sensor, robot, CoverageGrid(scene, self._rays))
+        return World(scene, sensor, robot, self._coverage(scene))
 
     def start_somewhere(self, rng: np.random.Generator) -> None:
         """Begin at the first pose drawn that can be used.
@@ -121,7 +125,7 @@ class Simulation:
         except UnreachableError as error:
             return str(error)
         noise_seed = int(rng.integers(2**31))
-        self.world = self.world._replace(coverage=CoverageGrid(scene, self._rays))
+        self.world = self.world._replace(coverage=self._coverage(scene))
         here = robot.T_world_camera
         try:
             self.camera_feed.begin(scene, self.world.sensor, here, noise_seed)
@@ -220,6 +224,11 @@ class Simulation:
         if before is None or now is None:
             return np.zeros(2)
         return self.divergence.divergence(now, before)[0]
+
+    def _coverage(self, scene: Scene) -> CoverageGrid:
+        """Nothing of a scene is mapped yet; a lens that nobody told of bends the true rays."""
+        bent = dataclasses.replace(self.intrinsics, distortion=self.camera_feed.lens)
+        return CoverageGrid(scene, _rays(bent))
 
     def _cover(self, frame: RGBDFrame, T_true: Float64, result: TrackResult) -> float:
         """Mark what a frame added to the map; return the newly mapped area, m2."""

@@ -126,15 +126,19 @@ class BodyCast:
 
 def _frustum(camera: Pinhole) -> Float64:
     """Inward unit normals (5, 3) of the planes that bound what an image sees."""
-    left, right = -0.5 - camera.cx, camera.width - 0.5 - camera.cx
-    top, bottom = -0.5 - camera.cy, camera.height - 0.5 - camera.cy
+    left, right = (np.array([-0.5, camera.width - 0.5]) - camera.cx) / camera.fx
+    top, bottom = (np.array([-0.5, camera.height - 0.5]) - camera.cy) / camera.fy
+    if camera.bent.shape[0] > 0:
+        rays = camera.bent.numpy()
+        half = 0.5 / np.array([camera.fx, camera.fy])
+        (left, top), (right, bottom) = rays.min(axis=0) - half, rays.max(axis=0) + half
     planes = np.array(
         [
             (0.0, 0.0, 1.0),
-            (1.0, 0.0, -left / camera.fx),
-            (-1.0, 0.0, right / camera.fx),
-            (0.0, 1.0, -top / camera.fy),
-            (0.0, -1.0, bottom / camera.fy),
+            (1.0, 0.0, -left),
+            (-1.0, 0.0, right),
+            (0.0, 1.0, -top),
+            (0.0, -1.0, bottom),
         ]
     )
     return planes / np.linalg.norm(planes, axis=1, keepdims=True)

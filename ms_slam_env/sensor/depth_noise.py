@@ -88,6 +88,8 @@ const float half_pi = HALF_PI;
 const float px = T.data[0][3], py = T.data[1][3], pz = T.data[2][3];
 const float last_x = (float)(camera.width - 1);
 const float last_y = (float)(camera.height - 1);
+const bool is_bent = camera.bent.shape[0] > 0;
+const float* bent = (const float*)camera.bent.data;
 
 PCG_SOURCEauto smaller = [](float a, float b) { return a < b ? a : b; };
 auto larger = [](float a, float b) { return a > b ? a : b; };
@@ -110,8 +112,10 @@ for (int k = 0; k < count; ++k) {
     const unsigned drop_word = pcg(word + 2u);
 
     // Lateral jitter [N]: depth is sampled sigma_L native pixels away.
-    const float dx = ((float)x - camera.cx) / camera.fx;
-    const float dy = ((float)y - camera.cy) / camera.fy;
+    const float plain_x = ((float)x - camera.cx) / camera.fx;
+    const float plain_y = ((float)y - camera.cy) / camera.fy;
+    const float dx = is_bent ? bent[2 * pixel] : plain_x;
+    const float dy = is_bent ? bent[2 * pixel + 1] : plain_y;
     const float rx = T.data[0][0] * dx + T.data[0][1] * dy + T.data[0][2];
     const float ry = T.data[1][0] * dx + T.data[1][1] * dy + T.data[1][2];
     const float rz = T.data[2][0] * dx + T.data[2][1] * dy + T.data[2][2];
@@ -128,9 +132,9 @@ for (int k = 0; k < count; ++k) {
     is_read = is_read && face_of[j] >= 0;
     const int sampled = face_of[j] >= 0 ? face_of[j] : 0;
 
-    // The sampled surface, met by the jittered ray.
-    const float ex = (u - camera.cx) / camera.fx;
-    const float ey = (v - camera.cy) / camera.fy;
+    // The sampled surface, met by the jittered ray; a lens shifts it as it does the pixel's.
+    const float ex = (u - camera.cx) / camera.fx + (is_bent ? bent[2 * pixel] - plain_x : 0.0f);
+    const float ey = (v - camera.cy) / camera.fy + (is_bent ? bent[2 * pixel + 1] - plain_y : 0.0f);
     const float sx = T.data[0][0] * ex + T.data[0][1] * ey + T.data[0][2];
     const float sy = T.data[1][0] * ex + T.data[1][1] * ey + T.data[1][2];
     const float sz = T.data[2][0] * ex + T.data[2][1] * ey + T.data[2][2];

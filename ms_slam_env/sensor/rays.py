@@ -4,13 +4,18 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 
 
 @wp.struct
 class Pinhole:
-    """Intrinsics for kernels, in pixels, and how many rows of an image share a pose."""
+    """Intrinsics for kernels, in pixels, and how many rows of an image share a pose.
+
+    With a lens the rays are those of a table, not of focal length and centre.
+    """
 
     fx: wp.float32
     fy: wp.float32
@@ -19,6 +24,7 @@ class Pinhole:
     width: wp.int32
     height: wp.int32
     rows: wp.int32  # that share a pose; ``height`` unless the shutter rolls
+    bent: wp.array(dtype=wp.vec2)  # (H * W,) x and y at z = 1; empty without a lens
 
 
 @wp.struct
@@ -39,13 +45,19 @@ def make_hits(count: int, device: str) -> Hits:
     return hits
 
 
-def make_pinhole(intrinsics: Intrinsics, rows: int | None = None) -> Pinhole:
-    """Copy intrinsics into the struct; every ``rows`` rows have a pose, by default all one."""
+def make_pinhole(intrinsics: Intrinsics, rows: int | None = None, device: str = "cpu") -> Pinhole:
+    """Copy intrinsics into the struct; every ``rows`` rows have a pose, by default all one.
+
+    Raises:
+        InputError: the lens leads no ray in front of the camera to some pixel.
+    """
     pinhole = Pinhole()
     pinhole.fx, pinhole.fy = intrinsics.fx, intrinsics.fy
     pinhole.cx, pinhole.cy = intrinsics.cx, intrinsics.cy
     pinhole.width, pinhole.height = intrinsics.width, intrinsics.height
     pinhole.rows = intrinsics.height if rows is None else rows
+    bent = intrinsics.rays()[..., :2].reshape(-1, 2) if intrinsics.distortion else np.zeros((0, 2))
+    pinhole.bent = wp.array(bent.astype(np.float32), dtype=wp.vec2, device=device)
     return pinhole
 
 
@@ -66,9 +78,13 @@ def rotate(T: wp.mat44, d: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def world_ray(T: wp.mat44, camera: Pinhole, u: float, v: float) -> wp.vec3:
-    """Direction in the world of image position (u, v); one unit of it is one metre of depth."""
-    return rotate(T, wp.vec3((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0))
+def world_ray(T: wp.mat44, camera: Pinhole, x: int, y: int) -> wp.vec3:
+    """Direction in the world of a pixel; one unit of it is one metre of depth."""
+    if camera.bent.shape[0] > 0:
+        ray = camera.bent[y * camera.width + x]
+        return rotate(T, wp.vec3(ray[0], ray[1], 1.0))
+    u = (float(x) - camera.cx) / camera.fx
+    return rotate(T, wp.vec3(u, (float(y) - camera.cy) / camera.fy, 1.0))
 
 
 @wp.func
@@ -89,7 +105,7 @@ def generate_rays(
     T = T_world_camera[pose_of_row(camera, b, y)]
     i = (b * camera.height + y) * camera.width + x
     origins[i] = camera_centre(T)
-    directions[i] = world_ray(T, camera, float(x), float(y))
+    directions[i] = world_ray(T, camera, x, y)
 
 
 @wp.kernel
@@ -103,7 +119,7 @@ def cast_rays(
     b, y, x = wp.tid()
     T = T_world_camera[pose_of_row(camera, b, y)]
     i = (b * camera.height + y) * camera.width + x
-    ray = world_ray(T, camera, float(x), float(y))
+    ray = world_ray(T, camera, x, y)
     query = wp.mesh_query_ray(mesh, camera_centre(T), ray, 1.0e6)
     if query.result:
         hits.t[i] = query.t

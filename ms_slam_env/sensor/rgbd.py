@@ -86,7 +86,7 @@ class RGBDSensor:
 
         Args:
             scene: the world; its mesh is copied to the device once.
-            intrinsics: of both images, which are registered.
+            intrinsics: of both images, which are registered; a lens bends both.
             noise: "kinect", "none" or a NoiseConfig.
             seed: of the noise.
             device: Warp device, such as "cpu" or "cuda:0".
@@ -105,8 +105,8 @@ class RGBDSensor:
         self.device = device
         self._caster = caster or make_caster(scene.mesh, device)
         self._cameras = {
-            False: make_pinhole(intrinsics),
-            True: make_pinhole(intrinsics, ROLLING_ROWS),
+            False: make_pinhole(intrinsics, device=device),
+            True: make_pinhole(intrinsics, ROLLING_ROWS, device),
         }
         self._depth_noise = make_depth_noise(self.noise, intrinsics)
         mesh = joined(scene.mesh, bodies) if bodies else scene.mesh

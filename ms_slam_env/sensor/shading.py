@@ -93,7 +93,7 @@ for (int k = 0; k < count; ++k) {
     const float v = v_of[i];
     const float w = 1.0f - u - v;
 
-    // Mip level: the width of the pixel's footprint on the surface, in texels.
+    // Mip level: the width of the pixel's footprint on the surface, in texels; as without a lens.
     const float dx = ((float)x - camera.cx) / camera.fx;
     const float rx = T.data[0][0] * dx + T.data[0][1] * dy + T.data[0][2];
     const float ry = T.data[1][0] * dx + T.data[1][1] * dy + T.data[1][2];
@@ -255,7 +255,7 @@ def true_geometry(
     points[i] = wp.vec3(0.0, 0.0, 0.0)
     if face >= 0:
         T = T_world_camera[pose_of_row(camera, b, y)]
-        ray = world_ray(T, camera, float(x), float(y))
+        ray = world_ray(T, camera, x, y)
         normal = surfaces.normal[face]
         if wp.dot(normal, ray) > 0.0:
             normal = -normal

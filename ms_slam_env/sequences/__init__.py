@@ -15,9 +15,9 @@ Rendered, streamed and reproducible bit for bit::
     for frame, T_world_camera in sequence: ...   # or sequence.frames[k], sequence.poses[k]
     sequence.frames.truth(k)                     # TrueView: depth, normals, labels, points
 
-A perturbation is one of ``RollingShutter, MotionBlur, Misregistration, ExposureRamp,
-ExposureJumps, AutoExposure, BlackFrames, DepthDropout, DepthQuantisation, FrameSkipping,
-MovingObjects, FastMotion, Illumination``, or
+A perturbation is one of ``RollingShutter, MotionBlur, LensDistortion, Misregistration,
+ExposureRamp, ExposureJumps, AutoExposure, BlackFrames, DepthDropout, DepthQuantisation,
+FrameSkipping, MovingObjects, FastMotion, Illumination``, or
 ``make_perturbation("rolling-shutter", {"readout_s": 0.02})``.
 """
 
@@ -45,6 +45,7 @@ from ms_slam_env.sequences.perturbations import (
     FastMotion,
     FrameSkipping,
     Illumination,
+    LensDistortion,
     Misregistration,
     MotionBlur,
     MovingObjects,
@@ -74,6 +75,7 @@ __all__ = [
     "FrameSkipping",
     "HandheldPath",
     "Illumination",
+    "LensDistortion",
     "Misregistration",
     "MotionBlur",
     "MotionSegments",

@@ -1,6 +1,7 @@
 """One way to name a sequence, for all commands: the folder of a recording, or a generated one.
 
-``FOLDER[,FOLDER ...]`` is a recording, in one part or several that follow each other.
+``FOLDER[,FOLDER ...]`` is a recording, in one part or several that follow each other; a ROS bag or
+an MCAP file stands for a folder.
 
 ``scene:seed[:word[+word ...]]``: a scene (a name or a mesh file), the seed of scene, path, noise
 and perturbations, then in any order the noise of the sensor, the path of the camera and what
@@ -17,7 +18,6 @@ What is left out is Kinect noise, the path that the command has for its sequence
 from __future__ import annotations
 
 import dataclasses
-import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -42,8 +42,8 @@ from ms_slam_env.sequences.paths import (
     WanderingPath,
 )
 from ms_slam_env.sequences.perturbations import POINT, Perturbation, make_perturbation
-from ms_slam_env.sequences.recording import Calibration, open_recording
-from ms_slam_env.sequences.recording.parts import part_folders
+from ms_slam_env.sequences.recording import Calibration, Topics, open_recording
+from ms_slam_env.sequences.recording.parts import is_recording, part_folders
 from ms_slam_env.sequences.recording.recording import Registration, recorded_sequence
 from ms_slam_env.sequences.rendering import render_sequence
 from ms_slam_env.sequences.sequence import Sequence
@@ -61,8 +61,8 @@ RENDERED_SIZE = "160x120"
 """Image size of a rendered sequence where none is asked for."""
 
 _GRAMMAR = (
-    "is neither a folder nor scene:seed[:word[+word ...]], such as table:2000, "
-    "table:2000:none or table:2000:kinect+rolling-shutter"
+    "is neither a folder nor scene:seed[:word[+word ...]], such as table:2000, table:2000:none or "
+    "table:2000:kinect+rolling-shutter, nor a bag (.bag, .mcap, .db3)"
 )
 
 
@@ -102,7 +102,7 @@ def parse_sequence(text: str | Path) -> SequenceName | Path:
         InputError: neither; an unknown word (the message lists what may stand there), or a bad
             option. Scenes are checked where they are made, or by `check_sequence`.
     """
-    if all(os.path.isdir(folder) for folder in part_folders(text)):
+    if all(is_recording(part) for part in part_folders(text)):
         return Path(text)
     parts = re.fullmatch(r"(.+?):(\d{1,18})(?::(.*))?", str(text))
     if parts is None:
@@ -154,6 +154,7 @@ def open_sequence(
     layout: str = "auto",
     intrinsics: Intrinsics | Calibration | None = None,
     register: bool | Registration | None = None,
+    topics: Topics | None = None,
 ) -> Sequence:
     """The sequence that ``name`` names; frames are decoded or rendered when they are asked for.
 
@@ -169,6 +170,7 @@ def open_sequence(
         layout: of the folder, as `open_recording` takes it; so are the next two.
         intrinsics: of the images on disk.
         register: whether colour is brought into the depth camera.
+        topics: of a bag.
 
     Raises:
         InputError: a sequence that cannot be made or read; ``every`` below 1.
@@ -180,7 +182,7 @@ def open_sequence(
         size = RENDERED_SIZE if image_size in (None, NATIVE) else image_size
         sequence = _rendered(named, size, path or HandheldPath())
     else:
-        recording = open_recording(named, layout, intrinsics, register)
+        recording = open_recording(named, layout, intrinsics, register, topics)
         sequence = recorded_sequence(recording.at_size(image_size or NATIVE))
     if with_truth:
         sequence = sequence.where_known()

@@ -68,6 +68,13 @@ class Imperfections:
             raise InputError("only one perturbation can change the light: give illumination once")
         return Imperfections(*sorted_out)  # type: ignore[arg-type]
 
+    def optics_of(self, intrinsics: Intrinsics) -> Optics:
+        """How a camera takes its frames."""
+        optics = Optics(intrinsics)
+        for perturbation in self.optics:
+            optics = perturbation.alter(optics)
+        return optics
+
     def movers(
         self, scene: Scene, path: PoseInterpolation, intrinsics: Intrinsics, seed: int
     ) -> list[Mover]:
@@ -95,7 +102,8 @@ class PerturbedCamera:
     """Takes frames with imperfect optics of a scene in which things move and the light changes.
 
     Attributes:
-        sensor: of the depth image, and of colour unless colour has a camera of its own.
+        sensor: of a perfect camera at the place of the depth camera.
+        lens: of the depth camera, and of that of colour.
     """
 
     def __init__(
@@ -130,18 +138,22 @@ class PerturbedCamera:
         is_still = not self._bodies and light is None
         self.sensor = sensor if sensor is not None and is_still else self._camera(intrinsics, noise)
         self._images = imperfections.images
-        optics = Optics(intrinsics)
-        for perturbation in imperfections.optics:
-            optics = perturbation.alter(optics)
-        self._optics = optics
+        self._optics = optics = imperfections.optics_of(intrinsics)
         self._has_own_color_camera = optics.color != intrinsics or bool(
             (optics.T_depth_color != np.eye(4)).any()
         )
-        self._color_sensor = self.sensor
+        self.lens = optics.lens
+        self._depth_sensor = self.sensor
+        if self.lens:
+            self._depth_sensor = self._camera(self._bent(intrinsics), noise)
+        self._color_sensor = self._depth_sensor
         if self._has_own_color_camera:
-            self._color_sensor = self._camera(optics.color, noise)
+            self._color_sensor = self._camera(self._bent(optics.color), noise)
         self._linear_light = LinearLight(self.sensor.noise)
         self._meter: RGBDSensor | None = None
+
+    def _bent(self, K: Intrinsics) -> Intrinsics:
+        return dataclasses.replace(K, distortion=self.lens)
 
     def _camera(self, K: Intrinsics, noise: str | NoiseConfig) -> RGBDSensor:
         if self._caster is None:
@@ -180,6 +192,10 @@ class PerturbedCamera:
             frame = perturbation.apply(frame, moment)
         return frame
 
+    def last_true_depth(self, moving: bool = True) -> NDArray[np.float32]:
+        """True depth (H, W) of the frame that was taken last; see ``RGBDSensor``."""
+        return self._depth_sensor.last_true_depth(moving)
+
     def brightness(self, T_world_camera: Float64, time_s: float) -> float:
         """Mean intensity in [0, 255] of what is seen from a pose (4, 4) at a time."""
         if self._meter is None:
@@ -197,7 +213,7 @@ class PerturbedCamera:
         elif self._has_own_color_camera:
             offset = self._optics.T_depth_color
             color = self._expose(self._color_sensor, path, time_s, index, seed, offset).color
-        frame = self._expose(self.sensor, path, time_s, index, seed, np.eye(4))
+        frame = self._expose(self._depth_sensor, path, time_s, index, seed, np.eye(4))
         return frame if color is None else dataclasses.replace(frame, color=color)
 
     def _expose(

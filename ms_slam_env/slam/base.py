@@ -236,7 +236,7 @@ class SlamBackend(Stateful):
         config = None if self.config is None else asdict(self.config)
         about = {
             "backend": type(self).__name__,
-            "intrinsics": asdict(self.intrinsics),
+            "intrinsics": _camera(self),
             "config": config,
         }
         write_state(Path(path), about, self.get_state())
@@ -273,9 +273,16 @@ def _check_origin(backend: SlamBackend, about: Mapping[str, Any], path: str | Pa
     name = type(backend).__name__
     if about.get("backend") != name:
         raise InputError(f"{path} holds a map of {about.get('backend')}, not of {name}")
-    own, saved = asdict(backend.intrinsics), about.get("intrinsics")
+    own, saved = _camera(backend), about.get("intrinsics")
     if saved != own:
         raise InputError(f"{path} holds a map of another camera: {saved}, not {own}")
+
+
+def _camera(backend: SlamBackend) -> dict[str, Any]:
+    """Intrinsics of the camera; it has no lens."""
+    numbers = asdict(backend.intrinsics)
+    del numbers["distortion"]
+    return numbers
 
 
 def check_views(poses: ArrayLike, scale: float) -> Float64:

@@ -59,6 +59,7 @@ class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
     saved: ClassVar[tuple[str, ...]] = ("_pose", "_motion", "_lost")
 
     def __init__(self, intrinsics: Intrinsics) -> None:
+        intrinsics.check_pinhole("SLAM")
         self.intrinsics = intrinsics
         self.reset()
 

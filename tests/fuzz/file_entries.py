@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import io
+import tempfile
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
+import yaml
+from bag_files import Messages, write_bag
 from fuzzing import Entry
-from mutations import Files, mutated_folder, mutated_text, write_files
+from mutations import Files, mutated_bytes, mutated_folder, mutated_text, write_files
 from PIL import Image
 
 from ms_slam_env.camera import Intrinsics
@@ -24,15 +27,16 @@ from ms_slam_env.sequences.recording import parse_calibration
 WIDTH, HEIGHT, FRAMES = 16, 12, 4
 K = Intrinsics(15.0, 15.0, 7.5, 5.5, WIDTH, HEIGHT)
 CALIBRATION = "15 15 7.5 5.5 16 12 5000\n"
+LENS = "15 15 7.5 5.5 16 12 5000 radial-tangential -0.2 0.05 0.001 0.002 0\n"
 
 
-def image(kind: str, number: int, suffix: str = "PNG") -> bytes:
+def image(kind: str, number: int, suffix: str = "PNG", times: int = 1) -> bytes:
     """A small image of colour or depth as a file."""
-    rng = np.random.default_rng(number)
+    rng, shape = np.random.default_rng(number), (times * HEIGHT, times * WIDTH)
     if kind == "depth":
-        pixels = rng.integers(4000, 9000, (HEIGHT, WIDTH)).astype(np.uint16)
+        pixels = rng.integers(4000, 9000, shape).astype(np.uint16)
     else:
-        pixels = rng.integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+        pixels = rng.integers(0, 256, (*shape, 3)).astype(np.uint8)
     stream = io.BytesIO()
     Image.fromarray(pixels).save(stream, suffix)
     return stream.getvalue()
@@ -102,10 +106,90 @@ def plain() -> Files:
     return {**images, "intrinsics.txt": CALIBRATION.encode(), "times.txt": times}
 
 
+@cache
+def euroc() -> Files:
+    """A stereo recording in the layout of EuRoC."""
+    files: Files = {}
+    stamps = [1_400_000_000_000_000_000 + 50_000_000 * k for k in range(FRAMES)]
+    for k in (0, 1):
+        pose = [1, 0, 0, 0.1 * k, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+        about = {
+            "camera_model": "pinhole",
+            "intrinsics": [60, 60, 31.5, 23.5],
+            "resolution": [4 * WIDTH, 4 * HEIGHT],
+            "distortion_model": "radial-tangential",
+            "distortion_coefficients": [-0.2, 0.05, 0.001, 0.001],
+            "T_BS": {"rows": 4, "cols": 4, "data": pose},
+        }
+        lines = "".join(f"{stamp},{stamp}.png\n" for stamp in stamps)
+        files |= {
+            f"mav0/cam{k}/sensor.yaml": yaml.safe_dump(about).encode(),
+            f"mav0/cam{k}/data.csv": f"#timestamp [ns],filename\n{lines}".encode(),
+        }
+        for index, stamp in enumerate(stamps):
+            files[f"mav0/cam{k}/data/{stamp}.png"] = image("color", index, times=4)
+    rows = "".join(f"{stamp},{0.01 * i},0,0,1,0,0,0\n" for i, stamp in enumerate(stamps))
+    return {**files, "mav0/state_groundtruth_estimate0/data.csv": rows.encode()}
+
+
+@cache
+def kitti() -> Files:
+    """A stereo recording in the layout of KITTI odometry."""
+    pictures = {f"{i:06d}.png": image("color", i, times=4) for i in range(FRAMES)}
+    right = "60 0 31.5 -6 0 60 23.5 0 0 0 1 0"
+    return {
+        **{f"image_{k}/{name}": data for k in (0, 1) for name, data in pictures.items()},
+        "calib.txt": f"P0: {right.replace('-6', '0')}\nP1: {right}\n".encode(),
+        "times.txt": "".join(f"{0.1 * k}\n" for k in range(FRAMES)).encode(),
+        "poses.txt": "".join(f"1 0 0 {0.1 * k} 0 1 0 0 0 0 1 0\n" for k in range(FRAMES)).encode(),
+    }
+
+
 def call_recording(files: Files, folder: Path) -> None:
     """Open a recording and decode all of it."""
     write_files(files, folder / "s")
-    sequence = open_sequence(folder / "s")
+    decode(folder / "s")
+
+
+@cache
+def bags() -> dict[str, bytes]:
+    """A bag of ROS 1 and one of ROS 2."""
+    made = {}
+    for name, version in (("a.bag", 1), ("a.mcap", 2)):
+        own = Messages(version)
+        rng = np.random.default_rng(0)
+        depth = rng.uniform(1, 2, (FRAMES, HEIGHT, WIDTH)).astype(np.float32)
+        color = rng.integers(0, 256, (FRAMES, HEIGHT, WIDTH, 3)).astype(np.uint8)
+        times = [1.0 + k / 30 for k in range(FRAMES)]
+        topics = {
+            "/depth/image": [
+                (t, own.image(t, d, "32FC1")) for t, d in zip(times, depth, strict=True)
+            ],
+            "/rgb/image": [(t, own.image(t, c, "rgb8")) for t, c in zip(times, color, strict=True)],
+            "/depth/camera_info": [(1.0, own.info(1.0, K))],
+            "/ground_truth": [(t, own.pose(t, np.eye(4))) for t in times],
+        }
+        with tempfile.TemporaryDirectory() as folder:
+            made[name] = write_bag(Path(folder) / name, own, topics).read_bytes()
+    return made
+
+
+def one_bag(files: dict[str, bytes], rng: np.random.Generator) -> dict[str, bytes]:
+    """Some bytes of one of them changed, often numbers of its header or its end."""
+    name = sorted(files)[rng.integers(len(files))]
+    return {name: mutated_bytes(files[name], rng)}
+
+
+def call_bag(files: dict[str, bytes], folder: Path) -> None:
+    """Open bags and decode all of them."""
+    for name, data in files.items():
+        (folder / name).write_bytes(data)
+        decode(folder / name)
+
+
+def decode(path: Path) -> None:
+    """Decode every frame of a recording."""
+    sequence = open_sequence(path)
     times = sequence.timestamps
     assert np.isfinite(times).all()
     assert (np.diff(times) > 0).all()
@@ -205,7 +289,7 @@ def call_mesh(files: Files, folder: Path) -> None:
 def call_calibration(data: bytes, folder: Path) -> None:
     """Read intrinsics."""
     words = data.decode("utf-8", errors="replace").split()
-    intrinsics = parse_calibration(words, "--intrinsics").intrinsics
+    intrinsics = parse_calibration(words, "--intrinsics").intrinsics.undistorted
     assert 1 <= intrinsics.width <= 4096
     assert 1 <= intrinsics.height <= 4096
     assert np.isfinite(intrinsics.rays_at([[0.0, 0.0]])).all()
@@ -218,12 +302,14 @@ def _of_folder(name: str, seed: Any, call: Any, mutate: Any = mutated_folder) ->
 ENTRIES = [
     *(
         _of_folder(seed.__name__.replace("_", "-"), seed, call_recording)
-        for seed in (tum, icl_nuim, seven_scenes, plain)
+        for seed in (tum, icl_nuim, seven_scenes, plain, euroc, kitti)
     ),
+    Entry("bag", bags, one_bag, call_bag),
     _of_folder("image", images, call_image, one_image),
     _of_folder("trajectory", lambda: {"a.txt": trajectory()}, call_trajectory),
     _of_folder("evaluate", two_trajectories, call_evaluate),
     _of_folder("surface", meshes, call_surface, one_image),
     _of_folder("mesh", meshes, call_mesh, one_image),
     Entry("calibration", CALIBRATION.encode, mutated_text, call_calibration),
+    Entry("lens", LENS.encode, mutated_text, call_calibration),
 ]

@@ -391,8 +391,8 @@ def test_empty_and_unequal_folders(tmp_path):
 
 
 def test_unknown_choices(tum):
-    with pytest.raises(InputError, match="unknown layout 'bag'; valid choices: auto, tum"):
-        open_recording(tum, layout="bag")
+    with pytest.raises(InputError, match="unknown layout 'zip'; valid choices: auto, tum"):
+        open_recording(tum, layout="zip")
     recording = open_recording(tum)
     with pytest.raises(InputError, match="valid choices: 80x60"):
         recording.at_size("1x1")

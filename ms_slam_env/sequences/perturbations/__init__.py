@@ -21,7 +21,12 @@ from ms_slam_env.sequences.perturbations.images import (
     ExposureRamp,
 )
 from ms_slam_env.sequences.perturbations.moving_objects import MovingObjects
-from ms_slam_env.sequences.perturbations.optics import Misregistration, MotionBlur, RollingShutter
+from ms_slam_env.sequences.perturbations.optics import (
+    LensDistortion,
+    Misregistration,
+    MotionBlur,
+    RollingShutter,
+)
 from ms_slam_env.sequences.perturbations.timing import FastMotion, FrameSkipping
 
 __all__ = ["PERTURBATIONS", "Moment", "Perturbation", "make_perturbation"]
@@ -30,6 +35,7 @@ PERTURBATIONS: dict[str, type[Perturbation]] = {
     "rolling-shutter": RollingShutter,
     "motion-blur": MotionBlur,
     "misregistration": Misregistration,
+    "lens-distortion": LensDistortion,
     "exposure-ramp": ExposureRamp,
     "exposure-jumps": ExposureJumps,
     "auto-exposure": AutoExposure,

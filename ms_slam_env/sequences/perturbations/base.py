@@ -14,7 +14,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.camera import Intrinsics, RGBDFrame
+from ms_slam_env.camera import Distortion, Intrinsics, RGBDFrame
+from ms_slam_env.camera.distortion import NO_DISTORTION
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import Float64
 from ms_slam_env.scenes.base import Scene
@@ -47,6 +48,7 @@ class Optics:
         readout_s: time from the first row to the last; 0 = all rows at once.
         exposure_s: time over which colour is integrated; 0 = an instant.
         exposure_samples: instants whose mean stands for the integral.
+        lens: of both cameras.
     """
 
     color: Intrinsics
@@ -54,6 +56,7 @@ class Optics:
     readout_s: float = 0.0
     exposure_s: float = 0.0
     exposure_samples: int = 1
+    lens: Distortion = NO_DISTORTION
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env.camera import Distortion
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.geometry import make_pose
 from ms_slam_env.sensor import NoiseConfig
@@ -88,6 +89,33 @@ class Misregistration(Checked, OpticalPerturbation):
         )
         offset = make_pose([[1, 0, 0], [0, 1, 0], [0, 0, 1]], [self.baseline_m, 0.0, 0.0])
         return dataclasses.replace(optics, color=color, T_depth_color=optics.T_depth_color @ offset)
+
+
+@dataclass(frozen=True)
+class LensDistortion(Checked, OpticalPerturbation):
+    """A lens bends both images, which are handed on as if they were a pinhole camera's.
+
+    Coefficients as in ``Distortion``. The defaults are about those of a colour camera with a wide
+    lens: barrel distortion of some two pixels in a corner at 160x120.
+
+    Attributes:
+        k1: of r^2,
+        k2: of r^4,
+        p1: tangential, down,
+        p2: tangential, across,
+        k3: of r^6; all 0 = off.
+    """
+
+    k1: float = bounded(-0.1, -0.4, 1.0)
+    k2: float = bounded(0.03, -1.0, 1.0)
+    p1: float = bounded(0.0, -0.1, 0.1)
+    p2: float = bounded(0.0, -0.1, 0.1)
+    k3: float = bounded(0.0, -1.0, 1.5)
+
+    def alter(self, optics: Optics) -> Optics:
+        """See the base class."""
+        lens = Distortion.of("radial-tangential", [self.k1, self.k2, self.p1, self.p2, self.k3])
+        return dataclasses.replace(optics, lens=lens)
 
 
 def linear_of_srgb(values: NDArray[np.floating]) -> NDArray[np.float64]:

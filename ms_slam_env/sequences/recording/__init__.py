@@ -1,5 +1,6 @@
-"""Recorded RGB-D sequences on disk: one class of recording, one file per folder layout."""
+"""Recorded sequences on disk: one class of recording, one file per format."""
 
+from ms_slam_env.sequences.recording.bags import Topics
 from ms_slam_env.sequences.recording.layouts import LAYOUTS, open_recording
 from ms_slam_env.sequences.recording.listings import Calibration, parse_calibration
 from ms_slam_env.sequences.recording.recording import (
@@ -17,6 +18,7 @@ __all__ = [
     "RecordedSequence",
     "Recording",
     "Registration",
+    "Topics",
     "open_recording",
     "parse_calibration",
     "recorded_sequence",

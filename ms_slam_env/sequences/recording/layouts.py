@@ -13,11 +13,14 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.geometry import Float64
 from ms_slam_env.input_files import is_named
+from ms_slam_env.sequences.recording.bags import SUFFIXES, Topics, is_bag, open_bag
+from ms_slam_env.sequences.recording.euroc import is_euroc, open_euroc
 from ms_slam_env.sequences.recording.image_folders import (
     FRAME_RATE_HZ,
     find_color,
     folder_entries,
 )
+from ms_slam_env.sequences.recording.kitti import is_kitti, open_kitti
 from ms_slam_env.sequences.recording.listings import (
     Calibration,
     Listed,
@@ -143,7 +146,8 @@ def _listed(folder: Path, layout: str, camera: Calibration) -> Recording:
 def _recording(folder: Path, layout: str, entries: list[Entry], camera: Calibration) -> Recording:
     scale, (times, truth) = camera.depth_scale or DEPTH_SCALE, _trajectory(folder, camera.flipped)
     K = camera.intrinsics
-    return Recording(folder.name, layout, tuple(entries), K, K, scale, None, times, truth)
+    frames = tuple(entries), K, K.undistorted
+    return Recording(folder.name, layout, *frames, scale, None, times, truth)
 
 
 def open_seven_scenes(folder: Path, intrinsics: Calibration | None) -> Recording:
@@ -168,7 +172,7 @@ def open_seven_scenes(folder: Path, intrinsics: Calibration | None) -> Recording
         layout="7-scenes",
         entries=tuple(entries),
         source=camera.intrinsics,
-        intrinsics=camera.intrinsics,
+        intrinsics=camera.intrinsics.undistorted,
         depth_scale=camera.depth_scale or 1000.0,
         no_reading=SEVEN_SCENES_NO_READING,
         truth_times=np.array([time for time, _ in poses]) if poses else None,
@@ -189,12 +193,18 @@ LAYOUTS: dict[str, Callable[[Path, Calibration | None], Recording]] = {
     "icl-nuim": open_icl_nuim,
     "7-scenes": open_seven_scenes,
     "folder": open_folder,
+    "euroc": open_euroc,
+    "kitti": open_kitti,
+    "bag": open_bag,
 }
 """Name of a layout to its reader."""
 
 
 def _recognise(folder: Path) -> str:
     """The layout of a folder, by the files in it."""
+    for layout, is_it in (("bag", is_bag), ("euroc", is_euroc), ("kitti", is_kitti)):
+        if is_it(folder):
+            return layout
     if any(folder.glob("*.gt.freiburg")):
         return "icl-nuim"
     if any(is_named(folder / n) for n in ("depth.txt", "associations.txt", "association.txt")):
@@ -207,7 +217,8 @@ def _recognise(folder: Path) -> str:
         return "folder"
     raise InputError(
         f"{folder} is no RGB-D sequence: found neither depth.txt or associations.txt (TUM, "
-        "ICL-NUIM) nor frame-*.depth.png (7-Scenes) nor a folder depth"
+        "ICL-NUIM) nor frame-*.depth.png (7-Scenes) nor a folder depth nor mav0 (EuRoC) nor "
+        "calib.txt and image_0 (KITTI) nor metadata.yaml (ROS 2)"
     )
 
 
@@ -216,11 +227,12 @@ def open_recording(
     layout: str = "auto",
     intrinsics: Intrinsics | Calibration | None = None,
     register: bool | Registration | None = None,
+    topics: Topics | None = None,
 ) -> Recording:
     """Open a recorded sequence; images are read later, frame by frame.
 
     Args:
-        path: its folder, or the folders of its parts in order, joined by commas (`join_parts`).
+        path: its folder or bag, or those of its parts in order, joined by commas (`join_parts`).
         layout: ``auto`` or one of ``LAYOUTS``.
         intrinsics: of the images on disk, with the scale of the depth images or without; by
             default those of ``intrinsics.txt`` in the folder, else the published ones of the
@@ -228,24 +240,31 @@ def open_recording(
         register: whether to bring colour into the depth camera, with the numbers of an
             uncalibrated Kinect or with those given; by default only the layout 7-Scenes does,
             whose images are not registered.
+        topics: of a bag; by default found by type and name.
 
     Raises:
-        InputError: no such folder or layout, a sequence that was not written to its end,
+        InputError: no such folder, bag or layout, a sequence that was not written to its end,
             intrinsics missing, a listing that does not parse, parts that do not fit together.
     """
     parts = part_folders(path)
     if len(parts) > 1:
-        return join_parts([open_recording(part, layout, intrinsics, register) for part in parts])
+        how = layout, intrinsics, register, topics
+        return join_parts([open_recording(part, *how) for part in parts])
     folder = Path(path).resolve()
-    if not folder.is_dir():
-        raise InputError(f"no sequence at {path}: not a folder")
+    if not folder.is_dir() and not is_bag(folder):
+        raise InputError(f"no sequence at {path}: not a folder, nor a bag {SUFFIXES}")
     if layout != "auto" and layout not in LAYOUTS:
         raise unknown("layout", layout, ("auto", *LAYOUTS))
     if (folder / UNFINISHED).is_file():
         raise InputError(f"{path} was not generated to its end: give its command again")
     if isinstance(intrinsics, Intrinsics):
         intrinsics = Calibration(intrinsics, False, None)
-    found = LAYOUTS[_recognise(folder) if layout == "auto" else layout](folder, intrinsics)
+    name = _recognise(folder) if layout == "auto" else layout
+    if topics not in (None, Topics()) and name != "bag":
+        raise InputError(f"{path} is no bag: it has no topics")
+    found = (
+        open_bag(folder, intrinsics, topics) if name == "bag" else LAYOUTS[name](folder, intrinsics)
+    )
     if register is None:
         return found
     given = register if isinstance(register, Registration) else Registration()

@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from ms_slam_env.camera import Intrinsics
+from ms_slam_env.camera import Distortion, Intrinsics
+from ms_slam_env.camera.distortion import ALIASES, NAMES
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import Float64, check_pose
 from ms_slam_env.input_files import read_text
 
 _ROUNDED = 1e-2  # as for the length of a quaternion
+
+CALIBRATION = (
+    "fx fy cx cy width height [depth_scale] "
+    "[radial-tangential k1 k2 p1 p2 k3 | equidistant k1 k2 k3 k4]"
+)
+"""What a calibration says; a lens is that of both images."""
 
 
 @dataclass(frozen=True)
@@ -86,11 +93,15 @@ def read_matrix(path: Path) -> Float64:
     values = [[number(word, where) for word in words] for where, words in rows(path)]
     if [len(row) for row in values] != [4, 4, 4, 4]:
         raise InputError(f"{path}: expected 4 rows of 4 numbers")
-    matrix = np.array(values)
+    return check_pose(rigid(np.array(values)), str(path))
+
+
+def rigid(matrix: Float64) -> Float64:
+    """A pose (4, 4) whose rotation, orthonormal but for rounding, is made so exactly."""
     if np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max() < _ROUNDED:
         left, _, right = np.linalg.svd(matrix[:3, :3])  # the nearest orthonormal matrix
         matrix[:3, :3] = left @ right
-    return check_pose(matrix, str(path))
+    return matrix
 
 
 @dataclass(frozen=True)
@@ -98,7 +109,7 @@ class Calibration:
     """What ``intrinsics.txt`` says.
 
     Attributes:
-        intrinsics: with positive focal lengths.
+        intrinsics: with positive focal lengths, of the images on disk.
         flipped: fy was negative: the camera frame of the poses has y up.
         depth_scale: value of a depth image for one metre; None where the file does not say.
     """
@@ -109,29 +120,34 @@ class Calibration:
 
 
 def read_intrinsics(path: Path) -> Calibration:
-    """Read ``fx fy cx cy width height [depth_scale]``.
+    """Read a `CALIBRATION`.
 
     Raises:
         InputError: naming file and line.
     """
     for where, words in rows(path):
         return parse_calibration(words, where)
-    raise InputError(f"{path} holds no intrinsics: 'fx fy cx cy width height [depth_scale]'")
+    raise InputError(f"{path} holds no intrinsics: {CALIBRATION!r}")
 
 
 def parse_calibration(words: Sequence[str], where: str) -> Calibration:
-    """Calibration of the words ``fx fy cx cy width height [depth_scale]``.
+    """Calibration of the words of `CALIBRATION`.
 
     Raises:
         InputError: naming ``where`` they stand.
     """
-    values = [number(word, where) for word in words]
+    models = (*NAMES, *ALIASES)
+    end = next((k for k, word in enumerate(words) if word in models), len(words))
+    values = [number(word, where) for word in words[:end]]
+    lens = [number(word, where) for word in words[end + 1 :]]
     if len(values) not in (6, 7):
-        raise InputError(
-            f"{where}: expected 'fx fy cx cy width height [depth_scale]', got {' '.join(words)!r}"
-        )
+        raise InputError(f"{where}: expected {CALIBRATION!r}, got {' '.join(words)!r}")
     try:
-        return calibration(*values)
+        read = calibration(*values)
+        if end == len(words):
+            return read
+        bent = replace(read.intrinsics, distortion=Distortion.of(words[end], lens))
+        return replace(read, intrinsics=bent)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
 

@@ -11,15 +11,21 @@ import numpy as np
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import Float64
+from ms_slam_env.sequences.recording.bags import is_bag
 from ms_slam_env.sequences.recording.recording import Entry, Recording
 
 SEPARATOR = ","
 
 
+def is_recording(path: str | Path) -> bool:
+    """Whether a path is that of a folder or a bag."""
+    return os.path.isdir(path) or is_bag(path)
+
+
 def part_folders(text: str | Path) -> list[str]:
-    """The folders of a recording ``FOLDER[,FOLDER ...]``: one where a folder has that name."""
+    """The folders or bags of a recording ``FOLDER[,FOLDER ...]``: one where one has that name."""
     parts = str(text).split(SEPARATOR)
-    is_one = os.path.isdir(text) or not all(os.path.isdir(part) for part in parts)
+    is_one = is_recording(text) or not all(is_recording(part) for part in parts)
     return [str(text)] if is_one else parts
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from ms_slam_env.camera import Intrinsics, RGBDFrame, parse_image_size
 from ms_slam_env.camera.frame import reduce_color, reduce_depth
 from ms_slam_env.camera.image_files import read_color, read_depth
 from ms_slam_env.camera.image_size import Crop
+from ms_slam_env.camera.undistortion import undistort_color, undistort_depth
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import Float64
@@ -118,6 +118,16 @@ class Entry:
     color: Path | None
     where: str
 
+    def read(self, camera: Intrinsics) -> tuple[NDArray[np.uint8] | None, NDArray[Any]]:
+        """Colour (H, W, 3), if there is any, and values of depth (H, W), as they are on disk.
+
+        Raises:
+            InputError: a file that is missing, truncated, of another kind or size; the message
+                names it.
+        """
+        depth = read_depth(self.depth, camera)
+        return None if self.color is None else read_color(self.color, camera), depth
+
 
 @dataclass(frozen=True)
 class Recording(Frames):
@@ -127,7 +137,8 @@ class Recording(Frames):
         name: for tables and files.
         layout: name of the folder layout it was read with.
         entries: N frames.
-        source: intrinsics of the images on disk.
+        source: intrinsics of the images on disk, maybe of a camera with a lens, which frames have
+            no more.
         intrinsics: intrinsics of the frames that are returned.
         depth_scale: value of a depth image for one metre.
         no_reading: value of a depth image, besides 0, that means no reading.
@@ -190,7 +201,7 @@ class Recording(Frames):
         """
         named = parse_image_size(size)
         crop = named.part_of(self.source, f"sequence {self.name}")
-        part = self.source.cropped(*dataclasses.astuple(crop))
+        part = self.source.undistorted.cropped(*dataclasses.astuple(crop))
         intrinsics = part if named.size is None else part.resized(*named.size)
         return dataclasses.replace(self, intrinsics=intrinsics, crop=crop)
 
@@ -210,13 +221,17 @@ class Recording(Frames):
                 names it and the line that lists it.
         """
         entry = self.entries[index]
-        raw = _named(entry, read_depth, entry.depth, self.source)
+        try:
+            read, raw = entry.read(self.source)
+        except InputError as error:
+            raise InputError(f"{entry.where}: {error}") from None
         depth: NDArray[Any] = raw.astype(np.float32) / np.float32(self.depth_scale)
         if self.no_reading is not None:
             depth[raw == self.no_reading] = 0
-        color: NDArray[Any] = np.zeros((*self.source.shape, 3), dtype=np.uint8)
-        if entry.color is not None:
-            color = _named(entry, read_color, entry.color, self.source)
+        color: NDArray[Any] = np.zeros((*raw.shape, 3), np.uint8) if read is None else read
+        if self.source.distortion:
+            color = undistort_color(color, self.source)
+            depth = undistort_depth(depth, self.source)
         crop = self.crop or Crop(0, 0, self.source.width, self.source.height)
         rows = slice(crop.top, crop.top + crop.height)
         columns = slice(crop.left, crop.left + crop.width)
@@ -229,16 +244,6 @@ class Recording(Frames):
             factor = self.intrinsics.width / crop.width
             color = self.registration.register(color, depth, self.intrinsics, factor)
         return RGBDFrame(np.ascontiguousarray(color), np.ascontiguousarray(depth), entry.timestamp)
-
-
-def _named(
-    entry: Entry, read: Callable[[Path, Intrinsics], NDArray[Any]], path: Path, K: Intrinsics
-) -> NDArray[Any]:
-    """What ``read`` makes of a file; errors name the line that lists it."""
-    try:
-        return read(path, K)
-    except InputError as error:
-        raise InputError(f"{entry.where}: {error}") from None
 
 
 @dataclass(frozen=True)

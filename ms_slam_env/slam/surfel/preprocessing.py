@@ -236,6 +236,7 @@ class Preprocessor:
     def __init__(
         self, batch: int, intrinsics: Intrinsics, config: SurfelConfig, device: str = "cpu"
     ) -> None:
+        intrinsics.check_pinhole("SLAM")
         self.intrinsics = intrinsics
         self.config = config
         self.device = device

@@ -1,0 +1,173 @@
+"""How a lens bends a pinhole camera's image, as OpenCV writes it, and how images are straightened.
+
+Models, of a ray (x, y, 1) with r = |(x, y)| and theta = atan r:
+
+    radial-tangential  (x, y) (1 + k1 r^2 + k2 r^4 + k3 r^6)
+                       + (2 p1 x y + p2 (r^2 + 2 x^2), p1 (r^2 + 2 y^2) + 2 p2 x y)
+    equidistant        (x, y) / r theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)
+
+Sources: Brown, "Close-range camera calibration" (1971); Kannala and Brandt (PAMI 2006); OpenCV's
+``calib3d`` and ``fisheye``, which these are tested against.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ms_slam_env.config import Checked, bounded, chosen
+from ms_slam_env.errors import InputError, unknown
+
+Array = NDArray[np.float64]
+
+_LARGEST = 20.0  # of any coefficient, more than calibrations have
+_STEPS = 30  # of Newton's method; from the bent point, most lenses need five
+_CONVERGED = 1e-9
+
+NAMES = {
+    "radial-tangential": ("k1", "k2", "p1", "p2", "k3"),
+    "equidistant": ("k1", "k2", "k3", "k4"),
+}
+"""Model to its coefficients in the order in which calibration files list them."""
+
+ALIASES = {
+    "radtan": "radial-tangential",
+    "plumb_bob": "radial-tangential",
+    "fisheye": "equidistant",
+    "kannala_brandt": "equidistant",
+}
+"""What others call the models."""
+
+
+@dataclass(frozen=True)
+class Distortion(Checked):
+    """A lens; by default none.
+
+    Attributes:
+        model: none, radial-tangential or equidistant (a fisheye).
+        k1: of r^2 or theta^2,
+        k2: of the fourth power,
+        p1: tangential, as is
+        p2: both radial-tangential only,
+        k3: of the sixth power,
+        k4: of the eighth, equidistant only.
+
+    Raises:
+        InputError: an unknown model, a coefficient out of range, or one that the model has not.
+    """
+
+    model: str = chosen("none", "none", *NAMES)
+    k1: float = bounded(0.0, -_LARGEST, _LARGEST)
+    k2: float = bounded(0.0, -_LARGEST, _LARGEST)
+    p1: float = bounded(0.0, -_LARGEST, _LARGEST)
+    p2: float = bounded(0.0, -_LARGEST, _LARGEST)
+    k3: float = bounded(0.0, -_LARGEST, _LARGEST)
+    k4: float = bounded(0.0, -_LARGEST, _LARGEST)
+
+    def __post_init__(self) -> None:
+        """Refuse what the model has not."""
+        super().__post_init__()
+        own = NAMES.get(self.model, ())
+        for name in ("k1", "k2", "p1", "p2", "k3", "k4"):
+            if name not in own and getattr(self, name) != 0:
+                raise InputError(f"distortion {self.model} has no {name}; it has: {list(own)}")
+
+    @staticmethod
+    def of(model: str, coefficients: Sequence[float]) -> Distortion:
+        """The lens of a model, or of an alias of it, and its coefficients in order; zeros follow.
+
+        No distortion where all are zero, unless the model is equidistant.
+
+        Raises:
+            InputError: an unknown model, or more coefficients than it has.
+        """
+        name = ALIASES.get(model, model)
+        if name not in NAMES:
+            raise unknown("distortion model", model, (*NAMES, *ALIASES))
+        names = NAMES[name]
+        if any(coefficients[len(names) :]):
+            raise InputError(f"distortion {name} has {len(names)} numbers, got {coefficients}")
+        if name == "radial-tangential" and not any(coefficients):
+            return Distortion()
+        pairs = zip(names, map(float, coefficients), strict=False)
+        return Distortion(name, **dict(pairs))
+
+    def __bool__(self) -> bool:
+        """Whether there is any."""
+        return self.model != "none"
+
+    def distort(self, points: ArrayLike) -> Array:
+        """Where rays (..., 2) with z = 1 appear, before focal length and centre (..., 2)."""
+        p = np.asarray(points, dtype=np.float64)
+        if self.model == "none":
+            return p
+        x, y = p[..., 0], p[..., 1]
+        squared = x**2 + y**2
+        if self.model == "equidistant":
+            return p * self._bent_angle(np.sqrt(squared))[0][..., None]
+        radial = 1 + squared * (self.k1 + squared * (self.k2 + squared * self.k3))
+        across = 2 * self.p1 * x * y + self.p2 * (squared + 2 * x**2)
+        down = self.p1 * (squared + 2 * y**2) + 2 * self.p2 * x * y
+        return p * radial[..., None] + np.stack([across, down], axis=-1)
+
+    def undistort(self, points: ArrayLike) -> Array:
+        """The inverse of ``distort``, by Newton's method.
+
+        Raises:
+            InputError: a point that no ray in front of the camera leads to.
+        """
+        bent = np.asarray(points, dtype=np.float64)
+        if self.model == "none":
+            return bent
+        found = bent.copy()
+        with np.errstate(all="ignore"):  # what diverges is refused below
+            for _ in range(_STEPS):
+                rest = self.distort(found) - bent
+                xx, xy, yy = self._jacobian(found)
+                determinant = xx * yy - xy**2
+                found[..., 0] -= (yy * rest[..., 0] - xy * rest[..., 1]) / determinant
+                found[..., 1] -= (xx * rest[..., 1] - xy * rest[..., 0]) / determinant
+                if np.abs(rest).max(initial=0) < _CONVERGED:
+                    break
+            reached = np.abs(self.distort(found) - bent).max(axis=-1) < 1e3 * _CONVERGED
+        if not reached.all() or not self.is_one_to_one(found):
+            raise InputError(f"{self} leads no ray to some of the pixels")
+        return found
+
+    def is_one_to_one(self, points: ArrayLike) -> bool:
+        """Whether the image is nowhere folded at rays (..., 2) with z = 1."""
+        if self.model == "none":
+            return True
+        xx, xy, yy = self._jacobian(np.asarray(points, dtype=np.float64))
+        return bool(((xx * yy - xy**2 > 0) & (xx + yy > 0)).all())
+
+    def _bent_angle(self, r: Array) -> tuple[Array, Array]:
+        """theta_d / r (...,) of the equidistant model at r (...,), and d theta_d / d r."""
+        theta = np.arctan(r)
+        t = theta**2
+        grown = 1 + t * (self.k1 + t * (self.k2 + t * (self.k3 + t * self.k4)))
+        slope = 1 + t * (3 * self.k1 + t * (5 * self.k2 + t * (7 * self.k3 + t * 9 * self.k4)))
+        ratio = np.where(r > 1e-9, theta * grown / np.maximum(r, 1e-9), 1.0)
+        return ratio, slope / (1 + r**2)
+
+    def _jacobian(self, p: Array) -> tuple[Array, Array, Array]:
+        """d distort / d(x, y), a symmetric matrix: its entries xx, xy and yy (...,)."""
+        x, y = p[..., 0], p[..., 1]
+        squared = x**2 + y**2
+        if self.model == "equidistant":
+            ratio, slope = self._bent_angle(np.sqrt(squared))
+            growth = np.where(squared > 1e-18, (slope - ratio) / np.maximum(squared, 1e-18), 0.0)
+            return ratio + growth * x**2, growth * x * y, ratio + growth * y**2
+        radial = 1 + squared * (self.k1 + squared * (self.k2 + squared * self.k3))
+        growth = 2 * (self.k1 + squared * (2 * self.k2 + squared * 3 * self.k3))
+        return (
+            radial + growth * x**2 + 2 * self.p1 * y + 6 * self.p2 * x,
+            growth * x * y + 2 * self.p1 * x + 2 * self.p2 * y,
+            radial + growth * y**2 + 6 * self.p1 * y + 2 * self.p2 * x,
+        )
+
+
+NO_DISTORTION = Distortion()
