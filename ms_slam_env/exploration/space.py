@@ -69,8 +69,17 @@ _OTHERS: dict[str, Parameter] = {
     "threads": Choice((1, 2)),
     "device": Choice(("cpu", "cuda")),
 }
-KNOWN: dict[str, Parameter] = {**_ALGORITHM, **_MOTION, **_FRAME, **_OTHERS, **_COMPILER}
-"""Parameters of the surfel backend that have a range of their own."""
+# KinectFusion's, which the paper's authors searched first; icp_threshold and rate as published.
+_KINECT_FUSION: dict[str, Parameter] = {
+    "volume_size_m": Float(4.0, 12.0),
+    "volume_resolution": Choice((64, 128, 256, 512)),
+    "mu_m": Float(0.01, 0.5, log=True),
+    "icp_threshold": Float(1e-6, 1e2, log=True),
+    "integration_rate": Integer(1, 30),
+}
+_OF_SURFELS = {**_ALGORITHM, **_MOTION, **_FRAME, **_OTHERS, **_COMPILER}
+KNOWN: dict[str, Parameter] = {**_OF_SURFELS, **_KINECT_FUSION}
+"""Parameters of the surfel backend, and of kinectfusion, that have a range of their own."""
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "paper": tuple(_PAPER),
@@ -78,6 +87,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "frame": tuple(_FRAME),
     "compiler": tuple(_COMPILER),
     "machine": ("threads", "device", "cpu_mhz", "gpu_mhz", "precision"),
+    "kinectfusion": (*_KINECT_FUSION, "iterations.0", "iterations.1", "iterations.2"),
 }
 """Names that stand for several parameters; those that a machine or a backend has not are left out
 of ``compiler`` and ``machine`` (``availability.why_absent``)."""

@@ -35,6 +35,7 @@ _OWN = {
     "surfel": BackendEntry("surfel", "SurfelSlam", "SurfelConfig", has_devices=True),
     "odometry": BackendEntry("odometry", "OdometrySlam", "OdometryConfig"),
     "volumetric": BackendEntry("volumetric", "VolumetricSlam", "VolumetricConfig"),
+    "kinectfusion": BackendEntry("volumetric", "KinectFusionSlam", "KinectFusionConfig"),
     "sparse": BackendEntry("sparse", "SparseSlam", "SparseConfig"),
 }
 

@@ -15,7 +15,7 @@ from mutations import mutated_bytes, mutated_tree, places
 
 from ms_slam_env.errors import InputError
 
-NEEDS = {"frames-sparse": "gtsam", "frames-volumetric": "open3d"}
+NEEDS = {"frames-sparse": "gtsam", "frames-volumetric": "open3d", "frames-kinectfusion": "open3d"}
 
 
 @pytest.mark.parametrize("name", ENTRIES)

@@ -176,6 +176,7 @@ MAKE: dict[str, dict[str, Any]] = {
     "odometry": {},
     "sparse": {},
     "volumetric": {},
+    "kinectfusion": {},
 }
 
 

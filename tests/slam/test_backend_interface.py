@@ -33,10 +33,15 @@ ACCURACY_M = {
     "surfel": 0.008,
     "odometry": 0.02,
     "volumetric": 0.015,
+    "kinectfusion": 0.015,
     "sparse": 0.01,
     MANAGED: 0.022,  # two frames are dropped before any motion is known
 }
 """Largest error of position on the noisy path of 0.11 m."""
+
+
+SLIDES_M = {"kinectfusion": 0.04}
+"""What is granted besides where geometry says little: its alignment is of geometry alone."""
 
 
 def _path() -> np.ndarray:
@@ -79,7 +84,7 @@ def frames(box_scene: BoxScene) -> list[RGBDFrame]:
 
 @pytest.fixture(scope="module", params=[*sorted(slam.BACKENDS), MANAGED])
 def name(request: pytest.FixtureRequest) -> str:
-    if request.param == "volumetric":
+    if request.param in ("volumetric", "kinectfusion"):
         pytest.importorskip("open3d", reason="Open3D is not installed", exc_type=ImportError)
     if request.param == "sparse":
         pytest.importorskip("gtsam", reason="GTSAM is not installed", exc_type=ImportError)
@@ -256,7 +261,8 @@ def test_a_guess_finds_a_distant_pose(name, frames, box_scene):
     guess = jump @ make_pose(so3_exp([0.0, 0.01, 0.0]), [0.01, 0.0, 0.0])
     result = backend.track(_capture(box_scene, jump), guess)
     assert result.tracking_ok, result.reason
-    assert np.linalg.norm(result.T_world_camera[:3, 3] - jump[:3, 3]) < 0.03
+    error_m = np.linalg.norm(result.T_world_camera[:3, 3] - jump[:3, 3])
+    assert error_m < 0.03 + SLIDES_M.get(name, 0.0)
 
 
 def test_a_step_of_the_environment_is_tracked(name, frames, box_scene):
@@ -322,4 +328,4 @@ def test_works_in_the_environment(name):
         runs.append((env.episode.trajectory_estimate, views.depth, views.intensity))
     for first, second in zip(*runs, strict=True):
         np.testing.assert_array_equal(first, second)
-    assert env.episode.pose_errors.max() < 0.03
+    assert env.episode.pose_errors.max() < 0.03 + SLIDES_M.get(name, 0.0)

@@ -47,7 +47,7 @@ def frames(box_scene: BoxScene) -> list[RGBDFrame]:
 
 @pytest.fixture(params=sorted(slam.BACKENDS))
 def name(request: pytest.FixtureRequest) -> str:
-    if request.param == "volumetric":
+    if request.param in ("volumetric", "kinectfusion"):
         pytest.importorskip("open3d", reason="Open3D is not installed", exc_type=ImportError)
     if request.param == "sparse":
         pytest.importorskip("gtsam", reason="GTSAM is not installed", exc_type=ImportError)

@@ -37,6 +37,7 @@ LARGE_OPTIONS: Mapping[str, Mapping[str, Any]] = {
     },
     "odometry": {"depth_cutoff_m": 10.0, "max_surfels": 2_000_000},
     "volumetric": {"depth_cutoff_m": 10.0, "voxel_m": 0.06},
+    "kinectfusion": {"depth_cutoff_m": 10.0, "volume_size_m": 20.0},
     "sparse": {"depth_cutoff_m": 10.0},
 }
 """Options that a backend needs in a large scene, beside what the user asks for.

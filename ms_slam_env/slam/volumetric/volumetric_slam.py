@@ -99,31 +99,36 @@ _FULL_WEIGHT = 3  # observations that tracking asks of the model, as soon as the
 
 
 @dataclass(frozen=True)
-class _RGBDImage(DepthImage):
+class FusedImage(DepthImage):
     """A frame with depth beyond the cutoff taken out."""
 
     raw_depth: NDArray[np.uint16]  # (H, W) in units of 1 / DEPTH_SCALE m
     color: NDArray[np.uint8]  # (H, W, 3)
 
 
-class VolumetricSlam(FrameByFrameSlam[_RGBDImage, None]):
+class VolumetricSlam(FrameByFrameSlam[FusedImage, None]):
     """The volumetric SLAM of one camera, through Open3D."""
 
     saved = (*FrameByFrameSlam.saved, "_fused", "_grid")
+    config: Any
 
     def __init__(self, intrinsics: Intrinsics, config: VolumetricConfig | None = None) -> None:
         """Start empty at the identity pose."""
         self.config = config or VolumetricConfig()
         in_force = self.config.in_force
-        self._judge_views(in_force)
-        self._grid = (StockVoxelGrid if in_force.stock else VoxelGrid)(intrinsics, in_force)
-        self._aligner: FrameToModel = (
-            Open3DAlignment(self._grid)
-            if in_force.aligner == "open3d"
-            else OpenCVAlignment(intrinsics, in_force.depth_cutoff_m)
+        grid = (StockVoxelGrid if in_force.stock else VoxelGrid)(intrinsics, in_force)
+        is_open3d = in_force.aligner == "open3d"
+        cutoff_m = in_force.depth_cutoff_m
+        self._assemble(
+            grid, Open3DAlignment(grid) if is_open3d else OpenCVAlignment(intrinsics, cutoff_m)
         )
+
+    def _assemble(self, grid: VoxelGrid, aligner: FrameToModel) -> None:
+        """Start empty at the identity pose, with these parts and what ``config`` demands."""
+        self._grid, self._aligner = grid, aligner
+        self._judge_views(self.config)
         self._fresh = True  # whether the grid is as allocated
-        super().__init__(intrinsics)
+        super().__init__(grid.intrinsics)
 
     @property
     def _has_map(self) -> bool:
@@ -140,14 +145,14 @@ class VolumetricSlam(FrameByFrameSlam[_RGBDImage, None]):
             self._grid.clear()
             self._fresh = True
 
-    def _prepare(self, frame: RGBDFrame) -> _RGBDImage:
+    def _prepare(self, frame: RGBDFrame) -> FusedImage:
         depth = np.where(frame.depth <= self.config.depth_cutoff_m, frame.depth, 0)
         raw = np.rint(depth * DEPTH_SCALE).astype(np.uint16)
         grey = intensity_image(frame.color).astype(np.float32)
         metres = (raw / np.float32(DEPTH_SCALE)).astype(np.float32)
-        return _RGBDImage(metres, grey, raw, frame.color)
+        return FusedImage(metres, grey, raw, frame.color)
 
-    def _attempts(self, prepared: _RGBDImage, guess: Float64 | None) -> Iterator[Attempt[None]]:
+    def _attempts(self, prepared: FusedImage, guess: Float64 | None) -> Iterator[Attempt[None]]:
         if self._view is None:
             self._view = self._cast(self._pose)
         yield self._align(prepared, self._pose, self._view, self._thresholds)
@@ -159,7 +164,7 @@ class VolumetricSlam(FrameByFrameSlam[_RGBDImage, None]):
         for motion in motion_hypotheses(prepared, seen, self._motion, self.intrinsics):
             yield self._confirmed(prepared, self._pose @ motion)
 
-    def _confirmed(self, image: _RGBDImage, pose: Float64) -> Attempt[None]:
+    def _confirmed(self, image: FusedImage, pose: Float64) -> Attempt[None]:
         """Align with the view from a pose, then, if it may be right, with the view from there."""
         attempt = self._align(image, pose, self._cast(pose), self._thresholds.tentative)
         if attempt.reason:
@@ -168,7 +173,7 @@ class VolumetricSlam(FrameByFrameSlam[_RGBDImage, None]):
         return self._align(image, closer, self._cast(closer), self._thresholds.confirmation)
 
     def _align(
-        self, image: _RGBDImage, pose: Float64, view: CastView, thresholds: AcceptanceThresholds
+        self, image: FusedImage, pose: Float64, view: CastView, thresholds: AcceptanceThresholds
     ) -> Attempt[None]:
         reference = DepthImage(view.depth, view.intensity)
         if reference.readings < self.fewest_readings:
@@ -185,19 +190,19 @@ class VolumetricSlam(FrameByFrameSlam[_RGBDImage, None]):
         weight = min(self._fused, _FULL_WEIGHT)
         return self._grid.cast(pose, weight, self.intrinsics)
 
-    def _start_from(self, frame: RGBDFrame, prepared: _RGBDImage) -> None:
+    def _start_from(self, frame: RGBDFrame, prepared: FusedImage) -> None:
         self._view = None
         if prepared.raw_depth.any():
             self._fuse(prepared)
 
-    def _extend(self, frame: RGBDFrame, prepared: _RGBDImage, attempt: Attempt[None]) -> None:
+    def _extend(self, frame: RGBDFrame, prepared: FusedImage, attempt: Attempt[None]) -> None:
         self._fuse(prepared)
 
-    def _miss(self, frame: RGBDFrame, prepared: _RGBDImage) -> None:
+    def _miss(self, frame: RGBDFrame, prepared: FusedImage) -> None:
         if self.config.stock:
             self._fuse(prepared)
 
-    def _fuse(self, image: _RGBDImage) -> None:
+    def _fuse(self, image: FusedImage) -> None:
         self._grid.fuse(image.raw_depth, image.color, self._pose)
         self._fresh = False
         self._fused += 1
