@@ -28,6 +28,7 @@ _PERTURBATIONS = (
     "rolling-shutter",
     "motion-blur",
     "misregistration",
+    "lens-distortion",
     "exposure-ramp",
     "exposure-jumps",
     "auto-exposure",
