@@ -34,7 +34,7 @@ class Arguments:
     """What to demand, as in "ate_m<0.01", "M_I<0.02" or "M_I>0.02"."""
     parameters: tuple[str, ...] = ("algorithm",)
     """Parameters of the backend: NAME, NAME=low:high[:log], NAME=a,b,c; keep_every, image_size,
-    pyramid_levels; or a group: paper, algorithm, frame, compiler, machine."""
+    pyramid_levels; or a group: paper, algorithm, frame, compiler, machine, kinectfusion."""
     config: Path | None = None
     """Configuration file (YAML) to start from; by default the surfel backend's own."""
     sampler: str = "tpe"

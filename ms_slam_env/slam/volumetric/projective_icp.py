@@ -1,4 +1,3 @@
-# mypy: disable-error-code="operator, call-overload"
 """Point-to-plane alignment of a depth image with a model's view, by projective association.
 
 Newcombe et al., "KinectFusion" (ISMAR 2011), section 3.5: a point of the frame is carried into the
