@@ -16,8 +16,9 @@ from ms_slam_env.experiments.harness.experiment import Experiment
 from ms_slam_env.exploration import SlamEvaluator, make_space
 from ms_slam_env.exploration.front import hypervolume
 from ms_slam_env.exploration.grid import Grid
+from ms_slam_env.exploration.in_memory import explore_in_memory
 from ms_slam_env.exploration.objectives import FAILURE, objective_values
-from ms_slam_env.exploration.samplers import SAMPLERS, make_sampler
+from ms_slam_env.exploration.samplers import SAMPLERS
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.statistics import Interval, bootstrap_interval
@@ -34,7 +35,6 @@ PARAMETERS = (
     "unstable_window=10:400:log",
     "keep_every=1:6",
 )
-_POPULATION = 10  # of NSGA-II: several generations within a budget of tens
 
 
 @dataclass(frozen=True)
@@ -189,22 +189,12 @@ def run_study(
     grid: Grid, sampler: str, seed: int, trials: int, reference: Mapping[str, float]
 ) -> list[float]:
     """Explore in memory; return the hypervolume after every trial, as a share of the box."""
-    import optuna
-
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-    study = optuna.create_study(
-        directions=["minimize"] * len(OBJECTIVES), sampler=make_sampler(sampler, seed, _POPULATION)
-    )
-    study.enqueue_trial(grid.space.defaults())
+    trials_made = explore_in_memory(grid.space, grid, OBJECTIVES, sampler, seed, trials, reference)
     kept: list[list[float]] = []
     history = []
-    for _ in range(trials):
-        trial = study.ask(grid.space.distributions())
-        measured = grid(trial.params)
-        values = objective_values(measured, OBJECTIVES, reference)
-        trial.set_constraint("failed", 1.0 if measured.get(FAILURE) else 0.0)
-        study.tell(trial, values)
+    for _, measured in trials_made:
         if not measured.get(FAILURE):
+            values = objective_values(measured, OBJECTIVES, reference)
             kept.append([v / reference[n] for v, n in zip(values, OBJECTIVES, strict=True)])
         history.append(hypervolume(kept, [1.0] * len(OBJECTIVES)))
     return history

@@ -12,6 +12,7 @@ import pytest
 from ms_slam_env.camera import xtion
 from ms_slam_env.errors import InputError
 from ms_slam_env.experiments.explore_divergence import ExploreDivergence
+from ms_slam_env.experiments.explore_rates import ExploreRates, front_of_trials
 from ms_slam_env.experiments.explore_samplers import ExploreSamplers, summarise
 from ms_slam_env.experiments.harness import Experiment
 from ms_slam_env.experiments.harness.running import write_all
@@ -92,9 +93,38 @@ def test_divergence_grows_when_frames_are_left_out(sequence, tmp_path):
     assert (tmp_path / "divergence.png").stat().st_size > 0
 
 
+def test_rates_have_a_front_each(sequence, tmp_path):
+    experiment = ExploreRates((1, 3), ("random", "tpe"), 1, 3, (sequence,), image_size="80x60")
+    rows, results = results_of(experiment, tmp_path)
+    lines: Any = results.tables[0].rows
+    assert [(line["keep_every"], line["sampler"]) for line in lines] == [
+        (1, "random"), (1, "tpe"), (3, "random"), (3, "tpe"),
+    ]  # fmt: skip
+    assert lines[2]["M_I"] > lines[0]["M_I"]  # fewer frames, more divergence
+    assert lines[0]["M_I"] == lines[1]["M_I"]
+    default = rows[0]["result"]["trials"][0]["parameters"]
+    assert default == "depth_cutoff_m=3.0, icp_rgb_weight=0.1, confidence_threshold=10.0"
+    for line in lines:
+        assert line["count"] == 3
+        assert line["error"] <= line["default_error"]
+        assert line["cost"] <= line["default_cost"]
+    assert (tmp_path / "fronts.png").stat().st_size > 0
+
+
+def test_a_front_of_trials_is_what_none_beats():
+    values = [(3.0, 0.1), (1.0, 0.3), (2.0, 0.3), (2.0, 0.2), (4.0, 0.1)]
+    trials = [{"cpu_ms_median": cost, "ate_max_m": error} for cost, error in values]
+    found = [(t["cpu_ms_median"], t["ate_max_m"]) for t in front_of_trials(trials)]
+    assert found == [(1.0, 0.3), (2.0, 0.2), (3.0, 0.1)]
+
+
 @pytest.mark.parametrize(
     ("experiment", "message"),
     [
+        (ExploreRates(samplers=("grid",)), "valid choices: random, nsga2, tpe, gp, forest"),
+        (ExploreRates(keep_every=()), "no sampler or no rate"),
+        (ExploreRates(keep_every=(0,)), "keep_every"),
+        (ExploreRates(parameters=("speed",)), "unknown parameter 'speed'"),
         (ExploreSamplers(samplers=("grid",)), "valid choices: random, nsga2, tpe, gp"),
         (ExploreSamplers(samplers=()), "no sampler"),
         (ExploreSamplers(parameters=("image_size",)), "'image_size' has no order"),

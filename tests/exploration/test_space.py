@@ -1,5 +1,7 @@
 """Design spaces from texts, and configurations from values."""
 
+import dataclasses
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -9,6 +11,8 @@ from ms_slam_env.exploration import Choice, Float, Integer, make_space
 from ms_slam_env.exploration.availability import why_absent
 from ms_slam_env.exploration.space import GROUPS, KNOWN, absences
 from ms_slam_env.slam.configuration import SlamConfiguration
+from ms_slam_env.slam.surfel import SurfelConfig
+from ms_slam_env.slam.surfel.config import PAPER
 
 
 def test_the_paper_has_three_parameters():
@@ -18,6 +22,24 @@ def test_the_paper_has_three_parameters():
         "icp_rgb_weight": 0.1,
         "confidence_threshold": 10.0,
     }
+
+
+def test_the_papers_ranges_and_defaults_are_those_it_prints():
+    """ICRA 2017, section IV-A: [0 - 10] m, 3 m; [0 - 1], 0.1; [0 - 12], 10."""
+    config = SurfelConfig.paper()
+    published = (config.depth_cutoff_m, config.icp_rgb_weight, config.confidence_threshold)
+    assert published == (3.0, 0.1, 10.0)
+    changed = {
+        field.name
+        for field in dataclasses.fields(SurfelConfig)
+        if getattr(config, field.name) != getattr(SurfelConfig(), field.name)
+    }
+    assert changed == {"depth_cutoff_m", "loop_closure"}  # the others are our default already
+    for name, high in (("depth_cutoff_m", 10), ("icp_rgb_weight", 1), ("confidence_threshold", 12)):
+        assert PAPER[name][1:] == (0, high)
+        assert KNOWN[name].ends()[1] == high
+        for value in PAPER[name]:
+            SurfelConfig(**{name: value})
 
 
 def test_every_known_parameter_holds_its_default():
