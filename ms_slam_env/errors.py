@@ -6,7 +6,13 @@ from collections.abc import Iterable
 
 
 class InputError(ValueError):
-    """A value given by the user is wrong; the message is one line fit to be shown as it is."""
+    """A value given by the user is wrong; the message is one line fit to be shown as it is.
+
+    Line breaks in what is quoted, as of a name or an array, become spaces.
+    """
+
+    def __init__(self, message: object = "") -> None:
+        super().__init__(" ".join(line.strip() for line in str(message).splitlines()))
 
 
 class InputWarning(UserWarning):

@@ -59,8 +59,8 @@ def test_a_death_or_a_complaint_costs_only_its_own_spec(
     assert found[13].died
     assert found[13].error.startswith("the process died")
     assert (found[-1].error, found[-1].message) == (
-        "InputError: no square of -1",
-        "no square of -1\nsecond line",
+        "InputError: no square of -1 second line",
+        "no square of -1 second line",
     )
     assert found[-1].is_bad_input
     assert not found[-2].is_bad_input

@@ -158,6 +158,8 @@ class EnvConfig(Checked):
         observation: ``rgbd``, ``features`` or ``lookahead``, ``module:Class`` or a class.
         step_m: translation of a motion, metres.
         step_rad: rotation of a motion, radians.
+        frames_per_action: frames that a camera which nothing holds takes on a motion, at 30 Hz; an
+            arm takes those of the time that it needs.
         lost_patience: steps that tracking may stay lost before the episode ends.
         away_patience: steps that the camera may be in submaps that are not joined to the first
             before it ends, lost or not: where it started is known no longer. For SLAM that starts
@@ -190,6 +192,7 @@ class EnvConfig(Checked):
     observation: str | type[Observation] = "features"
     step_m: float = bounded(0.12, 0, 1)
     step_rad: float = bounded(math.radians(12), 0, math.pi / 2)
+    frames_per_action: int = bounded(1, 1, 100)
     lost_patience: int = bounded(10, 1, 1_000_000)
     away_patience: int = bounded(50, 1, 1_000_000)
     seconds: float | None = bounded(None, 0.001, 1e9)

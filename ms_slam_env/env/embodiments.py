@@ -33,6 +33,11 @@ def _arm(cls: type[ArmEmbodiment]) -> EmbodimentType:
         return cls(scene, config.arm, config.step_m, config.step_rad, timings)
 
     def check(config: EnvConfig) -> None:  # a bad file is refused before the first reset
+        if config.frames_per_action != 1:
+            raise InputError(
+                "frames_per_action is for cameras that nothing holds; for the arm give "
+                "arm.frames_per_action"
+            )
         load_arm(config.arm.model, config.arm.camera_site, config.arm.joint_speed_rad_s)
 
     return EmbodimentType(cls.num_actions, build, check)
@@ -40,7 +45,7 @@ def _arm(cls: type[ArmEmbodiment]) -> EmbodimentType:
 
 def _free(cls: type[FreeCamera] | type[FixedTranslation]) -> EmbodimentType:
     def build(scene: Scene, config: EnvConfig, timings: Timings) -> Embodiment:
-        return cls(scene, config.step_m, config.step_rad)
+        return cls(scene, config.step_m, config.step_rad, config.frames_per_action)
 
     return EmbodimentType(cls.num_actions, build, _has_no_arm)
 

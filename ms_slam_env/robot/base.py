@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.geometry import Float64
+from ms_slam_env.geometry import Float64, make_pose, so3_exp, so3_log
 
 FRAME_PERIOD_S = 1 / 30
 """Time between frames of a camera whose carrier has no clock of its own."""
@@ -34,10 +34,17 @@ class MotionResult:
     energy_j: float = 0.0
 
     @staticmethod
-    def at_once(made: bool, T_world_camera: Float64) -> MotionResult:
-        """One frame, one frame period later, at a pose (4, 4) that is known exactly."""
-        pose = np.array(T_world_camera, dtype=np.float64)[None]
-        return MotionResult(made, pose, pose.copy(), np.array([FRAME_PERIOD_S]))
+    def along(made: bool, start: Float64, motion: Float64, frames: int = 1) -> MotionResult:
+        """``frames`` frames, one a frame period, at poses that are known exactly.
+
+        On a straight line, turning evenly, from a pose (4, 4) on by a ``motion`` (4, 4).
+        """
+        turn = so3_log(motion[:3, :3])
+        shares = np.arange(1, frames) / frames
+        parts = [make_pose(so3_exp(share * turn), share * motion[:3, 3]) for share in shares]
+        poses = np.stack([start @ part for part in [*parts, motion]])
+        times_s = FRAME_PERIOD_S * np.arange(1, frames + 1)
+        return MotionResult(made, poses, poses.copy(), times_s)
 
 
 class Embodiment(ABC):

@@ -38,13 +38,20 @@ def check_room(scene: Scene, T_world_camera: Float64) -> Float64:
 
 
 class FreeCamera(Embodiment):
-    """The 49 motions of the paper's decomposition, each made exactly."""
+    """The 49 motions of the paper's decomposition, each made exactly.
+
+    Args:
+        scene: to move in.
+        step_m, step_rad: of a motion.
+        frames: taken on a motion, the last at its end.
+    """
 
     num_actions = NUM_TRANSLATIONS * NUM_ROTATIONS
 
-    def __init__(self, scene: Scene, step_m: float, step_rad: float) -> None:
+    def __init__(self, scene: Scene, step_m: float, step_rad: float, frames: int = 1) -> None:
         self.scene = scene
         self.step_m = step_m
+        self.frames = frames
         self._motions = decompose(step_m, step_rad)
         self._motions.flags.writeable = False
         self._masks: NDArray[np.bool_] | None = None  # of the current pose
@@ -75,10 +82,12 @@ class FreeCamera(Embodiment):
     def move(self, action: int) -> MotionResult:
         """Make motion ``action`` if nothing blocks it."""
         made = bool(self.action_masks()[action])
+        motion = self._motions[action] if made else np.eye(4)
+        result = MotionResult.along(made, self.T_world_camera, motion, self.frames)
         if made:
-            self.T_world_camera = self.T_world_camera @ self._motions[action]
+            self.T_world_camera = result.T_world_camera[-1].copy()
             self._masks = None
-        return MotionResult.at_once(made, self.T_world_camera)
+        return result
 
     def get_state(self) -> dict[str, Any]:
         """The pose."""
@@ -94,15 +103,16 @@ class FixedTranslation(Embodiment):
     """The paper's second simulation: straight-line translation, the rotation is chosen.
 
     The line's direction is drawn at the start among those with the most room; where the camera
-    would touch something it turns back along the same line.
+    would touch something it turns back along the same line. Arguments as of `FreeCamera`.
     """
 
     num_actions = NUM_ROTATIONS
     _DIRECTIONS_TRIED = 16
 
-    def __init__(self, scene: Scene, step_m: float, step_rad: float) -> None:
+    def __init__(self, scene: Scene, step_m: float, step_rad: float, frames: int = 1) -> None:
         self.scene = scene
         self.step_m = step_m
+        self.frames = frames
         self._rotations = decompose(0.0, step_rad)[:NUM_ROTATIONS]
         self.T_world_camera = np.eye(4)
         self._direction = np.zeros(3)
@@ -149,11 +159,12 @@ class FixedTranslation(Embodiment):
 
     def move(self, action: int) -> MotionResult:
         """Step along the line and turn; always possible."""
-        step = self._translation()
-        self.T_world_camera = self.T_world_camera @ self.candidate_motions()[action]
+        step, motion = self._translation(), self.candidate_motions()[action]
+        result = MotionResult.along(True, self.T_world_camera, motion, self.frames)
+        self.T_world_camera = result.T_world_camera[-1].copy()
         if step @ self._direction < 0:
             self._direction = -self._direction
-        return MotionResult.at_once(True, self.T_world_camera)
+        return result
 
     def get_state(self) -> dict[str, Any]:
         """The pose and the line."""

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.env.embodiments import EMBODIMENTS, EmbodimentType
@@ -200,3 +201,28 @@ def test_an_embodiment_that_cannot_start_says_why(monkeypatch):
         env.reset(seed=0, options={"T_world_camera": np.eye(4)})
     with pytest.raises(InputError, match="must be reset"):
         env.step(0)
+
+
+@pytest.mark.parametrize("embodiment", ["free", "fixed-translation"])
+def test_a_free_camera_takes_its_frames_on_the_way(embodiment):
+    alone = ActiveSlamEnv(embodiment, **OPTIONS)
+    env = ActiveSlamEnv(embodiment, frames_per_action=4, **OPTIONS)
+    for one in (alone, env):
+        one.reset(seed=3)
+    for action in (5, 3, 6):
+        alone.step(action)
+        info = env.step(action)[-1]
+    truth = np.array(env.episode.trajectory_truth)
+    assert info["time"] == pytest.approx(12 / 30)
+    np.testing.assert_array_equal(truth[::4], alone.episode.trajectory_truth)
+    way = invert(truth[:-1]) @ truth[1:]
+    for leg in way.reshape(3, 4, 4, 4):
+        turns = [Rotation.from_matrix(T[:3, :3]).as_rotvec() for T in leg]
+        np.testing.assert_allclose(turns, np.tile(turns[0], (4, 1)), atol=1e-9)
+    steps = np.diff(truth[:, :3, 3], axis=0).reshape(3, 4, 3)
+    np.testing.assert_allclose(steps, np.repeat(steps[:, :1], 4, axis=1), atol=1e-9)
+
+
+def test_the_arm_has_an_option_of_its_own_for_frames():
+    with pytest.raises(InputError, match=r"arm\.frames_per_action"):
+        ActiveSlamEnv("arm", frames_per_action=2)
