@@ -62,10 +62,11 @@ def check_same_settings(saved: Any, own: Mapping[str, Any]) -> None:
         InputError: naming the first option that differs and both values.
     """
     check_mapping(saved, "settings")
+    check_keys(saved, list(own), "settings")
     for name, value in own.items():
-        if type(saved.get(name)) is not type(value) or not _is_equal(saved[name], value):
+        if type(saved[name]) is not type(value) or not _is_equal(saved[name], value):
             raise InputError(
-                f"the state was saved with {name} = {saved.get(name)!r}, "
+                f"the state was saved with {name} = {saved[name]!r}, "
                 f"this environment has {value!r}"
             )
 

@@ -38,6 +38,9 @@ def check_like(value: Any, like: Any, where: str) -> None:
     """
     if isinstance(like, np.ndarray):
         check_array(value, like, where)
+        is_count = like.dtype.kind == "i" and like.size and like.min() >= 0
+        if is_count and (value < 0).any():
+            raise wrong(where, f"counts to {value.min()}")
     elif isinstance(like, Mapping):
         _check_fields(value, like, where)
     elif isinstance(like, list) and like:

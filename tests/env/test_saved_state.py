@@ -176,6 +176,27 @@ def test_settings_of_arrays_are_other_settings(played):
     assert same(env.save_state(), before)
 
 
+def test_settings_that_are_missing_and_counts_below_zero_are_refused(played):
+    env, before, earlier, _ = played.values()
+    settings = {k: v for k, v in earlier["settings"].items() if k != "field_of_view_deg"}
+    with pytest.raises(InputError, match=r"settings lacks \['field_of_view_deg'\]"):
+        env.load_state({**earlier, "settings": settings})
+    state = copy.deepcopy(earlier)
+    lost = next(part for part in parts(state["slam"]) if "lost" in part)["lost"]
+    lost[:] = -1
+    with pytest.raises(InputError, match=r"lost counts to -1"):
+        env.load_state(state)
+    assert same(env.save_state(), before)
+
+
+def parts(value):
+    """All mappings in a tree."""
+    if isinstance(value, dict):
+        yield value
+        for one in value.values():
+            yield from parts(one)
+
+
 @pytest.mark.parametrize("state", [None, 3, [], "state", {}])
 def test_what_is_no_state_is_refused(played, state):
     with pytest.raises(InputError, match="state"):

@@ -31,7 +31,7 @@ PLAIN: tuple[Any, ...] = (
 """Values in the place of another, of JSON's types."""
 
 ARRAYS: tuple[Callable[[Any], Any], ...] = (
-    lambda value: np.full_like(value, np.nan) if _is_float(value) else -np.ones_like(value),
+    lambda value: np.full_like(value, np.nan) if _is_float(value) else ~np.zeros_like(value),
     lambda value: np.full_like(value, np.inf) if _is_float(value) else np.zeros_like(value),
     lambda value: value[:0] if value.ndim else value[None],
     lambda value: np.concatenate([value, value]) if value.ndim else value + 1,
