@@ -84,8 +84,9 @@ class Belief(NextBestView):
         information *= trust(start, information[0])
         motions = distances.max(axis=1) / count  # from stop to stop
         turn = self.steps[1] * distances[:, 1] / np.maximum(distances.max(axis=1), 1)
+        turn /= self.frames
         slips = risk_of(H, views, np.r_[0, np.repeat(turn, count)], depth)[1:].reshape(-1, count)
-        holds = np.prod((1 - slips) ** motions[:, None], axis=1)
+        holds = np.prod((1 - slips) ** (self.frames * motions[:, None]), axis=1)
         here = episode.T_world_camera_estimate
         ends = [
             propagated(start, [here, *way], of_way, between)

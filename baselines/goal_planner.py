@@ -7,12 +7,18 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from ms_slam_baselines.view_goals import distance_in_steps, draw_goals
+from ms_slam_baselines.view_goals import distance_in_steps, views_anywhere
 from numpy.typing import NDArray
 
 from ms_slam_env.config import check_range
 from ms_slam_env.env import Planner
-from ms_slam_env.mapping import OccupancyMap, expected_gain, reachable_positions
+from ms_slam_env.geometry import look_at, make_pose
+from ms_slam_env.mapping import (
+    FREE,
+    OccupancyMap,
+    expected_gain,
+    shortest_ways,
+)
 
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv
@@ -21,9 +27,10 @@ Float64 = NDArray[np.float64]
 
 ARRIVED = 3  # steps from a goal
 KEPT_AWAY = 0.7  # steps from where tracking was lost
+_LOOKAHEAD = 6  # positions of a way that are looked ahead
 _RANGES = {
     **{"goals": (3, 10_000), "radius_m": (0.1, 100), "cost": (0, 100)},
-    **{"replan": (1, 10_000), "cell_m": (0.02, 1)},
+    **{"replan": (1, 10_000), "cell_m": (0.02, 1), "enough_m3": (0, 1000), "far_m": (0.1, 1000)},
 }
 
 
@@ -32,6 +39,8 @@ class GoalPlanner(Planner):
 
     A goal is a pose of known free space. By default it is the one with the largest expected gain
     against its distance in steps (Bircher et al., ICRA 2016, weigh gain by exp(-lambda cost)).
+    Where that would gain too little the goal is the one that gains most a step of the way round
+    the walls, wherever in known free space (as Dang et al., J. Field Robotics 2020, do globally).
 
     Args:
         env: the unwrapped environment.
@@ -41,6 +50,8 @@ class GoalPlanner(Planner):
         cost: how much less a view is worth six steps farther away: exp(-cost).
         replan: steps after which a goal is drawn anew.
         cell_m: edge of a cell of the occupancy grid.
+        enough_m3: unknown volume that a goal near by should show.
+        far_m: how far a goal may be where none near by does.
 
     Raises:
         InputError: an option out of its range.
@@ -57,10 +68,13 @@ class GoalPlanner(Planner):
         cost: float = 0.7,
         replan: int = 7,
         cell_m: float = 0.1,
+        enough_m3: float = 1.0,
+        far_m: float = 12.0,
     ) -> None:
         super().__init__(env, seed)
         self.goals, self.radius_m, self.cost = goals, radius_m, cost
         self.replan, self.cell_m = replan, cell_m
+        self.enough_m3, self.far_m = enough_m3, far_m
         self.check(_RANGES)
         self.steps = env.config.step_m, env.config.step_rad
 
@@ -74,10 +88,16 @@ class GoalPlanner(Planner):
         self.map = OccupancyMap(self.cell_m)
         self.goal: Float64 | None = None
         self.age = 0
+        self.way = np.zeros((0, 3))
+        """Positions (K, 3) of the way to the goal."""
         self.lost_at = np.zeros((0, 4, 4))
         """Poses (N, 4, 4) at which tracking was lost."""
-        self.reached = np.zeros((0, 4, 4))
-        """Goals (N, 4, 4) that were reached."""
+        self.done_with = np.zeros((0, 4, 4))
+        """Goals (N, 4, 4) that were reached or given up."""
+        self.given_up = 0
+        """How many since the last one reached."""
+        self.begun = 0.0
+        """Motions to the goal when it was chosen, or last looked at."""
 
     def lost_by(self, action: int) -> None:
         """Keep away from where the last motion should have led."""
@@ -90,44 +110,102 @@ class GoalPlanner(Planner):
         here = episode.T_world_camera_estimate
         if info["tracking_ok"]:
             self.map.add(self.env.slam, episode.last_frame.depth, here, self.env.intrinsics)
-        if self.goal is not None and self.arrived(here):
-            self.reached = np.concatenate([self.reached, self.goal[None]])
-            self.goal = None
-        if self.goal is None or self.age >= self.replan:
-            self.goal, self.age = self.choose_goal(here), 0
+        if self.goal is not None:
+            self.judge_goal(here)
+        if self.goal is None:
+            self.find_goal(here)
         self.age += 1
-        action = self.motion_towards(self.goal)
+        action = self.motion_towards(self.next_on_way(here))
         self.heading_to = self.env.candidate_poses()[action]
         if action == 0:
             self.goal = None
         return action
 
-    def arrived(self, here: Float64) -> bool:
-        """Whether the goal is some three steps away."""
-        return bool(distance_in_steps(here[None], self.goal, *self.steps).sum() < ARRIVED)
+    def find_goal(self, here: Float64) -> None:
+        """Take a goal near by, or a far one where that would gain too little, and the way there."""
+        self.ways = shortest_ways(self.map.grid, here[:3, 3], self.radius_m)
+        goal = self.choose_goal(here)
+        if self.gain_of(goal[None])[0] < self.enough_m3:
+            self.ways = shortest_ways(self.map.grid, here[:3, 3], self.far_m)
+            goal = self.far_goal(here, goal)
+        self.goal, self.age = goal, 0
+        self.way = self.ways.to(_nearest(self.ways.positions, goal[:3, 3]))
+        self.begun = self.steps_to_goal(here)
+
+    def judge_goal(self, here: Float64) -> None:
+        """Drop the goal where it is reached, comes no nearer, or is old and not far."""
+        assert self.goal is not None
+        left = self.steps_to_goal(here)
+        is_old, is_reached = self.age >= self.replan, left < ARRIVED
+        if is_reached or (is_old and left >= self.begun):
+            self.given_up = 0 if is_reached else self.given_up + 1
+            self.done_with = np.concatenate([self.done_with, self.goal[None]])
+            self.goal = None
+        elif is_old:
+            is_far = left * self.steps[0] > self.radius_m
+            is_worth_it = self.gain_of(self.goal[None])[0] >= self.enough_m3
+            self.goal = self.goal if is_far and is_worth_it else None
+            self.begun, self.age = left, 0
+
+    def steps_to_goal(self, here: Float64) -> float:
+        """Motions that it takes from a pose (4, 4) to the goal along its way, one after another."""
+        assert self.goal is not None
+        metres, turns = distance_in_steps(here[None], self.goal, *self.steps)[0]
+        ahead = self.way[_nearest(self.way, here[:3, 3]) :]
+        legs = np.linalg.norm(np.diff(ahead, axis=0), axis=1).sum() / self.steps[0]
+        return float(max(metres, legs) + turns)
+
+    def next_on_way(self, here: Float64) -> Float64:
+        """The goal, or a pose (4, 4) on the way to it as far as the camera can go straight."""
+        assert self.goal is not None
+        ahead = self.way[_nearest(self.way, here[:3, 3]) :]
+        shares = np.linspace(0, 1, 2 * _LOOKAHEAD)[:, None, None]
+        between = here[:3, 3] + shares * (ahead[: _LOOKAHEAD + 1] - here[:3, 3])
+        is_free = self.map.grid.states_of(between.reshape(-1, 3)) == FREE
+        straight = np.flatnonzero(is_free.reshape(len(shares), -1)[1:].all(axis=0))
+        index = int(straight[-1]) if len(straight) else min(1, len(ahead) - 1)
+        if index == len(ahead) - 1:
+            return self.goal
+        beyond = ahead[min(index + _LOOKAHEAD, len(ahead) - 1)] - ahead[index]
+        level = np.array([beyond[0], beyond[1], 0.0])
+        if np.linalg.norm(level) < self.cell_m:
+            return make_pose(here[:3, :3], ahead[index])
+        return look_at(ahead[index], ahead[index] + level)
+
+    def gain_of(self, poses: Float64) -> Float64:
+        """Expected gain (N,) of poses (N, 4, 4), m^3."""
+        return expected_gain(self.map.grid, poses, self.env.intrinsics)
 
     def is_new(self, goals: Float64, here: Float64) -> NDArray[np.bool_]:
-        """Which goals (N, 4, 4) are neither where the camera is (4, 4) nor where it has been."""
-        known = np.concatenate([here[None], self.reached])
+        """Which goals (N, 4, 4) are neither where the camera is (4, 4) nor done with."""
+        known = np.concatenate([here[None], self.done_with])
         away = [distance_in_steps(goals, pose, *self.steps).sum(axis=1) for pose in known]
         return np.asarray(np.min(away, axis=0) >= ARRIVED)
 
     def choose_goal(self, here: Float64) -> Float64:
         """The pose (4, 4) whose gain is most worth its way from ``here`` (4, 4)."""
         poses, worth = self.drawn_goals(here)
-        return poses[np.argmax(worth)]
+        return poses[np.argmax(worth * self.is_new(poses, here))]
 
     def drawn_goals(self, here: Float64) -> tuple[Float64, Float64]:
-        """Poses (N, 4, 4) drawn for a goal, and their gain against their distance (N,), m^3."""
-        free = reachable_positions(self.map.grid, here[:3, 3], self.radius_m)
-        poses = draw_goals(self.rng, here, free, self.goals)
-        return poses, self.worth_of(poses, here)
+        """Poses (N, 4, 4) drawn for a goal near by, and their gain against their way (N,), m^3."""
+        drawn = self.rng.integers(len(self.ways.positions), size=self.goals)
+        lengths = np.concatenate([np.zeros(self.goals // 3), self.ways.lengths[drawn]])
+        positions = np.concatenate(
+            [np.repeat(here[None, :3, 3], self.goals // 3, axis=0), self.ways.positions[drawn]]
+        )
+        poses = views_anywhere(self.rng, positions)
+        turns = distance_in_steps(poses, here, *self.steps)[:, 1]
+        steps = 1 + np.maximum(lengths / self.steps[0], turns)
+        return poses, self.gain_of(poses) * np.exp(-self.cost * steps / 6)
 
-    def worth_of(self, poses: Float64, here: Float64) -> Float64:
-        """Expected gain (N,) of poses (N, 4, 4) against their distance in steps, m^3."""
-        gain = expected_gain(self.map.grid, poses, self.env.intrinsics)
-        steps = 1 + distance_in_steps(poses, here, *self.steps).max(axis=1)
-        return gain * np.exp(-self.cost * steps / 6)
+    def far_goal(self, here: Float64, otherwise: Float64) -> Float64:
+        """The pose (4, 4) that gains most a step of the way there; another if none gains enough."""
+        drawn = self.rng.integers(len(self.ways.positions), size=2 * self.goals)
+        poses = views_anywhere(self.rng, self.ways.positions[drawn])
+        gain = self.gain_of(poses) * self.is_new(poses, here)
+        best = int(np.argmax(gain / (self.replan + self.ways.lengths[drawn] / self.steps[0])))
+        return poses[best] if gain[best] >= self.enough_m3 else otherwise
 
     def near_loss(self, poses: Float64) -> NDArray[np.bool_]:
         """Which of poses (n, 4, 4) are where tracking was lost."""
@@ -139,3 +217,8 @@ class GoalPlanner(Planner):
     @abstractmethod
     def motion_towards(self, goal: Float64) -> int:
         """The motion to make next, on the way to a goal (4, 4)."""
+
+
+def _nearest(positions: Float64, position: Float64) -> int:
+    """Which of positions (N, 3) is nearest to one (3,)."""
+    return int(np.argmin(((positions - position) ** 2).sum(axis=1)))

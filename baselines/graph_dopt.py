@@ -12,7 +12,6 @@ from ms_slam_baselines.view_goals import distance_in_steps, frontiers, poses_bet
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import transform_points
-from ms_slam_env.mapping import reachable_positions
 
 _AWAY_M = 1.2  # from which a frontier is looked at
 _APART = 3.0  # steps between two keyframes
@@ -93,9 +92,8 @@ class GraphDOptimality(NextBestView):
     def choose_goal(self, here: Float64) -> Float64:
         """The view (4, 4) of the frontier whose way leaves the graph best connected."""
         grid = self.map.grid
-        free = reachable_positions(grid, here[:3, 3], self.radius_m)
         found = frontiers(grid, here[:3, 3], self.radius_m + _AWAY_M)
-        goals = views_of(found, free, here[:3, 3], _AWAY_M)
+        goals = views_of(found, self.ways.positions, here[:3, 3], _AWAY_M)
         goals = goals[self.is_new(goals, here)]
         if not len(goals):
             return super().choose_goal(here)

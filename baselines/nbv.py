@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from ms_slam_baselines.goal_planner import GoalPlanner
-from ms_slam_baselines.trackability import SCALE, can_follow
+from ms_slam_baselines.trackability import SCALE, can_follow, leads_on
 from ms_slam_baselines.view_goals import distance_in_steps
 from numpy.typing import NDArray
 
@@ -28,7 +28,8 @@ class NextBestView(GoalPlanner):
         env: the unwrapped environment.
         seed: of the goals drawn.
         overlap: share of a view that the map should fill.
-        risk: probability that a motion may have to slip; see `trackability`.
+        risk: probability that a frame may have to slip, see `trackability`; twice as much with
+            each goal in succession that could not be come nearer.
         own_gain: steps that the best view on the way is worth.
         **options: of the goals, see `GoalPlanner`.
 
@@ -47,6 +48,7 @@ class NextBestView(GoalPlanner):
     ) -> None:
         super().__init__(env, seed, **options)
         self.overlap, self.risk, self.own_gain = overlap, risk, own_gain
+        self.frames = env.config.frames_per_action
         self.check({"overlap": (0, 1), "risk": (0, 1), "own_gain": (0, 1000)})
 
     def motion_towards(self, goal: Float64) -> int:
@@ -61,14 +63,16 @@ class NextBestView(GoalPlanner):
     def admissible(self, poses: Float64) -> NDArray[np.bool_]:
         """Which motions to poses (n, 4, 4) SLAM can follow; the possible ones if it could none.
 
-        To stay is none of them, unless there is no other.
+        To stay, or but to roll, is none of them, unless there is no other.
         """
         possible = self.env.action_masks()
         here = self.env.episode.T_world_camera_estimate
         seen_from = np.concatenate([here[None], poses])
         views = self.env.slam.predict(seen_from, SCALE)
-        can = can_follow(views, seen_from, self.overlap, self.risk)[1:]
-        can &= possible & ~self.near_loss(poses)
-        moving = can & (distance_in_steps(poses, here, *self.steps).max(axis=1) > 0.1)
+        permitted = np.r_[True, possible & ~self.near_loss(poses)]
+        risk = min(self.risk * 2**self.given_up, 1.0)
+        limits = self.overlap, risk, self.frames
+        can = can_follow(views, seen_from, permitted, *limits)[1:]
+        moving = can & leads_on(poses, here)
         can = moving if moving.any() else can
         return can if can.any() else possible

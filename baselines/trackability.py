@@ -40,14 +40,16 @@ def image_motion(views: Views, poses: Float64) -> Float64:
     return np.median(np.arccos(np.clip(cosine, -1, 1)), axis=1)
 
 
-def slip_risk(views: Views, poses: Float64) -> Float64:
+def slip_risk(views: Views, poses: Float64, frames: int = 1) -> Float64:
     """Probability (n,) that SLAM slips on the way from view 0 to the views from poses (n, 4, 4).
 
     Where a surface is plain or its texture repeats, alignment may end on a wrong place near the
     right one: the farther the image moves, the nearer the surface is, and the less the geometry
-    tells about the two weakest directions of the pose, the likelier.
+    tells about the two weakest directions of the pose, the likelier. Of several ``frames`` on the
+    way it is the risk of each, which has its part of the motion.
     """
-    return risk_of(view_information(views), views, image_motion(views, poses), mean_depth(views)[0])
+    motion_rad = image_motion(views, poses) / frames
+    return risk_of(view_information(views), views, motion_rad, mean_depth(views)[0])
 
 
 def risk_of(H: Float64, views: Views, motion_rad: Float64, depth_m: Float64) -> Float64:
@@ -66,21 +68,34 @@ def risk_of(H: Float64, views: Views, motion_rad: Float64, depth_m: Float64) -> 
     return np.asarray(1 / (1 + np.exp(-log_odds)))
 
 
-def can_follow(views: Views, poses: Float64, overlap: float, risk: float) -> NDArray[np.bool_]:
+def can_follow(
+    views: Views,
+    poses: Float64,
+    permitted: NDArray[np.bool_],
+    overlap: float,
+    risk: float,
+    frames: int = 1,
+) -> NDArray[np.bool_]:
     """Which motions (n,) from view 0 to the views from poses (n, 4, 4) SLAM can follow.
 
     Args:
         views: predicted by the map; the first of where the camera is.
         poses: of the views, T_world_camera.
+        permitted: (n,) those that come into question.
         overlap: share of a view that the map should fill.
-        risk: of slipping that is permitted; where all that moves has more, that of the safest
-            motion and a little more.
+        risk: of slipping that is permitted for a frame; where all that leads to another view has
+            more, that of the safest such motion and a little more. A roll leads to no other.
+        frames: taken on a motion.
     """
     shown = (views.depth > 0).mean(axis=(1, 2))
     near = ((views.depth > 0) & (views.depth < NEAR_M)).mean(axis=(1, 2))
-    risks = slip_risk(views, poses)
-    can: NDArray[np.bool_] = shown >= min(overlap, shown[0])
+    risks = slip_risk(views, poses, frames)
+    can: NDArray[np.bool_] = permitted & (shown >= min(overlap, shown[0]))
     can &= near <= max(NEAR_SHARE, near[0])
-    moves = (np.abs(poses - poses[0]) > 1e-6).any(axis=(1, 2))
-    safest = np.min(risks[can & moves], initial=1.0)
+    safest = np.min(risks[can & leads_on(poses, poses[0])], initial=1.0)
     return can & (risks <= max(risk, _KEPT * safest))
+
+
+def leads_on(poses: Float64, here: Float64) -> NDArray[np.bool_]:
+    """Which poses (n, 4, 4) are elsewhere or look elsewhere than ``here`` (4, 4), not but roll."""
+    return np.asarray((np.abs(poses - here)[:, :3, 2:] > 1e-6).any(axis=(1, 2)))

@@ -21,13 +21,8 @@ def distance_in_steps(poses: Float64, goal: Float64, step_m: float, step_rad: fl
     return np.stack([metres / step_m, np.arccos(np.clip(cosine, -1, 1)) / step_rad], axis=1)
 
 
-def draw_goals(rng: np.random.Generator, here: Float64, free: Float64, number: int) -> Float64:
-    """Upright poses (N, 4, 4) looking anywhere but straight up or down.
-
-    ``number`` at positions drawn from ``free`` (M, 3), a third as many where the camera is.
-    """
-    away = free[rng.integers(len(free), size=number)] if len(free) else np.zeros((0, 3))
-    positions = np.concatenate([np.repeat(here[None, :3, 3], number // 3, axis=0), away])
+def views_anywhere(rng: np.random.Generator, positions: Float64) -> Float64:
+    """Upright poses (N, 4, 4) at positions (N, 3), looking anywhere but straight up or down."""
     yaw = rng.uniform(-np.pi, np.pi, len(positions))
     pitch = rng.uniform(-_PITCH_RAD, _PITCH_RAD, len(positions))
     forward = np.stack(

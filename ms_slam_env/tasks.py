@@ -6,6 +6,7 @@ Our own stand here, each with a Gymnasium id (:data:`ms_slam_env.TASK_IDS`); oth
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -51,9 +52,12 @@ def room() -> Task:
 def home() -> Task:
     """A free camera, 600 steps in a dwelling of several rooms.
 
-    ``nbv`` had mapped 270,000 surfels after 250 steps; by default there is room for 400,000.
+    A step is 30 cm and 24 degrees, in three frames: as far from frame to frame as in `room`, and
+    far enough to come through a dwelling. ``nbv`` had mapped 270,000 surfels after 250 steps of
+    12 cm; by default there is room for 400,000.
     """
-    options = {"slam_config": {"max_surfels": 2_000_000}}
+    steps = {"step_m": 0.3, "step_rad": math.radians(24), "frames_per_action": 3}
+    options = {**steps, "slam_config": {"max_surfels": 2_000_000}}
     return Task(("home",), steps=600, reference="scene", options=options)
 
 

@@ -3,7 +3,7 @@
 from ms_slam_env.mapping.expected_gain import expected_gain
 from ms_slam_env.mapping.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from ms_slam_env.mapping.occupancy_map import OccupancyMap
-from ms_slam_env.mapping.reachability import reachable_positions
+from ms_slam_env.mapping.reachability import Ways, reachable_positions, shortest_ways
 from ms_slam_env.mapping.surroundings import surrounding_occupancy
 from ms_slam_env.mapping.view_information import view_information
 
@@ -13,8 +13,10 @@ __all__ = [
     "UNKNOWN",
     "OccupancyGrid",
     "OccupancyMap",
+    "Ways",
     "expected_gain",
     "reachable_positions",
+    "shortest_ways",
     "surrounding_occupancy",
     "view_information",
 ]

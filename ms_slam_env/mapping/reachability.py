@@ -1,10 +1,14 @@
-"""Where a camera can go through space that is known to be free."""
+"""Where a camera can go through space that is known to be free, and how far that is."""
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, sparse
+from scipy.sparse.csgraph import dijkstra
 
 from ms_slam_env.mapping.occupancy_grid import OccupancyGrid
 
@@ -30,3 +34,58 @@ def reachable_positions(grid: OccupancyGrid, position: Float64, radius_m: float)
         return np.zeros((0, 3))
     nearest = inside[np.argmin(((inside + low - here) ** 2).sum(axis=1))]
     return grid.centres_of(np.argwhere(regions == regions[tuple(nearest)]) + low)
+
+
+@dataclass(frozen=True)
+class Ways:
+    """The shortest ways from one place to N others.
+
+    Attributes:
+        positions: (N, 3) metres; the first is where the ways begin.
+        lengths: (N,) metres of the way to each.
+        before: (N,) the position before each on its way; negative for the first.
+    """
+
+    positions: Float64
+    lengths: Float64
+    before: NDArray[np.int32]
+
+    def to(self, end: int) -> Float64:
+        """Positions (K, 3) of the way to position ``end``, where it begins the first."""
+        indices = [end]
+        while self.before[indices[-1]] >= 0:
+            indices.append(int(self.before[indices[-1]]))
+        return self.positions[indices[::-1]]
+
+
+def shortest_ways(grid: OccupancyGrid, position: Float64, radius_m: float) -> Ways:
+    """Ways (Dijkstra's) from ``position`` (3,) through the cells that `reachable_positions` gives.
+
+    Every other cell along each axis is a node, joined to those of the 26 around it: two cells with
+    free neighbours have none but free cells between them. Of the nodes only those that can be come
+    to are kept.
+    """
+    cells = grid.cells_of(reachable_positions(grid, position, radius_m))
+    nodes = cells[(cells % 2 == grid.cells_of(position) % 2).all(axis=1)] // 2
+    if not len(nodes):
+        return Ways(position[None].copy(), np.zeros(1), np.full(1, -1, np.int32))
+    low = nodes.min(axis=0) - 1
+    index = np.full(nodes.max(axis=0) - low + 2, -1)
+    index[tuple((nodes - low).T)] = np.arange(len(nodes))
+    lengths = sparse.csr_array((len(nodes), len(nodes)))
+    for step in _HALF_OF_26:
+        others = index[tuple((nodes - low + step).T)]
+        joined = np.flatnonzero(others >= 0)
+        metres = np.full(len(joined), 2 * grid.cell_m * math.sqrt((step**2).sum()))
+        lengths += sparse.csr_array((metres, (joined, others[joined])), shape=lengths.shape)
+    centres = grid.centres_of(2 * nodes + grid.cells_of(position) % 2)
+    first = int(np.argmin(((centres - position) ** 2).sum(axis=1)))
+    found, before = dijkstra(lengths, directed=False, indices=first, return_predecessors=True)
+    order = np.argsort(found, kind="stable")[: np.isfinite(found).sum()]
+    place = np.full(len(nodes), -1, np.int32)
+    place[order] = np.arange(len(order))
+    earlier = np.where(before[order] < 0, -1, place[np.maximum(before[order], 0)])
+    return Ways(centres[order], found[order], earlier.astype(np.int32))
+
+
+_HALF_OF_26 = np.argwhere(np.ones((3, 3, 3)))[14:] - 1

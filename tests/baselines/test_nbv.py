@@ -9,9 +9,9 @@ from ms_slam_baselines.nbv import NextBestView
 from ms_slam_baselines.trackability import SCALE, image_motion, slip_risk
 from ms_slam_baselines.view_goals import (
     distance_in_steps,
-    draw_goals,
     frontiers,
     poses_between,
+    views_anywhere,
     views_of,
 )
 
@@ -20,7 +20,7 @@ from ms_slam_env.camera import xtion
 from ms_slam_env.env.planners import make_planner
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at, make_pose, relative_angle, so3_exp
-from ms_slam_env.mapping import FREE, UNKNOWN, OccupancyGrid
+from ms_slam_env.mapping import FREE, UNKNOWN, OccupancyGrid, shortest_ways
 from ms_slam_env.slam.base import Views
 
 STEPS = 0.12, math.radians(12)
@@ -76,10 +76,11 @@ def test_admissible_motions_keep_overlap_and_distance_and_do_not_risk_much(episo
         for n in range(len(seen_from))
     ]
     risks = slip_risk(views, seen_from)
-    least = min(risk for risk, fit in zip(risks[2:], fits[2:], strict=True) if fit)
-    for n, possible in enumerate(env.action_masks()):
-        follows = risks[n + 1] <= max(planner.risk, 1.3 * least)
-        assert found[n] == (n > 0 and possible and fits[n + 1] and follows)
+    rolls = (1, 2)
+    others = [n for n in range(1, 49) if n not in rolls and env.action_masks()[n] and fits[n + 1]]
+    least = min(risks[n + 1] for n in others)
+    for n in range(49):
+        assert found[n] == (n in others and risks[n + 1] <= max(planner.risk, 1.3 * least))
     assert found.any()
 
 
@@ -165,18 +166,68 @@ def test_distances_are_those_of_each_pose():
         np.testing.assert_allclose(found, [metres / STEPS[0], turn / STEPS[1]], atol=1e-6)
 
 
-def test_goals_are_upright_poses_in_free_space():
-    rng = np.random.default_rng(1)
-    free = rng.uniform(-1, 1, (50, 3))
-    here = make_pose(np.eye(3), [0.1, 0.2, 0.3])
-    goals = draw_goals(rng, here, free, 90)
-    assert len(goals) == 120
+def test_goals_are_upright_poses_where_the_camera_can_come_to(episode):
+    planner = episode[2]
+    here = planner.env.episode.T_world_camera_estimate
+    goals, worth = planner.drawn_goals(here)
+    assert len(goals) == len(worth) == planner.goals + planner.goals // 3
     for goal in goals:
         upright = look_at(goal[:3, 3], goal[:3, 3] + goal[:3, 2])
         np.testing.assert_allclose(goal, upright, atol=1e-9)
-    assert (goals[:30, :3, 3] == here[:3, 3]).all()
-    assert {tuple(p) for p in goals[30:, :3, 3]} <= {tuple(p) for p in free}
-    assert len(draw_goals(rng, here, np.zeros((0, 3)), 90)) == 30
+    in_place = planner.goals // 3
+    assert (goals[:in_place, :3, 3] == here[:3, 3]).all()
+    known = {tuple(p) for p in planner.ways.positions}
+    assert {tuple(p) for p in goals[in_place:, :3, 3]} <= known
+    assert views_anywhere(np.random.default_rng(0), np.zeros((0, 3))).shape == (0, 4, 4)
+
+
+def two_rooms():
+    """Known free space of 4 x 2 x 2 m, a wall in the middle with a door at its end."""
+    grid = OccupancyGrid()
+    grid.first = np.zeros(3, dtype=np.int64)
+    grid.log_odds = np.full((40, 20, 20), -1, dtype=np.int8)
+    grid.log_odds[20, :14] = 3
+    grid.blanks = np.zeros_like(grid.log_odds)
+    return grid
+
+
+def test_the_way_to_a_goal_behind_a_wall_leads_through_the_door(episode):
+    planner = episode[2]
+    kept = planner.map.grid, planner.ways, planner.way, planner.goal
+    planner.map.grid = two_rooms()
+    R = look_at([0, 0, 0], [1, 0, 0])[:3, :3]
+    here, planner.goal = make_pose(R, [1.55, 0.55, 1.05]), make_pose(R, [2.55, 0.55, 1.05])
+    planner.ways = shortest_ways(planner.map.grid, here[:3, 3], 3.0)
+    nearest = np.linalg.norm(planner.ways.positions - planner.goal[:3, 3], axis=1).argmin()
+    planner.way = planner.ways.to(int(nearest))
+    assert planner.steps_to_goal(here) > 1.8 / STEPS[0]  # 1 m as the crow flies
+    first = planner.next_on_way(here)
+    assert first[1, 3] > here[1, 3] + 0.3  # along the wall
+    assert first[0, 3] < 2.0
+    np.testing.assert_array_equal(planner.next_on_way(make_pose(R, [2.55, 0.9, 1])), planner.goal)
+    planner.map.grid, planner.ways, planner.way, planner.goal = kept
+
+
+def test_a_goal_that_comes_no_nearer_is_given_up_and_more_is_risked(episode):
+    planner = episode[2]
+    here = planner.env.episode.T_world_camera_estimate
+    planner.goal, planner.way = make_pose(here[:3, :3], here[:3, 3] + 1.0), here[None, :3, 3]
+    planner.begun, planner.age, planner.given_up = planner.steps_to_goal(here), 0, 0
+    planner.judge_goal(here)
+    assert planner.goal is not None
+    planner.age, goal = planner.replan, planner.goal
+    planner.judge_goal(here)
+    assert planner.goal is None
+    assert planner.given_up == 1
+    assert not planner.is_new(goal[None], here).any()
+    poses, risk = planner.env.candidate_poses(), planner.risk
+    planner.risk = 1e-6
+    few = planner.admissible(poses)
+    planner.given_up = 20
+    more = planner.admissible(poses)
+    planner.given_up, planner.risk = 0, risk
+    assert (more >= few).all()
+    assert more.sum() > few.sum()
 
 
 def test_the_way_to_a_pose_is_straight_and_even():

@@ -7,7 +7,14 @@ from hypothesis import strategies as st
 
 from ms_slam_env.camera import xtion
 from ms_slam_env.geometry import look_at, make_pose, so3_exp, transform_points
-from ms_slam_env.mapping import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, reachable_positions
+from ms_slam_env.mapping import (
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    OccupancyGrid,
+    reachable_positions,
+    shortest_ways,
+)
 
 K = xtion("80x60").scaled(0.5)
 WALL = np.full(K.shape, 2.0, dtype=np.float32)
@@ -124,6 +131,41 @@ def flood_fill(grid, start, radius):
                 seen.add(tuple(cell + axis))
                 todo.append(cell + axis)
     return {tuple(int(n) for n in cell) for cell in seen}
+
+
+def test_ways_are_as_short_as_by_relaxing_every_edge_until_nothing_changes():
+    rng = np.random.default_rng(0)
+    grid = OccupancyGrid()
+    grid.first = np.array([3, -2, 5])
+    grid.log_odds = np.full((24, 22, 12), -1, dtype=np.int8)
+    for x, y in rng.integers(2, 20, (12, 2)):
+        grid.log_odds[x, y] = 3
+    grid.log_odds[14, :16] = 3
+    grid.blanks = np.zeros_like(grid.log_odds)
+    start = grid.centres_of(np.array([4, 5, 6]))
+    ways = shortest_ways(grid, start, 5.0)
+    np.testing.assert_allclose(ways.positions[0], start)
+    apart = np.linalg.norm(ways.positions[:, None] - ways.positions[None], axis=-1)
+    edges = np.where(apart < 0.2 * np.sqrt(3) + 1e-6, apart, np.inf)
+    lengths = np.where(np.arange(len(apart)) == 0, 0.0, np.inf)
+    while True:
+        shorter = (lengths[:, None] + edges).min(axis=0)
+        if (shorter >= lengths).all():
+            break
+        lengths = np.minimum(lengths, shorter)
+    np.testing.assert_allclose(ways.lengths, lengths, atol=1e-9)
+    assert (ways.positions[:, 0] > 1.8).any()  # behind the wall
+    for end in (0, len(lengths) // 2, len(lengths) - 1):
+        legs = np.diff(ways.to(end), axis=0)
+        assert np.linalg.norm(legs, axis=1).sum() == pytest.approx(lengths[end])
+    free = {tuple(cell) for cell in grid.cells_of(reachable_positions(grid, start, 5.0))}
+    assert {tuple(cell) for cell in grid.cells_of(ways.positions)} <= free
+
+
+def test_where_nothing_is_known_the_way_ends_where_it_begins():
+    ways = shortest_ways(OccupancyGrid(), np.ones(3), 2.5)
+    np.testing.assert_array_equal(ways.to(0), np.ones((1, 3)))
+    assert ways.lengths.tolist() == [0]
 
 
 def test_nothing_known_nowhere_to_go():
