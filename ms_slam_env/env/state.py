@@ -66,8 +66,7 @@ def check_same_settings(saved: Any, own: Mapping[str, Any]) -> None:
     for name, value in own.items():
         if type(saved[name]) is not type(value) or not _is_equal(saved[name], value):
             raise InputError(
-                f"the state was saved with {name} = {saved[name]!r}, "
-                f"this environment has {value!r}"
+                f"the state was saved with {name} = {saved[name]!r}, this environment has {value!r}"
             )
 
 
