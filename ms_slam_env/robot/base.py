@@ -42,7 +42,7 @@ class MotionResult:
         turn = so3_log(motion[:3, :3])
         shares = np.arange(1, frames) / frames
         parts = [make_pose(so3_exp(share * turn), share * motion[:3, 3]) for share in shares]
-        poses = np.stack([start @ part for part in [*parts, motion]])
+        poses: Float64 = np.stack([start @ part for part in [*parts, motion]])
         times_s = FRAME_PERIOD_S * np.arange(1, frames + 1)
         return MotionResult(made, poses, poses.copy(), times_s)
 
