@@ -43,7 +43,7 @@ class MotionResult:
         shares = np.arange(1, frames) / frames
         parts = [make_pose(so3_exp(share * turn), share * motion[:3, 3]) for share in shares]
         poses: Float64 = np.stack([start @ part for part in [*parts, motion]])
-        times_s = FRAME_PERIOD_S * np.arange(1, frames + 1)
+        times_s = FRAME_PERIOD_S * np.arange(1, frames + 1, dtype=np.float64)
         return MotionResult(made, poses, poses.copy(), times_s)
 
 
