@@ -30,6 +30,9 @@ class Arguments:
     """Take every n-th frame."""
     paper: bool = False
     """The paper's histograms (256 levels, no smoothing) in place of this package's defaults."""
+    measure: str = "kl"
+    """kl (the paper's), windowed-kl, earth-movers (exact), or wasserstein: how far observations of
+    the same surface move (Saeedi et al., ICRA 2019; needs true poses)."""
     out: Path = Path("results/divergence")
     """Folder of the results."""
 
@@ -46,8 +49,12 @@ def main(arguments: Sequence[str]) -> int:
         raise InputError("no sequence given")
     config = DivergenceConfig.paper() if args.paper else DivergenceConfig()
     opened = [open_sequence(name, args.image_size, layout=args.layout) for name in args.sequences]
-    measured = [sequence_divergence(one, config, args.every) for one in opened]
-    settings = {"divergence": asdict(config), "image_size": args.image_size, "every": args.every}
+    measured = [sequence_divergence(one, config, args.every, args.measure) for one in opened]
+    settings = {
+        "divergence": {**asdict(config), "measure": args.measure},
+        "image_size": args.image_size,
+        "every": args.every,
+    }
     print(write_divergences(measured, settings, args.out).as_markdown())
     print(f"written: {args.out}/divergence.json, table.md, divergence.png", file=sys.stderr)
     return 0

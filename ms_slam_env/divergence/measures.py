@@ -6,6 +6,8 @@ from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
+from scipy.optimize import linprog
+from scipy.sparse import coo_array
 
 from ms_slam_env.divergence.counting import HistogramCounter, Histograms
 from ms_slam_env.divergence.sphere import bin_directions
@@ -61,11 +63,6 @@ class WindowedKLDivergence(KLDivergence):
     """
 
 
-REGULARISATION_RAD = 0.03
-ITERATIONS = 200
-SELF_ITERATIONS = 40  # the symmetric problem converges much faster
-
-
 def earth_movers_1d(p: Float64, q: Float64) -> Float64:
     """Earth mover's distance (...) of distributions (..., K) over K equal bins of [0, 1].
 
@@ -77,38 +74,37 @@ def earth_movers_1d(p: Float64, q: Float64) -> Float64:
 class SphereTransport:
     """Transport between distributions over fixed directions; the ground distance is the angle.
 
-    The exact distance is a linear program of L^2 variables. This is Sinkhorn's entropic
-    approximation with its bias removed (Cuturi, NeurIPS 2013; Feydy et al., AISTATS 2019,
-    equation (3)): S(p, q) = OT(p, q) - OT(p, p) / 2 - OT(q, q) / 2. It keeps the order of
-    distances but is too small: a test holds it between 0.6 and 1 times the exact distance for
-    rotations of 5 to 20 degrees, the larger the closer; at 1 degree it can be a fifth.
+    A linear programme, solved exactly by HiGHS' dual simplex. What two distributions have in common
+    stays where it is, because the angle is a metric, so that only the bins in which one has more
+    than the other are sources, and the rest sinks: at most L^2 / 4 variables. 2 ms a pair with 22
+    bins, 7 ms with 86, on one core.
     """
 
     def __init__(self, directions: Float64) -> None:
         """Prepare for unit vectors (L, 3)."""
         self.angles = np.arccos(np.clip(directions @ directions.T, -1.0, 1.0))
-        self._kernel = np.exp(-self.angles / REGULARISATION_RAD)
 
     def distance(self, p: Float64, q: Float64) -> Float64:
-        """Distance (B,) in radians between positive distributions (B, L) and (1 or B, L)."""
-        self_cost = (self._self_transport(p) + self._self_transport(q)) / 2
-        return np.maximum(self._transport(p, q) - self_cost, 0.0)
+        """Distance (B,) in radians between distributions (B, L) and (1 or B, L)."""
+        return np.array([self._cost(row) for row in np.atleast_2d(p - q)])
 
-    def _transport(self, p: Float64, q: Float64) -> Float64:
-        """Dual value (B,) of the entropic transport of p (B, L) onto q (1 or B, L)."""
-        left = np.ones_like(p)
-        for _ in range(ITERATIONS):
-            right = q / (left @ self._kernel)
-            left = p / (right @ self._kernel)
-        dual = (p * np.log(left)).sum(axis=1) + (q * np.log(right)).sum(axis=1)
-        return REGULARISATION_RAD * dual
-
-    def _self_transport(self, p: Float64) -> Float64:
-        """Dual value (B,) of the entropic transport of p (B, L) onto itself."""
-        scaling = np.ones_like(p)
-        for _ in range(SELF_ITERATIONS):
-            scaling = np.sqrt(scaling * p / (scaling @ self._kernel))
-        return 2 * REGULARISATION_RAD * (p * np.log(scaling)).sum(axis=1)
+    def _cost(self, difference: Float64) -> float:
+        """Least sum of mass times angle that levels a difference (L,) of distributions."""
+        sources, sinks = np.flatnonzero(difference > 0), np.flatnonzero(difference < 0)
+        if not (len(sources) and len(sinks)):
+            return 0.0
+        m, n = len(sources), len(sinks)
+        arc = np.arange(m * n)
+        rows = np.concatenate([arc // n, m + arc % n])
+        moved = coo_array((np.ones(2 * m * n), (rows, np.concatenate([arc, arc]))))
+        given, taken = difference[sources], -difference[sinks]
+        masses = np.concatenate([given, taken * (given.sum() / taken.sum())])  # but for rounding
+        costs = self.angles[np.ix_(sources, sinks)].ravel()
+        # One equation follows from the others.
+        found = linprog(costs, A_eq=moved.tocsr()[:-1], b_eq=masses[:-1], method="highs-ds")
+        if found.x is None:
+            raise RuntimeError(f"earth mover's distance: {found.message}")
+        return max(0.0, float(found.fun))
 
 
 class EarthMoversDivergence(Divergence):
@@ -128,5 +124,5 @@ class EarthMoversDivergence(Divergence):
         return earth_movers_1d(current[:, 0], reference[:, 0])
 
     def compare_normals(self, current: Float64, reference: Float64) -> Float64:
-        """Debiased Sinkhorn distance on the sphere, radians."""
+        """Exact distance on the sphere, radians."""
         return self._transport.distance(current[:, 0], reference[:, 0])

@@ -7,7 +7,7 @@ divergence, such as mean and variance, to the sequence"; "evaluated per unit of 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
-from ms_slam_env.divergence import DivergenceConfig, make_divergence
-from ms_slam_env.errors import InputError
+from ms_slam_env.divergence import MEASURES, DivergenceConfig, make_divergence
+from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.evaluation.observation_distance import observation_distance
 from ms_slam_env.evaluation.trajectory_charts import thinned
+from ms_slam_env.geometry import invert
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.results import Results, write_result_folder
 from ms_slam_env.report.tables import Table, Value, make_table
@@ -28,6 +30,14 @@ from ms_slam_env.sequences.recording import Recording
 Float64 = NDArray[np.float64]
 
 KINDS = ("intensity", "depth")
+WASSERSTEIN = "wasserstein"
+"""The measure of `observation_distance`, which needs true poses."""
+ALL_MEASURES = (*MEASURES, WASSERSTEIN)
+_UNITS: Mapping[str, Mapping[str, str]] = {
+    "earth-movers": {"intensity": "share of the grey range", "depth": "rad"},
+    WASSERSTEIN: {"observation": "m"},
+}
+"""Units by kind of the measures that are no divergence in nats."""
 _WORST = 3  # frames of each kind that are named
 
 _ABOUT = (
@@ -47,6 +57,8 @@ class SequenceDivergence:
         gaps_s: (T,) seconds between the two frames of each pair.
         frames: (T,) number, in the whole sequence, of the later frame of each pair.
         files: (T,) name of its depth image; empty for a rendered sequence.
+        measure: one of ``ALL_MEASURES``. With ``earth-movers`` intensity is a share of the grey
+            range and depth an angle; ``wasserstein`` has one column, metres.
     """
 
     name: str
@@ -55,6 +67,22 @@ class SequenceDivergence:
     gaps_s: Float64
     frames: NDArray[np.int64]
     files: Sequence[str]
+    measure: str = MEASURES[0]
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """What the columns of ``divergences`` are of."""
+        return tuple(self.units) or KINDS
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Unit by kind; empty where all are in nats."""
+        return _UNITS.get(self.measure, {})
+
+    @property
+    def word(self) -> str:
+        """What keys of the registry call the values."""
+        return "distance" if self.units else "divergence"
 
     def statistics(self) -> dict[str, dict[str, float | None]]:
         """Of each kind: per frame ``max, mean, variance, std``; ``..._per_s`` those of the rates.
@@ -65,12 +93,18 @@ class SequenceDivergence:
         """
         return {
             kind: statistics_of(self.divergences[:, column], self.gaps_s)
-            for column, kind in enumerate(KINDS)
+            for column, kind in enumerate(self.kinds)
         }
 
 
 def statistics_of(values: Float64, gaps_s: Float64) -> dict[str, float | None]:
-    """Statistics of divergences (T,) between frames ``gaps_s`` (T,) apart, as described above."""
+    """Statistics of divergences (T,) between frames ``gaps_s`` (T,) apart, as described above.
+
+    Pairs of which nothing is known are left out; None where that is all.
+    """
+    known = ~np.isnan(values)
+    if known.any():
+        values, gaps_s = values[known], gaps_s[known]
     rates = values / gaps_s
     mean_rate = values.sum() / gaps_s.sum()
     rate_variance = np.average((rates - mean_rate) ** 2, weights=gaps_s)
@@ -104,15 +138,44 @@ def consecutive_divergences(
     return np.array(rows).reshape(-1, len(measures), len(KINDS))
 
 
+def consecutive_distances(
+    frames: Iterable[RGBDFrame], poses: Float64, intrinsics: Intrinsics
+) -> Float64:
+    """`observation_distance` (T,) of each of T + 1 frames from the one before.
+
+    ``poses`` (T + 1, 4, 4) are the true ones.
+    """
+    found: list[float] = []
+    before: RGBDFrame | None = None
+    for k, frame in enumerate(frames):
+        if before is not None:
+            motion = invert(poses[k - 1]) @ poses[k]
+            found.append(observation_distance(before, frame, motion, intrinsics))
+        before = frame
+    return np.array(found)
+
+
 def sequence_divergence(
-    sequence: RGBDSequence, config: DivergenceConfig | None = None, every: int = 1
+    sequence: RGBDSequence,
+    config: DivergenceConfig | None = None,
+    every: int = 1,
+    measure: str | None = None,
 ) -> SequenceDivergence:
     """Divergence of every frame from the one before, taking every ``every``-th frame.
 
+    ``measure``, one of ``ALL_MEASURES``, is by default that of the configuration.
+
     Raises:
         InputError: fewer than two frames are left, none has a depth reading, or an image cannot
-            be read.
+            be read; an unknown measure; ``wasserstein`` where a true pose is not known.
     """
+    if measure is not None and measure not in ALL_MEASURES:
+        raise unknown("measure", measure, ALL_MEASURES)
+    if measure == WASSERSTEIN and not sequence.known.all():
+        raise InputError(
+            f"sequence {sequence.name}: the measure {WASSERSTEIN} needs the true pose of every "
+            f"frame, and {int((~sequence.known).sum())} of {len(sequence)} have none"
+        )
     if isinstance(every, bool) or not isinstance(every, int) or every < 1:
         raise InputError(f"every must be an integer >= 1, got {every!r}")
     picked = range(0, len(sequence), every)
@@ -124,9 +187,13 @@ def sequence_divergence(
     frames = (sequence.frames[k] for k in tqdm(picked, desc=sequence.name, unit="frame"))
     config, K = config or DivergenceConfig(), sequence.intrinsics
     sequence.check_depth()
-    values = consecutive_divergences(frames, K, [config])[:, 0]
-    if not sequence.has_color:
-        values[:, 0] = np.nan
+    if measure == WASSERSTEIN:
+        values = consecutive_distances(frames, sequence.poses[list(picked)], K)[:, None]
+    else:
+        config = config if measure is None else replace(config, measure=measure)
+        values = consecutive_divergences(frames, K, [config])[:, 0]
+        if not sequence.has_color:
+            values[:, 0] = np.nan
     times = sequence.timestamps[list(picked)]
     later = np.arange(len(sequence))[::every][1:]
     recording = sequence.frames
@@ -134,7 +201,13 @@ def sequence_divergence(
         recording.entries[k].depth.name if isinstance(recording, Recording) else "" for k in later
     ]
     return SequenceDivergence(
-        sequence.name, times[1:] - times[0], values, np.diff(times), later, files
+        sequence.name,
+        times[1:] - times[0],
+        values,
+        np.diff(times),
+        later,
+        files,
+        measure or config.measure,
     )
 
 
@@ -149,8 +222,8 @@ def as_metrics(measured: Sequence[SequenceDivergence]) -> list[dict[str, Any]]:
             "frames": len(sequence.times) + 1,
             "statistics": _lines(sequence),
             "since_start_s": sequence.times.tolist(),
-            **{f"{kind}_divergence": sequence.divergences[:, k].tolist()
-               for k, kind in enumerate(KINDS)},
+            **{f"{kind}_{sequence.word}": sequence.divergences[:, k].tolist()
+               for k, kind in enumerate(sequence.kinds)},
         }
         for sequence in measured
     ]  # fmt: skip
@@ -175,14 +248,15 @@ def worst_table(measured: Sequence[SequenceDivergence]) -> Table:
             "divergence": kind,
             "frame": int(sequence.frames[k]),
             "since_start_s": float(sequence.times[k]),
-            "change": float(sequence.divergences[k, column]),
+            ("distance" if sequence.units else "change"): float(sequence.divergences[k, column]),
             "frame_file": sequence.files[k],
         }
         for sequence in measured
-        for column, kind in enumerate(KINDS)
+        for column, kind in enumerate(sequence.kinds)
         for k in _worst(sequence.divergences[:, column])
     ]
-    columns = ("sequence", "divergence", "frame", "since_start_s", "change", "frame_file")
+    value = "distance" if measured[0].units else "change"
+    columns = ("sequence", "divergence", "frame", "since_start_s", value, "frame_file")
     return make_table(columns, lines, "Hardest frames")
 
 
@@ -195,7 +269,7 @@ def _worst(values: Float64) -> list[int]:
 def chart(measured: Sequence[SequenceDivergence]) -> Chart:
     """The divergences over time, a line for each sequence; none of intensity without colour."""
     panels = []
-    for k, kind in enumerate(KINDS):
+    for k, kind in enumerate(measured[0].kinds):
         series = []
         for sequence in measured:
             values = sequence.divergences[:, k]
@@ -204,14 +278,18 @@ def chart(measured: Sequence[SequenceDivergence]) -> Chart:
                 series.append(Series(sequence.name, sequence.times[picked].tolist(),
                                      values[picked].tolist(), mode="lines"))  # fmt: skip
         if series:
-            panels.append(Panel("since_start_s", f"{kind}_divergence", series))
+            panels.append(Panel("since_start_s", f"{kind}_{measured[0].word}", series))
     return Chart("divergence", "Divergence over time", "From frame to frame.", panels)
 
 
 def _lines(sequence: SequenceDivergence) -> list[dict[str, Any]]:
     """The statistics of each kind, by keys of the registry."""
     return [
-        {"divergence": kind, **{f"divergence_{name}": value for name, value in numbers.items()}}
+        {
+            "divergence": kind,
+            **({"distance_unit": sequence.units[kind]} if sequence.units else {}),
+            **{f"{sequence.word}_{name}": value for name, value in numbers.items()},
+        }
         for kind, numbers in sequence.statistics().items()
     ]
 

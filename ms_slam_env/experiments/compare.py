@@ -10,10 +10,12 @@ from ms_slam_env import slam
 from ms_slam_env.camera import parse_image_size
 from ms_slam_env.config import Checked, bounded, parse_named
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.experiments.harness.command_runs import check_command, is_command
 from ms_slam_env.experiments.harness.compare_runs import (
     CompareSpec,
     TrajectoryPattern,
     digest,
+    judge_command,
     judge_trajectory,
     parse_trajectories,
     run_backend,
@@ -59,7 +61,9 @@ class Compare(Experiment, Checked):
     """Folders, or scene:seed[:word[+word ...]]."""
     backends: tuple[str, ...] = (*slam.BACKENDS, *PEERS)
     """NAME, parameters appended as in surfel,loop_closure=deformation; odometry,stock=true is
-    OpenCV's odometry as it is, volumetric,stock=true Open3D's dense SLAM."""
+    OpenCV's odometry as it is, volumetric,stock=true Open3D's dense SLAM. Any other system is
+    "command:PROGRAM --in {sequence} --out {trajectory}": it reads a folder in the TUM layout and
+    writes a TUM trajectory."""
     image_sizes: tuple[str, ...] = ("160x120", "320x240")
     """Such as 160x120."""
     frames: int = bounded(200, 10, 100_000)
@@ -70,6 +74,8 @@ class Compare(Experiment, Checked):
     """Mean speed of rotation, where it turns."""
     threads: int = bounded(1, 1, 1024)
     """Cores that a backend may use."""
+    command_timeout_s: float = bounded(3600.0, 0.1, 1e6)
+    """Seconds after which a command is stopped."""
     repeats: int = bounded(1, 1, 1000)
     """Runs of each; the tables show medians."""
     trajectories: tuple[str, ...] = ()
@@ -91,8 +97,10 @@ class Compare(Experiment, Checked):
         for text in self.sequences:
             check_sequence(text)
         for text in self.backends:
-            name, _ = parse_named(text, "backend")
-            slam.POINT.find(name)
+            if is_command(text):
+                check_command(text)
+            else:
+                slam.POINT.find(parse_named(text, "backend")[0])
         for size in self.image_sizes:
             parse_image_size(size)
         names = [*self.backends, *(pattern.name for pattern in self._patterns())]
@@ -112,7 +120,13 @@ class Compare(Experiment, Checked):
         for repeat in range(self.repeats):
             for sequence in self.sequences:
                 for size in self.image_sizes:
-                    made = [CompareSpec(sequence, b, size, *shared, repeat) for b in self.backends]
+                    made = [
+                        CompareSpec(
+                            *(sequence, b, size, *shared, repeat),
+                            timeout_s=self.command_timeout_s,
+                        )
+                        for b in self.backends
+                    ]
                     files = [(one.name, one.file(sequence)) for one in self._patterns()]
                     found += made + [
                         CompareSpec(sequence, name, size, *shared, 0, str(file), digest(file))
@@ -140,7 +154,9 @@ class Compare(Experiment, Checked):
     def run(spec: CompareSpec) -> dict[str, Any]:
         """Measure a backend, or the trajectory of another system."""
         limit_threads(spec.threads)
-        return judge_trajectory(spec) if spec.trajectory else run_backend(spec)
+        if spec.trajectory:
+            return judge_trajectory(spec)
+        return judge_command(spec) if is_command(spec.backend) else run_backend(spec)
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
         """For each image size every sequence with medians, then differences in pairs."""
@@ -155,4 +171,5 @@ class Compare(Experiment, Checked):
             own = [row for row in timed if row["spec"]["image_size"] == size]
             panel = scatter(own, "cpu_ms_median", "ate_m", "backend", log="xy")
             panels.append(replace(panel, title=size))
-        return [Chart("compare", "Error against time", "One mark a sequence.", panels)]
+        about = "Error against time", "One mark a sequence."
+        return [Chart("compare", *about, panels)] if panels else []

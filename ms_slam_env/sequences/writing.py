@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from ms_slam_env.input_files import read_json
 from ms_slam_env.interrupts import kept
 from ms_slam_env.output_files import write_bytes, write_text
 from ms_slam_env.sequences.rendering import RenderedSequence
+from ms_slam_env.sequences.sequence import Sequence
 from ms_slam_env.sequences.trajectory import write_trajectory
 
 DEPTH_SCALE = 5000.0
@@ -74,9 +75,8 @@ def write_sequence(
     with kept(f"finished frames are kept in {partial}; the same command goes on"):
         for index, name in enumerate(tqdm(names, desc=sequence.name, unit="frame")):
             _write_frame(partial, name, sequence, index, with_truth)
-    for kind in ("rgb", "depth", *(("depth_true", "labels") if with_truth else ())):
-        lines = "".join(f"{name} {kind}/{name}.png\n" for name in names)
-        write_text(partial / f"{kind}.txt", f"# timestamp filename\n{lines}")
+    truths = ("depth_true", "labels") if with_truth else ()
+    _write_lists(partial, names, ("rgb", "depth", *truths))
     if with_truth:
         objects = enumerate(sequence.frames.labels, start=1)
         lines = "".join(f"{value} {label}\n" for value, label in objects)
@@ -89,6 +89,27 @@ def write_sequence(
     os.replace(partial / UNFINISHED, partial / DESCRIPTION)
     os.replace(partial, target)
     return True
+
+
+def write_frames(sequence: Sequence, folder: Path) -> None:
+    """Write what a camera gives of a sequence into a folder, in the TUM layout, and no true pose.
+
+    ``rgb/TIME.png``, ``depth/TIME.png``, ``rgb.txt``, ``depth.txt`` and ``intrinsics.txt``, as
+    `write_sequence`; TIME in seconds with six decimals.
+    """
+    names = []
+    for frame in sequence.frames:
+        names.append(f"{frame.timestamp:.6f}")
+        _write_image(folder / f"rgb/{names[-1]}.png", frame.color[:, :, ::-1])
+        _write_image(folder / f"depth/{names[-1]}.png", depth_values(frame.depth))
+    _write_lists(folder, names, ("rgb", "depth"))
+    write_text(folder / "intrinsics.txt", _intrinsics(sequence.intrinsics))
+
+
+def _write_lists(folder: Path, names: Iterable[str], kinds: Iterable[str]) -> None:
+    for kind in kinds:
+        lines = "".join(f"{name} {kind}/{name}.png\n" for name in names)
+        write_text(folder / f"{kind}.txt", f"# timestamp filename\n{lines}")
 
 
 def _is_there(target: Path, content: dict[str, Any]) -> bool:

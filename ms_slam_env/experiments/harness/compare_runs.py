@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,15 @@ from ms_slam_env.evaluation.map_quality import THRESHOLDS_M, map_quality, share_
 from ms_slam_env.evaluation.run_sequence import run_sequence
 from ms_slam_env.evaluation.seen_surface import open_with_surface
 from ms_slam_env.evaluation.trajectory_files import tracked_beside
+from ms_slam_env.experiments.harness.command_runs import run_command
 from ms_slam_env.geometry import invert
-from ms_slam_env.sequences import HandheldPath, associate, open_sequence, read_trajectory
+from ms_slam_env.sequences import (
+    HandheldPath,
+    Sequence,
+    associate,
+    open_sequence,
+    read_trajectory,
+)
 from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S
 
 Float64 = NDArray[np.float64]
@@ -46,6 +54,7 @@ class CompareSpec:
         repeat: runs of one specification are told apart by this number.
         trajectory: TUM file that is judged in place of a backend.
         digest: of what it holds.
+        timeout_s: of a command.
     """
 
     sequence: str
@@ -58,6 +67,7 @@ class CompareSpec:
     repeat: int = 0
     trajectory: str = ""
     digest: str = ""
+    timeout_s: float = 3600.0
 
     @property
     def path(self) -> HandheldPath:
@@ -122,6 +132,24 @@ def run_backend(spec: CompareSpec) -> dict[str, Any]:
     }
 
 
+def judge_command(spec: CompareSpec) -> dict[str, Any]:
+    """Let a program track the sequence, and measure its trajectory and its time.
+
+    Times are of the whole program over the number of frames: its start counts, and its reading of
+    the images. Memory and map are not known.
+    """
+    sequence = _opened(spec)
+    with tempfile.TemporaryDirectory(prefix="ms-slam-compare-") as folder:
+        path = Path(folder) / "trajectory.txt"
+        cost = run_command(spec.backend, sequence, path, spec.timeout_s)
+        found = _judged(path, sequence)
+    return {
+        **found,
+        "ext_ms": 1e3 * cost.ext_s / len(sequence),
+        "cpu_ms_mean": 1e3 * cost.cpu_s / len(sequence),
+    }
+
+
 def judge_trajectory(spec: CompareSpec) -> dict[str, Any]:
     """Measure a trajectory file as if a backend had said its poses; costs and map are not known.
 
@@ -131,9 +159,15 @@ def judge_trajectory(spec: CompareSpec) -> dict[str, Any]:
     Raises:
         InputError: a file that cannot be read, or has fewer than two poses of the sequence.
     """
-    path = Path(spec.trajectory)
+    return _judged(Path(spec.trajectory), _opened(spec))
+
+
+def _opened(spec: CompareSpec) -> Sequence:
+    return open_sequence(spec.sequence, spec.image_size, path=spec.path, with_truth=True)
+
+
+def _judged(path: Path, sequence: Sequence) -> dict[str, Any]:
     times, poses = read_trajectory(path)
-    sequence = open_sequence(spec.sequence, spec.image_size, path=spec.path, with_truth=True)
     own, at = associate(times, sequence.timestamps, MAX_DIFFERENCE_S)
     if len(own) < 2:
         raise InputError(
