@@ -9,19 +9,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
-from ms_slam_env.config import Checked, bounded
+from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, relative_angle
 from ms_slam_env.slam.alignment_check import NO_ALIGNMENT, AcceptanceThresholds
 from ms_slam_env.slam.alignment_measures import DepthImage, check_alignment
 from ms_slam_env.slam.base import BorrowedMap, Float64
 from ms_slam_env.slam.pose_hypotheses import motion_hypotheses
+from ms_slam_env.slam.semi_dense import SemiDenseAligner
 from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
 from ms_slam_env.slam.tracking_template import Attempt, FrameByFrameSlam
 
@@ -40,6 +41,8 @@ class OdometryConfig(Checked):
         least_inliers: share of those that must fit its depth,
         least_alike: share of those that must fit its intensity.
         max_surfels: capacity of the map; None as in ``SurfelConfig``.
+        aligner: what aligns two images: ``opencv`` (depth and intensity of all pixels) or
+            ``semi-dense`` (intensity of pixels with a marked gradient, as LSD-SLAM tracks).
         stock: OpenCV's odometry as it is: every motion that it returns is believed, whatever the
             shares above, nothing is sought in views of the map, and a frame that it cannot align
             becomes the keyframe where the camera was last.
@@ -52,15 +55,26 @@ class OdometryConfig(Checked):
     least_inliers: float = bounded(0.75, 0.0, 1.0)
     least_alike: float = bounded(0.9, 0.0, 1.0)
     max_surfels: int | None = bounded(None, 1000, 50_000_000)
+    aligner: str = chosen("opencv", "opencv", "semi-dense")
     stock: bool = False
 
 
 @dataclass(frozen=True)
 class PreparedImage:
-    """An image and OpenCV's pyramids of it."""
+    """An image and what the aligner made of it."""
 
     image: DepthImage
-    pyramids: cv2.OdometryFrame
+    pyramids: Any
+
+
+class ImageAligner(Protocol):
+    """Finds the motion between two images."""
+
+    def prepare(self, image: DepthImage) -> Any:
+        """What ``align`` takes of an image."""
+
+    def align(self, frame: Any, reference: Any) -> Float64 | None:
+        """T_reference_frame (4, 4), searched from rest, or None if there is none."""
 
 
 class Aligner:
@@ -79,20 +93,20 @@ class Aligner:
             cv2.OdometryType_RGB_DEPTH, settings, cv2.OdometryAlgoType_COMMON
         )
 
-    def prepare(self, image: DepthImage) -> PreparedImage:
+    def prepare(self, image: DepthImage) -> cv2.OdometryFrame:
         """Build the pyramids of an image; ``align`` takes images so prepared."""
         depth = np.where(image.depth > 0, image.depth, np.float32(np.nan))
         grey = np.clip(np.rint(image.intensity), 0, 255).astype(np.uint8)
         pyramids = cv2.OdometryFrame(depth, grey)
         self._odometry.prepareFrame(pyramids)
-        return PreparedImage(image, pyramids)
+        return pyramids
 
-    def align(self, frame: PreparedImage, reference: PreparedImage) -> Float64 | None:
+    def align(self, frame: cv2.OdometryFrame, reference: cv2.OdometryFrame) -> Float64 | None:
         """T_reference_frame (4, 4), or None if OpenCV found none.
 
         The search starts at rest: OpenCV 5 ignores an initial guess.
         """
-        found, T = self._odometry.compute(frame.pyramids, reference.pyramids)
+        found, T = self._odometry.compute(frame, reference)
         if not found or T is None or not np.isfinite(T).all():
             return None
         return np.asarray(T, dtype=np.float64)
@@ -114,7 +128,11 @@ class OdometrySlam(BorrowedMap, FrameByFrameSlam[DepthImage, _Placed]):
 
     def __init__(self, intrinsics: Intrinsics, config: OdometryConfig | None = None) -> None:
         self.config = config or OdometryConfig()
-        self._aligner = Aligner(intrinsics, self.config.depth_cutoff_m)
+        self._aligner: ImageAligner = (
+            SemiDenseAligner(intrinsics)
+            if self.config.aligner == "semi-dense"
+            else Aligner(intrinsics, self.config.depth_cutoff_m)
+        )
         self._judge_views(self.config)
         kept = {name: getattr(self.config, name) for name in ("depth_cutoff_m", "max_surfels")}
         self._map = SurfelSlam(intrinsics, SurfelConfig(**kept))
@@ -138,10 +156,13 @@ class OdometrySlam(BorrowedMap, FrameByFrameSlam[DepthImage, _Placed]):
         depth = np.where(depth <= self.config.depth_cutoff_m, depth, np.float32(0))
         return DepthImage(depth, intensity_image(frame.color).astype(np.float32))
 
+    def _prepared(self, image: DepthImage) -> PreparedImage:
+        return PreparedImage(image, self._aligner.prepare(image))
+
     def _attempts(self, prepared: DepthImage, guess: Float64 | None) -> Iterator[Attempt[_Placed]]:
         assert self._key is not None
         assert self._last is not None
-        frame = self._aligner.prepare(prepared)
+        frame = self._prepared(prepared)
         yield self._align(frame, self._key, self._thresholds)
         if self._last is not self._key:
             yield self._align(frame, self._last, self._thresholds)
@@ -174,12 +195,12 @@ class OdometrySlam(BorrowedMap, FrameByFrameSlam[DepthImage, _Placed]):
         for pose, depth, intensity in zip(poses, views.depth, views.intensity, strict=True):
             image = DepthImage(depth, intensity)
             if image.readings >= self.fewest_readings:
-                yield _Placed(pose, self._aligner.prepare(image))
+                yield _Placed(pose, self._prepared(image))
 
     def _align(
         self, frame: PreparedImage, reference: _Placed, thresholds: AcceptanceThresholds
     ) -> Attempt[_Placed]:
-        T = self._aligner.align(frame, reference.prepared)
+        T = self._aligner.align(frame.pyramids, reference.prepared.pyramids)
         if T is None:
             reason = "no motion aligns the frame with the view before it"
             return Attempt(reference.T_world_image, NO_ALIGNMENT, reason, reference)
@@ -190,7 +211,7 @@ class OdometrySlam(BorrowedMap, FrameByFrameSlam[DepthImage, _Placed]):
 
     def _start_from(self, frame: RGBDFrame, prepared: DepthImage) -> None:
         if prepared.readings >= self.fewest_readings:  # nothing can be aligned with less
-            self._key = self._last = _Placed(self._pose, self._aligner.prepare(prepared))
+            self._key = self._last = _Placed(self._pose, self._prepared(prepared))
         self._map.fuse(frame, self._pose)
 
     def _extend(self, frame: RGBDFrame, prepared: DepthImage, attempt: Attempt[_Placed]) -> None:
@@ -228,7 +249,7 @@ class OdometrySlam(BorrowedMap, FrameByFrameSlam[DepthImage, _Placed]):
         if saved is None:
             return None
         image = DepthImage(saved["depth"].copy(), saved["intensity"].copy())
-        return _Placed(saved["pose"].copy(), self._aligner.prepare(image))
+        return _Placed(saved["pose"].copy(), self._prepared(image))
 
 
 def _save(placed: _Placed | None) -> dict[str, Any] | None:
