@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from ms_slam_baselines.view_goals import distance_in_steps, views_anywhere
+from ms_slam_baselines.view_goals import views_anywhere
 from numpy.typing import NDArray
 
 from ms_slam_env.config import check_range
@@ -19,6 +19,7 @@ from ms_slam_env.mapping import (
     expected_gain,
     shortest_ways,
 )
+from ms_slam_env.mapping.view_goals import distance_in_steps
 
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv

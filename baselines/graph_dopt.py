@@ -8,10 +8,11 @@ import numpy as np
 from ms_slam_baselines.belief import d_optimality
 from ms_slam_baselines.goal_planner import Float64
 from ms_slam_baselines.nbv import NextBestView
-from ms_slam_baselines.view_goals import distance_in_steps, frontiers, poses_between, views_of
+from ms_slam_baselines.view_goals import frontiers, poses_between, views_of
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import transform_points
+from ms_slam_env.mapping.view_goals import distance_in_steps
 
 _AWAY_M = 1.2  # from which a frontier is looked at
 _APART = 3.0  # steps between two keyframes

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from ms_slam_baselines.goal_planner import GoalPlanner
 from ms_slam_baselines.greedy import distance_to_targets
-from ms_slam_baselines.trackability import SCALE
-from ms_slam_baselines.view_goals import distance_in_steps
 from numpy.typing import NDArray
 
 from ms_slam_env.divergence import make_divergence
+from ms_slam_env.mapping.trackability import SCALE
+from ms_slam_env.mapping.view_goals import distance_in_steps
 
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv

@@ -1,4 +1,4 @@
-"""Poses to go to, and how many motions away they are."""
+"""Poses to go to."""
 
 from __future__ import annotations
 
@@ -8,33 +8,18 @@ from scipy import ndimage
 
 from ms_slam_env.geometry import look_at, make_pose, so3_exp, so3_log
 from ms_slam_env.mapping import OccupancyGrid
+from ms_slam_env.mapping.view_goals import upright_poses
 
 Float64 = NDArray[np.float64]
 
 _PITCH_RAD = 0.7
 
 
-def distance_in_steps(poses: Float64, goal: Float64, step_m: float, step_rad: float) -> Float64:
-    """Translations and rotations (N, 2) of one motion each, from ``poses`` (N, 4, 4) to a goal."""
-    metres = np.linalg.norm(poses[:, :3, 3] - goal[:3, 3], axis=1)
-    cosine = (np.einsum("nij,ij->n", poses[:, :3, :3], goal[:3, :3]) - 1) / 2
-    return np.stack([metres / step_m, np.arccos(np.clip(cosine, -1, 1)) / step_rad], axis=1)
-
-
 def views_anywhere(rng: np.random.Generator, positions: Float64) -> Float64:
     """Upright poses (N, 4, 4) at positions (N, 3), looking anywhere but straight up or down."""
     yaw = rng.uniform(-np.pi, np.pi, len(positions))
     pitch = rng.uniform(-_PITCH_RAD, _PITCH_RAD, len(positions))
-    forward = np.stack(
-        [np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)], axis=1
-    )
-    right = np.stack([np.sin(yaw), -np.cos(yaw), np.zeros_like(yaw)], axis=1)
-    poses = np.tile(np.eye(4), (len(positions), 1, 1))
-    poses[:, :3, 0] = right
-    poses[:, :3, 1] = np.cross(forward, right)
-    poses[:, :3, 2] = forward
-    poses[:, :3, 3] = positions
-    return poses
+    return upright_poses(positions, yaw, pitch)
 
 
 def poses_between(start: Float64, end: Float64, number: int) -> Float64:

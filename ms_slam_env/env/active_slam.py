@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from ms_slam_env import slam as slam_backends
 from ms_slam_env.env.actions import ActionDecoder, MotionActions, MotionAndConfigurationActions
 from ms_slam_env.env.camera_feed import CameraFeed, make_camera_feed
-from ms_slam_env.env.config import check_reset, make_config
+from ms_slam_env.env.config import LookaheadConfig, check_reset, make_config
 from ms_slam_env.env.coverage import CoverageGrid
 from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.env.episode import Episode
@@ -29,6 +30,8 @@ from ms_slam_env.env.saved_state import load_state, save_state
 from ms_slam_env.env.simulation import Simulation
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.geometry import check_pose
+from ms_slam_env.mapping.candidates import PredictedViews
+from ms_slam_env.mapping.trackability import SCALE
 from ms_slam_env.robot import Embodiment
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sensor import RGBDSensor
@@ -59,10 +62,11 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
 
     ## Observation space
     Option ``observation``: ``features`` (vector: state, grey histogram, coarse depth, action mask),
-    ``lookahead`` (features and the predicted divergences of every action) or ``rgbd`` (images and
-    state). Only what the robot itself has; see :mod:`ms_slam_env.env.observations`. Where the agent
-    chooses the SLAM configuration, also the one in force, one-hot (K,): at the end of the vector,
-    or as ``slam_configuration``.
+    ``lookahead`` (features and the predicted divergences of every action), ``map`` (features and
+    the space around), ``candidates`` (state, and what the planners look at of every action) or
+    ``rgbd`` (images and state). Only what the robot itself has; see
+    :mod:`ms_slam_env.env.observations`. Where the agent chooses the SLAM configuration, also the
+    one in force, one-hot (K,): at the end of the vector, or as ``slam_configuration``.
 
     ## Reward
     The sum of these terms (``info["reward_terms"]``), each times its weight (option ``reward``):
@@ -153,6 +157,8 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         embodiment_type.check(config)
         self.simulation = Simulation(config, embodiment_type, self.slam, self.timings)
         self._lookahead = Lookahead(config.lookahead, config.divergence, self.intrinsics)
+        glance = LookaheadConfig("predicted", SCALE)
+        self._glance = Lookahead(glance, config.divergence, self.intrinsics)
 
         num_motions = embodiment_type.num_motions
         self._actions: ActionDecoder = MotionActions(num_motions)
@@ -258,9 +264,18 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
                     configuration=self._actions.configuration,
                     lookahead=lambda: self.lookahead() / maxima,
                     candidates=self.candidate_poses,
+                    predicted=self._predicted,
+                    steps=(self.config.step_m, self.config.step_rad),
                     occupancy=episode.occupancy,
                 )
             )
+
+    def _predicted(self) -> PredictedViews:
+        """What the map predicts of here and of the candidates, in units of (M_I, M_D)."""
+        here = self.episode.T_world_camera_estimate
+        found = self._glance.from_here(self.slam, self.candidate_poses(), here)
+        scaled = found.divergences / self.config.targets.maxima
+        return dataclasses.replace(found, divergences=scaled)
 
     def _lost_share(self) -> float:
         """How much of the patience with a lost camera is used up; 1 or more ends the episode."""

@@ -13,7 +13,10 @@ from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.extension import ExtensionPoint
+from ms_slam_env.geometry import invert
 from ms_slam_env.mapping import OccupancyGrid, expected_gain, surrounding_occupancy
+from ms_slam_env.mapping.candidates import HIGHS, LOWS, PredictedViews, candidate_numbers
+from ms_slam_env.mapping.view_goals import best_goal, distance_in_steps
 from ms_slam_env.robot import NUM_ROTATIONS, NUM_TRANSLATIONS, ROTATIONS, TRANSLATIONS
 
 Float32 = NDArray[np.float32]
@@ -52,6 +55,7 @@ _ROWS, _COLUMNS = 6, 8
 _BLOCKS = (((10, 6, 10), 0.4), ((8, 4, 8), 1.2))  # around the camera: how many, edge in metres
 _GAIN_RAYS = (8, 6)
 _GAIN_CAP_M3 = 20.0  # more than a view of 4 m holds
+_SMALLEST_STEP = 1e-6  # a motion of no length is as many steps from everywhere
 
 
 _LOW = [-_POSITION_CAP] * 3 + [-1.0] * 6 + [0.0] * (NUM_STATE - 9)
@@ -77,6 +81,8 @@ class RobotKnowledge:
         configuration: index of the SLAM configuration in force; 0 where there is only one.
         lookahead: predicts the divergences (n, 2) of the candidates, in units of (M_I, M_D).
         candidates: the poses (n, 4, 4) that the motions would lead to; the first is the present.
+        predicted: what the map predicts of here and of the candidates, divergences in those units.
+        steps: translation, metres, and rotation, radians, of a motion.
         occupancy: what is known of space; None where the observation does not need it.
     """
 
@@ -91,6 +97,8 @@ class RobotKnowledge:
     configuration: int
     lookahead: Callable[[], Float64]
     candidates: Callable[[], Float64]
+    predicted: Callable[[], PredictedViews]
+    steps: tuple[float, float]
     occupancy: OccupancyGrid | None = None
 
 
@@ -192,6 +200,43 @@ class MapObservation(Observation):
         return np.concatenate([self._features.build(knowledge), *parts]).astype(np.float32)
 
 
+class CandidatesObservation(Observation):
+    """A state of 37 numbers, then 17 for each of the n motions, candidate by candidate: float32.
+
+    The state: the state vector (28), the largest expected gain of a motion, m3, and the best goal
+    (`mapping.view_goals.best_goal`): where it is in the camera's frame, in units of 5 m (3), where
+    it looks there (3), and how many steps away it is, in translation and rotation, / 10 (2). The
+    numbers of a motion are those of ``mapping.candidates.NAMES``.
+    """
+
+    needs_occupancy = True
+
+    def __init__(self, intrinsics: Intrinsics, num_motions: int) -> None:
+        self._intrinsics = intrinsics
+        low = np.concatenate([_STATE_BOUNDS[0], [0], [-2] * 3, [-1] * 3, [0] * 2])
+        high = np.concatenate([_STATE_BOUNDS[1], [_GAIN_CAP_M3], [2] * 3, [1] * 3, [5] * 2])
+        self._state_bounds = low, high
+        lowest = np.concatenate([low, *[LOWS] * num_motions]).astype(np.float32)
+        highest = np.concatenate([high, *[HIGHS] * num_motions]).astype(np.float32)
+        self.space = spaces.Box(lowest, highest)
+
+    def build(self, knowledge: RobotKnowledge) -> Float32:
+        """Return the vector."""
+        grid, predicted = knowledge.occupancy, knowledge.predicted()
+        assert grid is not None
+        here = predicted.poses[0]
+        steps = max(knowledge.steps[0], _SMALLEST_STEP), max(knowledge.steps[1], _SMALLEST_STEP)
+        goal = best_goal(grid, here, self._intrinsics, steps)
+        known = knowledge.motion_mask, grid, goal, self._intrinsics, steps
+        numbers, most = candidate_numbers(predicted, *known)
+        T_here_goal = invert(here) @ goal
+        away = distance_in_steps(here[None], goal, *steps)[0]
+        state: list[Any] = [state_vector(knowledge), [most], T_here_goal[:3, 3] / _POSITION_SCALE_M]
+        state += [T_here_goal[:3, 2], away / 10]
+        vector: Float64 = np.clip(np.concatenate(state), *self._state_bounds)
+        return np.concatenate([vector, numbers.ravel()]).astype(np.float32)
+
+
 class WithConfiguration(Observation):
     """Another observation and which of K SLAM configurations is in force, one-hot (K,) float32.
 
@@ -223,6 +268,7 @@ OBSERVATIONS: dict[str, Callable[[Intrinsics, int], Observation]] = {
     "features": FeaturesObservation,
     "lookahead": LookaheadObservation,
     "map": MapObservation,
+    "candidates": CandidatesObservation,
 }
 """Name of the option ``observation`` to variant."""
 

@@ -4,13 +4,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from ms_slam_baselines import GreedyLimited
-from ms_slam_baselines.trackability import SCALE
-from ms_slam_baselines.view_goals import distance_in_steps
 
 import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env.divergence import make_divergence
 from ms_slam_env.env.planners import make_planner
 from ms_slam_env.errors import InputError
+from ms_slam_env.mapping.trackability import SCALE
+from ms_slam_env.mapping.view_goals import distance_in_steps
 
 
 @pytest.fixture(scope="module")

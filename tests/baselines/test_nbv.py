@@ -6,9 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from ms_slam_baselines.nbv import NextBestView
-from ms_slam_baselines.trackability import SCALE, image_motion, slip_risk
 from ms_slam_baselines.view_goals import (
-    distance_in_steps,
     frontiers,
     poses_between,
     views_anywhere,
@@ -21,6 +19,8 @@ from ms_slam_env.env.planners import make_planner
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at, make_pose, relative_angle, so3_exp
 from ms_slam_env.mapping import FREE, UNKNOWN, OccupancyGrid, shortest_ways
+from ms_slam_env.mapping.trackability import SCALE, image_motion, slip_risk
+from ms_slam_env.mapping.view_goals import distance_in_steps
 from ms_slam_env.slam.base import Views
 
 STEPS = 0.12, math.radians(12)

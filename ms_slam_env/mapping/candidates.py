@@ -1,0 +1,101 @@
+"""What the planners look at, number by number, for each motion that can be chosen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.geometry import invert, so3_log
+from ms_slam_env.mapping.expected_gain import expected_gain
+from ms_slam_env.mapping.occupancy_grid import OccupancyGrid
+from ms_slam_env.mapping.trackability import NEAR_M, image_motion, risk_of
+from ms_slam_env.mapping.view_goals import distance_in_steps
+from ms_slam_env.mapping.view_information import mean_depth, view_information
+from ms_slam_env.slam.base import Views
+
+Float64 = NDArray[np.float64]
+
+NAMES: tuple[str, ...] = (
+    *("permitted", "intensity_divergence", "depth_divergence", "overlap", "near"),
+    *("d_optimality", "weakest", "slip_risk", "gain", "goal_translation", "goal_rotation"),
+    *("step_x", "step_y", "step_z", "turn_x", "turn_y", "turn_z"),
+)
+"""What the numbers of a candidate are, in order.
+
+Whether it is possible; the divergences of its view as the map predicts it from that of here, in
+units of M_I and M_D; the share of the view that the map fills, and the share nearer than 0.5 m; of
+the view's information H (`view_information`) log(1 + det(H)^(1/6)) and log(1 + its least
+eigenvalue), each a pixel, in 1/m^2; the probability that SLAM slips (`trackability`); the expected
+gain relative to the largest; by how many steps it leads nearer to the goal, in translation and in
+rotation; the motion itself, along and about the camera's axes, in steps.
+"""
+
+_GAIN_RAYS = (8, 6)
+_CAPS = {"intensity_divergence": 5, "depth_divergence": 5, "d_optimality": 20, "weakest": 20}
+_BOTH_WAYS = {"goal_translation": 3, "goal_rotation": 3}
+_BOTH_WAYS |= {f"{kind}_{axis}": 2 for kind in ("step", "turn") for axis in "xyz"}
+HIGHS = np.array([_BOTH_WAYS.get(name, _CAPS.get(name, 1)) for name in NAMES], dtype=np.float32)
+LOWS = np.array([-_BOTH_WAYS.get(name, 0) for name in NAMES], dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class PredictedViews:
+    """What the map predicts of here, first, and of where n motions lead.
+
+    Attributes:
+        poses: (1 + n, 4, 4) T_world_camera.
+        views: 1 + n.
+        divergences: (n, 2) of the motions' views from that of here, in units of (M_I, M_D).
+    """
+
+    poses: Float64
+    views: Views
+    divergences: Float64
+
+
+def candidate_numbers(
+    predicted: PredictedViews,
+    permitted: NDArray[np.bool_],
+    grid: OccupancyGrid,
+    goal: Float64,
+    intrinsics: Intrinsics,
+    steps: tuple[float, float],
+) -> tuple[Float64, float]:
+    """The numbers (n, ``NAMES``) of the motions, within their bounds, and the largest gain, m^3.
+
+    Args:
+        predicted: of here and of the motions.
+        permitted: (n,) which motions are possible.
+        grid: what is known of space.
+        goal: (4, 4) where to go.
+        intrinsics: of the live camera.
+        steps: translation, metres, and rotation, radians, of one motion.
+    """
+    poses, views = predicted.poses, predicted.views
+    gain = expected_gain(grid, poses[1:], intrinsics, _GAIN_RAYS)
+    H, pixels = view_information(views), views.depth[0].size
+    risk = risk_of(H, views, image_motion(views, poses), mean_depth(views)[0])
+    least = np.maximum(np.linalg.eigvalsh(H)[:, 0], 0) / pixels
+    d_optimality = np.exp(np.linalg.slogdet(H)[1] / 6) / pixels
+    away = distance_in_steps(poses, goal, *steps)
+    motions = invert(poses[0]) @ poses[1:]
+    turns = np.stack([so3_log(R) for R in motions[:, :3, :3]])
+    numbers = np.column_stack(
+        [
+            permitted,
+            predicted.divergences,
+            (views.depth > 0).mean(axis=(1, 2))[1:],
+            ((views.depth > 0) & (views.depth < NEAR_M)).mean(axis=(1, 2))[1:],
+            np.log1p(d_optimality)[1:],
+            np.log1p(least)[1:],
+            risk[1:],
+            gain / max(gain.max(), 1e-9),
+            away[0] - away[1:],
+            motions[:, :3, 3] / steps[0],
+            turns / steps[1],
+        ]
+    )
+    return np.clip(numbers, LOWS, HIGHS), float(gain.max())
