@@ -18,7 +18,14 @@ class LearnableFake(gym.Env):
 
     log: ClassVar[list] = []
 
-    def __init__(self, scene="", split="train", num_scene_seeds=1, observation="features"):
+    def __init__(
+        self,
+        scene="",
+        split="train",
+        num_scene_seeds=1,
+        observation="features",
+        frame_divergences=True,
+    ):
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (NUM_ACTIONS,), np.float32)
         self.action_space = gym.spaces.Discrete(NUM_ACTIONS)
         self.config = SimpleNamespace(targets=TargetConfig(rho_I=0, rho_D=0))
