@@ -23,12 +23,15 @@ import torch
 from gymnasium import spaces
 from ms_slam_agents.demonstrations import Demonstration, Task, play
 from ms_slam_agents.learning_curve import Curve, read_curve
-from ms_slam_agents.options import Problem, check_kept, check_new
+from ms_slam_agents.options import Problem, check_kept, check_new, numbers_of_candidates
 from ms_slam_agents.policy import CLIP, EPSILON
 from ms_slam_agents.policy_file import Metadata, PolicyFile, read_policy, write_policy
+from ms_slam_agents.ppo import Network
+from ms_slam_agents.sb3_state import PooledMoments
 from ms_slam_agents.supervisor import LATEST
 from ms_slam_agents.train_sb3 import VALIDATION_SEED, env_options, make_venv, problem_options
 from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
+from torch import Tensor
 from tqdm import tqdm
 
 from ms_slam_env.command_line import exit_code, parse
@@ -169,20 +172,45 @@ class Student:
         if file:
             self.seen, self.returns = (Moments.read(file, n) for n in ("observation", "return"))
         else:
-            self.seen = Moments.of(np.concatenate([d.observations for d in demonstrations]))
+            self.seen = self._moments(np.concatenate([d.observations for d in demonstrations]))
             sums = np.concatenate([d.returns(args.gamma) for d in demonstrations])
             self.returns = Moments.of(sums)
         torch.manual_seed(args.seed)
-        self.network = MaskableActorCriticPolicy(
+        self.network = self._network()
+        self.epochs = file.metadata.epochs if file else 0
+        if file:
+            tensors = {name: torch.from_numpy(v) for name, v in file.part("policy").items()}
+            self.network.load_state_dict(tensors)
+
+    def _network(self) -> MaskableActorCriticPolicy | Network:
+        """Ours where candidates are looked at one by one, Stable-Baselines3's otherwise."""
+        args, candidates = self.args, numbers_of_candidates(self.args)
+        if candidates:
+            return Network(self.inputs, args.hidden, self.actions, 0, candidates)
+        return MaskableActorCriticPolicy(
             spaces.Box(-np.inf, np.inf, (self.inputs,), np.float32),
             spaces.Discrete(self.actions),
             lambda _: args.learning_rate,
             net_arch=[args.hidden, args.hidden],
         )
-        self.epochs = file.metadata.epochs if file else 0
-        if file:
-            tensors = {name: torch.from_numpy(v) for name, v in file.part("policy").items()}
-            self.network.load_state_dict(tensors)
+
+    def _moments(self, observations: Any) -> Moments:
+        """Means and variances of observations (N, inputs), the same for all candidates."""
+        candidates = numbers_of_candidates(self.args)
+        if not candidates:
+            return Moments.of(observations)
+        pooled = PooledMoments(self.inputs, self.actions, candidates)
+        mean, var = pooled.pooled(observations.astype(np.float64))
+        return Moments(mean, var, float(len(observations)))
+
+    def _evaluate(self, seen: Tensor, labels: Tensor, masks: Any) -> tuple[Tensor, Tensor]:
+        """Values (B,) and log-probabilities (B,) of labelled actions."""
+        if isinstance(self.network, Network):
+            nothing = torch.zeros(len(seen), 0)
+            log_probs, values = self.network(seen, nothing, torch.as_tensor(masks))
+            return values, log_probs.gather(1, labels[:, None].long())[:, 0]
+        values, log_probs, _ = self.network.evaluate_actions(seen, labels, masks)
+        return values.flatten(), log_probs
 
     def fit(self, demonstrations: Sequence[Demonstration]) -> dict[str, float]:
         """Learn from all episodes; return the loss and the share of actions agreed on at last."""
@@ -193,11 +221,11 @@ class Student:
         for k, (observations, masks, labels, returns) in enumerate(data):
             optimizer.param_groups[0]["lr"] = args.learning_rate * (1 - k / len(data))
             scaled = np.clip((observations - self.seen.mean) / self.seen.std, -CLIP, CLIP)
-            values, log_probs, _ = self.network.evaluate_actions(
+            values, log_probs = self._evaluate(
                 torch.as_tensor(scaled, dtype=torch.float32), torch.as_tensor(labels), masks
             )
             target = torch.as_tensor(returns / self.returns.std, dtype=torch.float32)
-            error = torch.mean((values.flatten() - target) ** 2)
+            error = torch.mean((values - target) ** 2)
             loss = -log_probs.mean() + args.value_weight * error
             optimizer.zero_grad()
             loss.backward()
@@ -220,6 +248,7 @@ class Student:
             inputs=self.inputs,
             hidden=(args.hidden, args.hidden),
             actions=(self.actions,),
+            candidates=numbers_of_candidates(args),
             timesteps=timesteps,
             epochs=self.epochs,
             minutes=minutes,

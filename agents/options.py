@@ -10,6 +10,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 from ms_slam_env.config import Checked, bounded, from_dict
 from ms_slam_env.env.observations import POINT as OBSERVATIONS
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.mapping.candidates import NAMES
 
 
 @dataclass(frozen=True)
@@ -107,6 +108,11 @@ class Args(Problem):
     ent_coef: float = bounded(0.003, 0, 1)
     clip_range: float = bounded(0.2, 0, 1)
     hidden: int = bounded(128, 1, 4096)
+
+
+def numbers_of_candidates(args: Problem) -> int:
+    """Numbers of each action that our own networks look at one by one; 0 where there are none."""
+    return len(NAMES) if args.observation == "candidates" else 0
 
 
 KEPT = ("algorithm", "env_id", "embodiment", "observation", "step_m", "step_deg", "hidden")

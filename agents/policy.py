@@ -54,7 +54,10 @@ class Policy:
         self._gates = {name: network[f"memory.{name}"] for name in _GATES if file.metadata.memory}
         layers = range(0, 2 * len(file.metadata.hidden), 2)
         names = [*(f"mlp_extractor.policy_net.{i}" for i in layers), "action_net"]
-        self._layers = [(network[f"{n}.weight"].T, network[f"{n}.bias"]) for n in names]
+        self._layers = [_layer(network, name) for name in names]
+        has_candidates = file.metadata.candidates > 0
+        self._encoder = [_layer(network, f"encoder.{i}") for i in (0, 2) if has_candidates]
+        self._score = [_layer(network, "score") for _ in range(has_candidates)]
         moments = file.part("observation")
         self._mean, self._std = moments["mean"], np.sqrt(moments["var"] + EPSILON)
         self.reset()
@@ -84,7 +87,7 @@ class Policy:
         """
         if not self._gates:
             return memory
-        x = self._scaled(observations)
+        x, _ = self._look(self._scaled(observations))
         of_x = x @ self._gates["weight_ih"].T + self._gates["bias_ih"]
         of_h = memory @ self._gates["weight_hh"].T + self._gates["bias_hh"]
         (r_x, z_x, n_x), (r_h, z_h, n_h) = (np.split(a, 3, axis=1) for a in (of_x, of_h))
@@ -95,6 +98,20 @@ class Policy:
         """As the network saw them in training."""
         scaled = np.clip((observations - self._mean) / self._std, -CLIP, CLIP)
         return scaled.astype(np.float32).astype(np.float64)
+
+    def _look(self, scaled: Float64) -> tuple[Float64, Float64]:
+        """What the layers see (B, k), and the candidates (B, n, E) as encoded, if there are any.
+
+        The state, and the mean and the largest of the encoded candidates: none comes first.
+        """
+        if not self._encoder:
+            return scaled, np.zeros((len(scaled), 0, 0))
+        start = self.metadata.num_state
+        encoded = scaled[:, start:].reshape(len(scaled), self.num_actions, -1)
+        for weight, bias in self._encoder:
+            encoded = np.tanh(encoded @ weight + bias)
+        pooled = [scaled[:, :start], encoded.mean(axis=1), encoded.max(axis=1)]
+        return np.concatenate(pooled, axis=1), encoded
 
     def probabilities(
         self,
@@ -117,10 +134,14 @@ class Policy:
         self._check(observations, masks)
         *hidden, (weight, bias) = self._layers
         memory = self.empty_memory(len(masks)) if memory is None else memory
-        x = np.concatenate([self._scaled(observations), memory], axis=1)
+        seen, encoded = self._look(self._scaled(observations))
+        x = np.concatenate([seen, memory], axis=1)
         for hidden_weight, hidden_bias in hidden:
             x = np.tanh(x @ hidden_weight + hidden_bias)
-        logits = np.where(masks, x @ weight + bias, -np.inf)
+        for score_weight, score_bias in self._score:  # of each candidate, by itself and the whole
+            beside = np.broadcast_to(x[:, None], (*encoded.shape[:2], x.shape[1]))
+            x = np.tanh(np.concatenate([encoded, beside], axis=2) @ score_weight + score_bias)
+        logits = np.where(masks, (x @ weight + bias).reshape(masks.shape), -np.inf)
         return np.concatenate([_softmax(part) for part in split(logits, self.parts)], axis=1)
 
     def _check(self, observations: NDArray[Any], masks: NDArray[np.bool_]) -> None:
@@ -199,6 +220,11 @@ class Policy:
                 f"{self.metadata.inputs} numbers; the environment's observations have shape "
                 f"{env.observation_space.shape}"
             )
+
+
+def _layer(network: dict[str, Float64], name: str) -> tuple[Float64, Float64]:
+    """Weight, transposed, and bias of a layer."""
+    return network[f"{name}.weight"].T, network[f"{name}.bias"]
 
 
 def action_parts(space: Any) -> tuple[int, ...]:

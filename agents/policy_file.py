@@ -55,6 +55,8 @@ class Metadata:
         hidden: widths of the hidden layers, tanh between them.
         actions: choices of each number that an action consists of.
         memory: width of the recurrent unit before the layers; 0 without one.
+        candidates: numbers of each action at the end of an observation, which one encoder sees,
+            the same for all, and one score is given for; 0: the layers see it all as it is.
         timesteps: environment steps trained.
         epochs: passes over its experience that the network learnt from; 0: it is untrained.
         minutes: wall-clock time trained, evaluations left out.
@@ -73,6 +75,7 @@ class Metadata:
     epochs: int
     minutes: float
     memory: int = 0
+    candidates: int = 0
     env_options: dict[str, Any] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
@@ -106,11 +109,31 @@ class Metadata:
             many = 0 < len(sizes) <= _MOST_LAYERS
             if not many or not all(0 < size <= _LARGEST_LAYER for size in sizes):
                 raise InputError(f"{name} = {str(sizes)[:80]} are no sizes of layers")
-        if not 0 <= self.memory <= _LARGEST_LAYER:
-            raise InputError(f"memory = {self.memory} is no width")
+        for name in ("memory", "candidates"):
+            if not 0 <= getattr(self, name) <= _LARGEST_LAYER:
+                raise InputError(f"{name} = {getattr(self, name)} is no width")
+        if self.candidates and (len(self.actions) > 1 or self.num_state < 0):
+            raise InputError(
+                f"{self.inputs} numbers do not hold {self.candidates} for each of {self.actions}"
+            )
         counts = (self.timesteps, self.epochs, self.minutes)
         if not all(0 <= count < math.inf for count in counts):
             raise InputError(f"timesteps, epochs, minutes = {counts} are no counts")
+
+    @property
+    def num_state(self) -> int:
+        """Numbers of an observation before those of the candidates."""
+        return self.inputs - sum(self.actions) * self.candidates
+
+    @property
+    def encoded(self) -> int:
+        """Width of what the encoder makes of a candidate."""
+        return encoded_width(self.hidden[0])
+
+
+def encoded_width(hidden: int) -> int:
+    """Width of what the encoder makes of a candidate, beside a hidden layer of some width."""
+    return max(8, hidden // 4)
 
 
 @dataclass(frozen=True)
@@ -143,20 +166,28 @@ class PolicyFile:
 
 def network_shapes(metadata: Metadata) -> Shapes:
     """Shapes of the network's parameters, by Stable-Baselines3's names, in its order."""
-    width = metadata.memory
+    width, encoded = metadata.memory, metadata.encoded
+    seen = metadata.inputs
     shapes: Shapes = {}
+    heads = {"action_net": (sum(metadata.actions), metadata.hidden[-1])}
+    if metadata.candidates:
+        seen = metadata.num_state + 2 * encoded  # their mean and their largest
+        shapes |= _linear("encoder.0", encoded, metadata.candidates)
+        shapes |= _linear("encoder.2", encoded, encoded)
+        shapes |= _linear("score", encoded, encoded + metadata.hidden[-1])
+        heads = {"action_net": (1, encoded)}
     if width:  # three gates one above the other, as PyTorch has them
-        shapes |= {"memory.weight_ih": (3 * width, metadata.inputs)}
+        shapes |= {"memory.weight_ih": (3 * width, seen)}
         shapes |= {"memory.weight_hh": (3 * width, width)}
         shapes |= {"memory.bias_ih": (3 * width,), "memory.bias_hh": (3 * width,)}
-    sizes = (metadata.inputs + width, *metadata.hidden)
+    sizes = (seen + width, *metadata.hidden)
     layers = list(zip(sizes[1:], sizes[:-1], strict=True))
-    heads = {"action_net": sum(metadata.actions), "value_net": 1}
+    heads["value_net"] = 1, sizes[-1]
     for net in ("policy_net", "value_net"):
         for i, shape in enumerate(layers):
             shapes |= _linear(f"mlp_extractor.{net}.{2 * i}", *shape)  # tanh at the odd places
-    for head, outputs in heads.items():
-        shapes |= _linear(head, outputs, sizes[-1])
+    for head, shape in heads.items():
+        shapes |= _linear(head, *shape)
     return shapes
 
 

@@ -25,9 +25,23 @@ import numpy as np
 import torch
 from ms_slam_agents.evaluation import references
 from ms_slam_agents.learning_curve import Curve, read_curve
-from ms_slam_agents.options import KEPT, Problem, check_kept, check_new, check_steps_left
-from ms_slam_agents.policy_file import Metadata, PolicyFile, read_policy, write_policy
+from ms_slam_agents.options import (
+    KEPT,
+    Problem,
+    check_kept,
+    check_new,
+    check_steps_left,
+    numbers_of_candidates,
+)
+from ms_slam_agents.policy_file import (
+    Metadata,
+    PolicyFile,
+    encoded_width,
+    read_policy,
+    write_policy,
+)
 from ms_slam_agents.sb3_state import (
+    PooledMoments,
     moment_tensors,
     optimizer_tensors,
     restore_adam,
@@ -106,20 +120,30 @@ class Args(Problem):
 class Network(nn.Module):
     """Two hidden layers for the policy and two for the value, behind a memory if there is one.
 
-    The names of the parameters are Stable-Baselines3's, and ``memory.*``.
+    With ``candidates`` numbers of each action at the end of an observation, one encoder looks at
+    each action's, the layers see the state and the mean and the largest of what it makes of them,
+    and one score is given for each: in another order the actions have the same probabilities.
+
+    The names of the parameters are Stable-Baselines3's, ``memory.*``, ``encoder.*``, ``score.*``.
     """
 
-    def __init__(self, inputs: int, hidden: int, actions: int, memory: int) -> None:
+    def __init__(
+        self, inputs: int, hidden: int, actions: int, memory: int, candidates: int = 0
+    ) -> None:
         super().__init__()
-        self.width = memory
-        self.memory = nn.GRUCell(inputs, memory) if memory else None
+        self.width, self.actions = memory, actions
+        self.num_state = inputs - actions * candidates
+        encoded = encoded_width(hidden)
+        seen = self.num_state + 2 * encoded if candidates else inputs
+        self.memory = nn.GRUCell(seen, memory) if memory else None
 
         def layers() -> nn.Sequential:
-            first, second = nn.Linear(inputs + memory, hidden), nn.Linear(hidden, hidden)
-            return nn.Sequential(first, nn.Tanh(), second, nn.Tanh())
+            return _layers(seen + memory, hidden, hidden)
 
+        self.encoder = _layers(candidates, encoded, encoded) if candidates else None
         self.mlp_extractor = nn.ModuleDict({"policy_net": layers(), "value_net": layers()})
-        self.action_net = nn.Linear(hidden, actions)
+        self.score = nn.Linear(encoded + hidden, encoded) if candidates else None
+        self.action_net = nn.Linear(encoded, 1) if candidates else nn.Linear(hidden, actions)
         self.value_net = nn.Linear(hidden, 1)
         for module in self.modules():
             if isinstance(module, nn.Linear):
@@ -131,14 +155,32 @@ class Network(nn.Module):
         """The memory (B, M) after observations (B, k); empty where an episode ``begins`` (B,)."""
         if self.memory is None:
             return memory
-        return self.memory(seen, memory * (1 - begins[:, None]))
+        return self.memory(self._look(seen)[0], memory * (1 - begins[:, None]))
+
+    def _look(self, seen: Tensor) -> tuple[Tensor, Tensor | None]:
+        """What the layers see (B, k), and the candidates (B, n, E) as encoded, if there are any."""
+        if self.encoder is None:
+            return seen, None
+        encoded = self.encoder(seen[:, self.num_state :].unflatten(1, (self.actions, -1)))
+        parts = [seen[:, : self.num_state], encoded.mean(dim=1), encoded.amax(dim=1)]
+        return torch.cat(parts, dim=1), encoded
 
     def forward(self, seen: Tensor, memory: Tensor, masks: Tensor) -> tuple[Tensor, Tensor]:
         """Log-probabilities (B, n) of the actions, and values (B,)."""
+        seen, encoded = self._look(seen)
         x = torch.cat([seen, memory], dim=1)
-        logits = self.action_net(self.mlp_extractor["policy_net"](x))
+        whole = self.mlp_extractor["policy_net"](x)
+        if self.score is not None and encoded is not None:
+            beside = whole[:, None].expand(-1, self.actions, -1)
+            whole = torch.tanh(self.score(torch.cat([encoded, beside], dim=2)))
+        logits = self.action_net(whole).reshape(masks.shape)
         values = self.value_net(self.mlp_extractor["value_net"](x))
         return log_softmax(logits.masked_fill(~masks, _BLOCKED), dim=1), values.flatten()
+
+
+def _layers(inputs: int, first: int, second: int) -> nn.Sequential:
+    """Two layers, tanh after each."""
+    return nn.Sequential(nn.Linear(inputs, first), nn.Tanh(), nn.Linear(first, second), nn.Tanh())
 
 
 # -- Experience --------------------------------------------------------------------------------
@@ -241,7 +283,7 @@ class Player:
             if infos[i].get("TimeLimit.truncated"):
                 there = _tensor(self.venv.normalize_obs(infos[i]["terminal_observation"]))[None]
                 memory = self.network.remember(there, self.memory[i : i + 1], torch.zeros(1))
-                possible = torch.ones(1, self.network.action_net.out_features, dtype=torch.bool)
+                possible = torch.ones(1, self.network.actions, dtype=torch.bool)
                 rest[i] = self.args.gamma * self.network(there, memory, possible)[1][0]
         return rest
 
@@ -324,7 +366,10 @@ class Run:
         self.args, self.venv, self.validation = args, venv, validation
         torch.manual_seed(args.seed)
         inputs, actions = venv.observation_space.shape[0], int(venv.action_space.n)  # type: ignore
-        self.network = Network(inputs, args.hidden, actions, args.memory)
+        candidates = numbers_of_candidates(args)
+        if candidates:
+            venv.obs_rms = PooledMoments(inputs, actions, candidates)
+        self.network = Network(inputs, args.hidden, actions, args.memory, candidates)
         self.optimizer = torch.optim.Adam(self.network.parameters(), args.learning_rate, eps=1e-5)
         self.first = _first_policy(args, inputs, actions)
         begun = file or (read_policy(args.init) if args.init else None)
@@ -350,8 +395,9 @@ class Run:
             observation=args.observation,
             inputs=self.venv.observation_space.shape[0],  # type: ignore[index]
             hidden=(args.hidden, args.hidden),
-            actions=(network.action_net.out_features,),
+            actions=(network.actions,),
             memory=args.memory,
+            candidates=numbers_of_candidates(args),
             timesteps=self.steps,
             epochs=self.epochs,
             minutes=self.minutes,
@@ -419,11 +465,13 @@ def _first_policy(args: Args, inputs: int, actions: int) -> Network | None:
             raise InputError(f"{args.init} is for {name} {getattr(known, name)!r}, not {own!r}")
     if known.memory or tuple(known.actions) != (actions,) or known.inputs != inputs:
         raise InputError(f"{args.init} is a policy with a memory, or of other actions")
+    if known.candidates != numbers_of_candidates(args):
+        raise InputError(f"{args.init} does not look at the candidates one by one")
     if tuple(known.hidden) != (args.hidden,) * 2:
         raise InputError(f"{args.init} has layers of {known.hidden}: give --hidden that")
     if not args.pull:
         return None
-    first = Network(inputs, args.hidden, actions, 0)
+    first = Network(inputs, args.hidden, actions, 0, known.candidates)
     first.load_state_dict(_parameters(file))
     return first
 

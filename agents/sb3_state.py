@@ -7,13 +7,42 @@ from typing import Any
 import numpy as np
 import torch
 from ms_slam_agents.policy_file import MOMENTS, STEP, PolicyFile, Tensors
+from numpy.typing import NDArray
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import PPO
+from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 
 Model = PPO | MaskablePPO
 
 ALGORITHMS: dict[str, type[PPO] | type[MaskablePPO]] = {"maskable_ppo": MaskablePPO, "ppo": PPO}
+
+
+class PooledMoments(RunningMeanStd):
+    """Running moments that are the same for all candidates, whose order means nothing.
+
+    Args:
+        inputs: numbers of an observation.
+        actions: candidates at its end.
+        candidates: numbers of each.
+    """
+
+    def __init__(self, inputs: int, actions: int, candidates: int) -> None:
+        super().__init__(shape=(inputs,))
+        self._tail = slice(inputs - actions * candidates, None)
+        self._rows = actions, candidates
+
+    def update(self, arr: NDArray[Any]) -> None:
+        """Learn from observations (B, inputs)."""
+        self.update_from_moments(*self.pooled(arr), len(arr))
+
+    def pooled(self, observations: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Means and variances (inputs,) of observations (B, inputs)."""
+        mean, var = observations.mean(axis=0), observations.var(axis=0)
+        rows = observations[:, self._tail].reshape(-1, self._rows[1])
+        mean[self._tail] = np.tile(rows.mean(axis=0), self._rows[0])
+        var[self._tail] = np.tile(rows.var(axis=0), self._rows[0])
+        return mean, var
 
 
 def tensors_of(model: Model) -> Tensors:

@@ -1,0 +1,163 @@
+"""A network that looks at candidates one by one: order, NumPy against PyTorch, moments, a run."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from learnable_fake import LearnableFake, read_curve
+
+pytest.importorskip("sb3_contrib")
+
+from ms_slam_agents import imitation, options, ppo
+from ms_slam_agents.policy import Policy
+from ms_slam_agents.policy_file import Metadata, PolicyFile, read_policy, write_policy
+from ms_slam_agents.sb3_state import PooledMoments
+
+from ms_slam_env.errors import InputError
+
+STATE, ACTIONS, NUMBERS = 4, 7, 3
+INPUTS = STATE + ACTIONS * NUMBERS
+ENV_ID = "LearnableCandidates-v0"
+
+
+class Candidates(LearnableFake):
+    """The right action is the one whose second number is the largest; the state says nothing."""
+
+    def __init__(self, **options):
+        super().__init__(**options)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (INPUTS,), np.float32)
+
+    def _next(self):
+        super()._next()
+        numbers = self.np_random.uniform(size=(ACTIONS, NUMBERS))
+        numbers[self.right, 1] = 1.5
+        state = self.np_random.uniform(size=STATE)
+        return np.concatenate([state, numbers.ravel()]).astype(np.float32)
+
+    def _info(self, reward):
+        return super()._info(reward) | {"action_mask": self.action_masks()}
+
+
+gym.register(ENV_ID, Candidates)
+
+
+@pytest.fixture(autouse=True)
+def numbers_of_the_fake(monkeypatch):
+    for module in (options, ppo, imitation):
+        monkeypatch.setattr(
+            module,
+            "numbers_of_candidates",
+            lambda args: NUMBERS if args.observation == "candidates" else 0,
+        )
+
+
+def make_network(memory=0):
+    torch.manual_seed(0)
+    network = ppo.Network(INPUTS, 16, ACTIONS, memory, NUMBERS)
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, 0, 0.5)
+    return network
+
+
+def file_of(network, memory=0):
+    metadata = Metadata(
+        *("masked_ppo", ENV_ID, "candidates", INPUTS, (16, 16), (ACTIONS,), 1, 1, 0.0),
+        memory=memory,
+        candidates=NUMBERS,
+    )
+    tensors = {f"policy.{n}": p.detach().numpy() for n, p in network.named_parameters()}
+    for name, shape in (("observation", (INPUTS,)), ("return", ())):
+        tensors |= {f"{name}.mean": np.full(shape, 0.5), f"{name}.var": np.full(shape, 4.0)}
+        tensors |= {f"{name}.count": np.array(9.0)}
+    return PolicyFile(metadata, tensors)
+
+
+@pytest.mark.parametrize("memory", [0, 8])
+def test_the_policy_in_numpy_is_the_network_and_is_read_back(memory, tmp_path):
+    network = make_network(memory)
+    write_policy(tmp_path / "policy.safetensors", file_of(network, memory))
+    policy = Policy.load(tmp_path / "policy.safetensors")
+    rng = np.random.default_rng(0)
+    own, theirs = policy.empty_memory(4), torch.zeros(4, memory)
+    for _ in range(4):
+        seen, masks = rng.normal(size=(4, INPUTS)), rng.random((4, ACTIONS)) < 0.6
+        masks[:, 0] = True
+        own = policy.remember(seen, own)
+        scaled = torch.as_tensor((seen - 0.5) / 2, dtype=torch.float32)
+        with torch.no_grad():
+            theirs = network.remember(scaled, theirs, torch.zeros(4))
+            expected = network(scaled, theirs, torch.as_tensor(masks))[0].exp().numpy()
+        np.testing.assert_allclose(policy.probabilities(seen, masks, own), expected, atol=1e-5)
+    assert expected.max() > 1.5 / ACTIONS
+
+
+def test_the_order_of_the_candidates_means_nothing():
+    network, rng = make_network(memory=5), np.random.default_rng(1)
+    seen, order = rng.normal(size=(6, INPUTS)), rng.permutation(ACTIONS)
+    masks = rng.random((6, ACTIONS)) < 0.7
+    masks[:, 2] = True
+    rows = seen[:, STATE:].reshape(6, ACTIONS, NUMBERS)
+    moved = np.concatenate([seen[:, :STATE], rows[:, order].reshape(6, -1)], axis=1)
+    found = []
+    for one, mask in ((seen, masks), (moved, masks[:, order])):
+        tensor = torch.as_tensor(one, dtype=torch.float32)
+        with torch.no_grad():
+            memory = network.remember(tensor, torch.zeros(6, 5), torch.zeros(6))
+            log_probs, values = network(tensor, memory, torch.as_tensor(mask))
+        found.append((log_probs.exp().numpy(), values.numpy()))
+    np.testing.assert_allclose(found[1][0], found[0][0][:, order], atol=1e-6)
+    np.testing.assert_allclose(found[1][1], found[0][1], atol=1e-6)
+
+
+def test_moments_are_those_of_all_candidates_together():
+    rng = np.random.default_rng(2)
+    batches = [rng.normal(k, 1 + k, size=(50, INPUTS)) for k in range(4)]
+    moments = PooledMoments(INPUTS, ACTIONS, NUMBERS)
+    for batch in batches:
+        moments.update(batch)
+    every = np.concatenate(batches)
+    rows = every[:, STATE:].reshape(-1, NUMBERS)
+    mean = np.concatenate([every[:, :STATE].mean(axis=0), np.tile(rows.mean(axis=0), ACTIONS)])
+    var = np.concatenate([every[:, :STATE].var(axis=0), np.tile(rows.var(axis=0), ACTIONS)])
+    np.testing.assert_allclose(moments.mean, mean, atol=1e-4)
+    np.testing.assert_allclose(moments.var, var, rtol=1e-3)
+
+
+def test_ppo_learns_by_it_and_goes_on(tmp_path):
+    words = {
+        "out": tmp_path / "run",
+        "env-id": ENV_ID,
+        "observation": "candidates",
+        "total-timesteps": 2048,
+        "num-envs": 1,
+        "episode-steps": 10,
+        "eval-episodes": 6,
+        "eval-every": 0,
+        "n-steps": 256,
+        "batch-size": 64,
+        "n-epochs": 8,
+        "hidden": 32,
+        "gamma": 0.5,
+        "learning-rate": 0.003,
+    }
+
+    def run(*more):
+        given = [word for name, value in words.items() for word in (f"--{name}", str(value))]
+        return ppo.main([*given, *more])
+
+    assert run() == 0
+    points = read_curve(tmp_path / "run").points
+    assert points[-1]["return"] > 8 > 5 > points[0]["return"]
+    file = read_policy(tmp_path / "run" / "latest.safetensors")
+    assert file.metadata.candidates == NUMBERS
+    mean = file.part("observation")["mean"][STATE:].reshape(ACTIONS, NUMBERS)
+    np.testing.assert_array_equal(mean, np.tile(mean[0], (ACTIONS, 1)))
+    words["total-timesteps"] = 2304
+    assert run("--resume") == 0
+    assert read_policy(tmp_path / "run" / "latest.safetensors").metadata.timesteps == 2304
+
+
+def test_numbers_that_do_not_hold_the_candidates_are_refused():
+    metadata = file_of(make_network()).metadata
+    with pytest.raises(InputError, match="do not hold 9 for each"):
+        Metadata(**{**vars(metadata), "candidates": 9}).check()
