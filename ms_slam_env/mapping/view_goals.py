@@ -47,8 +47,9 @@ def best_goal(
     """The pose (4, 4) most worth its way, of some in free space and some where the camera is.
 
     Gain is weighed by exp(-lambda cost) (Bircher et al., ICRA 2016), cost the distance in
-    ``steps``, metres and radians of one motion. A function of what is known alone: which cells are compared, and where the camera looks from
-    them, are drawn by a hash of the cell, so that a goal stays while nothing better is found.
+    ``steps``, metres and radians of one motion. A function of what is known alone: which cells are
+    compared, and where the camera looks from them, are drawn by a hash of the cell, so that a goal
+    stays while nothing better is found.
     """
     free = reachable_positions(grid, here[:3, 3], _RADIUS_M)
     drawn = _hash(np.floor(free / grid.cell_m).astype(np.int64))
