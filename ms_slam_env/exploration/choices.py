@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -11,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.exploration.front import Point
+from ms_slam_env.exploration.objectives import METRICS
 from ms_slam_env.slam.adaptation.adaptive_slam import MOST
 from ms_slam_env.slam.configuration import SlamConfiguration
 
@@ -74,12 +76,19 @@ class Limit:
     def of(cls, points: Sequence[Point], objectives: Sequence[str], tolerance: float) -> Limit:
         """The limit of a study's first objective."""
         sound = [point for point in points if point.is_default and point.feasible]
-        value = tolerance * sound[0].values[0] if sound else float("inf")
+        value = tolerance * error_of(sound[0], objectives[0]) if sound else math.inf
         return cls(objectives[0], value)
 
     def holds(self, point: Point) -> bool:
         """Whether ``point`` is feasible, has its time measured, and is good enough."""
-        return point.feasible and _has(point, COST) and point.values[0] <= self.value
+        error = error_of(point, self.objective)
+        return point.feasible and _has(point, COST) and error <= self.value
+
+
+def error_of(point: Point, objective: str) -> float:
+    """What samplers are told of the error, though beyond the reference; infinite if unknown."""
+    value = point.measured.get(objective)
+    return math.inf if value is None else METRICS[objective].told(value)
 
 
 def _has(point: Point, *names: str) -> bool:
@@ -106,7 +115,7 @@ def for_divergence(points: Sequence[Point], M_I: float, M_D: float, limit: Limit
     good = [p for p in hard if limit.holds(p)]
     if good:
         return min(good, key=lambda p: p.measured[COST])
-    return min(hard, key=lambda p: p.values[0])
+    return min(hard, key=lambda p: error_of(p, limit.objective))
 
 
 def levels_of(points: Sequence[Point], limit: Limit) -> list[Point]:

@@ -73,3 +73,40 @@ def test_what_may_have_won_by_chance_is_named(
     _, table = explored.tables()
     assert said in table.note
     assert table.rows[0]["configuration"] == "default"
+
+
+def test_every_frame_rate_has_a_front_of_its_own_and_absences_are_said() -> None:
+    values = [(1, 0.02, 5.0), (1, 0.01, 7.0), (1, 0.03, 6.0), (2, 0.04, 4.0), (2, 0.05, 9.0)]
+    points = [
+        Point(
+            number,
+            {"keep_every": every},
+            {"ate_m": ate, "ext_ms": ext, "M_I": 0.01 * every},
+            (ate, ext),
+            number != 1,
+            False,
+            number == 0,
+        )
+        for number, (every, ate, ext) in enumerate(values)
+    ]
+    explored = Explored(
+        objectives=("ate_m", "ext_ms"),
+        clock="processor",
+        parameters=("keep_every",),
+        points=points,
+        chosen={"for-divergence": points[3]},
+        reference={"ate_m": 0.06, "ext_ms": 15.0},
+        hypervolume=[0.5],
+        importance={},
+        held_out=(),
+        again=(),
+        absent=["threads is absent: Warp runs a kernel on one thread"],
+        levels=[3, 0],
+    )
+    (rates,) = (chart for chart in explored.charts() if chart.name == "rates")
+    fronts = {series.name: (series.x, series.y) for series in rates.panels[0].series}
+    assert fronts == {"every 1, M_I 0.010": ([5.0], [0.02]), "every 2, M_I 0.020": ([4.0], [0.04])}
+    table = explored.tables()[0]
+    purposes = {row["trial"]: row["purpose"] for row in table.rows}
+    assert purposes == {0: "default, level 1", 3: "for-divergence, level 0"}
+    assert "Threads is absent: Warp runs a kernel on one thread." in table.note
