@@ -33,6 +33,17 @@ class Arguments:
         tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="GROUNDTRUTH")
     ] = None
     """True trajectory."""
+    runs: tuple[str, ...] = ()
+    """Many estimates against one --truth, as FILE or NAME=FILE; those of one name are runs of one
+    system, of which medians with intervals and box plots are given."""
+    truth: Path | None = None
+    """True trajectory of --runs."""
+    deltas: tuple[float, ...] = ()
+    """Of --runs: relative errors are given over each of these."""
+    tables: tuple[str, ...] = ()
+    """Write the tables also as latex, csv, or both (with --out)."""
+    rerun: bool = False
+    """Write paths and errors as evaluation.rrd for the Rerun viewer (with --out)."""
     align: str = "se3"
     """Alignment for ATE: se3, sim3 (relative errors are then of the scaled estimate), yaw (rotation
     about the world's z axis and translation), origin (first pose onto first) or none."""
@@ -92,14 +103,28 @@ def main(arguments: Sequence[str]) -> int:
         raise InputError("Missing GROUNDTRUTH: trajectories are given as ESTIMATE GROUNDTRUTH")
     if (args.map is None) != (args.true_map is None):
         raise InputError("Missing file: maps are given as --map ESTIMATE --true-map GROUNDTRUTH")
-    if args.estimate is None and args.map is None:
+    if (args.truth is None) != (not args.runs):
+        raise InputError("Missing file: runs are given as --runs FILE ... --truth GROUNDTRUTH")
+    if args.runs and (args.estimate is not None or args.map is not None):
+        raise InputError("--runs stand alone: without ESTIMATE, GROUNDTRUTH and --map")
+    if args.estimate is None and args.map is None and not args.runs:
         raise InputError(
-            "Missing files: ESTIMATE GROUNDTRUTH, or --map ESTIMATE --true-map GROUNDTRUTH"
+            "Missing files: ESTIMATE GROUNDTRUTH, --runs FILE ... --truth GROUNDTRUTH, or "
+            "--map ESTIMATE --true-map GROUNDTRUTH"
         )
+    if (args.tables or args.rerun) and args.out is None:
+        raise InputError("--tables and --rerun write files: they need --out FOLDER")
     from ms_slam_env.evaluation import evaluation_report as report
+    from ms_slam_env.evaluation.many_runs import evaluate_runs
+    from ms_slam_env.report.table_files import check_formats
 
+    check_formats(args.tables)
     # Nothing is written before everything has been measured: bad input leaves no half of a result.
     parts = []
+    if args.truth is not None:
+        options = _trajectory_options(args)
+        parts.append(evaluate_runs(args.runs, args.truth, options, args.deltas))
+        print(parts[-1].summary)
     if args.estimate is not None and args.groundtruth is not None:
         options = _trajectory_options(args)
         parts.append(report.evaluate_trajectories(args.estimate, args.groundtruth, options))
@@ -108,7 +133,7 @@ def main(arguments: Sequence[str]) -> int:
         parts.append(report.evaluate_map_files(args.map, args.true_map, _map_options(args)))
         print(parts[-1].summary)
     if args.out is not None:
-        report.write_evaluation(parts, args.out)
+        report.write_evaluation(parts, args.out, args.tables, args.rerun)
     return 0
 
 

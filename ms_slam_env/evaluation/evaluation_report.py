@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.evaluation.map_files import MEASURES, MapOptions, evaluate_maps
 from ms_slam_env.evaluation.map_quality import ComparedMap, share_keys
+from ms_slam_env.evaluation.rerun_file import write_paths
 from ms_slam_env.evaluation.trajectory_charts import error_panel, path_panel, widest_axes
 from ms_slam_env.evaluation.trajectory_files import (
     Matched,
@@ -26,6 +27,7 @@ from ms_slam_env.metrics.registry import metric
 from ms_slam_env.report import figures
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.results import write_result_folder
+from ms_slam_env.report.table_files import write_tables
 from ms_slam_env.report.tables import Column, Table, format_value, make_table
 from ms_slam_env.sequences import write_trajectory
 
@@ -59,6 +61,7 @@ class Evaluation:
         tables: of the metrics.
         charts: the same.
         write: writes what else belongs into a folder.
+        record: writes a Rerun recording to a file.
     """
 
     found: Found
@@ -67,14 +70,32 @@ class Evaluation:
     tables: Sequence[Table]
     charts: Sequence[Chart]
     write: Callable[[Path], object]
+    record: Callable[[Path], object] | None = None
 
 
-def write_evaluation(parts: Sequence[Evaluation], out: Path) -> None:
-    """Write ``evaluation.json``, ``table.md``, figures and files of all parts into ``out``."""
+RECORDING = "evaluation.rrd"
+
+
+def write_evaluation(
+    parts: Sequence[Evaluation], out: Path, formats: Sequence[str] = (), rerun: bool = False
+) -> None:
+    """Write ``evaluation.json``, ``table.md``, figures and files of all parts into ``out``.
+
+    ``formats``, of `table_files.FORMATS`, are more files of the tables; ``rerun`` asks for a
+    recording.
+    """
+
+    def write_more(folder: Path) -> None:
+        for part in parts:
+            part.write(folder)
+            if rerun and part.record is not None:
+                part.record(folder / RECORDING)
+        write_tables([table for part in parts for table in part.tables], folder, formats)
+
     write_result_folder(
         out,
         EVALUATION,
-        lambda folder: [part.write(folder) for part in parts],
+        write_more,
         kind="evaluation",
         title="Estimate against the truth",
         about=_ABOUT,
@@ -109,6 +130,7 @@ def evaluate_trajectories(estimate: Path, truth: Path, options: TrajectoryOption
         trajectory_tables(found, options),
         trajectory_charts(matched, options),
         write,
+        lambda path: write_paths(path, {"estimate": matched}),
     )
 
 
