@@ -16,13 +16,20 @@ from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.env.coverage import team_share
 from ms_slam_env.env.planners import Planner, Recovering, check_planner, make_planner
 from ms_slam_env.errors import InputError
-from ms_slam_env.experiments.harness.episodes import EpisodeSpec, make_env, seed_list
+from ms_slam_env.experiments.harness.episodes import (
+    DEFAULT_STEP_DEG,
+    DEFAULT_STEP_M,
+    EpisodeSpec,
+    make_env,
+    seed_list,
+)
 from ms_slam_env.experiments.harness.experiment import Experiment
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Grouping, Table, finished, make_table
-from ms_slam_env.scenes import Scene
+from ms_slam_env.scenes import HOMES, Scene
 from ms_slam_env.scenes.registry import check_name
+from ms_slam_env.tasks import find_task
 
 Float64 = NDArray[np.float64]
 
@@ -59,7 +66,7 @@ class TeamMapping(Experiment, Checked):
 
     scenes: tuple[str, ...] = ("corridor", "home")
     """Names of scenes."""
-    goals: tuple[float, ...] = (0.8, 0.3)
+    goals: tuple[float, ...] = (0.8, 0.5)
     """Share of the surface to be mapped, of each scene."""
     robots: tuple[int, ...] = (1, 2, 3)
     """Sizes of the teams."""
@@ -67,7 +74,7 @@ class TeamMapping(Experiment, Checked):
     """Split that the seeds come from: train, validation or test."""
     teams: int = bounded(2, 1, 1000)
     """Seeds for each scene."""
-    steps: int = bounded(250, 1, 100_000)
+    steps: int = bounded(200, 1, 100_000)
     """Most steps of a robot; a goal not reached by then is never reached."""
     planner: str = PLANNER
     """Planner of each robot, with its options; spread_m=0 lets it not divide frontiers."""
@@ -133,8 +140,7 @@ class Team:
 
     def __init__(self, spec: TeamMappingSpec) -> None:
         self._spec = spec
-        episode = EpisodeSpec(spec.planner, spec.scene, spec.seed, steps=spec.steps, task="home")
-        self._envs = [make_env(episode) for _ in range(spec.robots)]
+        self._envs = [make_env(_episode(spec)) for _ in range(spec.robots)]
         self._last: list[tuple[Any, dict[str, Any]]] = [self._envs[0].reset(seed=spec.seed)]
         starts = nearby_starts(
             self.worlds[0].scene, self._last[0][1]["T_world_camera"], spec.robots, spec.seed
@@ -218,6 +224,19 @@ def nearby_starts(scene: Scene, first: Float64, count: int, seed: int) -> list[F
     if len(chosen) < count:
         raise InputError(f"scene {scene.name!r}, seed {seed}, has no room for {count} robots")
     return chosen
+
+
+def _episode(spec: TeamMappingSpec) -> EpisodeSpec:
+    """What a robot is in; its steps are those of the task of such a scene."""
+    task = "home" if spec.scene in HOMES else "room"
+    options = find_task(task).options
+    return EpisodeSpec(
+        *(spec.planner, spec.scene, spec.seed),
+        steps=spec.steps,
+        step_m=options.get("step_m", DEFAULT_STEP_M),
+        step_deg=math.degrees(options.get("step_rad", math.radians(DEFAULT_STEP_DEG))),
+        task=task,
+    )
 
 
 def _inner(planner: Planner) -> Planner:

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from ms_slam_baselines.team_nbv import TeamNextBestView, Ways, looked_at
+from ms_slam_baselines.team_nbv import TeamNextBestView, looked_at
 
 from ms_slam_env.camera import xtion
 from ms_slam_env.cli import main
@@ -19,7 +19,7 @@ from ms_slam_env.sensor import RGBDSensor
 
 
 def planner(spread_m: float) -> TeamNextBestView:
-    config = SimpleNamespace(step_m=0.12, step_rad=0.2)
+    config = SimpleNamespace(step_m=0.12, step_rad=0.2, frames_per_action=1)
     made = TeamNextBestView(SimpleNamespace(config=config), spread_m=spread_m)  # type: ignore[arg-type]
     made.reset()
     return made
@@ -36,20 +36,6 @@ def test_what_a_team_mate_is_to_look_at_is_left_to_it() -> None:
     np.testing.assert_allclose(one.left_over(goals), [0, 0.5, 1])
     np.testing.assert_array_equal(planner(0.0).left_over(goals), 1)
     np.testing.assert_allclose(looked_at(goals)[1], [1.5, 0, 1.5])
-
-
-def test_ways_go_around_what_is_not_free() -> None:
-    cells = np.argwhere(np.ones((7, 7, 1), bool))
-    wall = (cells[:, 0] == 3) & (cells[:, 1] < 6)
-    free = 0.1 * cells[~wall].astype(float)
-    here, there = np.zeros(3), np.array([0.6, 0.0, 0.0])
-    ways = Ways(free, here, 0.1)
-    assert ways.lengths(there[None])[0] == pytest.approx(1.8)  # 6 cells up, 6 across, 6 down
-    way = ways.to(there)
-    np.testing.assert_allclose(way[[0, -1]], [here, there])
-    np.testing.assert_allclose(np.linalg.norm(np.diff(way, axis=0), axis=1), 0.1)
-    assert ways.lengths(here[None])[0] == 0
-    assert len(Ways(np.zeros((0, 3)), here, 0.1).to(there)) == 0
 
 
 def test_a_team_has_mapped_what_one_of_it_has(box_scene) -> None:
