@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import warnings
@@ -22,6 +23,7 @@ from ms_slam_env.env.planners import check_planner, make_planner, planner_observ
 from ms_slam_env.errors import InputError
 from ms_slam_env.interrupts import kept
 from ms_slam_env.output_files import check_out_folder, naming, result_folder
+from ms_slam_env.parallel import open_pool, run_each
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.scenes import SEED_SPLITS
 
@@ -97,21 +99,40 @@ def record(args: Args) -> Path:
     folder = args.out / name
     if folder.exists():
         raise InputError(f"{folder} is there already: give another --name, or remove it")
-    env = _environment(args)
-    try:
-        with (
-            kept(f"nothing is left in {folder}"),
-            result_folder(args.out, _marker(name)) as made,
-            naming(made / name),
-        ):
-            _write(env, args, name, made)
-    finally:
-        env.close()
+    with (
+        kept(f"nothing is left in {folder}"),
+        result_folder(args.out, _marker(name)) as made,
+        naming(made / name),
+        open_pool(_attempt, 1) as pool,
+    ):
+        (outcome,) = run_each(pool, {name: (args, name, made)})
+        if isinstance(outcome.value, OSError):
+            raise outcome.value
+        if outcome.is_bad_input:
+            raise InputError(outcome.message)
+        if outcome.died:  # HDF5 does not survive what it cannot write
+            raise OSError(errno.EIO, "the process that wrote it died", str(made / name))
+        if outcome.error:
+            raise RuntimeError(outcome.traceback)
     print(
         f"{args.episodes} episodes in {folder}; in Python, with MINARI_DATASETS_PATH="
         f"{args.out.resolve()}: minari.load_dataset({name!r})"
     )
     return folder
+
+
+def _attempt(job: tuple[Args, str, Path]) -> OSError | None:
+    """Play and write in a process of its own; return what the disk said against it."""
+    args, name, folder = job
+    try:
+        env = _environment(args)
+        try:
+            _write(env, args, name, folder)
+        finally:
+            env.close()
+    except OSError as error:
+        return error
+    return None
 
 
 def _environment(args: Args) -> gym.Env[Any, Any]:

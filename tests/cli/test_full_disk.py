@@ -260,6 +260,17 @@ LIMITED = {
 }
 
 
+def limited(size: int, command: str, out: Path) -> subprocess.CompletedProcess[str]:
+    """Run a command whose every file may have so many bytes."""
+    code = (
+        "import resource, sys; from ms_slam_env.cli import main; size = int(sys.argv[1]); "
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (size, size)); sys.exit(main(sys.argv[2:]))"
+    )
+    place = ["--save", f"{out}/a.rrd"] if command.startswith("view") else ["--out", str(out)]
+    words = [sys.executable, "-c", code, str(size), *command.split(), *place]
+    return subprocess.run(words, capture_output=True, text=True, check=False)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("command", LIMITED, ids=lambda command: command[:9].strip())
 def test_a_limit_of_the_system_is_one_line(command: str, tmp_path: Path) -> None:
@@ -267,17 +278,7 @@ def test_a_limit_of_the_system_is_one_line(command: str, tmp_path: Path) -> None
     for start, library in {"train": "sb3_contrib", "record": "minari", "view": "rerun"}.items():
         if command.startswith(start):
             pytest.importorskip(library)
-    code = (
-        "import resource, sys; from ms_slam_env.cli import main; size = int(sys.argv[1]); "
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (size, size)); sys.exit(main(sys.argv[2:]))"
-    )
-    out = (
-        ["--save", f"{tmp_path}/a.rrd"] if command.startswith("view") else ["--out", str(tmp_path)]
-    )
-    words = [str(LIMITED[command]), *command.split(), *out]
-    done = subprocess.run(
-        [sys.executable, "-c", code, *words], capture_output=True, text=True, check=False
-    )
+    done = limited(LIMITED[command], command, tmp_path)
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
     (line,) = [line for line in done.stderr.splitlines() if "error: " in line]
@@ -285,6 +286,18 @@ def test_a_limit_of_the_system_is_one_line(command: str, tmp_path: Path) -> None
     assert line.endswith(": File too large")
     left = {path.name for path in tmp_path.rglob("*")}
     assert not left & (MARKERS | {"latest.safetensors", "best.safetensors", "a.rrd"})
+
+
+@pytest.mark.slow
+def test_a_library_that_dies_of_a_full_disk_takes_nothing_with_it(tmp_path: Path) -> None:
+    """HDF5 crashes the process that closes a file which could not be written."""
+    pytest.importorskip("minari")
+    done = limited(5000, "record --planner random --scenes table --episodes 1 --steps 2", tmp_path)
+    assert done.returncode == 1
+    (line,) = [line for line in done.stderr.splitlines() if "error: " in line[:30]]
+    assert f"error: {tmp_path}/random-v0: " in line
+    assert line.endswith(("the process that wrote it died", "File too large"))
+    assert not list(tmp_path.iterdir())
 
 
 def test_every_command_is_attacked() -> None:
