@@ -23,7 +23,13 @@ import torch
 from gymnasium import spaces
 from ms_slam_agents.demonstrations import Demonstration, Task, play
 from ms_slam_agents.learning_curve import Curve, read_curve
-from ms_slam_agents.options import Problem, check_kept, check_new, numbers_of_candidates
+from ms_slam_agents.options import (
+    Problem,
+    check_kept,
+    check_new,
+    numbers_of_candidates,
+    parse_for_task,
+)
 from ms_slam_agents.policy import CLIP, EPSILON
 from ms_slam_agents.policy_file import Metadata, PolicyFile, read_policy, write_policy
 from ms_slam_agents.ppo import Network
@@ -34,7 +40,7 @@ from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
 from torch import Tensor
 from tqdm import tqdm
 
-from ms_slam_env.command_line import exit_code, parse
+from ms_slam_env.command_line import exit_code
 from ms_slam_env.config import bounded
 from ms_slam_env.env.planners import check_planner
 from ms_slam_env.errors import InputError
@@ -352,7 +358,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status: 0, 1 if an episode failed, 2, 130."""
     words = list(sys.argv[1:] if argv is None else argv)
     return exit_code(
-        lambda: train(parse(Args, words, "ms-slam train imitation")), "ms-slam train imitation"
+        lambda: train(parse_for_task(Args, words, "ms-slam train imitation", "imitation")),
+        "ms-slam train imitation",
     )
 
 

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
-from ms_slam_env.config import Checked, bounded, from_dict
+from ms_slam_env.command_line import parse
+from ms_slam_env.config import Checked, bounded, from_dict, load_yaml
 from ms_slam_env.env.observations import POINT as OBSERVATIONS
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.input_files import read_text
 from ms_slam_env.mapping.candidates import NAMES
+from ms_slam_env.slam.configuration import is_file_name
 
 
 @dataclass(frozen=True)
@@ -20,6 +24,8 @@ class Problem(Checked):
     Attributes:
         out: folder for everything the run writes.
         resume: go on with the run in ``out``.
+        task: whose options to begin with: a name, of a file in ``hyperparameters/``, or a YAML file
+            of your own; what is given beside it counts more.
         env_id: id of the environment.
         embodiment: what carries the camera; None: what the id says.
         observation: a variant by name; `lookahead` shows the agent what the greedy planner
@@ -29,9 +35,10 @@ class Problem(Checked):
         episode_steps: time limit of an episode.
         step_m: translation of a motion; None: the environment's default.
         step_deg: rotation of a motion; None: the environment's default.
-        frames_per_action: frames of a motion of an arm; None: as many as arrive while it moves,
-            some ten. With ``--embodiment arm-kinematic --frames-per-action 1`` a step costs little
-            more than the free camera's: a world to train in before the arm itself (``--init``).
+        frames_per_action: frames of a motion; None: of an arm as many as arrive while it moves,
+            some ten, of a free camera those of the environment. With ``--embodiment arm-kinematic
+            --frames-per-action 1`` a step costs little more than the free camera's: a world to
+            train in before the arm itself (``--init``).
         num_envs: parallel environments, one process and one thread each.
         seed: of network, training episodes and sampling.
         eval_episodes: validation episodes, the same at each evaluation, with the same random
@@ -41,6 +48,7 @@ class Problem(Checked):
 
     out: Path = Path("runs/policy")
     resume: bool = False
+    task: str | None = None
     env_id: str = "MSActiveSLAM-FreeCamera-v0"
     embodiment: str | None = None
     observation: str = "features"
@@ -110,10 +118,55 @@ class Args(Problem):
     hidden: int = bounded(128, 1, 4096)
 
 
+TASKS = Path(__file__).parent / "hyperparameters"
+P = TypeVar("P", bound=Problem)
+
+
+def parse_for_task(cls: type[P], arguments: Sequence[str], prog: str, trainer: str) -> P:
+    """Options ``cls`` of a command line; what it does not say is as its ``--task`` has it.
+
+    Raises:
+        InputError: bad options, an unknown task, or a file with an option that there is not.
+    """
+    words = [part for word in arguments for part in word.split("=", 1 if "--task" in word else 0)]
+    named = [after for word, after in pairwise(words) if word == "--task"]
+    default = of_task(cls, named[-1], trainer) if named else None
+    return parse(cls, arguments, prog, default=default)
+
+
+def of_task(cls: type[P], task: str, trainer: str) -> P:
+    """Options ``cls`` of a task: those of ``problem``, and those of the trainer.
+
+    Raises:
+        InputError: an unknown task, or a file that does not hold such options.
+    """
+    path = Path(task) if is_file_name(task) else TASKS / f"{task}.yaml"
+    if not is_file_name(task) and not path.is_file():
+        raise unknown("task", task, sorted(one.stem for one in TASKS.glob("*.yaml")))
+    text = read_text(path, "hyperparameters")
+    try:
+        content = load_yaml(text)
+    except ValueError as error:
+        raise InputError(f"{path}: not YAML: {error}") from None
+    values: dict[str, Any] = {"task": task}
+    for name, part in content.items() if isinstance(content, Mapping) else [("", content)]:
+        if name not in SECTIONS or not isinstance(part, Mapping):
+            raise InputError(f"{path}: {name!r} must be one of {', '.join(SECTIONS)}, a mapping")
+        if name in ("problem", trainer):
+            values |= {key: tuple(v) if isinstance(v, list) else v for key, v in part.items()}
+    try:
+        return _of_types(from_dict(cls, values), "option")
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
 def numbers_of_candidates(args: Problem) -> int:
     """Numbers of each action that our own networks look at one by one; 0 where there are none."""
     return len(NAMES) if args.observation == "candidates" else 0
 
+
+SECTIONS = ("problem", "sb3", "imitation", "ppo")
+"""Of a file of hyperparameters: the problem, and the options of each trainer."""
 
 KEPT = ("algorithm", "env_id", "embodiment", "observation", "step_m", "step_deg", "hidden")
 """Options that a run keeps when it is resumed: another network, or another problem."""
@@ -137,10 +190,7 @@ def resumed(given: Args, saved: Mapping[str, Any]) -> Args:
         named = [text for text in texts if isinstance(text, str) and ":" in text]
         if named and value != getattr(given, name):
             raise InputError(f"saved option {name} names code, {named[0]!r}: give --{name} again")
-    for name, hint in get_type_hints(Args).items():
-        if not _is_of(getattr(made, name), hint):
-            raise InputError(f"saved option {name} = {getattr(made, name)!r} is of the wrong type")
-    return made
+    return _of_types(made, "saved option")
 
 
 def check_new(out: Path, *names: str) -> None:
@@ -176,6 +226,14 @@ def check_steps_left(path: Path, done: int, total: int) -> None:
         raise InputError(
             f"{path} is trained for {done} steps already: give more than --total-timesteps {total}"
         )
+
+
+def _of_types(made: P, what: str) -> P:
+    """The same options, all of the types that they are declared with."""
+    for name, hint in get_type_hints(type(made)).items():
+        if not _is_of(getattr(made, name), hint):
+            raise InputError(f"{what} {name} = {getattr(made, name)!r} is of the wrong type")
+    return made
 
 
 def _is_of(value: Any, hint: Any) -> bool:

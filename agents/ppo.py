@@ -32,6 +32,7 @@ from ms_slam_agents.options import (
     check_new,
     check_steps_left,
     numbers_of_candidates,
+    parse_for_task,
 )
 from ms_slam_agents.policy_file import (
     Metadata,
@@ -54,7 +55,7 @@ from torch import Tensor, nn
 from torch.nn.functional import kl_div, log_softmax, mse_loss
 from tqdm import tqdm
 
-from ms_slam_env.command_line import exit_code, parse
+from ms_slam_env.command_line import exit_code
 from ms_slam_env.config import bounded
 from ms_slam_env.errors import InputError
 from ms_slam_env.interrupts import kept
@@ -550,7 +551,9 @@ def train(args: Args) -> int:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status: 0, 2 or 130."""
     words = list(sys.argv[1:] if argv is None else argv)
-    return exit_code(lambda: train(parse(Args, words, "ms-slam train ppo")), "ms-slam train ppo")
+    return exit_code(
+        lambda: train(parse_for_task(Args, words, "ms-slam train ppo", "ppo")), "ms-slam train ppo"
+    )
 
 
 if __name__ == "__main__":

@@ -33,6 +33,7 @@ from ms_slam_agents.options import (
     check_kept,
     check_new,
     check_steps_left,
+    parse_for_task,
     resumed,
 )
 from ms_slam_agents.policy_file import PolicyFile, read_policy
@@ -69,7 +70,12 @@ def make_env(args: Problem, split: str, seeds: Sequence[int]) -> gym.Env[Any, An
 
 def problem_options(args: Problem, split: str) -> dict[str, Any]:
     """Options of ``gym.make`` for the episodes of a split."""
-    few = args.frames_per_action
+    few: dict[str, Any] = {"frames_per_action": args.frames_per_action}
+    holder = args.embodiment or gym.spec(args.env_id).kwargs.get("embodiment", "")
+    if args.frames_per_action is None:
+        few = {}
+    elif str(holder).startswith("arm"):
+        few = {"arm": few}
     return {
         "max_episode_steps": args.episode_steps,
         "scene": args.scenes,
@@ -77,7 +83,7 @@ def problem_options(args: Problem, split: str) -> dict[str, Any]:
         "num_scene_seeds": args.scene_seeds,
         "observation": args.observation,
         "frame_divergences": False,  # nobody reads them here
-        **({} if few is None else {"arm": {"frames_per_action": few}}),
+        **few,
         **env_options(args),
     }
 
@@ -285,11 +291,12 @@ def parse_options(argv: Sequence[str] | None) -> Args:
         InputError: bad options, or nothing to resume from.
     """
     prog = "ms-slam train"
-    given = parse(Args, argv, prog)
+    words = list(sys.argv[1:] if argv is None else argv)
+    given = parse_for_task(Args, words, prog, "sb3")
     if not given.resume:
         return given
     saved = resumed(given, read_policy(given.out / LATEST).metadata.options)
-    return parse(Args, argv, prog, default=saved)
+    return parse(Args, words, prog, default=saved)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

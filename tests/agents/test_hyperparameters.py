@@ -1,0 +1,89 @@
+"""Options of a task: from its YAML file, before those of the command line."""
+
+import math
+
+import gymnasium as gym
+import pytest
+from ms_slam_agents import imitation, options, ppo, train_sb3
+
+from ms_slam_env.errors import InputError
+from ms_slam_env.tasks import OWN, env_id_of
+
+TRAINERS = {"ppo": ppo.Args, "imitation": imitation.Args, "sb3": train_sb3.Args}
+NAMES = sorted(path.stem for path in options.TASKS.glob("*.yaml"))
+
+
+def parsed(words, trainer="ppo"):
+    return options.parse_for_task(TRAINERS[trainer], words, "ms-slam train", trainer)
+
+
+def test_every_task_of_the_benchmark_has_a_file():
+    assert set(OWN) <= set(NAMES)
+
+
+@pytest.mark.parametrize("trainer", TRAINERS)
+@pytest.mark.parametrize("task", NAMES)
+def test_every_file_is_read_by_every_trainer_and_is_about_its_task(task, trainer):
+    args = parsed(["--task", task], trainer)
+    own = OWN[task.removesuffix("-kinematic")]()
+    assert args.env_id == env_id_of(task.removesuffix("-kinematic"))
+    assert args.scenes == own.scenes
+    assert args.task == task
+    if task in OWN:
+        assert args.episode_steps == own.steps
+    else:
+        assert train_sb3.problem_options(args, "train")["arm"] == {"frames_per_action": 1}
+
+
+def test_the_command_line_counts_more():
+    args = parsed(["--task=home", "--gamma", "0.5", "--scenes", "table"])
+    assert (args.gamma, args.scenes, args.memory) == (0.5, ("table",), 128)
+    assert parsed([]).gamma == ppo.Args().gamma
+    assert parsed(["--task", "home"], "sb3").gamma == 0.99
+
+
+def test_a_file_of_ones_own(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("problem: {scenes: [table]}\nppo: {gamma: 0.7}\nsb3: {gamma: 0.6}\n")
+    assert parsed(["--task", str(path)]).gamma == 0.7
+    args = parsed(["--task", str(path)], "sb3")
+    assert (args.gamma, args.scenes, args.hidden) == (0.6, ("table",), train_sb3.Args().hidden)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("ppo: {gama: 0.7}", "unknown option of Args 'gama'; valid choices"),
+        ("ppo: {gamma: 7}", "gamma"),
+        ("ppo: {gamma: high}", "gamma"),
+        ("problem: {scenes: 3}", "scenes"),
+        ("pro: {gamma: 0.7}", "'pro' must be one of problem, sb3, imitation, ppo"),
+        ("ppo: 3", "'ppo' must be one of"),
+        ("- ppo", "must be one of"),
+        ("{", "not YAML"),
+    ],
+)
+def test_what_a_file_cannot_say_is_one_line_with_its_name(tmp_path, text, said, capsys):
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=f"mine.yaml: .*{said}"):
+        parsed(["--task", str(path)])
+    assert ppo.main(["--task", str(path), "--out", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unknown_task_lists_those_that_there_are():
+    with pytest.raises(InputError, match="unknown task 'rooms'; valid choices: .*room"):
+        parsed(["--task", "rooms"])
+
+
+def test_frames_a_motion_are_the_arms_or_the_free_cameras():
+    free = train_sb3.problem_options(ppo.Args(frames_per_action=2), "train")
+    assert free["frames_per_action"] == 2
+    arm = ppo.Args(env_id="MSActiveSLAM-v0", frames_per_action=2)
+    assert train_sb3.problem_options(arm, "train")["arm"] == {"frames_per_action": 2}
+    held = ppo.Args(embodiment="arm-kinematic", frames_per_action=3)
+    env = gym.make(held.env_id, **train_sb3.problem_options(held, "train"))
+    assert env.unwrapped.config.arm.frames_per_action == 3
+    assert math.isclose(env.unwrapped.config.step_m, 0.12)
