@@ -551,9 +551,8 @@ def train(args: Args) -> int:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status: 0, 2 or 130."""
     words = list(sys.argv[1:] if argv is None else argv)
-    return exit_code(
-        lambda: train(parse_for_task(Args, words, "ms-slam train ppo", "ppo")), "ms-slam train ppo"
-    )
+    prog = "ms-slam train ppo"
+    return exit_code(lambda: train(parse_for_task(Args, words, prog, "ppo")), prog)
 
 
 if __name__ == "__main__":

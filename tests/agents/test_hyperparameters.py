@@ -35,6 +35,11 @@ def test_every_file_is_read_by_every_trainer_and_is_about_its_task(task, trainer
         assert train_sb3.problem_options(args, "train")["arm"] == {"frames_per_action": 1}
 
 
+@pytest.mark.parametrize("task", NAMES)
+def test_the_environment_of_every_file_can_be_made(task):
+    train_sb3.check_problem(parsed(["--task", task]))
+
+
 def test_the_command_line_counts_more():
     args = parsed(["--task=home", "--gamma", "0.5", "--scenes", "table"])
     assert (args.gamma, args.scenes, args.memory) == (0.5, ("table",), 128)
@@ -74,7 +79,7 @@ def test_what_a_file_cannot_say_is_one_line_with_its_name(tmp_path, text, said, 
 
 
 def test_an_unknown_task_lists_those_that_there_are():
-    with pytest.raises(InputError, match="unknown task 'rooms'; valid choices: .*room"):
+    with pytest.raises(InputError, match=r"unknown task 'rooms'; valid choices: .*room"):
         parsed(["--task", "rooms"])
 
 
