@@ -26,6 +26,7 @@ from ms_slam_env.slam.alignment_check import (
 )
 from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
 from ms_slam_env.slam.surfel.acceptance import Alignment, acceptance_thresholds, is_nearly_accepted
+from ms_slam_env.slam.surfel.map_search import FrameLookup
 from ms_slam_env.slam.surfel.relocalization import Images
 
 Float64 = NDArray[np.float64]
@@ -164,16 +165,15 @@ def judge(
     slam: BatchedSurfelSlam, frame: RGBDFrame, start: Float64, truth: Float64
 ) -> dict[str, Any]:
     """Align a frame from ``start`` (4, 4): features, decisions, and whether ``truth`` was found."""
-    images = Images(frame.color[None], frame.depth[None])
-    slam.show(images)
-    alignment = slam.align_near(start)
+    lookup = FrameLookup(slam, Images(frame.color[None], frame.depth[None]))
+    alignment = lookup.align_near(start)
     pose = alignment.T_world_live[0]
     away_m = np.linalg.norm(pose[:3, 3] - truth[:3, 3])
     away_rad = relative_angle(pose[:3, :3], truth[:3, :3])
     is_right = True if away_m < RIGHT_M and away_rad < RIGHT_RAD else None
     if away_m > WRONG_M or away_rad > WRONG_RAD:
         is_right = False
-    view = slam.consistency(images, alignment.T_world_live)
+    view = lookup.consistency(alignment.T_world_live)
     features = {
         name: sign * float(alignment.statistics[0][name]) for name, sign in FEATURES.items()
     }

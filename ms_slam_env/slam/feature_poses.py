@@ -96,6 +96,11 @@ class LastFrames(Saved):
             for env in np.flatnonzero(known):
                 own[env] = new[env]
 
+    @property
+    def images(self) -> tuple[NDArray[np.uint8], Float32]:
+        """Colour (B, H, W, 3) and depth (B, H, W) of the frames."""
+        return self._color, self._depth
+
     def move(self, env: int, T_world_camera: Float64) -> None:
         """Put an env's frame elsewhere (4, 4)."""
         self._poses[env] = T_world_camera

@@ -25,6 +25,7 @@ MODULES = (
     "pose_hypotheses",
     "preprocessing",
     "pyramid",
+    "rolling_shutter",
     "solver",
     "splatting",
     "surfel_culling",

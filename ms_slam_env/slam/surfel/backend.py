@@ -81,14 +81,14 @@ class SurfelSlam(SlamBackend):
     def track(self, frame: RGBDFrame, T_world_camera_guess: ArrayLike | None = None) -> TrackResult:
         """Estimate the pose of ``frame`` and fuse it into the map; see ``SlamBackend``."""
         color, depth = self._images(frame)
-        result = self._slam.track(color, depth, [T_world_camera_guess])[0]
+        result = self._slam.track(color, depth, [T_world_camera_guess], [frame.timestamp])[0]
         return self._submaps.follow(Images(color, depth), T_world_camera_guess, result)
 
     def fuse(self, frame: RGBDFrame, T_world_camera: ArrayLike) -> TrackResult:
         """Fuse ``frame`` into the map at a known pose (4, 4), without tracking."""
         color, depth = self._images(frame)
         pose = check_pose(T_world_camera, "T_world_camera")
-        return self._slam.fuse(color, depth, pose[None])[0]
+        return self._slam.fuse(color, depth, pose[None], [frame.timestamp])[0]
 
     def _images(self, frame: RGBDFrame) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Colour (1, h, w, 3) and depth (1, h, w) at the size in force."""

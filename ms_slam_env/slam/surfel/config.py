@@ -218,6 +218,8 @@ class SurfelConfig(Checked):
         submap_rules: parameters of the former.
         motion_mask: "geometric": what moves is neither tracked nor mapped, see ``free_space_mask``;
             "none": the world is taken to be still.
+        readout_s: time that a rolling shutter takes from the first row to the last, see
+            ``rolling_shutter``; 0: all rows are taken at once. It takes frames with their times.
     """
 
     depth_cutoff_m: float = bounded(8.0, 0.0, 10.0)
@@ -252,6 +254,7 @@ class SurfelConfig(Checked):
     submaps: str = chosen("off", *SUBMAPS)
     submap_rules: SubmapConfig = field(default_factory=SubmapConfig)
     motion_mask: str = chosen("none", *MOTION_MASKS)
+    readout_s: float = bounded(0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -132,6 +132,16 @@ class Localizer:
         self._motion_mask.find(*self._trusted(alignment, expected))
         return alignment
 
+    def realign(self, live: LiveFrame, alignment: Alignment, where: NDArray[np.bool_]) -> Alignment:
+        """Align the envs ``where`` (B,) again from where they were found, with other images."""
+        self._tracker.set_frame(live)
+        states = self._states
+        starts = np.where(where[:, None, None], alignment.T_model_live, np.eye(4))
+        hypotheses = np.repeat(starts[:, None], NUM_HYPOTHESES, axis=1)
+        thresholds = acceptance_thresholds(self._config.acceptance, states.lost > 0, states.lost)
+        again = self.align_from(states.poses, hypotheses, thresholds)
+        return alignment.replace(where & again.tracked, again)
+
     def _is_settled(self, alignment: Alignment) -> bool:
         """Whether every env is tracked, was so before and beyond doubt: nothing more to ask."""
         states = self._states

@@ -10,18 +10,52 @@ from numpy.typing import NDArray
 
 from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.geometry import invert
+from ms_slam_env.slam.alignment_check import AlignmentStatistics
 from ms_slam_env.slam.base import Float64, Views
 from ms_slam_env.slam.map_fit import FitConfig, measure_fit, why_not_believed
 from ms_slam_env.slam.state import Saved
+from ms_slam_env.slam.surfel.acceptance import Alignment
 from ms_slam_env.slam.surfel.config import SubmapConfig
 from ms_slam_env.slam.surfel.detached_map import DetachedMap
-from ms_slam_env.slam.surfel.pose_hypotheses import is_within
-from ms_slam_env.slam.surfel.relocalization import Images
+from ms_slam_env.slam.surfel.pose_hypotheses import is_within, tracking_hypotheses
+from ms_slam_env.slam.surfel.relocalization import Images, measure_consistency
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.view_prediction import mean_pose
 
 _FIT = FitConfig(queries=8)
+
+
+class FrameLookup:
+    """Looks for a frame in the map of a SLAM of one camera, which stays as it is."""
+
+    def __init__(self, slam: BatchedSurfelSlam, frames: Images) -> None:
+        """Look for ``frames`` (1, H, W) from now on; the SLAM's next frame ends that."""
+        self._slam, self._frames = slam, frames
+        slam.localizer.set_frame(slam.preprocess(frames.color, frames.depth))
+
+    def align_near(self, pose: Float64) -> Alignment:
+        """Align with the map as seen from ``pose`` (4, 4), under strict thresholds."""
+        hypotheses, localizer = tracking_hypotheses(np.eye(4))[None], self._slam.localizer
+        return localizer.align_from(pose[None], hypotheses, localizer.strict_thresholds())
+
+    def consistency(self, poses: Float64) -> AlignmentStatistics:
+        """How the frame agrees with the map's view from ``poses`` (1, 4, 4)."""
+        slam, wanted = self._slam, np.ones(1, dtype=bool)
+        cutoff_m = slam.config.depth_cutoff_m
+        return measure_consistency(self._frames, poses, wanted, slam.localizer, cutoff_m)[0]
+
+    def verify(self, poses: Float64) -> bool:
+        """Whether the map's view from ``poses`` (1, 4, 4) is like the frame."""
+        slam, found = self._slam, np.ones(1, dtype=bool)
+        return bool(slam.relocalization.verify(self._frames, poses, found, slam.localizer)[0])
+
+    def propose(self, attempt: int) -> Float64 | None:
+        """A pose (4, 4) where the frame may have been taken, from keyframes; None without."""
+        slam, lost = self._slam, np.ones(1, dtype=bool)
+        attempts = np.array([attempt], dtype=np.int32)
+        poses = slam.relocalization.propose(self._frames, lost, attempts, slam.localizer)
+        return poses[0] if np.isfinite(poses).all() else None
 
 
 class MapFinder:
@@ -51,16 +85,15 @@ class MapFinder:
 
     def near(self, frames: Images, other: DetachedMap, pose: Float64) -> Float64 | None:
         """Where in a map a frame was taken if that is near ``pose`` (4, 4); None if it is not."""
-        self._load(other, frames)
-        found = self._slam.align_near(pose)
-        if not found.tracked[0] or not self._slam.verify(frames, found.T_world_live):
+        lookup = self._lookup(other, frames)
+        found = lookup.align_near(pose)
+        if not found.tracked[0] or not lookup.verify(found.T_world_live):
             return None
         return found.T_world_live[0]
 
     def anywhere(self, frames: Images, other: DetachedMap, attempt: int) -> Float64 | None:
         """Where in a map a frame was taken, from keyframes that resemble it; None if none does."""
-        self._load(other, frames)
-        pose = self._slam.propose(frames, attempt)
+        pose = self._lookup(other, frames).propose(attempt)
         return None if pose is None else self.near(frames, other, pose)
 
     def bears_out(self, slam: BatchedSurfelSlam, T_other_present: Float64, pose: Float64) -> bool:
@@ -74,12 +107,12 @@ class MapFinder:
         fit = measure_fit(there, present, T_other_present, _FIT)
         return not why_not_believed(fit, _FIT)
 
-    def _load(self, other: DetachedMap, frames: Images) -> None:
+    def _lookup(self, other: DetachedMap, frames: Images) -> FrameLookup:
         self._slam.reconfigure(self._present.config, self._present.intrinsics)
         if self._loaded is not other:
             self._slam.attach_map(other)
             self._loaded = other
-        self._slam.show(frames)
+        return FrameLookup(self._slam, frames)
 
 
 class JointSearch(Saved):

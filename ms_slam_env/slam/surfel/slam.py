@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import check_pose, invert
-from ms_slam_env.slam.alignment_check import MAP_REASONS, AlignmentStatistics, TrackingStatus
+from ms_slam_env.slam.alignment_check import MAP_REASONS, TrackingStatus
 from ms_slam_env.slam.base import Float64, TrackResult
 from ms_slam_env.slam.ferns import Candidate
 from ms_slam_env.slam.state import Saved, check_has
@@ -37,10 +37,10 @@ from ms_slam_env.slam.surfel.pose_hypotheses import (
     check_guesses,
     check_poses,
     motion_weight,
-    tracking_hypotheses,
 )
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
-from ms_slam_env.slam.surfel.relocalization import Images, make_relocalization, measure_consistency
+from ms_slam_env.slam.surfel.relocalization import Images, make_relocalization
+from ms_slam_env.slam.surfel.rolling_shutter import make_shutter
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.tracker import model_stride
 
@@ -62,9 +62,10 @@ class BatchedSurfelSlam(Saved):
         self.relocalization = make_relocalization(batch, intrinsics, config)
         self._states = CameraStates.at_rest(batch)
         self.motion_mask = make_motion_mask(batch, intrinsics, config, device)
-        self._localizer = Localizer(self._states, self.map, self.relocalization, self.motion_mask)
-        self._invalid_frames = self._localizer.invalid_frames
-        self._last_frames = self._localizer.last_frames
+        self._shutter = make_shutter(batch, config.readout_s, device)
+        self.localizer = Localizer(self._states, self.map, self.relocalization, self.motion_mask)
+        self._invalid_frames = self.localizer.invalid_frames
+        self._last_frames = self.localizer.last_frames
         dtypes = (wp.mat44, wp.int32, wp.float32, wp.int32)  # of pose, time, weight and mask
         self._fused = [HostDeviceBuffer(batch, dtype, device) for dtype in dtypes]
         self._use(self._pipelines.get(intrinsics, config))
@@ -90,60 +91,78 @@ class BatchedSurfelSlam(Saved):
         self.preprocess, self.tracker = pipeline.preprocess, pipeline.tracker
         self._correct_exposure = pipeline.correct_exposure
         self.map.use(pipeline.map_kernels)
-        self._localizer.use(pipeline)
+        self.localizer.use(pipeline)
+        self._shutter.use(self.intrinsics)
 
     def reset(self, T_world_camera: ArrayLike | None = None, env: int = 0) -> None:
         """Forget one env; its next frame is taken at ``T_world_camera`` (identity if None)."""
         pose = np.eye(4) if T_world_camera is None else T_world_camera
         self._states.reset(env, check_pose(pose, "T_world_camera"))
+        self._last_frames.forget(env)
+        self._shutter.forget(env)
+        self._forget_map(env)
+
+    def _forget_map(self, env: int) -> None:
         self.map.clear(env)
         self.relocalization.clear(env)
         self.loops.reset(env)
         self.motion_mask.forget(env)
-        self._last_frames.forget(env)
-        self._localizer.forget_view()
+        self.localizer.forget_view()
 
     def track(
         self,
         color: NDArray[np.uint8],
         depth: NDArray[np.float32],
         T_world_camera_guess: Sequence[ArrayLike | None] | None = None,
+        times_s: Sequence[float] | None = None,
     ) -> list[TrackResult]:
         """Track and fuse one frame per env: colour (B, H, W, 3) uint8, depth (B, H, W) metres.
 
-        ``T_world_camera_guess`` holds for every env a pose (4, 4) to start from too, or None.
+        ``T_world_camera_guess`` holds for every env a pose (4, 4) to start from too, or None;
+        ``times_s`` says when the frames were taken, without which no rolling shutter is undone.
         """
-        live, frames = self.preprocess(color, depth), Images(color, depth)
         guesses = check_guesses(T_world_camera_guess, self.batch)
         self._select_surfels(self._states.lost)
-        results = self._track(live, frames, guesses)
+        taken = Images(color, depth)
+        frames = self._shutter.level(taken, self._states.motions)
+        live = self.preprocess(frames.color, frames.depth)
+        alignment = self.localizer.locate(live, frames, guesses)
+        self._shutter.take_time(times_s)
+        if self._shutter.is_rolling:
+            live, frames, alignment = self._locate_again(taken, alignment)
+        results = [self._follow(env, live, alignment) for env in range(self.batch)]
         self._correct_exposure(live, self._states.photometry)
         known = np.array([result.tracking_ok for result in results])
-        self._last_frames.keep(color, depth, self.poses, known)
+        self._last_frames.keep(frames.color, frames.depth, self.poses, known)
         self._fuse(live, frames, np.array([result.fused for result in results]))
         return self._close_loops(live, frames, results)
 
     def fuse(
-        self, color: NDArray[np.uint8], depth: NDArray[np.float32], T_world_camera: Float64
+        self,
+        color: NDArray[np.uint8],
+        depth: NDArray[np.float32],
+        T_world_camera: Float64,
+        times_s: Sequence[float] | None = None,
     ) -> list[TrackResult]:
-        """Fuse one frame per env at known poses (B, 4, 4), without tracking."""
-        live, frames = self.preprocess(color, depth), Images(color, depth)
-        poses = check_poses(T_world_camera, self.batch)
+        """Fuse one frame per env at known poses (B, 4, 4), without tracking; see ``track``."""
+        poses, states = check_poses(T_world_camera, self.batch), self._states
+        moves_on = states.started & (states.lost == 0)
+        motions = np.where(moves_on[:, None, None], invert(states.poses) @ poses, np.eye(4))
+        self._shutter.take_time(times_s)
+        frames = self._shutter.level(Images(color, depth), motions)
+        live = self.preprocess(frames.color, frames.depth)
         self._select_surfels(np.ones(self.batch, dtype=np.int32))  # known poses: old and new fit
-        states = self._states
-        self._invalid_frames.find(color, states.started)
+        self._invalid_frames.find(frames.color, states.started)
         self.motion_mask.expect(live, poses, states.started)
         self.motion_mask.find(poses, states.started)
+        states.motions = motions
         for env in range(self.batch):
-            moves_on = states.started[env] and not states.lost[env]
-            motion = invert(states.poses[env]) @ poses[env]
-            states.motions[env] = motion if moves_on else np.eye(4)
             # With too little to see, the first frame that is tracked starts the map.
             states.started[env] = states.started[env] or _readings(env, live) >= FEWEST_READINGS
         states.poses = poses
         states.lost[:] = 0
         everywhere = np.ones(self.batch, dtype=bool)
-        self._last_frames.keep(color, depth, poses, everywhere)
+        self._last_frames.keep(frames.color, frames.depth, poses, everywhere)
         self._fuse(live, frames, everywhere)
         return [
             TrackResult(pose.copy(), True, moving=self.motion_mask.mask(env))
@@ -153,15 +172,35 @@ class BatchedSurfelSlam(Saved):
     def _select_surfels(self, lost: NDArray[np.int32]) -> None:
         """Let loop closure choose what frames are aligned with and fused into."""
         if self.loops.select(lost):
-            self._localizer.forget_view()
+            self.localizer.forget_view()
 
-    def _track(self, live: LiveFrame, frames: Images, guesses: Float64 | None) -> list[TrackResult]:
-        """Poses of the live frames: given for the first, tracked or searched for the others."""
-        alignment = self._localizer.locate(live, frames, guesses)
-        return [
-            self._move_on(env, alignment) if self._states.started[env] else self._start(env, live)
-            for env in range(self.batch)
-        ]
+    def _locate_again(
+        self, taken: Images, alignment: Alignment
+    ) -> tuple[LiveFrame, Images, Alignment]:
+        """Level frames by the motions that were found, and align them once more."""
+        states = self._states
+        moved = states.started & alignment.tracked & (states.lost == 0)
+        motions = np.where(moved[:, None, None], alignment.T_model_live, np.eye(4))
+        self._map_first_again(motions, moved & (states.time == 1))
+        frames = self._shutter.level(taken, motions)
+        live = self.preprocess(frames.color, frames.depth)
+        return live, frames, self.localizer.realign(live, alignment, moved)
+
+    def _map_first_again(self, motions: Float64, where: NDArray[np.bool_]) -> None:
+        """Map the first frames of the envs ``where`` (B,) as levelled by the motions since."""
+        if where.any():
+            frames = self._shutter.level(Images(*self._last_frames.images), motions)
+            live = self.preprocess(frames.color, frames.depth)
+            for env in np.flatnonzero(where):
+                self._forget_map(int(env))
+            self._states.time -= 1
+            self._fuse(live, frames, where)
+
+    def _follow(self, env: int, live: LiveFrame, alignment: Alignment) -> TrackResult:
+        """Pose of a live frame: given for the first, tracked or searched for the others."""
+        if self._states.started[env]:
+            return self._move_on(env, alignment)
+        return self._start(env, live)
 
     def _start(self, env: int, live: LiveFrame) -> TrackResult:
         """Take the first frame at the given pose, if there is something in it to map."""
@@ -211,7 +250,7 @@ class BatchedSurfelSlam(Saved):
                 buffer.write(value)
             self.map.fuse(live, *(buffer.array for buffer in self._fused))
             self.loops.record(states.poses, states.time, good)
-            self._localizer.forget_view()
+            self.localizer.forget_view()
         states.time += 1
 
     def _close_loops(
@@ -252,7 +291,7 @@ class BatchedSurfelSlam(Saved):
         self.map.set_surfels(env, detached.surfels)
         self.relocalization.set_keyframes(env, detached.keyframes)
         self.loops.set_history(env, detached.history)
-        self._localizer.forget_view()
+        self.localizer.forget_view()
 
     def restart(self, T_world_camera: Float64, env: int = 0) -> None:
         """Forget an env's map and its last frame, which is to be taken first of a new one."""
@@ -295,37 +334,9 @@ class BatchedSurfelSlam(Saved):
         readings = float((frames.depth[env] > 0).mean())
         return readings >= FEWEST_READINGS and (not blank or self._invalid_frames.colorless[env])
 
-    # -- Finding a frame in the map without tracking it; of one env ------------------------------
-
-    def show(self, frames: Images) -> None:
-        """Take the frames that the next three look at."""
-        self._localizer.set_frame(self.preprocess(frames.color, frames.depth))
-
-    def align_near(self, pose: Float64) -> Alignment:
-        """Align with the map as seen from ``pose`` (4, 4), under strict thresholds."""
-        hypotheses = tracking_hypotheses(np.eye(4))[None]
-        thresholds = self._localizer.strict_thresholds()
-        return self._localizer.align_from(pose[None], hypotheses, thresholds)
-
-    def consistency(self, frames: Images, poses: Float64) -> AlignmentStatistics:
-        """How the frame agrees with the map's view from ``poses`` (1, 4, 4)."""
-        wanted, cutoff_m = np.ones(1, dtype=bool), self.config.depth_cutoff_m
-        return measure_consistency(frames, poses, wanted, self._localizer, cutoff_m)[0]
-
-    def verify(self, frames: Images, poses: Float64) -> bool:
-        """Whether the map's view from ``poses`` (1, 4, 4) is like the frame."""
-        found = np.ones(1, dtype=bool)
-        return bool(self.relocalization.verify(frames, poses, found, self._localizer)[0])
-
-    def propose(self, frames: Images, attempt: int) -> Float64 | None:
-        """A pose (4, 4) where the frame may have been taken, from keyframes; None without."""
-        attempts, lost = np.array([attempt], dtype=np.int32), np.ones(1, dtype=bool)
-        poses = self.relocalization.propose(frames, lost, attempts, self._localizer)
-        return poses[0] if np.isfinite(poses).all() else None
-
     def get_state(self) -> dict[str, Any]:
         """Everything needed to go on bit-exactly, as NumPy arrays."""
-        return self._states.get_state() | super().get_state()
+        return self._states.get_state() | super().get_state() | self._shutter.get_state()
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state of a SLAM of the same batch, intrinsics and configuration."""
@@ -333,7 +344,8 @@ class BatchedSurfelSlam(Saved):
         self.map.check_fits(state["map"])
         self._states.set_state(state)
         super().set_state(state)
-        self._localizer.forget_view()
+        self._shutter.set_state(state)
+        self.localizer.forget_view()
 
 
 def _readings(env: int, live: LiveFrame) -> float:
