@@ -78,7 +78,7 @@ class Relocalization(Experiment, Checked):
     """Image sizes."""
     settings: tuple[str, ...] = ALL_SETTINGS
     """Kinds of interruption."""
-    variants: tuple[str, ...] = RELOCALISATIONS
+    variants: tuple[str, ...] = ("ferns", "local")
     """Variants of the relocalisation."""
     maps: int = bounded(25, 1, 100)
     """Maps, each of its own seed."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -63,6 +64,76 @@ def pose_from_features(
     return FeaturePose(T, int(inlier.sum()), spread)
 
 
+class FrameFeatures:
+    """Features of frames of one camera."""
+
+    def __init__(self, intrinsics: Intrinsics) -> None:
+        self.intrinsics = intrinsics
+        self._extract = FeatureExtractor(intrinsics)
+
+    def features_of(self, image: NDArray[np.uint8], depth: Float32, cutoff_m: float) -> Features:
+        """Of a frame, grey (H, W) or in colour (H, W, 3); depth (H, W) counts up to a cutoff."""
+        grey = image if image.ndim == 2 else grey_of(image)
+        within = np.where(depth <= cutoff_m, depth, np.float32(0))
+        return self._extract(grey, InverseDepth(within))
+
+
+def grey_of(color: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Grey image (H, W) of one in colour (H, W, 3)."""
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(color), cv2.COLOR_RGB2GRAY))
+
+
+MOST_IMAGES = 100
+
+
+class KeyframeImages(FrameFeatures, Saved):
+    """Images of keyframes of one camera, whose features are sought when they are asked for.
+
+    Beyond ``MOST_IMAGES`` every second one is dropped, so that they stay spread over the time.
+    """
+
+    saved = ("times", "_grey", "_depth")
+
+    def __init__(self, intrinsics: Intrinsics) -> None:
+        super().__init__(intrinsics)
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all images."""
+        self.times: list[int] = []
+        self._grey: list[NDArray[np.uint8]] = []
+        self._depth: list[Float32] = []
+        self._found: dict[tuple[int, float], Features] = {}
+
+    def keep(self, color: NDArray[np.uint8], depth: Float32, time: int) -> None:
+        """Take the image of a keyframe."""
+        self.times.append(time)
+        self._grey.append(grey_of(color))
+        self._depth.append(depth.copy())
+        if len(self.times) > MOST_IMAGES:
+            kept: list[list[Any]] = [self.times, self._grey, self._depth]
+            for each in kept:
+                del each[1::2]
+        self._found = {key: one for key, one in self._found.items() if key[0] in self.times}
+
+    def features(self, time: int, cutoff_m: float) -> Features:
+        """Features of the keyframe of a time, which is one of ``times``."""
+        key, index = (time, cutoff_m), self.times.index(time)
+        if key not in self._found:
+            images = self._grey[index], self._depth[index]
+            self._found[key] = self.features_of(*images, cutoff_m)
+        return self._found[key]
+
+    def fitting(self, intrinsics: Intrinsics) -> KeyframeImages:
+        """Itself for a camera with these intrinsics, or one without images."""
+        return self if intrinsics == self.intrinsics else KeyframeImages(intrinsics)
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state; features are sought anew."""
+        super().set_state(state)
+        self._found = {}
+
+
 class LastFrames(Saved):
     """The last frames with a known pose of B envs; features are sought when they are asked for."""
 
@@ -76,8 +147,7 @@ class LastFrames(Saved):
 
     def use(self, intrinsics: Intrinsics) -> None:
         """Expect frames of a camera; those of another size are forgotten."""
-        self._intrinsics = intrinsics
-        self._extract = FeatureExtractor(intrinsics)
+        self._frames = FrameFeatures(intrinsics)
         size = (len(self._poses), *intrinsics.shape)
         if self._depth.shape != size:
             self._poses[:] = np.nan
@@ -115,11 +185,7 @@ class LastFrames(Saved):
         """Where (4, 4) T_world_camera a frame (H, W) was taken; None if features do not say."""
         if not np.isfinite(self._poses[env, 0, 0]):
             return None
-        before = self._features(self._color[env], self._depth[env], cutoff_m)
-        found = pose_from_features(before, self._features(color, depth, cutoff_m), self._intrinsics)
+        of = self._frames.features_of
+        before, now = of(self._color[env], self._depth[env], cutoff_m), of(color, depth, cutoff_m)
+        found = pose_from_features(before, now, self._frames.intrinsics)
         return None if found is None else (self._poses[env] @ found.T_reference_frame, found)
-
-    def _features(self, color: NDArray[np.uint8], depth: Float32, cutoff_m: float) -> Features:
-        grey = cv2.cvtColor(np.ascontiguousarray(color), cv2.COLOR_RGB2GRAY)
-        within = np.where(depth <= cutoff_m, depth, np.float32(0))
-        return self._extract(np.asarray(grey), InverseDepth(within))

@@ -14,6 +14,7 @@ from ms_slam_env.geometry import check_pose
 from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult, Views, check_views
 from ms_slam_env.slam.state import check_has
 from ms_slam_env.slam.submaps import Submaps
+from ms_slam_env.slam.surfel.color_cameras import make_color_camera
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.relocalization import Images
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
@@ -31,6 +32,7 @@ class SurfelSlam(SlamBackend):
         self.device = device
         self._slam = BatchedSurfelSlam(1, intrinsics, config or SurfelConfig(), device)
         self._submaps = make_submaps(self._slam)
+        self._color_camera = make_color_camera(self.config.color_registration)
 
     @property
     def config(self) -> SurfelConfig:
@@ -77,11 +79,13 @@ class SurfelSlam(SlamBackend):
         """Forget everything; the next frame is taken at ``T_world_camera`` (identity if None)."""
         self._slam.reset(T_world_camera)
         self._submaps.reset()
+        self._color_camera.reset(T_world_camera)
 
     def track(self, frame: RGBDFrame, T_world_camera_guess: ArrayLike | None = None) -> TrackResult:
         """Estimate the pose of ``frame`` and fuse it into the map; see ``SlamBackend``."""
         color, depth = self._images(frame)
-        result = self._slam.track(color, depth, [T_world_camera_guess], [frame.timestamp])[0]
+        guess, time_s = T_world_camera_guess, frame.timestamp
+        result = self._color_camera.track(self._slam, color, depth, guess, time_s)
         return self._submaps.follow(Images(color, depth), T_world_camera_guess, result)
 
     def fuse(self, frame: RGBDFrame, T_world_camera: ArrayLike) -> TrackResult:
@@ -93,10 +97,11 @@ class SurfelSlam(SlamBackend):
     def _images(self, frame: RGBDFrame) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Colour (1, h, w, 3) and depth (1, h, w) at the size in force."""
         self.intrinsics.check_image(frame.depth, "frame")
-        if self._slam.intrinsics == self.intrinsics:
-            return frame.color[None], frame.depth[None]
-        size = self.image_size
-        return reduce_color(frame.color, size)[None], reduce_depth(frame.depth, size)[None]
+        color, depth = frame.color, frame.depth
+        if self._slam.intrinsics != self.intrinsics:
+            size = self.image_size
+            color, depth = reduce_color(color, size), reduce_depth(depth, size)
+        return self._color_camera.registered(self._slam, color[None], depth[None]), depth[None]
 
     def predict(self, poses: ArrayLike, scale: float = 1.0) -> Views:
         """Render the map from ``poses`` (N, 4, 4) T_world_camera at ``scale`` times the size."""
@@ -156,10 +161,12 @@ class SurfelSlam(SlamBackend):
 
     def get_state(self) -> dict[str, Any]:
         """Everything needed to go on bit-exactly, as NumPy arrays."""
-        return self._slam.get_state() | {"submaps": self._submaps.get_state()}
+        own = self._color_camera.get_state() | {"submaps": self._submaps.get_state()}
+        return self._slam.get_state() | own
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state that ``get_state`` returned."""
         check_has(state, ("submaps",), type(self).__name__)
         self._slam.set_state(state)
         self._submaps.set_state(state["submaps"])
+        self._color_camera.set_state(state)

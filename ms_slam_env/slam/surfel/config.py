@@ -151,7 +151,8 @@ class SubmapConfig(Checked):
     guess_sigma_deg: float = bounded(2.0, 0.0, 180.0)
 
 
-RELOCALISATIONS = ("ferns", "local")
+COLOR_REGISTRATIONS = ("estimated", "given")
+RELOCALISATIONS = ("ferns", "features", "local")
 LOOP_CLOSURES = ("none", "deformation")
 SUBMAPS = ("atlas", "off")
 MOTION_MASKS = ("none", "geometric")
@@ -211,7 +212,8 @@ class SurfelConfig(Checked):
             with its recent part; where that meets the old part again the map is deformed to fit.
         loops: parameters of the latter.
         relocalisation: where a lost frame is searched besides around the last good pose: "ferns",
-            at keyframes that resemble it, or "local", nowhere.
+            at keyframes that resemble it, "features", where their ORB features put it if that leads
+            nowhere, or "local", nowhere.
         submaps: "atlas": a camera that stays lost goes on in a new map, which is joined to the old
             one where that is seen again; "off": it waits. Of several cameras in lockstep each
             waits.
@@ -220,6 +222,11 @@ class SurfelConfig(Checked):
             "none": the world is taken to be still.
         readout_s: time that a rolling shutter takes from the first row to the last, see
             ``rolling_shutter``; 0: all rows are taken at once. It takes frames with their times.
+        check_slips: whether a frame whose grey values all at once fit worse is aligned anew at the
+            finest level alone; see ``Localizer``.
+        color_registration: "estimated": where the colour camera is, is found from the edges of the
+            first frames, see ``color_cameras``; "given": colour is taken as it comes. Of several
+            cameras in lockstep it is.
     """
 
     depth_cutoff_m: float = bounded(8.0, 0.0, 10.0)
@@ -255,6 +262,8 @@ class SurfelConfig(Checked):
     submap_rules: SubmapConfig = field(default_factory=SubmapConfig)
     motion_mask: str = chosen("none", *MOTION_MASKS)
     readout_s: float = bounded(0.0, 0.0, 1.0)
+    check_slips: bool = False
+    color_registration: str = chosen("given", *COLOR_REGISTRATIONS)
 
     def __post_init__(self) -> None:
         super().__post_init__()

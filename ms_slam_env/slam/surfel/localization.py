@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env._warp import wp
+from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, se3_log
 from ms_slam_env.slam.alignment_check import (
     DISPUTED,
@@ -16,42 +14,34 @@ from ms_slam_env.slam.alignment_check import (
     status_on_appeal,
 )
 from ms_slam_env.slam.base import Float64
-from ms_slam_env.slam.feature_poses import LastFrames
+from ms_slam_env.slam.feature_poses import FeaturePose, LastFrames
 from ms_slam_env.slam.surfel.acceptance import (
     Alignment,
     accept_any_fit,
-    acceptance_thresholds,
-    geometric_thresholds,
     is_nearly_accepted,
 )
 from ms_slam_env.slam.surfel.camera_states import CameraStates
-from ms_slam_env.slam.surfel.device import HostDeviceBuffer
+from ms_slam_env.slam.surfel.map_alignment import MapAligner
 from ms_slam_env.slam.surfel.motion_mask import MotionMask
-from ms_slam_env.slam.surfel.photometry import (
-    InvalidFrameDetector,
-    geometry_only,
-)
+from ms_slam_env.slam.surfel.photometry import InvalidFrameDetector, is_leap
 from ms_slam_env.slam.surfel.pipeline import Pipeline
 from ms_slam_env.slam.surfel.pose_hypotheses import (
-    NUM_FIRST,
-    NUM_HYPOTHESES,
     UNMOVED,
     relocalization_hypotheses,
     tracking_hypotheses,
 )
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
 from ms_slam_env.slam.surfel.relocalization import Images, Relocalization, measure_consistency
-from ms_slam_env.slam.surfel.rendering import ModelView
-from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 
 MOSTLY_MOVING = 0.6  # share of the readings: rather the pose is wrong, or too little is left
 CLEARLY_APART = 30.0  # squared Mahalanobis distance; below 20 where nothing leads a pose
 APART_M, APART_RAD = (0.006, 0.1), np.radians((0.4, 6.0))  # more than noise, less than a jump
+MENDED = 0.9  # of the cost of an alignment that may have slipped
 RETRIES = 2  # further searches within a frame whose tracking failed
 
 
 class Localizer:
-    """Aligns the frames of B envs with their maps, and keeps the view of the map that it used.
+    """Finds where the frames of B envs were taken.
 
     Attributes:
         invalid_frames: tells frames with nothing to track in them.
@@ -61,61 +51,37 @@ class Localizer:
     def __init__(
         self,
         states: CameraStates,
-        surfel_map: SurfelMap,
+        aligner: MapAligner,
         relocalization: Relocalization,
         motion_mask: MotionMask,
+        intrinsics: Intrinsics,
     ) -> None:
-        self.invalid_frames = InvalidFrameDetector(surfel_map.batch)
-        self.last_frames = LastFrames(surfel_map.batch, surfel_map.intrinsics)
+        self.invalid_frames = InvalidFrameDetector(len(states.poses))
+        self.last_frames = LastFrames(len(states.poses), intrinsics)
         self._states = states
-        self._map = surfel_map
+        self._aligner = aligner
         self._relocalization = relocalization
         self._motion_mask = motion_mask
-        self._device_poses = HostDeviceBuffer(surfel_map.batch, wp.mat44, surfel_map.device)
-        self._strict = np.ones(surfel_map.batch, dtype=bool)
-        self._view: ModelView
-        self._view_poses: Float64 | None = None  # of ``_view``; None: the maps have changed since
 
     def use(self, pipeline: Pipeline) -> None:
         """Look at frames in this way from now on."""
-        self._tracker = pipeline.tracker
         self._config = pipeline.config
         self.last_frames.use(pipeline.intrinsics)
-        self.forget_view()
-
-    def forget_view(self) -> None:
-        """Render anew next time: the maps have changed, or what of them takes part."""
-        self._view_poses = None
-
-    def render(self, poses: Float64) -> ModelView:
-        """Render the maps from ``poses`` (B, 4, 4), unless that view is at hand."""
-        if self._view_poses is None or not np.array_equal(self._view_poses, poses):
-            self._device_poses.write(poses)
-            self._view = self._map.render_model(self._device_poses.array)
-            self._view_poses = poses.copy()
-        return self._view
-
-    def set_frame(self, live: LiveFrame) -> None:
-        """Take the frames that ``align_from`` aligns next."""
-        self._tracker.set_frame(live)
-
-    def align_from(
-        self, origins: Float64, hypotheses: Float64, thresholds: NDArray[Any]
-    ) -> Alignment:
-        """Align the current frames with the maps as seen from ``origins`` (B, 4, 4)."""
-        return self._align(origins, hypotheses, thresholds, self._states.photometry)
+        self._aligner.use(pipeline)
 
     def locate(self, live: LiveFrame, frames: Images, guesses: Float64 | None) -> Alignment:
         """Align the frames: near the last poses, at the guesses, around, at keyframes.
 
         ``guesses`` (B, 4, 4) are NaN for an env without; None if none has one.
         """
-        self._tracker.set_frame(live)
+        self._aligner.set_frame(live)
         states = self._states
         expected = states.poses @ states.motions
         self._motion_mask.expect(live, expected, states.started & (states.lost == 0))
         invalid = self.invalid_frames.find(frames.color, states.started)
-        alignment = self._track(invalid, guesses)
+        alignment = self._aligner.track(invalid, guesses)
+        if self._config.check_slips:
+            alignment = self._mend_slips(alignment, frames, invalid)
         if self._motion_mask.can_doubt:
             alignment = self._mask_moving(alignment, expected, invalid, guesses)
         if self._is_settled(alignment):
@@ -132,21 +98,43 @@ class Localizer:
         self._motion_mask.find(*self._trusted(alignment, expected))
         return alignment
 
-    def realign(self, live: LiveFrame, alignment: Alignment, where: NDArray[np.bool_]) -> Alignment:
-        """Align the envs ``where`` (B,) again from where they were found, with other images."""
-        self._tracker.set_frame(live)
-        states = self._states
-        starts = np.where(where[:, None, None], alignment.T_model_live, np.eye(4))
-        hypotheses = np.repeat(starts[:, None], NUM_HYPOTHESES, axis=1)
-        thresholds = acceptance_thresholds(self._config.acceptance, states.lost > 0, states.lost)
-        again = self.align_from(states.poses, hypotheses, thresholds)
-        return alignment.replace(where & again.tracked, again)
-
     def _is_settled(self, alignment: Alignment) -> bool:
         """Whether every env is tracked, was so before and beyond doubt: nothing more to ask."""
         states = self._states
         is_open = states.started & (~alignment.tracked | (states.lost > 0) | (states.doubted > 0))
         return self._config.refuse_bad_fits and not is_open.any()
+
+    def _mend_slips(
+        self, alignment: Alignment, frames: Images, invalid: NDArray[np.bool_]
+    ) -> Alignment:
+        """Align anew, at the finest level alone, where the texture all at once fits badly.
+
+        Fine texture that is much the same everywhere, such as a carpet's, is gone at the coarser
+        levels, which then slip along what geometry leaves open. So the frame is aligned from where
+        it was expected, and from where the features of the last one put it, without them.
+        """
+        states, poses = self._states, self._states.poses
+        slipped = states.started & (states.lost == 0) & ~invalid
+        slipped &= is_leap(states.photometry, alignment.photometry, self._config.cauchy_rgb)
+        if not slipped.any():
+            return alignment
+        by_features = np.full_like(poses, np.nan)
+        for env in np.flatnonzero(slipped):
+            found = self._feature_pose(int(env), frames)
+            if found is not None:
+                by_features[env] = found[0]
+        for starts in (states.motions, invert(poses) @ by_features):
+            given = slipped & np.isfinite(starts[:, 0, 0])
+            again = self._aligner.refine(np.where(given[:, None, None], starts, np.eye(4)))
+            is_better = again.statistics["cost"] < MENDED * alignment.statistics["cost"]
+            taken = given & again.tracked & (is_better | ~alignment.tracked)
+            alignment = alignment.replace(taken, again)
+        return alignment
+
+    def _feature_pose(self, env: int, frames: Images) -> tuple[Float64, FeaturePose] | None:
+        """Where (4, 4) the features of an env's last frame put the present one."""
+        images = frames.color[env], frames.depth[env]
+        return self.last_frames.find(env, *images, self._config.depth_cutoff_m)
 
     def _mask_moving(
         self,
@@ -157,7 +145,7 @@ class Localizer:
     ) -> Alignment:
         """Look for what moves, align without it, and refuse a pose by which most would move."""
         if self._motion_mask.find(*self._trusted(alignment, expected)).any():
-            alignment = self._track(invalid, guesses)
+            alignment = self._aligner.track(invalid, guesses)
         alignment = self._doubt(alignment, expected, invalid, guesses)
         self._motion_mask.find(*self._trusted(alignment, expected))
         is_most = alignment.tracked & (self._motion_mask.share() > MOSTLY_MOVING)
@@ -186,7 +174,7 @@ class Localizer:
         moving = doubtful & mask.find(expected, doubtful, strict=True)
         if not moving.any():
             return alignment
-        again = self._track(invalid, guesses)
+        again = self._aligner.track(invalid, guesses)
         taken = moving & again.tracked & (again.statistics["degenerate_directions"] == 0)
         taken &= ~alignment.tracked | _is_refuted(alignment, again)
         mask.confirm(taken)
@@ -199,39 +187,6 @@ class Localizer:
         is_known = self._states.started & (alignment.tracked | (self._states.lost == 0))
         tracked = alignment.tracked[:, None, None]
         return np.where(tracked, alignment.T_world_live, expected), is_known
-
-    def _track(self, invalid: NDArray[np.bool_], guesses: Float64 | None) -> Alignment:
-        """Align with the views from the last poses; a lost env searches wider at every frame."""
-        states = self._states
-        lost = states.lost > 0
-        hypotheses = np.stack(
-            [
-                relocalization_hypotheses(int(frames_lost) - 1)
-                if frames_lost
-                else tracking_hypotheses(motion)
-                for motion, frames_lost in zip(states.motions, states.lost, strict=True)
-            ]
-        )
-        thresholds = acceptance_thresholds(self._config.acceptance, lost, states.lost)
-        alignment = self._align(states.poses, hypotheses, thresholds, states.photometry, guesses)
-        alignment = alignment.with_status(invalid, TrackingStatus.BLANK)
-        return self._without_color(hypotheses, alignment)
-
-    def _without_color(self, hypotheses: Float64, alignment: Alignment) -> Alignment:
-        """Align the envs whose grey values do not fit by geometry alone, from the nearest poses.
-
-        Lights are switched, cameras glare, and a recording's colour may not be registered with its
-        depth. Geometry must then constrain the pose without help, near to where it is expected.
-        """
-        states = self._states
-        failed = states.started & (alignment.status == TrackingStatus.PHOTOMETRIC_MISMATCH)
-        if not failed.any():
-            return alignment
-        near = np.repeat(hypotheses[:, :1], NUM_HYPOTHESES, axis=1)
-        near[:, :NUM_FIRST] = hypotheses[:, :NUM_FIRST]
-        thresholds = geometric_thresholds(self._config.acceptance, states.lost)
-        again = self._align(states.poses, near, thresholds, geometry_only(states.photometry))
-        return alignment.replace(failed & again.tracked, again)
 
     def _appeal(
         self, alignment: Alignment, frames: Images, where: NDArray[np.bool_] | None = None
@@ -248,7 +203,7 @@ class Localizer:
         if where is not None:
             asked &= where
         poses, cutoff_m = alignment.T_world_live, self._config.depth_cutoff_m
-        seen = measure_consistency(frames, poses, asked, self, cutoff_m)
+        seen = measure_consistency(frames, poses, asked, self._aligner, cutoff_m)
         for number, found in seen.items():
             alignment.status[number] = self._status_on_appeal(number, found, bool(appealed[number]))
         return alignment
@@ -276,16 +231,13 @@ class Localizer:
         states, found = self._states, {}
         origins = states.poses.copy()
         for env in np.flatnonzero(self._failed(alignment)):
-            images = frames.color[env], frames.depth[env]
-            pose = self.last_frames.find(int(env), *images, self._config.depth_cutoff_m)
+            pose = self._feature_pose(int(env), frames)
             if pose is not None:
                 origins[env], found[int(env)] = pose
         if not found:
             return alignment
         where = np.isin(np.arange(len(origins)), list(found))
-        again = self.align_from(
-            origins, np.tile(UNMOVED, (len(origins), 1, 1, 1)), self.strict_thresholds()
-        )
+        again = self._aligner.align_strictly(origins, np.tile(UNMOVED, (len(origins), 1, 1, 1)))
         again = self._appeal(again, frames, where)
         taken = where & (again.tracked | (again.uncertain & ~alignment.uncertain))
         alignment = alignment.replace(taken, again.seen_from(states.poses))
@@ -308,7 +260,7 @@ class Localizer:
         poses = self._states.poses
         origins = np.where(failed[:, None, None], guesses, poses)
         hypotheses = np.tile(tracking_hypotheses(np.eye(4)), (len(poses), 1, 1, 1))
-        again = self.align_from(origins, hypotheses, self.strict_thresholds())
+        again = self._aligner.align_strictly(origins, hypotheses)
         return alignment.replace(failed & again.tracked, again.seen_from(poses))
 
     def _search_around(self, alignment: Alignment) -> Alignment:
@@ -321,7 +273,7 @@ class Localizer:
             hypotheses = np.stack(
                 [relocalization_hypotheses(attempt + RETRIES * int(lost)) for lost in states.lost]
             )
-            again = self.align_from(states.poses, hypotheses, self.strict_thresholds())
+            again = self._aligner.align_strictly(states.poses, hypotheses)
             alignment = alignment.replace(failed & again.tracked, again)
         return alignment
 
@@ -329,30 +281,15 @@ class Localizer:
         """Let the relocalization verify and find the envs that were lost before."""
         lost = self._states.lost > 0
         again = lost & alignment.tracked
-        verified = self._relocalization.verify(frames, alignment.T_world_live, again, self)
+        verified = self._relocalization.verify(frames, alignment.T_world_live, again, self._aligner)
         alignment = alignment.with_status(again & ~verified, TrackingStatus.PHOTOMETRIC_MISMATCH)
-        found = self._relocalization.relocalize(frames, lost & self._failed(alignment), self)
+        found = self._relocalization.relocalize(
+            frames, lost & self._failed(alignment), self._aligner
+        )
         if found is None:
             return alignment
         where, elsewhere = found
         return alignment.replace(where, elsewhere.seen_from(self._states.poses))
-
-    def _align(
-        self,
-        origins: Float64,
-        hypotheses: Float64,
-        thresholds: NDArray[Any],
-        photometry: NDArray[Any],
-        guesses: Float64 | None = None,
-    ) -> Alignment:
-        view = self.render(origins)
-        if self._motion_mask.hide(view, origins):
-            self.forget_view()  # it is whole no more
-        return self._tracker.align(view, origins, hypotheses, thresholds, guesses, photometry)
-
-    def strict_thresholds(self) -> NDArray[Any]:
-        """Thresholds (B,) of alignments that a wide search leads to."""
-        return acceptance_thresholds(self._config.acceptance, self._strict, self._states.lost)
 
     def _failed(self, alignment: Alignment) -> NDArray[np.bool_]:
         """Which envs (B,) may be searched for: also those whose pose is uncertain."""

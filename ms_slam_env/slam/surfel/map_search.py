@@ -32,29 +32,28 @@ class FrameLookup:
     def __init__(self, slam: BatchedSurfelSlam, frames: Images) -> None:
         """Look for ``frames`` (1, H, W) from now on; the SLAM's next frame ends that."""
         self._slam, self._frames = slam, frames
-        slam.localizer.set_frame(slam.preprocess(frames.color, frames.depth))
+        slam.aligner.set_frame(slam.preprocess(frames.color, frames.depth))
 
     def align_near(self, pose: Float64) -> Alignment:
         """Align with the map as seen from ``pose`` (4, 4), under strict thresholds."""
-        hypotheses, localizer = tracking_hypotheses(np.eye(4))[None], self._slam.localizer
-        return localizer.align_from(pose[None], hypotheses, localizer.strict_thresholds())
+        return self._slam.aligner.align_strictly(pose[None], tracking_hypotheses(np.eye(4))[None])
 
     def consistency(self, poses: Float64) -> AlignmentStatistics:
         """How the frame agrees with the map's view from ``poses`` (1, 4, 4)."""
         slam, wanted = self._slam, np.ones(1, dtype=bool)
         cutoff_m = slam.config.depth_cutoff_m
-        return measure_consistency(self._frames, poses, wanted, slam.localizer, cutoff_m)[0]
+        return measure_consistency(self._frames, poses, wanted, slam.aligner, cutoff_m)[0]
 
     def verify(self, poses: Float64) -> bool:
         """Whether the map's view from ``poses`` (1, 4, 4) is like the frame."""
         slam, found = self._slam, np.ones(1, dtype=bool)
-        return bool(slam.relocalization.verify(self._frames, poses, found, slam.localizer)[0])
+        return bool(slam.relocalization.verify(self._frames, poses, found, slam.aligner)[0])
 
     def propose(self, attempt: int) -> Float64 | None:
         """A pose (4, 4) where the frame may have been taken, from keyframes; None without."""
         slam, lost = self._slam, np.ones(1, dtype=bool)
         attempts = np.array([attempt], dtype=np.int32)
-        poses = slam.relocalization.propose(self._frames, lost, attempts, slam.localizer)
+        poses = slam.relocalization.propose(self._frames, lost, attempts, slam.aligner)
         return poses[0] if np.isfinite(poses).all() else None
 
 

@@ -38,6 +38,8 @@ TRUST_GROWS = 1.15
 LEAST_TRUST = 1.0e-4
 USUAL_SCALE = 1.4  # a frame's residuals may have 1.4 times the scale estimated for the last ones
 SCALE_FALLS = 0.1  # share of the way to a smaller scale, a frame
+LEAP = 1.3  # times that of the frames before
+TRUSTED = 0.1
 _EVERY = 4  # rows and columns that are looked at
 _CONSTANT = 0.5  # largest standard deviation of an image that no sensor took, grey levels
 _DARK, _BRIGHT = 16.0, 240.0  # means below and above which an image
@@ -78,6 +80,13 @@ def next_photometry(
         trust *= falls if conflict > LARGEST_CONFLICT else TRUST_GROWS
     after["trust"] = min(1.0, max(LEAST_TRUST, trust))
     return after
+
+
+def is_leap(before: NDArray[Any], frame: NDArray[Any], least_scale: float) -> Bool:
+    """Which envs' (B,) grey values, trusted before, all at once fit worse or not at all."""
+    share = USUAL_SCALE * frame["scale"] / least_scale
+    is_blind = (frame["trust"] == 0.0) & (before["trust"] > TRUSTED)
+    return (share > LEAP * before["reference"]) | is_blind
 
 
 def correction(photometry: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

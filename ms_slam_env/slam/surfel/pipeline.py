@@ -20,7 +20,7 @@ from ms_slam_env.slam.surfel.tracker import Tracker, model_stride
 
 FIXED = (
     *("max_surfels", "acceptance", "relocalisation", "loop_closure", "loops", "submaps"),
-    *("motion_mask", "readout_s"),
+    *("motion_mask", "readout_s", "color_registration"),
 )
 """Fields of ``SurfelConfig`` that a running SLAM keeps: they shape what it has stored, or what its
 parts were made with."""

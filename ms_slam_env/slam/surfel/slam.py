@@ -29,17 +29,15 @@ from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.detached_map import DetachedMap
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer
 from ms_slam_env.slam.surfel.free_space_mask import make_motion_mask
+from ms_slam_env.slam.surfel.keyframe_search import make_relocalization
 from ms_slam_env.slam.surfel.localization import Localizer
 from ms_slam_env.slam.surfel.loop_closure import make_loop_closure
+from ms_slam_env.slam.surfel.map_alignment import MapAligner
 from ms_slam_env.slam.surfel.photometry import is_invalid_frame, same_exposure
 from ms_slam_env.slam.surfel.pipeline import Pipeline, PipelineCache, check_change
-from ms_slam_env.slam.surfel.pose_hypotheses import (
-    check_guesses,
-    check_poses,
-    motion_weight,
-)
+from ms_slam_env.slam.surfel.pose_hypotheses import check_guesses, check_poses, motion_weight
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
-from ms_slam_env.slam.surfel.relocalization import Images, make_relocalization
+from ms_slam_env.slam.surfel.relocalization import Images
 from ms_slam_env.slam.surfel.rolling_shutter import make_shutter
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.tracker import model_stride
@@ -63,9 +61,11 @@ class BatchedSurfelSlam(Saved):
         self._states = CameraStates.at_rest(batch)
         self.motion_mask = make_motion_mask(batch, intrinsics, config, device)
         self._shutter = make_shutter(batch, config.readout_s, device)
-        self.localizer = Localizer(self._states, self.map, self.relocalization, self.motion_mask)
-        self._invalid_frames = self.localizer.invalid_frames
-        self._last_frames = self.localizer.last_frames
+        self.aligner = MapAligner(self._states, self.map, self.motion_mask)
+        parts = self._states, self.aligner, self.relocalization, self.motion_mask
+        self._localizer = Localizer(*parts, intrinsics)
+        self._invalid_frames = self._localizer.invalid_frames
+        self._last_frames = self._localizer.last_frames
         dtypes = (wp.mat44, wp.int32, wp.float32, wp.int32)  # of pose, time, weight and mask
         self._fused = [HostDeviceBuffer(batch, dtype, device) for dtype in dtypes]
         self._use(self._pipelines.get(intrinsics, config))
@@ -91,7 +91,7 @@ class BatchedSurfelSlam(Saved):
         self.preprocess, self.tracker = pipeline.preprocess, pipeline.tracker
         self._correct_exposure = pipeline.correct_exposure
         self.map.use(pipeline.map_kernels)
-        self.localizer.use(pipeline)
+        self._localizer.use(pipeline)
         self._shutter.use(self.intrinsics)
 
     def reset(self, T_world_camera: ArrayLike | None = None, env: int = 0) -> None:
@@ -107,7 +107,7 @@ class BatchedSurfelSlam(Saved):
         self.relocalization.clear(env)
         self.loops.reset(env)
         self.motion_mask.forget(env)
-        self.localizer.forget_view()
+        self.aligner.forget_view()
 
     def track(
         self,
@@ -126,7 +126,7 @@ class BatchedSurfelSlam(Saved):
         taken = Images(color, depth)
         frames = self._shutter.level(taken, self._states.motions)
         live = self.preprocess(frames.color, frames.depth)
-        alignment = self.localizer.locate(live, frames, guesses)
+        alignment = self._localizer.locate(live, frames, guesses)
         self._shutter.take_time(times_s)
         if self._shutter.is_rolling:
             live, frames, alignment = self._locate_again(taken, alignment)
@@ -172,7 +172,7 @@ class BatchedSurfelSlam(Saved):
     def _select_surfels(self, lost: NDArray[np.int32]) -> None:
         """Let loop closure choose what frames are aligned with and fused into."""
         if self.loops.select(lost):
-            self.localizer.forget_view()
+            self.aligner.forget_view()
 
     def _locate_again(
         self, taken: Images, alignment: Alignment
@@ -184,7 +184,7 @@ class BatchedSurfelSlam(Saved):
         self._map_first_again(motions, moved & (states.time == 1))
         frames = self._shutter.level(taken, motions)
         live = self.preprocess(frames.color, frames.depth)
-        return live, frames, self.localizer.realign(live, alignment, moved)
+        return live, frames, self.aligner.realign(live, alignment, moved)
 
     def _map_first_again(self, motions: Float64, where: NDArray[np.bool_]) -> None:
         """Map the first frames of the envs ``where`` (B,) as levelled by the motions since."""
@@ -250,7 +250,7 @@ class BatchedSurfelSlam(Saved):
                 buffer.write(value)
             self.map.fuse(live, *(buffer.array for buffer in self._fused))
             self.loops.record(states.poses, states.time, good)
-            self.localizer.forget_view()
+            self.aligner.forget_view()
         states.time += 1
 
     def _close_loops(
@@ -291,7 +291,7 @@ class BatchedSurfelSlam(Saved):
         self.map.set_surfels(env, detached.surfels)
         self.relocalization.set_keyframes(env, detached.keyframes)
         self.loops.set_history(env, detached.history)
-        self.localizer.forget_view()
+        self.aligner.forget_view()
 
     def restart(self, T_world_camera: Float64, env: int = 0) -> None:
         """Forget an env's map and its last frame, which is to be taken first of a new one."""
@@ -345,7 +345,7 @@ class BatchedSurfelSlam(Saved):
         self._states.set_state(state)
         super().set_state(state)
         self._shutter.set_state(state)
-        self.localizer.forget_view()
+        self.aligner.forget_view()
 
 
 def _readings(env: int, live: LiveFrame) -> float:

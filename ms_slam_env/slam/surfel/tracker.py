@@ -7,6 +7,7 @@ one that explains the frame best goes on. Nothing waits for the device before th
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,7 @@ from ms_slam_env.slam.surfel.rendering import ModelView
 SEARCH_POINTS = 400
 SEARCH_ITERATIONS = 5
 GOOD_SCORE = 0.4  # of a first hypothesis, which makes the other hypotheses needless
+FINE_ITERATIONS = 11  # without the coarser levels
 SPARSE = 0.3  # share of the points that all iterations but the last look at
 
 
@@ -131,26 +133,41 @@ class Tracker:
                 if no env has one.
             photometry: (B,) ``Photometry`` to start from; exposed like the model if None.
         """
-        images = self._model.build(model.vertices, model.normals, model.intensity)
-        model_levels = [images[index] for index in self._model_level]
-        self.gauss_newton.set_images(self._live_levels, model_levels)
+        self._set_model(model, T_world_model, thresholds)
         self._start_from(hypotheses, T_world_model, guesses)
-        self._T_world_model.write(T_world_model)
-        self._thresholds.write(thresholds)
         photometry = same_exposure(self.batch) if photometry is None else photometry
         for state in (self._first, self._more):
             state.photometry.write(photometry[:, None])
         self._search()
-        self._refine()
-        self._evaluate()
-        return Alignment(
-            T_world_live=self._T_world_live.read(),
-            T_model_live=self._one.poses.read()[:, 0],
-            status=self._status.read(),
-            statistics=self._statistics.read(),
-            photometry=self._one.photometry.read()[:, 0],
-            covariance=self._covariance.read(),
+        self._refine(len(self._model_level) - 1, self.config.iterations)
+        return self._evaluate()
+
+    def refine(
+        self,
+        model: ModelView,
+        T_world_model: Float64,
+        starts: Float64,
+        thresholds: NDArray[np.void],
+        photometry: NDArray[Any],
+    ) -> Alignment:
+        """Align at the finest level alone, from one pose (B, 4, 4) T_model_live; see ``align``."""
+        self._set_model(model, T_world_model, thresholds)
+        self._predicted.write(starts)
+        self._one.poses.write(starts[:, None])
+        self._one.photometry.write(photometry[:, None])
+        self._one.states.write(np.full((self.batch, 1), RUNNING, dtype=np.int32))
+        self._refine(0, (FINE_ITERATIONS,))
+        return self._evaluate()
+
+    def _set_model(
+        self, model: ModelView, T_world_model: Float64, thresholds: NDArray[np.void]
+    ) -> None:
+        images = self._model.build(model.vertices, model.normals, model.intensity)
+        self.gauss_newton.set_images(
+            self._live_levels, [images[index] for index in self._model_level]
         )
+        self._T_world_model.write(T_world_model)
+        self._thresholds.write(thresholds)
 
     def _start_from(
         self, hypotheses: Float64, T_world_model: Float64, guesses: Float64 | None
@@ -196,20 +213,28 @@ class Tracker:
         coarsest, stride = len(self._model_level) - 1, self._search_stride()
         self.gauss_newton.iterate(coarsest, stride, state, SEARCH_ITERATIONS, ends_with_sums=True)
 
-    def _refine(self) -> None:
+    def _refine(self, coarsest: int, iterations: Sequence[int]) -> None:
         """Align the one hypothesis from the coarsest level to the finest."""
-        for level in range(len(self._model_level) - 1, -1, -1):
+        for level in range(coarsest, -1, -1):
             last = int(level == 0)  # the last iteration sees more points than the others
-            count = self.config.iterations[level] - last
+            count = iterations[level] - last
             self.gauss_newton.iterate(level, self._stride(level, SPARSE), self._one, count)
         # The decision is on what the last step starts from, which has all but converged.
-        step = min(self.config.iterations[0], 1)
+        step = min(iterations[0], 1)
         self.gauss_newton.iterate(0, self._stride(0), self._one, step, ends_with_sums=step == 0)
 
-    def _evaluate(self) -> None:
+    def _evaluate(self) -> Alignment:
         one, given = self._one, (self._predicted, self._thresholds, self._T_world_model)
         found = (self._T_world_live, self._status, self._statistics, self._covariance)
         arrays = [buffer.array for buffer in (*given, *found)]
         self._launches.launch(
             "assess", assess_alignment, lambda: (self.batch, [one.arrays, *arrays])
+        )
+        return Alignment(
+            T_world_live=self._T_world_live.read(),
+            T_model_live=self._one.poses.read()[:, 0],
+            status=self._status.read(),
+            statistics=self._statistics.read(),
+            photometry=self._one.photometry.read()[:, 0],
+            covariance=self._covariance.read(),
         )
