@@ -17,6 +17,7 @@ from ms_slam_env._warp import wp
 HOPPER = 90
 MODULES = (
     "acceptance",
+    "block_bounds",
     "frustum_culling",
     "fusion",
     "map_deformation",

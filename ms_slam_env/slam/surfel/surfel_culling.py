@@ -7,8 +7,8 @@ many.
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
+from ms_slam_env.slam.surfel.block_bounds import num_blocks
 from ms_slam_env.slam.surfel.device import fetch, put
-from ms_slam_env.slam.surfel.frustum_culling import num_blocks
 from ms_slam_env.slam.surfel.fusion import FusedFrame
 from ms_slam_env.slam.surfel.surfels import BLOCK_SIZE, Compaction, CullingBlocks, Surfels
 

@@ -15,8 +15,9 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.slam.base import Float64, Views
 from ms_slam_env.slam.state import Stateful
 from ms_slam_env.slam.surfel import fusion, surfel_culling, surfel_update
+from ms_slam_env.slam.surfel.block_bounds import bound_blocks, set_bounded
 from ms_slam_env.slam.surfel.config import SurfelConfig
-from ms_slam_env.slam.surfel.frustum_culling import FrustumCuller, bound_blocks, set_bounded
+from ms_slam_env.slam.surfel.frustum_culling import FrustumCuller
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
 from ms_slam_env.slam.surfel.rendering import (
     ModelView,
