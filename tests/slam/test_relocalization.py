@@ -16,7 +16,8 @@ from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.alignment_check import is_photometrically_consistent
 from ms_slam_env.slam.alignment_measures import measure_photometric_consistency
 from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
-from ms_slam_env.slam.surfel.relocalization import FernRelocalization, Images
+from ms_slam_env.slam.surfel.keyframe_search import FernRelocalization
+from ms_slam_env.slam.surfel.relocalization import Images
 
 CAMERA = xtion("160x120")
 OPTIONS = {"max_surfels": 120_000, "depth_cutoff_m": 4.0}

@@ -129,7 +129,7 @@ class BatchedSurfelSlam(Saved):
         alignment = self._localizer.locate(live, frames, guesses)
         self._shutter.take_time(times_s)
         if self._shutter.is_rolling:
-            live, frames, alignment = self._locate_again(taken, alignment)
+            live, frames, alignment = self._unroll(taken, alignment)
         results = [self._follow(env, live, alignment) for env in range(self.batch)]
         self._correct_exposure(live, self._states.photometry)
         known = np.array([result.tracking_ok for result in results])
@@ -146,8 +146,8 @@ class BatchedSurfelSlam(Saved):
     ) -> list[TrackResult]:
         """Fuse one frame per env at known poses (B, 4, 4), without tracking; see ``track``."""
         poses, states = check_poses(T_world_camera, self.batch), self._states
-        moves_on = states.started & (states.lost == 0)
-        motions = np.where(moves_on[:, None, None], invert(states.poses) @ poses, np.eye(4))
+        motions = np.stack([invert(T) @ pose for T, pose in zip(states.poses, poses, strict=True)])
+        motions[~states.started | (states.lost > 0)] = np.eye(4)
         self._shutter.take_time(times_s)
         frames = self._shutter.level(Images(color, depth), motions)
         live = self.preprocess(frames.color, frames.depth)
@@ -174,9 +174,7 @@ class BatchedSurfelSlam(Saved):
         if self.loops.select(lost):
             self.aligner.forget_view()
 
-    def _locate_again(
-        self, taken: Images, alignment: Alignment
-    ) -> tuple[LiveFrame, Images, Alignment]:
+    def _unroll(self, taken: Images, alignment: Alignment) -> tuple[LiveFrame, Images, Alignment]:
         """Level frames by the motions that were found, and align them once more."""
         states = self._states
         moved = states.started & alignment.tracked & (states.lost == 0)
