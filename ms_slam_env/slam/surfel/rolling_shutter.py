@@ -21,12 +21,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ms_slam_env._warp import wp
+from ms_slam_env._warp import RecordedLaunch, wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import se3_log
 from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.state import Saved
-from ms_slam_env.slam.surfel.device import HostDeviceBuffer, record_launch
+from ms_slam_env.slam.surfel.device import HostDeviceBuffer
 from ms_slam_env.slam.surfel.preprocessing import check_images
 from ms_slam_env.slam.surfel.relocalization import Images
 
@@ -183,7 +183,7 @@ class _Leveller:
         rows.centre = wp.vec2(i.cx, i.cy)
         dim = (batch, i.height, -(-i.width // PIECE))
         levelled = [self._levelled_color.array.flatten(), self._levelled_depth.array.flatten()]
-        self._launch = record_launch(_level, dim, [rows, *levelled], device)
+        self._launch = RecordedLaunch(_level, dim, [rows, *levelled], device)
 
     def __call__(self, frames: Images, twists: Float64) -> Images:
         """Level frames that were read while the cameras moved by ``twists`` (B, 6)."""

@@ -196,9 +196,8 @@ class BatchedSurfelSlam(Saved):
 
     def _follow(self, env: int, live: LiveFrame, alignment: Alignment) -> TrackResult:
         """Pose of a live frame: given for the first, tracked or searched for the others."""
-        if self._states.started[env]:
-            return self._move_on(env, alignment)
-        return self._start(env, live)
+        started = self._states.started[env]
+        return self._move_on(env, alignment) if started else self._start(env, live)
 
     def _start(self, env: int, live: LiveFrame) -> TrackResult:
         """Take the first frame at the given pose, if there is something in it to map."""
