@@ -97,7 +97,7 @@ def _numbers(sensor: dict[str, Any], key: str, count: int | None, path: Path) ->
     if not is_right or not all(type(value) in (int, float) for value in values):
         many = "numbers" if count is None else f"{count} numbers"
         raise InputError(f"{path}: {key} must be a list of {many}, got {given!r}")
-    return [float(value) for value in values]
+    return [number(str(value), f"{path}: {key}") for value in values]
 
 
 def _pose(sensor: dict[str, Any], path: Path) -> Float64:
