@@ -101,14 +101,14 @@ class Bag:
         if self.path.suffix in SUFFIXES:
             check_file(self.path, "bag", _MAX_BYTES)
         is_first = self.path.suffix == ".bag"
-        with self._refused():
+        with self.refusing():
             reader = (rosbag1 if is_first else rosbag2).Reader(self.path)
             reader.open()
         store = get_typestore(Stores.ROS1_NOETIC if is_first else Stores.LATEST)
         return reader, store.deserialize_ros1 if is_first else store.deserialize_cdr
 
     @contextmanager
-    def _refused(self, what: str = "") -> Iterator[None]:
+    def refusing(self, what: str = "") -> Iterator[None]:
         """Turn whatever the library raises at a damaged file into one line."""
         try:
             yield
@@ -121,7 +121,7 @@ class Bag:
     @cached_property
     def types(self) -> dict[str, str]:
         """Topic to type of its messages."""
-        with self._refused():
+        with self.refusing():
             return {str(c.topic): str(c.msgtype) for c in self._opened[0].connections}
 
     def of_types(self, types: Iterable[str]) -> list[str]:
@@ -131,7 +131,7 @@ class Bag:
     def _messages(self, topic: str, *span: int) -> Iterator[tuple[int, bytes]]:
         reader, _ = self._opened
         connections = [c for c in reader.connections if c.topic == topic]
-        with self._refused(f", topic {topic}"):
+        with self.refusing(f", topic {topic}"):
             for _, recorded, data in reader.messages(connections, *span):
                 yield recorded, bytes(data)
 
@@ -157,7 +157,7 @@ class Bag:
         """Times in seconds and messages of a topic, decoded, in the order of recording."""
         is_first = self.path.suffix == ".bag"
         for recorded, data in self._messages(topic):
-            with self._refused(f", topic {topic}"):
+            with self.refusing(f", topic {topic}"):
                 message = self._opened[1](data, self.types[topic])
             yield _stamp(data, is_first) or 1e-9 * recorded, message
 
@@ -166,7 +166,7 @@ class Bag:
         span = address.recorded_ns, address.recorded_ns + 1
         for number, (_, data) in enumerate(self._messages(address.topic, *span)):
             if number == address.number:
-                with self._refused(f", topic {address.topic}"):
+                with self.refusing(f", topic {address.topic}"):
                     return self._opened[1](data, self.types[address.topic])
         raise InputError(f"{self.path}: topic {address.topic} has lost a message")
 
@@ -201,12 +201,12 @@ class BagEntry(Entry):
     def read(self, camera: Intrinsics) -> tuple[NDArray[np.uint8] | None, NDArray[Any]]:
         """Colour, and depth in metres; see the base class."""
         message = self.bag.read(self.depth_at)
-        with self.bag._refused(f", topic {self.depth_at.topic}"):
+        with self.bag.refusing(f", topic {self.depth_at.topic}"):
             depth = read_depth_message(message, self.depth_at.topic, camera, self.depth_scale)
         if self.color_at is None:
             return None, depth
         message = self.bag.read(self.color_at)
-        with self.bag._refused(f", topic {self.color_at.topic}"):
+        with self.bag.refusing(f", topic {self.color_at.topic}"):
             return read_color_message(message, self.color_at.topic, camera), depth
 
 
@@ -309,7 +309,7 @@ def _camera(bag: Bag, depth: str, given: str | None) -> Intrinsics:
     message = next((message for _, message in bag.messages(given)), None)
     if message is None:
         raise InputError(f"{bag.path}: topic {given} has no message")
-    with bag._refused(f", topic {given}"):
+    with bag.refusing(f", topic {given}"):
         return _intrinsics(message, "rect" in parts[-1])
 
 
@@ -337,7 +337,7 @@ def _truth(bag: Bag, given: str | None) -> tuple[Float64, Float64] | tuple[None,
     _check_topic(bag, "pose", given, POSES)
     poses: dict[float, Float64] = {}
     for time, message in bag.messages(given):
-        with bag._refused(f", topic {given}, time {time:.9f}"):
+        with bag.refusing(f", topic {given}, time {time:.9f}"):
             poses.setdefault(time, _pose(message, given))
     times = np.array(sorted(poses))
     if len(times) == 0:
