@@ -54,8 +54,8 @@ def home() -> Task:
 
     A step is 30 cm and 24 degrees, in three frames: as far from frame to frame as in `room`, and
     far enough to come through a dwelling. What was seen stays in the map: by default surfels that
-    fewer than ten frames have seen go after 200 more, which cost ``nbv`` a third of the completeness.
-    It had 1.6 million surfels after 350 steps.
+    fewer than ten frames have seen go after 200 more, which cost ``nbv`` a third of the
+    completeness. It had 1.6 million surfels after 350 steps.
     """
     steps = {"step_m": 0.3, "step_rad": math.radians(24), "frames_per_action": 3}
     slam_config = {"max_surfels": 4_000_000, "unstable_window": 2000}

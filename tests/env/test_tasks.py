@@ -47,9 +47,10 @@ def test_options_count_more_than_the_tasks_own():
 def test_the_tasks_slam_is_configured_unless_another_is_asked_for():
     name = "MSActiveSLAM-Home-v0"
     room = gym.make(name, **SMALL, slam_config={"submaps": "atlas"}).unwrapped.config.slam_config
-    assert room == {"max_surfels": 2_000_000, "submaps": "atlas"}
+    own = {"max_surfels": 4_000_000, "unstable_window": 2000}
+    assert room == {**own, "submaps": "atlas"}
     fewer = gym.make(name, **SMALL, slam_config={"max_surfels": 5000}).unwrapped.config.slam_config
-    assert fewer == {"max_surfels": 5000}
+    assert fewer == {**own, "max_surfels": 5000}
     assert gym.make(name, **SMALL, slam="odometry").unwrapped.config.slam_config == {}
 
 
