@@ -177,7 +177,7 @@ def test_a_camera_at_rest_is_not_encoded_again(monkeypatch):
 
 
 def test_an_unknown_variant_is_refused():
-    with pytest.raises(InputError, match="ferns, local"):
+    with pytest.raises(InputError, match="ferns, features, local"):
         slam.make("surfel", CAMERA, relocalisation="sift")
 
 
