@@ -164,7 +164,7 @@ def test_shares_and_times_of_known_attempts():
 @pytest.mark.parametrize(
     ("fields", "reason"),
     [
-        ({"variants": ("sift",)}, "ferns, local"),
+        ({"variants": ("sift",)}, "ferns, features, local"),
         ({"settings": ("upside-down",)}, "near, far, black, foreign"),
         ({"scenes": ()}, "at least one"),
         ({"scenes": ("table", "table")}, "different"),
