@@ -70,7 +70,7 @@ class Usme(Experiment, Checked):
     """Folder that ms-slam usme make wrote; without it every frame is rendered when it is needed."""
     backends: tuple[str, ...] = (
         *("surfel", "surfel,loop_closure=deformation"),
-        *("sparse", "volumetric", "odometry"),
+        *("sparse", "volumetric", "kinectfusion", "odometry"),
     )
     """NAME, parameters appended as in surfel,loop_closure=deformation."""
     sequences: tuple[str, ...] = ()
