@@ -194,8 +194,8 @@ class Explored:
         rates = sorted({point.params.get(_RATE, 1) for point in self.points})
         if len(rates) > 1:
             caption = "Feasible trials that none of the same frame rate beats."
-            panels = [self._by_rate(*pair, rates) for pair in self._pairs()]
-            found.insert(1, Chart("rates", "Fronts of the frame rates", caption, panels))
+            panel = self._by_rate(self.objectives[0], self.objectives[1], rates)
+            found.insert(1, Chart("rates", "Fronts of the frame rates", caption, [panel]))
         if self.importance:
             names = by_importance(self.importance)
             marks = [
@@ -254,7 +254,7 @@ class Explored:
             own = front_of(own, (error, cost))
             if own:
                 x, y = self._values(own, cost), self._values(own, error)
-                M_I = own[0].measured.get("M_I")
+                M_I = max(point.measured.get("M_I") or 0.0 for point in own)
                 name = f"every {every}" + (f", M_I {format_number(M_I, 2)}" if M_I else "")
                 series.append(Series(name, x, y, mode="lines+markers"))
         return Panel(key_of(cost, self.clock), key_of(error, self.clock), series, "xy")
