@@ -101,13 +101,9 @@ class Adaptation(Experiment, Checked):
 
     def adaptation(self) -> DivergenceAdaptationConfig:
         """What is to be judged."""
-        return DivergenceAdaptationConfig(
-            configurations=self.configurations or None,
-            levels=self.levels,
-            thresholds=self.thresholds,
-            release_share=self.release_share,
-            dwell_frames=self.dwell_frames,
-        )
+        names = ("levels", "thresholds", "release_share", "dwell_frames")
+        own = {name: getattr(self, name) for name in names}
+        return DivergenceAdaptationConfig(configurations=self.configurations or None, **own)
 
     def specs(self) -> list[AdaptationSpec]:
         """Every sequence."""

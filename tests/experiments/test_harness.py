@@ -18,6 +18,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.experiments.harness import Experiment, experiment_class, experiment_names, rows
 from ms_slam_env.experiments.harness.checking import check_results, compare, spec_type
 from ms_slam_env.experiments.harness.running import run_experiment
+from ms_slam_env.experiments.usme import Usme
 from ms_slam_env.metrics.registry import RESULTS_VERSION, check_keys, registry
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.results import read_results
@@ -167,3 +168,9 @@ def test_experiments_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert all(name in shown for name in experiment_names())
     assert main(["experiment", "nonsense"]) == 2
     assert "valid choices: " in capsys.readouterr().err
+
+
+def test_an_empty_list_is_no_experiment(tmp_path):
+    with pytest.raises(InputError, match="no runs to run: an option is an empty list"):
+        run_experiment(Usme(backends=()), tmp_path / "out")
+    assert not (tmp_path / "out").exists()

@@ -113,6 +113,8 @@ def mutated_study(data: bytes, rng: Rng) -> bytes:
 
 def _mutate_table(connection: sqlite3.Connection, table: str, rng: Rng) -> None:
     columns = [row[1] for row in connection.execute(f"PRAGMA table_info({table})")]
+    if not columns:  # dropped by a mutation before
+        return
     column = columns[rng.integers(len(columns))]
     draw = rng.random()
     if draw < 0.05:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ms_slam_env.errors import InputError
 from ms_slam_env.experiments.harness.experiment import Experiment
 from ms_slam_env.experiments.harness.rows import check_any_finished, failures, lost_runs, run_all
 from ms_slam_env.report.records import Row, from_plain, to_plain
@@ -43,6 +44,8 @@ def run_experiment(
         RuntimeError: every row failed; the files of an earlier run are left as they are.
     """
     specs = experiment.specs()
+    if not specs:
+        raise InputError(f"no {experiment.unit} to run: an option is an empty list")
     experiment.prepare()
     rows = run_all(
         specs,
