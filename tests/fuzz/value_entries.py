@@ -219,7 +219,8 @@ def mutated_frames(frames: Any, rng: Rng) -> Any:
             case 6:
                 depth = rng.uniform(0.1, 9, depth.shape).astype(np.float32)
             case 7:
-                color, depth = color[:, : len(columns) // 2], depth[:, : len(columns) // 2]
+                half = len(columns) // 2  # the last axis of depth, whatever became of it before
+                color, depth = color[:, :half], depth[..., :half]
             case 8:
                 color, depth = color[::-1], depth[::-1]
             case 9:
