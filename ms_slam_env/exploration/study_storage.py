@@ -170,6 +170,7 @@ class StudyStorage:
                 load_if_exists=True,
                 sampler=optuna.samplers.RandomSampler(),
             )
+            self._check_rows()
             self._check_settings(study)
             check_study(study, self.space, self.settings.objectives)
         if not any(trial.user_attrs.get(DEFAULT) for trial in study.get_trials(deepcopy=False)):
@@ -187,6 +188,13 @@ class StudyStorage:
                 raise
             line = " ".join(str(error).split("\n")[0].split())
             raise InputError(f"{self.folder / STUDY_FILE}: not a study: {line}") from None
+
+    def _check_rows(self) -> None:
+        """Refuse rows of trials that are not there: a later trial would get their number."""
+        with contextlib.closing(self._connect()) as connection:
+            orphan = connection.execute("PRAGMA foreign_key_check").fetchone()
+        if orphan:
+            raise ValueError(f"{orphan[0]} has a row of a {orphan[2][:-1]} that is not there")
 
     def _check_settings(self, study: Study) -> None:
         mine = self.settings.fingerprint(self.space)
