@@ -13,12 +13,7 @@ from numpy.typing import NDArray
 from ms_slam_env.config import check_range
 from ms_slam_env.env import Planner
 from ms_slam_env.geometry import look_at, make_pose
-from ms_slam_env.mapping import (
-    FREE,
-    OccupancyMap,
-    expected_gain,
-    shortest_ways,
-)
+from ms_slam_env.mapping import FREE, OccupancyMap, expected_gain, shortest_ways
 from ms_slam_env.mapping.view_goals import distance_in_steps
 
 if TYPE_CHECKING:
@@ -137,13 +132,13 @@ class GoalPlanner(Planner):
         """Drop the goal where it is reached, comes no nearer, or is old and not far."""
         assert self.goal is not None
         left = self.steps_to_goal(here)
+        is_far = self.metres_left(here) > self.radius_m
         is_old, is_reached = self.age >= self.replan, left < ARRIVED
         if is_reached or (is_old and left >= self.begun):
             self.given_up = 0 if is_reached else self.given_up + 1
             self.done_with = np.concatenate([self.done_with, self.goal[None]])
             self.goal = None
         elif is_old:
-            is_far = left * self.steps[0] > self.radius_m
             is_worth_it = self.gain_of(self.goal[None])[0] >= self.enough_m3
             self.goal = self.goal if is_far and is_worth_it else None
             self.begun, self.age = left, 0
@@ -151,10 +146,13 @@ class GoalPlanner(Planner):
     def steps_to_goal(self, here: Float64) -> float:
         """Motions that it takes from a pose (4, 4) to the goal along its way, one after another."""
         assert self.goal is not None
-        metres, turns = distance_in_steps(here[None], self.goal, *self.steps)[0]
+        straight, turns = distance_in_steps(here[None], self.goal, *self.steps)[0]
+        return float(max(straight, self.metres_left(here) / self.steps[0]) + turns)
+
+    def metres_left(self, here: Float64) -> float:
+        """Length of what is left of the way from a pose (4, 4)."""
         ahead = self.way[_nearest(self.way, here[:3, 3]) :]
-        legs = np.linalg.norm(np.diff(ahead, axis=0), axis=1).sum() / self.steps[0]
-        return float(max(metres, legs) + turns)
+        return float(np.linalg.norm(np.diff(ahead, axis=0), axis=1).sum())
 
     def next_on_way(self, here: Float64) -> Float64:
         """The goal, or a pose (4, 4) on the way to it as far as the camera can go straight."""

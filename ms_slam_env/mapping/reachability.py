@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,12 +71,12 @@ def shortest_ways(grid: OccupancyGrid, position: Float64, radius_m: float) -> Wa
     low = nodes.min(axis=0) - 1
     index = np.full(nodes.max(axis=0) - low + 2, -1)
     index[tuple((nodes - low).T)] = np.arange(len(nodes))
-    lengths = sparse.csr_array((len(nodes), len(nodes)))
-    for step in _HALF_OF_26:
-        others = index[tuple((nodes - low + step).T)]
-        joined = np.flatnonzero(others >= 0)
-        metres = np.full(len(joined), 2 * grid.cell_m * math.sqrt((step**2).sum()))
-        lengths += sparse.csr_array((metres, (joined, others[joined])), shape=lengths.shape)
+    around = nodes[None] - low + _HALF_OF_26[:, None]
+    others = index[tuple(np.moveaxis(around, -1, 0))]
+    step, node = np.nonzero(others >= 0)
+    metres = 2 * grid.cell_m * np.linalg.norm(_HALF_OF_26, axis=1)[step]
+    edges = metres, (node, others[step, node])
+    lengths = sparse.csr_array(edges, shape=(len(nodes), len(nodes)))
     centres = grid.centres_of(2 * nodes + grid.cells_of(position) % 2)
     first = int(np.argmin(((centres - position) ** 2).sum(axis=1)))
     found, before = dijkstra(lengths, directed=False, indices=first, return_predecessors=True)
