@@ -275,7 +275,8 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         here = self.episode.T_world_camera_estimate
         found = self._glance.from_here(self.slam, self.candidate_poses(), here)
         scaled = found.divergences / self.config.targets.maxima
-        return dataclasses.replace(found, divergences=scaled)
+        frames = self.config.frames_per_action
+        return dataclasses.replace(found, divergences=scaled, frames=frames)
 
     def _lost_share(self) -> float:
         """How much of the patience with a lost camera is used up; 1 or more ends the episode."""

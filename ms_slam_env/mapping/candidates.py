@@ -28,9 +28,9 @@ NAMES: tuple[str, ...] = (
 Whether it is possible; the divergences of its view as the map predicts it from that of here, in
 units of M_I and M_D; the share of the view that the map fills, and the share nearer than 0.5 m; of
 the view's information H (`view_information`) log(1 + det(H)^(1/6)) and log(1 + its least
-eigenvalue), each a pixel, in 1/m^2; the probability that SLAM slips (`trackability`); the expected
-gain relative to the largest; by how many steps it leads nearer to the goal, in translation and in
-rotation; the motion itself, along and about the camera's axes, in steps.
+eigenvalue), each a pixel, in 1/m^2; the probability that SLAM slips, a frame (`trackability`); the
+expected gain relative to the largest; by how many steps it leads nearer to the goal, in translation
+and in rotation; the motion itself, along and about the camera's axes, in steps.
 """
 
 _GAIN_RAYS = (8, 6)
@@ -49,11 +49,13 @@ class PredictedViews:
         poses: (1 + n, 4, 4) T_world_camera.
         views: 1 + n.
         divergences: (n, 2) of the motions' views from that of here, in units of (M_I, M_D).
+        frames: taken on a motion.
     """
 
     poses: Float64
     views: Views
     divergences: Float64
+    frames: int = 1
 
 
 def candidate_numbers(
@@ -77,7 +79,8 @@ def candidate_numbers(
     poses, views = predicted.poses, predicted.views
     gain = expected_gain(grid, poses[1:], intrinsics, _GAIN_RAYS)
     H, pixels = view_information(views), views.depth[0].size
-    risk = risk_of(H, views, image_motion(views, poses), mean_depth(views)[0])
+    motion_rad = image_motion(views, poses) / predicted.frames
+    risk = risk_of(H, views, motion_rad, mean_depth(views)[0])
     least = np.maximum(np.linalg.eigvalsh(H)[:, 0], 0) / pixels
     d_optimality = np.exp(np.linalg.slogdet(H)[1] / 6) / pixels
     away = distance_in_steps(poses, goal, *steps)

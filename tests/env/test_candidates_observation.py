@@ -76,6 +76,18 @@ def test_overlap_nearness_information_and_risk_are_those_of_the_other_planners(m
     np.testing.assert_allclose(numbers["slip_risk"], slip_risk(views, poses)[1:], rtol=1e-4)
 
 
+def test_the_risk_of_a_motion_of_several_frames_is_that_of_one():
+    env = make(frames_per_action=3)
+    observation, _ = env.reset(seed=0)
+    world = env.unwrapped
+    here = world.episode.T_world_camera_estimate
+    poses = np.concatenate([here[None], world.candidate_poses()])
+    views = world.slam.predict(poses, SCALE)
+    found = numbers_of(observation)["slip_risk"]
+    np.testing.assert_allclose(found, slip_risk(views, poses, 3)[1:], rtol=1e-4)
+    assert (found <= slip_risk(views, poses)[1:] + 1e-6).all()
+
+
 def test_gain_and_the_way_to_the_goal_are_those_of_the_occupancy_grid(moment):
     env, observation = moment
     world, numbers = env.unwrapped, numbers_of(observation)
