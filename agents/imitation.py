@@ -35,7 +35,13 @@ from ms_slam_agents.policy_file import Metadata, PolicyFile, read_policy, write_
 from ms_slam_agents.ppo import Network
 from ms_slam_agents.sb3_state import PooledMoments
 from ms_slam_agents.supervisor import LATEST
-from ms_slam_agents.train_sb3 import VALIDATION_SEED, env_options, make_venv, problem_options
+from ms_slam_agents.train_sb3 import (
+    VALIDATION_SEED,
+    check_problem,
+    env_options,
+    make_venv,
+    problem_options,
+)
 from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
 from torch import Tensor
 from tqdm import tqdm
@@ -324,6 +330,7 @@ def train(args: Args) -> int:
     torch.set_num_threads(1)
     check_planner(args.teacher)
     file, done = load_run(args)
+    check_problem(args)
     curve = Curve(args.eval_episodes, {}, config=to_plain(asdict(args)))
     if done and (args.out / RESULTS).is_file():
         curve = replace(read_curve(args.out / RESULTS), config=curve.config)

@@ -95,7 +95,8 @@ def check_problem(args: Problem) -> None:
         InputError: an unknown environment, or options that it refuses.
     """
     try:
-        make_env(args, "train", ()).close()
+        for split in ("train", "validation"):
+            make_env(args, split, ()).close()
     except gym.error.UnregisteredEnv:
         raise unknown("environment", args.env_id, ms_slam_env.ENV_IDS) from None
     except gym.error.Error as error:

@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("sb3_contrib")
 
-from ms_slam_agents import train_sb3
+from ms_slam_agents import imitation, ppo, train_sb3
 from ms_slam_agents.policy import Policy
 from ms_slam_agents.policy_planner import TrainedPolicy
 
@@ -56,10 +56,12 @@ def test_two_processes_train_a_policy_that_plans(tmp_path):
             "unknown environment 'Mars-v0'; valid choices: MSA",
         ),
         (("--step-m", "7"), "EnvConfig.step_m = 7.0 is outside"),
+        (("--scene-seeds", "1000"), "EnvConfig.num_scene_seeds = 1000 is outside"),  # validation's
     ],
 )
-def test_bad_options_of_the_environment_give_one_line(tmp_path, capsys, option, message):
-    assert train_sb3.main(["--out", str(tmp_path / "run"), *option]) == 2
+@pytest.mark.parametrize("trainer", [imitation, ppo, train_sb3])
+def test_bad_options_of_the_environment_give_one_line(tmp_path, capsys, option, message, trainer):
+    assert trainer.main(["--out", str(tmp_path / "run"), *option]) == 2
     error = capsys.readouterr().err
     assert message in error
     assert len(error.strip().splitlines()) == 1
