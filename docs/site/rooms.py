@@ -6,6 +6,7 @@ follow from others are left out, as is what lies below everything (config, error
 
 from __future__ import annotations
 
+import argparse
 import ast
 import itertools
 from pathlib import Path
@@ -131,4 +132,6 @@ def draw(edges: dict[str, set[str]]) -> str:
 
 
 if __name__ == "__main__":
-    OUT.write_text(draw(uses()), encoding="utf-8")
+    parser = argparse.ArgumentParser(description="Draw the rooms of the package as SVG.")
+    parser.add_argument("--out", type=Path, default=OUT, help="the SVG file to write")
+    parser.parse_args().out.write_text(draw(uses()), encoding="utf-8")

@@ -72,6 +72,16 @@ def test_the_drawing_shows_the_rooms() -> None:
     assert set(shown) == set(rooms.uses()), "run python docs/site/rooms.py"
 
 
+def test_asking_the_drawing_for_help_draws_nothing(tmp_path: Path) -> None:
+    drawing = ROOT / "docs" / "pictures" / "rooms.svg"
+    before = drawing.stat().st_mtime_ns
+    command = [sys.executable, str(ROOT / "docs" / "site" / "rooms.py")]
+    subprocess.run([*command, "--help"], check=True, capture_output=True)
+    subprocess.run([*command, "--out", str(tmp_path / "rooms.svg")], check=True)
+    assert drawing.stat().st_mtime_ns == before
+    assert text_of(tmp_path / "rooms.svg").startswith("<svg")
+
+
 @pytest.mark.slow
 def test_the_site_builds_and_loads_nothing_from_the_network(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
