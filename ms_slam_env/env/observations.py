@@ -16,6 +16,7 @@ from ms_slam_env.extension import ExtensionPoint
 from ms_slam_env.geometry import invert
 from ms_slam_env.mapping import OccupancyGrid, expected_gain, surrounding_occupancy
 from ms_slam_env.mapping.candidates import HIGHS, LOWS, PredictedViews, candidate_numbers
+from ms_slam_env.mapping.goals_around import NUM_GOALS, gain_around
 from ms_slam_env.mapping.view_goals import best_goal, distance_in_steps
 from ms_slam_env.robot import NUM_ROTATIONS, NUM_TRANSLATIONS, ROTATIONS, TRANSLATIONS
 
@@ -193,11 +194,38 @@ class MapObservation(Observation):
         """Return the vector."""
         grid, poses = knowledge.occupancy, knowledge.candidates()
         assert grid is not None
-        gain = expected_gain(grid, poses, self._intrinsics, _GAIN_RAYS)
-        most = gain.max()
-        parts = [gain / max(most, 1e-9), [min(most, _GAIN_CAP_M3)]]
+        parts = _relative_gain(grid, poses, self._intrinsics)
         parts += [surrounding_occupancy(grid, poses[0], *each).ravel() for each in _BLOCKS]
         return np.concatenate([self._features.build(knowledge), *parts]).astype(np.float32)
+
+
+class GoalsObservation(Observation):
+    """``features``, what each motion would gain, and what views around would: float32.
+
+    After the features: the gain of each motion (n) relative to the largest and the largest itself,
+    m3, as `map` has them; the world's upward axis in the camera's frame (3); then the gain of the
+    views of `mapping.goals_around`, m3 (232), 0 where free space does not lead.
+    """
+
+    needs_occupancy = True
+
+    def __init__(self, intrinsics: Intrinsics, num_motions: int) -> None:
+        self._intrinsics = intrinsics
+        self._features = FeaturesObservation(intrinsics, num_motions)
+        space = self._features.space
+        low = [0.0] * (num_motions + 1) + [-1.0] * 3 + [0.0] * NUM_GOALS
+        high = [1.0] * num_motions + [_GAIN_CAP_M3] + [1.0] * 3 + [_GAIN_CAP_M3] * NUM_GOALS
+        lowest, highest = np.concatenate([space.low, low]), np.concatenate([space.high, high])
+        self.space = spaces.Box(lowest.astype(np.float32), highest.astype(np.float32))
+
+    def build(self, knowledge: RobotKnowledge) -> Float32:
+        """Return the vector."""
+        grid, poses = knowledge.occupancy, knowledge.candidates()
+        assert grid is not None
+        parts = [self._features.build(knowledge), *_relative_gain(grid, poses, self._intrinsics)]
+        parts += [np.clip(poses[0][2, :3], -1, 1)]
+        around = gain_around(grid, poses[0], self._intrinsics)
+        return np.concatenate([*parts, np.minimum(around, _GAIN_CAP_M3)]).astype(np.float32)
 
 
 class CandidatesObservation(Observation):
@@ -268,6 +296,7 @@ OBSERVATIONS: dict[str, Callable[[Intrinsics, int], Observation]] = {
     "features": FeaturesObservation,
     "lookahead": LookaheadObservation,
     "map": MapObservation,
+    "goals": GoalsObservation,
     "candidates": CandidatesObservation,
 }
 """Name of the option ``observation`` to variant."""
@@ -303,6 +332,13 @@ def state_vector(knowledge: RobotKnowledge) -> Float32:
         ]
     ).astype(np.float32)
     return np.clip(state, *_STATE_BOUNDS)
+
+
+def _relative_gain(grid: OccupancyGrid, poses: Float64, intrinsics: Intrinsics) -> list[Any]:
+    """Expected gain of poses (n, 4, 4) relative to the largest (n,), and the largest (1,), m^3."""
+    gain = expected_gain(grid, poses, intrinsics, _GAIN_RAYS)
+    most = gain.max()
+    return [gain / max(most, 1e-9), [min(most, _GAIN_CAP_M3)]]
 
 
 def coarse_depth(depth: Float32) -> Float32:
