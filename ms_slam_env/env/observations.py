@@ -212,11 +212,9 @@ class GoalsObservation(Observation):
     def __init__(self, intrinsics: Intrinsics, num_motions: int) -> None:
         self._intrinsics = intrinsics
         self._features = FeaturesObservation(intrinsics, num_motions)
-        space = self._features.space
-        low = [0.0] * (num_motions + 1) + [-1.0] * 3 + [0.0] * NUM_GOALS
-        high = [1.0] * num_motions + [_GAIN_CAP_M3] + [1.0] * 3 + [_GAIN_CAP_M3] * NUM_GOALS
-        lowest, highest = np.concatenate([space.low, low]), np.concatenate([space.high, high])
-        self.space = spaces.Box(lowest.astype(np.float32), highest.astype(np.float32))
+        space = _longer(self._features.space, [*(1,) * num_motions, _GAIN_CAP_M3])
+        space = _longer(space, [1] * 3, [-1] * 3)
+        self.space = _longer(space, [_GAIN_CAP_M3] * NUM_GOALS)
 
     def build(self, knowledge: RobotKnowledge) -> Float32:
         """Return the vector."""
@@ -356,9 +354,11 @@ def _cell_sums(image: Float32) -> Float32:
     return np.add.reduceat(np.add.reduceat(image, rows, axis=0), columns, axis=1)
 
 
-def _longer(space: spaces.Space[Any], highs: Sequence[float]) -> spaces.Box:
-    """A vector's space and more numbers, from 0 to ``highs``."""
+def _longer(
+    space: spaces.Space[Any], highs: Sequence[float], lows: Sequence[float] | None = None
+) -> spaces.Box:
+    """A vector's space and more numbers, from ``lows``, or 0, to ``highs``."""
     assert isinstance(space, spaces.Box)
-    more = np.asarray(highs, dtype=np.float32)
-    low = np.concatenate([space.low, np.zeros_like(more)])
-    return spaces.Box(low, np.concatenate([space.high, more]))
+    high = np.asarray(highs, dtype=np.float32)
+    low = np.zeros_like(high) if lows is None else np.asarray(lows, dtype=np.float32)
+    return spaces.Box(np.concatenate([space.low, low]), np.concatenate([space.high, high]))

@@ -45,9 +45,9 @@ def goals_around(here: Float64) -> Float64:
 def gain_around(grid: OccupancyGrid, here: Float64, intrinsics: Intrinsics) -> Float64:
     """Expected gain (NUM_GOALS,) in m^3 of `goals_around`; 0 where free space does not lead.
 
-    Free space leads to a position if its cell is free and joined to the cell of ``here``, or to
-    the free one nearest to it, by faces of free cells within a ring more than the goals reach. Where
-    the camera is it need not: its own cell may be unknown yet.
+    Free space leads to a position if its cell is free and joined to the free cell nearest to
+    ``here``, by faces of free cells no farther than half as far again as the goals. Where the
+    camera is that is not asked: its own cell may be unknown yet.
     """
     goals = goals_around(here)
     gain = expected_gain(grid, goals, intrinsics, _RAYS)

@@ -54,7 +54,9 @@ def env():
 
 
 @pytest.mark.parametrize("env_id", IDS)
-@pytest.mark.parametrize("observation", ["rgbd", "features", "lookahead", "map", "candidates"])
+@pytest.mark.parametrize(
+    "observation", ["rgbd", "features", "lookahead", "map", "goals", "candidates"]
+)
 def test_gymnasium_checker_finds_nothing(env_id, observation, recwarn):
     env = gym.make(env_id, observation=observation, **OPTIONS)
     assert env.action_space.n == NUM_ACTIONS[env_id]
