@@ -39,6 +39,9 @@ class Problem(Checked):
             some ten, of a free camera those of the environment. With ``--embodiment arm-kinematic
             --frames-per-action 1`` a step costs little more than the free camera's: a world to
             train in before the arm itself (``--init``).
+        image_size: of the camera in training and validation, width x height; None: the
+            environment's own. At 80x60 a step costs half as much, and SLAM holds on less: a world
+            to begin in. Which one it was is no part of the policy.
         num_envs: parallel environments, one process and one thread each.
         seed: of network, training episodes and sampling.
         eval_episodes: validation episodes, the same at each evaluation, with the same random
@@ -58,6 +61,7 @@ class Problem(Checked):
     step_m: float | None = None
     step_deg: float | None = None
     frames_per_action: int | None = bounded(None, 1, 1000)
+    image_size: str | None = None
     num_envs: int = bounded(2, 1, 100_000)
     seed: int = 0
     eval_episodes: int = bounded(24, 1, 100_000)

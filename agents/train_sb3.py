@@ -76,6 +76,8 @@ def problem_options(args: Problem, split: str) -> dict[str, Any]:
         few = {}
     elif str(holder).startswith("arm"):
         few = {"arm": few}
+    if args.image_size is not None:
+        few["image_size"] = args.image_size
     return {
         "max_episode_steps": args.episode_steps,
         "scene": args.scenes,
