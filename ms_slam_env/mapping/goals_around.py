@@ -17,7 +17,8 @@ _HEADINGS = 8
 _RINGS_M = (0.5, 1.0, 2.0)
 _HEIGHTS_M = (-0.5, 0.5)  # above where the camera is
 _PITCHES_RAD = (-0.5, 0.5)  # looked along as well where the camera is
-_RAYS = (8, 6)
+_RAYS = (6, 4)
+_REACH_M = 2.5  # how far free space is followed along each axis
 
 NUM_POSITIONS = 1 + len(_RINGS_M) * _HEADINGS + len(_HEIGHTS_M)
 NUM_GOALS = (NUM_POSITIONS + len(_PITCHES_RAD)) * _HEADINGS
@@ -46,8 +47,8 @@ def gain_around(grid: OccupancyGrid, here: Float64, intrinsics: Intrinsics) -> F
     """Expected gain (NUM_GOALS,) in m^3 of `goals_around`; 0 where free space does not lead.
 
     Free space leads to a position if its cell is free and joined to the free cell nearest to
-    ``here``, by faces of free cells no farther than half as far again as the goals. Where the
-    camera is that is not asked: its own cell may be unknown yet.
+    ``here``, by faces of free cells within 2.5 m of it along each axis. Where the camera is that is
+    not asked: its own cell may be unknown yet.
     """
     goals = goals_around(here)
     gain = expected_gain(grid, goals, intrinsics, _RAYS)
@@ -59,16 +60,19 @@ def gain_around(grid: OccupancyGrid, here: Float64, intrinsics: Intrinsics) -> F
 
 def _is_led_to(grid: OccupancyGrid, start: Float64, positions: Float64) -> NDArray[np.bool_]:
     """Which of positions (N, 3) free space leads to from ``start`` (3,)."""
-    cell, reach = grid.cells_of(start), int(1.5 * max(_RINGS_M) / grid.cell_m)
+    cell, reach = grid.cells_of(start), int(_REACH_M / grid.cell_m)
     low = np.clip(cell - reach, 0, grid.log_odds.shape)
     high = np.clip(cell + reach + 1, low, grid.log_odds.shape)
     free = grid.log_odds[tuple(map(slice, low, high))] < 0
     regions, _ = ndimage.label(free)
-    inside = np.argwhere(free)
-    if not len(inside):
-        return np.zeros(len(positions), dtype=bool)
-    nearest = inside[np.argmin(((inside + low - cell) ** 2).sum(axis=1))]
+    own = cell - low
+    inside = (own >= 0).all() and (own < regions.shape).all()
+    if not (inside and free[tuple(own)]):
+        cells = np.argwhere(free)
+        if not len(cells):
+            return np.zeros(len(positions), dtype=bool)
+        own = cells[np.argmin(((cells - own) ** 2).sum(axis=1))]
     cells = grid.cells_of(positions) - low
     known = ((cells >= 0) & (cells < regions.shape)).all(axis=1)
     cells[~known] = 0
-    return np.asarray(known & (regions[tuple(cells.T)] == regions[tuple(nearest)]))
+    return np.asarray(known & (regions[tuple(cells.T)] == regions[tuple(own)]))
