@@ -22,6 +22,7 @@ Row = dict[str, Any]
 T = TypeVar("T")
 
 _MAX_BYTES = 2**30
+_LINE = 100  # characters of JSON that are not broken into lines
 _INFINITE = {math.inf: "Infinity", -math.inf: "-Infinity"}
 _FROM_TEXT = {text: number for number, text in _INFINITE.items()}
 
@@ -82,7 +83,19 @@ class RecordFile:
 
 def write_json(path: Path, content: Any) -> None:
     """Write ``content``, whole or not at all; see :func:`to_plain` for what JSON does not have."""
-    write_text(path, json.dumps(to_plain(content), indent=1, allow_nan=False) + "\n")
+    write_text(path, to_text(to_plain(content)) + "\n")
+
+
+def to_text(content: Any, margin: str = "\n") -> str:
+    """JSON of plain ``content``: what is short, or holds no list or mapping, stands on one line."""
+    line = json.dumps(content, allow_nan=False)
+    inner = content.values() if isinstance(content, dict) else content
+    if len(line) <= _LINE or not any(value and isinstance(value, (dict, list)) for value in inner):
+        return line
+    names = [f"{json.dumps(str(key))}: " for key in content] if isinstance(content, dict) else []
+    texts = [to_text(value, margin + " ") for value in inner]
+    parts = [name + text for name, text in zip(names or [""] * len(texts), texts, strict=True)]
+    return line[0] + margin + " " + f",{margin} ".join(parts) + margin + line[-1]
 
 
 def to_plain(content: Any) -> Any:
