@@ -17,8 +17,13 @@ from ms_slam_env import metrics
 from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.errors import InputError, InputWarning
 from ms_slam_env.input_files import read_text
-from ms_slam_env.metrics.as_printed import printed_ate, printed_relative_errors
-from ms_slam_env.metrics.relative import DELTA_UNITS, PAIRINGS, TOLERANCE
+from ms_slam_env.metrics.relative import (
+    DELTA_UNITS,
+    PAIRINGS,
+    TOLERANCE,
+    printed_ate,
+    printed_relative_errors,
+)
 from ms_slam_env.metrics.trajectory import ALIGNMENTS, check_first
 from ms_slam_env.sequences import associate, read_trajectory
 

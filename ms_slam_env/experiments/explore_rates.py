@@ -12,9 +12,8 @@ from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.experiments.harness.experiment import Experiment
 from ms_slam_env.exploration import SlamEvaluator, make_space
-from ms_slam_env.exploration.in_memory import explore_in_memory
 from ms_slam_env.exploration.objectives import FAILURE, as_metrics
-from ms_slam_env.exploration.samplers import SAMPLERS
+from ms_slam_env.exploration.samplers import SAMPLERS, explore_in_memory
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Column, Table, finished, make_table

@@ -15,10 +15,8 @@ from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.experiments.harness.experiment import Experiment
 from ms_slam_env.exploration import SlamEvaluator, make_space
 from ms_slam_env.exploration.front import hypervolume
-from ms_slam_env.exploration.grid import Grid
-from ms_slam_env.exploration.in_memory import explore_in_memory
 from ms_slam_env.exploration.objectives import FAILURE, objective_values
-from ms_slam_env.exploration.samplers import SAMPLERS
+from ms_slam_env.exploration.samplers import SAMPLERS, Grid, explore_in_memory
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.statistics import Interval, bootstrap_interval

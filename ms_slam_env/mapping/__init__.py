@@ -1,11 +1,16 @@
 """What is known of space: occupancy, what a view would add to it, where a camera can go."""
 
 from ms_slam_env.mapping.expected_gain import expected_gain
-from ms_slam_env.mapping.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from ms_slam_env.mapping.occupancy_map import OccupancyMap
+from ms_slam_env.mapping.occupancy_grid import (
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    OccupancyGrid,
+    OccupancyMap,
+    surrounding_occupancy,
+)
 from ms_slam_env.mapping.reachability import Ways, reachable_positions, shortest_ways
-from ms_slam_env.mapping.surroundings import surrounding_occupancy
-from ms_slam_env.mapping.view_information import view_information
+from ms_slam_env.mapping.trackability import view_information
 
 __all__ = [
     "FREE",

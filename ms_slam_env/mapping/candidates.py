@@ -11,9 +11,14 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, so3_log
 from ms_slam_env.mapping.expected_gain import expected_gain
 from ms_slam_env.mapping.occupancy_grid import OccupancyGrid
-from ms_slam_env.mapping.trackability import NEAR_M, image_motion, risk_of
+from ms_slam_env.mapping.trackability import (
+    NEAR_M,
+    image_motion,
+    mean_depth,
+    risk_of,
+    view_information,
+)
 from ms_slam_env.mapping.view_goals import distance_in_steps
-from ms_slam_env.mapping.view_information import mean_depth, view_information
 from ms_slam_env.slam.base import Views
 
 Float64 = NDArray[np.float64]

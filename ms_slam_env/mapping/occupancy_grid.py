@@ -1,10 +1,9 @@
-"""Unknown, free and occupied space, carved from depth images.
-
-A cell has a log-odds of being occupied, as in OctoMap (Hornung et al., Autonomous Robots 2013):
-one measurement a frame, and in a frame a surface outweighs the rays that pass it.
-"""
+"""Occupancy of space: carved from depth, followed where SLAM moves frames, seen from a camera."""
 
 from __future__ import annotations
+
+import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,9 @@ from numpy.typing import NDArray
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import transform_points
-from ms_slam_env.mapping.kernels import BLANK, PASSED, STRUCK, mark_rays
+from ms_slam_env.mapping.kernels import BLANK, PASSED, STRUCK, count_states, mark_rays
+from ms_slam_env.slam.base import SlamBackend
+from ms_slam_env.slam.submaps import Submaps
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -123,3 +124,107 @@ class OccupancyGrid:
         log_odds, blanks = np.zeros(grown, np.int8), np.zeros(grown, np.int8)
         log_odds[box], blanks[box] = self.log_odds, self.blanks
         self.first, self.log_odds, self.blanks = first, log_odds, blanks
+
+
+Float32 = NDArray[np.float32]
+
+_MOST_SAMPLES = 5
+
+
+def surrounding_occupancy(
+    grid: OccupancyGrid, T_world_camera: Float64, blocks: tuple[int, int, int], block_m: float
+) -> Float32:
+    """Shares of free and of occupied space in blocks around a camera, (2, X, Y, Z) in [0, 1].
+
+    The rest of a block is unknown. Blocks lie along the camera's axes (x right, y down, z forward),
+    as many on either side of it; each is looked at in as many places as leave no cell out, but no
+    more than five along an edge.
+
+    Args:
+        grid: what is known.
+        T_world_camera: (4, 4).
+        blocks: X, Y, Z, how many along each axis.
+        block_m: edge of a block, metres.
+    """
+    samples = min(_MOST_SAMPLES, math.ceil(block_m / grid.cell_m - 1e-9))
+    corner = -0.5 * block_m * np.array(blocks)
+    start = T_world_camera[:3, :3] @ corner + T_world_camera[:3, 3]
+    with wp.ScopedDevice("cpu"):
+        shares = wp.zeros((2, *blocks), dtype=float)
+        given = [
+            wp.array(grid.log_odds, dtype=wp.int8, copy=False),
+            wp.mat33(*(T_world_camera[:3, :3] * block_m / grid.cell_m).ravel()),
+            wp.vec3(*(start / grid.cell_m - grid.first)),
+            samples,
+        ]
+        wp.launch(count_states, blocks, given, [shares])
+    return np.asarray(shares.numpy())
+
+
+class _Carved(NamedTuple):
+    """A frame and where it was carved."""
+
+    number: int  # as SLAM counts
+    depth: NDArray[np.float32]
+    T_world_camera: Float64
+
+
+class OccupancyMap:
+    """Keeps the frames that it was carved from, and carves anew what SLAM has moved.
+
+    ``grid`` holds the frames of the present submap and of those joined to it: where another lies is
+    a guess, and what it saw would be carved in the wrong place.
+
+    Args:
+        cell_m: edge of a cell, metres.
+        reach_m: depth up to which a ray carves and strikes, metres.
+    """
+
+    def __init__(self, cell_m: float = 0.1, reach_m: float = 3.5) -> None:
+        self.cell_m, self.reach_m = cell_m, reach_m
+        self.grid = OccupancyGrid(cell_m, reach_m)
+        self._frames: list[_Carved] = []
+        self._in_grid: set[int] = set()
+
+    def add(
+        self,
+        slam: SlamBackend,
+        depth: NDArray[np.float32],
+        T_world_camera: Float64,
+        intrinsics: Intrinsics,
+    ) -> None:
+        """Take the frame (H, W), metres, that ``slam`` tracked last, at its pose (4, 4)."""
+        number = slam.frames_counted - 1 if slam.frames_counted else len(self._frames)
+        moved = self._follow(slam)
+        self._frames.append(_Carved(number, depth, T_world_camera))
+        present = _of_present_submap(slam.submaps(), [frame.number for frame in self._frames])
+        if moved or self._in_grid | {number} != present:
+            self.grid = OccupancyGrid(self.cell_m, self.reach_m)
+            self._in_grid = set()
+        missing = present - self._in_grid
+        for frame in self._frames if len(missing) > 1 else self._frames[-1:]:
+            if frame.number in missing:
+                self.grid.integrate(frame.depth, frame.T_world_camera, intrinsics)
+        self._in_grid = present
+
+    def _follow(self, slam: SlamBackend) -> bool:
+        """Put the frames where SLAM has them now; whether one in the grid has moved by that."""
+        numbers, poses = slam.corrected_trajectory()
+        now = dict(zip(numbers.tolist(), poses, strict=True))
+        moved = False
+        for index, frame in enumerate(self._frames):
+            pose = now.get(frame.number)
+            if pose is None:
+                continue
+            # Each entry of the rotation tells how far the depths along an axis have turned.
+            apart = np.abs(pose - frame.T_world_camera)[:3] @ [*[self.reach_m] * 3, 1.0]
+            if apart.max() > 0.5 * self.cell_m:
+                self._frames[index] = frame._replace(T_world_camera=pose)
+                moved |= frame.number in self._in_grid
+        return moved
+
+
+def _of_present_submap(submaps: Submaps, numbers: list[int]) -> set[int]:
+    """Which of the frames belong to the submap of the last one, or to one that it is joined to."""
+    roots = submaps.joined_to[np.searchsorted(submaps.first_frames, numbers, side="right") - 1]
+    return {number for number, root in zip(numbers, roots, strict=True) if root == roots[-1]}

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,6 +23,7 @@ from ms_slam_env.metrics.trajectory import (
     check_poses,
     check_positive,
     check_times,
+    find_alignment,
     path_distances,
     rotation_angles,
     statistics_of,
@@ -255,3 +257,52 @@ def drifts(
         )
         found.append(Drift(float(length), len(first), translation, rotation))
     return found
+
+
+def printed_errors(
+    estimate: ArrayLike, truth: ArrayLike, align: str = "se3", kind: str = "translation"
+) -> Float64:
+    """Errors (N,), m or rad, of USME equation (1) to the letter; arguments of `absolute_errors`.
+
+    The typeset formulas are missing from the text that we have; its words (the rotation dR_i
+    between estimated and true state, N states, pairs d_k = {x_s, x_e} with e > s) are those of
+    Zhang and Scaramuzza, "A tutorial on quantitative trajectory evaluation for
+    visual(-inertial) odometry", IROS 2018, whose formulas these are:
+
+        dR_i = R_i R'_i^T,   dp_i = p_i - dR_i p'_i                                     (1)
+        ATE_rot = sqrt(1/N sum |angle(dR_i)|^2),   ATE_pos = sqrt(1/N sum |dp_i|^2)     (2)
+        RE = {the same of x_e, after x'_s was laid onto x_s}                            (4), (5)
+
+    with R, p the truth and R', p' the estimate after alignment. dp_i is no distance between
+    positions: an error of orientation moves it by as much as the camera is away from the world's
+    origin, so that the same trajectories in another world have another error. `ate_rmse` has
+    |p_i - p'_i| there, as all tools do. The angles are the same.
+    """
+    check_kind(kind)
+    poses, true = check_pair(estimate, truth)
+    return _state_errors(find_alignment(poses, true, align).poses(poses), true, kind)
+
+
+@with_arguments_of(printed_errors)
+def printed_ate(errors: Float64) -> ErrorStatistics:
+    """Statistics of `printed_errors`; ``rmse`` is USME equation (2)."""
+    return statistics_of(errors)
+
+
+def printed_relative_errors(
+    estimate: ArrayLike, truth: ArrayLike, kind: str = "translation", **which: Any
+) -> Float64:
+    """The set (K,) of USME equation (5), m or rad, of the pairs ``which`` of `pose_pairs`."""
+    check_kind(kind)
+    poses, true = check_pair(estimate, truth)
+    first, second = pose_pairs(true, **which).T
+    laid = true[first] @ invert(poses[first]) @ poses[second]
+    return _state_errors(laid, true[second], kind)
+
+
+def _state_errors(poses: Float64, true: Float64, kind: str) -> Float64:
+    R, p = poses[:, :3, :3], poses[:, :3, 3]
+    turned = true[:, :3, :3] @ np.swapaxes(R, 1, 2)
+    if kind == "rotation":
+        return rotation_angles(turned)
+    return np.linalg.norm(true[:, :3, 3] - np.einsum("nij,nj->ni", turned, p), axis=1)

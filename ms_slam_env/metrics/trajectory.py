@@ -4,7 +4,7 @@ Sources: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", I
 Yang, Dong, "USME", Navigation Positioning and Timing 2021, equations (1) and (2). With R_i, p_i the
 true pose and R'_i, p'_i the estimate after alignment, the errors at pose i are |p_i - p'_i| and the
 angle of R_i^T R'_i; ATE is their root mean square. USME's own (1), with p_i - dR_i p'_i, is in
-`as_printed`.
+`relative`.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from ms_slam_env.cli import COMMANDS, main
 from ms_slam_env.command_line import exit_code
 from ms_slam_env.errors import InputError
-from ms_slam_env.experiments.harness import running
+from ms_slam_env.experiments.harness import rows as harness_rows
 from ms_slam_env.experiments.planners import DETAILS, HEADLINE
 from ms_slam_env.geometry import make_pose, so3_exp
 from ms_slam_env.report.records import Row
@@ -135,7 +135,7 @@ def test_failed_episodes_are_code_1_and_stay_in_the_results(
     result = dict.fromkeys((*HEADLINE, *DETAILS), 0.5)
     curve = {"looks_at_steps": [0, 5], "f_score_5cm_over_steps": [0.0, 0.5]}
     finished = {"result": {**result, "ate_over_time": [0.1], **curve}, "error": None}
-    monkeypatch.setattr(running, "run_all", made_up_rows(failed(), finished))
+    monkeypatch.setattr(harness_rows, "run_all", made_up_rows(failed(), finished))
     assert main([*TWO_EPISODES, "--out", str(tmp_path)]) == 1
     assert "1 failed, the first: planner random, scene table, seed 2000" in capsys.readouterr().err
     content = json.loads((tmp_path / "results.json").read_text())
@@ -146,7 +146,7 @@ def test_where_every_episode_failed_the_old_report_stays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "table.md").write_text("good")
-    monkeypatch.setattr(running, "run_all", made_up_rows(failed(), failed()))
+    monkeypatch.setattr(harness_rows, "run_all", made_up_rows(failed(), failed()))
     assert main([*TWO_EPISODES, "--out", str(tmp_path)]) == 1
     assert "all 2 failed, the first: planner random, scene tab" in one_line(capsys.readouterr().err)
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("table.md", "good")]

@@ -77,7 +77,7 @@ def run_here(specs: Any, run: Any, out: Path, *_: Any, **options: Any) -> list[R
 
 def run_tiny(arguments: list[str]) -> int:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("ms_slam_env.experiments.harness.running.run_all", run_here)
+        patch.setattr("ms_slam_env.experiments.harness.rows.run_all", run_here)
         return exit_code(lambda: experiment.run(Tiny, arguments, "ms-slam experiment", Path("x")))
 
 

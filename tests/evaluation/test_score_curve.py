@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ms_slam_env.evaluation.map_quality import map_quality
-from ms_slam_env.evaluation.score_curve import ScoreCurve
+from ms_slam_env.evaluation.map_quality import ScoreCurve, map_quality
 
 
 def plane(low: float, high: float, spacing_m: float) -> np.ndarray:

@@ -22,7 +22,7 @@ from ms_slam_env.experiments.harness.motion_difficulty import (
     judgements,
     statistics,
 )
-from ms_slam_env.experiments.harness.running import write_all
+from ms_slam_env.experiments.harness.rows import write_all
 from ms_slam_env.report.results import read_results
 from ms_slam_env.sequences import write_trajectory
 

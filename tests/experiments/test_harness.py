@@ -17,7 +17,7 @@ from ms_slam_env.cli.experiment import run
 from ms_slam_env.errors import InputError
 from ms_slam_env.experiments.harness import Experiment, experiment_class, experiment_names, rows
 from ms_slam_env.experiments.harness.checking import check_results, compare, spec_type
-from ms_slam_env.experiments.harness.running import run_experiment
+from ms_slam_env.experiments.harness.rows import run_experiment
 from ms_slam_env.experiments.usme import Usme
 from ms_slam_env.metrics.registry import RESULTS_VERSION, check_keys, registry
 from ms_slam_env.report.records import Row

@@ -12,7 +12,7 @@ import pytest
 from ms_slam_env.errors import InputError
 from ms_slam_env.experiments.harness.episodes import seed_list, short_planner_names
 from ms_slam_env.experiments.harness.planner_tables import DETAILS, HEADLINE, score_matrices
-from ms_slam_env.experiments.harness.running import write_all
+from ms_slam_env.experiments.harness.rows import write_all
 from ms_slam_env.experiments.planners import PlannerBenchmark
 from ms_slam_env.experiments.step_size import StepSize
 from ms_slam_env.report.records import Row, spec_key

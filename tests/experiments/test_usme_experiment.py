@@ -12,7 +12,8 @@ from ms_slam_env import scenes, slam
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
 from ms_slam_env.experiments import usme
-from ms_slam_env.experiments.harness import running, usme_runs
+from ms_slam_env.experiments.harness import rows as harness_rows
+from ms_slam_env.experiments.harness import usme_runs
 from ms_slam_env.sequences.usme_suite import NAMES, find
 
 make_scene = cache(scenes.make)
@@ -97,7 +98,7 @@ def test_make_writes_what_run_reads(tmp_path, capsys, monkeypatch):
     assert (tmp_path / "made/room-fast/groundtruth.txt").is_file()
     assert main(["usme", "make", *few, "--out", str(tmp_path / "made")]) == 0
     monkeypatch.setattr(usme, "limit_threads", lambda _: None)
-    monkeypatch.setattr(running, "run_all", run_here)
+    monkeypatch.setattr(harness_rows, "run_all", run_here)
     ran = ["usme", "run", str(tmp_path / "made"), "--backends", "odometry"]
     assert main([*ran, "--out", str(tmp_path / "out")]) == 1  # ten frames of a path for hundreds
     text, said = capsys.readouterr()

@@ -22,9 +22,9 @@ from ms_slam_env.exploration import (
 )
 from ms_slam_env.exploration import evaluator as evaluator_module
 from ms_slam_env.exploration.evaluator import CLOCKS, summarise
-from ms_slam_env.exploration.grid import Grid
 from ms_slam_env.exploration.held_out import compare_configurations
 from ms_slam_env.exploration.objectives import METRICS, as_metrics, key_of
+from ms_slam_env.exploration.samplers import Grid
 from ms_slam_env.geometry import look_at
 from ms_slam_env.geometry.point_clouds import voxel_downsample
 from ms_slam_env.metrics import ate_rmse

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.exploration import Choice, Float, Integer, make_space
-from ms_slam_env.exploration.availability import why_absent
-from ms_slam_env.exploration.space import GROUPS, KNOWN, absences
+from ms_slam_env.exploration.space import GROUPS, KNOWN, absences, why_absent
 from ms_slam_env.slam.configuration import SlamConfiguration
 from ms_slam_env.slam.surfel import SurfelConfig
 from ms_slam_env.slam.surfel.config import PAPER

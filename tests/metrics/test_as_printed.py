@@ -8,7 +8,7 @@ import pytest
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import make_pose, se3_exp, so3_exp
 from ms_slam_env.metrics import absolute_errors, ate_rmse, relative_errors
-from ms_slam_env.metrics.as_printed import printed_ate, printed_errors, printed_relative_errors
+from ms_slam_env.metrics.relative import printed_ate, printed_errors, printed_relative_errors
 
 
 def winding(count: int = 50, seed: int = 0) -> np.ndarray:
@@ -67,15 +67,15 @@ def test_as_printed_the_error_depends_on_where_the_world_begins() -> None:
 
 def test_the_set_of_equation_five_written_out() -> None:
     truth, estimate = winding(), noisy(winding())
-    found = printed_relative_errors(estimate, truth, 3)
+    found = printed_relative_errors(estimate, truth, delta=3)
     assert len(found) == 47
     laid = truth[4] @ np.linalg.inv(estimate[4]) @ estimate[7]
     dR = truth[7][:3, :3] @ laid[:3, :3].T
     assert found[4] == pytest.approx(np.linalg.norm(truth[7][:3, 3] - dR @ laid[:3, 3]))
     np.testing.assert_allclose(
-        printed_relative_errors(estimate, truth, 3, "rotation"),
+        printed_relative_errors(estimate, truth, delta=3, kind="rotation"),
         relative_errors(estimate, truth, 3, "rotation"),
         atol=1e-9,
     )
     with pytest.raises(InputError, match="valid choices: translation"):
-        printed_relative_errors(estimate, truth, 3, "both")
+        printed_relative_errors(estimate, truth, delta=3, kind="both")

@@ -15,7 +15,7 @@ from ms_slam_env.geometry import check_pose
 from ms_slam_env.scenes.base import floor_height
 from ms_slam_env.scenes.free_space import FreeSpace
 from ms_slam_env.scenes.homes import home as home_module
-from ms_slam_env.scenes.homes.visibility import CAMERA_M, reachable_cells
+from ms_slam_env.scenes.homes.home import CAMERA_M, reachable_cells
 from ms_slam_env.scenes.homes.ways import Ways
 from ms_slam_env.scenes.lighting import Lamp, RoomLight, mean_albedo
 from ms_slam_env.scenes.mesh_queries import RayCaster, face_cross

@@ -1,8 +1,12 @@
 """What all experiments share: finding, running, checking and writing them."""
 
-from ms_slam_env.experiments.harness.experiment import Experiment
-from ms_slam_env.experiments.harness.finding import EXPERIMENTS, experiment_class, experiment_names
-from ms_slam_env.experiments.harness.running import Outcome, run_experiment
+from ms_slam_env.experiments.harness.experiment import (
+    EXPERIMENTS,
+    Experiment,
+    experiment_class,
+    experiment_names,
+)
+from ms_slam_env.experiments.harness.rows import Outcome, run_experiment
 
 __all__ = [
     "EXPERIMENTS",

@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 from ms_slam_env import metrics
 from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.errors import InputError
-from ms_slam_env.evaluation.map_quality import map_quality
+from ms_slam_env.evaluation.map_quality import SURFACE_SPACING_M, ScoreCurve, map_quality
 from ms_slam_env.evaluation.map_truth import (
     surface_nearby,
     surface_of_scene,
     surface_of_views,
     true_surface,
 )
-from ms_slam_env.evaluation.score_curve import SURFACE_SPACING_M, ScoreCurve
 from ms_slam_env.robot.arm.arm import ArmEmbodiment
 from ms_slam_env.robot.arm.workspace import camera_poses
 from ms_slam_env.slam.base import SlamBackend

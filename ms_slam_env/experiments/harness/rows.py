@@ -1,10 +1,11 @@
-"""Runs many independent pieces of work in parallel processes and resumes after an interrupt."""
+"""Run what is missing of an experiment in parallel, then write all that is made of the rows."""
 
 from __future__ import annotations
 
 import dataclasses
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,14 @@ from tqdm import tqdm
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.run_sequence import lost_throughout
+from ms_slam_env.experiments.harness.experiment import Experiment
 from ms_slam_env.interrupts import kept
 from ms_slam_env.output_files import check_out_folder
-from ms_slam_env.parallel import Outcome, one_thread_unless_set, open_pool, run_each
+from ms_slam_env.parallel import Outcome as Done
+from ms_slam_env.parallel import one_thread_unless_set, open_pool, run_each
 from ms_slam_env.report.provenance import git_commit
-from ms_slam_env.report.records import RecordFile, Row, spec_key
+from ms_slam_env.report.records import RecordFile, Row, from_plain, spec_key, to_plain
+from ms_slam_env.report.results import RESULTS, Results, write_result_folder
 from ms_slam_env.report.tables import finished
 
 RECORDS = "rows.jsonl"
@@ -139,7 +143,7 @@ def check_any_finished(rows: Sequence[Row]) -> None:
         raise RuntimeError(f"all {len(rows)} failed, the first: {errors[0]}; no report is written")
 
 
-def _row(outcome: Outcome, spec: Any) -> Row:
+def _row(outcome: Done, spec: Any) -> Row:
     """An outcome as it is recorded."""
     row: Row = {
         "key": outcome.key,
@@ -150,3 +154,74 @@ def _row(outcome: Outcome, spec: Any) -> Row:
     if outcome.traceback:
         row["traceback"] = outcome.traceback
     return {**row, "elapsed_s": outcome.elapsed_s}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run of an experiment came to.
+
+    Attributes:
+        results: as written.
+        failures: errors of the rows that failed and complaints of the others, one line each.
+    """
+
+    results: Results
+    failures: Sequence[str]
+
+
+def run_experiment(
+    experiment: Experiment, out: Path, workers: int | None = None, ray: str | None = None
+) -> Outcome:
+    """Run the rows that ``out`` does not hold yet; write ``results.json``, ``table.md``, figures.
+
+    Args:
+        experiment: with its options.
+        out: folder of the results; finished rows stand there at once, in ``rows.jsonl``.
+        workers: processes; None for the experiment's own default.
+        ray: address of a Ray cluster whose workers run the rows; None: processes of this machine.
+
+    Raises:
+        InputError: options that no row could be run with, or no cluster at the address.
+        RuntimeError: every row failed; the files of an earlier run are left as they are.
+    """
+    specs = experiment.specs()
+    if not specs:
+        raise InputError(f"no {experiment.unit} to run: an option is an empty list")
+    experiment.prepare()
+    rows = run_all(
+        specs,
+        type(experiment).run,
+        out,
+        experiment.workers if workers is None else workers,
+        experiment.unit,
+        ray=ray,
+        fresh=experiment.fresh_process,
+        environment=experiment.environment(),
+    )
+    check_any_finished(rows)
+    wrong = [*failures(rows), *(lost_runs(rows) if experiment.tracks else [])]
+    return Outcome(write_all(experiment, rows, out), wrong)
+
+
+def write_all(experiment: Experiment, rows: Sequence[Row], out: Path) -> Results:
+    """Write everything that is made of the rows into folder ``out``."""
+    rows = from_plain(to_plain(rows))
+    return write_result_folder(
+        out,
+        RESULTS,
+        lambda folder: experiment.write_pictures(rows, folder),
+        kind=type(experiment).__module__.rpartition(".")[2],
+        title=experiment.title(),
+        about=experiment.about(),
+        tables=experiment.tables(rows),
+        charts=experiment.charts(rows),
+        rows=rows,
+        rows_key=experiment.rows_key,
+        content={"config": as_config(experiment), **experiment.content(rows)},
+    )
+
+
+def as_config(experiment: Any) -> dict[str, Any]:
+    """The options of an experiment as JSON's types."""
+    names = [field.name for field in dataclasses.fields(experiment)]
+    return {name: to_plain(getattr(experiment, name)) for name in names}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from functools import cached_property, lru_cache
 from pathlib import Path
 
@@ -10,6 +11,8 @@ import cv2
 import numpy as np
 import scipy
 from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.scenes import mesh_cache
@@ -17,13 +20,21 @@ from ms_slam_env.scenes.base import Float64, Int32, Rng, TexturedMesh
 from ms_slam_env.scenes.builder import MeshBuilder
 from ms_slam_env.scenes.free_space import FreeSpace
 from ms_slam_env.scenes.homes.arrangement import Furnisher
-from ms_slam_env.scenes.homes.floor_plan import DOOR_M, FloorPlan, draw_plan
-from ms_slam_env.scenes.homes.interior import furnished
-from ms_slam_env.scenes.homes.room_light import home_lighting
-from ms_slam_env.scenes.homes.visibility import seen_faces
+from ms_slam_env.scenes.homes.floor_plan import DOOR_M, FloorPlan, RoomPlan, draw_plan
+from ms_slam_env.scenes.homes.interior import furnished, lamp_size
 from ms_slam_env.scenes.homes.ways import Ways
-from ms_slam_env.scenes.lighting import light_and_expose
-from ms_slam_env.scenes.mesh_scene import MeshScene, free_space_around
+from ms_slam_env.scenes.lighting import (
+    Lamp,
+    Light,
+    Lighting,
+    Panel,
+    RoomLight,
+    Sun,
+    light_and_expose,
+)
+from ms_slam_env.scenes.mesh_queries import RayCaster, face_cross
+from ms_slam_env.scenes.mesh_scene import MeshScene, free_space_around, unit_rows
+from ms_slam_env.scenes.room import PANE, Room, Window
 
 _KEY = 0.18
 _VARIETY = 5
@@ -160,3 +171,125 @@ class HomeScene(MeshScene):
         eye = np.array([*draw.uniform(low + 0.4, high - 0.4), draw.uniform(1.0, 1.6)])
         target = np.array([*draw.uniform(low + 0.1, high - 0.1), draw.uniform(0.5, 1.1)])
         return eye, target
+
+
+_SKY = np.array([0.95, 1.0, 1.08]) * 6.0
+_WARM = np.array([1.0, 0.9, 0.75])
+_BULB = np.array([1.0, 0.78, 0.5])
+_LEVEL = (0.09, 0.13)  # flux of all light of a room over the area of its surfaces
+_LEAST_LAMP = 0.015  # of the lamp under the ceiling, in the same units
+_REVEAL_M = 0.14  # the light of a window comes from behind its reveal
+
+
+def home_lighting(rng: Rng, plan: FloorPlan, rooms: Sequence[Furnisher]) -> Lighting:
+    """Daylight of one brightness for all windows, and lamps that make up for it room by room."""
+    day = rng.uniform(0.4, 1.0)
+    sky = _SKY * day
+    angle = rng.uniform(0, 2 * np.pi)
+    sun = (np.cos(angle), np.sin(angle), rng.uniform(0.5, 0.9))
+    lights: list[Light] = [Sun(sun, tuple(np.array([3.0, 2.7, 2.2]) * rng.uniform(0.0, day)))]
+    glow = {}
+    for own, of in zip(plan.rooms, rooms, strict=True):
+        w, d, h = of.room.size
+        surface = 2 * (w * d + (w + d) * h)
+        flux = rng.uniform(*_LEVEL) * surface
+        panes = [_window_light(own, of.room, *one, sky) for one in own.windows]
+        from_windows = sum(one.width * one.height for _, one in own.windows) * float(sky.mean())
+        wide, deep = lamp_size(own)
+        strength = max(_LEAST_LAMP * surface, flux - from_windows) / (wide * deep)
+        x, y = np.add(own.low, own.high) / 2
+        ceiling = Panel(
+            (x - wide / 2, y + deep / 2, h - 0.05),
+            (wide, 0, 0),
+            (0, -deep, 0),
+            tuple(_WARM * strength),
+            (2, 2),
+        )
+        bulbs = [
+            Lamp(
+                tuple(np.add(place, (*own.low, 0.0))),
+                tuple(_BULB * rng.uniform(0.04, 0.14)),
+                0.08,
+                2,
+            )
+            for place in of.bulbs
+        ]
+        low, high = (*own.low, 0.0), (*own.high, h)
+        lights += [RoomLight(light, low, high) for light in (*panes, ceiling, *bulbs)]
+        bright = min(3.0, 0.3 + 0.25 * strength)
+        glow[f"{own.name} ceiling lamp"] = (bright, 0.96 * bright, 0.86 * bright)
+        glow[f"{own.name} {PANE}"] = tuple(sky.tolist())
+        glow[f"{own.name} lamp shade"] = (0.62, 0.51, 0.34)
+        glow[f"{own.name} TV screen"] = (0.45, 0.47, 0.5)
+    shining = frozenset(name for name in glow if not name.endswith("TV screen"))
+    return Lighting(tuple(lights), glow, shining, bounce_rays=20)
+
+
+def _window_light(own: RoomPlan, room: Room, wall: int, window: Window, sky: Float64) -> Panel:
+    """The light of the sky through a window, in the dwelling's frame."""
+    half = window.width / 2
+    right, left = (
+        room.to_world(wall, (window.along + side * half, _REVEAL_M, window.sill))
+        for side in (1, -1)
+    )
+    # The front of the panel, edge_u x edge_v, faces the room.
+    origin = tuple(np.add(left, (*own.low, 0.0)).tolist())
+    return Panel(origin, tuple(right - left), (0, 0, window.height), tuple(sky), (3, 2))
+
+
+Bool = NDArray[np.bool_]
+
+CAMERA_M = 0.15
+"""Free space around a camera that goes about."""
+_SPACING_M = 0.4  # between viewpoints
+_HEIGHTS_M = (0.4, 1.1, 1.8)  # not from the floor up under tables
+_LOOKS = ((6, 1), (240, 5), (700, 7))
+"""Each face is looked at from so many nearest viewpoints, or every so many of these; what the
+first few do not see from the others, which lie on more sides."""
+_HIT = 0.99
+_LEAST_COSINE = 0.15
+"""Of the angle of incidence: what is seen more obliquely gives a depth camera no reading."""
+
+
+def reachable_cells(free: FreeSpace, start: Float64, radius_m: float = CAMERA_M) -> Bool:
+    """Voxels (nx, ny, nz) that a ball of ``radius_m`` can get to from ``start`` (3,)."""
+    component, _ = ndimage.label(free.distance > radius_m)
+    at = component[tuple(np.rint((start - free.origin) / free.voxel_m).astype(int))]
+    return (component == at) & (at > 0)
+
+
+def viewpoints(free: FreeSpace, start: Float64) -> Float64:
+    """Places (K, 3) in a grid over all of the free space that a camera can reach."""
+    step = max(1, round(_SPACING_M / free.voxel_m))
+    cells = reachable_cells(free, start)
+    heights = np.rint((np.array(_HEIGHTS_M) - free.origin[2]) / free.voxel_m).astype(int)
+    grid = np.zeros_like(cells)
+    grid[::step, ::step, heights] = True
+    return free.origin + free.voxel_m * np.argwhere(cells & grid)
+
+
+def seen_faces(mesh: TexturedMesh, free: FreeSpace, start: Float64) -> Bool:
+    """Which faces (F,) show the middle of their front, which opens into free space, to a viewpoint.
+
+    A few in a hundred that only few places see are missed.
+    """
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    middle, normal = corners.mean(axis=1), unit_rows(face_cross(corners))
+    eyes = viewpoints(free, start)
+    rays = RayCaster(mesh.vertices, mesh.faces)
+    seen = np.zeros(len(middle), bool)
+    opens = np.flatnonzero(free.clearance(middle + 1.2 * free.voxel_m * normal) > 0)
+    tree = cKDTree(eyes)
+    for nearest, stride in _LOOKS:
+        rest = opens[~seen[opens]]
+        of_rest = tree.query(middle[rest], min(nearest, len(eyes)))[1][:, ::stride]
+        for rank in range(of_rest.shape[1]):
+            left = np.flatnonzero(~seen[rest])
+            face, eye = rest[left], eyes[of_rest[left, rank]]
+            towards = middle[face] - eye
+            cosine = -np.einsum("ij,ij->i", towards, normal[face])
+            facing = cosine > _LEAST_COSINE * np.linalg.norm(towards, axis=1)
+            face, eye, towards = face[facing], eye[facing], towards[facing]
+            distance, _ = rays.first_hit(eye, towards)
+            seen[face[distance > _HIT]] = True
+    return seen

@@ -6,10 +6,9 @@ from collections.abc import Callable
 
 from ms_slam_env.errors import unknown
 from ms_slam_env.scenes.base import Rng
-from ms_slam_env.scenes.movers.box import box
 from ms_slam_env.scenes.movers.car import car
 from ms_slam_env.scenes.movers.person import person
-from ms_slam_env.scenes.movers.shape import Joint, Part, Shape
+from ms_slam_env.scenes.movers.shape import Joint, Part, Shape, box
 
 MOVERS: dict[str, Callable[[Rng], Shape]] = {"box": box, "person": person, "car": car}
 """Kind to what builds one from random numbers."""

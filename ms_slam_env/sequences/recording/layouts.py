@@ -20,7 +20,6 @@ from ms_slam_env.sequences.recording.image_folders import (
     find_color,
     folder_entries,
 )
-from ms_slam_env.sequences.recording.kitti import is_kitti, open_kitti
 from ms_slam_env.sequences.recording.listings import (
     Calibration,
     Listed,
@@ -34,6 +33,7 @@ from ms_slam_env.sequences.recording.listings import (
 )
 from ms_slam_env.sequences.recording.parts import join_parts, part_folders
 from ms_slam_env.sequences.recording.recording import Entry, Recording, Registration
+from ms_slam_env.sequences.recording.stereo import is_kitti, open_kitti
 from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S, associate, read_trajectory
 from ms_slam_env.sequences.writing import DESCRIPTION, UNFINISHED
 
