@@ -20,7 +20,8 @@ class Arguments:
     """Write the tables of a clone's Markdown pages, and those beside its results, from the results.
 
     A table stands between <!-- results: FOLDER table=0 columns=planner,ate_m --> and
-    <!-- end -->; FOLDER is one of docs/results.
+    <!-- end -->; FOLDER is one of docs/results. Model cards stand between <!-- agents: FILE -->
+    and <!-- end -->; FILE is a policy, or a folder of them.
     """
 
     pages: tyro.conf.Positional[tuple[Path, ...]] = ()

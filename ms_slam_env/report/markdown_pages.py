@@ -11,6 +11,9 @@ default all); ``where``, a column and the text that it must have, as in ``where=
 ``rows``, at most so many of the first; ``made_by=yes``, the command in a line below;
 ``optional=yes``, a page may be written before there is such a table.
 Where the result is older than the code, the first of its tables on the page says so above.
+
+After ``agents:`` in place of ``results:`` stand policy files or folders of them, from the root of
+the clone on; what follows are their model cards.
 """
 
 from __future__ import annotations
@@ -25,10 +28,11 @@ from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.input_files import read_text
 from ms_slam_env.output_files import write_text
 from ms_slam_env.report.discovery import find_results
+from ms_slam_env.report.model_cards import model_cards
 from ms_slam_env.report.results import RESULTS, TABLE, Results, made_by, read_results
 from ms_slam_env.report.tables import Table
 
-_START = re.compile(r"^<!-- results: (?P<what>.*) -->$")
+_START = re.compile(r"^<!-- (?P<kind>results|agents): (?P<what>.*) -->$")
 _END = "<!-- end -->"
 _OPTIONS = ("table", "columns", "where", "rows", "made_by", "optional")
 _ABSENT = "*Not run yet.*"
@@ -95,7 +99,11 @@ def with_tables(text: str, results: Path, name: str = "page") -> str:
         if start:
             opened = number
             try:
-                lines += [line, "", *_inserted(start["what"], results, warned).split("\n"), ""]
+                if start["kind"] == "agents":
+                    inserted = _cards(start["what"], results, Path(name))
+                else:
+                    inserted = _inserted(start["what"], results, warned)
+                lines += [line, "", *inserted.split("\n"), ""]
             except InputError as error:
                 raise InputError(f"{name}, line {number}: {error}") from None
         elif line == _END:
@@ -107,15 +115,25 @@ def with_tables(text: str, results: Path, name: str = "page") -> str:
     return "\n".join(lines)
 
 
+def _cards(what: str, results: Path, page: Path) -> str:
+    """The cards of the policies that a comment names."""
+    root = results.parent.parent
+    return model_cards([root / word for word in _words(what)], results, page).rstrip("\n")
+
+
+def _words(what: str) -> list[str]:
+    try:
+        return shlex.split(what)
+    except ValueError as error:
+        raise InputError(f"{what!r}: {str(error).lower()}") from None
+
+
 def _inserted(what: str, folder: Path, warned: set[Path]) -> str:
     """What stands below a comment: a warning where the result is out of date, note and table.
 
     Results in ``warned`` have their warning further up; this one's is added.
     """
-    try:
-        place, *words = shlex.split(what)
-    except ValueError as error:
-        raise InputError(f"{what!r}: {str(error).lower()}") from None
+    place, *words = _words(what)
     options = dict(word.partition("=")[::2] for word in words)
     for option in options:
         if option not in _OPTIONS:

@@ -1,0 +1,271 @@
+"""Model cards: what a trained policy is, how it came to be, what it scores, and where it ends.
+
+Made from the text in a policy file and the results that are about it. Of the file nothing but that
+text is read, so neither the trainer's libraries nor the agents are needed. Results are about a
+policy if they are of its training (the same options, and a point after as many steps) or have a
+planner ``agent-NAME`` of the file ``NAME.safetensors``.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ms_slam_env.errors import InputError
+from ms_slam_env.report.discovery import FoundResult, find_results
+from ms_slam_env.report.statistics import Interval
+from ms_slam_env.report.tables import Table, format_value
+
+SUFFIX = ".safetensors"
+_TEXT = "ms_slam_policy"
+_LARGEST_HEADER = 1_000_000  # bytes
+_NO_MATTER = ("out", "resume")  # options that make no other training
+_SCORES = (
+    *("planner", "episodes", "f_score_5cm", "f_score_5cm_area", "ate_m", "lost"),
+    *("not_recovered_share", "violations", "decision_ms"),
+)
+_ACROSS, _BETTER = "over all scenes", "Better than each other"
+_TRAINED = ("agent-", "policy")  # planners that were
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A policy file by what it says of itself.
+
+    Attributes:
+        path: of the file.
+        known: its metadata, as ``agents/policy_file.py`` describes them.
+    """
+
+    path: Path
+    known: Mapping[str, Any]
+
+    @property
+    def planner(self) -> str:
+        """The name that it is benchmarked by."""
+        return f"agent-{self.path.stem}"
+
+    @property
+    def options(self) -> Mapping[str, Any]:
+        """Of its training."""
+        return dict(self.known.get("options") or {})
+
+    def is_trained_as(self, one: FoundResult, but_for: Sequence[str] = ()) -> bool:
+        """Whether a result is of a training with the same options, but for some."""
+        config = _config(one)
+        own = {k: v for k, v in self.options.items() if k not in (*_NO_MATTER, *but_for)}
+        same = all(config.get(key) == value for key, value in own.items())
+        return one.results.kind == "train" and bool(own) and same
+
+    def is_trained_in(self, one: FoundResult) -> bool:
+        """Whether a training run led to it."""
+        steps = [(row["result"] or {}).get("timesteps") for row in one.results.rows]
+        return self.is_trained_as(one) and self.known["timesteps"] in steps
+
+
+def read_policy_text(path: Path) -> Policy:
+    """What a policy file says of itself, without its numbers.
+
+    Raises:
+        InputError: no policy file.
+    """
+    try:
+        with path.open("rb") as file:
+            length = int.from_bytes(file.read(8), "little")
+            if length > _LARGEST_HEADER:
+                raise ValueError("its head is too long")
+            text = json.loads(file.read(length))["__metadata__"][_TEXT]
+        known = json.loads(text)
+        return Policy(path, {**known, "timesteps": int(known["timesteps"])})
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(f"{path} is no policy file: {error!r}") from None
+
+
+def model_cards(paths: Sequence[Path], results: Path, page: Path) -> str:
+    """A card for each policy, in Markdown with headings of the second level.
+
+    Args:
+        paths: policy files, or folders of them.
+        results: folder of the folders of results.
+        page: where the cards stand, which links are from.
+
+    Raises:
+        InputError: a path that is no policy file, or a folder without one.
+    """
+    found, _ = find_results(results)
+    return "\n".join(_card(policy, found, page) for policy in map(read_policy_text, _files(paths)))
+
+
+def _files(paths: Sequence[Path]) -> Iterator[Path]:
+    for path in paths:
+        inside = sorted(path.glob(f"*{SUFFIX}")) if path.is_dir() else [path]
+        if not inside:
+            raise InputError(f"{path} holds no policy (*{SUFFIX})")
+        yield from inside
+
+
+def _config(one: FoundResult) -> Mapping[str, Any]:
+    config = one.results.content.get("config")
+    return config if isinstance(config, dict) else {}
+
+
+def _card(policy: Policy, found: Sequence[FoundResult], page: Path) -> str:
+    trainings = [one for one in found if policy.is_trained_in(one)]
+    benchmarks = [one for one in found if one.results.kind == "planners" and _lines(one, policy)]
+    parts = [f"## `{policy.planner}`\n", _facts(policy), _command(policy.known)]
+    for one in benchmarks:
+        parts += list(_scores(one, policy))
+    if not benchmarks:
+        parts.append("It has not been benchmarked yet.\n")
+    like = {_config(one).get("seed") for one in found if policy.is_trained_as(one, ("seed",))}
+    parts += ["### Limits\n", *_limits(policy, benchmarks, trainings, len(like))]
+    for one in trainings:
+        parts += list(_training(one, page))
+    return "\n".join(parts)
+
+
+# -- What it is ------------------------------------------------------------------------------------
+
+
+def _facts(policy: Policy) -> str:
+    known, options = policy.known, policy.options
+    layers = " and ".join(map(str, known["hidden"]))
+    network = f"tanh layers of {layers}"
+    if known.get("candidates"):
+        network += f", one encoder for all candidates ({known['candidates']} numbers each)"
+    if known.get("memory"):
+        network += f", a gated recurrent unit of {known['memory']}"
+    changed = "".join(f", {key} {value}" for key, value in known.get("env_options", {}).items())
+    where = options.get("scenes") or ()
+    scenes = ", ".join(f"`{name}`" for name in where)
+    actions = " x ".join(map(str, known["actions"]))
+    lines = {
+        "Run it": f"`ms-slam benchmark --planners {policy.planner}`",
+        "File": f"`{policy.path.name}`, {policy.path.stat().st_size / 1e3:.0f} kB",
+        "Environment": f"`{known['env_id']}`{changed}",
+        "Sees": f"`{known['observation']}`, {known['inputs']} numbers; has {actions} actions",
+        "Network": network,
+        "Learnt by": f"`{known['algorithm']}`, {known['timesteps']:,} steps in "
+        f"{known['minutes']:.0f} minutes, seed {options.get('seed', 'unknown')}",
+    }
+    if scenes:
+        seeds, steps = options.get("scene_seeds", "?"), options.get("episode_steps", "?")
+        lines["In"] = f"{scenes}, {seeds} training seeds each, episodes of {steps} steps"
+    if options.get("init"):
+        lines["Begun from"] = f"`{options['init']}`"
+    return "".join(f"- {what}: {value}\n" for what, value in lines.items())
+
+
+def _command(known: Mapping[str, Any]) -> str:
+    made = known.get("provenance") or {}
+    versions = ", ".join(f"{name} {version}" for name, version in made.get("versions", {}).items())
+    where = f"On {made.get('cpu', 'an unknown machine')}, {versions}."
+    return f"```sh\n{made.get('command', '')}\n```\n\n{where}\n"
+
+
+# -- What it scores --------------------------------------------------------------------------------
+
+
+def _is_of(policy: Policy, planner: Any) -> bool:
+    name, _, options = str(planner).partition(",")
+    return name == policy.planner or (name == "policy" and f"/{policy.path.name}" in options)
+
+
+def _lines(one: FoundResult, policy: Policy) -> list[tuple[Table, Any, Any]]:
+    """The tables over all scenes that have the policy: its line, and the best classical one's.
+
+    Benchmarks rank their lines, the best first.
+    """
+    lines = []
+    for k, table in enumerate(one.results.tables):
+        own = [row for row in table.rows if _is_of(policy, row.get("planner"))]
+        others = [r for r in table.rows if not str(r.get("planner")).startswith(_TRAINED)]
+        if own and others and (_ACROSS in table.title or (k == 0 and not table.title)):
+            lines.append((table, own[0], others[0]))
+    return lines
+
+
+def _scores(one: FoundResult, policy: Policy) -> Iterator[str]:
+    results = one.results
+    for table, own, best in _lines(one, policy):
+        task = _task(one, table)
+        yield f"### In `{task}`\n"
+        if results.stale:
+            yield f"*{results.stale}*\n"
+        columns = tuple(c for c in table.columns if c.name in _SCORES)
+        yield replace(table, title="", columns=columns, rows=(own, best)).as_markdown()
+        chance = _chance(one, policy, task, best["planner"])
+        if chance is not None:
+            shown = format_value(chance, "improvement")
+            verdict = _verdict(chance, best["planner"])
+            yield f"{verdict}: its F-score is the better one in {shown} % of pairs of episodes.\n"
+
+
+def _task(one: FoundResult, table: Table) -> str:
+    title, _, _ = table.title.partition(":")
+    return title if table.title else str(_config(one).get("task", one.title))
+
+
+def _chance(one: FoundResult, policy: Policy, task: str, best: Any) -> Interval | None:
+    """Probability that the policy is better than a planner, from the benchmark's own table."""
+    for table in one.results.tables:
+        if table.title in (_BETTER, f"{task}: {_BETTER}"):
+            for row in table.rows:
+                value = row.get(str(best))
+                if _is_of(policy, row.get("planner")) and isinstance(value, Interval):
+                    return value
+    return None
+
+
+def _verdict(chance: Interval, best: Any) -> str:
+    if chance.low > 0.5:
+        return f"It beats the best classical planner, `{best}`"
+    if chance.high < 0.5:
+        return f"It does not beat the best classical planner, `{best}`"
+    return f"Neither it nor the best classical planner, `{best}`, is shown to be better"
+
+
+# -- Where it ends ---------------------------------------------------------------------------------
+
+
+def _limits(
+    policy: Policy,
+    benchmarks: Sequence[FoundResult],
+    trainings: Sequence[FoundResult],
+    training_seeds: int,
+) -> Iterator[str]:
+    known, options = policy.known, policy.options
+    sees, actions = known["observation"], " x ".join(map(str, known["actions"]))
+    yield f"- It fits observations `{sees}` and {actions} actions; anything else is refused."
+    rows = [row for one in benchmarks for row in one.results.rows]
+    met = {row["spec"].get("scene") for row in rows if _is_of(policy, row["spec"].get("planner"))}
+    new = sorted(str(name) for name in met - set(options.get("scenes") or ()))
+    if options.get("scenes") and new:
+        yield f"- Of the scenes of its scores it was not trained in {', '.join(new)}."
+    if benchmarks and all(_config(one).get("seeds") != "train" for one in benchmarks):
+        yield "- No score is on a seed that it was trained with."
+    if not trainings:
+        yield "- The curve of its training is not among the results."
+    if training_seeds > 1:
+        yield f"- Trained with {training_seeds} seeds; this is one of them."
+    else:
+        yield "- One training run: how much of it is luck is not known."
+    for one in trainings:
+        if one.results.stale:
+            version = one.results.version
+            yield f"- Its training is of results version {version}, older than the code."
+    yield ""
+
+
+def _training(one: FoundResult, page: Path) -> Iterator[str]:
+    yield "### While it learnt\n"
+    for chart in one.results.charts:
+        figure = one.path.with_name(f"{chart.name}.png")
+        if figure.is_file():
+            link = Path(os.path.relpath(figure, page.parent)).as_posix()
+            yield f"![{chart.title}]({link})\n\n*{chart.caption}.*\n"
+    yield replace(one.results.tables[0], title="").as_markdown()

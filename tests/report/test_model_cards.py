@@ -1,0 +1,133 @@
+"""A card says what is in the policy file and in the results about it, and nothing else."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+from policy_files import METADATA, as_bytes
+
+from ms_slam_env.cli import main
+from ms_slam_env.report.results import write_results
+from ms_slam_env.report.statistics import Interval
+from ms_slam_env.report.tables import Column, make_table
+
+OPTIONS = {"out": "runs/a", "seed": 3, "scenes": ["table"], "scene_seeds": 2, "episode_steps": 40}
+SCENES = ("table", "wall")
+
+
+def scores(folder: Path, chance: Interval, planner: str = "agent-hand") -> None:
+    """A planner benchmark in which ``planner`` is that much better than ``nbv``."""
+    names = ("nbv", planner, "random")
+    lines = [{"planner": name, "f_score_5cm": 0.9 - 0.2 * k} for k, name in enumerate(names)]
+    better = make_table(
+        ["planner", Column("nbv", "improvement", "nbv")],
+        [{"planner": planner, "nbv": chance}],
+        "Better than each other",
+    )
+    rows = [
+        {"spec": {"planner": name, "scene": scene}, "result": {}, "error": None}
+        for name in names
+        for scene in SCENES
+    ]
+    write_results(
+        folder / "results.json",
+        "planners",
+        "Planners",
+        "About.",
+        [make_table(["planner", "f_score_5cm"], lines), better],
+        rows=rows,
+        content={"config": {"task": "kitchen", "seeds": "test"}},
+    )
+
+
+def training(folder: Path, steps: int = 100, **changed: object) -> None:
+    """A training run with a point after ``steps``."""
+    lines = [{"timesteps": steps, "return": 12.5}]
+    rows = [{"spec": {"planner": "policy"}, "result": lines[0], "error": None}]
+    config = {**OPTIONS, "out": "elsewhere", **changed}
+    tables = [make_table(["timesteps", "return"], lines, "The policy")]
+    content = {"config": config}
+    write_results(
+        folder / "results.json", "train", "T", "About.", tables, rows=rows, content=content
+    )
+
+
+@pytest.fixture
+def clone(tmp_path: Path) -> Path:
+    """A clone with one policy, a page for it, and its training among others."""
+    made = {"command": "ms-slam train ppo --seed 3", "cpu": "a chip", "versions": {"torch": "2"}}
+    known = replace(METADATA, options=OPTIONS, provenance=made)
+    policy = tmp_path / "agents/policies/hand.safetensors"
+    policy.parent.mkdir(parents=True)
+    policy.write_bytes(as_bytes(json.dumps(asdict(known)), **dict.fromkeys(["optimizer.step"])))
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs/agents.md").write_text("<!-- agents: agents/policies -->\n<!-- end -->\n")
+    training(tmp_path / "docs/results/own")
+    training(tmp_path / "docs/results/other_steps", steps=64)
+    training(tmp_path / "docs/results/other_scene", scenes=["wall"])
+    return tmp_path
+
+
+def card(clone: Path) -> str:
+    assert main(["docs", "--root", str(clone)]) == 0
+    return (clone / "docs/agents.md").read_text()
+
+
+def test_a_card_says_what_the_file_and_the_results_say(clone: Path) -> None:
+    scores(clone / "docs/results/judged", Interval(0.1, 0.02, 0.3))
+    text = card(clone)
+    assert "## `agent-hand`" in text
+    assert "- Sees: `features`, 5 numbers; has 7 actions" in text
+    assert "- Environment: `MSActiveSLAM-FreeCamera-v0`, step_m 0.1" in text
+    assert "100 steps in 2 minutes, seed 3" in text
+    assert "ms-slam train ppo --seed 3\n" in text
+    assert "### In `kitchen`" in text
+    assert "| nbv | 90 |" in text
+    assert "| random |" not in text  # the best classical planner alone
+    assert "It does not beat the best classical planner, `nbv`" in text
+    assert "10 [2.0, 30] % of pairs" in text
+    assert "not trained in wall." in text
+    assert text.count("| 100 | 12 |") == 1
+    assert "| 64 |" not in text
+    assert main(["docs", "--root", str(clone), "--check"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("chance", "verdict"),
+    [
+        (Interval(0.8, 0.6, 0.9), "It beats the best classical planner, `nbv`"),
+        (Interval(0.6, 0.4, 0.8), "Neither it nor the best classical planner, `nbv`, is shown"),
+    ],
+)
+def test_the_interval_decides(clone: Path, chance: Interval, verdict: str) -> None:
+    scores(clone / "docs/results/judged", chance)
+    assert verdict in card(clone)
+
+
+def test_scores_of_another_agent_are_not_its_own(clone: Path) -> None:
+    scores(clone / "docs/results/judged", Interval(0.8, 0.6, 0.9), "agent-handsome")
+    text = card(clone)
+    assert "It has not been benchmarked yet." in text
+    assert "kitchen" not in text
+
+
+def test_training_seeds_are_counted(clone: Path) -> None:
+    assert "One training run" in card(clone)
+    training(clone / "docs/results/second", seed=4)
+    text = card(clone)
+    assert "Trained with 2 seeds" in text
+    assert text.count("### While it learnt") == 1
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff" * 64, as_bytes("[]"), b"{}"])
+def test_what_is_no_policy_is_refused(
+    clone: Path, content: bytes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (clone / "agents/policies/other.safetensors").write_bytes(content)
+    assert main(["docs", "--root", str(clone)]) == 2
+    error = capsys.readouterr().err
+    assert "other.safetensors is no policy file" in error
+    assert error.count("\n") == 1
