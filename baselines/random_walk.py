@@ -5,13 +5,21 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from gymnasium.spaces import MultiDiscrete
 
 from ms_slam_env.env import Planner
 
 
 class RandomWalk(Planner):
-    """Each step takes one of the motions that are not blocked, all equally likely."""
+    """Each step takes one of the motions that are not blocked, all equally likely.
 
-    def act(self, observation: Any, info: dict[str, Any]) -> int:
-        """Draw an action uniformly from the unmasked ones."""
-        return int(self.rng.choice(np.flatnonzero(self.env.action_masks())))
+    So it does with SLAM configurations, where the agent chooses them too.
+    """
+
+    def act(self, observation: Any, info: dict[str, Any]) -> Any:
+        """Draw an action uniformly from the unmasked ones, number by number if it has several."""
+        mask, space = self.env.action_masks(), self.env.action_space
+        if not isinstance(space, MultiDiscrete):
+            return int(self.rng.choice(np.flatnonzero(mask)))
+        parts = np.split(mask, np.cumsum(space.nvec)[:-1])
+        return np.array([self.rng.choice(np.flatnonzero(part)) for part in parts])

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ms_slam_env.config import parse_named
 from ms_slam_env.errors import InputError
@@ -108,6 +109,12 @@ class Recovering(Planner):
         self.undoing = self.made.pop()
         undone = opposite(self.undoing, self.env.action_masks().size)
         return undone if self.env.action_masks()[undone] else 0
+
+
+def goal_of(planner: Planner | None) -> NDArray[np.float64] | None:
+    """The pose (4, 4) that a planner is on its way to, as it believes; None for one without."""
+    chooses = planner.planner if isinstance(planner, Recovering) else planner
+    return getattr(chooses, "goal", None)
 
 
 def is_known(info: dict[str, Any]) -> bool:

@@ -19,7 +19,8 @@ from ms_slam_env.slam.base import SlamBackend
 Image = NDArray[np.uint8]
 Float64 = NDArray[np.float64]
 
-_PANEL = (240, 320)  # (height, width) of the live images
+PANEL = (240, 320)
+"""Height and width of the live images."""
 _MAP = 480
 _PLOT = (160, 320)
 _DARK = (20, 20, 20)
@@ -43,26 +44,28 @@ def draw_moment(
         the picture (480, 1120, 3) uint8.
     """
     third_person, count = draw_third_person(episode, slam, embodiment, scene, _MAP)
-    _caption(third_person, f"map: {count} points; path: true wide green, estimated thin red")
-    left = np.vstack([_color(episode, scene), _depth(episode)])
+    caption(third_person, f"map: {count} points; path: true wide green, estimated thin red")
+    left = np.vstack([draw_color(episode, scene), draw_depth(episode)])
     return np.hstack([left, third_person, np.vstack(_plots(episode, targets))])
 
 
-def _color(episode: Episode, scene: Scene) -> Image:
-    image = cv2.resize(episode.last_frame.color, _PANEL[::-1])
+def draw_color(episode: Episode, scene: Scene) -> Image:
+    """What the camera sees, (240, 320, 3), and how it came there."""
+    image = cv2.resize(episode.last_frame.color, PANEL[::-1])
     motions = len(episode.step_divergences) - 1
     motion = f"motion {motions}: {describe(episode.action)}" if motions else "start"
     state = "" if episode.tracking_ok else ", TRACKING LOST"
-    return _caption(image, f"{scene.name}, {motion}{state}")
+    return caption(image, f"{scene.name}, {motion}{state}")
 
 
-def _depth(episode: Episode) -> Image:
+def draw_depth(episode: Episode) -> Image:
+    """The depth image in false colours, (240, 320, 3)."""
     depth = episode.last_frame.depth
     grey = (255 * (1 - np.clip(depth / _MAX_DEPTH_M, 0, 1))).astype(np.uint8)
     colored = cv2.cvtColor(cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB)
     colored[depth == 0] = 0
-    image = cv2.resize(colored, _PANEL[::-1], interpolation=cv2.INTER_NEAREST)
-    return _caption(image, f"depth, 0 to {_MAX_DEPTH_M:g} m, black: no reading")
+    image = cv2.resize(colored, PANEL[::-1], interpolation=cv2.INTER_NEAREST)
+    return caption(image, f"depth, 0 to {_MAX_DEPTH_M:g} m, black: no reading")
 
 
 def _plots(episode: Episode, targets: TargetConfig) -> list[Image]:
@@ -111,7 +114,7 @@ def _dash(image: Image, left: int, right: int, y: int) -> None:
         cv2.line(image, (x, y), (min(x + 5, right), y), _TARGET_COLOR, 1)
 
 
-def _caption(image: Any, text: str) -> Image:
+def caption(image: Any, text: str) -> Image:
     """Write one line on the darkened top of ``image`` in place and return it."""
     image[:20] = image[:20] // 3
     cv2.putText(image, text, (6, 14), _FONT, 0.42, (255, 255, 255), 1, cv2.LINE_AA)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.env.planners import Planner, Recovering
+from ms_slam_env.env.planners import Planner, goal_of
 from ms_slam_env.env.third_person_view import ESTIMATE_COLOR, TRUE_COLOR, arm_dots
 from ms_slam_env.errors import InputError
 from ms_slam_env.output_files import write_bytes
@@ -140,8 +140,7 @@ class EpisodeView:
             poses[:, :3, 3], colors=shown, radii=0.008, labels=labels, show_labels=False
         )
         self._send("world/candidates", candidates)
-        chooses = planner.planner if isinstance(planner, Recovering) else planner
-        goal = getattr(chooses, "goal", None)
+        goal = goal_of(planner)
         if goal is None:
             self._send("world/goal", rr.Clear(recursive=True))
         else:

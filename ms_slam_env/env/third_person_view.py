@@ -39,22 +39,46 @@ def draw_third_person(
     episode: Episode, slam: SlamBackend, embodiment: Embodiment, scene: Scene, size: int
 ) -> tuple[Image, int]:
     """The picture (size, size, 3), and how many points the map has."""
-    points, colors = slam.surface_points(), slam.surface_colors()
+    points, truth = slam.surface_points(), episode.trajectory_truth
+    low = is_low(points, episode)
+    arm = arm_dots(embodiment, scene)
+    must = np.concatenate([arm[0], truth[:, :3, 3], _frustum(truth[-1])])
+    camera = camera_of(size, size)
+    pose = point_of_view(truth[0, :3, 2], points[low], must, camera)
+    picture = draw_from(camera, pose, episode, points[low], slam.surface_colors()[low], arm)
+    return picture, len(points)
+
+
+def camera_of(width: int, height: int) -> Intrinsics:
+    """That of a picture (height, width, 3)."""
+    return Intrinsics(width, width, 0.5 * (width - 1), 0.5 * (height - 1), width, height)
+
+
+def is_low(points: Float64, episode: Episode) -> NDArray[np.bool_]:
+    """Which of points (N, 3) are not far above all places where the camera was."""
+    highest = episode.trajectory_truth[:, 2, 3].max()
+    return np.asarray(points[:, 2] < highest + _HEADROOM_M)
+
+
+def draw_from(
+    camera: Intrinsics,
+    pose: Float64,
+    episode: Episode,
+    points: Float64,
+    colors: Image,
+    arm: tuple[Float64, Image],
+) -> Image:
+    """A map (N, 3) in colours (N, 3), the arm's dots and both paths, from a pose (4, 4)."""
     truth, estimate = episode.trajectory_truth, episode.trajectory_estimate
-    arm_points, arm_colors = arm_dots(embodiment, scene)
-    ceiling = truth[:, 2, 3].max() + _HEADROOM_M
-    low = np.flatnonzero(points[:, 2] < ceiling)
-    frustum = _frustum(truth[-1])
-    must = np.concatenate([arm_points, truth[:, :3, 3], frustum])
-    camera = Intrinsics(size, size, 0.5 * (size - 1), 0.5 * (size - 1), size, size)
-    pose = _point_of_view(truth[0], points[low], must, camera)
+    arm_points, arm_colors = arm
     picture = render_points(
         camera,
         pose,
-        np.concatenate([points[low], arm_points]),
-        np.concatenate([colors[low], arm_colors]),
-        np.repeat([_MAP_DOT_M, _ARM_DOT_M], [len(low), len(arm_points)]),
+        np.concatenate([points, arm_points]),
+        np.concatenate([colors, arm_colors]),
+        np.repeat([_MAP_DOT_M, _ARM_DOT_M], [len(points), len(arm_points)]),
     )
+    frustum = _frustum(truth[-1])
     if len(arm_points) == 0:
         for corner in frustum[1:]:
             _draw_line(picture, camera, pose, np.stack([truth[-1, :3, 3], corner]), _OUTLINE, 1)
@@ -67,7 +91,7 @@ def draw_third_person(
     ):
         end = _draw_line(picture, camera, pose, path[:, :3, 3], color, width)
         cv2.circle(picture, end, 2 + width // 2, color, -1, cv2.LINE_AA)
-    return picture, len(points)
+    return picture
 
 
 def arm_dots(arm: Embodiment, scene: Scene) -> tuple[Float64, Image]:
@@ -82,21 +106,21 @@ def arm_dots(arm: Embodiment, scene: Scene) -> tuple[Float64, Image]:
     return points, np.clip(255 * rgb * light[:, None], 0, 255).astype(np.uint8)
 
 
-def _point_of_view(start: Float64, points: Float64, must: Float64, camera: Intrinsics) -> Float64:
-    """From above and behind the start pose, as near as everything still fits in.
+def point_of_view(ahead: Float64, points: Float64, must: Float64, camera: Intrinsics) -> Float64:
+    """From above, looking along a direction (3,), as near as everything still fits in.
 
     A point with coordinates (x, z) across and along the view is seen from (a, b) within the slope
     k if |x - a| <= k (z - b): the largest and smallest x -+ k z bound a and b.
     """
-    heading = start[:3, 2] * [1, 1, 0]
+    heading = ahead * [1, 1, 0]
     heading = heading / max(1e-9, float(np.linalg.norm(heading)))
     forward = np.cos(_PITCH) * heading - np.sin(_PITCH) * np.array([0, 0, 1.0])
     R = look_at(np.zeros(3), forward)[:3, :3]
-    slope = (0.5 * camera.width - _EDGE) / camera.fx
     eye = np.zeros(3)
     nearest = np.inf
     seen, needed = points @ R, must @ R
-    for axis in (0, 1):
+    for axis, pixels in enumerate((camera.width, camera.height)):
+        slope = (0.5 * pixels - _EDGE) / camera.fx
         right = (seen[:, axis] - slope * seen[:, 2], needed[:, axis] - slope * needed[:, 2])
         left = (seen[:, axis] + slope * seen[:, 2], needed[:, axis] + slope * needed[:, 2])
         most, least = right[1].max(), left[1].min()

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from gymnasium.spaces import Discrete, MultiDiscrete
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ms_slam_baselines import GreedyDivergence, MaxInformation, RandomWalk, Stationary
@@ -25,6 +26,7 @@ class FakeEnv:
         self.depth = rng.choice([0.0, 1.5], (NUM_ACTIONS, 3, 4)).astype(np.float32)
         self.mask = rng.random(NUM_ACTIONS) >= blocked
         self.mask[0] = True  # standing still is always possible
+        self.action_space = Discrete(NUM_ACTIONS)
 
     def action_masks(self):
         return self.mask.copy()
@@ -62,6 +64,15 @@ def test_random_walk_takes_every_unmasked_action_equally_often():
     degrees = env.mask.sum() - 1
     assert chi_squared < degrees + 5 * np.sqrt(2 * degrees)  # 5 standard deviations
     assert act(RandomWalk(env, 3), 30) != act(RandomWalk(env, 4), 30)
+
+
+def test_random_walk_draws_each_number_of_an_action_from_its_own_choices():
+    env = FakeEnv()
+    env.mask = np.concatenate([env.mask, [True, False, True]])
+    env.action_space = MultiDiscrete([NUM_ACTIONS, 3])
+    motions, configurations = np.transpose(act(RandomWalk(env, 3), 2000))
+    assert set(motions) == set(np.flatnonzero(env.mask[:NUM_ACTIONS]))
+    assert set(configurations) == {0, 2}
 
 
 def test_stationary_stays():

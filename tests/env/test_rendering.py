@@ -51,17 +51,18 @@ def test_small_gaps_are_closed_and_large_ones_are_not():
 
 def test_everything_that_must_be_seen_is_in_the_picture():
     rng = np.random.default_rng(0)
-    camera = Intrinsics(480, 480, 239.5, 239.5, 480, 480)
-    for _ in range(20):
+    for width, height in 10 * [(480, 480), (480, 400)]:
+        camera = third_person_view.camera_of(width, height)
         start = look_at(rng.uniform(-1, 1, 3), rng.uniform(-1, 1, 3))
         points = rng.uniform(-1, 1, (500, 3)) * rng.uniform(0.3, 4, 3)
         must = start[:3, 3] + rng.uniform(-1, 1, (50, 3))
-        pose = third_person_view._point_of_view(start, points, must, camera)
+        pose = third_person_view.point_of_view(start[:3, 2], points, must, camera)
         pixels, depth = project(camera, pose, must)
         assert (depth > 0).all()
-        assert ((pixels > 0) & (pixels < 479)).all()
+        last = [width - 1, height - 1]
+        assert ((pixels > 0) & (pixels < last)).all()
         pixels, _ = project(camera, pose, points)
-        assert ((pixels > 0) & (pixels < 479)).all(axis=1).mean() > 0.95
+        assert ((pixels > 0) & (pixels < last)).all(axis=1).mean() > 0.95
         extent = np.ptp(np.concatenate([pixels, project(camera, pose, must)[0]]), axis=0).max()
         assert extent > 300
 

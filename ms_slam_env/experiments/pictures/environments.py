@@ -1,61 +1,70 @@
-"""The pictures of the gallery: `python -m ms_slam_env.experiments.pictures.environments`.
+"""The films of the gallery: `python -m ms_slam_env.experiments.pictures.environments`.
 
-What `render()` shows of each id after some random motions.
+An episode of each id: as `render()` shows it, or what an imperfect camera takes.
 """
 
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
-import gymnasium as gym
-import numpy as np
-
-from ms_slam_env import ENV_IDS
-from ms_slam_env.experiments.pictures.drawing import Image, run_script, save_image
+from ms_slam_env import ENV_IDS, PERTURBED_ENV_IDS
+from ms_slam_env.errors import unknown
+from ms_slam_env.experiments.pictures import film
+from ms_slam_env.experiments.pictures.drawing import run_script
 from ms_slam_env.output_files import check_out_folder
+
+SHOWN_IDS = (*ENV_IDS, *(name for name in PERTURBED_ENV_IDS if "-FreeCamera-" in name))
+"""An imperfect camera takes the same pictures whoever holds it."""
+
+_PLANNERS = {"MSActiveSLAM-FixedTranslation-v0": "greedy", "MSActiveSLAM-Adaptive-v0": "random"}
+_SCENES = {"MSActiveSLAM-v0": "table"}
 
 
 @dataclass(frozen=True)
 class Options:
-    """Draw a moment of an episode of each environment.
+    """Film an episode of each environment.
 
     Attributes:
-        out: folder of the PNG files.
-        steps: random motions before that moment.
-        scene: where.
-        width: of a picture, pixels.
+        out: folder of the WebP files.
+        ids: of the environments; by default all.
+        steps: length of an episode.
     """
 
     out: Path = Path("docs/pictures/environments")
-    steps: int = 12
-    scene: str = "living_room"
-    width: int = 840
+    ids: tuple[str, ...] = ()
+    steps: int = 40
+
+    def __post_init__(self) -> None:
+        """Refuse ids that have no film."""
+        for env_id in self.ids:
+            if env_id not in SHOWN_IDS:
+                raise unknown("environment", env_id, SHOWN_IDS)
 
 
-def moment(env_id: str, options: Options) -> Image:
-    """The picture of one environment, (H, width, 3) RGB."""
-    env = gym.make(env_id, scene=options.scene, scene_seed=0, render_mode="rgb_array")
-    _, info = env.reset(seed=1)
-    rng = np.random.default_rng(1)
-    for _ in range(options.steps):
-        motions = info["action_mask"][: 7 if "FixedTranslation" in env_id else 49]
-        motion = rng.choice(np.flatnonzero(motions))
-        action = np.array([motion, 2]) if "Adaptive" in env_id else motion
-        *_, info = env.step(action)
-    picture = np.asarray(env.render(), dtype=np.uint8)
-    height = round(picture.shape[0] * options.width / picture.shape[1])
-    shrunk = cv2.resize(picture, (options.width, height), interpolation=cv2.INTER_AREA)
-    return np.asarray(shrunk, dtype=np.uint8)
+def film_of(env_id: str, options: Options) -> film.Options:
+    """How the episode of an id is filmed."""
+    plain = film.Options(
+        out=options.out / f"{env_id}.webp",
+        planner=_PLANNERS.get(env_id, "nbv"),
+        env_id=env_id,
+        view="moment",
+        scene=_SCENES.get(env_id, "living_room"),
+        steps=options.steps,
+        every=1,
+        width=640,
+        most_kb=400,
+    )
+    return plain if env_id in ENV_IDS else replace(plain, view="camera", width=480, most_kb=150)
 
 
 def draw(options: Options) -> str:
-    """Write the pictures; return what was done."""
-    for env_id in ENV_IDS:
-        save_image(options.out / f"{env_id}.png", moment(env_id, options))
-    return f"{len(ENV_IDS)} pictures"
+    """Write the films; return what was done."""
+    ids = options.ids or SHOWN_IDS
+    for env_id in ids:
+        print(f"{env_id}: {film.save_film(film_of(env_id, options))}")
+    return f"{len(ids)} films"
 
 
 if __name__ == "__main__":
