@@ -9,6 +9,8 @@ from ms_slam_env._warp import wp
 from ms_slam_env.mapping.kernels import mat66, sum_information
 from ms_slam_env.slam.base import Views
 
+Float64 = NDArray[np.float64]
+
 
 def view_information(views: Views) -> Float64:
     """Information matrices (N, 6, 6) of the camera's pose, translation first.
@@ -39,8 +41,6 @@ def mean_depth(views: Views) -> Float64:
     shown = np.count_nonzero(views.depth, axis=(1, 2))
     return np.maximum(views.depth.sum(axis=(1, 2), dtype=np.float64) / np.maximum(shown, 1), 0.3)
 
-
-Float64 = NDArray[np.float64]
 
 SCALE = 0.25
 """Size of the views predicted, relative to the camera's image."""
