@@ -216,10 +216,7 @@ def trajectory_charts(matched: Matched, options: TrajectoryOptions) -> list[Char
 
 
 def _errors(options: TrajectoryOptions) -> tuple[str, ...]:
-    return (
-        *(absolute_key(options, unit) for unit in ("m", "rad")),
-        *("rpe_m", "rpe_rad"),
-    )
+    return (*(absolute_key(options, unit) for unit in ("m", "rad")), *("rpe_m", "rpe_rad"))
 
 
 def _alignment(options: TrajectoryOptions) -> str:

@@ -39,8 +39,7 @@ _SHARE = re.compile(r"(precision|recall|f_score)_(\d+(?:\.\d+)?)cm")
 
 
 def share_keys(
-    thresholds_m: Sequence[float],
-    kinds: Iterable[str] = ("precision", "recall", "f_score"),
+    thresholds_m: Sequence[float], kinds: Iterable[str] = ("precision", "recall", "f_score")
 ) -> tuple[str, ...]:
     """Keys such as ``precision_2cm`` for each threshold in metres.
 

@@ -53,10 +53,7 @@ def _number(name: str, value: float) -> str:
     return "" if math.isnan(value) else f"{value:.{digits}f}"
 
 
-_PLY_NAMES = {
-    "color": ("red", "green", "blue"),
-    "normal": ("nx", "ny", "nz"),
-}
+_PLY_NAMES = {"color": ("red", "green", "blue"), "normal": ("nx", "ny", "nz")}
 _PLY_TYPES = {"u1": "uchar", "f4": "float"}
 
 

@@ -131,11 +131,7 @@ class ArmMasks(Checked, Experiment):
             _append(stops, {**stop, "sees_itself": truth.sees_itself(arm.q, _view_rays())})
             reason = arm.probe().reason
             for action in range(arm.num_actions):
-                case = {
-                    "stop": number,
-                    "action": action,
-                    "reason": REASONS[int(reason[action])],
-                }
+                case = {"stop": number, "action": action, "reason": REASONS[int(reason[action])]}
                 _append(cases, {**case, **judge(arm, truth, action)})
         return {"cases": cases, "stops": stops}
 

@@ -122,8 +122,7 @@ class Compare(Experiment, Checked):
                 for size in self.image_sizes:
                     made = [
                         CompareSpec(
-                            *(sequence, b, size, *shared, repeat),
-                            timeout_s=self.command_timeout_s,
+                            *(sequence, b, size, *shared, repeat), timeout_s=self.command_timeout_s
                         )
                         for b in self.backends
                     ]

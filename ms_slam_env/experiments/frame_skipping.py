@@ -25,12 +25,7 @@ from ms_slam_env.report.charts import Chart, scatter
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Grouping, Table, make_table
 from ms_slam_env.sensor.scene_cache import get_scene
-from ms_slam_env.sequences import (
-    handheld_trajectory,
-    icl_nuim,
-    place_trajectory,
-    render_sequence,
-)
+from ms_slam_env.sequences import handheld_trajectory, icl_nuim, place_trajectory, render_sequence
 
 Float64 = NDArray[np.float64]
 

@@ -27,13 +27,7 @@ from ms_slam_env.experiments.harness.planner_tables import (
     better_than_each_other,
     with_losses,
 )
-from ms_slam_env.report.charts import (
-    Chart,
-    Panel,
-    by_group,
-    quartile_band,
-    scatter,
-)
+from ms_slam_env.report.charts import Chart, Panel, by_group, quartile_band, scatter
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Grouping, Table, complete_cases, finished
 from ms_slam_env.tasks import OWN, find_task

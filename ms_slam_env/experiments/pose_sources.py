@@ -13,14 +13,7 @@ from ms_slam_env.experiments.harness.episodes import parse_options
 from ms_slam_env.report.charts import Chart, by_group
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.statistics import Interval, relative_cut
-from ms_slam_env.report.tables import (
-    Grouping,
-    Table,
-    complete_cases,
-    grouped,
-    make_table,
-    measured,
-)
+from ms_slam_env.report.tables import Grouping, Table, complete_cases, grouped, make_table, measured
 
 REFERENCE = "slam"
 """The source that the others are compared with, episode by episode."""

@@ -21,12 +21,7 @@ from ms_slam_env.parallel import limit_threads, thread_environment
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished, make_table, measured
-from ms_slam_env.sequences.usme_suite import (
-    NAMES,
-    SUITE,
-    find,
-    made_with,
-)
+from ms_slam_env.sequences.usme_suite import NAMES, SUITE, find, made_with
 
 Float64 = NDArray[np.float64]
 

@@ -13,12 +13,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.exploration.choices import Limit, as_options, choose, for_divergence, levels_of
 from ms_slam_env.exploration.evaluator import SlamEvaluator
 from ms_slam_env.exploration.explorer import explore
-from ms_slam_env.exploration.front import (
-    Point,
-    hypervolume_history,
-    importances,
-    points_of,
-)
+from ms_slam_env.exploration.front import Point, hypervolume_history, importances, points_of
 from ms_slam_env.exploration.held_out import DEFAULT, compare_configurations
 from ms_slam_env.exploration.results import ABOUT, TITLE, Explored
 from ms_slam_env.exploration.settings import ExplorationSettings
@@ -27,11 +22,7 @@ from ms_slam_env.exploration.study_storage import StudyStorage
 from ms_slam_env.metrics.cost import energy_counters
 from ms_slam_env.report.results import Results, write_result_folder
 from ms_slam_env.sequences import check_sequence
-from ms_slam_env.slam.configuration import (
-    SlamConfiguration,
-    write_configuration,
-    write_levels,
-)
+from ms_slam_env.slam.configuration import SlamConfiguration, write_configuration, write_levels
 
 FOR_DIVERGENCE = "for-divergence"
 

@@ -301,8 +301,7 @@ def explore_in_memory(
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     limits = reference or {name: METRICS[name].worst for name in objectives}
     study = optuna.create_study(
-        directions=["minimize"] * len(objectives),
-        sampler=make_sampler(sampler, seed, _POPULATION),
+        directions=["minimize"] * len(objectives), sampler=make_sampler(sampler, seed, _POPULATION)
     )
     study.enqueue_trial(space.defaults())
     found = []

@@ -16,10 +16,7 @@ RAYS = (16, 12)  # of a view, across and down
 
 
 def expected_gain(
-    grid: OccupancyGrid,
-    poses: Float64,
-    intrinsics: Intrinsics,
-    rays: tuple[int, int] = RAYS,
+    grid: OccupancyGrid, poses: Float64, intrinsics: Intrinsics, rays: tuple[int, int] = RAYS
 ) -> Float64:
     """Unknown volume (N,) in m^3 that cameras at ``poses`` (N, 4, 4) would see.
 

@@ -212,10 +212,7 @@ def equal_pieces(count: int, pieces: int) -> Int64:
 
 
 def drifts(
-    estimate: ArrayLike,
-    truth: ArrayLike,
-    lengths_m: Sequence[float] | None = None,
-    every: int = 1,
+    estimate: ArrayLike, truth: ArrayLike, lengths_m: Sequence[float] | None = None, every: int = 1
 ) -> list[Drift]:
     """Relative errors over sub-trajectories of given lengths, by length.
 

@@ -159,12 +159,7 @@ class PerturbedCamera:
         if self._caster is None:
             self._caster = make_caster(self._scene.mesh, "cpu")
         return RGBDSensor(
-            self._scene,
-            K,
-            noise=noise,
-            caster=self._caster,
-            bodies=self._bodies,
-            light=self._light,
+            self._scene, K, noise=noise, caster=self._caster, bodies=self._bodies, light=self._light
         )
 
     def take(

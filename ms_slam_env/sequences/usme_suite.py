@@ -199,10 +199,7 @@ def find(name: str) -> UsmeSequence:
 
 
 def render(
-    entry: UsmeSequence,
-    scene: Scene,
-    image_size: str = "160x120",
-    frames_scale: float = 1.0,
+    entry: UsmeSequence, scene: Scene, image_size: str = "160x120", frames_scale: float = 1.0
 ) -> RenderedSequence:
     """The frames of a sequence, rendered when they are asked for.
 

@@ -234,11 +234,7 @@ class SlamBackend(Stateful):
             OSError: nothing can be written there.
         """
         config = None if self.config is None else asdict(self.config)
-        about = {
-            "backend": type(self).__name__,
-            "intrinsics": _camera(self),
-            "config": config,
-        }
+        about = {"backend": type(self).__name__, "intrinsics": _camera(self), "config": config}
         write_state(Path(path), about, self.get_state())
 
     def load(self, path: str | Path, lost: bool = True) -> None:

@@ -6,12 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from ms_slam_baselines.nbv import NextBestView
-from ms_slam_baselines.view_goals import (
-    frontiers,
-    poses_between,
-    views_anywhere,
-    views_of,
-)
+from ms_slam_baselines.view_goals import frontiers, poses_between, views_anywhere, views_of
 
 import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env.camera import xtion

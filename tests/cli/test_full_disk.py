@@ -146,10 +146,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_that_looks_finished(
 
 
 def test_a_run_whose_map_does_not_fit_says_that_it_is_not_complete(
-    work: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    limit: Callable[[int], None],
+    work: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], limit: Callable[[int], None]
 ) -> None:
     limit(30_000)
     assert RUNS["run"](work, tmp_path) == 1

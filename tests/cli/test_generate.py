@@ -127,10 +127,7 @@ def test_an_interrupted_command_goes_on_to_the_same_files(tmp_path) -> None:
         (["--scene", "mars"], "unknown scene 'mars'"),
         (["--image-size", "1x1"], "unknown image size '1x1'"),
         (["--noise", "loud"], "unknown noise model 'loud'"),
-        (
-            ["--perturbations", "rain"],
-            "unknown perturbation 'rain'; valid choices: rolling",
-        ),
+        (["--perturbations", "rain"], "unknown perturbation 'rain'; valid choices: rolling"),
         (["--perturbations", "motion-blur,time=1"], "unknown option of MotionBlur"),
         (["--perturbations", "motion-blur,samples"], "'samples' is not option=value"),
         (["--perturbations", "motion-blur,samples=x"], "MotionBlur.samples = 'x' is outside"),

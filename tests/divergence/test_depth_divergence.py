@@ -46,11 +46,7 @@ def loop_histogram(normals, N, alpha, pseudo_count):
         M = math.floor(2 * N * math.sin(theta) + 1e-9) + 1
         for j in range(1, M + 1):
             phi = 2 * math.pi * j / M
-            v = (
-                math.sin(theta) * math.cos(phi),
-                math.sin(theta) * math.sin(phi),
-                math.cos(theta),
-            )
+            v = (math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi), math.cos(theta))
             total = pseudo_count
             for n in normals:
                 cosine = sum(a * b for a, b in zip(n, v, strict=True))

@@ -70,9 +70,7 @@ def test_a_run_draws_its_map(tmp_path: Path) -> None:
     assert cv2.imread(str(tmp_path / "maps" / "table_stationary_0.png")) is not None
 
 
-def test_runs_of_one_scene_differ_in_light_and_noise_alone(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_runs_of_one_scene_differ_in_light_and_noise_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[Any] = []
 
     def judge(world: Any, rule: Any) -> Any:

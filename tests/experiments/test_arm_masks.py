@@ -43,10 +43,7 @@ def row(scene, seed, cases):
                 "error_m": [0.001] * count,
                 "error_rad": [0.01] * count,
             },
-            "stops": {
-                **{name: [0.002, 0.004] for name in AT_REST},
-                "sees_itself": [False, False],
-            },
+            "stops": {**{name: [0.002, 0.004] for name in AT_REST}, "sees_itself": [False, False]},
         },
     }
 

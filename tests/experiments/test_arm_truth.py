@@ -121,12 +121,7 @@ def test_self_contact_is_that_of_the_capsules():
     assert not found[~expected & ~unsure].any()
 
 
-SHAPES = {
-    "sphere": "0.05",
-    "capsule": "0.03 0.1",
-    "cylinder": "0.04 0.07",
-    "box": "0.05 0.02 0.08",
-}
+SHAPES = {"sphere": "0.05", "capsule": "0.03 0.1", "cylinder": "0.04 0.07", "box": "0.05 0.02 0.08"}
 
 
 @pytest.mark.parametrize("kind", SHAPES)

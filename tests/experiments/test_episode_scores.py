@@ -29,14 +29,7 @@ def world_of(states: str) -> Any:
 
 @pytest.mark.parametrize(
     ("states", "losses", "for_good"),
-    [
-        ("....", 0, 0),
-        (".xx.", 1, 0),
-        (".x.x", 2, 1),
-        (".xss", 1, 1),
-        (".xs..!", 2, 1),
-        ("x", 1, 1),
-    ],
+    [("....", 0, 0), (".xx.", 1, 0), (".x.x", 2, 1), (".xss", 1, 1), (".xs..!", 2, 1), ("x", 1, 1)],
 )
 def test_a_loss_lasts_until_the_camera_is_where_it_thinks(
     states: str, losses: int, for_good: int
@@ -55,9 +48,7 @@ def test_submaps_that_hang_together_with_the_first_count() -> None:
         links=np.zeros((3, 6, 6)),
     )
     slam: Any = SimpleNamespace(
-        map_points=lambda: points,
-        map_attributes=lambda: {"submap": labels},
-        submaps=lambda: whole,
+        map_points=lambda: points, map_attributes=lambda: {"submap": labels}, submaps=lambda: whole
     )
     np.testing.assert_array_equal(anchored_points(slam), points[:2])
 

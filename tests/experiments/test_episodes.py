@@ -12,10 +12,7 @@ import pytest
 
 from ms_slam_env.config import parse_named
 from ms_slam_env.env.embodiments import EMBODIMENTS
-from ms_slam_env.env.planners import (
-    PLANNERS,
-    make_planner,
-)
+from ms_slam_env.env.planners import PLANNERS, make_planner
 from ms_slam_env.errors import InputError
 from ms_slam_env.experiments.harness.episodes import (
     EpisodeSpec,
@@ -125,10 +122,7 @@ def test_options_may_name_the_embodiment() -> None:
     assert env.unwrapped.simulation.embodiment_type is EMBODIMENTS["arm-kinematic"]
     for text, message in (
         ("embodiment=boat", "unknown embodiment 'boat'; valid choices: arm, arm-kinematic, free"),
-        (
-            "boat=1",
-            "option of the environment 'boat'; valid choices: embodiment, num_scene_seeds",
-        ),
+        ("boat=1", "option of the environment 'boat'; valid choices: embodiment, num_scene_seeds"),
         ("render_mode=human", "option 'render_mode' is not free: the benchmark sets it"),
         ("max_episode_steps=3", "option 'max_episode_steps' is not free: the benchmark sets it"),
     ):

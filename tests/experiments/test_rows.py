@@ -103,10 +103,7 @@ def test_interruption_loses_and_repeats_nothing(tmp_path: Path, how: signal.Sign
     out, log, count = tmp_path / "out", tmp_path / "log", 24
     command = [sys.executable, fake_work.__file__, str(out), str(count), "0.1", str(log)]
     process = subprocess.Popen(
-        command,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-        preexec_fn=heed_interrupts,
+        command, stderr=subprocess.DEVNULL, start_new_session=True, preexec_fn=heed_interrupts
     )
     while not (out / RECORDS).exists() and process.poll() is None:
         time.sleep(0.01)

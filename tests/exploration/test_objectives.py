@@ -23,11 +23,7 @@ def test_a_constraint_is_read():
     assert str(Constraint("ext_ms", 5.0)) == "ext_ms<5"
 
 
-@given(
-    name=st.sampled_from(sorted(METRICS)),
-    limit=st.floats(1e-9, 1e9),
-    at_least=st.booleans(),
-)
+@given(name=st.sampled_from(sorted(METRICS)), limit=st.floats(1e-9, 1e9), at_least=st.booleans())
 def test_a_constraint_is_read_back_from_its_text(name, limit, at_least):
     constraint = Constraint(name, limit, at_least and name in ("M_I", "M_D"))
     assert parse_constraint(str(constraint)) == constraint

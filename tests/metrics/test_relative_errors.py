@@ -63,11 +63,7 @@ def test_equals_evo(
     )
     metric.process_data(tuple(PosePath3D(poses_se3=list(poses)) for poses in (truth, estimate)))
     expected = metric.get_all_statistics()
-    options = {
-        "unit": unit,
-        "pairs": "all" if every else "consecutive",
-        "tolerance": tolerance,
-    }
+    options = {"unit": unit, "pairs": "all" if every else "consecutive", "tolerance": tolerance}
     found = rpe_statistics(estimate, truth, delta, kind, **options)
     for name in STATISTICS:
         assert getattr(found, name) == pytest.approx(expected[name], abs=1e-9)

@@ -107,7 +107,7 @@ def test_plotly_takes_every_chart() -> None:
 def test_series_are_drawn_in_the_shown_unit_with_their_intervals() -> None:
     over_steps, groups, bars, plan = plots_of(example_charts()[0])
     assert [plot.label for plot in (over_steps, groups, bars)] == [
-        *("ATE [mm]", "F-score at 5 cm [%]", "scenes"),
+        *("ATE [mm]", "F-score at 5 cm [%]", "scenes")
     ]
     band, line, *_ = over_steps.data
     assert (line["x"], line["y"]) == ([1, 2, 4], [1, 10, 1000])
@@ -362,10 +362,7 @@ def make_broken(folder: Path) -> None:
     ],
 )
 def test_bad_folders_are_one_line(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    make: Callable[[Path], None],
-    message: str,
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], make: Callable[[Path], None], message: str
 ) -> None:
     make(tmp_path / "folder")
     assert main(["report", str(tmp_path / "folder")]) == 2

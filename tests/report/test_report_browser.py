@@ -261,10 +261,7 @@ def test_columns_out_of_sight_are_counted(browser: Any, tmp_path: Path, width: i
     wide = [Column(f"{k}{n}", k) for n in range(3) for k in keys]
     tables = [
         make_table(["sequence", *keys], [{"sequence": "living_room:2000:kinect", **row}]),
-        make_table(
-            ["sequence", *wide],
-            [{"sequence": "x", **{c.name: row[c.key] for c in wide}}],
-        ),
+        make_table(["sequence", *wide], [{"sequence": "x", **{c.name: row[c.key] for c in wide}}]),
     ]
     write_results(tmp_path / "results.json", "k", "wide", "", tables=tables)
     page = Visit(browser, write_report(tmp_path), viewport={"width": width, "height": 800})

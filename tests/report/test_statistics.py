@@ -95,10 +95,7 @@ def test_rliables_intervals_are_the_same_twice_and_leave_the_global_generator_al
     scores = {name: rng.normal(size=(7, 3)) for name in ("a", "b")}
     before = np.random.get_state()  # noqa: NPY002
     first, second = (
-        (
-            statistics.interquartile_means(scores),
-            statistics.improvement_matrix(scores),
-        )
+        (statistics.interquartile_means(scores), statistics.improvement_matrix(scores))
         for _ in range(2)
     )
     after = np.random.get_state()  # noqa: NPY002

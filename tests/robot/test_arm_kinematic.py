@@ -19,10 +19,7 @@ START = look_at([0.0, -0.8, 1.2], [1.2, 0.2, 0.7])
 STEP_M, STEP_RAD = 0.12, np.radians(12)
 
 
-SECOND_ARM = {
-    "model": str(Path(__file__).with_name("second_arm.xml")),
-    "camera_site": "lens",
-}
+SECOND_ARM = {"model": str(Path(__file__).with_name("second_arm.xml")), "camera_site": "lens"}
 
 
 def make_arm(scene, **options):

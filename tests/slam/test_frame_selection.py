@@ -162,10 +162,7 @@ def _slow_change(current: RGBDFrame, reference: RGBDFrame, weight: float) -> flo
         images.append(grey[depth > 0].reshape(1, -1))  # as the default configuration has it
         depths.append(depth)
     intensity = intensity_divergence(
-        *images,
-        bins=config.bins,
-        pseudo_count=config.pseudo_count,
-        smoothing=config.smoothing,
+        *images, bins=config.bins, pseudo_count=config.pseudo_count, smoothing=config.smoothing
     )
     depth = depth_divergence(
         *depths,

@@ -17,11 +17,7 @@ from ms_slam_env.geometry import invert, look_at, make_pose, se3_exp, so3_exp, t
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.configuration import SlamConfiguration
 from ms_slam_env.slam.volumetric import KinectFusionConfig
-from ms_slam_env.slam.volumetric.projective_icp import (
-    ProjectiveICP,
-    frame_pyramid,
-    model_surface,
-)
+from ms_slam_env.slam.volumetric.projective_icp import ProjectiveICP, frame_pyramid, model_surface
 from ms_slam_env.slam.volumetric.voxel_grid import CastView
 
 CAMERA = xtion("160x120")

@@ -68,10 +68,7 @@ def test_levelled_frames_are_those_of_a_global_shutter(clean, box_scene):
 
     before, after = (
         errors(depth, color)
-        for depth, color in (
-            (clean.depth, clean.color),
-            (levelled.depth[0], levelled.color[0]),
-        )
+        for depth, color in ((clean.depth, clean.color), (levelled.depth[0], levelled.color[0]))
     )
     assert (after < np.array([0.25, 0.4, 0.6]) * before).all(), after / before
 

@@ -15,9 +15,7 @@ from ms_slam_env.geometry import invert, look_at, relative_angle, se3_exp
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.alignment_check import TrackingStatus
 from ms_slam_env.slam.surfel import alignment_arrays as aa
-from ms_slam_env.slam.surfel.acceptance import (
-    acceptance_thresholds,
-)
+from ms_slam_env.slam.surfel.acceptance import acceptance_thresholds
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.gauss_newton import weights_of
 from ms_slam_env.slam.surfel.normal_equations import accumulate_normal_equations

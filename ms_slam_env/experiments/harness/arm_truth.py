@@ -83,11 +83,7 @@ class ArmTruth:
     """
 
     def __init__(
-        self,
-        model: ArmModel,
-        furniture: Cloud,
-        T_world_base: Float64,
-        column: Cloud | None = None,
+        self, model: ArmModel, furniture: Cloud, T_world_base: Float64, column: Cloud | None = None
     ) -> None:
         self._mj, self._qpos, self._camera_site = model.mj, model.qpos, model.camera_site
         self._furniture, self._column = furniture, column

@@ -20,13 +20,7 @@ from ms_slam_env.evaluation.seen_surface import open_with_surface
 from ms_slam_env.evaluation.trajectory_files import tracked_beside
 from ms_slam_env.experiments.harness.command_runs import run_command
 from ms_slam_env.geometry import invert
-from ms_slam_env.sequences import (
-    HandheldPath,
-    Sequence,
-    associate,
-    open_sequence,
-    read_trajectory,
-)
+from ms_slam_env.sequences import HandheldPath, Sequence, associate, open_sequence, read_trajectory
 from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S
 
 Float64 = NDArray[np.float64]

@@ -225,7 +225,7 @@ def map_measures(points: Float64, surface: Float64, scene: str) -> dict[str, Any
     """Measures of the map (N, 3) against the true surface (M, 3); see `run_usme`."""
     near = 5 * voxel_m(scene)
     nothing = dict.fromkeys(
-        ("c2c_mean_m", "c2c_std_m", "hausdorff_directed_m", "recall_near", "noise_ratio"),
+        ("c2c_mean_m", "c2c_std_m", "hausdorff_directed_m", "recall_near", "noise_ratio")
     )
     result: dict[str, Any] = {"map_points": len(points), "near_m": near, **nothing}
     result["spacing_m"] = None

@@ -201,13 +201,7 @@ class Arrangement:
         return not any(overlap(box, doorstep) for doorstep in self.doorsteps)
 
     def _alongs(
-        self,
-        rng: Rng,
-        wall: int,
-        width: float,
-        in_corner: bool,
-        near: float | None,
-        off: float,
+        self, rng: Rng, wall: int, width: float, in_corner: bool, near: float | None, off: float
     ) -> Iterator[float]:
         """Places along a wall for something so wide, the better ones first."""
         slack = self.room.length(wall) / 2 - width / 2 - 0.02

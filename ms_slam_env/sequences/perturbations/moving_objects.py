@@ -16,12 +16,7 @@ from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.mesh_queries import RayCaster
 from ms_slam_env.scenes.movers import MOVERS, Shape, make_mover
 from ms_slam_env.sequences.perturbations.base import WorldPerturbation, random_numbers
-from ms_slam_env.sequences.perturbations.movers import (
-    Mover,
-    Track,
-    round_track,
-    straight_track,
-)
+from ms_slam_env.sequences.perturbations.movers import Mover, Track, round_track, straight_track
 from ms_slam_env.sequences.trajectory import PoseInterpolation
 
 _TRIES = 4000

@@ -15,11 +15,7 @@ from ms_slam_env.geometry import Float64
 from ms_slam_env.input_files import is_named
 from ms_slam_env.sequences.recording.bags import SUFFIXES, Topics, is_bag, open_bag
 from ms_slam_env.sequences.recording.euroc import is_euroc, open_euroc
-from ms_slam_env.sequences.recording.image_folders import (
-    FRAME_RATE_HZ,
-    find_color,
-    folder_entries,
-)
+from ms_slam_env.sequences.recording.image_folders import FRAME_RATE_HZ, find_color, folder_entries
 from ms_slam_env.sequences.recording.listings import (
     Calibration,
     Listed,

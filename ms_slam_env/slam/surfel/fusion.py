@@ -15,12 +15,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env._warp import wp
 from ms_slam_env.slam.surfel.device import fetch, put
-from ms_slam_env.slam.surfel.surfels import (
-    SplatCamera,
-    Surfels,
-    rotation_of,
-    translation_of,
-)
+from ms_slam_env.slam.surfel.surfels import SplatCamera, Surfels, rotation_of, translation_of
 
 COARSER = wp.constant(1.5)  # a reading with a radius this much larger refines nothing (Keller)
 FULL_WEIGHT_SIGMA_M = 0.048  # readings with more noise weigh less; the default's at 4 m

@@ -15,11 +15,7 @@ from ms_slam_env.slam.alignment_check import (
 )
 from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.feature_poses import FeaturePose, LastFrames
-from ms_slam_env.slam.surfel.acceptance import (
-    Alignment,
-    accept_any_fit,
-    is_nearly_accepted,
-)
+from ms_slam_env.slam.surfel.acceptance import Alignment, accept_any_fit, is_nearly_accepted
 from ms_slam_env.slam.surfel.camera_states import CameraStates
 from ms_slam_env.slam.surfel.map_alignment import MapAligner
 from ms_slam_env.slam.surfel.motion_mask import MotionMask

@@ -138,9 +138,7 @@ class AtlasSubmaps(NoSubmaps):
         if result.covariance is not None:
             covariance = covariance + result.covariance
         return replace(
-            result,
-            submap=self._present,
-            covariance=covariance if result.tracking_ok else None,
+            result, submap=self._present, covariance=covariance if result.tracking_ok else None
         )
 
     # -- Losing a map --------------------------------------------------------------------------
