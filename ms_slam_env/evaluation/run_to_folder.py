@@ -12,8 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import metrics, slam
-from ms_slam_env.evaluation.mesh_export import MESH, check_open3d, write_mesh
-from ms_slam_env.evaluation.run_files import COSTS, frame_costs, write_frames, write_ply
+from ms_slam_env.evaluation.run_files import (
+    COSTS,
+    MESH,
+    check_open3d,
+    frame_costs,
+    write_frames,
+    write_mesh,
+    write_ply,
+)
 from ms_slam_env.evaluation.run_sequence import SequenceRun
 from ms_slam_env.evaluation.submaps import (
     paths_by_submap,

@@ -24,7 +24,7 @@ from ms_slam_env.experiments.harness.teams import (
     merge_pairs,
     place_robots,
 )
-from ms_slam_env.experiments.pictures.team_maps import save_picture
+from ms_slam_env.experiments.pictures.judged_map import save_team_picture
 from ms_slam_env.metrics.registry import metric
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import (
@@ -157,7 +157,7 @@ class MultiRobot(Experiment, Checked):
         name = Path(spec.scene).stem
         path = out / f"map_{name}_{spec.seed}_{spec.robots}.png"
         title = f"{name}, seed {spec.seed}, {spec.robots} robots"
-        save_picture(team, placed, found, path, title)
+        save_team_picture(team, placed, found, path, title)
 
 
 def _teams(rows: Sequence[Row]) -> Table:

@@ -9,8 +9,8 @@ from ms_slam_env.mapping.occupancy_grid import (
     OccupancyMap,
     surrounding_occupancy,
 )
-from ms_slam_env.mapping.reachability import Ways, reachable_positions, shortest_ways
 from ms_slam_env.mapping.trackability import view_information
+from ms_slam_env.mapping.view_goals import Ways, reachable_positions, shortest_ways
 
 __all__ = [
     "FREE",

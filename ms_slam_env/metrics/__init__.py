@@ -19,7 +19,6 @@ from ms_slam_env.metrics.cost import (
     FrameCost,
     energy_counters,
 )
-from ms_slam_env.metrics.initialisation import Initialisation, initialisation, local_scales
 from ms_slam_env.metrics.multi_robot import (
     inter_robot_errors,
     inter_robot_rpe,
@@ -55,8 +54,11 @@ from ms_slam_env.metrics.relative import (
     rpe_statistics,
 )
 from ms_slam_env.metrics.robustness import (
+    Initialisation,
     Relocalisation,
     TrackingRobustness,
+    initialisation,
+    local_scales,
     mean_relocalisation_time,
     relocalisation,
     relocalisation_times,

@@ -7,9 +7,8 @@ import pytest
 
 from ms_slam_env import scenes
 from ms_slam_env.robot.arm import ArmConfig
-from ms_slam_env.robot.arm.arm import KinematicArm
+from ms_slam_env.robot.arm.arm import KinematicArm, camera_poses
 from ms_slam_env.robot.arm.clearance import LinkClearance
-from ms_slam_env.robot.arm.workspace import camera_poses
 from ms_slam_env.timings import Timings
 
 

@@ -10,7 +10,7 @@ from box_scene import BoxScene
 
 from ms_slam_env.camera import xtion
 from ms_slam_env.geometry import invert, look_at, make_pose, so3_exp
-from ms_slam_env.scenes.light_probe import LightProbe
+from ms_slam_env.scenes.mesh_queries import LightProbe
 from ms_slam_env.scenes.movers import make_mover
 from ms_slam_env.scenes.movers.shape import box
 from ms_slam_env.sensor import Body, ChangingLight, RGBDSensor, WarpRayCaster

@@ -17,8 +17,7 @@ from ms_slam_env.evaluation.map_truth import (
     surface_of_views,
     true_surface,
 )
-from ms_slam_env.robot.arm.arm import ArmEmbodiment
-from ms_slam_env.robot.arm.workspace import camera_poses
+from ms_slam_env.robot.arm.arm import ArmEmbodiment, camera_poses
 from ms_slam_env.slam.base import SlamBackend
 
 Float64 = NDArray[np.float64]

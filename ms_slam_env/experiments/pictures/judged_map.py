@@ -1,19 +1,23 @@
-"""Pictures of judged maps: as SLAM coloured them, and with second copies of objects in red."""
+"""Pictures of maps: second copies of objects in red; the merged map of a team of robots."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import matplotlib
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.env.point_renderer import render_points
 from ms_slam_env.evaluation.duplicate_objects import JudgedMap
+from ms_slam_env.experiments.harness.teams import Team
 from ms_slam_env.experiments.pictures.drawing import Image
 from ms_slam_env.geometry import invert, look_at, transform_points
-from ms_slam_env.report.figures import caption, new_figure, save
+from ms_slam_env.geometry.point_clouds import voxel_firsts
+from ms_slam_env.report.figures import caption, colour, new_figure, save
 
 Float64 = NDArray[np.float64]
 
@@ -33,16 +37,21 @@ def save_map_picture(judged: JudgedMap, cameras: ArrayLike, path: Path, title: s
         title: what map this is; the verdict is appended.
     """
     pose = overview_pose(judged.points, np.asarray(cameras))
-    figure: Figure = new_figure(2, width=5.0, height=4.3)
     panels = {
         "the map": overview(judged.points, judged.colors, pose),
         "second copies in red, seen through the rest": _marked(judged, pose),
     }
+    return _save_pair(panels, f"{title}: {describe(judged)}", path)
+
+
+def _save_pair(panels: Mapping[str, Image], text: str, path: Path) -> Path:
+    """Two images with their names side by side, ``text`` below them."""
+    figure = new_figure(2, width=5.0, height=4.3)
     for ax, (name, image) in zip(figure.subplots(1, 2), panels.items(), strict=True):
         ax.imshow(image)
         ax.set_title(name, fontsize="small")
         ax.axis("off")
-    caption(figure, f"{title}: {describe(judged)}")
+    caption(figure, text)
     return save(figure, path)
 
 
@@ -79,3 +88,46 @@ def overview(points: Float64, colors: ArrayLike, T_world_camera: Float64) -> Ima
     ahead = transform_points(invert(T_world_camera), points)[:, 2] > _NEAREST_M
     points, shades = points[ahead], np.asarray(colors, dtype=np.uint8)[ahead]
     return render_points(CAMERA, T_world_camera, points, shades, np.full(len(points), _DOT_M))
+
+
+_VOXEL_M = 0.01
+_SHADE = 0.65  # of a robot's colour in the picture; the rest is the surface's own
+
+
+def save_team_picture(
+    team: Team, placed: dict[int, Float64], found: dict[str, Any], path: Path, title: str
+) -> Path:
+    """The merged map as seen obliquely from behind the cameras, as it is and coloured by robot.
+
+    Args:
+        team: the robots.
+        placed: T_0_b (4, 4) by robot.
+        found: figures of the team.
+        path: of the PNG.
+        title: what team this is.
+    """
+    T_world_first = team.truths[0][0]
+    points, shades, tints, cameras = [], [], [], []
+    for k, T_first in placed.items():
+        robot, T = team.robots[k], T_world_first @ T_first
+        own = transform_points(T, robot.backend.surface_points())
+        kept = voxel_firsts(own, _VOXEL_M)
+        color = robot.backend.surface_colors()[kept].astype(np.float64)
+        tint = 255 * np.array(matplotlib.colors.to_rgb(colour(k)))
+        grey = color.mean(axis=1, keepdims=True)
+        points.append(own[kept])
+        shades.append(color)
+        tints.append(_SHADE * tint * (0.4 + 0.6 * grey / 255) + (1 - _SHADE) * grey)
+        cameras.append((T @ robot.estimates)[:, :3, 3])
+    everything = np.concatenate(points)
+    pose = overview_pose(everything, np.concatenate(cameras))
+    panels = {
+        name: overview(everything, np.concatenate(colors).clip(0, 255).astype(np.uint8), pose)
+        for name, colors in (("the merged map", shades), ("coloured by robot", tints))
+    }
+    alone = float(np.mean([robot["f_score_5cm"] for robot in found["alone"]]))
+    text = (
+        f"{title}: {found['merged_robots']} in one frame, ATE {1e3 * found['team_ate_m']:.1f} mm, "
+        f"F-score at 5 cm {100 * found['f_score_5cm']:.0f} % (alone {100 * alone:.0f} %)"
+    )
+    return _save_pair(panels, text, path)

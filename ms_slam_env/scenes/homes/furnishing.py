@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from ms_slam_env.scenes.furniture import bedroom, decor, fittings, pieces, small_things
+from ms_slam_env.scenes.furniture import decor, fittings, pieces, small_things
 from ms_slam_env.scenes.homes.arrangement import Furnisher, Spot
 from ms_slam_env.scenes.textures import interior
 from ms_slam_env.scenes.textures.noise import hsv
@@ -75,13 +75,13 @@ def _nursery(of: Furnisher) -> None:
     _wardrobe(of, 1.0)
     _desk(of)
     _put(of, (0.95, 0.32, 1.3), lambda: pieces.bookshelf(build, rng, 0.95, 1.25, 3, "bookshelf"))
-    _put(of, (0.62, 0.42, 0.4), lambda: bedroom.toy_box(build, rng))
+    _put(of, (0.62, 0.42, 0.4), lambda: pieces.toy_box(build, rng))
     middle = of.arrangement.in_the_room(rng, (0.5, 0.5))
     if middle is not None:
         with build.frame((*middle, 0.0)):
             for k in range(5):
                 with build.frame((*rng.uniform(-0.2, 0.2, 2), 0.0)):
-                    bedroom.toy(build, rng, f"toy {k}")
+                    pieces.toy(build, rng, f"toy {k}")
 
 
 def _study(of: Furnisher) -> None:
@@ -124,7 +124,7 @@ def _hall(of: Furnisher) -> None:
     rack = of.arrangement.hang(rng, (1.0, 1.1), 1.3, of.walls(), depth=0.2)
     if rack is not None:
         with of.at(rack, 1.72):
-            bedroom.coat_rack(build, rng, 0.95)
+            pieces.coat_rack(build, rng, 0.95)
     w, d, _ = of.room.size
     count = max(1, round(max(w, d) / 4.0))
     for k in range(count):
@@ -363,12 +363,12 @@ def _on_counter(of: Furnisher, wide: float) -> None:
 def _bed(of: Furnisher, width: float) -> None:
     """A bed, head to a wall, bedside tables with lamps, a rug."""
     build, rng = of.build, of.rng
-    size = (width + 0.1, bedroom.BED_LENGTH_M + 0.04, 1.15)
+    size = (width + 0.1, pieces.BED_LENGTH_M + 0.04, 1.15)
     spot = of.arrangement.stand(rng, size, _inner_first(of), 0.01, 0.4)
     if spot is None:
         return
     with of.at(spot):
-        bedroom.bed(build, rng, width)
+        pieces.bed(build, rng, width)
     _rug_before(of, spot, 1.75, width + 1.0, 1.3)
     for k, side in enumerate((-1, 1)):
         x = spot.along + side * (width / 2 + 0.36)
@@ -379,14 +379,14 @@ def _bed(of: Furnisher, width: float) -> None:
                 pieces.drawers(build, rng, 0.44, 0.5, f"bedside table {k}")
                 with build.frame((0.1 * side, -0.35, 0.5)):
                     small_things.lying_book(build, rng, f"bedside book {k}", 0.03)
-            lamp = partial(bedroom.table_lamp, build, rng, 0.42, f"bedside lamp {k}")
+            lamp = partial(pieces.table_lamp, build, rng, 0.42, f"bedside lamp {k}")
             _shine(of, table, (0, -0.16, 0.5), lamp)
 
 
 def _wardrobe(of: Furnisher, width: float) -> None:
     for wide in (width, 1.0):
         height = min(2.1, of.room.size[2] - 0.25)
-        draw = partial(bedroom.wardrobe, of.build, of.rng, wide, height)
+        draw = partial(pieces.wardrobe, of.build, of.rng, wide, height)
         if _put(of, (wide + 0.04, 0.64, height + 0.05), draw, 0.01, 0.5) is not None:
             return
 
@@ -414,7 +414,7 @@ def _desk(of: Furnisher) -> None:
         with build.frame((rng.uniform(-0.1, 0.1), -depth - 0.36, 0), turn):
             pieces.chair(build, rng, "desk chair")
     side = (-width / 2 + 0.18, -0.2, _TABLE_M)
-    _shine(of, spot, side, lambda: bedroom.table_lamp(build, rng, 0.45, "desk lamp"))
+    _shine(of, spot, side, lambda: pieces.table_lamp(build, rng, 0.45, "desk lamp"))
 
 
 def _plant(of: Furnisher) -> None:

@@ -22,12 +22,13 @@ from ms_slam_env.sequences.perturbations.images import (
 )
 from ms_slam_env.sequences.perturbations.moving_objects import MovingObjects
 from ms_slam_env.sequences.perturbations.optics import (
+    FastMotion,
+    FrameSkipping,
     LensDistortion,
     Misregistration,
     MotionBlur,
     RollingShutter,
 )
-from ms_slam_env.sequences.perturbations.timing import FastMotion, FrameSkipping
 
 __all__ = ["PERTURBATIONS", "Moment", "Perturbation", "make_perturbation"]
 

@@ -12,7 +12,7 @@ from scipy.interpolate import CubicSpline
 
 from ms_slam_env.geometry import Float64
 from ms_slam_env.scenes.base import Scene
-from ms_slam_env.scenes.light_probe import LightProbe
+from ms_slam_env.scenes.mesh_queries import LightProbe
 from ms_slam_env.scenes.movers import Joint, Shape
 from ms_slam_env.sensor import Body
 

@@ -24,7 +24,6 @@ from ms_slam_env.geometry import invert, transform_points
 from ms_slam_env.slam.alignment_measures import DepthImage
 from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.tracking_template import Attempt
-from ms_slam_env.slam.volumetric.config import VolumetricConfig
 from ms_slam_env.slam.volumetric.projective_icp import (
     ProjectiveICP,
     Surface,
@@ -32,7 +31,7 @@ from ms_slam_env.slam.volumetric.projective_icp import (
     model_surface,
 )
 from ms_slam_env.slam.volumetric.volumetric_slam import FrameToModel, FusedImage, VolumetricSlam
-from ms_slam_env.slam.volumetric.voxel_grid import CastView, VoxelGrid
+from ms_slam_env.slam.volumetric.voxel_grid import CastView, VolumetricConfig, VoxelGrid
 
 _EVERY_FRAME = 4  # frames that are fused whatever the rate, as in SLAMBench
 

@@ -23,11 +23,11 @@ from ms_slam_env.slam.base import Float64, Views, check_views
 from ms_slam_env.slam.odometry import Aligner
 from ms_slam_env.slam.pose_hypotheses import motion_hypotheses
 from ms_slam_env.slam.tracking_template import Attempt, FrameByFrameSlam
-from ms_slam_env.slam.volumetric.config import VolumetricConfig
 from ms_slam_env.slam.volumetric.voxel_grid import (
     DEPTH_SCALE,
     CastView,
     StockVoxelGrid,
+    VolumetricConfig,
     VoxelGrid,
     camera_matrix,
 )
