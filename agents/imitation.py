@@ -22,26 +22,19 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from ms_slam_agents.demonstrations import Demonstration, Task, play
-from ms_slam_agents.learning_curve import Curve, read_curve
-from ms_slam_agents.options import (
-    Problem,
-    check_kept,
-    check_new,
-    numbers_of_candidates,
-    parse_for_task,
-)
-from ms_slam_agents.policy import CLIP, EPSILON
-from ms_slam_agents.policy_file import Metadata, PolicyFile, read_policy, write_policy
-from ms_slam_agents.ppo import Network
-from ms_slam_agents.sb3_state import PooledMoments
-from ms_slam_agents.supervisor import LATEST
-from ms_slam_agents.train_sb3 import (
+from ms_slam_agents.environments import (
     VALIDATION_SEED,
     check_problem,
-    env_options,
     make_venv,
     problem_options,
 )
+from ms_slam_agents.learning_curve import LATEST, Curve, read_curve
+from ms_slam_agents.network import Network, load_parameters
+from ms_slam_agents.normalization import PooledMoments
+from ms_slam_agents.options import Problem, check_new, parse_for_task
+from ms_slam_agents.policy import CLIP, EPSILON
+from ms_slam_agents.policy_file import PolicyFile, write_policy
+from ms_slam_agents.training_run import metadata_of, read_run
 from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
 from torch import Tensor
 from tqdm import tqdm
@@ -191,12 +184,11 @@ class Student:
         self.network = self._network()
         self.epochs = file.metadata.epochs if file else 0
         if file:
-            tensors = {name: torch.from_numpy(v) for name, v in file.part("policy").items()}
-            self.network.load_state_dict(tensors)
+            load_parameters(self.network, file)
 
     def _network(self) -> MaskableActorCriticPolicy | Network:
         """Ours where candidates are looked at one by one, Stable-Baselines3's otherwise."""
-        args, candidates = self.args, numbers_of_candidates(self.args)
+        args, candidates = self.args, self.args.candidates
         if candidates:
             return Network(self.inputs, args.hidden, self.actions, 0, candidates)
         return MaskableActorCriticPolicy(
@@ -208,7 +200,7 @@ class Student:
 
     def _moments(self, observations: Any) -> Moments:
         """Means and variances of observations (N, inputs), the same for all candidates."""
-        candidates = numbers_of_candidates(self.args)
+        candidates = self.args.candidates
         if not candidates:
             return Moments.of(observations)
         pooled = PooledMoments(self.inputs, self.actions, candidates)
@@ -252,19 +244,15 @@ class Student:
     def file(self, timesteps: int, minutes: float) -> PolicyFile:
         """The policy as it is now."""
         args = self.args
-        metadata = Metadata(
-            algorithm="imitation",
-            env_id=args.env_id,
-            env_options=env_options(args),
-            observation=args.observation,
+        metadata = metadata_of(
+            args,
+            "imitation",
             inputs=self.inputs,
-            hidden=(args.hidden, args.hidden),
             actions=(self.actions,),
-            candidates=numbers_of_candidates(args),
+            candidates=args.candidates,
             timesteps=timesteps,
             epochs=self.epochs,
             minutes=minutes,
-            options=to_plain(asdict(args)),
             provenance=provenance(),
         )
         network = {f"policy.{n}": p.numpy() for n, p in self.network.state_dict().items()}
@@ -312,11 +300,8 @@ def load_run(args: Args) -> tuple[PolicyFile | None, int]:
         return None, 0
     if not path.exists():
         return None, 0  # interrupted in the first round
-    file = read_policy(path)
-    if file.metadata.algorithm != "imitation":
-        raise InputError(f"{path} is of {file.metadata.algorithm}, not of imitation")
-    names = ("env_id", "observation", "hidden", "teacher", "episodes", "epochs", "seed")
-    check_kept(path, file.metadata.options, args, names)
+    names = {"env_id", "observation", "hidden", "teacher", "episodes", "epochs", "seed"}
+    file = read_run(args, "imitation", names)
     return file, file.metadata.epochs // args.epochs
 
 
@@ -354,8 +339,7 @@ def train(args: Args) -> int:
         write_policy(args.out / LATEST, file)  # last: a round without it is done again
         print(
             f"round {number}: {steps} steps, loss {said['loss']:.3f}, the teacher's action has "
-            f"probability {said['probability']:.2f}; validation return {point['return']:.2f}, "
-            f"mapped {point['mapped_area_m2']:.1f} m2, ended early {point['terminated']:.0%}",
+            f"probability {said['probability']:.2f}; {curve.in_words(point)}",
             flush=True,
         )
     return 0

@@ -19,6 +19,7 @@ from ms_slam_env.report.results import RESULTS, Results, read_results, write_res
 from ms_slam_env.report.tables import Table, make_table
 
 BEST = "best.safetensors"
+LATEST = "latest.safetensors"
 BASELINE = "random walk"
 POLICY = "policy"
 
@@ -72,6 +73,19 @@ class Curve:
         point = self.add(known.timesteps, known.minutes, scores)
         self.write(out)
         return point
+
+    def in_words(self, point: Mapping[str, Any]) -> str:
+        """A point in one line."""
+        gain = ""
+        if "return_gain" in point:
+            gain = (
+                f", {point['return_gain']:+.2f} ± {point['return_gain_sem']:.2f} over random "
+                f"walk's {self.references[BASELINE]['return']:.2f}"
+            )
+        return (
+            f"validation return {point['return']:.2f}{gain}; mapped "
+            f"{point['mapped_area_m2']:.1f} m2, ended early {point['terminated']:.0%}"
+        )
 
     def write(self, out: Path) -> Results:
         """Write ``results.json``, ``table.md`` and the figure into folder ``out``."""

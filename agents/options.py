@@ -1,4 +1,4 @@
-"""Options of the training script."""
+"""Options of the training scripts."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from ms_slam_env.command_line import parse
 from ms_slam_env.config import Checked, bounded, from_dict, load_yaml
@@ -75,50 +75,82 @@ class Problem(Checked):
         if self.observation not in OBSERVATIONS.names():  # a policy file names no module
             raise unknown("observation", self.observation, OBSERVATIONS.names())
 
+    @property
+    def candidates(self) -> int:
+        """Numbers of each action that our own networks look at one by one; 0 without any."""
+        return len(NAMES) if self.observation == "candidates" else 0
+
 
 @dataclass(frozen=True)
-class Args(Problem):
-    """Train a camera-motion policy with PPO; these options are the command line.
+class Training(Problem):
+    """How long a policy learns from the steps that it makes, and what from.
 
     Attributes:
-        resume: go on from ``out/latest.safetensors``; options that are not given are those of the
-            run so far.
         init: policy file to begin with, as of ``ms-slam train imitation``; its network and
             normalisation, not its steps.
-        algorithm: PPO over the actions that are not blocked, or over all of them.
         total_timesteps: environment steps, all runs of a resumed training together.
         minutes: stop this run after training for so much wall-clock time; evaluations and the
             episodes of the references come on top. None: by steps alone.
         eval_every: environment steps between evaluations; 0: only first and last.
         references: play the validation episodes with random walk, standing still and the greedy
             planner too, before training.
-        n_steps: steps of each environment between updates; fewer where ``total_timesteps`` leaves
-            fewer.
-        batch_size: of the gradient steps.
-        n_epochs: passes over the data of one update.
         learning_rate: of Adam.
         gamma: discount factor.
-        gae_lambda: trade-off between bias and variance of the advantages.
-        ent_coef: weight of the entropy bonus.
-        clip_range: of PPO's objective.
         hidden: width of the two hidden layers.
     """
 
-    out: Path = Path("runs/sb3")
     init: Path | None = None
-    algorithm: Literal["maskable_ppo", "ppo"] = "maskable_ppo"
     total_timesteps: int = bounded(200_000, 2, 1_000_000_000)
     minutes: float | None = bounded(None, 0, 1_000_000)
-    eval_every: int = bounded(10_000, 0, 1_000_000_000)
-    references: bool = True
-    n_steps: int = bounded(512, 2, 1_000_000)  # advantages of one sample have no spread
-    batch_size: int = bounded(128, 2, 1_000_000)
-    n_epochs: int = bounded(8, 1, 1000)
-    learning_rate: float = bounded(3e-4, 0, 1)
+    eval_every: int = bounded(20_000, 0, 1_000_000_000)
+    references: bool = False
+    learning_rate: float = bounded(2.5e-4, 0, 1)
     gamma: float = bounded(0.98, 0, 1)
+    hidden: int = bounded(256, 1, 4096)
+
+    kept: ClassVar[tuple[str, ...]] = ()
+    """Options beside ``KEPT`` that a run keeps when it is resumed."""
+
+
+@dataclass(frozen=True)
+class PpoTraining(Training):
+    """How proximal policy optimisation learns.
+
+    Attributes:
+        n_steps: steps of each environment between updates; of ``ms-slam train sb3`` fewer where
+            ``total_timesteps`` leaves fewer.
+        batch_size: of the gradient steps, in steps.
+        n_epochs: passes over the data of one update.
+        gae_lambda: trade-off between bias and variance of the advantages.
+        ent_coef: weight of the entropy bonus.
+        clip_range: of PPO's objective.
+    """
+
+    n_steps: int = bounded(512, 2, 1_000_000)  # advantages of one sample have no spread
+    batch_size: int = bounded(256, 2, 1_000_000)
+    n_epochs: int = bounded(6, 1, 1000)
     gae_lambda: float = bounded(0.95, 0, 1)
     ent_coef: float = bounded(0.003, 0, 1)
     clip_range: float = bounded(0.2, 0, 1)
+
+
+@dataclass(frozen=True)
+class Args(PpoTraining):
+    """Train a camera-motion policy with PPO; these options are the command line.
+
+    Attributes:
+        resume: go on from ``out/latest.safetensors``; options that are not given are those of the
+            run so far.
+        algorithm: PPO over the actions that are not blocked, or over all of them.
+    """
+
+    out: Path = Path("runs/sb3")
+    algorithm: Literal["maskable_ppo", "ppo"] = "maskable_ppo"
+    eval_every: int = bounded(10_000, 0, 1_000_000_000)
+    references: bool = True
+    batch_size: int = bounded(128, 2, 1_000_000)
+    n_epochs: int = bounded(8, 1, 1000)
+    learning_rate: float = bounded(3e-4, 0, 1)
     hidden: int = bounded(128, 1, 4096)
 
 
@@ -164,12 +196,7 @@ def of_task(cls: type[P], task: str, trainer: str) -> P:
         raise InputError(f"{path}: {error}") from None
 
 
-def numbers_of_candidates(args: Problem) -> int:
-    """Numbers of each action that our own networks look at one by one; 0 where there are none."""
-    return len(NAMES) if args.observation == "candidates" else 0
-
-
-SECTIONS = ("problem", "sb3", "imitation", "ppo")
+SECTIONS = ("problem", "sb3", "imitation", "ppo", "qrdqn")
 """Of a file of hyperparameters: the problem, and the options of each trainer."""
 
 KEPT = ("algorithm", "env_id", "embodiment", "observation", "step_m", "step_deg", "hidden")

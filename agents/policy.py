@@ -55,6 +55,11 @@ class Policy:
         layers = range(0, 2 * len(file.metadata.hidden), 2)
         names = [*(f"mlp_extractor.policy_net.{i}" for i in layers), "action_net"]
         self._layers = [_layer(network, name) for name in names]
+        if file.metadata.quantiles:  # their mean is linear in them
+            weight, bias = self._layers.pop()
+            columns = weight.reshape(len(weight), -1, file.metadata.quantiles)
+            rows = bias.reshape(-1, file.metadata.quantiles)
+            self._layers.append((columns.mean(axis=2), rows.mean(axis=1)))
         has_candidates = file.metadata.candidates > 0
         self._encoder = [_layer(network, f"encoder.{i}") for i in (0, 2) if has_candidates]
         self._score = [_layer(network, "score") for _ in range(has_candidates)]
@@ -121,7 +126,8 @@ class Policy:
     ) -> Float64:
         """Probabilities (B, n) of the actions, 0 where ``masks`` (B, n) is false.
 
-        Of an action of several numbers, those of each number side by side; each sums to 1.
+        Of an action of several numbers, those of each number side by side; each sums to 1. Of a
+        network of quantiles, 1 for the action whose return is expected to be the largest.
 
         Args:
             observations: (B, k) as the environment returns them, not normalised.
@@ -142,6 +148,8 @@ class Policy:
             beside = np.broadcast_to(x[:, None], (*encoded.shape[:2], x.shape[1]))
             x = np.tanh(np.concatenate([encoded, beside], axis=2) @ score_weight + score_bias)
         logits = np.where(masks, (x @ weight + bias).reshape(masks.shape), -np.inf)
+        if self.metadata.quantiles:
+            return np.eye(self.num_actions)[logits.argmax(axis=1)]
         return np.concatenate([_softmax(part) for part in split(logits, self.parts)], axis=1)
 
     def _check(self, observations: NDArray[Any], masks: NDArray[np.bool_]) -> None:

@@ -2,7 +2,8 @@
 
 Tensors: ``policy.*``, the network under Stable-Baselines3's names; ``observation.*`` and
 ``return.*``, the running moments that normalised training; in a file to resume from also
-``optimizer.*``, the moments of Adam. The text is :class:`Metadata`. Whatever is loaded is checked
+``optimizer.*``, the moments of Adam, and ``target.*``, the network that says what quantiles are
+fitted to. The text is :class:`Metadata`. Whatever is loaded is checked
 first, since policies come from strangers.
 """
 
@@ -12,7 +13,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +29,12 @@ from ms_slam_env.report.records import build, to_plain
 Tensors = dict[str, NDArray[Any]]
 Shapes = dict[str, tuple[int, ...]]
 
-ALGORITHMS = ("maskable_ppo", "ppo", "imitation", "masked_ppo")
+ALGORITHMS = ("maskable_ppo", "ppo", "imitation", "masked_ppo", "rllib_ppo", "qr_dqn")
 VERSION = 1
 STEP = "optimizer.step"
 MOMENTS = ("exp_avg", "exp_avg_sq")  # of Adam, each of its parameter's shape
 
+_OF_TRAINING = ("optimizer.", "target.")
 _TEXT = "ms_slam_policy"
 _LARGEST_FILE = 2**30  # bytes
 _LARGEST_LAYER = 100_000
@@ -57,6 +59,8 @@ class Metadata:
         memory: width of the recurrent unit before the layers; 0 without one.
         candidates: numbers of each action at the end of an observation, which one encoder sees,
             the same for all, and one score is given for; 0: the layers see it all as it is.
+        quantiles: of the return, that the network says of each action; 0: it says how probable
+            each is, and beside it a value.
         timesteps: environment steps trained.
         epochs: passes over its experience that the network learnt from; 0: it is untrained.
         minutes: wall-clock time trained, evaluations left out.
@@ -76,6 +80,7 @@ class Metadata:
     minutes: float
     memory: int = 0
     candidates: int = 0
+    quantiles: int = 0
     env_options: dict[str, Any] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
@@ -109,13 +114,15 @@ class Metadata:
             many = 0 < len(sizes) <= _MOST_LAYERS
             if not many or not all(0 < size <= _LARGEST_LAYER for size in sizes):
                 raise InputError(f"{name} = {str(sizes)[:80]} are no sizes of layers")
-        for name in ("memory", "candidates"):
+        for name in ("memory", "candidates", "quantiles"):
             if not 0 <= getattr(self, name) <= _LARGEST_LAYER:
                 raise InputError(f"{name} = {getattr(self, name)} is no width")
         if self.candidates and (len(self.actions) > 1 or self.num_state < 0):
             raise InputError(
                 f"{self.inputs} numbers do not hold {self.candidates} for each of {self.actions}"
             )
+        if self.quantiles and (self.memory or len(self.actions) > 1):
+            raise InputError("quantiles go with one number an action, and with no memory")
         counts = (self.timesteps, self.epochs, self.minutes)
         if not all(0 <= count < math.inf for count in counts):
             raise InputError(f"timesteps, epochs, minutes = {counts} are no counts")
@@ -158,9 +165,14 @@ class PolicyFile:
         start = f"{name}."
         return {k.removeprefix(start): v for k, v in self.tensors.items() if k.startswith(start)}
 
+    def untrained(self) -> PolicyFile:
+        """The same policy, to begin another training with."""
+        metadata = replace(self.metadata, timesteps=0, epochs=0)
+        return replace(self.without_optimizer(), metadata=metadata)
+
     def without_optimizer(self) -> PolicyFile:
         """The same policy, to run alone: a third of the size."""
-        kept = {k: v for k, v in self.tensors.items() if not k.startswith("optimizer.")}
+        kept = {k: v for k, v in self.tensors.items() if not k.startswith(_OF_TRAINING)}
         return PolicyFile(self.metadata, kept)
 
 
@@ -169,26 +181,24 @@ def network_shapes(metadata: Metadata) -> Shapes:
     width, encoded = metadata.memory, metadata.encoded
     seen = metadata.inputs
     shapes: Shapes = {}
-    heads = {"action_net": (sum(metadata.actions), metadata.hidden[-1])}
+    head = (sum(metadata.actions), metadata.hidden[-1])
     if metadata.candidates:
         seen = metadata.num_state + 2 * encoded  # their mean and their largest
         shapes |= _linear("encoder.0", encoded, metadata.candidates)
         shapes |= _linear("encoder.2", encoded, encoded)
         shapes |= _linear("score", encoded, encoded + metadata.hidden[-1])
-        heads = {"action_net": (1, encoded)}
+        head = (1, encoded)
     if width:  # three gates one above the other, as PyTorch has them
         shapes |= {"memory.weight_ih": (3 * width, seen)}
         shapes |= {"memory.weight_hh": (3 * width, width)}
         shapes |= {"memory.bias_ih": (3 * width,), "memory.bias_hh": (3 * width,)}
     sizes = (seen + width, *metadata.hidden)
     layers = list(zip(sizes[1:], sizes[:-1], strict=True))
-    heads["value_net"] = 1, sizes[-1]
-    for net in ("policy_net", "value_net"):
+    for net in ("policy_net", "value_net")[: 1 if metadata.quantiles else 2]:
         for i, shape in enumerate(layers):
             shapes |= _linear(f"mlp_extractor.{net}.{2 * i}", *shape)  # tanh at the odd places
-    for head, shape in heads.items():
-        shapes |= _linear(head, *shape)
-    return shapes
+    shapes |= _linear("action_net", head[0] * (metadata.quantiles or 1), head[1])
+    return shapes if metadata.quantiles else shapes | _linear("value_net", 1, sizes[-1])
 
 
 def _linear(name: str, outputs: int, inputs: int) -> Shapes:
@@ -205,6 +215,8 @@ def tensor_shapes(metadata: Metadata, with_optimizer: bool) -> Shapes:
         shapes[STEP] = ()
         for moment in MOMENTS:
             shapes |= {f"optimizer.{name}.{moment}": shape for name, shape in network.items()}
+        if metadata.quantiles:
+            shapes |= {f"target.{name}": shape for name, shape in network.items()}
     return shapes
 
 

@@ -6,43 +6,15 @@ from typing import Any
 
 import numpy as np
 import torch
+from ms_slam_agents.normalization import moment_tensors, restore_moments
 from ms_slam_agents.policy_file import MOMENTS, STEP, PolicyFile, Tensors
-from numpy.typing import NDArray
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import PPO
-from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 
 Model = PPO | MaskablePPO
 
 ALGORITHMS: dict[str, type[PPO] | type[MaskablePPO]] = {"maskable_ppo": MaskablePPO, "ppo": PPO}
-
-
-class PooledMoments(RunningMeanStd):
-    """Running moments that are the same for all candidates, whose order means nothing.
-
-    Args:
-        inputs: numbers of an observation.
-        actions: candidates at its end.
-        candidates: numbers of each.
-    """
-
-    def __init__(self, inputs: int, actions: int, candidates: int) -> None:
-        super().__init__(shape=(inputs,))
-        self._tail = slice(inputs - actions * candidates, None)
-        self._rows = actions, candidates
-
-    def update(self, arr: NDArray[Any]) -> None:
-        """Learn from observations (B, inputs)."""
-        self.update_from_moments(*self.pooled(arr), len(arr))
-
-    def pooled(self, observations: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Means and variances (inputs,) of observations (B, inputs)."""
-        mean, var = observations.mean(axis=0), observations.var(axis=0)
-        rows = observations[:, self._tail].reshape(-1, self._rows[1])
-        mean[self._tail] = np.tile(rows.mean(axis=0), self._rows[0])
-        var[self._tail] = np.tile(rows.var(axis=0), self._rows[0])
-        return mean, var
 
 
 def tensors_of(model: Model) -> Tensors:
@@ -53,20 +25,6 @@ def tensors_of(model: Model) -> Tensors:
         **optimizer_tensors(list(model.policy.state_dict()), model.policy.optimizer.state_dict()),
         **moment_tensors(normalize),
     }
-
-
-def moment_tensors(normalize: VecNormalize) -> Tensors:
-    """Running moments of observations and returns."""
-    return {
-        **_moments("observation", normalize.obs_rms),
-        **_moments("return", normalize.ret_rms),
-    }
-
-
-def restore_moments(normalize: VecNormalize, file: PolicyFile) -> None:
-    """Put the running moments where they stood when the file was written."""
-    _restore_moments(normalize.obs_rms, file.part("observation"))
-    _restore_moments(normalize.ret_rms, file.part("return"))
 
 
 def optimizer_tensors(parameters: list[str], state: dict[str, Any]) -> Tensors:
@@ -108,16 +66,6 @@ def _normalize(model: Model) -> VecNormalize:
     normalize = model.get_vec_normalize_env()
     assert normalize is not None
     return normalize
-
-
-def _moments(name: str, running: Any) -> Tensors:
-    parts = {"mean": running.mean, "var": running.var, "count": running.count}
-    return {f"{name}.{part}": np.asarray(v, dtype=np.float64) for part, v in parts.items()}
-
-
-def _restore_moments(running: Any, saved: Tensors) -> None:
-    running.mean, running.var = saved["mean"].copy(), saved["var"].copy()
-    running.count = float(saved["count"])
 
 
 def update_on_partial_rollout(model: Model, batch_size: int) -> bool:

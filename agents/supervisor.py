@@ -4,23 +4,19 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import asdict, replace
-from typing import Any
 
 import numpy as np
-from ms_slam_agents.learning_curve import BASELINE, Curve
+from ms_slam_agents.learning_curve import LATEST, Curve
 from ms_slam_agents.options import Args
 from ms_slam_agents.policy import action_parts
-from ms_slam_agents.policy_file import Metadata, PolicyFile, write_policy
+from ms_slam_agents.policy_file import PolicyFile, write_policy
 from ms_slam_agents.sb3_state import Model, tensors_of, update_on_partial_rollout
+from ms_slam_agents.training_run import metadata_of
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 from tqdm import tqdm
 
 from ms_slam_env.report.provenance import provenance
-from ms_slam_env.report.records import to_plain
-
-LATEST = "latest.safetensors"
 
 
 class Supervisor(BaseCallback):
@@ -28,7 +24,6 @@ class Supervisor(BaseCallback):
 
     Args:
         args: of the training script.
-        env_options: those of the environment that the policy depends on.
         validation: environments of ``FixedEpisodes``.
         curve: so far.
         minutes_before: trained by the runs that this one goes on from.
@@ -39,14 +34,12 @@ class Supervisor(BaseCallback):
     def __init__(
         self,
         args: Args,
-        env_options: dict[str, Any],
         validation: VecEnv,
         curve: Curve,
         minutes_before: float = 0.0,
     ) -> None:
         super().__init__()
         self.args = args
-        self.env_options = env_options
         self.validation = validation
         self.curve = curve
         self.stop_reason = ""
@@ -140,18 +133,14 @@ class Supervisor(BaseCallback):
         """The policy as it is now, with the state of the optimiser."""
         space = self.training_env.observation_space
         assert space.shape is not None
-        metadata = Metadata(
-            algorithm=self.args.algorithm,
-            env_id=self.args.env_id,
-            env_options=self.env_options,
-            observation=self.args.observation,
+        metadata = metadata_of(
+            self.args,
+            self.args.algorithm,
             inputs=space.shape[0],
-            hidden=(self.args.hidden, self.args.hidden),
             actions=action_parts(self.training_env.action_space),
             timesteps=self.num_timesteps,
             epochs=self.model._n_updates,
             minutes=self._minutes_before + self.minutes,
-            options=to_plain(asdict(self.args)),
             provenance=self._provenance,
         )
         return PolicyFile(metadata, tensors_of(self.model))
@@ -165,21 +154,10 @@ class Supervisor(BaseCallback):
         started = time.monotonic()
         file = self.policy_file().without_optimizer()
         minutes = file.metadata.minutes
-        self.curve = replace(self.curve, config=file.metadata.options)
         point = self.curve.judge(file, self.validation, self.args.out, self.args.deterministic_eval)
         for name in point.keys() - {"returns", "timesteps", "training_min"}:
             self.logger.record(f"validation/{name}", point[name])
         self._evaluation_s += time.monotonic() - started
-        self._bar.write(f"{self.num_timesteps} steps, {minutes:.1f} min: {self._in_words(point)}")
-
-    def _in_words(self, point: dict[str, Any]) -> str:
-        gain = ""
-        if "return_gain" in point:
-            gain = (
-                f", {point['return_gain']:+.2f} ± {point['return_gain_sem']:.2f} over random "
-                f"walk's {self.curve.references[BASELINE]['return']:.2f}"
-            )
-        return (
-            f"validation return {point['return']:.2f}{gain}; mapped "
-            f"{point['mapped_area_m2']:.1f} m2, ended early {point['terminated']:.0%}"
+        self._bar.write(
+            f"{self.num_timesteps} steps, {minutes:.1f} min: {self.curve.in_words(point)}"
         )

@@ -61,6 +61,7 @@ class LearnableFake(gym.Env):
             "mapped_area": self.score,
             "ate": 0.0,
             "reward_terms": {"right": reward},
+            "action_mask": self.action_masks(),
         }
 
 

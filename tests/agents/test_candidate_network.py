@@ -8,10 +8,11 @@ from learnable_fake import LearnableFake, read_curve
 
 pytest.importorskip("sb3_contrib")
 
-from ms_slam_agents import imitation, options, ppo
+from ms_slam_agents import options, ppo
+from ms_slam_agents.network import Network
+from ms_slam_agents.normalization import PooledMoments
 from ms_slam_agents.policy import Policy
 from ms_slam_agents.policy_file import Metadata, PolicyFile, read_policy, write_policy
-from ms_slam_agents.sb3_state import PooledMoments
 
 from ms_slam_env.errors import InputError
 
@@ -34,26 +35,19 @@ class Candidates(LearnableFake):
         state = self.np_random.uniform(size=STATE)
         return np.concatenate([state, numbers.ravel()]).astype(np.float32)
 
-    def _info(self, reward):
-        return super()._info(reward) | {"action_mask": self.action_masks()}
-
 
 gym.register(ENV_ID, Candidates)
 
 
 @pytest.fixture(autouse=True)
 def numbers_of_the_fake(monkeypatch):
-    for module in (options, ppo, imitation):
-        monkeypatch.setattr(
-            module,
-            "numbers_of_candidates",
-            lambda args: NUMBERS if args.observation == "candidates" else 0,
-        )
+    own = property(lambda args: NUMBERS if args.observation == "candidates" else 0)
+    monkeypatch.setattr(options.Problem, "candidates", own)
 
 
 def make_network(memory=0):
     torch.manual_seed(0)
-    network = ppo.Network(INPUTS, 16, ACTIONS, memory, NUMBERS)
+    network = Network(INPUTS, 16, ACTIONS, memory, NUMBERS)
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, 0, 0.5)
     return network

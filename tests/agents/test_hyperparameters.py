@@ -4,12 +4,17 @@ import math
 
 import gymnasium as gym
 import pytest
-from ms_slam_agents import imitation, options, ppo, train_sb3
+from ms_slam_agents import environments, imitation, options, ppo, qrdqn, train_sb3
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.tasks import OWN, env_id_of
 
-TRAINERS = {"ppo": ppo.Args, "imitation": imitation.Args, "sb3": train_sb3.Args}
+TRAINERS = {
+    "ppo": ppo.Args,
+    "imitation": imitation.Args,
+    "sb3": train_sb3.Args,
+    "qrdqn": qrdqn.Args,
+}
 NAMES = sorted(path.stem for path in options.TASKS.glob("*.yaml"))
 
 
@@ -32,12 +37,12 @@ def test_every_file_is_read_by_every_trainer_and_is_about_its_task(task, trainer
     if task in OWN:
         assert args.episode_steps == own.steps
     else:
-        assert train_sb3.problem_options(args, "train")["arm"] == {"frames_per_action": 1}
+        assert environments.problem_options(args, "train")["arm"] == {"frames_per_action": 1}
 
 
 @pytest.mark.parametrize("task", NAMES)
 def test_the_environment_of_every_file_can_be_made(task):
-    train_sb3.check_problem(parsed(["--task", task]))
+    environments.check_problem(parsed(["--task", task]))
 
 
 def test_the_command_line_counts_more():
@@ -84,12 +89,12 @@ def test_an_unknown_task_lists_those_that_there_are():
 
 
 def test_frames_a_motion_are_the_arms_or_the_free_cameras():
-    free = train_sb3.problem_options(ppo.Args(frames_per_action=2), "train")
+    free = environments.problem_options(ppo.Args(frames_per_action=2), "train")
     assert free["frames_per_action"] == 2
     arm = ppo.Args(env_id="MSActiveSLAM-v0", frames_per_action=2)
-    assert train_sb3.problem_options(arm, "train")["arm"] == {"frames_per_action": 2}
+    assert environments.problem_options(arm, "train")["arm"] == {"frames_per_action": 2}
     held = ppo.Args(embodiment="arm-kinematic", frames_per_action=3)
-    env = gym.make(held.env_id, **train_sb3.problem_options(held, "train"))
+    env = gym.make(held.env_id, **environments.problem_options(held, "train"))
     assert env.unwrapped.config.arm.frames_per_action == 3
     assert math.isclose(env.unwrapped.config.step_m, 0.12)
 

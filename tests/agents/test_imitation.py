@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("sb3_contrib")
 
-from learnable_fake import ENV_ID, NUM_ACTIONS, LearnableFake, read_curve
+from learnable_fake import ENV_ID, NUM_ACTIONS, read_curve
 from ms_slam_agents import imitation, train_sb3
 from ms_slam_agents.demonstrations import Demonstration, Task, play
 from ms_slam_agents.policy import Policy
@@ -31,14 +31,8 @@ class Knowing(Planner):
 
 
 @pytest.fixture(autouse=True)
-def masks_in_info(monkeypatch):
-    """As our environments have it; and all episodes in this process, which knows the fake."""
-    plain = LearnableFake._info
-    monkeypatch.setattr(
-        LearnableFake,
-        "_info",
-        lambda self, reward: plain(self, reward) | {"action_mask": self.action_masks()},
-    )
+def in_this_process(monkeypatch):
+    """All episodes are played where the fake is known."""
     monkeypatch.setattr(imitation, "open_pool", InThisProcess)
 
 

@@ -9,8 +9,10 @@ from learnable_fake import ENV_ID, LearnableFake, arguments, read_curve
 pytest.importorskip("sb3_contrib")
 
 from ms_slam_agents import ppo, train_sb3
+from ms_slam_agents.network import Network
 from ms_slam_agents.policy import Policy
 from ms_slam_agents.policy_file import Metadata, PolicyFile, read_policy
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 RECALL_ID = "LearnableRecall-v0"
 
@@ -79,6 +81,26 @@ def test_advantages_are_those_of_a_loop_over_their_definition():
             assert rollout.advantages[t, b] == pytest.approx(total)
 
 
+def test_what_a_time_limit_cuts_off_is_the_value_of_the_last_observation(monkeypatch):
+    observations, after = [], LearnableFake._next
+    monkeypatch.setattr(
+        LearnableFake, "_next", lambda self: observations.append(after(self)) or observations[-1]
+    )
+    make = lambda: gym.make(ENV_ID, max_episode_steps=1)  # noqa: E731
+    venv = VecNormalize(DummyVecEnv([make]), training=False, gamma=0.5)
+    venv.obs_rms.mean[:], venv.obs_rms.var[:] = 2.0, 25.0
+    network = Network(7, 16, 7)
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, 0, 1.0)
+    player = ppo.Player(venv, network, ppo.Args(gamma=0.5), None, seed=0)
+    rollout = player.play(1, lambda: False)
+    _, last, _ = observations
+    scaled = torch.as_tensor((last - 2) / 5)[None]
+    value = network(scaled, torch.zeros(1, 0), torch.ones(1, 7, dtype=torch.bool))[1]
+    expected = venv.get_original_reward() + 0.5 * value.item()
+    assert rollout.rewards.item() == pytest.approx(expected.item(), rel=1e-4)
+
+
 def test_chunks_hold_consecutive_steps_of_one_environment():
     steps = torch.arange(7)[:, None] + 100 * torch.arange(2)[None]
     rollout = ppo.Rollout(*[steps] * 9, advantages=steps)
@@ -98,7 +120,7 @@ def policy_of(network, memory):
 @pytest.mark.parametrize("memory", [0, 8])
 def test_the_policy_in_numpy_is_the_network(memory):
     torch.manual_seed(0)
-    network = ppo.Network(5, 16, 7, memory)
+    network = Network(5, 16, 7, memory)
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, 0, 0.5)
     policy = policy_of(network, memory)
@@ -116,7 +138,7 @@ def test_the_policy_in_numpy_is_the_network(memory):
 
 def test_act_remembers_until_it_is_reset():
     torch.manual_seed(0)
-    network = ppo.Network(5, 16, 7, 8)
+    network = Network(5, 16, 7, 8)
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, 0, 1.0)
     policy = policy_of(network, 8)

@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("sb3_contrib")
 
-from ms_slam_agents import imitation, ppo, train_sb3
+from ms_slam_agents import environments, imitation, ppo, train_sb3
 from ms_slam_agents.policy import Policy
 from ms_slam_agents.policy_planner import TrainedPolicy
 
@@ -71,7 +71,7 @@ def test_bad_options_of_the_environment_give_one_line(tmp_path, capsys, option, 
 def test_a_policy_with_the_defaults_fits_the_environment_with_the_defaults():
     """The observation of training is the one that an environment has if nobody says another."""
     args = train_sb3.Args(scenes=("table",), scene_seeds=1)
-    trained_in = train_sb3.make_env(args, "validation", ())
+    trained_in = environments.make_env(args, "validation", ())
     for env_id in (args.env_id, "MSActiveSLAM-v0"):  # of the README
         env = gym.make(env_id, scene="table", scene_seed=1000)
         assert env.observation_space == trained_in.observation_space

@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("sb3_contrib")
 
 from learnable_fake import ENV_ID, LearnableFake, arguments, read_curve
-from ms_slam_agents import evaluation, learning_curve, supervisor, train_sb3
+from ms_slam_agents import environments, evaluation, learning_curve, supervisor, train_sb3
 from ms_slam_agents.policy_file import read_policy
 from ms_slam_agents.sb3_state import whole_batches
 from scipy.stats import sem
@@ -79,7 +79,9 @@ def played(num_envs, choose, seeds=(5, 6, 7, 8, 9)):
     """Returns of episodes dealt out to so many environments."""
     args = train_sb3.Args(env_id=ENV_ID, episode_steps=10, num_envs=1)
     shares = [list(seeds)[rank::num_envs] for rank in range(num_envs)]
-    makers = [lambda share=share: train_sb3.make_env(args, "validation", share) for share in shares]
+    makers = [
+        lambda share=share: environments.make_env(args, "validation", share) for share in shares
+    ]
     return evaluation.evaluate(DummyVecEnv(makers), len(seeds), choose)["returns"]
 
 

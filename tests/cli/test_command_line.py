@@ -59,7 +59,7 @@ def one_line(text: str) -> str:
         (["benchmark", "--workers", "0", "--planners", "random"], "workers = 0"),
         (["evaluate"], "Missing"),
         (["evaluate", "missing.txt", "missing.txt"], "cannot read trajectory missing.txt"),
-        (["train", "nonsense"], "unknown trainer 'nonsense'; valid choices: imitation, ppo, sb3"),
+        (["train", "nonsense"], "unknown trainer 'nonsense'; valid choices: imitation, ppo"),
     ],
 )
 def test_bad_input_is_one_line_and_code_2(

@@ -1,0 +1,88 @@
+"""The environments that policies are trained and judged in."""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gymnasium as gym
+import torch
+from ms_slam_agents.evaluation import FixedEpisodes
+from ms_slam_agents.options import Problem
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+
+import ms_slam_env  # registers the ids, in a worker process too
+from ms_slam_env.errors import InputError, unknown
+
+VALIDATION_SEED = 1_000_000  # of the first validation episode; training draws from small seeds
+
+
+def make_env(args: Problem, split: str, seeds: Sequence[int]) -> gym.Env[Any, Any]:
+    """Build one environment; with ``seeds`` it plays those episodes only."""
+    if multiprocessing.parent_process() is not None:  # in a worker Ctrl-C is the main's to answer
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        torch.set_num_threads(1)
+    env = gym.make(args.env_id, disable_env_checker=True, **problem_options(args, split))
+    return FixedEpisodes(env, seeds) if seeds else env
+
+
+def problem_options(args: Problem, split: str) -> dict[str, Any]:
+    """Options of ``gym.make`` for the episodes of a split."""
+    few: dict[str, Any] = {"frames_per_action": args.frames_per_action}
+    holder = args.embodiment or gym.spec(args.env_id).kwargs.get("embodiment", "")
+    if args.frames_per_action is None:
+        few = {}
+    elif str(holder).startswith("arm"):
+        few = {"arm": few}
+    if args.image_size is not None:
+        few["image_size"] = args.image_size
+    return {
+        "max_episode_steps": args.episode_steps,
+        "scene": args.scenes,
+        "split": split,
+        "num_scene_seeds": args.scene_seeds,
+        "observation": args.observation,
+        "frame_divergences": False,  # nobody reads them here
+        **few,
+        **env_options(args),
+    }
+
+
+def check_problem(args: Problem) -> None:
+    """Refuse what no environment can be made of.
+
+    Raises:
+        InputError: an unknown environment, or options that it refuses.
+    """
+    try:
+        for split in ("train", "validation"):
+            make_env(args, split, ()).close()
+    except gym.error.UnregisteredEnv:
+        raise unknown("environment", args.env_id, ms_slam_env.ENV_IDS) from None
+    except gym.error.Error as error:
+        raise InputError(f"environment {args.env_id!r} cannot be made: {error}") from None
+
+
+def env_options(args: Problem) -> dict[str, Any]:
+    """Options of the environment that a policy depends on, where not the environment's own."""
+    step_rad = None if args.step_deg is None else math.radians(args.step_deg)
+    options = {"embodiment": args.embodiment, "step_m": args.step_m, "step_rad": step_rad}
+    return {name: value for name, value in options.items() if value is not None}
+
+
+def make_venv(args: Problem, split: str, seeds: Sequence[int] = ()) -> VecEnv:
+    """Build the parallel environments; the episodes ``seeds`` are dealt out to them in turn."""
+    num_envs = min(args.num_envs, len(seeds)) if seeds else args.num_envs
+
+    def maker(rank: int) -> Callable[[], gym.Env[Any, Any]]:
+        return lambda: make_env(args, split, seeds[rank::num_envs])
+
+    makers = [maker(rank) for rank in range(num_envs)]
+    if num_envs == 1:
+        return DummyVecEnv(makers)
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # inherited by the workers
+    return SubprocVecEnv(makers, start_method="spawn")

@@ -1,0 +1,104 @@
+"""The network of our own trainers: a policy and a value, or the quantiles of the returns."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from ms_slam_agents.policy_file import PolicyFile, Tensors, encoded_width
+from torch import Tensor, nn
+from torch.nn.functional import log_softmax
+
+BLOCKED = -1e9  # logit of a blocked action; -inf would make NaN of its entropy
+
+
+class Network(nn.Module):
+    """Two hidden layers for the policy and two for the value, behind a memory if there is one.
+
+    With ``candidates`` numbers of each action at the end of an observation, one encoder looks at
+    each action's, the layers see the state and the mean and the largest of what it makes of them,
+    and one score is given for each: in another order the actions have the same probabilities.
+    With ``quantiles`` there is no value: each action has so many quantiles of the return.
+
+    The names of the parameters are Stable-Baselines3's, ``memory.*``, ``encoder.*``, ``score.*``.
+    """
+
+    def __init__(
+        self,
+        inputs: int,
+        hidden: int,
+        actions: int,
+        memory: int = 0,
+        candidates: int = 0,
+        quantiles: int = 0,
+    ) -> None:
+        super().__init__()
+        self.width, self.actions = memory, actions
+        self.num_state = inputs - actions * candidates
+        encoded = encoded_width(hidden)
+        seen = self.num_state + 2 * encoded if candidates else inputs
+        heads = (1 if candidates else actions) * (quantiles or 1)
+        self.memory = nn.GRUCell(seen, memory) if memory else None
+        self.encoder = _layers(candidates, encoded, encoded) if candidates else None
+        names = ("policy_net",) if quantiles else ("policy_net", "value_net")
+        self.mlp_extractor = nn.ModuleDict(
+            {name: _layers(seen + memory, hidden, hidden) for name in names}
+        )
+        self.score = nn.Linear(encoded + hidden, encoded) if candidates else None
+        self.action_net = nn.Linear(encoded if candidates else hidden, heads)
+        self.value_net = None if quantiles else nn.Linear(hidden, 1)
+        for module in self.modules():
+            if isinstance(module, nn.Linear):
+                gain = {self.action_net: 0.01, self.value_net: 1.0}.get(module, math.sqrt(2))
+                nn.init.orthogonal_(module.weight, gain)
+                nn.init.zeros_(module.bias)
+
+    def remember(self, seen: Tensor, memory: Tensor, begins: Tensor) -> Tensor:
+        """The memory (B, M) after observations (B, k); empty where an episode ``begins`` (B,)."""
+        if self.memory is None:
+            return memory
+        return self.memory(self._look(seen)[0], memory * (1 - begins[:, None]))
+
+    def forward(self, seen: Tensor, memory: Tensor, masks: Tensor) -> tuple[Tensor, Tensor]:
+        """Log-probabilities (B, n) of the actions, and values (B,)."""
+        assert self.value_net is not None
+        seen, encoded = self._look(seen)
+        x = torch.cat([seen, memory], dim=1)
+        logits = self._score(x, encoded).reshape(masks.shape)
+        values = self.value_net(self.mlp_extractor["value_net"](x))
+        return log_softmax(logits.masked_fill(~masks, BLOCKED), dim=1), values.flatten()
+
+    def quantiles(self, seen: Tensor) -> Tensor:
+        """Quantiles (B, n, Q) of the return after each action."""
+        scores = self._score(*self._look(seen))
+        return scores.reshape(len(seen), self.actions, -1)
+
+    def _look(self, seen: Tensor) -> tuple[Tensor, Tensor | None]:
+        """What the layers see (B, k), and the candidates (B, n, E) as encoded, if there are any."""
+        if self.encoder is None:
+            return seen, None
+        encoded = self.encoder(seen[:, self.num_state :].unflatten(1, (self.actions, -1)))
+        parts = [seen[:, : self.num_state], encoded.mean(dim=1), encoded.amax(dim=1)]
+        return torch.cat(parts, dim=1), encoded
+
+    def _score(self, x: Tensor, encoded: Tensor | None) -> Tensor:
+        """What the last layer says, of all actions (B, n Q) or of each candidate (B, n, Q)."""
+        whole = self.mlp_extractor["policy_net"](x)
+        if self.score is not None and encoded is not None:
+            beside = whole[:, None].expand(-1, self.actions, -1)
+            whole = torch.tanh(self.score(torch.cat([encoded, beside], dim=2)))
+        return self.action_net(whole)
+
+    def tensors(self) -> Tensors:
+        """The parameters, as a policy file has them."""
+        return {f"policy.{n}": p.detach().numpy().copy() for n, p in self.named_parameters()}
+
+
+def load_parameters(network: nn.Module, file: PolicyFile, part: str = "policy") -> None:
+    """Put the parameters where they stood when the file was written."""
+    network.load_state_dict({name: torch.from_numpy(v) for name, v in file.part(part).items()})
+
+
+def _layers(inputs: int, first: int, second: int) -> nn.Sequential:
+    """Two layers, tanh after each."""
+    return nn.Sequential(nn.Linear(inputs, first), nn.Tanh(), nn.Linear(first, second), nn.Tanh())

@@ -1,0 +1,264 @@
+"""What training scripts have in common: to go on from a file, to learn until the steps are made, to
+save after each update and judge every so often, to stop by the clock or a signal."""
+
+from __future__ import annotations
+
+import signal
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict
+from typing import Any, ClassVar, TypeVar
+
+import torch
+from gymnasium import spaces
+from ms_slam_agents.environments import VALIDATION_SEED, check_problem, env_options, make_venv
+from ms_slam_agents.evaluation import references
+from ms_slam_agents.learning_curve import LATEST, Curve, read_curve
+from ms_slam_agents.options import (
+    KEPT,
+    Problem,
+    Training,
+    check_kept,
+    check_new,
+    check_steps_left,
+)
+from ms_slam_agents.policy_file import Metadata, PolicyFile, Tensors, read_policy, write_policy
+from stable_baselines3.common.vec_env import VecEnv
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+from ms_slam_env.errors import InputError
+from ms_slam_env.interrupts import kept
+from ms_slam_env.report.provenance import provenance
+from ms_slam_env.report.records import to_plain
+from ms_slam_env.report.results import RESULTS
+
+T = TypeVar("T", bound=Training)
+
+
+class TrainingRun(ABC):
+    """A training run: what it has learnt, and what of it is on disk.
+
+    Args:
+        args: of the training.
+        observations: the environments' space.
+        actions: the environments' space.
+        file: to go on from, if there is one.
+
+    Raises:
+        InputError: an action of several numbers.
+    """
+
+    algorithm: ClassVar[str]
+
+    def __init__(
+        self, args: Training, observations: spaces.Space, actions: spaces.Space, file: Any
+    ) -> None:
+        if not isinstance(actions, spaces.Discrete) or not observations.shape:
+            raise InputError(
+                f"{args.env_id} has actions of several numbers, or no vector as its observation: "
+                "ms-slam train sb3 takes the first, nothing the second"
+            )
+        self.options = args
+        self.inputs, self.actions = observations.shape[0], int(actions.n)
+        self.steps = file.metadata.timesteps if file else 0
+        self.epochs = file.metadata.epochs if file else 0
+        self.minutes = file.metadata.minutes if file else 0.0
+        self._provenance = provenance()
+
+    @abstractmethod
+    def advance(self, stop: Callable[[], bool]) -> dict[str, float] | None:
+        """Play and learn for a while, counting ``steps`` and ``epochs``.
+
+        Returns:
+            What there is to say of it; None where ``stop()`` said so before its end.
+        """
+
+    @abstractmethod
+    def tensors(self) -> Tensors:
+        """The policy as it is now, with the state of the optimiser."""
+
+    def metadata(self) -> Metadata:
+        """What the file says about the policy as it is now."""
+        return metadata_of(
+            self.options,
+            self.algorithm,
+            inputs=self.inputs,
+            actions=(self.actions,),
+            candidates=self.options.candidates,
+            timesteps=self.steps,
+            epochs=self.epochs,
+            minutes=self.minutes,
+            provenance=self._provenance,
+        )
+
+    def file(self) -> PolicyFile:
+        """The policy as it is now, with the state of the optimiser."""
+        return PolicyFile(self.metadata(), self.tensors())
+
+    def learn(self, curve: Curve, validation: VecEnv, signals: Sequence[str]) -> None:
+        """Advance until the steps are made, time is up or there are ``signals``."""
+        args, before = self.options, self.minutes
+        board = SummaryWriter(str(args.out / "tensorboard"))
+        bar = tqdm(total=args.total_timesteps, initial=self.steps, unit="step", smoothing=0.1)
+        with board, bar:
+            if not curve.points:
+                self._judge(curve, validation, board)
+            while self.steps < args.total_timesteps and not signals:
+                if args.minutes is not None and self.minutes - before >= args.minutes:
+                    break
+                steps, begun = self.steps, time.monotonic()
+                said = self.advance(lambda: bool(signals))
+                if said is None:
+                    break
+                self.minutes += (time.monotonic() - begun) / 60
+                bar.update(self.steps - steps)
+                bar.set_postfix({name: f"{value:.3g}" for name, value in said.items()})
+                for name, value in said.items():
+                    board.add_scalar(f"train/{name}", value, self.steps)
+                write_policy(args.out / LATEST, self.file())
+                if args.eval_every and self.steps // args.eval_every > steps // args.eval_every:
+                    self._judge(curve, validation, board)
+            if not signals and curve.points[-1]["timesteps"] < self.steps:
+                self._judge(curve, validation, board)
+
+    def _judge(self, curve: Curve, validation: VecEnv, board: SummaryWriter) -> None:
+        """Evaluate, and keep what is best so far."""
+        file = self.file().without_optimizer()
+        point = curve.judge(file, validation, self.options.out, self.options.deterministic_eval)
+        for name in point.keys() - {"returns", "timesteps", "training_min"}:
+            board.add_scalar(f"validation/{name}", point[name], self.steps)
+        tqdm.write(f"{self.steps} steps, {self.minutes:.1f} min: {curve.in_words(point)}")
+
+
+def train(
+    args: T, algorithm: str, make: Callable[[T, PolicyFile | None, ExitStack], TrainingRun]
+) -> int:
+    """Train as ``args`` say; return the exit status, 130 after an interrupt.
+
+    Args:
+        args: of the training.
+        algorithm: what the run's policy file says that it is of.
+        make: makes the run, new or from a file, and lets the stack close what it opens.
+
+    Raises:
+        InputError: bad options, or nothing to train.
+    """
+    torch.set_num_threads(1)
+    file = load_run(args, algorithm)
+    if args.init:
+        read_init(args)  # refused before anything is written
+    check_problem(args)
+    signals: list[str] = []
+    with ExitStack() as stack:
+        seeds = range(VALIDATION_SEED, VALIDATION_SEED + args.eval_episodes)
+        validation = make_venv(args, "validation", seeds)
+        stack.callback(validation.close)
+        stack.enter_context(caught_signals(signals.append))
+        run = make(args, file, stack)
+        args.out.mkdir(parents=True, exist_ok=True)
+        curve = load_curve(args, validation)
+        with kept(f"what was trained before the last update is kept in {args.out}"):
+            run.learn(curve, validation, signals)
+    print(f"{'interrupted' if signals else 'done'}: {run.steps} steps, policy in {args.out}")
+    return 130 if signals else 0
+
+
+@contextmanager
+def caught_signals(tell: Callable[[str], Any]) -> Iterator[None]:
+    """While this lasts, SIGINT and SIGTERM ``tell`` their name; a second one ends at once."""
+    before: dict[int, Any] = {}
+
+    def handle(number: int, _: object) -> None:
+        signal.signal(number, before[number])
+        tell(signal.Signals(number).name)
+
+    for name in (signal.SIGINT, signal.SIGTERM):
+        before[name] = signal.signal(name, handle)
+    try:
+        yield
+    finally:
+        for caught, handler in before.items():
+            signal.signal(caught, handler)
+
+
+def metadata_of(args: Any, algorithm: str, **counts: Any) -> Metadata:
+    """What a policy file says, of the options that all trainers have and of ``counts``."""
+    return Metadata(
+        algorithm=algorithm,
+        env_id=args.env_id,
+        env_options=env_options(args),
+        observation=args.observation,
+        hidden=(args.hidden, args.hidden),
+        options=to_plain(asdict(args)),
+        **counts,
+    )
+
+
+def load_run(args: Training, algorithm: str) -> PolicyFile | None:
+    """What there is to resume; None for a new run.
+
+    Raises:
+        InputError: nothing to resume from, nothing left to do, another network or problem, or a
+            new run where there is one already.
+    """
+    if not args.resume:
+        check_new(args.out, LATEST)
+        return None
+    file = read_run(args, algorithm, {*KEPT, *args.kept} - {"algorithm"})
+    check_steps_left(args.out / LATEST, file.metadata.timesteps, args.total_timesteps)
+    return file
+
+
+def read_run(args: Problem, algorithm: str, names: set[str]) -> PolicyFile:
+    """The policy file of the run in ``args.out``.
+
+    Raises:
+        InputError: there is none, or one of another algorithm or other options ``names``.
+    """
+    path = args.out / LATEST
+    file = read_policy(path)
+    if file.metadata.algorithm != algorithm:
+        raise InputError(f"{path} is of {file.metadata.algorithm}, not of {algorithm}")
+    check_kept(path, file.metadata.options, args, sorted(names))
+    return file
+
+
+def load_curve(args: Training, validation: VecEnv) -> Curve:
+    """Return the learning curve so far: that of the run to resume, or references and no points.
+
+    Raises:
+        InputError: the run to resume was evaluated on another number of episodes.
+    """
+    path, config = args.out / RESULTS, to_plain(asdict(args))
+    if args.resume and path.is_file():
+        curve = read_curve(path)
+        if curve.episodes != args.eval_episodes:
+            raise InputError(
+                f"{path} has points of eval_episodes = {curve.episodes} each, "
+                f"not {args.eval_episodes}"
+            )
+        curve.config = config
+        return curve
+    known = references(validation, args.eval_episodes) if args.references else {}
+    return Curve(args.eval_episodes, known, config=config)
+
+
+def read_init(args: Training) -> PolicyFile:
+    """The policy to begin with.
+
+    Raises:
+        InputError: no policy, or one of another network or problem.
+    """
+    assert args.init
+    file = read_policy(args.init)
+    known = file.metadata
+    for name in ("env_id", "observation"):
+        own = getattr(args, name)
+        if getattr(known, name) != own:
+            raise InputError(f"{args.init} is for {name} {getattr(known, name)!r}, not {own!r}")
+    if tuple(known.hidden) != (args.hidden, args.hidden):
+        raise InputError(f"{args.init} has layers of {known.hidden}: give --hidden that")
+    return file
