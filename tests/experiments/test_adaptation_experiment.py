@@ -10,7 +10,6 @@ import pytest
 from ms_slam_env import slam
 from ms_slam_env.cli import main
 from ms_slam_env.config import from_dict
-from ms_slam_env.errors import InputError
 from ms_slam_env.experiments.adaptation import Adaptation, AdaptationSpec, comparison, judge
 from ms_slam_env.report.records import spec_key, to_plain
 from ms_slam_env.report.tables import flattened
@@ -75,17 +74,3 @@ def test_a_recorded_specification_can_be_run_again():
     spec = Adaptation(scenes=("table",), sequences=1).specs()[0]
     recorded = json.loads(json.dumps(to_plain(asdict(spec))))
     assert spec_key(from_dict(AdaptationSpec, recorded)) == spec_key(spec)
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"image_size": "1x1"}, "unknown image size"),
-        ({"scenes": ("mars",)}, "unknown scene"),
-        ({"thresholds": (0.1,)}, "thresholds"),
-        ({"configurations": ("a.yaml", "b.yaml")}, "cannot read configuration a.yaml"),
-    ],
-)
-def test_bad_options(fields, message):
-    with pytest.raises(InputError, match=message):
-        Adaptation(**fields).specs()

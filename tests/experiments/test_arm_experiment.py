@@ -184,9 +184,3 @@ def test_one_good_map_is_enough_for_no_distance() -> None:
     specs = DuplicateObjects(scenes=("wall",), episodes=1).specs()
     assert [(s.offset_m, s.axis) for s in specs[:2]] == [(0.0, 0), (0.03, 0)]
     assert len(specs) == 1 + 4 * 3
-
-
-@pytest.mark.parametrize("offsets", [(), (-1.0,), (math.inf,)])
-def test_bad_distances_are_refused(offsets: tuple[float, ...]) -> None:
-    with pytest.raises(InputError, match="offsets_cm"):
-        DuplicateObjects(offsets_cm=offsets)

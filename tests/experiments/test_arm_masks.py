@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from ms_slam_env import scenes
-from ms_slam_env.errors import InputError
 from ms_slam_env.experiments import arm_masks
 from ms_slam_env.experiments.arm_masks import ArmMasks, WalkSpec
 from ms_slam_env.experiments.harness.arm_truth import furniture_cloud
@@ -72,21 +71,6 @@ def test_tables():
     (sag,) = [line for line in errors.rows if "sag" in line["error_kind"]]
     assert (sag["values"], sag["median_m"]) == (4, pytest.approx(0.003))
     assert "view at 0 % of stops" in masks.note
-
-
-@pytest.mark.parametrize(
-    ("fields", "reason"),
-    [
-        ({"scenes": ("garage",)}, "unknown scene 'garage'; valid choices: living_room"),
-        ({"options": ("targets.M_I=0.1",)}, "only those of the arm"),
-        ({"options": ("arm.colour=red",)}, "unknown option of ArmConfig 'arm.colour'"),
-        ({"states": 0}, "states = 0 is outside"),
-        ({"episodes": 101}, "outside"),
-    ],
-)
-def test_bad_input(fields, reason):
-    with pytest.raises(InputError, match=reason):
-        ArmMasks(**fields).specs()
 
 
 SPEC = WalkSpec("carpet", 1000, states=1, moves=1)

@@ -4,7 +4,6 @@ from dataclasses import asdict
 
 import pytest
 
-from ms_slam_env.errors import InputError
 from ms_slam_env.experiments.env_speed import EnvSpeed, EnvSpeedSpec
 from ms_slam_env.experiments.lookahead_speed import STAGES, LookaheadSpeed
 
@@ -45,16 +44,3 @@ def test_every_stage_of_the_lookahead_is_found_by_the_profiler():
     assert set(STAGES) < set(times)
     missing = [stage for stage, ms in times.items() if ms == 0 and stage != "copy to the host"]
     assert missing == []
-
-
-@pytest.mark.parametrize(
-    ("fields", "reason"),
-    [
-        ({"embodiments": ("tripod",)}, "unknown embodiment 'tripod'"),
-        ({"observations": ("smell",)}, "unknown observation 'smell'"),
-        ({"seconds": 0}, "EnvSpeed.seconds = 0 is outside"),
-    ],
-)
-def test_bad_input(fields, reason):
-    with pytest.raises(InputError, match=reason):
-        EnvSpeed(**{"embodiments": ("free",), **fields}).specs()

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from ms_slam_env.camera import xtion
-from ms_slam_env.errors import InputError
 from ms_slam_env.experiments.explore_divergence import ExploreDivergence
 from ms_slam_env.experiments.explore_rates import ExploreRates, front_of_trials
 from ms_slam_env.experiments.explore_samplers import ExploreSamplers, summarise
@@ -116,26 +115,3 @@ def test_a_front_of_trials_is_what_none_beats():
     trials = [{"cpu_ms_median": cost, "ate_max_m": error} for cost, error in values]
     found = [(t["cpu_ms_median"], t["ate_max_m"]) for t in front_of_trials(trials)]
     assert found == [(1.0, 0.3), (2.0, 0.2), (3.0, 0.1)]
-
-
-@pytest.mark.parametrize(
-    ("experiment", "message"),
-    [
-        (ExploreRates(samplers=("grid",)), "valid choices: random, nsga2, tpe, gp, forest"),
-        (ExploreRates(keep_every=()), "no sampler or no rate"),
-        (ExploreRates(keep_every=(0,)), "keep_every"),
-        (ExploreRates(parameters=("speed",)), "unknown parameter 'speed'"),
-        (ExploreSamplers(samplers=("grid",)), "valid choices: random, nsga2, tpe, gp"),
-        (ExploreSamplers(samplers=()), "no sampler"),
-        (ExploreSamplers(parameters=("image_size",)), "'image_size' has no order"),
-        (ExploreDivergence(sequences=("nowhere:1",)), "nowhere"),
-        (ExploreDivergence(keep_every=(0,)), "keep_every"),
-    ],
-)
-def test_bad_input_is_refused_before_anything_runs(experiment, message):
-    def start():
-        experiment.specs()
-        experiment.prepare()
-
-    with pytest.raises(InputError, match=message):
-        start()

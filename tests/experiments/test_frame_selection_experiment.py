@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from ms_slam_env.errors import InputError
 from ms_slam_env.experiments.frame_selection import FilterSpec, FrameSelection
 
 
@@ -45,20 +44,3 @@ def test_tables_take_medians_and_count_pairs():
     ate = FrameSelection().charts(rows)[0].panels[0]
     assert ate.guides[0].value == 0.015
     assert [series.x for series in ate.series] == [[0.5] * 3, [0.5]]
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"sequences": ("room",)}, "neither a folder nor scene:seed"),
-        ({"sequences": ("cellar:2000",)}, "unknown scene 'cellar'"),
-        ({"managements": ("some",)}, "valid choices: none, regular"),
-        ({"managements": ("budget,budget_per_s=1,measured=true",)}, "measures time"),
-        ({"backend": "orb"}, "unknown SLAM backend 'orb'"),
-        ({"image_size": "3x2"}, "unknown image size '3x2'"),
-        ({"frames": 3}, "frames = 3 is outside"),
-    ],
-)
-def test_bad_input_is_named(fields, message):
-    with pytest.raises(InputError, match=message):
-        FrameSelection(**fields).specs()

@@ -125,12 +125,3 @@ def test_the_targets_stand_in_the_tables(ate_m: float) -> None:
         assert "no interval suffices" in table.note
     (chart,) = experiment.charts(rows)
     assert [series.name for series in chart.panels[0].series] == ["every 2", "every frame"]
-
-
-@pytest.mark.parametrize(
-    "options",
-    [{"intervals": (0,)}, {"intervals": (81,)}, {"desired_ate_m": 0}, {"histograms": "of-paper"}],
-)
-def test_bad_skipping_options_are_refused(options: dict[str, Any]) -> None:
-    with pytest.raises(InputError):
-        FrameSkipping(**options)

@@ -7,7 +7,6 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from ms_slam_env.errors import InputError
 from ms_slam_env.experiments import pose_covariance as pc
 
 
@@ -48,8 +47,3 @@ def test_a_short_run_is_about_calibrated():
     assert 0.1 < experiment.content(rows)["validation_factor"] < 4
     (panel,) = experiment.charts(rows)[0].panels
     assert panel.series[1].y == sorted(panel.series[1].y)
-
-
-def test_too_few_frames_are_refused():
-    with pytest.raises(InputError, match="frames"):
-        pc.PoseCovariance(frames=3)

@@ -2,7 +2,6 @@
 
 import pytest
 
-from ms_slam_env.errors import InputError
 from ms_slam_env.experiments.pose_sources import METRICS, PoseSourceExperiment
 
 ERROR_M = {"slam": 0.010, "slam-kinematics": 0.008, "kinematics": 0.005, "ground_truth": 0.0}
@@ -66,18 +65,3 @@ def test_only_episodes_that_every_source_finished_are_compared():
     assert counts["wall", "greedy"] == 1
     assert counts["wall", "random"] == 2
     assert counts["all", "greedy"] == 3
-
-
-@pytest.mark.parametrize(
-    ("fields", "reason"),
-    [
-        ({"sources": ("odometry",)}, "valid choices: slam, slam-kinematics, kinematics"),
-        ({"sources": ()}, "at least one"),
-        ({"sources": ("slam", "slam")}, "must be different"),
-        ({"options": ("pose=slam",)}, "option 'pose' is not free"),
-        ({"seeds": "exam"}, "unknown split of seeds 'exam'"),
-    ],
-)
-def test_bad_input(fields, reason):
-    with pytest.raises(InputError, match=reason):
-        PoseSourceExperiment(**fields).specs()

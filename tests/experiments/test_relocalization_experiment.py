@@ -9,7 +9,6 @@ import pytest
 from box_scene import BoxScene
 
 from ms_slam_env.camera import RGBDFrame
-from ms_slam_env.errors import InputError
 from ms_slam_env.experiments.harness.interruptions import (
     SETTINGS,
     Interruption,
@@ -159,23 +158,6 @@ def test_shares_and_times_of_known_attempts():
     ]
     assert every["wrong"] == line["wrong"]
     assert experiment.charts(rows)[0].panels[0].series[0].x == ["near", "all"]
-
-
-@pytest.mark.parametrize(
-    ("fields", "reason"),
-    [
-        ({"variants": ("sift",)}, "ferns, features, local"),
-        ({"settings": ("upside-down",)}, "near, far, black, foreign"),
-        ({"scenes": ()}, "at least one"),
-        ({"scenes": ("table", "table")}, "different"),
-        ({"sizes": ("1x1",)}, "image size"),
-        ({"maps": 0}, "maps"),
-        ({"after": 300}, "after"),
-    ],
-)
-def test_bad_arguments_are_refused(fields, reason):
-    with pytest.raises(InputError, match=reason):
-        Relocalization(**fields).specs()
 
 
 def test_maps_take_the_scenes_in_turns():

@@ -4,7 +4,6 @@ import pytest
 
 from ms_slam_env._warp import wp
 from ms_slam_env.cli import main
-from ms_slam_env.errors import InputError
 from ms_slam_env.experiments.slam_batch import SlamBatch, device_bytes
 
 TINY = {"scene": "carpet", "seed": 1000, "size": "80x60", "frames": 4, "sequences": 2}
@@ -33,12 +32,3 @@ def test_bytes_of_arrays_and_their_views():
     made, size = device_bytes(lambda: (array := wp.zeros((5, 4), dtype=wp.vec3), array.flatten()))
     assert made[0].shape == (5, 4)
     assert size == 5 * 4 * 12
-
-
-@pytest.mark.parametrize(
-    ("fields", "reason"),
-    [({"device": "tpu"}, "device"), ({"batch": (0,)}, "must hold"), ({"frames": 1}, "frames")],
-)
-def test_bad_input(fields, reason):
-    with pytest.raises(InputError, match=reason):
-        SlamBatch(**fields)

@@ -93,19 +93,6 @@ def test_the_ratio_is_the_median_over_rounds():
     assert this["same_poses"] is False
 
 
-@pytest.mark.parametrize(
-    ("fields", "reason"),
-    [
-        ({"frames": 1}, "SlamSpeed.frames = 1 is outside"),
-        ({"warm_up": 80}, "SlamSpeed.warm_up = 80 is outside"),
-        ({"stored": (0,)}, "must hold integers"),
-    ],
-)
-def test_bad_input(fields, reason):
-    with pytest.raises(InputError, match=reason):
-        SlamSpeed(**fields)
-
-
 def test_bad_checkout_and_parameter(tmp_path):
     with pytest.raises(InputError, match="holds no package"):
         SlamSpeed(against=tmp_path)

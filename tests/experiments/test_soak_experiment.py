@@ -3,10 +3,8 @@
 from dataclasses import asdict
 
 import numpy as np
-import pytest
 
 from ms_slam_env import ENV_IDS
-from ms_slam_env.errors import InputError
 from ms_slam_env.experiments.soak import IDS, Soak, SoakSpec, not_finite
 
 
@@ -39,10 +37,3 @@ def test_a_piece_counts_its_steps_episodes_and_memory():
     (table,) = Soak().tables(rows)
     assert table.rows[0]["measured_steps"] == 8
     assert "8 steps in all" in table.note
-
-
-def test_bad_input():
-    with pytest.raises(InputError, match="unknown environment 'moon'"):
-        Soak(env_ids=("moon",)).specs()
-    with pytest.raises(InputError, match=r"Soak\.steps = 0 is outside"):
-        Soak(steps=0)

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from ms_slam_env import scenes
 from ms_slam_env.camera import xtion
-from ms_slam_env.errors import InputError
 from ms_slam_env.experiments.harness.interruptions import map_path
 from ms_slam_env.experiments.submaps import (
     DARK,
@@ -48,8 +46,3 @@ def test_a_wrong_joint_is_counted(monkeypatch):
     monkeypatch.setattr("ms_slam_env.experiments.submaps.WRONG_M", 1e-6)
     wrong = SubmapsExperiment.run(SPEC)["attempts"]
     assert sum(a["wrong_joins"] for a in wrong) == sum(a["joined_submaps"] for a in joined)
-
-
-def test_unknown_settings_are_named():
-    with pytest.raises(InputError, match="return, dark, foreign"):
-        SubmapsExperiment(settings=("sideways",)).specs()
