@@ -14,6 +14,7 @@ from ms_slam_env.mapping import (
     OccupancyGrid,
     reachable_positions,
     shortest_ways,
+    surrounding_occupancy,
 )
 
 K = xtion("80x60").scaled(0.5)
@@ -177,3 +178,42 @@ def test_a_position_far_from_all_that_is_known_can_go_nowhere(far):
     grid = OccupancyGrid()
     grid.integrate(WALL, np.eye(4), K)
     assert reachable_positions(grid, np.full(3, far), 1.0).shape == (0, 3)
+
+
+CAMERA_K = xtion("80x60")
+
+
+def grid_of(pose, depth_m):
+    grid = OccupancyGrid()
+    grid.integrate(np.full(CAMERA_K.shape, depth_m, np.float32), pose, CAMERA_K)
+    return grid
+
+
+@settings(max_examples=10, deadline=None)
+@given(
+    turn=st.tuples(*[st.floats(-3, 3)] * 3),
+    place=st.tuples(*[st.floats(-2, 2)] * 3),
+    blocks=st.tuples(*[st.integers(1, 5)] * 3),
+    block_m=st.floats(0.05, 1),
+)
+def test_blocks_are_those_of_a_loop(turn, place, blocks, block_m):
+    grid = grid_of(np.eye(4), 1.5)
+    pose = make_pose(so3_exp(np.array(turn)), place)
+    found = surrounding_occupancy(grid, pose, blocks, block_m)
+    assert found.dtype == np.float32
+    n = min(5, int(np.ceil(block_m / grid.cell_m)))
+    for block in np.ndindex(*blocks):
+        corner = (np.array(block) - np.array(blocks) / 2) * block_m
+        points = corner + (np.array(list(np.ndindex(n, n, n))) + 0.5) * block_m / n
+        states = grid.states_of(transform_points(pose, points))
+        expected = [(states == FREE).mean(), (states == OCCUPIED).mean()]
+        # Single precision may fall to either side of a cell's face.
+        np.testing.assert_allclose(found[(slice(None), *block)], expected, atol=0.03 + 1 / n**3)
+
+
+def test_a_wall_ahead_is_ahead_wherever_the_camera_stands():
+    pose = make_pose(so3_exp([0.3, -1.2, 0.4]), [3.0, -2.0, 1.0])
+    free, occupied = surrounding_occupancy(grid_of(pose, 1.25), pose, (6, 6, 8), 0.5)
+    assert occupied[3, 3].argmax() == 6  # from 1.0 to 1.5 m
+    assert (free[2:4, 2:4, 5] > 0.6).all()
+    assert not free[:, :, :4].any()  # nothing is known of what lies behind

@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from ms_slam_env import scenes
 from ms_slam_env.geometry import check_pose
-from ms_slam_env.scenes.base import floor_height
+from ms_slam_env.scenes.base import enclosed, floor_height, outside
 from ms_slam_env.scenes.free_space import FreeSpace
 from ms_slam_env.scenes.homes import home as home_module
 from ms_slam_env.scenes.homes.home import CAMERA_M, reachable_cells
@@ -20,6 +20,7 @@ from ms_slam_env.scenes.homes.ways import Ways
 from ms_slam_env.scenes.lighting import Lamp, RoomLight, mean_albedo
 from ms_slam_env.scenes.mesh_queries import RayCaster, face_cross
 from ms_slam_env.scenes.mesh_scene import MIN_START_CLEARANCE_M
+from ms_slam_env.sensor.scene_cache import get_scene
 from ms_slam_env.sequences import RoutePath
 
 FIELDS = ("vertices", "faces", "uv", "face_texture", "face_label", "irradiance")
@@ -234,3 +235,29 @@ def test_free_space_is_one_piece_for_a_walker(scene):
     sizes = np.bincount(ndimage.label(scene.free_space.distance[:, :, level] > 0.28)[0].ravel())[1:]
     assert count >= 1
     assert sizes.max() > 0.9 * sizes.sum()
+
+
+@pytest.mark.parametrize(
+    ("position", "words"),
+    [
+        ((0.0, -1.0, 1.0), ""),
+        ((1.25, 0.05, 0.4), "inside something in scene box"),
+        ((0.0, 0.0, -0.5), "below the floor of scene box, which is at z = 0.00 m"),
+        ((0.0, 0.0, 3.0), "outside scene box, which spans -2.00 to 2.00 x -2.00 to 2.00 x 0.00 to"),
+        ((9.0, 0.0, -3.0), "outside scene box, which spans"),
+    ],
+)
+def test_where_a_place_lies(box_scene, position, words):
+    found = enclosed(box_scene, np.array(position))
+    assert found.startswith(words)
+    assert bool(found) == bool(words)
+
+
+def test_on_the_floor_is_not_outside(box_scene):
+    assert outside(box_scene, np.zeros(3)) == ""
+
+
+def test_leaves_below_the_floor_do_not_lower_it():
+    scene = get_scene("table", 2000)
+    assert scene.mesh.vertices[:, 2].min() < -0.1
+    assert floor_height(scene) == 0.0

@@ -14,12 +14,18 @@ import numpy as np
 import pytest
 from box_scene import BoxScene
 
-from ms_slam_env.camera import xtion
+from ms_slam_env import slam
+from ms_slam_env import slam as slam_backends
+from ms_slam_env.camera import RGBDFrame, xtion
+from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import relative_angle, se3_exp
 from ms_slam_env.sensor import RGBDSensor
+from ms_slam_env.sequences import HandheldPath, Sequence, open_sequence
+from ms_slam_env.slam import SlamBackend
 from ms_slam_env.slam.alignment_check import TrackingStatus
 from ms_slam_env.slam.surfel.acceptance import Alignment, acceptance_thresholds
 from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.photometry import is_leap, same_exposure
 from ms_slam_env.slam.surfel.pose_hypotheses import NUM_HYPOTHESES, tracking_hypotheses
 from ms_slam_env.slam.surfel.preprocessing import Preprocessor
 from ms_slam_env.slam.surfel.rendering import ModelView
@@ -115,3 +121,78 @@ def test_a_stricter_rule_refuses_right_alignments(rule, factor):
 def test_without_three_of_the_rules_a_wrong_alignment_is_accepted():
     assert not _accepted(inliers=0.3) & set(WRONG)
     assert _accepted(inliers=0.3, conflicts=0.3, cost=3.0) & set(WRONG)
+
+
+STEP = 6  # frames of 1.5 cm and 0.7 degrees that are skipped
+
+
+@pytest.fixture(scope="module")
+def carpet() -> Sequence:
+    path = HandheldPath(240, speed_m_s=0.4, turn_deg_s=20.0)
+    return open_sequence("carpet:1003", path=path).picked(STEP * np.arange(6))
+
+
+def _errors(sequence: Sequence, frames: list[RGBDFrame], check_slips: bool) -> np.ndarray:
+    system = slam.make("surfel", sequence.intrinsics, check_slips=check_slips)
+    system.reset(sequence.poses[0])
+    estimate = np.stack([system.track(frame).T_world_camera for frame in frames])
+    return np.linalg.norm(estimate[:, :3, 3] - sequence.poses[:, :3, 3], axis=1)
+
+
+def test_frames_that_slip_over_a_carpet_are_put_right(carpet):
+    frames = list(carpet.frames)
+    slipped, checked = (_errors(carpet, frames, check) for check in (False, True))
+    assert slipped.max() > 0.05
+    assert checked.max() < 0.005
+
+
+def test_a_leap_is_a_sudden_misfit_of_grey_values_that_were_trusted():
+    before, after = same_exposure(5), same_exposure(5)
+    before["reference"][3], before["trust"][4] = 3.0, 0.01
+    after["scale"] = [0.9, 1.0, 0.7, 1.0, 0.7]
+    after["trust"][[2, 4]] = 0.0
+    np.testing.assert_array_equal(is_leap(before, after, 1.0), [False, True, True, False, False])
+
+
+def frames_with_a_jump() -> tuple[np.ndarray, list[RGBDFrame]]:
+    """The same view four times, then one from the other side of the room."""
+    scene = BoxScene()
+    sensor = RGBDSensor(scene, xtion("80x60"), noise="none")
+    start = scene.sample_start(np.random.default_rng(0))
+    back = start.copy()
+    back[:3, :3] = start[:3, :3] @ np.diag([-1.0, 1.0, -1.0])
+    poses = [start] * 4 + [back]
+    return start, [sensor.capture(pose, index=k) for k, pose in enumerate(poses)]
+
+
+def run(refuse: bool) -> tuple[list[bool], SlamBackend]:
+    start, frames = frames_with_a_jump()
+    slam = slam_backends.make("surfel", xtion("80x60"), refuse_bad_fits=refuse)
+    slam.reset(start)
+    return [slam.track(frame).tracking_ok for frame in frames], slam
+
+
+def test_a_frame_from_elsewhere_is_refused_or_fused() -> None:
+    ok, careful = run(refuse=True)
+    assert ok == [True] * 4 + [False]
+    ok, careless = run(refuse=False)
+    assert ok == [True] * 5
+    assert np.isfinite(careless.map_points()).all()
+    assert len(careless.map_points()) > 1.1 * len(careful.map_points())
+
+
+@pytest.mark.parametrize(("inliers", "fused"), [(0.65, [True] * 4), (1.0, [True] + [False] * 3)])
+def test_the_share_of_inliers_that_is_demanded_is_an_option(inliers: float, fused: list) -> None:
+    scene = BoxScene()
+    sensor = RGBDSensor(scene, xtion("80x60"), noise="kinect")
+    start = scene.sample_start(np.random.default_rng(0))
+    rules = {"inliers": inliers, "doubted": {"inliers": inliers}}
+    slam = slam_backends.make("surfel", xtion("80x60"), acceptance=rules)
+    slam.reset(start)
+    frames = [sensor.capture(start, index=k) for k in range(4)]
+    assert [slam.track(frame).fused for frame in frames] == fused
+
+
+def test_only_booleans_are_taken() -> None:
+    with pytest.raises(InputError, match="refuse_bad_fits"):
+        slam_backends.make("surfel", xtion("80x60"), refuse_bad_fits="no")
