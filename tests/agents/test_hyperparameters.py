@@ -101,9 +101,9 @@ def test_frames_a_motion_are_the_arms_or_the_free_cameras():
 
 def test_the_size_of_the_images_is_that_of_the_environments_and_no_part_of_the_policy():
     args = ppo.Args(image_size="64x48", scenes=("table",), scene_seeds=1)
-    env = train_sb3.make_env(args, "train", ())
+    env = environments.make_env(args, "train", ())
     assert env.unwrapped.intrinsics.shape == (48, 64)
     assert "image_size" not in train_sb3.env_options(args)
-    assert train_sb3.problem_options(ppo.Args(), "train").get("image_size") is None
+    assert environments.problem_options(ppo.Args(), "train").get("image_size") is None
     with pytest.raises(InputError, match="image size"):
-        train_sb3.check_problem(ppo.Args(image_size="64"))
+        environments.check_problem(ppo.Args(image_size="64"))
