@@ -39,6 +39,73 @@ class DepthImage:
         return float((self.depth > 0).mean())
 
 
+@dataclass(frozen=True)
+class Overlay:
+    """Readings of a frame that motions lay on a reference, those of the first motion first.
+
+    Attributes:
+        looked_at: readings of the frame that each motion carries.
+        counts: (M,) those of them that land on a reading of the reference, of each motion.
+        inlier: (sum of counts,) whether they lie on its surface.
+        alike: (sum of counts,) whether they look like it.
+        residual: (sum of counts,) metres from its surface.
+    """
+
+    looked_at: int
+    counts: NDArray[np.int64]
+    inlier: NDArray[np.bool_]
+    alike: NDArray[np.bool_]
+    residual: Float64
+
+    @property
+    def scores(self) -> Float64:
+        """Of each motion (M,): overlap times the sum of both ratios; 0 where nothing overlaps."""
+        which = np.repeat(np.arange(len(self.counts)), self.counts)
+        good = [
+            np.bincount(which[fits], minlength=len(self.counts)) / np.maximum(self.counts, 1)
+            for fits in (self.inlier, self.alike)
+        ]
+        return np.asarray(self.counts / max(self.looked_at, 1) * (good[0] + good[1]))
+
+
+def overlay(
+    frame: DepthImage,
+    reference: DepthImage,
+    T_reference_frame: Float64,
+    intrinsics: Intrinsics,
+    samples: int,
+) -> Overlay:
+    """Lay about ``samples`` readings of a frame on a reference by each motion (M, 4, 4)."""
+    v, u = np.nonzero(frame.depth > 0)
+    step = max(1, len(v) // samples)
+    v, u = v[::step], u[::step]
+    points = _back_project(u, v, frame.depth[v, u].astype(np.float64), intrinsics)
+    R, t = T_reference_frame[:, :3, :3], T_reference_frame[:, None, :3, 3]
+    moved = points @ R.transpose(0, 2, 1) + t  # (M, N, 3)
+    ahead = moved[..., 2] > 1e-3
+    pixels = np.full((*ahead.shape, 2), -1.0)
+    pixels[ahead] = intrinsics.project(moved[ahead])
+    column, row = np.moveaxis(np.clip(np.rint(pixels), -1, 1e6).astype(np.int64), -1, 0)
+    # The last row and column have no neighbour to take the normal from.
+    seen = (column >= 0) & (column < intrinsics.width - 1)
+    seen &= (row >= 0) & (row < intrinsics.height - 1)
+    seen[seen] = reference.depth[row[seen], column[seen]] > 0
+    row, column, landed = row[seen], column[seen], moved[seen]
+    counts = seen.sum(axis=1)
+    grey = np.broadcast_to(frame.intensity[v, u], seen.shape)[seen]
+    difference = grey - reference.intensity[row, column]
+    own = np.split(difference, np.cumsum(counts)[:-1])
+    median = [np.median(part) if len(part) else np.float32(0) for part in own]
+    residual = _distance_to_surface(landed, row, column, reference.depth, intrinsics)
+    return Overlay(
+        looked_at=len(v),
+        counts=counts,
+        inlier=residual <= 0.02 + 0.01 * landed[:, 2] ** 2,
+        alike=np.abs(difference - np.repeat(median, counts)) <= _PHOTOMETRIC_LEVELS,
+        residual=residual,
+    )
+
+
 def measure_alignment(
     frame: DepthImage,
     reference: DepthImage,
@@ -52,38 +119,20 @@ def measure_alignment(
     structured light growing with depth squared. About ``samples`` readings are looked at; more
     than the default do not change the decision.
     """
-    v, u = np.nonzero(frame.depth > 0)
-    step = max(1, len(v) // samples)
-    v, u = v[::step], u[::step]
-    depth = frame.depth[v, u].astype(np.float64)
-    points = _back_project(u, v, depth, intrinsics)
-    points = points @ T_reference_frame[:3, :3].T + T_reference_frame[:3, 3]
-    ahead = points[:, 2] > 1e-3
-    pixels = np.full((len(points), 2), -1.0)
-    pixels[ahead] = intrinsics.project(points[ahead])
-    column, row = np.clip(np.rint(pixels), -1, 1e6).astype(np.int64).T
-    # The last row and column have no neighbour to take the normal from.
-    seen = (column >= 0) & (column < intrinsics.width - 1)
-    seen &= (row >= 0) & (row < intrinsics.height - 1)
-    seen[seen] = reference.depth[row[seen], column[seen]] > 0
     motion = AlignmentStatistics(
         motion_m=float(np.linalg.norm(T_reference_frame[:3, 3])),
         rotation_cos=float(np.cos(relative_angle(np.eye(3), T_reference_frame[:3, :3]))),
     )
-    if not seen.any():
+    laid = overlay(frame, reference, T_reference_frame[None], intrinsics, samples)
+    if not len(laid.inlier):
         return motion
-    row, column, points = row[seen], column[seen], points[seen]
-    residual = _distance_to_surface(points, row, column, reference.depth, intrinsics)
-    inlier = residual <= 0.02 + 0.01 * points[:, 2] ** 2
-    difference = frame.intensity[v, u][seen] - reference.intensity[row, column]
-    alike = np.abs(difference - np.median(difference)) <= _PHOTOMETRIC_LEVELS
-    squares = residual[inlier] ** 2
+    squares = laid.residual[laid.inlier] ** 2
     return replace(
         motion,
-        overlap=float(seen.mean()),
-        inlier_ratio=float(inlier.mean()),
-        photometric_inlier_ratio=float(alike.mean()),
-        residual_m=float(np.sqrt(squares.mean())) if inlier.any() else 0.0,
+        overlap=float(laid.counts[0] / laid.looked_at),
+        inlier_ratio=float(laid.inlier.mean()),
+        photometric_inlier_ratio=float(laid.alike.mean()),
+        residual_m=float(np.sqrt(squares.mean())) if laid.inlier.any() else 0.0,
     )
 
 
@@ -116,11 +165,12 @@ def _distance_to_surface(
 ) -> Float64:
     """Distances (N,) of points to the planes through the pixels and their neighbours."""
 
-    def corner(down: int, right: int) -> Float64:
-        z = depth[row + down, column + right].astype(np.float64)
-        return _back_project(column + right, row + down, z, intrinsics)
-
-    here, right, below = corner(0, 0), corner(0, 1), corner(1, 0)
+    rows, columns = (
+        np.concatenate([row, row, row + 1]),
+        np.concatenate([column, column + 1, column]),
+    )
+    z = depth[rows, columns].astype(np.float64)
+    here, right, below = np.split(_back_project(columns, rows, z, intrinsics), 3)
     normal = np.cross(right - here, below - here)
     length = np.linalg.norm(normal, axis=1)
     flat = (right[:, 2] > 0) & (below[:, 2] > 0) & (length > 0)

@@ -6,7 +6,7 @@ import numpy as np
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import make_pose, so3_exp
-from ms_slam_env.slam.alignment_measures import DepthImage, measure_alignment
+from ms_slam_env.slam.alignment_measures import DepthImage, overlay
 from ms_slam_env.slam.base import Float64
 
 TURN_RAD = np.radians(10.0)
@@ -38,13 +38,6 @@ def motion_hypotheses(
     First the last motion ``T_last_camera`` (4, 4), should it go on; then the best of ``MOTIONS``,
     judged by how well they lay the frame over the reference, in depth and intensity.
     """
-    scores = [_score(frame, reference, motion, intrinsics) for motion in MOTIONS]
-    best = np.argsort(-np.array(scores), kind="stable")[:_TRIALS]
+    scores = overlay(frame, reference, MOTIONS, intrinsics, _SAMPLES).scores
+    best = np.argsort(-scores, kind="stable")[:_TRIALS]
     return np.concatenate([T_last_camera[None], MOTIONS[best]])
-
-
-def _score(
-    frame: DepthImage, reference: DepthImage, motion: Float64, intrinsics: Intrinsics
-) -> float:
-    found = measure_alignment(frame, reference, motion, intrinsics, _SAMPLES)
-    return found.overlap * (found.inlier_ratio + found.photometric_inlier_ratio)

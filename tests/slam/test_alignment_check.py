@@ -24,8 +24,8 @@ from ms_slam_env.slam.alignment_check import (
     evaluate_on_device,
     status_on_appeal,
 )
-from ms_slam_env.slam.alignment_measures import DepthImage, measure_alignment
-from ms_slam_env.slam.pose_hypotheses import motion_hypotheses
+from ms_slam_env.slam.alignment_measures import DepthImage, measure_alignment, overlay
+from ms_slam_env.slam.pose_hypotheses import MOTIONS, motion_hypotheses
 
 CAMERA = Intrinsics(fx=80.0, fy=84.0, cx=39.3, cy=29.8, width=80, height=60)
 REST = np.eye(4)
@@ -89,6 +89,20 @@ def test_pixels_without_a_reading_count_neither_way():
     found = measure_alignment(frame, reference, REST, CAMERA)
     assert found.overlap == pytest.approx(0.5, abs=0.05)
     assert found.inlier_ratio == 1
+
+
+def test_many_motions_at_once_score_as_one_by_one_to_the_last_bit():
+    away = make_pose(so3_exp([0.0, np.pi, 0.0]), np.zeros(3))
+    motions = np.concatenate([MOTIONS, away[None], MOVED[None]])
+    frame, reference = _view(MOVED), _view(REST)
+    frame.depth[:, ::7], reference.depth[5:9] = 0, 0
+    one_by_one = []
+    for motion in motions:
+        found = measure_alignment(frame, reference, motion, CAMERA, 600)
+        one_by_one.append(found.overlap * (found.inlier_ratio + found.photometric_inlier_ratio))
+    laid = overlay(frame, reference, motions, CAMERA, 600)
+    np.testing.assert_array_equal(laid.scores, one_by_one)
+    assert 0 == min(one_by_one) < max(one_by_one)
 
 
 def test_starts_go_on_first_and_then_from_near_the_motion():
