@@ -12,6 +12,7 @@ from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import file_entries
 import numpy as np
@@ -27,13 +28,15 @@ from mutations import (
     mutated_json,
     write_files,
 )
+from optuna.storages._rdb.storage import _VersionManager
 from policy_files import as_bytes
 
 from ms_slam_env.exploration import ExplorationSettings, explore, make_space
 from ms_slam_env.exploration.choices import choose
 from ms_slam_env.exploration.front import hypervolume_history, importances, points_of
+from ms_slam_env.exploration.space import SearchSpace
+from ms_slam_env.report import page
 from ms_slam_env.report.charts import Chart, Panel, Series
-from ms_slam_env.report.page import write_report
 from ms_slam_env.report.records import RecordFile
 from ms_slam_env.report.results import write_results
 from ms_slam_env.report.statistics import Interval
@@ -83,11 +86,16 @@ def evaluate(configuration: SlamConfiguration) -> dict[str, Any]:
 
 
 @cache
+def space() -> SearchSpace:
+    """What is explored."""
+    return make_space(PARAMETERS, SlamConfiguration("odometry"))
+
+
+@cache
 def study() -> bytes:
     """A study of three trials."""
-    space = make_space(PARAMETERS, SlamConfiguration("odometry"))
     with tempfile.TemporaryDirectory() as folder:
-        storage = explore(Path(folder), space, SETTINGS, evaluate, 3)
+        storage = explore(Path(folder), space(), SETTINGS, evaluate, 3)
         storage.study._storage.remove_session()
         with contextlib.closing(sqlite3.connect(Path(folder) / "study.db")) as connection:
             connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
@@ -130,11 +138,20 @@ def _mutate_table(connection: sqlite3.Connection, table: str, rng: Rng) -> None:
         connection.execute(f"UPDATE {table} SET {column} = ? WHERE {where}", (text, offset))
 
 
+@cache
+def migrations() -> Any:
+    """Those of Optuna's tables, which it imports anew whenever it opens a study."""
+    manager = object.__new__(_VersionManager)
+    manager.url = "sqlite://"
+    return manager._create_alembic_script()
+
+
 def call_study(data: bytes, folder: Path) -> None:
     """Go on with a study, and look at its front."""
     (folder / "study.db").write_bytes(data)
-    space = make_space(PARAMETERS, SlamConfiguration("odometry"))
-    storage = explore(folder, space, SETTINGS, evaluate, 4)
+    known = migrations()
+    with patch.object(_VersionManager, "_create_alembic_script", lambda manager: known):
+        storage = explore(folder, space(), SETTINGS, evaluate, 4)
     points = points_of(storage)
     reference = storage.reference()
     assert reference is not None
@@ -212,10 +229,11 @@ class Reader(HTMLParser):
 
 
 def call_report(files: Files, folder: Path) -> None:
-    """Make a report; it shows nothing from elsewhere and loads nothing."""
+    """Make a report, but for Plotly's 4 MB; it shows nothing from elsewhere and loads nothing."""
     write_files({"secret.txt": SECRET.encode()}, folder / "outside")
     write_files(files, folder / "in")
-    path = write_report(folder / "in", folder / "report.html")
+    with patch.object(page, "_plotly_source", lambda: "let Plotly"):
+        path = page.write_report(folder / "in", folder / "report.html")
     text = re.sub(r"<script>.*?</script>", "", path.read_text(encoding="utf-8"), flags=re.DOTALL)
     assert SECRET not in text
     reader = Reader()

@@ -6,6 +6,7 @@ import contextlib
 import copy
 import io
 from functools import cache, partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -175,15 +176,15 @@ MAKE: dict[str, dict[str, Any]] = {
     "surfel": {"max_surfels": 20_000},
     "odometry": {},
     "sparse": {},
-    "volumetric": {},
+    "volumetric": {"blocks": 1000},
     "kinectfusion": {},
 }
 
 
 @cache
 def rendered() -> list[Any]:
-    """Colour, depth and time of some frames."""
-    frames = open_sequence("table:0:none+handheld,frames=6", "80x60").frames
+    """Colour, depth and time of some frames: one to begin with, and few to be lost and found in."""
+    frames = islice(open_sequence("table:0:none+handheld,frames=6", "80x60").frames, 4)
     return [[frame.color, frame.depth, frame.timestamp] for frame in frames]
 
 
