@@ -34,6 +34,7 @@ Row = dict[str, Any]
 
 _WARM_UP = 5  # frames left out of the timing: buffers grow, kernels are loaded
 _WARM_UP_FRAMES = 15
+_LEAST_ERROR_M = 1e-3  # in ratios; below, which of two errors is the larger is chance
 
 
 @dataclass(frozen=True)
@@ -172,9 +173,14 @@ def summarise(rows: Sequence[Row], baseline: Sequence[Row] = ()) -> Row:
 
 
 def worst_ratio(rows: Sequence[Row], baseline: Sequence[Row]) -> float:
-    """Largest error of a sequence in units of the baseline's on the same; NaN without any."""
+    """Largest error of a sequence in units of the baseline's on the same; NaN without any.
+
+    Errors below a millimetre count as one, or a sequence of half a millimetre would rule.
+    """
     pairs = [(a.get("ate_m"), b.get("ate_m")) for a, b in zip(rows, baseline, strict=True)]
-    return max((own / its for own, its in pairs if own is not None and its), default=math.nan)
+    least = _LEAST_ERROR_M
+    known = ((own, its) for own, its in pairs if own is not None and its is not None)
+    return max((max(own, least) / max(its, least) for own, its in known), default=math.nan)
 
 
 _BASELINES: dict[str, list[Row]] = {}

@@ -21,7 +21,7 @@ from ms_slam_env.exploration import (
     run_exploration,
 )
 from ms_slam_env.exploration import evaluator as evaluator_module
-from ms_slam_env.exploration.evaluator import CLOCKS, summarise
+from ms_slam_env.exploration.evaluator import CLOCKS, summarise, worst_ratio
 from ms_slam_env.exploration.held_out import compare_configurations
 from ms_slam_env.exploration.objectives import METRICS, as_metrics, key_of
 from ms_slam_env.exploration.samplers import Grid
@@ -192,7 +192,16 @@ def test_the_worst_sequence_counts(sequences):
     rows = [[evaluator.measure(c, s)["ate_m"] for s in sequences] for c in (other, base)]
     measured = evaluator(other)
     assert measured["ate_worst_m"] == max(rows[0])
-    assert measured["ate_worst_ratio"] == max(a / b for a, b in zip(*rows, strict=True))
+    assert measured["ate_worst_ratio"] == max(
+        max(a, 1e-3) / max(b, 1e-3) for a, b in zip(*rows, strict=True)
+    )
+
+
+def test_fractions_of_a_millimetre_are_no_worst_sequence():
+    errors = [[{"ate_m": e} for e in each] for each in ((9e-4, 4e-3, None), (3e-4, 2e-3, 1e-3))]
+    assert worst_ratio(*errors) == 2.0
+    assert worst_ratio(*errors[::-1]) == 1.0
+    assert np.isnan(worst_ratio([{"ate_m": None}], [{"ate_m": 1.0}]))
 
 
 def test_chosen_configurations_are_taken_everywhere(explored, sequences, tmp_path):
