@@ -103,7 +103,7 @@ def test_the_size_of_the_images_is_that_of_the_environments_and_no_part_of_the_p
     args = ppo.Args(image_size="64x48", scenes=("table",), scene_seeds=1)
     env = environments.make_env(args, "train", ())
     assert env.unwrapped.intrinsics.shape == (48, 64)
-    assert "image_size" not in train_sb3.env_options(args)
+    assert "image_size" not in environments.env_options(args)
     assert environments.problem_options(ppo.Args(), "train").get("image_size") is None
     with pytest.raises(InputError, match="image size"):
         environments.check_problem(ppo.Args(image_size="64"))
