@@ -94,7 +94,7 @@ class AcceptanceRoc(Experiment, Checked):
         """Every sequence."""
         for name in self.sequences:
             check_sequence(name)
-        return [RocSpec(name, self.image_size, self.frames, self.every) for name in self.sequences]
+        return [self.spec(RocSpec, sequence=name) for name in self.sequences]
 
     @staticmethod
     def run(spec: RocSpec) -> dict[str, Any]:

@@ -111,7 +111,7 @@ class Adaptation(Experiment, Checked):
         check_names(("random",), self.scenes)
         adaptation = self.adaptation()
         return [
-            AdaptationSpec(scene, seed, self.stretches, self.image_size, adaptation)
+            self.spec(AdaptationSpec, scene=scene, seed=seed, adaptation=adaptation)
             for scene in self.scenes
             for seed in seed_list(self.seeds, self.sequences)
         ]

@@ -148,9 +148,9 @@ class ArmExperiment(Experiment):
         if self.same_scene is not None:
             options |= {"scene_seed": self.same_scene, "perturbed_by": "illumination"}
             options["perturbation"] = LAMP
-        own = ("env_id", "step_m", "step_deg", "seconds", "rule")
         return [
-            RunSpec(
+            self.spec(
+                RunSpec,
                 planner=planner,
                 scene=scene,
                 seed=seed,
@@ -158,7 +158,6 @@ class ArmExperiment(Experiment):
                 options=options,
                 picture=self._picture(scene, planner, seed),
                 same_start=self.same_scene is not None,
-                **{name: getattr(self, name) for name in own},
             )
             for scene in self.scenes
             for seed in seed_list(self.seeds, self.episodes)

@@ -52,17 +52,10 @@ Float64 = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class WalkSpec:
-    """One random walk of the arm.
+    """One random walk of the arm; see :class:`ArmMasks` for the other fields.
 
     Attributes:
-        scene: a scene's name.
         seed: of the scene, the start pose, the arm's errors and the walk.
-        states: how often the walk stops to attempt all motions.
-        moves: permitted motions between two stops.
-        approach: share of them that go where the camera comes nearest to furniture; the others
-            are random.
-        step_m: translation of a motion.
-        step_deg: rotation of a motion.
         arm: options of the arm.
     """
 
@@ -143,16 +136,7 @@ class ArmMasks(Checked, Experiment):
         if set(options) - {"arm"}:
             raise InputError(f"options {sorted(options)}: only those of the arm, as in arm.model=x")
         return [
-            WalkSpec(
-                scene,
-                seed,
-                self.states,
-                self.moves,
-                self.approach,
-                self.step_m,
-                self.step_deg,
-                options.get("arm", {}),
-            )
+            self.spec(WalkSpec, scene=scene, seed=seed, arm=options.get("arm", {}))
             for scene in self.scenes
             for seed in seed_list(self.seeds, self.episodes)
         ]

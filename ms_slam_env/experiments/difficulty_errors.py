@@ -82,10 +82,7 @@ class DifficultyErrors(Experiment, Checked):
         for text in self.backends:
             slam.check_parameters(*parse_named(text, "backend"))
         parse_image_size(self.image_size)
-        return [
-            DifficultySpec(text, self.backends, self.image_size, self.frames)
-            for text in self.sequences
-        ]
+        return [self.spec(DifficultySpec, sequence=text) for text in self.sequences]
 
     @staticmethod
     def run(spec: DifficultySpec) -> dict[str, Any]:

@@ -77,9 +77,13 @@ class EnvSpeed(Experiment, Checked):
             for name in names:
                 if name not in choices:
                     raise unknown(kind, name, choices)
-        common = (self.scene, self.scene_seed, self.image_size, self.seconds, self.warm_up)
         return [
-            EnvSpeedSpec(embodiment, frames, observation, *common)
+            self.spec(
+                EnvSpeedSpec,
+                embodiment=embodiment,
+                frames_per_action=frames,
+                observation=observation,
+            )
             for embodiment in self.embodiments
             for frames in ((1,) if embodiment in WITHOUT_FRAMES else self.frames_per_action)
             for observation in self.observations

@@ -71,12 +71,11 @@ class ExploreDivergence(Experiment):
         base = SlamConfiguration() if self.config is None else read_configuration(self.config)
         SlamEvaluator(self.sequences, self.frames, image_size=self.image_size)  # refuses bad input
         return [
-            RateSpec(
-                sequence,
-                dataclasses.replace(base, keep_every=every).keep_every,
-                self.image_size,
-                self.frames,
-                asdict(base),
+            self.spec(
+                RateSpec,
+                sequence=sequence,
+                keep_every=dataclasses.replace(base, keep_every=every).keep_every,
+                base=asdict(base),
             )
             for sequence in self.sequences
             for every in self.keep_every

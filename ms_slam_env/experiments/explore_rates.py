@@ -97,16 +97,12 @@ class ExploreRates(Checked, Experiment):
         SlamEvaluator(self.sequences, self.frames, image_size=self.image_size)  # refuses bad input
         make_space(self.parameters, base)
         return [
-            FrontSpec(
-                dataclasses.replace(base, keep_every=every).keep_every,
-                name,
-                seed,
-                self.trials,
-                self.sequences,
-                self.parameters,
-                self.image_size,
-                self.frames,
-                asdict(base),
+            self.spec(
+                FrontSpec,
+                keep_every=dataclasses.replace(base, keep_every=every).keep_every,
+                sampler=name,
+                seed=seed,
+                base=asdict(base),
             )
             for every in self.keep_every
             for seed in range(self.seeds)

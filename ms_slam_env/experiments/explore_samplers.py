@@ -37,15 +37,7 @@ PARAMETERS = (
 
 @dataclass(frozen=True)
 class StudySpec:
-    """One study.
-
-    Attributes:
-        sampler: name; with ``seed`` and ``trials`` of the study.
-        sequences: that configurations are measured on, ``frames`` long if rendered.
-        parameters: each at ``levels`` points of the grid.
-        reference_factor: the hypervolume counts from so many times the default's figures.
-        evaluations: file of what has been measured.
-    """
+    """One study; see :class:`ExploreSamplers` for the fields."""
 
     sampler: str
     seed: int
@@ -117,18 +109,7 @@ class ExploreSamplers(Checked, Experiment):
             if name not in SAMPLERS:
                 raise unknown("sampler", name, SAMPLERS)
         return [
-            StudySpec(
-                name,
-                seed,
-                self.trials,
-                self.sequences,
-                self.parameters,
-                self.levels,
-                self.image_size,
-                self.frames,
-                self.reference_factor,
-                str(self.evaluations),
-            )
+            self.spec(StudySpec, sampler=name, seed=seed, evaluations=str(self.evaluations))
             for seed in range(self.seeds)
             for name in self.samplers
         ]

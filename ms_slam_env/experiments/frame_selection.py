@@ -97,10 +97,7 @@ class FrameSelection(Experiment, Checked):
                 raise InputError(f"{text!r} measures time: no two runs are alike")
         slam.POINT.find(self.backend)
         parse_image_size(self.image_size)
-        return [
-            FilterSpec(sequence, self.managements, self.backend, self.image_size, self.frames)
-            for sequence in self.sequences
-        ]
+        return [self.spec(FilterSpec, sequence=sequence) for sequence in self.sequences]
 
     @staticmethod
     def run(spec: FilterSpec) -> dict[str, Any]:

@@ -10,9 +10,9 @@ import numpy as np
 
 from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.config import Checked, bounded
-from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.sequence_divergence import consecutive_divergences
+from ms_slam_env.experiments.difficulty_errors import HISTOGRAMS
 from ms_slam_env.experiments.harness.episodes import seed_list
 from ms_slam_env.experiments.harness.experiment import Experiment
 from ms_slam_env.parallel import limit_threads
@@ -22,12 +22,6 @@ from ms_slam_env.scenes import PUBLISHED_ROOMS
 from ms_slam_env.scenes.registry import check_name
 from ms_slam_env.sequences import HandheldPath, open_sequence
 
-MEASURES = {
-    "kl, paper": DivergenceConfig.paper(),
-    "kl": DivergenceConfig(),
-    "windowed-kl": DivergenceConfig(measure="windowed-kl"),
-    "earth-movers": DivergenceConfig(measure="earth-movers"),
-}
 GAMMA = 2.2
 
 
@@ -79,10 +73,7 @@ class LightTolerance(Experiment, Checked):
         for scene in self.scenes:
             check_name(scene)
         (seed,) = seed_list(self.seeds, 1)
-        return [
-            LightSpec(f"{scene}:{seed}", self.gains, self.offsets, self.frames, self.every)
-            for scene in self.scenes
-        ]
+        return [self.spec(LightSpec, sequence=f"{scene}:{seed}") for scene in self.scenes]
 
     @staticmethod
     def run(spec: LightSpec) -> dict[str, Any]:
@@ -91,7 +82,7 @@ class LightTolerance(Experiment, Checked):
         K = xtion("160x120")
         path = HandheldPath(spec.frames)
         frames = list(open_sequence(spec.sequence, "160x120", path=path).frames)[:: spec.every]
-        configs = list(MEASURES.values())
+        configs = list(HISTOGRAMS.values())
         moved = np.median(consecutive_divergences(frames, K, configs)[..., 0], axis=0)
         changes = [
             *((f"exposure x {gain:g}", gain, 0.0) for gain in spec.gains),
@@ -106,7 +97,7 @@ class LightTolerance(Experiment, Checked):
             lit = np.median(pairs, axis=0)
             lines += [
                 {"light": name, "measure": measure, "light_to_motion": float(lit[k] / moved[k])}
-                for k, measure in enumerate(MEASURES)
+                for k, measure in enumerate(HISTOGRAMS)
             ]
         return {"frames": len(frames), "lights": lines}
 

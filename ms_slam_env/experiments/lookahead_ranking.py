@@ -75,16 +75,7 @@ SETTINGS: dict[str, tuple[DivergenceConfig, LookaheadConfig]] = {
 
 @dataclass(frozen=True)
 class RankingSpec:
-    """The states of one path.
-
-    Attributes:
-        scene: a scene's name or a mesh file.
-        seed: of the scene, the path and the sensor noise.
-        states: how many.
-        step_m: translation of a candidate motion, metres.
-        step_deg: rotation of a candidate motion, degrees.
-        image_size: width x height.
-    """
+    """The states of one path; see :class:`LookaheadRanking` for the fields."""
 
     scene: str
     seed: int
@@ -166,7 +157,7 @@ class LookaheadRanking(Experiment):
         if self.states < 1:
             raise InputError(f"states = {self.states} must be at least 1")
         return [
-            RankingSpec(scene, seed, self.states, self.step_m, self.step_deg, self.image_size)
+            self.spec(RankingSpec, scene=scene, seed=seed)
             for scene in self.scenes
             for seed in seed_list(self.seeds, self.paths)
         ]

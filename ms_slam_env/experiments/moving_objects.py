@@ -87,8 +87,7 @@ class MovingObjectsExperiment(Experiment, Checked):
 
     def specs(self) -> list[MovingObjectsSpec]:
         """Every sequence."""
-        common = (self.backends, self.image_size, self.frames)
-        return [MovingObjectsSpec(sequence, *common) for sequence in self.sequences]
+        return [self.spec(MovingObjectsSpec, sequence=text) for text in self.sequences]
 
     @staticmethod
     def run(spec: MovingObjectsSpec) -> dict[str, Any]:

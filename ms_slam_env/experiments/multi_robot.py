@@ -105,18 +105,7 @@ class MultiRobot(Experiment, Checked):
             if setting not in SETTINGS:
                 raise unknown("setting", setting, SETTINGS)
         return [
-            MultiRobotSpec(
-                scene,
-                seed,
-                self.robots,
-                setting,
-                self.frames,
-                self.image_size,
-                self.noise,
-                self.least_overlap,
-                merge=self.merge,
-                server=self.server,
-            )
+            self.spec(MultiRobotSpec, scene=scene, seed=seed, setting=setting)
             for setting in self.settings
             for scene in self.scenes
             for seed in seed_list(self.seeds, self.teams)

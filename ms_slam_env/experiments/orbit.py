@@ -80,9 +80,8 @@ class Orbit(Experiment, Checked):
             check_name(scene)
         for backend in self.backends:
             slam.check_parameters(*parse_named(backend, "backend"))
-        shared = self.stretches, self.laps, self.image_size
         return [
-            OrbitSpec(scene, seed, backend, black, *shared)
+            self.spec(OrbitSpec, scene=scene, seed=seed, backend=backend, black_frames=black)
             for scene in self.scenes
             for seed in seed_list(self.seeds, self.recordings)
             for black in self.black_frames

@@ -84,9 +84,8 @@ class PoseCovariance(Experiment, Checked):
         xtion(self.size)
         noise_config(self.noise)
         split = {VALIDATION: self.validation_seeds, TEST: self.test_seeds}
-        common = (self.size, self.frames, self.noise, self.speed_m, self.rot_deg)
         return [
-            CovarianceSpec(seeds, scene, seed, *common)
+            self.spec(CovarianceSpec, seeds=seeds, scene=scene, seed=seed)
             for seeds, numbers in split.items()
             for scene in self.scenes
             for seed in numbers

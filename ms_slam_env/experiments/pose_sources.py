@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from ms_slam_env.env.pose_sources import POSE_SOURCES
-from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.errors import InputError
 from ms_slam_env.experiments.harness.episode_experiment import DOTS, SteppedExperiment
 from ms_slam_env.experiments.harness.episodes import parse_options
+from ms_slam_env.experiments.harness.experiment import check_each
 from ms_slam_env.report.charts import Chart, by_group
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.statistics import Interval, relative_cut
@@ -45,11 +46,7 @@ class PoseSourceExperiment(SteppedExperiment):
 
     def __post_init__(self) -> None:
         """Refuse unknown or repeated sources."""
-        if not self.sources or len(set(self.sources)) < len(self.sources):
-            raise InputError(f"sources {', '.join(self.sources)!r} must be different, at least one")
-        for source in self.sources:
-            if source not in POSE_SOURCES:
-                raise unknown("source of the pose", source, POSE_SOURCES)
+        check_each("source", self.sources, POSE_SOURCES)
 
     def compared(self) -> Sequence[Mapping[str, Any]]:
         """Every planner with every source."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -13,10 +14,10 @@ from numpy.typing import NDArray
 from ms_slam_env import scenes, slam
 from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
 from ms_slam_env.config import Checked, bounded
-from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.run_sequence import SequenceRun, run_sequence
 from ms_slam_env.experiments.harness.episodes import seed_list
-from ms_slam_env.experiments.harness.experiment import Experiment
+from ms_slam_env.experiments.harness.experiment import Experiment, check_each
 from ms_slam_env.experiments.harness.interruptions import (
     ALL_SETTINGS,
     FOREIGN,
@@ -97,25 +98,18 @@ class Relocalization(Experiment, Checked):
         """Every map."""
         for scene in self.scenes:
             check_name(scene)
-        for name, given, valid in (
-            ("scene", self.scenes, self.scenes),
-            ("setting", self.settings, ALL_SETTINGS),
-            ("variant", self.variants, RELOCALISATIONS),
-        ):
-            if not given or len(set(given)) < len(given):
-                raise InputError(f"{name}s {', '.join(given)!r} must be different, at least one")
-            for one in given:
-                if one not in valid:
-                    raise unknown(name, one, valid)
+        check_each("scene", self.scenes, self.scenes)
+        check_each("setting", self.settings, ALL_SETTINGS)
+        check_each("variant", self.variants, RELOCALISATIONS)
         if self.after > self.map_frames:
             raise InputError(f"after = {self.after} is more than map_frames = {self.map_frames}")
         for size in self.sizes:
             xtion(size)
-        common = (self.settings, self.variants, self.jumps, self.map_frames, self.after)
+        seeds = seed_list(self.seeds, self.maps)
         return [
-            RelocalizationSpec(self.scenes[index % len(self.scenes)], seed, size, *common)
+            self.spec(RelocalizationSpec, scene=scene, seed=seed, size=size)
             for size in self.sizes
-            for index, seed in enumerate(seed_list(self.seeds, self.maps))
+            for scene, seed in zip(cycle(self.scenes), seeds, strict=False)
         ]
 
     @staticmethod

@@ -90,11 +90,7 @@ class SlamBatch(Experiment, Checked):
         """Every size of a batch."""
         xtion(self.size)
         SurfelConfig(**nested_options(self.backend))
-        common = (self.size, self.scene, self.seed, self.sequences, self.frames, self.warm_up)
-        return [
-            BatchSpec(self.device, batch, *common, self.max_surfels, self.backend)
-            for batch in self.batch
-        ]
+        return [self.spec(BatchSpec, batch=batch) for batch in self.batch]
 
     def prepare(self) -> None:
         """Refuse a GPU that is not there."""

@@ -93,12 +93,11 @@ class SlamSpeed(Experiment, Checked):
         backend_parameters(self.backend)
         for size in self.sizes:
             xtion(size)
-        sequence = (self.scene, self.seed, self.stored, self.frames, self.warm_up, self.backend)
         checkouts = {THIS: ""}
         if self.against is not None:
             checkouts[OTHER] = str(self.against)
         return [
-            SpeedSpec(version, size, repeat, *sequence, checkout)
+            self.spec(SpeedSpec, version=version, size=size, repeat=repeat, checkout=checkout)
             for repeat in range(self.repeats)
             for size in self.sizes
             for version, checkout in checkouts.items()

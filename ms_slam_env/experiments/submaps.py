@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -13,11 +14,10 @@ from numpy.typing import NDArray
 from ms_slam_env import scenes, slam
 from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
 from ms_slam_env.config import Checked, bounded
-from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.evaluation.run_sequence import SequenceRun, run_sequence
 from ms_slam_env.evaluation.submaps import submap_errors, submap_measures, submap_numbers
 from ms_slam_env.experiments.harness.episodes import seed_list
-from ms_slam_env.experiments.harness.experiment import Experiment
+from ms_slam_env.experiments.harness.experiment import Experiment, check_each
 from ms_slam_env.experiments.harness.interruptions import FOREIGN, map_path
 from ms_slam_env.geometry import invert, relative_angle, so3_exp
 from ms_slam_env.metrics import ate_rmse
@@ -89,20 +89,13 @@ class SubmapsExperiment(Experiment, Checked):
 
     def specs(self) -> list[SubmapsSpec]:
         """Every map."""
-        for name, given, valid in (
-            ("scene", self.scenes, SCENES),
-            ("setting", self.settings, KINDS),
-            ("variant", self.variants, SUBMAPS),
-        ):
-            if not given or len(set(given)) < len(given):
-                raise InputError(f"{name}s {', '.join(given)!r} must be different, at least one")
-            for one in given:
-                if one not in valid:
-                    raise unknown(name, one, valid)
-        common = (self.settings, self.variants, self.jumps, self.map_frames, self.after)
+        check_each("scene", self.scenes, SCENES)
+        check_each("setting", self.settings, KINDS)
+        check_each("variant", self.variants, SUBMAPS)
+        seeds = seed_list(self.seeds, self.maps)
         return [
-            SubmapsSpec(self.scenes[index % len(self.scenes)], seed, self.size, *common)
-            for index, seed in enumerate(seed_list(self.seeds, self.maps))
+            self.spec(SubmapsSpec, scene=scene, seed=seed, kinds=self.settings)
+            for scene, seed in zip(cycle(self.scenes), seeds, strict=False)
         ]
 
     @staticmethod

@@ -96,7 +96,7 @@ class TeamMapping(Experiment, Checked):
         for scene in self.scenes:
             check_name(scene)
         return [
-            TeamMappingSpec(scene, seed, robots, goal, self.steps, self.planner)
+            self.spec(TeamMappingSpec, scene=scene, seed=seed, robots=robots, goal=goal)
             for scene, goal in zip(self.scenes, self.goals, strict=True)
             for seed in seed_list(self.seeds, self.teams)
             for robots in self.robots

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import pkgutil
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import ms_slam_env.experiments
+from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.extension import ExtensionPoint
 from ms_slam_env.parallel import one_thread_unless_set
 from ms_slam_env.report.charts import Chart
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table
+
+S = TypeVar("S")
 
 
 class Experiment(ABC):
@@ -72,6 +76,13 @@ class Experiment(ABC):
     def write_pictures(self, rows: Sequence[Row], out: Path) -> None:  # noqa: B027
         """Draw into folder ``out`` what no chart can show; nothing by default."""
 
+    def spec(self, kind: type[S], **own: Any) -> S:
+        """One of the `specs`: fields ``own``, and the options that are named as its others."""
+        options = {field.name for field in dataclasses.fields(self)}  # type: ignore[arg-type]
+        names = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
+        shared = {name: getattr(self, name) for name in names if name in options - own.keys()}
+        return kind(**shared, **own)
+
     def prepare(self) -> None:  # noqa: B027
         """Refuse, in seconds, what would make every row fail; nothing by default.
 
@@ -92,6 +103,20 @@ class Experiment(ABC):
     def about(cls) -> str:
         """The docstring without its first line."""
         return " ".join(_paragraphs(cls)[1:])
+
+
+def check_each(kind: str, given: Sequence[str], valid: Iterable[str]) -> None:
+    """Refuse a list of a ``kind`` of thing that is empty, or has one twice or an unknown one.
+
+    Raises:
+        InputError: naming it; of an unknown one, with the valid choices.
+    """
+    if not given or len(set(given)) < len(given):
+        raise InputError(f"{kind}s {', '.join(given)!r} must be different, at least one")
+    valid = tuple(valid)
+    for one in given:
+        if one not in valid:
+            raise unknown(kind, one, valid)
 
 
 def _paragraphs(cls: type) -> list[str]:
