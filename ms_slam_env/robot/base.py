@@ -39,8 +39,8 @@ class MotionResult:
 
         On a straight line, turning evenly, from a pose (4, 4) on by a ``motion`` (4, 4).
         """
-        turn = so3_log(motion[:3, :3])
         shares = np.arange(1, frames) / frames
+        turn = so3_log(motion[:3, :3]) if len(shares) else np.zeros(3)
         parts = [make_pose(so3_exp(share * turn), share * motion[:3, 3]) for share in shares]
         poses: Float64 = np.stack([start @ part for part in [*parts, motion]])
         times_s = FRAME_PERIOD_S * np.arange(1, frames + 1, dtype=np.float64)
