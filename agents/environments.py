@@ -6,11 +6,12 @@ import math
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
 import torch
+from ms_slam_agents.curriculum import Staged, read_curriculum
 from ms_slam_agents.evaluation import FixedEpisodes
 from ms_slam_agents.options import Problem
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
@@ -22,12 +23,22 @@ VALIDATION_SEED = 1_000_000  # of the first validation episode; training draws f
 
 
 def make_env(args: Problem, split: str, seeds: Sequence[int]) -> gym.Env[Any, Any]:
-    """Build one environment; with ``seeds`` it plays those episodes only."""
+    """Build one environment; with ``seeds`` it plays those episodes only.
+
+    One to train in follows the curriculum, if there is one.
+    """
     if multiprocessing.parent_process() is not None:  # in a worker Ctrl-C is the main's to answer
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         torch.set_num_threads(1)
-    env = gym.make(args.env_id, disable_env_checker=True, **problem_options(args, split))
-    return FixedEpisodes(env, seeds) if seeds else env
+
+    def make(problem: Problem, more: Mapping[str, Any]) -> gym.Env[Any, Any]:
+        options = problem_options(problem, split)
+        return gym.make(args.env_id, disable_env_checker=True, **options, **more)
+
+    path = getattr(args, "curriculum", None)
+    if path and split == "train":
+        return Staged(read_curriculum(path), args, make)
+    return FixedEpisodes(make(args, {}), seeds) if seeds else make(args, {})
 
 
 def problem_options(args: Problem, split: str) -> dict[str, Any]:
@@ -60,7 +71,10 @@ def check_problem(args: Problem) -> None:
     """
     try:
         for split in ("train", "validation"):
-            make_env(args, split, ()).close()
+            env = make_env(args, split, ())
+            if isinstance(env, Staged):
+                env.check()
+            env.close()
     except gym.error.UnregisteredEnv:
         raise unknown("environment", args.env_id, ms_slam_env.ENV_IDS) from None
     except gym.error.Error as error:

@@ -97,6 +97,7 @@ class Training(Problem):
         learning_rate: of Adam.
         gamma: discount factor.
         hidden: width of the two hidden layers.
+        curriculum: YAML file of stages, from easy to the problem itself: see ``curriculum.py``.
     """
 
     init: Path | None = None
@@ -107,6 +108,7 @@ class Training(Problem):
     learning_rate: float = bounded(2.5e-4, 0, 1)
     gamma: float = bounded(0.98, 0, 1)
     hidden: int = bounded(256, 1, 4096)
+    curriculum: Path | None = None
 
     kept: ClassVar[tuple[str, ...]] = ()
     """Options beside ``KEPT`` that a run keeps when it is resumed."""

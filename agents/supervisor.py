@@ -11,7 +11,7 @@ from ms_slam_agents.options import Args
 from ms_slam_agents.policy import action_parts
 from ms_slam_agents.policy_file import PolicyFile, write_policy
 from ms_slam_agents.sb3_state import Model, tensors_of, update_on_partial_rollout
-from ms_slam_agents.training_run import metadata_of
+from ms_slam_agents.training_run import metadata_of, stage_of
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 from tqdm import tqdm
@@ -87,6 +87,9 @@ class Supervisor(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         self._save_latest()
+        if self.args.curriculum:
+            stage = stage_of(self.args, self.num_timesteps, self.curve)
+            self.training_env.env_method("enter_stage", stage)
         if self.num_timesteps >= self._next_evaluation:
             self._evaluate()
             self._plan_evaluation()

@@ -13,6 +13,7 @@ from typing import Any, ClassVar, TypeVar
 
 import torch
 from gymnasium import spaces
+from ms_slam_agents.curriculum import read_curriculum, stage_now
 from ms_slam_agents.environments import VALIDATION_SEED, check_problem, env_options, make_venv
 from ms_slam_agents.evaluation import references
 from ms_slam_agents.learning_curve import LATEST, Curve, read_curve
@@ -52,6 +53,7 @@ class TrainingRun(ABC):
     """
 
     algorithm: ClassVar[str]
+    venv: VecEnv
 
     def __init__(
         self, args: Training, observations: spaces.Space, actions: spaces.Space, file: Any
@@ -75,6 +77,10 @@ class TrainingRun(ABC):
         Returns:
             What there is to say of it; None where ``stop()`` said so before its end.
         """
+
+    def enter_stage(self, stage: int) -> None:
+        """Let the environments be of a stage of the curriculum from their next episodes on."""
+        self.venv.env_method("enter_stage", stage)
 
     @abstractmethod
     def tensors(self) -> Tensors:
@@ -110,6 +116,8 @@ class TrainingRun(ABC):
                 if args.minutes is not None and self.minutes - before >= args.minutes:
                     break
                 steps, begun = self.steps, time.monotonic()
+                if args.curriculum:
+                    self.enter_stage(stage_of(args, self.steps, curve))
                 said = self.advance(lambda: bool(signals))
                 if said is None:
                     break
@@ -182,6 +190,12 @@ def caught_signals(tell: Callable[[str], Any]) -> Iterator[None]:
     finally:
         for caught, handler in before.items():
             signal.signal(caught, handler)
+
+
+def stage_of(args: Training, steps: int, curve: Curve) -> int:
+    """The stage of the curriculum after so many steps."""
+    assert args.curriculum
+    return stage_now(read_curriculum(args.curriculum), steps, curve.points, args.total_timesteps)
 
 
 def metadata_of(args: Any, algorithm: str, **counts: Any) -> Metadata:
