@@ -5,8 +5,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from arc import CAMERA, arc
 from box_scene import BoxScene
 from hypothesis import settings
+
+from ms_slam_env.camera import RGBDFrame
+from ms_slam_env.sensor import RGBDSensor
 
 # The same examples on every run: a failure says something about the change that shows it.
 settings.register_profile("repeatable", derandomize=True)
@@ -39,3 +43,10 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 def box_scene() -> BoxScene:
     """A small textured room with two boxes, seed 0."""
     return BoxScene(seed=0)
+
+
+@pytest.fixture(scope="session")
+def arc_frames(box_scene: BoxScene) -> list[RGBDFrame]:
+    """Sixteen noisy frames along `arc` in that room."""
+    sensor = RGBDSensor(box_scene, CAMERA, noise="kinect", seed=0)
+    return [sensor.capture(pose, index) for index, pose in enumerate(arc(16))]

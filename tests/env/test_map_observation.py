@@ -52,8 +52,9 @@ def test_an_episode_forgets_the_one_before():
     np.testing.assert_array_equal(again, first)
 
 
-def test_a_saved_state_holds_the_grid_and_goes_on_bit_exactly():
-    env, other = make(), make()
+@pytest.mark.parametrize("observation", ["map", "candidates"])
+def test_a_saved_state_holds_the_grid_and_goes_on_bit_exactly(observation):
+    env, other = make(observation), make(observation)
     env.reset(seed=0)
     env.step(14)
     state = env.unwrapped.save_state()

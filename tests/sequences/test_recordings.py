@@ -242,50 +242,39 @@ def test_broken_listings(tum, case):
     assert "\n" not in str(caught.value)
 
 
+REMOVED = (lambda p: p.unlink(), "No such file")
+CUT = (lambda p: p.write_bytes(p.read_bytes()[:60]), "truncated|cannot identify|broken")
 IMAGES = {
-    "missing": (lambda p: p.unlink(), "No such file"),
-    "truncated": (lambda p: p.write_bytes(p.read_bytes()[:60]), "truncated|cannot identify|broken"),
-    "another size": (
+    ("depth", "missing"): REMOVED,
+    ("depth", "truncated"): CUT,
+    ("depth", "another size"): (
         lambda p: Image.fromarray(depth_values(0)[:20]).save(p),
         "is 32x20 but the intrinsics say 32x24",
     ),
-    "colour for depth": (lambda p: Image.fromarray(colors(0)).save(p), "not a 16-bit depth image"),
-}
-
-
-@pytest.mark.parametrize("case", IMAGES)
-def test_broken_images(tum, case):
-    breaks, message = IMAGES[case]
-    breaks(tum / "depth/1.png")
-    recording = open_recording(tum)
-    recording.frame(0)
-    with pytest.raises(InputError, match=message) as caught:
-        recording.frame(1)
-    assert re.search(r"depth\.txt:2: .*depth/1\.png", str(caught.value))
-    assert "\n" not in str(caught.value)
-
-
-COLOR_IMAGES = {
-    "missing": (lambda p: p.unlink(), "No such file"),
-    "truncated": (lambda p: p.write_bytes(p.read_bytes()[:60]), "truncated|cannot identify|broken"),
-    "empty": (lambda p: p.write_bytes(b""), "cannot identify"),
-    "another size": (
+    ("depth", "colour"): (
+        lambda p: Image.fromarray(colors(0)).save(p),
+        "not a 16-bit depth image",
+    ),
+    ("rgb", "missing"): REMOVED,
+    ("rgb", "truncated"): CUT,
+    ("rgb", "empty"): (lambda p: p.write_bytes(b""), "cannot identify"),
+    ("rgb", "another size"): (
         lambda p: Image.fromarray(colors(0)[:, :16]).save(p),
         "is 16x24 but the intrinsics say 32x24",
     ),
-    "depth for colour": (lambda p: Image.fromarray(depth_values(0)).save(p), "not a colour image"),
+    ("rgb", "depth"): (lambda p: Image.fromarray(depth_values(0)).save(p), "not a colour image"),
 }
 
 
-@pytest.mark.parametrize("case", COLOR_IMAGES)
-def test_broken_colour_images(tum, case):
-    breaks, message = COLOR_IMAGES[case]
-    breaks(tum / "rgb/1.png")
+@pytest.mark.parametrize(("kind", "case"), IMAGES)
+def test_broken_images(tum, kind, case):
+    breaks, message = IMAGES[kind, case]
+    breaks(tum / kind / "1.png")
     recording = open_recording(tum)
     recording.frame(0)
     with pytest.raises(InputError, match=message) as caught:
         recording.frame(1)
-    assert re.search(r"depth\.txt:2: .*rgb/1\.png", str(caught.value))
+    assert re.search(rf"depth\.txt:2: .*{kind}/1\.png", str(caught.value))
     assert "\n" not in str(caught.value)
 
 

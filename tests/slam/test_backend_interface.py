@@ -6,19 +6,18 @@ import pickle
 
 import numpy as np
 import pytest
+from arc import CAMERA, START, arc, black_frame
 from box_scene import BoxScene
 from scipy.spatial import cKDTree
 
 from ms_slam_env import slam
-from ms_slam_env.camera import RGBDFrame, intensity_image, xtion
+from ms_slam_env.camera import RGBDFrame, intensity_image
 from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at, make_pose, relative_angle, so3_exp
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.frame_selection import make_config
 
-CAMERA = xtion("160x120")
-START = look_at([-0.8, -0.8, 1.2], [1.2, 0.1, 0.5])
 COUNT = 12
 MANAGED = "surfel behind a filter"
 """A decorator is a backend, too; of the path it processes some of the frames."""
@@ -44,15 +43,7 @@ SLIDES_M = {"kinectfusion": 0.04}
 """What is granted besides where geometry says little: its alignment is of geometry alone."""
 
 
-def _path() -> np.ndarray:
-    """1 cm and 0.5 degrees a frame."""
-    poses = [START]
-    for _ in range(COUNT - 1):
-        poses.append(poses[-1] @ make_pose(so3_exp([0, np.radians(-0.5), 0]), [0.01, 0, 0.002]))
-    return np.stack(poses)
-
-
-PATH = _path()
+PATH = arc(COUNT)
 
 
 def _make(name: str, **options: object) -> slam.SlamBackend:
@@ -66,20 +57,13 @@ def _new(name: str) -> slam.SlamBackend:
     return backend
 
 
-def _black() -> RGBDFrame:
-    return RGBDFrame(
-        np.zeros((*CAMERA.shape, 3), dtype=np.uint8), np.zeros(CAMERA.shape, dtype=np.float32)
-    )
-
-
 def _capture(scene: BoxScene, pose: np.ndarray, noise: str = "kinect") -> RGBDFrame:
     return RGBDSensor(scene, CAMERA, noise=noise, seed=1).capture(pose, 0)
 
 
 @pytest.fixture(scope="module")
-def frames(box_scene: BoxScene) -> list[RGBDFrame]:
-    sensor = RGBDSensor(box_scene, CAMERA, noise="kinect", seed=0)
-    return [sensor.capture(pose, index) for index, pose in enumerate(PATH)]
+def frames(arc_frames: list[RGBDFrame]) -> list[RGBDFrame]:
+    return arc_frames[:COUNT]
 
 
 @pytest.fixture(scope="module", params=[*sorted(slam.BACKENDS), MANAGED])
@@ -187,7 +171,7 @@ def test_a_state_goes_on_bit_exactly(name, frames):
     backend = _new(name)
     for frame in frames[:4]:
         backend.track(frame)
-    backend.track(_black())  # saved while lost
+    backend.track(black_frame())  # saved while lost
     state = backend.get_state()
     assert _is_plain(state)
     saved = pickle.dumps(state)
@@ -210,7 +194,7 @@ def test_a_state_goes_on_bit_exactly(name, frames):
 def test_reset_forgets_everything(name, frames, tracked):
     backend = _new(name)
     backend.track(frames[8])
-    backend.track(_black())
+    backend.track(black_frame())
     backend.reset(START)
     assert len(backend.surface_points()) == 0
     assert not backend.predict(START[None]).depth.any()
@@ -221,7 +205,7 @@ def test_reset_forgets_everything(name, frames, tracked):
 
 def test_empty_frames_are_lost_and_leave_pose_and_map(name, frames):
     backend = _new(name)
-    result = backend.track(_black())
+    result = backend.track(black_frame())
     assert not result.tracking_ok
     assert "first frame" in result.reason
     for frame in frames[:3]:
@@ -232,7 +216,7 @@ def test_empty_frames_are_lost_and_leave_pose_and_map(name, frames):
         rng.integers(0, 256, (*CAMERA.shape, 3), dtype=np.uint8),
         rng.uniform(0.5, 3, CAMERA.shape).astype(np.float32),
     )
-    for bad in (_black(), garbage):
+    for bad in (black_frame(), garbage):
         result = backend.track(bad)
         assert not result.tracking_ok
         assert result.reason
@@ -284,9 +268,9 @@ def test_bad_input_is_refused(name):
     with pytest.raises(InputError, match="80x60"):
         backend.fuse(small, START)
     with pytest.raises(InputError, match="T_world_camera_guess"):
-        backend.track(_black(), no_pose)
+        backend.track(black_frame(), no_pose)
     with pytest.raises(InputError, match="T_world_camera"):
-        backend.fuse(_black(), no_pose)
+        backend.fuse(black_frame(), no_pose)
     with pytest.raises(InputError, match="T_world_camera"):
         backend.reset(no_pose)
     with pytest.raises(InputError, match="poses"):

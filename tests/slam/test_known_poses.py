@@ -4,36 +4,26 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from arc import CAMERA, START, arc, black_frame
 from box_scene import BoxScene
 from scipy.spatial import cKDTree
 
 from ms_slam_env import slam
-from ms_slam_env.camera import RGBDFrame, xtion
+from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at, make_pose, so3_exp
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
 from ms_slam_env.slam.surfel.localization import Localizer
 
-CAMERA = xtion("160x120")
-START = look_at([-0.8, -0.8, 1.2], [1.2, 0.1, 0.5])
 CONFIG = SurfelConfig(max_surfels=60_000, depth_cutoff_m=4.0)
 # 40 cm along the viewing direction and up, 30 degrees about a slanted axis
 JUMP = START @ make_pose(so3_exp(np.radians([12.0, 20.0, 19.0])), [0.12, -0.1, 0.37])
 
 
-def _path(count: int) -> np.ndarray:
-    """A slow arc: 1 cm and 0.5 degrees a frame."""
-    poses = [START]
-    for _ in range(count - 1):
-        poses.append(poses[-1] @ make_pose(so3_exp([0, np.radians(-0.5), 0]), [0.01, 0, 0.002]))
-    return np.stack(poses)
-
-
 @pytest.fixture(scope="module")
-def frames(box_scene: BoxScene) -> list[RGBDFrame]:
-    sensor = RGBDSensor(box_scene, CAMERA, noise="kinect", seed=0)
-    return [sensor.capture(pose, index) for index, pose in enumerate(_path(10))]
+def frames(arc_frames: list[RGBDFrame]) -> list[RGBDFrame]:
+    return arc_frames[:10]
 
 
 @pytest.fixture(scope="module")
@@ -45,12 +35,6 @@ def _new() -> slam.SlamBackend:
     backend = slam.make("surfel", CAMERA, max_surfels=60_000, depth_cutoff_m=4.0)
     backend.reset(START)
     return backend
-
-
-def _black() -> RGBDFrame:
-    return RGBDFrame(
-        np.zeros((*CAMERA.shape, 3), dtype=np.uint8), np.zeros(CAMERA.shape, dtype=np.float32)
-    )
 
 
 def _error_m(result: slam.TrackResult, truth: np.ndarray) -> float:
@@ -76,7 +60,7 @@ def test_a_guess_finds_a_jump_that_plain_tracking_loses(frames, jump_frame, lost
         backend = _new()
         backend.track(frames[0])
         for _ in range(lost_frames):
-            assert not backend.track(_black(), JUMP).tracking_ok
+            assert not backend.track(black_frame(), JUMP).tracking_ok
         result = backend.track(jump_frame, guess)
         assert result.tracking_ok == (guess is not None), result.reason
     assert _error_m(result, JUMP) < 0.02
@@ -96,7 +80,7 @@ def test_the_alignment_corrects_a_guess_that_is_a_little_off(frames, jump_frame)
 def test_wrong_guesses_do_no_harm(frames):
     rng = np.random.default_rng(0)
     plain, guided = _new(), _new()
-    for frame, truth in zip(frames, _path(10), strict=True):
+    for frame, truth in zip(frames, arc(10), strict=True):
         wrong = truth @ make_pose(so3_exp(rng.uniform(-1, 1, 3)), rng.uniform(-0.6, 0.6, 3))
         result = guided.track(frame, wrong)
         assert result.tracking_ok, result.reason
@@ -144,7 +128,7 @@ def test_guesses_of_a_batch_are_those_of_its_envs_alone(frames, jump_frame):
 
 def test_frames_fused_at_true_poses_map_the_true_surface(frames, box_scene):
     backend = _new()
-    for frame, truth in zip(frames, _path(10), strict=True):
+    for frame, truth in zip(frames, arc(10), strict=True):
         result = backend.fuse(frame, truth)
         assert result.tracking_ok
         np.testing.assert_array_equal(result.T_world_camera, truth)
@@ -158,9 +142,9 @@ def test_frames_fused_at_true_poses_map_the_true_surface(frames, box_scene):
 
 def test_tracking_goes_on_from_fused_frames(frames):
     backend = _new()
-    path = _path(10)
+    path = arc(10)
     backend.track(frames[0])
-    backend.track(_black())
+    backend.track(black_frame())
     for index in (5, 6):
         assert not backend.fuse(frames[index], path[index]).relocalised
     for index in (7, 8, 9):
@@ -172,13 +156,13 @@ def test_tracking_goes_on_from_fused_frames(frames):
 
 def test_a_fused_frame_without_depth_leaves_the_map_to_start(frames):
     backend = _new()
-    assert backend.fuse(_black(), START).tracking_ok
+    assert backend.fuse(black_frame(), START).tracking_ok
     assert len(backend.surface_points()) == 0
     np.testing.assert_array_equal(backend.track(frames[0]).T_world_camera, START)
 
 
 def test_state_with_fused_frames_goes_on_bit_exactly(frames):
-    path = _path(10)
+    path = arc(10)
     backend = _new()
     for index in range(4):
         backend.fuse(frames[index], path[index])

@@ -4,34 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from box_scene import BoxScene
+from arc import CAMERA, START, arc, black_frame
 from scipy.spatial import cKDTree
 
 from ms_slam_env import slam
-from ms_slam_env.camera import RGBDFrame, xtion
+from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at, make_pose, so3_exp
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
 from ms_slam_env.slam.surfel.pose_hypotheses import motion_weight
 
-CAMERA = xtion("160x120")
-START = look_at([-0.8, -0.8, 1.2], [1.2, 0.1, 0.5])
 CONFIG = SurfelConfig(max_surfels=60_000, depth_cutoff_m=4.0)
 
 
-def _path(count: int) -> np.ndarray:
-    """A slow arc: 1 cm and 0.5 degrees a frame."""
-    poses = [START]
-    for _ in range(count - 1):
-        poses.append(poses[-1] @ make_pose(so3_exp([0, np.radians(-0.5), 0]), [0.01, 0, 0.002]))
-    return np.stack(poses)
-
-
 @pytest.fixture(scope="module")
-def frames(box_scene: BoxScene) -> list[RGBDFrame]:
-    sensor = RGBDSensor(box_scene, CAMERA, noise="kinect", seed=0)
-    return [sensor.capture(pose, index) for index, pose in enumerate(_path(16))]
+def frames(arc_frames: list[RGBDFrame]) -> list[RGBDFrame]:
+    return arc_frames[:16]
 
 
 def _new() -> slam.SlamBackend:
@@ -40,15 +29,9 @@ def _new() -> slam.SlamBackend:
     return backend
 
 
-def _black() -> RGBDFrame:
-    return RGBDFrame(
-        np.zeros((*CAMERA.shape, 3), dtype=np.uint8), np.zeros(CAMERA.shape, dtype=np.float32)
-    )
-
-
 def test_a_noisy_path_is_tracked_to_millimetres(frames, box_scene):
     backend = _new()
-    for frame, truth in zip(frames, _path(16), strict=True):
+    for frame, truth in zip(frames, arc(16), strict=True):
         result = backend.track(frame)
         assert result.tracking_ok, result.reason
         assert np.linalg.norm(result.T_world_camera[:3, 3] - truth[:3, 3]) < 0.008
@@ -71,7 +54,7 @@ def test_lost_frames_hold_the_pose_and_the_map_until_relocalised(frames):
         rng.integers(0, 256, (*CAMERA.shape, 3), dtype=np.uint8),
         rng.uniform(0.5, 3, CAMERA.shape).astype(np.float32),
     )
-    for bad in (_black(), garbage, _black()):
+    for bad in (black_frame(), garbage, black_frame()):
         result = backend.track(bad)
         assert not result.tracking_ok
         assert result.reason
@@ -80,7 +63,7 @@ def test_lost_frames_hold_the_pose_and_the_map_until_relocalised(frames):
     result = backend.track(frames[8])
     assert result.tracking_ok
     assert result.relocalised
-    assert np.linalg.norm(result.T_world_camera[:3, 3] - _path(9)[8, :3, 3]) < 0.01
+    assert np.linalg.norm(result.T_world_camera[:3, 3] - arc(9)[8, :3, 3]) < 0.01
     assert not backend.track(frames[9]).relocalised
 
 
@@ -108,7 +91,7 @@ def test_a_frame_from_elsewhere_is_not_called_tracked(frames, box_scene):
 
 def test_first_frame_needs_depth(frames):
     backend = _new()
-    result = backend.track(_black())
+    result = backend.track(black_frame())
     assert not result.tracking_ok
     assert "first frame" in result.reason
     result = backend.track(frames[0])
@@ -119,7 +102,7 @@ def test_first_frame_needs_depth(frames):
 def test_reset_forgets_everything(frames):
     backend = _new()
     first = [backend.track(frame) for frame in frames[:4]]
-    backend.track(_black())
+    backend.track(black_frame())
     backend.reset(START)
     assert backend.map.count() == 0
     assert len(backend.surface_points()) == 0
@@ -130,13 +113,13 @@ def test_reset_forgets_everything(frames):
 
 def test_a_batch_is_bit_identical_to_its_envs_alone(frames):
     orders = [[0, 1, 2, 3, 4], [10, 9, 8, 7, 6], [0, 1, 15, 0, 1]]
-    poses = _path(16)
+    poses = arc(16)
     together = BatchedSurfelSlam(3, CAMERA, CONFIG)
     alone = [BatchedSurfelSlam(1, CAMERA, CONFIG) for _ in orders]
     for env, order in enumerate(orders):
         together.reset(poses[order[0]], env)
         alone[env].reset(poses[order[0]])
-    black = _black()
+    black = black_frame()
     for step in range(5):
         # The last env loses its third frame, so that envs differ in what they do.
         batch = [
@@ -157,7 +140,7 @@ def test_state_goes_on_bit_exactly(frames):
     backend = _new()
     for frame in frames[:6]:
         backend.track(frame)
-    backend.track(_black())  # saved while lost
+    backend.track(black_frame())  # saved while lost
     state = backend.get_state()
     expected = [backend.track(frame) for frame in frames[6:10]]
     for other in (backend, _new()):
