@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from tqdm import tqdm
 import ms_slam_env
 from ms_slam_env.command_line import parse
 from ms_slam_env.config import Checked, bounded, chosen, nested_options
+from ms_slam_env.env.lerobot_dataset import DatasetWriter, Steps
 from ms_slam_env.env.planners import check_planner, make_planner, planner_observation
 from ms_slam_env.errors import InputError
 from ms_slam_env.interrupts import kept
@@ -35,10 +37,14 @@ _INFOS = (
 )
 """What is kept of ``info`` at every step."""
 
+_MARKERS = {"minari": "data/metadata.json", "lerobot": "meta/info.json"}
+"""Format to the file that a whole dataset has."""
+_NEEDS = {"minari": "minari", "lerobot": "pyarrow"}
+
 
 @dataclass(frozen=True)
 class Args(Checked):
-    """Record episodes of a planner as a Minari dataset
+    """Record episodes of a planner as a Minari or LeRobot dataset
 
     ``minari.load_dataset(NAME)`` finds it where the environment variable MINARI_DATASETS_PATH names
     the folder ``--out``.
@@ -64,6 +70,8 @@ class Args(Checked):
     """What is recorded; by default what the planner is shown."""
     options: tuple[str, ...] = ()
     """Further options of the environment, as name=value."""
+    format: str = chosen("minari", *_MARKERS)
+    """minari, or lerobot: a LeRobotDataset of format v3.0."""
     name: str | None = None
     """Of the dataset; by default PLANNER-v0."""
     out: Path = field(default=Path("results/record"))
@@ -87,12 +95,13 @@ def record(args: Args) -> Path:
     """Play the episodes and write the dataset; return its folder.
 
     Raises:
-        InputError: Minari is not installed, bad options, or a dataset of this name.
+        InputError: the format's library is not installed, bad options, or a dataset of this name.
     """
-    try:
-        import minari  # noqa: F401 -- said here, before any work is done
-    except ImportError:
-        raise InputError("ms-slam record needs Minari: pip install 'ms-slam-env[record]'") from None
+    if find_spec(_NEEDS[args.format]) is None:  # said here, before any work is done
+        raise InputError(
+            f"ms-slam record --format {args.format} needs {_NEEDS[args.format]}: "
+            "pip install 'ms-slam-env[record]'"
+        )
     check_planner(args.planner)
     check_out_folder(args.out)
     name = args.name or f"{args.planner.partition(',')[0].replace(':', '-')}-v0"
@@ -101,7 +110,7 @@ def record(args: Args) -> Path:
         raise InputError(f"{folder} is there already: give another --name, or remove it")
     with (
         kept(f"nothing is left in {folder}"),
-        result_folder(args.out, _marker(name)) as made,
+        result_folder(args.out, f"{name}/{_MARKERS[args.format]}") as made,
         naming(made / name),
         open_pool(_attempt, 1) as pool,
     ):
@@ -114,11 +123,16 @@ def record(args: Args) -> Path:
             raise OSError(errno.EIO, "the process that wrote it died", str(made / name))
         if outcome.error:
             raise RuntimeError(outcome.traceback)
-    print(
-        f"{args.episodes} episodes in {folder}; in Python, with MINARI_DATASETS_PATH="
-        f"{args.out.resolve()}: minari.load_dataset({name!r})"
-    )
+    print(f"{args.episodes} episodes in {folder}; in Python{_read_by(args, name)}")
     return folder
+
+
+def _read_by(args: Args, name: str) -> str:
+    """How the dataset is read."""
+    place = str(args.out.resolve())
+    if args.format == "lerobot":
+        return f": LeRobotDataset({name!r}, root={str(Path(place, name))!r})"
+    return f", with MINARI_DATASETS_PATH={place}: minari.load_dataset({name!r})"
 
 
 def _attempt(job: tuple[Args, str, Path]) -> OSError | None:
@@ -127,7 +141,8 @@ def _attempt(job: tuple[Args, str, Path]) -> OSError | None:
     try:
         env = _environment(args)
         try:
-            _write(env, args, name, folder)
+            write = _write_lerobot if args.format == "lerobot" else _write_minari
+            write(env, args, name, folder)
         finally:
             env.close()
     except OSError as error:
@@ -148,31 +163,65 @@ def _environment(args: Args) -> gym.Env[Any, Any]:
     )
 
 
-def _write(env: gym.Env[Any, Any], args: Args, name: str, folder: Path) -> None:
+def _write_minari(env: gym.Env[Any, Any], args: Args, name: str, folder: Path) -> None:
     """Play the episodes and write them, one after another, as dataset ``name`` below ``folder``."""
     import minari
+    from minari.data_collector import EpisodeBuffer
 
-    bar = tqdm(range(args.seed, args.seed + args.episodes), "episodes", unit="episode")
-    seeds = iter(bar)
+    def buffers() -> Iterator[Any]:
+        for seed, played in _episodes(env, args):
+            seen = played.observations
+            yield EpisodeBuffer(
+                None,
+                seed,
+                None,
+                {k: list(v) for k, v in seen.items()} if _has_parts(env) else list(seen[""]),
+                list(played.actions),
+                played.rewards.tolist(),
+                played.terminated.tolist(),
+                played.truncated.tolist(),
+                {k: list(v) for k, v in played.infos.items()},
+            )
+
     with _datasets_in(folder):
+        made = buffers()
         dataset = minari.create_dataset_from_buffers(
             name,
-            [_play(env, args, next(seeds))],
+            [next(made)],
             env=env,
             algorithm_name=args.planner,
-            description=f"{provenance()['command']}; {args.episodes} episodes of {args.planner} in "
-            f"{args.env_id}, scenes {', '.join(args.scenes)}, {args.seeds} seeds",
+            description=f"{provenance()['command']}; {_told(args)}",
             requirements=[f"ms-slam-env=={ms_slam_env.__version__}"],
             jpeg_encoding=False,
         )
-        for seed in seeds:
-            dataset.update_dataset_from_buffer([_play(env, args, seed)])
+        for buffer in made:
+            dataset.update_dataset_from_buffer([buffer])
 
 
-def _play(env: gym.Env[Any, Any], args: Args, seed: int) -> Any:
-    """One episode to its end, as Minari's ``EpisodeBuffer``."""
-    from minari.data_collector import EpisodeBuffer
+def _write_lerobot(env: gym.Env[Any, Any], args: Args, name: str, folder: Path) -> None:
+    """The same as a LeRobotDataset; a step counts as one of the film that an episode makes."""
+    assert env.spec is not None
+    robot = env.spec.kwargs["embodiment"]
+    writer = DatasetWriter(folder / name, _told(args), env.metadata["render_fps"], robot)
+    for _, played in _episodes(env, args):
+        writer.add(played)
+    writer.close()
 
+
+def _told(args: Args) -> str:
+    where = f"{args.env_id}, scenes {', '.join(args.scenes)}, {args.seeds} seeds"
+    return f"{args.episodes} episodes of {args.planner} in {where}"
+
+
+def _episodes(env: gym.Env[Any, Any], args: Args) -> Iterator[tuple[int, Steps]]:
+    """The episodes with their seeds."""
+    bar = tqdm(range(args.seed, args.seed + args.episodes), "episodes", unit="episode")
+    for seed in bar:
+        yield seed, _play(env, args, seed)
+
+
+def _play(env: gym.Env[Any, Any], args: Args, seed: int) -> Steps:
+    """One episode to its end."""
     observation, info = env.reset(seed=seed)
     stream = np.random.default_rng([seed, _STREAM])
     planner = make_planner(args.planner, env.unwrapped, seed=int(stream.integers(2**31)))
@@ -186,12 +235,11 @@ def _play(env: gym.Env[Any, Any], args: Args, seed: int) -> Any:
         known.append(info)
         steps.append((np.asarray(action), reward, terminated, truncated))
         is_over = terminated or truncated
-    actions, rewards, terminations, truncations = map(list, zip(*steps, strict=True))
-    infos = {key: [np.asarray(each[key]) for each in known] for key in _INFOS}
-    by_part = {key: [each[key] for each in seen] for key in seen[0]} if _has_parts(env) else seen
-    return EpisodeBuffer(
-        None, seed, None, by_part, actions, rewards, terminations, truncations, infos
+    by_part = (
+        {k: np.array([each[k] for each in seen]) for k in seen[0]} if _has_parts(env) else None
     )
+    infos = {key: np.array([each[key] for each in known]) for key in _INFOS}
+    return Steps(by_part or {"": np.array(seen)}, infos, *map(np.array, zip(*steps, strict=True)))
 
 
 def _has_parts(env: gym.Env[Any, Any]) -> bool:
@@ -212,7 +260,3 @@ def _datasets_in(folder: Path) -> Iterator[None]:
             del os.environ[_VARIABLE]
         else:
             os.environ[_VARIABLE] = before
-
-
-def _marker(name: str) -> str:
-    return f"{name}/data/metadata.json"

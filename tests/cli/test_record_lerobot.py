@@ -1,0 +1,149 @@
+"""Episodes in LeRobot's format, read back as its reader does: Parquet files, JSON, PNG."""
+
+import io
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from PIL import Image
+
+from ms_slam_env.cli import main
+from ms_slam_env.env.lerobot_dataset import DatasetWriter, Steps
+from ms_slam_env.env.planners import make_planner
+
+pq = pytest.importorskip("pyarrow.parquet")
+pd = pytest.importorskip("pandas")
+
+RNG = np.random.default_rng(0)
+
+
+def rows_of(folder):
+    """Columns of all data files, by the paths that each episode names."""
+    info = json.loads((folder / "meta/info.json").read_text())
+    episodes = pq.read_table(folder / "meta/episodes").to_pylist()
+    rows = []
+    for episode in episodes:
+        where = {key: episode[f"data/{key}"] for key in ("chunk_index", "file_index")}
+        table = pq.read_table(folder / info["data_path"].format(**where)).to_pylist()
+        own = [row for row in table if row["episode_index"] == episode["episode_index"]]
+        assert len(own) == episode["length"]
+        assert [row["index"] for row in own] == list(
+            range(episode["dataset_from_index"], episode["dataset_to_index"])
+        )
+        rows.append(own)
+    return info, episodes, rows
+
+
+def replayed(seed, observation):
+    """Observation, action, reward, mask of each step of an episode played again."""
+    env = gym.make(
+        "MSActiveSLAM-FreeCamera-v0",
+        scene=["table"],
+        split="train",
+        num_scene_seeds=1,
+        image_size="80x60",
+        observation=observation,
+        max_episode_steps=4,
+    )
+    seen, info = env.reset(seed=seed)
+    stream = np.random.default_rng([seed, 2])
+    planner = make_planner("random", env.unwrapped, seed=int(stream.integers(2**31)))
+    planner.reset()
+    is_over = False
+    while not is_over:
+        action = planner.act(seen, info)
+        after, reward, terminated, truncated, later = env.step(action)
+        is_over = terminated or truncated
+        yield seen, action, reward, info["action_mask"], is_over
+        seen, info = after, later
+
+
+@pytest.mark.parametrize("observation", ["features", "rgbd"])
+def test_the_dataset_is_what_happened(tmp_path, capsys, observation):
+    words = ["record", "--format", "lerobot", "--planner", "random", "--scenes", "table"]
+    words += ["--scene-seeds", "1", "--episodes", "2", "--steps", "4", "--seed", "7"]
+    words += ["--observation", observation, "--options", "image_size=80x60"]
+    assert main([*words, "--out", str(tmp_path)]) == 0
+    assert "LeRobotDataset('random-v0'" in capsys.readouterr().out
+    info, _, episodes = rows_of(tmp_path / "random-v0")
+    assert info["codebase_version"] == "v3.0"
+    assert (info["total_episodes"], info["total_frames"]) == (2, 8)
+    assert info["robot_type"] == "free"
+    tasks = pd.read_parquet(tmp_path / "random-v0/meta/tasks.parquet")
+    assert tasks.iloc[0].name.startswith("2 episodes of random in MSActiveSLAM-FreeCamera-v0")
+    for seed, rows in enumerate(episodes, start=7):
+        happened = list(replayed(seed, observation))
+        assert len(happened) == len(rows) == 4
+        for k, (row, (seen, action, reward, mask, done)) in enumerate(
+            zip(rows, happened, strict=True)
+        ):
+            assert row["frame_index"] == k
+            assert row["timestamp"] == pytest.approx(k / info["fps"])
+            assert row["action"] == action
+            assert row["next.reward"] == np.float32(reward)
+            assert row["next.done"] == done
+            assert row["info.action_mask"] == mask.tolist()
+            if observation == "features":
+                np.testing.assert_array_equal(np.float32(row["observation.state"]), seen)
+                continue
+            image = Image.open(io.BytesIO(row["observation.images.color"]["bytes"]))
+            np.testing.assert_array_equal(image, seen["color"])
+            depth = np.reshape(np.float32(row["observation.depth"]), (60, 80))
+            np.testing.assert_array_equal(depth, seen["depth"])
+            np.testing.assert_array_equal(np.float32(row["observation.state"]), seen["state"])
+
+
+def played(length):
+    """An episode of nothing in particular."""
+    return Steps(
+        {"color": RNG.integers(0, 255, (length + 1, 6, 8, 3), dtype=np.uint8)},
+        {"pose_error": RNG.random(length + 1)},
+        RNG.integers(0, 49, (length, 2)),
+        RNG.normal(size=length),
+        np.zeros(length, bool),
+        np.arange(length) == length - 1,
+    )
+
+
+def test_files_are_divided_and_numbers_summed_up(tmp_path, monkeypatch):
+    monkeypatch.setattr("ms_slam_env.env.lerobot_dataset._FILE_MB", 0)  # a file an episode
+    monkeypatch.setattr("ms_slam_env.env.lerobot_dataset._FILES_A_CHUNK", 2)
+    given = [played(length) for length in (3, 5, 2)]
+    writer = DatasetWriter(tmp_path, "look about", 10, "free")
+    for steps in given:
+        writer.add(steps)
+    writer.close()
+    assert sorted(p.relative_to(tmp_path).as_posix() for p in tmp_path.glob("data/*/*")) == [
+        "data/chunk-000/file-000.parquet",
+        "data/chunk-000/file-001.parquet",
+        "data/chunk-001/file-000.parquet",
+    ]
+    info, episodes, rows = rows_of(tmp_path)
+    assert info["features"]["observation.images.color"]["shape"] == [6, 8, 3]
+    assert info["features"]["action"] == {"dtype": "int64", "shape": [2], "names": None}
+    assert [row["action"] for own in rows for row in own] == np.concatenate(
+        [steps.actions for steps in given]
+    ).tolist()
+    stats = json.loads((tmp_path / "meta/stats.json").read_text())
+    rewards = np.concatenate([steps.rewards for steps in given]).astype(np.float32)
+    assert stats["next.reward"]["mean"] == pytest.approx([rewards.mean()], rel=1e-5)
+    assert stats["next.reward"]["std"] == pytest.approx([rewards.std()], rel=1e-5)
+    assert stats["next.reward"]["max"] == pytest.approx([rewards.max()])
+    assert stats["next.reward"]["count"] == [10]
+    colors = np.concatenate([steps.observations["color"][:-1] for steps in given]) / 255
+    found = stats["observation.images.color"]
+    np.testing.assert_allclose(np.squeeze(found["mean"]), colors.mean(axis=(0, 1, 2)))
+    np.testing.assert_allclose(np.squeeze(found["std"]), colors.std(axis=(0, 1, 2)))
+    first = given[0].observations["color"][:-1] / 255
+    np.testing.assert_allclose(
+        np.squeeze(episodes[0]["stats/observation.images.color/min"]), first.min(axis=(0, 1, 2))
+    )
+
+
+def test_without_its_library_nothing_is_begun(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("ms_slam_env.cli.record.find_spec", lambda name: None)
+    assert main(["record", "--format", "lerobot", "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert "ms-slam record --format lerobot needs pyarrow: pip install" in error
+    assert not (tmp_path / "out").exists()
