@@ -5,6 +5,7 @@ MkDocs calls the functions ``on_...`` while it builds (``make docs``).
 
 from __future__ import annotations
 
+import inspect
 import json
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -172,7 +173,7 @@ ENVIRONMENT = """# {env_id}
 
 {holder}
 
-![A moment of an episode](../pictures/environments/{env_id}.png)
+![An episode](../pictures/environments/{env_id}.webp)
 
 ```python
 import gymnasium as gym
@@ -197,28 +198,84 @@ At the default image size of 160x120. What the numbers are, the reward, `info` a
 [environments](../environments.md).
 """
 
+GALLERY = """# Environments
+
+{own}
+
+The pictures are episodes of `nbv`, of `greedy` on the straight line, and of `random` where the SLAM
+configuration is chosen too; `python -m ms_slam_env.experiments.pictures.environments` makes them.
+
+## Tasks
+
+The same with scenes, a length and a reference ([more](../environments.md#tasks)). `nbv` in a home:
+
+![nbv explores a home](../pictures/home.webp)
+
+{tasks}
+
+## With an imperfect camera
+
+Actions and observations are those of the plain ids; `perturbation={{...}}` sets the strength.
+
+{perturbed}"""
+
+PERTURBED = """### {name}
+
+{what}
+
+{ids}
+
+{film}"""
+
 
 def _gallery() -> Iterator[tuple[str, str]]:
-    """A page for each id, with picture, spaces and an example, and one that shows them all."""
-    from ms_slam_env import ENV_IDS, PERTURBED_ENV_IDS
+    """A page for each id, with an episode, spaces and an example, and one that shows them all."""
+    from ms_slam_env import ENV_IDS, TASK_IDS
+    from ms_slam_env.tasks import OWN
 
     rows = []
     for env_id in ENV_IDS:
-        picture = f"![{env_id}](../pictures/environments/{env_id}.png)"
+        picture = f"![{env_id}](../pictures/environments/{env_id}.webp)"
         rows.append((picture, f"[`{env_id}`]({env_id}.md)", _space(env_id)))
-    free = [name for name in PERTURBED_ENV_IDS if "-FreeCamera-" in name]
-    pairs = [(name.replace("FreeCamera-", ""), name) for name in free]
-    held = [f"`{arm}`" if arm in PERTURBED_ENV_IDS else "" for arm, _ in pairs]
-    perturbed = [(arm, f"`{name}`") for arm, (_, name) in zip(held, pairs, strict=True)]
+    tasks = [
+        (f"`{task_id}`", f"[`{task().env_id}`]({task().env_id}.md)", _summary(task))
+        for task_id, task in zip(TASK_IDS, OWN.values(), strict=True)
+    ]
     yield (
         "gallery/index.md",
-        "# Environments\n\n"
-        + _table(["", "id", "actions"], rows)
-        + "\nWith an imperfect camera; `perturbation={...}` sets its strength:\n\n"
-        + _table(["arm", "free camera"], perturbed),
+        GALLERY.format(
+            own=_table(["", "id", "actions"], rows),
+            tasks=_table(["id", "spaces as", "what"], tasks),
+            perturbed="".join(_perturbed()),
+        ),
     )
     for env_id in ENV_IDS:
         yield f"gallery/{env_id}.md", _environment(env_id)
+
+
+def _perturbed() -> Iterator[str]:
+    """A section for each imperfection of the camera."""
+    import gymnasium as gym
+
+    from ms_slam_env import PERTURBED_ENV_IDS
+    from ms_slam_env.sequences.perturbations import PERTURBATIONS
+
+    by_name: dict[str, list[str]] = {}
+    for env_id in PERTURBED_ENV_IDS:
+        by_name.setdefault(gym.spec(env_id).kwargs["perturbed_by"], []).append(env_id)
+    for name, ids in by_name.items():
+        film = next(f"environments/{env_id}.webp" for env_id in ids if "-FreeCamera-" in env_id)
+        is_filmed = (ROOT / "docs" / "pictures" / film).is_file()
+        shown = f"![What the camera takes](../pictures/{film})\n\n" if is_filmed else ""
+        listed = ", ".join(f"`{env_id}`" for env_id in ids)
+        what = _summary(PERTURBATIONS[name])
+        yield PERTURBED.format(name=f"`{name}`", what=what, ids=listed, film=shown)
+
+
+def _summary(thing: Any) -> str:
+    """First paragraph of a docstring, its roles as code."""
+    text = re.sub(r":\w+:`~?([^`]+)`", r"`\1`", inspect.getdoc(thing).split("\n\n")[0])
+    return text.replace("``", "`").replace("\n", " ")
 
 
 def _space(env_id: str) -> str:

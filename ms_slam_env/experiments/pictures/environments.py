@@ -30,11 +30,13 @@ class Options:
         out: folder of the WebP files.
         ids: of the environments; by default all.
         steps: length of an episode.
+        camera_steps: of one with an imperfect camera.
     """
 
     out: Path = Path("docs/pictures/environments")
     ids: tuple[str, ...] = ()
     steps: int = 40
+    camera_steps: int = 24
 
     def __post_init__(self) -> None:
         """Refuse ids that have no film."""
@@ -56,7 +58,9 @@ def film_of(env_id: str, options: Options) -> film.Options:
         width=640,
         most_kb=400,
     )
-    return plain if env_id in ENV_IDS else replace(plain, view="camera", width=480, most_kb=150)
+    if env_id in ENV_IDS:
+        return plain
+    return replace(plain, view="camera", steps=options.camera_steps, width=400, most_kb=250)
 
 
 def draw(options: Options) -> str:
