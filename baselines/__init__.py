@@ -7,6 +7,7 @@ from ms_slam_baselines.greedy_limited import GreedyLimited
 from ms_slam_baselines.max_information import MaxInformation
 from ms_slam_baselines.nbv import NextBestView
 from ms_slam_baselines.random_walk import RandomWalk
+from ms_slam_baselines.receding_nbv import RecedingNextBestView
 from ms_slam_baselines.stationary import Stationary
 
 __all__ = [
@@ -17,5 +18,6 @@ __all__ = [
     "MaxInformation",
     "NextBestView",
     "RandomWalk",
+    "RecedingNextBestView",
     "Stationary",
 ]

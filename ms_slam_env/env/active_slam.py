@@ -264,8 +264,10 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
                     configuration=self._actions.configuration,
                     lookahead=lambda: self.lookahead() / maxima,
                     candidates=self.candidate_poses,
+                    view=lambda: self.slam.predict(episode.T_world_camera_estimate[None], SCALE),
                     predicted=self._predicted,
                     steps=(self.config.step_m, self.config.step_rad),
+                    frames=self.config.frames_per_action,
                     occupancy=episode.occupancy,
                 )
             )

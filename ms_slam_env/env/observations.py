@@ -3,22 +3,36 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.extension import ExtensionPoint
 from ms_slam_env.geometry import invert
-from ms_slam_env.mapping import OccupancyGrid, expected_gain, surrounding_occupancy
-from ms_slam_env.mapping.candidates import HIGHS, LOWS, PredictedViews, candidate_numbers
+from ms_slam_env.mapping import (
+    OccupancyGrid,
+    expected_gain,
+    reachable_positions,
+    surrounding_occupancy,
+)
+from ms_slam_env.mapping.candidates import (
+    GRID_HIGHS,
+    GRID_LOWS,
+    HIGHS,
+    LOWS,
+    PredictedViews,
+    candidate_numbers,
+    grid_numbers,
+)
 from ms_slam_env.mapping.goals_around import NUM_GOALS, gain_around
-from ms_slam_env.mapping.view_goals import best_goal, distance_in_steps
+from ms_slam_env.mapping.view_goals import GOAL_RADIUS_M, best_goal, distance_in_steps
 from ms_slam_env.robot import NUM_ROTATIONS, NUM_TRANSLATIONS, ROTATIONS, TRANSLATIONS
+from ms_slam_env.slam.base import Views
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -59,6 +73,7 @@ _GAIN_CAP_M3 = 20.0  # more than a view of 4 m holds
 _SMALLEST_STEP = 1e-6  # a motion of no length is as many steps from everywhere
 
 
+_GOAL_LOW, _GOAL_HIGH = [-2.0] * 3 + [-1.0] * 3 + [0.0] * 2, [2.0] * 3 + [1.0] * 3 + [5.0] * 2
 _LOW = [-_POSITION_CAP] * 3 + [-1.0] * 6 + [0.0] * (NUM_STATE - 9)
 _HIGH = [_POSITION_CAP] * 3 + [1.0] * 6 + [_DIVERGENCE_CAP] * 2 + [1.0] * (NUM_STATE - 11)
 _STATE_BOUNDS = np.array([_LOW, _HIGH], dtype=np.float32)
@@ -82,8 +97,10 @@ class RobotKnowledge:
         configuration: index of the SLAM configuration in force; 0 where there is only one.
         lookahead: predicts the divergences (n, 2) of the candidates, in units of (M_I, M_D).
         candidates: the poses (n, 4, 4) that the motions would lead to; the first is the present.
+        view: what the map predicts of here, at `trackability.SCALE`.
         predicted: what the map predicts of here and of the candidates, divergences in those units.
         steps: translation, metres, and rotation, radians, of a motion.
+        frames: taken on a motion.
         occupancy: what is known of space; None where the observation does not need it.
     """
 
@@ -98,8 +115,10 @@ class RobotKnowledge:
     configuration: int
     lookahead: Callable[[], Float64]
     candidates: Callable[[], Float64]
+    view: Callable[[], Views]
     predicted: Callable[[], PredictedViews]
     steps: tuple[float, float]
+    frames: int
     occupancy: OccupancyGrid | None = None
 
 
@@ -200,30 +219,40 @@ class MapObservation(Observation):
 
 
 class GoalsObservation(Observation):
-    """``features``, what each motion would gain, and what views around would: float32.
+    """What the occupancy grid and one predicted view say of where to go: float32.
 
-    After the features: the gain of each motion (n) relative to the largest and the largest itself,
-    m3, as `map` has them; the world's upward axis in the camera's frame (3); then the gain of the
-    views of `mapping.goals_around`, m3 (232), 0 where free space does not lead.
+    The state: ``features`` without the mask (140), the world's upward axis in the camera's frame
+    (3), the gain of the views of `mapping.goals_around`, m3 (232), 0 where free space does not
+    lead, the largest gain of a motion, m3, and the best goal as in ``candidates`` (8). Then
+    ``mapping.candidates.GRID_NAMES`` of each of the n motions, motion by motion.
     """
 
     needs_occupancy = True
 
     def __init__(self, intrinsics: Intrinsics, num_motions: int) -> None:
         self._intrinsics = intrinsics
-        self._features = FeaturesObservation(intrinsics, num_motions)
-        space = _longer(self._features.space, [*(1,) * num_motions, _GAIN_CAP_M3])
-        space = _longer(space, [1] * 3, [-1] * 3)
-        self.space = _longer(space, [_GAIN_CAP_M3] * NUM_GOALS)
+        space = _longer(FeaturesObservation(intrinsics, 0).space, [1] * 3, [-1] * 3)
+        space = _longer(space, [_GAIN_CAP_M3] * (NUM_GOALS + 1))
+        space = _longer(space, _GOAL_HIGH, _GOAL_LOW)
+        self._features = FeaturesObservation(intrinsics, 0)
+        self._state_bounds = space.low, space.high
+        rows = np.tile(GRID_HIGHS, num_motions), np.tile(GRID_LOWS, num_motions)
+        self.space = _longer(space, *rows)
 
     def build(self, knowledge: RobotKnowledge) -> Float32:
         """Return the vector."""
-        grid, poses = knowledge.occupancy, knowledge.candidates()
+        grid, poses, steps = knowledge.occupancy, knowledge.candidates(), _least(knowledge.steps)
         assert grid is not None
-        parts = [self._features.build(knowledge), *_relative_gain(grid, poses, self._intrinsics)]
-        parts += [np.clip(poses[0][2, :3], -1, 1)]
-        around = gain_around(grid, poses[0], self._intrinsics)
-        return np.concatenate([*parts, np.minimum(around, _GAIN_CAP_M3)]).astype(np.float32)
+        here, camera = poses[0], self._intrinsics
+        free = reachable_positions(grid, here[:3, 3], GOAL_RADIUS_M)
+        goal = best_goal(grid, here, camera, steps, free)
+        known = knowledge.motion_mask, grid, goal, camera, steps, knowledge.frames
+        numbers, most = grid_numbers(poses, knowledge.view(), *known)
+        features = self._features.build(knowledge)[: -len(knowledge.motion_mask)]
+        parts: list[Any] = [features, here[2, :3]]
+        parts += [gain_around(grid, here, camera, free), [most], _seen_goal(here, goal, steps)]
+        state = np.clip(np.concatenate(parts), *self._state_bounds)
+        return np.concatenate([state, numbers.ravel()]).astype(np.float32)
 
 
 class CandidatesObservation(Observation):
@@ -239,26 +268,20 @@ class CandidatesObservation(Observation):
 
     def __init__(self, intrinsics: Intrinsics, num_motions: int) -> None:
         self._intrinsics = intrinsics
-        low = np.concatenate([_STATE_BOUNDS[0], [0], [-2] * 3, [-1] * 3, [0] * 2])
-        high = np.concatenate([_STATE_BOUNDS[1], [_GAIN_CAP_M3], [2] * 3, [1] * 3, [5] * 2])
-        self._state_bounds = low, high
-        lowest = np.concatenate([low, *[LOWS] * num_motions]).astype(np.float32)
-        highest = np.concatenate([high, *[HIGHS] * num_motions]).astype(np.float32)
-        self.space = spaces.Box(lowest, highest)
+        state = _longer(spaces.Box(*_STATE_BOUNDS), [_GAIN_CAP_M3, *_GOAL_HIGH], [0, *_GOAL_LOW])
+        self._state_bounds = state.low, state.high
+        self.space = _longer(state, np.tile(HIGHS, num_motions), np.tile(LOWS, num_motions))
 
     def build(self, knowledge: RobotKnowledge) -> Float32:
         """Return the vector."""
         grid, predicted = knowledge.occupancy, knowledge.predicted()
         assert grid is not None
         here = predicted.poses[0]
-        steps = max(knowledge.steps[0], _SMALLEST_STEP), max(knowledge.steps[1], _SMALLEST_STEP)
+        steps = _least(knowledge.steps)
         goal = best_goal(grid, here, self._intrinsics, steps)
         known = knowledge.motion_mask, grid, goal, self._intrinsics, steps
         numbers, most = candidate_numbers(predicted, *known)
-        T_here_goal = invert(here) @ goal
-        away = distance_in_steps(here[None], goal, *steps)[0]
-        state: list[Any] = [state_vector(knowledge), [most], T_here_goal[:3, 3] / _POSITION_SCALE_M]
-        state += [T_here_goal[:3, 2], away / 10]
+        state: list[Any] = [state_vector(knowledge), [most], _seen_goal(here, goal, steps)]
         vector: Float64 = np.clip(np.concatenate(state), *self._state_bounds)
         return np.concatenate([vector, numbers.ravel()]).astype(np.float32)
 
@@ -332,6 +355,18 @@ def state_vector(knowledge: RobotKnowledge) -> Float32:
     return np.clip(state, *_STATE_BOUNDS)
 
 
+def _least(steps: tuple[float, float]) -> tuple[float, float]:
+    """The length of a motion, where it is none something that can be divided by."""
+    return max(steps[0], _SMALLEST_STEP), max(steps[1], _SMALLEST_STEP)
+
+
+def _seen_goal(here: Float64, goal: Float64, steps: tuple[float, float]) -> Float64:
+    """Where a goal is (3), where it looks (3), and how far away it is in steps (2), as shown."""
+    T_here_goal = invert(here) @ goal
+    away = distance_in_steps(here[None], goal, *steps)[0]
+    return np.concatenate([T_here_goal[:3, 3] / _POSITION_SCALE_M, T_here_goal[:3, 2], away / 10])
+
+
 def _relative_gain(grid: OccupancyGrid, poses: Float64, intrinsics: Intrinsics) -> list[Any]:
     """Expected gain of poses (n, 4, 4) relative to the largest (n,), and the largest (1,), m^3."""
     gain = expected_gain(grid, poses, intrinsics, _GAIN_RAYS)
@@ -355,7 +390,7 @@ def _cell_sums(image: Float32) -> Float32:
 
 
 def _longer(
-    space: spaces.Space[Any], highs: Sequence[float], lows: Sequence[float] | None = None
+    space: spaces.Space[Any], highs: ArrayLike, lows: ArrayLike | None = None
 ) -> spaces.Box:
     """A vector's space and more numbers, from ``lows``, or 0, to ``highs``."""
     assert isinstance(space, spaces.Box)

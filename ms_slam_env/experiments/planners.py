@@ -36,7 +36,7 @@ ALL = "all"
 """Stands for all our tasks."""
 PLANNERS = (
     *("random", "stationary", "greedy", "greedy-limited", "max-information"),
-    *("nbv", "belief", "graph-dopt"),
+    *("nbv", "receding-nbv", "belief", "graph-dopt"),
 )
 """Those that need no extra."""
 EPISODES, LEADERBOARD_EPISODES = 10, 25

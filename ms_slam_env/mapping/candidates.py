@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, so3_log
-from ms_slam_env.mapping.expected_gain import expected_gain
+from ms_slam_env.mapping.expected_gain import expected_gain, look_from
 from ms_slam_env.mapping.occupancy_grid import OccupancyGrid
 from ms_slam_env.mapping.trackability import (
     NEAR_M,
     image_motion,
     mean_depth,
+    remaining,
     risk_of,
     view_information,
 )
@@ -44,6 +45,24 @@ _BOTH_WAYS = {"goal_translation": 3, "goal_rotation": 3}
 _BOTH_WAYS |= {f"{kind}_{axis}": 2 for kind in ("step", "turn") for axis in "xyz"}
 HIGHS = np.array([_BOTH_WAYS.get(name, _CAPS.get(name, 1)) for name in NAMES], dtype=np.float32)
 LOWS = np.array([-_BOTH_WAYS.get(name, 0) for name in NAMES], dtype=np.float32)
+
+
+GRID_NAMES: tuple[str, ...] = (
+    *("permitted", "gain", "occupied", "depth", "remains", "near", "slip_risk"),
+    *("goal_translation", "goal_rotation"),
+    *("step_x", "step_y", "step_z", "turn_x", "turn_y", "turn_z"),
+)
+"""What the numbers of a candidate are where one predicted view and the occupancy grid are enough.
+
+As in ``NAMES``, but in place of a view of each candidate: the share of its rays that meet an
+occupied cell, and their mean depth in units of 4 m; the share of the view from here that remains in
+its image (`trackability.remaining`), that of what is then nearer than 0.5 m, and the risk to slip
+where no more than that is seen.
+"""
+
+GRID_HIGHS = np.array([_BOTH_WAYS.get(name, 1) for name in GRID_NAMES], dtype=np.float32)
+GRID_LOWS = np.array([-_BOTH_WAYS.get(name, 0) for name in GRID_NAMES], dtype=np.float32)
+_DEPTH_SCALE_M = 4.0
 
 
 @dataclass(frozen=True)
@@ -88,9 +107,6 @@ def candidate_numbers(
     risk = risk_of(H, views, motion_rad, mean_depth(views)[0])
     least = np.maximum(np.linalg.eigvalsh(H)[:, 0], 0) / pixels
     d_optimality = np.exp(np.linalg.slogdet(H)[1] / 6) / pixels
-    away = distance_in_steps(poses, goal, *steps)
-    motions = invert(poses[0]) @ poses[1:]
-    turns = np.stack([so3_log(R) for R in motions[:, :3, :3]])
     numbers = np.column_stack(
         [
             permitted,
@@ -101,9 +117,58 @@ def candidate_numbers(
             np.log1p(least)[1:],
             risk[1:],
             gain / max(gain.max(), 1e-9),
-            away[0] - away[1:],
-            motions[:, :3, 3] / steps[0],
-            turns / steps[1],
+            *_ways(poses[0], poses[1:], goal, steps),
         ]
     )
     return np.clip(numbers, LOWS, HIGHS), float(gain.max())
+
+
+def grid_numbers(
+    poses: Float64,
+    view: Views,
+    permitted: NDArray[np.bool_],
+    grid: OccupancyGrid,
+    goal: Float64,
+    intrinsics: Intrinsics,
+    steps: tuple[float, float],
+    frames: int,
+) -> tuple[Float64, float]:
+    """The numbers (n, ``GRID_NAMES``) of the motions, within bounds, and the largest gain, m^3.
+
+    Args:
+        poses: (n, 4, 4) that the motions lead to; the first is here.
+        view: one, predicted from here.
+        permitted: (n,) which motions are possible.
+        grid: what is known of space.
+        goal: (4, 4) where to go.
+        intrinsics: of the live camera.
+        steps: translation, metres, and rotation, radians, of one motion.
+        frames: taken on a motion.
+    """
+    gain, depth = look_from(grid, poses, intrinsics, _GAIN_RAYS)
+    H, remains, near = remaining(view, invert(poses[0]) @ poses)
+    motion_rad = image_motion(view, poses) / frames
+    meets = depth > 0
+    numbers = np.column_stack(
+        [
+            permitted,
+            gain / max(gain.max(), 1e-9),
+            meets.mean(axis=1),
+            depth.sum(axis=1) / np.maximum(meets.sum(axis=1), 1) / _DEPTH_SCALE_M,
+            remains,
+            near,
+            risk_of(H, view, motion_rad, mean_depth(view)[0]),
+            *_ways(poses[0], poses, goal, steps),
+        ]
+    )
+    return np.clip(numbers, GRID_LOWS, GRID_HIGHS), float(gain.max())
+
+
+def _ways(
+    here: Float64, poses: Float64, goal: Float64, steps: tuple[float, float]
+) -> tuple[Float64, Float64, Float64]:
+    """By how many steps motions lead nearer to a goal (n, 2), and the motions (n, 3) and (n, 3)."""
+    motions = invert(here) @ poses
+    turns = np.stack([so3_log(R) for R in motions[:, :3, :3]])
+    away = distance_in_steps(here[None], goal, *steps) - distance_in_steps(poses, goal, *steps)
+    return away, motions[:, :3, 3] / steps[0], turns / steps[1]

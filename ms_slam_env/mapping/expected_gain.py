@@ -16,7 +16,10 @@ RAYS = (16, 12)  # of a view, across and down
 
 
 def expected_gain(
-    grid: OccupancyGrid, poses: Float64, intrinsics: Intrinsics, rays: tuple[int, int] = RAYS
+    grid: OccupancyGrid,
+    poses: Float64,
+    intrinsics: Intrinsics,
+    rays: tuple[int, int] = RAYS,
 ) -> Float64:
     """Unknown volume (N,) in m^3 that cameras at ``poses`` (N, 4, 4) would see.
 
@@ -28,13 +31,20 @@ def expected_gain(
     ray, u counts the unknown cells (of depth) passed on the way, and b the frames in which the
     cell was looked at without a reading: an open door beyond the reach is not gained for ever.
     """
+    return look_from(grid, poses, intrinsics, rays)[0]
+
+
+def look_from(
+    grid: OccupancyGrid, poses: Float64, intrinsics: Intrinsics, rays: tuple[int, int]
+) -> tuple[Float64, NDArray[np.float32]]:
+    """`expected_gain` (N,), and depths (N, rays), metres, of the first occupied cells; 0: none."""
     across, down = rays
     u = (np.arange(across) + 0.5) / across * intrinsics.width - 0.5
     v = (np.arange(down) + 0.5) / down * intrinsics.height - 0.5
     directions = intrinsics.rays_at(np.stack(np.meshgrid(u, v), axis=-1)).reshape(-1, 3)
     starts = poses[:, :3, 3] / grid.cell_m - grid.first
     with wp.ScopedDevice("cpu"):
-        gains = wp.zeros((len(poses), len(directions)), dtype=float)
+        gains, depths = (wp.zeros((len(poses), len(directions)), dtype=float) for _ in range(2))
         given = [
             wp.array(directions.astype(np.float32), dtype=wp.vec3),
             wp.array((poses[:, :3, :3] / grid.cell_m).astype(np.float32), dtype=wp.mat33),
@@ -44,7 +54,8 @@ def expected_gain(
             grid.cell_m,
             grid.reach_m,
         ]
-        wp.launch(sum_unknown, gains.shape, given, [gains])
+        wp.launch(sum_unknown, gains.shape, given, [gains, depths])
     pixels_a_ray = intrinsics.width * intrinsics.height / (across * down)
     solid_angle = pixels_a_ray / (intrinsics.fx * intrinsics.fy)
-    return solid_angle * gains.numpy().sum(axis=1, dtype=np.float64)
+    gain = solid_angle * gains.numpy().sum(axis=1, dtype=np.float64)
+    return gain, depths.numpy()

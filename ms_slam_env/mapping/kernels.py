@@ -68,8 +68,12 @@ def sum_unknown(
     cell_m: float,
     reach_m: float,
     gains: wp.array2d(dtype=float),
+    depths: wp.array2d(dtype=float),
 ):
-    """Unknown length of each ray of each pose, weighed by z^2 and by the chance to see it."""
+    """Unknown length of each ray of each pose, weighed by z^2 and by the chance to see it.
+
+    And the depth of the first occupied cell that it meets, 0 if none.
+    """
     pose, ray = wp.tid()
     shape = wp.vec3i(log_odds.shape[0], log_odds.shape[1], log_odds.shape[2])
     direction = rotations[pose] * directions[ray]
@@ -83,6 +87,7 @@ def sum_unknown(
         if cell[0] >= 0:
             state = wp.int32(log_odds[cell[0], cell[1], cell[2]])
         if state > 0:
+            depths[pose, ray] = z
             break
         if state == 0:
             worth = chance * z * z * dz
@@ -119,6 +124,41 @@ def sum_information(
             J = vec6(n[0], n[1], n[2], turn[0], turn[1], turn[2])
             H += wp.outer(J, J)
     sums[view, v] = H
+
+
+@wp.kernel
+def sum_remaining(
+    depth: wp.array2d(dtype=float),
+    normals: wp.array2d(dtype=wp.vec3),
+    T_there_here: wp.array(dtype=wp.mat44),
+    length: float,
+    nearest: float,  # metres: what is nearer counts as near
+    focal: wp.vec2,
+    centre: wp.vec2,
+    sums: wp.array2d(dtype=mat66),
+    counts: wp.array2d(dtype=wp.vec2),  # pixels that remain, and near ones among them
+):
+    """As `sum_information`, of those pixels of one view that others, near by, show as well."""
+    there, v = wp.tid()
+    H = mat66()
+    count = wp.vec2()
+    for u in range(depth.shape[1]):
+        z = depth[v, u]
+        if z > 0.0:
+            ray = wp.vec3((float(u) - centre[0]) / focal[0], (float(v) - centre[1]) / focal[1], 1.0)
+            p = wp.transform_point(T_there_here[there], z * ray)
+            n = wp.transform_vector(T_there_here[there], normals[v, u])
+            at = wp.vec2(focal[0] * p[0] / p[2] + centre[0], focal[1] * p[1] / p[2] + centre[1])
+            inside = p[2] > CAMERA_M and at[0] > -0.5 and at[0] < float(depth.shape[1]) - 0.5
+            if inside and at[1] > -0.5 and at[1] < float(depth.shape[0]) - 0.5:
+                beyond = wp.max(p[2] - DEPTH_NOISE[2], 0.0)
+                n /= DEPTH_NOISE[0] + DEPTH_NOISE[1] * beyond * beyond
+                turn = wp.cross(p, n) / length
+                J = vec6(n[0], n[1], n[2], turn[0], turn[1], turn[2])
+                H += wp.outer(J, J)
+                count += wp.vec2(1.0, wp.where(p[2] < nearest, 1.0, 0.0))
+    sums[there, v] = H
+    counts[there, v] = count
 
 
 @wp.kernel

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env._warp import wp
-from ms_slam_env.mapping.kernels import mat66, sum_information
+from ms_slam_env.mapping.kernels import mat66, sum_information, sum_remaining
 from ms_slam_env.slam.base import Views
 
 Float64 = NDArray[np.float64]
@@ -34,6 +34,36 @@ def view_information(views: Views) -> Float64:
         ]
         wp.launch(sum_information, sums.shape, given, [sums])
     return sums.numpy().sum(axis=1, dtype=np.float64)
+
+
+def remaining(view: Views, poses: Float64) -> tuple[Float64, Float64, Float64]:
+    """What of a view is still seen from poses near by, without asking the map.
+
+    Args:
+        view: one, from where the camera is.
+        poses: (n, 4, 4) T_here_there.
+
+    Returns:
+        `view_information` (n, 6, 6) of its pixels that those views show as well, with the mean
+        depth of the view itself; how many they are (n,), and how many of them are nearer than
+        NEAR_M (n,), as shares of the image.
+    """
+    k, (height, width) = view.intrinsics, view.depth.shape[1:]
+    with wp.ScopedDevice("cpu"):
+        sums = wp.zeros((len(poses), height), dtype=mat66)
+        counts = wp.zeros((len(poses), height), dtype=wp.vec2)
+        given = [
+            wp.array(view.depth[0], dtype=float, copy=False),
+            wp.array(view.normals[0], dtype=wp.vec3, copy=False),
+            wp.array(np.linalg.inv(poses).astype(np.float32), dtype=wp.mat44),
+            float(mean_depth(view)[0]),
+            NEAR_M,
+            wp.vec2(k.fx, k.fy),
+            wp.vec2(k.cx, k.cy),
+        ]
+        wp.launch(sum_remaining, sums.shape, given, [sums, counts])
+    shares = counts.numpy().sum(axis=1, dtype=np.float64) / (height * width)
+    return sums.numpy().sum(axis=1, dtype=np.float64), shares[:, 0], shares[:, 1]
 
 
 def mean_depth(views: Views) -> Float64:

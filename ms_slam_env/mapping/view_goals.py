@@ -93,7 +93,7 @@ _HALF_OF_26 = np.argwhere(np.ones((3, 3, 3)))[14:] - 1
 
 
 _COST = 0.7  # a view six steps farther away is worth exp(-0.7) times as much
-_RADIUS_M = 2.5  # how far a goal may be
+GOAL_RADIUS_M = 2.5  # how far a goal may be
 _GOALS, _TURNS = 48, 16  # compared: elsewhere, and where the camera is
 _GOAL_RAYS = (8, 6)
 _PITCH_RAD = 0.7
@@ -122,7 +122,11 @@ def upright_poses(positions: Float64, yaw: Float64, pitch: Float64) -> Float64:
 
 
 def best_goal(
-    grid: OccupancyGrid, here: Float64, intrinsics: Intrinsics, steps: tuple[float, float]
+    grid: OccupancyGrid,
+    here: Float64,
+    intrinsics: Intrinsics,
+    steps: tuple[float, float],
+    free: Float64 | None = None,
 ) -> Float64:
     """The pose (4, 4) most worth its way, of some in free space and some where the camera is.
 
@@ -130,8 +134,16 @@ def best_goal(
     ``steps``, metres and radians of one motion. A function of what is known alone: which cells are
     compared, and where the camera looks from them, are drawn by a hash of the cell, so that a goal
     stays while nothing better is found.
+
+    Args:
+        grid: what is known.
+        here: (4, 4) where the camera is.
+        intrinsics: of the camera.
+        steps: translation, metres, and rotation, radians, of one motion.
+        free: `reachable_positions` (N, 3) within GOAL_RADIUS_M, if they are known already.
     """
-    free = reachable_positions(grid, here[:3, 3], _RADIUS_M)
+    if free is None:
+        free = reachable_positions(grid, here[:3, 3], GOAL_RADIUS_M)
     drawn = _hash(np.floor(free / grid.cell_m).astype(np.int64))
     chosen = np.argsort(drawn, kind="stable")[:_GOALS]
     yaw, pitch = ((drawn[chosen] >> np.uint64(k) & np.uint64(0xFFFF)) / 65536 for k in (0, 16))

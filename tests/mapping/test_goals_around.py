@@ -1,13 +1,12 @@
 """Views around a camera and what they would gain, against one pose and one cell at a time."""
 
-from collections import deque
-
 import numpy as np
 import pytest
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import look_at, make_pose
-from ms_slam_env.mapping import OccupancyGrid, expected_gain
+from ms_slam_env.mapping import OccupancyGrid, expected_gain, reachable_positions
+from ms_slam_env.mapping.expected_gain import look_from
 from ms_slam_env.mapping.goals_around import NUM_GOALS, NUM_POSITIONS, gain_around, goals_around
 
 CAMERA = Intrinsics(40.0, 40.0, 31.5, 23.5, 64, 48)
@@ -28,36 +27,29 @@ def grid():
     return made
 
 
-def joined_cells(grid, start, reach):
-    """Free cells that a walk from face to face finds from a cell, one at a time."""
-    found, waiting = {tuple(start)}, deque([tuple(start)])
-    while waiting:
-        cell = waiting.popleft()
-        for axis in range(3):
-            for way in (-1, 1):
-                near = list(cell)
-                near[axis] += way
-                near = tuple(near)
-                if near in found or np.abs(np.subtract(near, start)).max() > reach:
-                    continue
-                inside = min(near) >= 0 and (np.array(near) < grid.log_odds.shape).all()
-                if inside and grid.log_odds[near] < 0:
-                    found.add(near)
-                    waiting.append(near)
-    return found
-
-
-def test_gains_are_those_of_each_pose_where_a_walk_through_free_cells_leads(grid):
-    gain, goals = gain_around(grid, HERE, CAMERA), goals_around(HERE)
-    joined = joined_cells(grid, grid.cells_of(HERE[:3, 3]), 25)
+def test_gains_are_those_of_each_pose_whose_cell_can_be_gone_to(grid):
+    free = reachable_positions(grid, HERE[:3, 3], 2.5)
+    gain, goals = gain_around(grid, HERE, CAMERA, free), goals_around(HERE)
+    reached = {tuple(cell) for cell in grid.cells_of(free)}
     led_to = 0
     for k, goal in enumerate(goals):
         own = expected_gain(grid, goal[None], CAMERA, (6, 4))[0]
-        leads = tuple(grid.cells_of(goal[:3, 3])) in joined
+        leads = tuple(grid.cells_of(goal[:3, 3])) in reached or not (goal - HERE)[:3, 3].any()
         led_to += leads
         assert gain[k] == pytest.approx(own if leads else 0.0, rel=1e-5)
-    assert 0 < led_to < NUM_GOALS
+    assert 24 < led_to < NUM_GOALS
     assert gain.max() > 0.1
+
+
+def test_a_view_says_how_far_its_rays_go_before_they_meet_something(grid):
+    pose = look_at(np.array([0.05, 0.05, 1.05]), np.array([0.95, 0.05, 1.05]))
+    gain, depth = look_from(grid, pose[None], CAMERA, (16, 12))
+    np.testing.assert_array_equal(gain, expected_gain(grid, pose[None], CAMERA, (16, 12)))
+    middle = depth.reshape(12, 16)[4:8, 2:14]
+    assert (
+        np.abs(middle - 0.75).max() <= 0.1
+    )  # the wall's cells begin 0.8 m from the world's origin
+    assert not look_from(OccupancyGrid(), pose[None], CAMERA, (16, 12))[1].any()
 
 
 def test_goals_begin_with_the_view_ahead_and_are_level_or_tilted():
@@ -77,14 +69,16 @@ def test_a_world_turned_by_a_right_angle_looks_the_same(grid):
     turned.log_odds = np.ascontiguousarray(np.rot90(grid.log_odds))
     turned.blanks, turned.first = np.zeros_like(turned.log_odds), grid.first.copy()
     R = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    expected = gain_around(grid, HERE, CAMERA)
-    found = gain_around(turned, make_pose(R, np.zeros(3)) @ HERE, CAMERA)
+    there = make_pose(R, np.zeros(3)) @ HERE
+    expected = gain_around(grid, HERE, CAMERA, reachable_positions(grid, HERE[:3, 3], 2.5))
+    free = reachable_positions(turned, there[:3, 3], 2.5)
+    found = gain_around(turned, there, CAMERA, free)
     assert np.median(np.abs(found - expected)) < 1e-5
     np.testing.assert_allclose(found, expected, atol=0.05)  # rays along faces of cells
 
 
 def test_nothing_is_led_to_where_nothing_is_known():
-    gain = gain_around(OccupancyGrid(), HERE, CAMERA)
+    gain = gain_around(OccupancyGrid(), HERE, CAMERA, np.zeros((0, 3)))
     stays = (goals_around(HERE)[:, :3, 3] == HERE[:3, 3]).all(axis=1)
     assert stays.sum() == 24
     assert (gain[stays] > 0).all()

@@ -1,10 +1,12 @@
 """The information matrix against finite differences of the residuals that SLAM minimises."""
 
 import numpy as np
+import pytest
 
 from ms_slam_env.camera import xtion
 from ms_slam_env.geometry import invert, se3_exp, transform_points
 from ms_slam_env.mapping import view_information
+from ms_slam_env.mapping.trackability import remaining
 from ms_slam_env.slam.base import Views
 
 K = xtion("80x60").scaled(0.5)
@@ -61,3 +63,28 @@ def test_an_empty_view_tells_nothing():
     empty = np.zeros((2, 30, 40), np.float32)
     views = Views(empty, empty, np.zeros((2, 30, 40, 3), np.float32), K)
     assert not view_information(views).any()
+
+
+def test_what_remains_of_a_view_is_counted_pixel_by_pixel():
+    views, points, normal = plane_views([0.2, -0.3, -1.0], 0.5)
+    views.depth[0, :20] = 0
+    there = np.stack([np.eye(4), se3_exp(np.array([0.05, -0.02, 0.1, 0.05, -0.1, 0.02]))])
+    H, remains, near = remaining(views, there)
+    np.testing.assert_allclose(H[0], view_information(views)[0], rtol=1e-4, atol=1e-5 * H[0].max())
+    length = views.depth[views.depth > 0].mean()
+    for k, T_here_there in enumerate(there):
+        T = invert(T_here_there)
+        expected, seen, seen_near = np.zeros((6, 6)), 0, 0
+        for v, u in zip(*np.nonzero(views.depth[0]), strict=True):
+            p, n = transform_points(T, points[v, u][None])[0], T[:3, :3] @ normal
+            x, y = K.fx * p[0] / p[2] + K.cx, K.fy * p[1] / p[2] + K.cy
+            if -0.5 < x < K.width - 0.5 and -0.5 < y < K.height - 0.5:
+                J = np.concatenate([n, np.cross(p, n) / length])
+                expected += np.outer(J, J) / (0.0012 + 0.0019 * max(p[2] - 0.4, 0) ** 2) ** 2
+                seen, seen_near = seen + 1, seen_near + (p[2] < 0.5)
+        pixels = views.depth[0].size
+        assert remains[k] == pytest.approx(seen / pixels, abs=2 / pixels)  # single precision
+        assert near[k] == pytest.approx(seen_near / pixels, abs=2 / pixels)
+        np.testing.assert_allclose(H[k], expected, rtol=1e-2, atol=1e-3 * np.abs(expected).max())
+    assert 0 < remains[1] < remains[0]
+    assert 0 < near[0] < remains[0]

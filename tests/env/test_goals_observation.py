@@ -1,0 +1,104 @@
+"""The observation `goals`: the occupancy grid alone, motion by motion what planners ask it."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import ms_slam_env  # noqa: F401 -- registers the environments
+from ms_slam_env.geometry import invert, relative_angle
+from ms_slam_env.mapping import OccupancyGrid, expected_gain, reachable_positions
+from ms_slam_env.mapping.candidates import GRID_NAMES
+from ms_slam_env.mapping.expected_gain import look_from
+from ms_slam_env.mapping.goals_around import NUM_GOALS, gain_around
+from ms_slam_env.mapping.trackability import SCALE, remaining, slip_risk
+from ms_slam_env.mapping.view_goals import best_goal
+
+OPTIONS = {"scene": "table", "scene_seed": 0, "image_size": "80x60", "disable_env_checker": True}
+STATE = 140 + 3 + NUM_GOALS + 1 + 8
+
+
+def make(observation="goals", env_id="MSActiveSLAM-FreeCamera-v0", **options):
+    return gym.make(env_id, observation=observation, **{**OPTIONS, **options})
+
+
+@pytest.fixture(scope="module")
+def moment():
+    """An environment after a few steps, what it showed, and a grid carved from the same frames."""
+    env, grid = make(), OccupancyGrid()
+    observation, info = env.reset(seed=0)
+    for action in (14, 3, 41, None):
+        frame = env.unwrapped.episode.last_frame.depth
+        assert info["tracking_ok"]
+        grid.integrate(frame, info["T_world_camera_estimate"], env.unwrapped.intrinsics)
+        if action is not None:
+            observation, *_, info = env.step(action)
+    return env.unwrapped, observation, grid
+
+
+def test_the_state_is_features_gains_around_and_the_best_goal(moment):
+    world, observation, grid = moment
+    here, camera = world.candidate_poses()[0], world.intrinsics
+    steps = world.config.step_m, world.config.step_rad
+    features = make("features").reset(seed=0)[0]
+    assert len(features) == 140 + 49
+    np.testing.assert_array_equal(make().reset(seed=0)[0][:140], features[:140])
+    up, around, rest = np.split(observation[140:STATE], [3, 3 + NUM_GOALS])
+    np.testing.assert_allclose(up, here[2, :3], atol=1e-6)
+    free = reachable_positions(grid, here[:3, 3], 2.5)
+    np.testing.assert_allclose(around, gain_around(grid, here, camera, free), rtol=1e-5)
+    goal = best_goal(grid, here, camera, steps)
+    assert rest[0] == pytest.approx(
+        expected_gain(grid, world.candidate_poses(), camera, (8, 6)).max()
+    )
+    T_here_goal = invert(here) @ goal
+    np.testing.assert_allclose(rest[1:4], T_here_goal[:3, 3] / 5, atol=1e-6)
+    np.testing.assert_allclose(rest[4:7], T_here_goal[:3, 2], atol=1e-6)
+    assert rest[7] == pytest.approx(np.linalg.norm(T_here_goal[:3, 3]) / steps[0] / 10, rel=1e-5)
+
+
+def test_a_motion_has_what_the_grid_says_of_where_it_leads(moment):
+    world, observation, grid = moment
+    poses, steps = world.candidate_poses(), (world.config.step_m, world.config.step_rad)
+    rows = observation[STATE:].reshape(49, len(GRID_NAMES)).astype(np.float64)
+    numbers = dict(zip(GRID_NAMES, rows.T, strict=True))
+    gain, depth = look_from(grid, poses, world.intrinsics, (8, 6))
+    np.testing.assert_array_equal(numbers["permitted"], world.action_masks())
+    np.testing.assert_allclose(numbers["gain"], gain / gain.max(), rtol=1e-5)
+    np.testing.assert_allclose(numbers["occupied"], (depth > 0).mean(axis=1), rtol=1e-6)
+    view = world.slam.predict(poses[:1], SCALE)
+    _, remains, near = remaining(view, invert(poses[0]) @ poses)
+    np.testing.assert_allclose(numbers["remains"], remains, rtol=1e-6)
+    np.testing.assert_allclose(numbers["near"], near, rtol=1e-6)
+    assert (
+        np.corrcoef(numbers["slip_risk"], slip_risk(world.slam.predict(poses, SCALE), poses))[0, 1]
+        > 0.8
+    )
+    mean = [np.mean(row[row > 0]) / 4 if row.any() else 0 for row in depth]
+    np.testing.assert_allclose(numbers["depth"], mean, rtol=1e-5)
+    goal = best_goal(grid, poses[0], world.intrinsics, steps)
+    for k in (0, 1, 8, 30, 48):
+        closer = np.linalg.norm((poses[0] - goal)[:3, 3]) - np.linalg.norm((poses[k] - goal)[:3, 3])
+        assert numbers["goal_translation"][k] == pytest.approx(closer / steps[0], abs=1e-5)
+        turn = relative_angle(poses[0][:3, :3], goal[:3, :3])
+        turn -= relative_angle(poses[k][:3, :3], goal[:3, :3])
+        assert numbers["goal_rotation"][k] == pytest.approx(turn / steps[1], abs=1e-4)
+
+
+def test_a_saved_state_goes_on_bit_exactly():
+    env, other = make(), make()
+    env.reset(seed=0)
+    env.step(14)
+    state = env.unwrapped.save_state()
+    goes_on = [env.step(action)[0] for action in (3, 41)]
+    other.reset(seed=5)
+    other.unwrapped.load_state(state)
+    for expected, action in zip(goes_on, (3, 41), strict=True):
+        np.testing.assert_array_equal(other.step(action)[0], expected)
+
+
+@pytest.mark.parametrize("env_id", ["MSActiveSLAM-v0", "MSActiveSLAM-FixedTranslation-v0"])
+def test_arm_and_straight_line_show_it_within_its_space(env_id):
+    env = make(env_id=env_id)
+    observation, _ = env.reset(seed=0)
+    assert env.observation_space.contains(observation)
+    assert env.observation_space.contains(env.step(1)[0])
