@@ -64,4 +64,4 @@ def test_it_is_found_by_its_name_and_goes_back_when_lost():
     ).unwrapped
     planner = make_planner("receding-nbv,enough_m3=0.5", env)
     assert isinstance(planner.planner, RecedingNextBestView)
-    assert planner.enough_m3 == pytest.approx(0.5)
+    assert planner.planner.enough_m3 == pytest.approx(0.5)
