@@ -198,7 +198,7 @@ def of_task(cls: type[P], task: str, trainer: str) -> P:
         raise InputError(f"{path}: {error}") from None
 
 
-SECTIONS = ("problem", "sb3", "imitation", "ppo", "qrdqn")
+SECTIONS = ("problem", "sb3", "imitation", "ppo", "qrdqn", "rllib")
 """Of a file of hyperparameters: the problem, and the options of each trainer."""
 
 KEPT = ("algorithm", "env_id", "embodiment", "observation", "step_m", "step_deg", "hidden")

@@ -23,6 +23,9 @@ _EXTRAS = {
     "torch": "train",
     "stable_baselines3": "train",
     "sb3_contrib": "train",
+    "ray": "rllib",
+    "tree": "rllib",
+    "ormsgpack": "rllib",
 }
 
 

@@ -1,0 +1,93 @@
+"""Steps a second on Ray RLlib with different numbers of environment runners.
+
+ms-slam train rllib scaling --runners 1 2 4 --out runs/rllib-scaling
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ms_slam_agents.train_rllib import Args, make_run
+from tqdm import tqdm
+
+from ms_slam_env.command_line import parse
+from ms_slam_env.config import bounded
+from ms_slam_env.errors import InputError
+from ms_slam_env.report.records import to_plain
+from ms_slam_env.report.results import RESULTS, write_result_folder
+from ms_slam_env.report.tables import make_table
+
+_SPLIT = {
+    "sampling_s": "env_runner_sampling_timer",
+    "learning_s": "learner_update_timer",
+    "broadcast_s": "synch_weights",
+}
+
+
+@dataclass(frozen=True)
+class Scaling(Args):
+    """Measure steps a second with different numbers of runners; these options are the command line.
+
+    Attributes:
+        runners: numbers of environment runners, one after the other.
+        rounds: of ``n_steps`` steps of each runner and an update, that are measured; one more comes
+            before, in which scenes are built and kernels loaded.
+    """
+
+    out: Path = Path("runs/rllib-scaling")
+    runners: tuple[int, ...] = (1, 2, 4)
+    rounds: int = bounded(2, 1, 10_000)
+    n_steps: int = bounded(128, 2, 1_000_000)
+
+
+def main(words: Sequence[str]) -> int:
+    """Measure as the command line says; return the exit code.
+
+    Raises:
+        InputError: bad options, or fewer than one runner.
+    """
+    args = parse(Scaling, words, "ms-slam train rllib scaling")
+    if not args.runners or min(args.runners) < 1:
+        raise InputError(f"runners = {args.runners} must be numbers from 1 on")
+    rows = [measure(args, count) for count in tqdm(args.runners, unit="number of runners")]
+    alone = rows[0]["steps_per_s"] / rows[0]["runners"]
+    for row in rows:
+        row["scaling_efficiency"] = row["steps_per_s"] / (row["runners"] * alone)
+    columns = ("runners", "steps_per_s", "scaling_efficiency", *_SPLIT)
+    note = (
+        f"{os.cpu_count()} processor threads for all runners and the learner; sampling, learning "
+        "and broadcast are means of a round. Efficiency is that of the first row's runners."
+    )
+    write_result_folder(
+        args.out,
+        RESULTS,
+        kind="rllib_scaling",
+        title="Steps a second on Ray RLlib with so many environment runners",
+        about="Synchronous PPO: runners play, then the learner learns while they wait.",
+        tables=[make_table(columns, rows, note=note)],
+        rows=[{"spec": {"runners": r["runners"]}, "result": r, "error": None} for r in rows],
+        content={"config": to_plain(asdict(args))},
+    )
+    print((args.out / "table.md").read_text(encoding="utf-8"))
+    return 0
+
+
+def measure(args: Scaling, count: int) -> dict[str, Any]:
+    """Steps a second with ``count`` runners, and where the time of a round goes."""
+    own: dict[str, Any] = {"num_envs": count, "total_timesteps": 1_000_000_000}
+    with ExitStack() as stack:
+        run = make_run(replace(args, **own), None, stack)
+        run.advance(bool)
+        before, begun = run.steps, time.monotonic()
+        for _ in range(args.rounds):
+            run.advance(bool)
+        seconds = time.monotonic() - begun
+        timers = run.timers
+    split = {name: float(timers.get(key, 0.0)) for name, key in _SPLIT.items()}
+    return {"runners": count, "steps_per_s": (run.steps - before) / seconds, **split}
