@@ -86,8 +86,9 @@ class TrainedPolicy(Planner):
 
 
 class RoomAgent(TrainedPolicy):
-    """The policy that comes with the package for the task ``room``."""
+    """The policy that comes with the package for the task ``room``; it goes back when lost."""
 
+    recovers = True
     default_path = SHIPPED / "room.safetensors"
 
 

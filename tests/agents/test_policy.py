@@ -155,7 +155,7 @@ def test_the_planner_refuses_what_it_cannot_run(trained, tmp_path, monkeypatch):
 def test_a_planner_is_shown_what_its_policy_was_trained_on(trained, monkeypatch):
     monkeypatch.delenv("MS_SLAM_POLICY", raising=False)
     assert planner_observation(f"policy,path={trained[1]},deterministic=true") == "features"
-    assert RoomAgent.observation_for(deterministic=True) == "features"
+    assert RoomAgent.observation_for(deterministic=True) == "goals"
     assert planner_observation("greedy,recovery=true") == "features"
     with pytest.raises(InputError, match="MS_SLAM_POLICY"):
         planner_observation("policy")
