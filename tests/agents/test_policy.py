@@ -14,6 +14,7 @@ pytest.importorskip("sb3_contrib")
 import torch
 from learnable_fake import ENV_ID, NUM_ACTIONS, LearnableFake, fake_env
 from ms_slam_agents import policy as policy_module
+from ms_slam_agents.network import Network
 from ms_slam_agents.policy import Policy
 from ms_slam_agents.policy_file import Metadata, PolicyFile, read_policy, write_policy
 from ms_slam_agents.policy_planner import RoomAgent, TrainedPolicy
@@ -86,14 +87,19 @@ def test_numpy_agrees_with_stable_baselines3(trained):
 
 def test_the_shipped_policy_agrees_with_pytorch():
     file, policy = read_policy(SHIPPED), Policy.load(SHIPPED)
-    rng = np.random.default_rng(1)
+    known, rng = policy.metadata, np.random.default_rng(1)
     moments = file.part("observation")
-    observations = rng.normal(
-        moments["mean"], np.sqrt(moments["var"]), (500, policy.metadata.inputs)
-    )
+    observations = rng.normal(moments["mean"], np.sqrt(moments["var"]), (500, known.inputs))
     scaled = np.clip((observations - moments["mean"]) / np.sqrt(moments["var"] + 1e-8), -10, 10)
-    found = policy.probabilities(observations, np.ones((500, policy.num_actions), dtype=bool))
-    np.testing.assert_allclose(found, torch_probabilities(file.part("policy"), scaled), atol=1e-6)
+    masks = rng.random((500, policy.num_actions)) < 0.7
+    masks[:, 0] = True
+    network = Network(known.inputs, known.hidden[0], policy.num_actions, 0, known.candidates)
+    network.load_state_dict({k: torch.from_numpy(v) for k, v in file.part("policy").items()})
+    with torch.no_grad():
+        seen = torch.as_tensor(scaled, dtype=torch.float32)
+        expected = network(seen, torch.zeros(500, 0), torch.as_tensor(masks))[0].exp().numpy()
+    np.testing.assert_allclose(policy.probabilities(observations, masks), expected, atol=1e-5)
+    assert np.ptp(expected, axis=0).max() > 0.05  # not just uniform
 
 
 def test_a_mask_takes_its_share_from_the_others(trained):
@@ -180,12 +186,10 @@ def test_the_policy_makes_the_environment_that_fits(trained):
 
 def test_observations_of_another_environment_are_refused():
     policy = Policy.load(SHIPPED)
-    with pytest.raises(
-        InputError, match=r"\(287,\).*|observations of shape \(1, 287\).*'features'"
-    ):
+    with pytest.raises(InputError, match=r"\(287,\).*|observations of shape \(1, 287\).*'goals'"):
         policy.act(np.zeros(287), np.ones(49, dtype=bool))
     with pytest.raises(InputError, match=r"masks of shape \(1, 7\)"):
-        policy.act(np.zeros(189), np.ones(7, dtype=bool))
+        policy.act(np.zeros(1119), np.ones(7, dtype=bool))
 
 
 WITHOUT_TRAINERS = """
@@ -206,7 +210,7 @@ def test_running_a_policy_needs_neither_pytorch_nor_a_trainer():
         f"{WITHOUT_TRAINERS}import numpy as np; from ms_slam_agents.policy import Policy;"
         "from ms_slam_env.env.planners import PLANNERS; PLANNERS.find('agent-room');"
         f"policy = Policy.load({str(SHIPPED)!r});"
-        "print(policy.act(np.zeros(189), np.ones(49, dtype=bool)))"
+        "print(policy.act(np.zeros(1119), np.ones(49, dtype=bool)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -226,7 +230,7 @@ def test_the_example_of_the_documentation_runs(where, monkeypatch):
         source = re.sub(r"^ {8}", "", text[1], flags=re.MULTILINE)
         names = {"Policy": Policy, "np": np}
     exec(source, names)
-    assert names["policy"].metadata.observation == "features"
+    assert names["policy"].metadata.observation == "goals"
     assert 0 <= names["action"] < 49
     assert np.isfinite(names["reward"])
     names["env"].close()
