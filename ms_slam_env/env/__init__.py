@@ -3,8 +3,8 @@
 from ms_slam_env.env.active_slam import ActiveSlamEnv
 from ms_slam_env.env.config import EnvConfig, LookaheadConfig, RewardConfig, TargetConfig
 from ms_slam_env.env.episode import Episode
-from ms_slam_env.env.observations import STATE_NAMES
 from ms_slam_env.env.planners import Planner
+from ms_slam_env.env.robot_knowledge import STATE_NAMES
 
 __all__ = [
     "STATE_NAMES",

@@ -18,14 +18,10 @@ from ms_slam_env.env.coverage import CoverageGrid
 from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.env.episode import Episode
 from ms_slam_env.env.lookahead import Lookahead
-from ms_slam_env.env.observations import (
-    CONFIGURATION,
-    STATE_NAMES,
-    RobotKnowledge,
-    make_observation,
-)
+from ms_slam_env.env.observations import CONFIGURATION, make_observation
 from ms_slam_env.env.rendering import draw_moment
 from ms_slam_env.env.reward import Outcome, reward_terms
+from ms_slam_env.env.robot_knowledge import STATE_NAMES, RobotKnowledge
 from ms_slam_env.env.saved_state import load_state, save_state
 from ms_slam_env.env.simulation import Simulation
 from ms_slam_env.errors import InputError, unknown

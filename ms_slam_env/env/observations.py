@@ -4,14 +4,20 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
+from ms_slam_env.camera import Intrinsics, intensity_image
+from ms_slam_env.env.robot_knowledge import (
+    DIVERGENCE_CAP,
+    POSITION_SCALE_M,
+    STATE_BOUNDS,
+    RobotKnowledge,
+    state_vector,
+)
 from ms_slam_env.extension import ExtensionPoint
 from ms_slam_env.geometry import invert
 from ms_slam_env.mapping import (
@@ -25,14 +31,11 @@ from ms_slam_env.mapping.candidates import (
     GRID_LOWS,
     HIGHS,
     LOWS,
-    PredictedViews,
     candidate_numbers,
     grid_numbers,
 )
 from ms_slam_env.mapping.goals_around import NUM_GOALS, gain_around
 from ms_slam_env.mapping.view_goals import GOAL_RADIUS_M, best_goal, distance_in_steps
-from ms_slam_env.robot import NUM_ROTATIONS, NUM_TRANSLATIONS, ROTATIONS, TRANSLATIONS
-from ms_slam_env.slam.base import Views
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -40,28 +43,6 @@ Float64 = NDArray[np.float64]
 CONFIGURATION = "slam_configuration"
 """Key of the SLAM configuration in ``info``, and in an observation of several parts."""
 
-STATE_NAMES: tuple[str, ...] = (
-    *("x", "y", "z"),
-    *("R_xx", "R_yx", "R_zx", "R_xy", "R_yy", "R_zy"),
-    *("intensity_divergence", "depth_divergence"),
-    *("tracking_ok", "inlier_fraction", "lost_share"),
-    *(f"translation_{name}" for name in TRANSLATIONS),
-    *(f"rotation_{name.replace(' ', '_')}" for name in ROTATIONS),
-)
-"""What the numbers of the state vector are, in order.
-
-Position relative to the start in units of 5 m (in the start camera's frame: x right, y down, z
-forward); the first two columns of the rotation, R_ij the component along i of the camera's axis j;
-the divergences of the last step in units of M_I and M_D; SLAM's word on its last frame, the share
-of pixels that it explained, and consecutive steps lost as a share of the patience; the last motion,
-one-hot.
-"""
-
-NUM_STATE = len(STATE_NAMES)
-
-_POSITION_SCALE_M = 5.0
-_POSITION_CAP = 200.0  # in units of that: a kilometre, farther than any scene
-_DIVERGENCE_CAP = 5.0  # in units of M_I, M_D
 _MAX_DEPTH_M = 20.0
 _DEPTH_SCALE_M = 4.0
 _DEPTH_CAP = _MAX_DEPTH_M / _DEPTH_SCALE_M
@@ -74,52 +55,6 @@ _SMALLEST_STEP = 1e-6  # a motion of no length is as many steps from everywhere
 
 
 _GOAL_LOW, _GOAL_HIGH = [-2.0] * 3 + [-1.0] * 3 + [0.0] * 2, [2.0] * 3 + [1.0] * 3 + [5.0] * 2
-_LOW = [-_POSITION_CAP] * 3 + [-1.0] * 6 + [0.0] * (NUM_STATE - 9)
-_HIGH = [_POSITION_CAP] * 3 + [1.0] * 6 + [_DIVERGENCE_CAP] * 2 + [1.0] * (NUM_STATE - 11)
-_STATE_BOUNDS = np.array([_LOW, _HIGH], dtype=np.float32)
-
-
-@dataclass(frozen=True)
-class RobotKnowledge:
-    """What the robot knows after a step.
-
-    Attributes:
-        frame: the last live frame.
-        T_start_camera: (4, 4) estimated pose relative to the start.
-        divergence: (2,) of the last two live frames, in units of (M_I, M_D).
-        tracking_ok: SLAM's own word on its last frame.
-        inlier_fraction: share of pixels that the alignment explained.
-        lost_share: consecutive steps lost, or away from the first submap, as a share of the
-            patience.
-        motion: the last motion as an index of the 49, of the 7 rotations alone where the
-            translation is fixed, also where it was blocked; 0 before the first.
-        motion_mask: (n,) which motions are possible now.
-        configuration: index of the SLAM configuration in force; 0 where there is only one.
-        lookahead: predicts the divergences (n, 2) of the candidates, in units of (M_I, M_D).
-        candidates: the poses (n, 4, 4) that the motions would lead to; the first is the present.
-        view: what the map predicts of here, at `trackability.SCALE`.
-        predicted: what the map predicts of here and of the candidates, divergences in those units.
-        steps: translation, metres, and rotation, radians, of a motion.
-        frames: taken on a motion.
-        occupancy: what is known of space; None where the observation does not need it.
-    """
-
-    frame: RGBDFrame
-    T_start_camera: Float64
-    divergence: Float64
-    tracking_ok: bool
-    inlier_fraction: float
-    lost_share: float
-    motion: int
-    motion_mask: NDArray[np.bool_]
-    configuration: int
-    lookahead: Callable[[], Float64]
-    candidates: Callable[[], Float64]
-    view: Callable[[], Views]
-    predicted: Callable[[], PredictedViews]
-    steps: tuple[float, float]
-    frames: int
-    occupancy: OccupancyGrid | None = None
 
 
 class Observation(ABC):
@@ -142,7 +77,7 @@ class RGBDObservation(Observation):
             {
                 "color": spaces.Box(0, 255, (*intrinsics.shape, 3), np.uint8),
                 "depth": spaces.Box(0, _MAX_DEPTH_M, intrinsics.shape, np.float32),
-                "state": spaces.Box(*_STATE_BOUNDS),
+                "state": spaces.Box(*STATE_BOUNDS),
             }
         )
 
@@ -161,7 +96,7 @@ class FeaturesObservation(Observation):
     def __init__(self, intrinsics: Intrinsics, num_motions: int) -> None:
         cells = _ROWS * _COLUMNS
         highs = [*(1,) * _GREY_BINS, *(_DEPTH_CAP,) * cells, *(1,) * (cells + num_motions)]
-        self.space = _longer(spaces.Box(*_STATE_BOUNDS), highs)
+        self.space = _longer(spaces.Box(*STATE_BOUNDS), highs)
 
     def build(self, knowledge: RobotKnowledge) -> Float32:
         """Return the vector."""
@@ -182,11 +117,11 @@ class LookaheadObservation(Observation):
 
     def __init__(self, intrinsics: Intrinsics, num_motions: int) -> None:
         self._features = FeaturesObservation(intrinsics, num_motions)
-        self.space = _longer(self._features.space, [_DIVERGENCE_CAP] * (2 * num_motions))
+        self.space = _longer(self._features.space, [DIVERGENCE_CAP] * (2 * num_motions))
 
     def build(self, knowledge: RobotKnowledge) -> Float32:
         """Return the vector."""
-        predicted = np.clip(knowledge.lookahead(), 0, _DIVERGENCE_CAP)
+        predicted = np.clip(knowledge.lookahead(), 0, DIVERGENCE_CAP)
         return np.concatenate(
             [self._features.build(knowledge), predicted.ravel().astype(np.float32)]
         )
@@ -268,7 +203,7 @@ class CandidatesObservation(Observation):
 
     def __init__(self, intrinsics: Intrinsics, num_motions: int) -> None:
         self._intrinsics = intrinsics
-        state = _longer(spaces.Box(*_STATE_BOUNDS), [_GAIN_CAP_M3, *_GOAL_HIGH], [0, *_GOAL_LOW])
+        state = _longer(spaces.Box(*STATE_BOUNDS), [_GAIN_CAP_M3, *_GOAL_HIGH], [0, *_GOAL_LOW])
         self._state_bounds = state.low, state.high
         self.space = _longer(state, np.tile(HIGHS, num_motions), np.tile(LOWS, num_motions))
 
@@ -339,22 +274,6 @@ def make_observation(
     return WithConfiguration(observation, num_configurations)
 
 
-def state_vector(knowledge: RobotKnowledge) -> Float32:
-    """The numbers of ``STATE_NAMES``, (28,) float32 of order one, clipped to their bounds."""
-    translation, rotation = divmod(knowledge.motion, NUM_ROTATIONS)
-    state = np.concatenate(
-        [
-            knowledge.T_start_camera[:3, 3] / _POSITION_SCALE_M,
-            knowledge.T_start_camera[:3, :2].T.ravel(),
-            knowledge.divergence,
-            [knowledge.tracking_ok, knowledge.inlier_fraction, knowledge.lost_share],
-            np.eye(NUM_TRANSLATIONS)[translation],
-            np.eye(NUM_ROTATIONS)[rotation],
-        ]
-    ).astype(np.float32)
-    return np.clip(state, *_STATE_BOUNDS)
-
-
 def _least(steps: tuple[float, float]) -> tuple[float, float]:
     """The length of a motion, where it is none something that can be divided by."""
     return max(steps[0], _SMALLEST_STEP), max(steps[1], _SMALLEST_STEP)
@@ -364,7 +283,7 @@ def _seen_goal(here: Float64, goal: Float64, steps: tuple[float, float]) -> Floa
     """Where a goal is (3), where it looks (3), and how far away it is in steps (2), as shown."""
     T_here_goal = invert(here) @ goal
     away = distance_in_steps(here[None], goal, *steps)[0]
-    return np.concatenate([T_here_goal[:3, 3] / _POSITION_SCALE_M, T_here_goal[:3, 2], away / 10])
+    return np.concatenate([T_here_goal[:3, 3] / POSITION_SCALE_M, T_here_goal[:3, 2], away / 10])
 
 
 def _relative_gain(grid: OccupancyGrid, poses: Float64, intrinsics: Intrinsics) -> list[Any]:

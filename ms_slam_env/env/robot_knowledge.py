@@ -1,0 +1,104 @@
+"""What the robot knows after a step, and the numbers of its state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.camera import RGBDFrame
+from ms_slam_env.mapping import OccupancyGrid
+from ms_slam_env.mapping.candidates import PredictedViews
+from ms_slam_env.robot import NUM_ROTATIONS, NUM_TRANSLATIONS, ROTATIONS, TRANSLATIONS
+from ms_slam_env.slam.base import Views
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+STATE_NAMES: tuple[str, ...] = (
+    *("x", "y", "z"),
+    *("R_xx", "R_yx", "R_zx", "R_xy", "R_yy", "R_zy"),
+    *("intensity_divergence", "depth_divergence"),
+    *("tracking_ok", "inlier_fraction", "lost_share"),
+    *(f"translation_{name}" for name in TRANSLATIONS),
+    *(f"rotation_{name.replace(' ', '_')}" for name in ROTATIONS),
+)
+"""What the numbers of the state vector are, in order.
+
+Position relative to the start in units of 5 m (in the start camera's frame: x right, y down, z
+forward); the first two columns of the rotation, R_ij the component along i of the camera's axis j;
+the divergences of the last step in units of M_I and M_D; SLAM's word on its last frame, the share
+of pixels that it explained, and consecutive steps lost as a share of the patience; the last motion,
+one-hot.
+"""
+
+NUM_STATE = len(STATE_NAMES)
+
+POSITION_SCALE_M = 5.0
+DIVERGENCE_CAP = 5.0  # in units of M_I, M_D
+_POSITION_CAP = 200.0  # in units of 5 m: a kilometre, farther than any scene
+
+_LOW = [-_POSITION_CAP] * 3 + [-1.0] * 6 + [0.0] * (NUM_STATE - 9)
+_HIGH = [_POSITION_CAP] * 3 + [1.0] * 6 + [DIVERGENCE_CAP] * 2 + [1.0] * (NUM_STATE - 11)
+STATE_BOUNDS = np.array([_LOW, _HIGH], dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class RobotKnowledge:
+    """What the robot knows after a step.
+
+    Attributes:
+        frame: the last live frame.
+        T_start_camera: (4, 4) estimated pose relative to the start.
+        divergence: (2,) of the last two live frames, in units of (M_I, M_D).
+        tracking_ok: SLAM's own word on its last frame.
+        inlier_fraction: share of pixels that the alignment explained.
+        lost_share: consecutive steps lost, or away from the first submap, as a share of the
+            patience.
+        motion: the last motion as an index of the 49, of the 7 rotations alone where the
+            translation is fixed, also where it was blocked; 0 before the first.
+        motion_mask: (n,) which motions are possible now.
+        configuration: index of the SLAM configuration in force; 0 where there is only one.
+        lookahead: predicts the divergences (n, 2) of the candidates, in units of (M_I, M_D).
+        candidates: the poses (n, 4, 4) that the motions would lead to; the first is the present.
+        view: what the map predicts of here, at `trackability.SCALE`.
+        predicted: what the map predicts of here and of the candidates, divergences in those units.
+        steps: translation, metres, and rotation, radians, of a motion.
+        frames: taken on a motion.
+        occupancy: what is known of space; None where the observation does not need it.
+    """
+
+    frame: RGBDFrame
+    T_start_camera: Float64
+    divergence: Float64
+    tracking_ok: bool
+    inlier_fraction: float
+    lost_share: float
+    motion: int
+    motion_mask: NDArray[np.bool_]
+    configuration: int
+    lookahead: Callable[[], Float64]
+    candidates: Callable[[], Float64]
+    view: Callable[[], Views]
+    predicted: Callable[[], PredictedViews]
+    steps: tuple[float, float]
+    frames: int
+    occupancy: OccupancyGrid | None = None
+
+
+def state_vector(knowledge: RobotKnowledge) -> Float32:
+    """The numbers of ``STATE_NAMES``, (28,) float32 of order one, clipped to their bounds."""
+    translation, rotation = divmod(knowledge.motion, NUM_ROTATIONS)
+    state = np.concatenate(
+        [
+            knowledge.T_start_camera[:3, 3] / POSITION_SCALE_M,
+            knowledge.T_start_camera[:3, :2].T.ravel(),
+            knowledge.divergence,
+            [knowledge.tracking_ok, knowledge.inlier_fraction, knowledge.lost_share],
+            np.eye(NUM_TRANSLATIONS)[translation],
+            np.eye(NUM_ROTATIONS)[rotation],
+        ]
+    ).astype(np.float32)
+    return np.clip(state, *STATE_BOUNDS)
