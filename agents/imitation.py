@@ -235,7 +235,7 @@ class Student:
             loss.backward()
             torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
             optimizer.step()
-            said.append((float(loss), float(torch.exp(log_probs).mean())))
+            said.append((loss.item(), torch.exp(log_probs).mean().item()))
         self.epochs += args.epochs
         last = said[-max(1, len(said) // args.epochs) :]
         loss, probability = np.mean(last, axis=0)

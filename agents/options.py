@@ -13,7 +13,6 @@ from ms_slam_env.config import Checked, bounded, from_dict, load_yaml
 from ms_slam_env.env.observations import POINT as OBSERVATIONS
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.input_files import read_text
-from ms_slam_env.mapping.candidates import GRID_NAMES, NAMES
 from ms_slam_env.slam.configuration import is_file_name
 
 
@@ -78,7 +77,7 @@ class Problem(Checked):
     @property
     def candidates(self) -> int:
         """Numbers of each action that our own networks look at one by one; 0 without any."""
-        return {"candidates": len(NAMES), "goals": len(GRID_NAMES)}.get(self.observation, 0)
+        return int(getattr(OBSERVATIONS.find(self.observation), "candidate_numbers", 0))
 
 
 @dataclass(frozen=True)

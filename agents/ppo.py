@@ -25,15 +25,14 @@ import torch
 from ms_slam_agents.environments import make_venv
 from ms_slam_agents.network import Network, load_parameters
 from ms_slam_agents.normalization import PooledMoments, moment_tensors, restore_moments
-from ms_slam_agents.options import PpoTraining, parse_for_task
+from ms_slam_agents.options import PpoTraining
 from ms_slam_agents.policy_file import Metadata, PolicyFile, Tensors, read_policy
 from ms_slam_agents.sb3_state import optimizer_tensors, restore_adam
-from ms_slam_agents.training_run import TrainingRun, read_init, train
+from ms_slam_agents.training_run import TrainingRun, read_init, run_command_line
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import Tensor, nn
 from torch.nn.functional import kl_div, mse_loss
 
-from ms_slam_env.command_line import exit_code
 from ms_slam_env.config import bounded
 from ms_slam_env.errors import InputError
 
@@ -316,10 +315,7 @@ def make_run(args: Args, file: PolicyFile | None, stack: ExitStack) -> Run:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status: 0, 2 or 130."""
-    words = list(sys.argv[1:] if argv is None else argv)
-    prog = "ms-slam train ppo"
-    parsed = lambda: parse_for_task(Args, words, prog, "ppo")  # noqa: E731
-    return exit_code(lambda: train(parsed(), Run.algorithm, make_run), prog)
+    return run_command_line(Args, "ppo", Run.algorithm, make_run, argv)
 
 
 if __name__ == "__main__":

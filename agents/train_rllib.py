@@ -27,11 +27,11 @@ import torch
 from ms_slam_agents.environments import make_env
 from ms_slam_agents.network import Network, load_parameters
 from ms_slam_agents.normalization import Normalization, moment_tensors, restore_moments
-from ms_slam_agents.options import PpoTraining, Problem, parse_for_task
+from ms_slam_agents.options import PpoTraining, Problem
 from ms_slam_agents.policy import CLIP, EPSILON
 from ms_slam_agents.policy_file import PolicyFile, Tensors
 from ms_slam_agents.sb3_state import optimizer_tensors, restore_adam
-from ms_slam_agents.training_run import TrainingRun, read_init, train
+from ms_slam_agents.training_run import TrainingRun, read_init, run_command_line
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.connectors.connector_v2 import ConnectorV2
 from ray.rllib.core.columns import Columns
@@ -353,8 +353,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         from ms_slam_agents import rllib_scaling
 
         return exit_code(lambda: rllib_scaling.main(words[1:]), f"{prog} scaling")
-    parsed = lambda: parse_for_task(Args, words, prog, "rllib")  # noqa: E731
-    return exit_code(lambda: train(parsed(), Run.algorithm, make_run), prog)
+    return run_command_line(Args, "rllib", Run.algorithm, make_run, words)
 
 
 if __name__ == "__main__":

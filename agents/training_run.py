@@ -4,6 +4,7 @@ save after each update and judge every so often, to stop by the clock or a signa
 from __future__ import annotations
 
 import signal
+import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
@@ -24,12 +25,14 @@ from ms_slam_agents.options import (
     check_kept,
     check_new,
     check_steps_left,
+    parse_for_task,
 )
 from ms_slam_agents.policy_file import Metadata, PolicyFile, Tensors, read_policy, write_policy
 from stable_baselines3.common.vec_env import VecEnv
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
+from ms_slam_env.command_line import exit_code
 from ms_slam_env.errors import InputError
 from ms_slam_env.interrupts import kept
 from ms_slam_env.report.provenance import provenance
@@ -172,6 +175,19 @@ def train(
             run.learn(curve, validation, signals)
     print(f"{'interrupted' if signals else 'done'}: {run.steps} steps, policy in {args.out}")
     return 130 if signals else 0
+
+
+def run_command_line(
+    args: type[T],
+    name: str,
+    algorithm: str,
+    make: Callable[[T, PolicyFile | None, ExitStack], TrainingRun],
+    argv: Sequence[str] | None,
+) -> int:
+    """Run ``ms-slam train NAME``; return the exit status: 0, 2 or 130."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    prog = f"ms-slam train {name}"
+    return exit_code(lambda: train(parse_for_task(args, words, prog, name), algorithm, make), prog)
 
 
 @contextmanager

@@ -29,8 +29,10 @@ from ms_slam_env.mapping import (
 from ms_slam_env.mapping.candidates import (
     GRID_HIGHS,
     GRID_LOWS,
+    GRID_NAMES,
     HIGHS,
     LOWS,
+    NAMES,
     candidate_numbers,
     grid_numbers,
 )
@@ -63,6 +65,8 @@ class Observation(ABC):
     space: spaces.Space[Any]
     needs_occupancy: bool = False
     """Whether an occupancy grid is to be carved from the frames."""
+    candidate_numbers: int = 0
+    """Numbers of each motion at the end, motion by motion, for networks that look at them so."""
 
     @abstractmethod
     def build(self, knowledge: RobotKnowledge) -> Any:
@@ -163,6 +167,7 @@ class GoalsObservation(Observation):
     """
 
     needs_occupancy = True
+    candidate_numbers = len(GRID_NAMES)
 
     def __init__(self, intrinsics: Intrinsics, num_motions: int) -> None:
         self._intrinsics = intrinsics
@@ -200,6 +205,7 @@ class CandidatesObservation(Observation):
     """
 
     needs_occupancy = True
+    candidate_numbers = len(NAMES)
 
     def __init__(self, intrinsics: Intrinsics, num_motions: int) -> None:
         self._intrinsics = intrinsics
