@@ -63,6 +63,13 @@ def invert(T: ArrayLike) -> Float64:
     return inverse
 
 
+def orthonormal(T: ArrayLike) -> Float64:
+    """The rigid motion next to a matrix (4, 4) that many products have worn."""
+    matrix = np.asarray(T, dtype=np.float64)
+    U, _, Vt = np.linalg.svd(matrix[:3, :3])
+    return make_pose(U @ Vt, matrix[:3, 3])
+
+
 def transform_points(T_a_b: ArrayLike, points_b: ArrayLike) -> Float64:
     """Map points (..., 3) of frame b into frame a with one motion (4, 4)."""
     T = np.asarray(T_a_b, dtype=np.float64)

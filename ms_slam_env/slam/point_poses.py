@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.geometry import invert, make_pose, transform_points
+from ms_slam_env.geometry import invert, make_pose, orthonormal, transform_points
 from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.rows import Rows
 
@@ -153,9 +153,3 @@ def pose_from_matches(
     inlier = np.zeros(len(points), dtype=bool)
     inlier[kept.ravel()] = True
     return invert(make_pose(cv2.Rodrigues(turn)[0], shift.ravel())), inlier
-
-
-def orthonormal(T: Float64) -> Float64:
-    """The rigid motion next to a matrix (4, 4) that many products have worn."""
-    U, _, Vt = np.linalg.svd(T[:3, :3])
-    return make_pose(U @ Vt, T[:3, 3])

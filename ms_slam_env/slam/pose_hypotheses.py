@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.geometry import make_pose, so3_exp
+from ms_slam_env.geometry import make_pose, orthonormal, so3_exp
 from ms_slam_env.slam.alignment_measures import DepthImage, overlay
 from ms_slam_env.slam.base import Float64
 
@@ -38,6 +38,8 @@ def motion_hypotheses(
     First the last motion ``T_last_camera`` (4, 4), should it go on; then the best of ``MOTIONS``,
     judged by how well they lay the frame over the reference, in depth and intensity.
     """
+    # What goes on from frame to frame is made rigid: pose times last motion, frame after frame,
+    # multiplies rounding errors of the rotation by 2.4 each time.
     scores = overlay(frame, reference, MOTIONS, intrinsics, _SAMPLES).scores
     best = np.argsort(-scores, kind="stable")[:_TRIALS]
-    return np.concatenate([T_last_camera[None], MOTIONS[best]])
+    return np.concatenate([orthonormal(T_last_camera)[None], MOTIONS[best]])

@@ -12,7 +12,7 @@ from surfel_scenes import ray_cast
 
 from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.geometry import make_pose, relative_angle, so3_exp
+from ms_slam_env.geometry import invert, make_pose, relative_angle, so3_exp
 from ms_slam_env.slam.alignment_check import (
     VIEW_THRESHOLDS,
     AcceptanceThresholds,
@@ -113,10 +113,18 @@ def test_starts_go_on_first_and_then_from_near_the_motion():
         depth, _, color = ray_cast(pose, CAMERA)
         frames.append(DepthImage(depth.astype(np.float32), color.mean(-1).astype(np.float32)))
     starts = motion_hypotheses(*frames, MOVED, CAMERA)
-    np.testing.assert_array_equal(starts[0], MOVED)
+    np.testing.assert_allclose(starts[0], MOVED, atol=1e-15)
     angles = [np.degrees(relative_angle(start[:3, :3], turn)) for start in starts[1:]]
     steps = [np.linalg.norm(start[:3, 3] - step) for start in starts[1:]]
     assert any(angle < 2 and step < 0.12 for angle, step in zip(angles, steps, strict=True))
+
+
+def test_a_motion_that_goes_on_for_ever_stays_rigid():
+    last, pose = MOVED @ REST, MOVED @ MOVED
+    for _ in range(100):
+        going_on = motion_hypotheses(_view(REST), _view(REST), invert(last) @ pose, CAMERA)[0]
+        last, pose = pose, pose @ going_on
+    np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
 
 
 def test_a_repetition_must_hardly_move_but_may_look_less_alike():

@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import invert
+from ms_slam_env.geometry import invert, orthonormal
 from ms_slam_env.slam.base import Float64
 from ms_slam_env.slam.feature_matching import Int64
 from ms_slam_env.slam.point_poses import (
     CHI2_PIXEL,
     CHI2_PIXEL_AND_DEPTH,
     Sightings,
-    orthonormal,
     residuals,
 )
 from ms_slam_env.slam.sparse.config import SparseConfig

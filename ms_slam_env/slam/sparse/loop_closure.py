@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.geometry import invert, relative_angle
+from ms_slam_env.geometry import invert, orthonormal, relative_angle
 from ms_slam_env.slam.base import Float64, Loop
 from ms_slam_env.slam.feature_matching import most_alike
-from ms_slam_env.slam.point_poses import orthonormal
 from ms_slam_env.slam.sparse.config import SparseConfig
 from ms_slam_env.slam.sparse.local_mapping import load_gtsam
 from ms_slam_env.slam.sparse.localization import Fix, LiveFrame, Localizer
