@@ -185,6 +185,8 @@ class OdometrySlam(BorrowedMap, FrameByFrameSlam[DepthImage, _Placed]):
         """Views of the map to align ``image`` with where the earlier frames fail."""
         if guess is not None:
             yield from self._views(guess[None])
+        if not self._searches:
+            return
         seen = last.prepared.image
         motions = motion_hypotheses(image, seen, self._motion, self.intrinsics)
         yield from self._views(last.T_world_image @ motions)

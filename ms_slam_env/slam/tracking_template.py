@@ -31,6 +31,9 @@ class PreparedFrame(Protocol):
         """Share of the pixels that have depth."""
 
 
+SEARCHED_FRAMES = 100
+"""So many lost frames in a row are sought at once, then every tenth."""
+
 Frame = TypeVar("Frame", bound=PreparedFrame)
 Match = TypeVar("Match")
 
@@ -56,7 +59,7 @@ class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
     """
 
     fewest_readings = FEWEST_READINGS
-    saved: ClassVar[tuple[str, ...]] = ("_pose", "_motion", "_lost")
+    saved: ClassVar[tuple[str, ...]] = ("_pose", "_motion", "_lost_frames")
 
     def __init__(self, intrinsics: Intrinsics) -> None:
         intrinsics.check_pinhole("SLAM")
@@ -81,7 +84,7 @@ class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
         pose = np.eye(4) if T_world_camera is None else T_world_camera
         self._pose = np.array(check_pose(pose, "T_world_camera"))
         self._motion = np.eye(4)  # from the frame before to the last one
-        self._lost = False
+        self._lost_frames = 0  # since the last one that was found
         self._clear()
 
     def track(self, frame: RGBDFrame, T_world_camera_guess: ArrayLike | None = None) -> TrackResult:
@@ -108,7 +111,7 @@ class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
     def mark_lost(self) -> None:
         """Seek the next frame as one after lost tracking; see ``SlamBackend``."""
         self._motion = np.eye(4)
-        self._lost = self._has_map
+        self._lost_frames = self._lost_frames + 1 if self._has_map else 0
 
     def fuse(self, frame: RGBDFrame, T_world_camera: ArrayLike) -> TrackResult:
         """Fuse ``frame`` into the map at a known pose (4, 4), without tracking."""
@@ -119,13 +122,13 @@ class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
     def _take(self, frame: RGBDFrame, prepared: Frame) -> TrackResult:
         """Go on from a frame whose pose is known."""
         self._motion = np.eye(4)
-        self._lost = False
+        self._lost_frames = 0
         self._start_from(frame, prepared)
         return TrackResult(self._pose.copy(), True)
 
     def _accept(self, frame: RGBDFrame, prepared: Frame, attempt: Attempt[Match]) -> TrackResult:
         """Move on to a frame whose pose was found."""
-        relocalised, self._lost = self._lost, False
+        relocalised, self._lost_frames = self._lost_frames > 0, 0
         before, self._pose = self._pose, attempt.T_world_camera
         self._motion = np.eye(4) if relocalised else invert(before) @ self._pose
         self._extend(frame, prepared, attempt)
@@ -140,6 +143,15 @@ class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
         return TrackResult(
             self._pose.copy(), False, False, *figures, reason, overlap=statistics.overlap
         )
+
+    @property
+    def _searches(self) -> bool:
+        """Whether a frame that is not found near the last pose is sought farther away.
+
+        A search costs many times what tracking does. After `SEARCHED_FRAMES` in vain the camera is
+        hardly near, and every tenth frame is enough to notice that it came back.
+        """
+        return self._lost_frames < SEARCHED_FRAMES or self._lost_frames % 10 == 0
 
     @property
     @abstractmethod

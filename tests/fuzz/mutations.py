@@ -142,10 +142,14 @@ def _other(value: Any, rng: Rng, plain: Sequence[Any]) -> Any:
 
 
 def mutated_json(data: bytes, rng: Rng) -> bytes:
-    """The nested values of a JSON text, or its bytes."""
+    """The nested values of a JSON text, or its bytes; these alone where it is broken already."""
     if rng.random() < 0.2:
         return mutated_text(data, rng)
-    return json.dumps(mutated_tree(json.loads(data), rng), default=repr).encode()
+    try:
+        tree = json.loads(data)
+    except ValueError:
+        return mutated_text(data, rng)
+    return json.dumps(mutated_tree(tree, rng), default=repr).encode()
 
 
 def mutated_folder(files: Files, rng: Rng) -> Files:

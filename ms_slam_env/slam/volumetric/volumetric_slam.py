@@ -160,6 +160,8 @@ class VolumetricSlam(FrameByFrameSlam[FusedImage, None]):
             return
         if guess is not None:
             yield self._confirmed(prepared, guess)
+        if not self._searches:
+            return
         seen = DepthImage(self._view.depth, self._view.intensity)
         for motion in motion_hypotheses(prepared, seen, self._motion, self.intrinsics):
             yield self._confirmed(prepared, self._pose @ motion)
