@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env import metrics, slam
 from ms_slam_env.camera import xtion
+from ms_slam_env.config import parse_named
 from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.evaluation.run_sequence import run_sequence
@@ -47,6 +48,7 @@ class SkippingSpec:
         motion: ICL-NUIM's that is placed in the scene, such as ``lr_kt1``; empty: hand-held.
         data: folder that holds it.
         histograms: ``default`` or ``paper``, how divergence is measured.
+        backend: SLAM that runs on what is kept, with its parameters.
     """
 
     scene: str
@@ -75,6 +77,7 @@ class SkippingSpec:
         return whole[self.kept[self.kept < len(whole)]]
 
     histograms: str = "default"
+    backend: str = "surfel"
 
 
 @dataclass(frozen=True)
@@ -105,6 +108,8 @@ class FrameSkipping(Experiment):
     """Trajectory error for which the targets M_I and M_D are read."""
     histograms: str = "default"
     """Settings of the divergence: default, or paper (256 bins, no smoothing, every pixel)."""
+    backends: tuple[str, ...] = ("surfel",)
+    """NAME, parameters appended as in surfel,check_slips=true; of several no targets are read."""
 
     unit = rows_key = "sequences"
 
@@ -117,6 +122,10 @@ class FrameSkipping(Experiment):
             raise InputError(f"desired_ate_m = {self.desired_ate_m} must be > 0")
         if self.histograms not in HISTOGRAMS:
             raise unknown("setting of histograms", self.histograms, HISTOGRAMS)
+        if not self.backends:
+            raise InputError("backends is empty")
+        for text in self.backends:
+            slam.POINT.find(parse_named(text, "backend")[0])
 
     def specs(self) -> list[SkippingSpec]:
         """Every sequence at every interval."""
@@ -130,11 +139,13 @@ class FrameSkipping(Experiment):
                 motion=motion,
                 data=data,
                 histograms=self.histograms,
+                backend=backend,
             )
             for scene in self.scenes
             for seed in seed_list(self.seeds, self.sequences)
             for motion in self.motions or ("",)
             for interval in self.intervals
+            for backend in self.backends
         ]
 
     @staticmethod
@@ -146,7 +157,8 @@ class FrameSkipping(Experiment):
         K = sequence.intrinsics
         measure = HISTOGRAMS[spec.histograms]
         divergences = consecutive_divergences(sequence.frames, K, [measure])[:, 0]
-        run = run_sequence(slam.make("surfel", K), sequence)
+        name, options = parse_named(spec.backend, "backend")
+        run = run_sequence(slam.make(name, K, **options), sequence)
         worst = metrics.absolute_errors(run.estimates, sequence.poses, align="none").max()
         return {
             "frames": len(sequence),
@@ -162,10 +174,10 @@ class FrameSkipping(Experiment):
     def tables(self, rows: Sequence[Row]) -> list[Table]:
         """One line an interval, and the targets."""
         note = "Medians (of losses: the share) over sequences with their 95 % intervals."
+        if self._compared:
+            grouping = Grouping((*self._compared, "keep_every"), (*DIVERGENCES, "ate_m", "lost"))
+            return [grouping.table(rows, note=note)]
         lines = by_interval(rows, note)
-        if self.motions:
-            fields = ("motion", "keep_every")
-            return [Grouping(fields, (*DIVERGENCES, "ate_m", "lost")).table(rows, note=note)]
         targets = suggest_targets(lines.rows, self.desired_ate_m)
         wanted = f"For an ATE of {1000 * self.desired_ate_m:g} mm and no sequence lost"
         if targets is None:
@@ -181,10 +193,17 @@ class FrameSkipping(Experiment):
 
     def content(self, rows: Sequence[Row]) -> Mapping[str, Any]:
         """The seeds and the targets."""
-        return {
-            "seeds": seed_list(self.seeds, self.sequences),
-            "suggested_targets": suggest_targets(by_interval(rows).rows, self.desired_ate_m),
-        }
+        seeds = {"seeds": seed_list(self.seeds, self.sequences)}
+        if self._compared:
+            return seeds
+        targets = suggest_targets(by_interval(rows).rows, self.desired_ate_m)
+        return {**seeds, "suggested_targets": targets}
+
+    @property
+    def _compared(self) -> tuple[str, ...]:
+        """What the sequences differ in besides the interval; targets are read where in nothing."""
+        has = {"motion": self.motions, "backend": self.backends[1:]}
+        return tuple(name for name, which in has.items() if which)
 
 
 def by_interval(rows: Sequence[Row], note: str = "") -> Table:

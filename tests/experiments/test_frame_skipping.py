@@ -80,6 +80,23 @@ def test_motions_are_placed_as_they_were_and_skipped(tmp_path: Path) -> None:
         FrameSkipping(motions=("lr_kt9",), data=tmp_path).specs()
 
 
+def test_backends_are_compared_on_the_same_frames() -> None:
+    backends = ("surfel", "surfel,check_slips=true")
+    experiment = FrameSkipping(("table",), intervals=(3,), frames=9, backends=backends, sequences=1)
+    specs = [replace(spec, image_size="80x60") for spec in experiment.specs()]
+    rows = [
+        {"spec": vars(spec), "error": None, "result": FrameSkipping.run(spec)} for spec in specs
+    ]
+    assert rows[0]["result"]["M_I"] == rows[1]["result"]["M_I"]
+    (table,) = experiment.tables(rows)
+    assert [line["backend"] for line in table.rows] == list(backends)
+    assert "suggested_targets" not in experiment.content(rows)
+    with pytest.raises(InputError, match="nothing"):
+        FrameSkipping(backends=("nothing",))
+    with pytest.raises(InputError, match="backends is empty"):
+        FrameSkipping(backends=())
+
+
 def test_the_papers_histograms_have_divergences_of_their_own() -> None:
     experiment = FrameSkipping(("table",), intervals=(3,), frames=9, histograms="paper")
     found = FrameSkipping.run(replace(experiment.specs()[0], image_size="80x60"))
