@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
@@ -195,6 +198,26 @@ def _map(rng: np.random.Generator) -> SparseMap:
         pose = make_pose(np.eye(3), [0.1 * k, 0, 0])
         sparse_map.add(Keyframe(pose, k == 0, k, features, ids, color, intensity, depth))
     return sparse_map
+
+
+@pytest.mark.parametrize("keyframes", [1, 12])
+def test_neighbours_are_those_with_most_features_on_points_of_a_keyframe(keyframes: int) -> None:
+    rng = np.random.default_rng(keyframes)
+    sparse_map = SparseMap(CAMERA)
+    sparse_map.positions = np.zeros((40, 3))
+    ids = [rng.integers(-1, 40, rng.integers(0, 30)) for _ in range(keyframes)]
+    sparse_map.keyframes = [
+        SimpleNamespace(point_ids=one, seen_points=lambda one=one: one[one >= 0]) for one in ids
+    ]
+    slow = []
+    for k, mine in enumerate(ids):
+        shared = [sum(i >= 0 and i in mine for i in other) for other in ids]
+        others = sorted((j for j in range(keyframes) if j != k), key=lambda j: -shared[j])
+        slow.append([j for j in others[:5] if shared[j] >= 6])
+    assert [sparse_map.neighbours(k, 5, 6) for k in range(keyframes)] == slow
+    assert sparse_map.neighbours_of_each(range(keyframes), 5, 6) == slow
+    assert sparse_map.neighbours_of_each([], 5) == []
+    assert sparse_map.shared(np.array([1, 2]), []).tolist() == []
 
 
 def test_keyframes_share_points_take_them_along_and_merge_them():

@@ -86,9 +86,10 @@ class LoopCloser(Stateful):
         if old < 1:
             return []
         frames = self._map.keyframes
-        known = set(self._map.neighbours(keyframe, len(frames)))
-        near = {k for other in list(known) for k in self._map.neighbours(other, 10)}
-        rest = [k for k in range(old) if k not in known and k not in near]
+        known = self._map.neighbours(keyframe, len(frames))
+        near = {k for of_one in self._map.neighbours_of_each(known, 10) for k in of_one}
+        near.update(known)
+        rest = [k for k in range(old) if k not in near]
         looks = [frames[k].thumbnail for k in rest]
         alike = most_alike(frames[keyframe].thumbnail, looks, _CANDIDATES)
         return [rest[index] for index in alike]
@@ -122,10 +123,11 @@ class LoopCloser(Stateful):
     def _edges_of(self, poses: Float64) -> list[Edge]:
         """Motions between keyframes as they are now: consecutive ones, and those sharing points."""
         edges = []
+        closed = {frozenset((edge.a, edge.b)) for edge in self.edges}
+        near = self._map.neighbours_of_each(range(len(poses)), 10, _SHARED_POINTS)
         for b in range(1, len(poses)):
-            near = self._map.neighbours(b, 10, _SHARED_POINTS)
-            for a in sorted({b - 1, *(k for k in near if k < b)}):
-                if not any((edge.a, edge.b) in ((a, b), (b, a)) for edge in self.edges):
+            for a in sorted({b - 1, *(k for k in near[b] if k < b)}):
+                if frozenset((a, b)) not in closed:
                     edges.append(Edge(a, b, invert(poses[a]) @ poses[b]))
         return edges
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, transform_points
@@ -93,18 +94,40 @@ class SparseMap(Saved):
 
     def shared(self, point_ids: Int64, keyframes: Iterable[int]) -> Int64:
         """How many of some points each of the keyframes sees."""
-        wanted = np.zeros(len(self.positions), dtype=bool)
+        wanted = np.zeros(len(self.positions) + 1, dtype=bool)  # the last stands for "none", -1
         wanted[point_ids] = True
-        counts = [wanted[self.keyframes[k].seen_points()].sum() for k in keyframes]
-        return np.array(counts, dtype=np.int64)
+        shown, lengths = self._shown(keyframes)
+        sums = np.concatenate([[0], np.cumsum(wanted[shown])])
+        ends = np.cumsum(lengths, dtype=np.int64)
+        return np.asarray(sums[ends] - sums[ends - lengths], dtype=np.int64)
 
     def neighbours(self, keyframe: int, count: int, least: int = 15) -> list[int]:
         """The keyframes, ``count`` at most, that share most points with one; ``least`` each."""
         everyone = range(len(self.keyframes))
         counts = self.shared(self.keyframes[keyframe].seen_points(), everyone)
-        counts[keyframe] = 0
-        order = np.argsort(-counts, kind="stable")[:count]
-        return [int(k) for k in order if counts[k] >= least]
+        return _most_shared(counts, keyframe, count, least)
+
+    def neighbours_of_each(
+        self, keyframes: Sequence[int], count: int, least: int = 15
+    ) -> list[list[int]]:
+        """``neighbours`` of many keyframes at once: one product counts what all pairs share."""
+        shown, lengths = self._shown(range(len(self.keyframes)))
+        rows = np.repeat(np.arange(len(lengths)), lengths)[shown >= 0]
+        shown = shown[shown >= 0]
+        shape = len(self.keyframes), len(self.positions)
+        sights = csr_array((np.ones(len(shown), dtype=np.int64), (rows, shown)), shape=shape)
+        seen = sights.astype(bool).astype(np.int64)[list(keyframes)]
+        counts = (sights @ seen.T).toarray()
+        return [
+            _most_shared(counts[:, n], keyframe, count, least)
+            for n, keyframe in enumerate(keyframes)
+        ]
+
+    def _shown(self, keyframes: Iterable[int]) -> tuple[Int64, Int64]:
+        """The points of the keyframes' features, one keyframe after another, and how many each."""
+        ids = [self.keyframes[k].point_ids for k in keyframes]
+        none = np.zeros(0, dtype=np.int64)
+        return np.concatenate([none, *ids]), np.array([len(one) for one in ids], dtype=np.int64)
 
     def points_of(self, keyframes: Iterable[int]) -> Int64:
         """Ids, sorted, of the living points that some keyframes see."""
@@ -148,6 +171,13 @@ class SparseMap(Saved):
         """Go on from a state."""
         super().set_state(state)
         self.keyframes = [_restore(saved) for saved in state["keyframes"]]
+
+
+def _most_shared(counts: Int64, keyframe: int, count: int, least: int) -> list[int]:
+    """The keyframes with the largest counts but for one."""
+    others = np.where(np.arange(len(counts)) == keyframe, 0, counts)
+    order = np.argsort(-others, kind="stable")[:count]
+    return [int(k) for k in order if others[k] >= least]
 
 
 _OF_KEYFRAME = ("T_world_camera", "point_ids", "color", "intensity", "depth")
