@@ -73,6 +73,7 @@ class GoalPlanner(Planner):
         self.enough_m3, self.far_m = enough_m3, far_m
         self.check(_RANGES)
         self.steps = env.config.step_m, env.config.step_rad
+        self.reset()
 
     def check(self, ranges: Mapping[str, tuple[float, float]]) -> None:
         """Refuse options outside ``ranges``."""

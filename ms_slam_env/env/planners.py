@@ -81,13 +81,17 @@ class Recovering(Planner):
     def __init__(self, env: ActiveSlamEnv, planner: Planner) -> None:
         super().__init__(env)
         self.planner = planner
+        self._begin()
 
     def reset(self) -> None:
         """Nothing was done yet."""
+        self._begin()
+        self.planner.reset()
+
+    def _begin(self) -> None:
         self.made: list[int] = []
         self.was_tracked = False
         self.has_chosen = False
-        self.planner.reset()
 
     def instead(self, action: int) -> None:
         """Remember the motion that was made, to undo that one."""

@@ -11,6 +11,7 @@ from ms_slam_baselines.greedy import PAPER_TARGETS
 import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env.divergence import depth_divergence, intensity_divergence
 from ms_slam_env.env.config import TargetConfig
+from ms_slam_env.env.planners import make_planner
 from ms_slam_env.errors import InputError
 
 PLANNERS = (GreedyDivergence, MaxInformation, RandomWalk, Stationary)
@@ -40,6 +41,14 @@ def play(env, planner_class, steps=4, seed=5):
 @pytest.mark.parametrize("planner_class", PLANNERS)
 def test_motions_are_free_and_reproducible(env, planner_class):
     assert play(env, planner_class) == play(env, planner_class)
+
+
+@pytest.mark.parametrize("name", ["nbv", "belief", "graph-dopt", "greedy-limited", "receding-nbv"])
+def test_a_new_planner_needs_no_reset(env, name):
+    observation, info = env.reset(seed=2)
+    fresh, reset = (make_planner(name, env.unwrapped, seed=2) for _ in range(2))
+    reset.reset()
+    assert fresh.act(observation, info) == reset.act(observation, info)
 
 
 def test_greedy_takes_the_smallest_distance_to_the_targets(env):
