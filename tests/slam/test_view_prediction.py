@@ -12,6 +12,7 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import make_pose, so3_exp
 from ms_slam_env.robot.action_primitives import decompose
+from ms_slam_env.slam.surfel import view_prediction
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.surfels import SplatCamera
@@ -93,6 +94,21 @@ def test_views_far_apart_are_splatted_one_by_one(wide_map: SurfelMap) -> None:
     np.testing.assert_array_equal(views.intensity[0], direct.intensity.numpy()[0])
     np.testing.assert_array_equal(views.depth[0], views.depth[2])
     assert (views.depth[1] == 0).all()
+
+
+def test_of_dozens_of_surfels_to_a_pixel_some_are_enough(
+    wide_map: SurfelMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    turned = make_pose(so3_exp([0.0, 2.5, 0.0]), [0.0, 0.0, 0.0])
+    poses = np.stack([np.eye(4), turned])
+    enough = wide_map.predict(poses, 0.25)
+    monkeypatch.setattr(view_prediction, "LAYERS", np.inf)
+    every = wide_map.predict(poses, 0.25)
+    assert not np.array_equal(enough.intensity, every.intensity)
+    assert ((enough.depth > 0) == (every.depth > 0)).mean() > 0.995
+    assert np.percentile(np.abs(enough.depth - every.depth), 95) < 0.005
+    monkeypatch.setattr(view_prediction, "LAYERS", 0.01)
+    assert (wide_map.predict(poses, 0.25).depth[0] > 0).mean() < 0.5
 
 
 def test_an_empty_map_predicts_nothing() -> None:

@@ -118,6 +118,13 @@ class SplatRenderer:
         dim = (self.envs, workers)
         return [RecordedLaunch(kernel, dim, inputs, self.device) for kernel, inputs in passes]
 
+    def list_enough(self, layers: float, kept: VisibleList) -> None:
+        """List so many of the culled surfels that ``layers`` surfaces of them are left."""
+        kept.count.zero_()
+        workers = self._buffers.workers
+        inputs = [self.visible, self.camera, workers, layers, kept]
+        wp.launch(splatting.list_enough, (self.envs, workers), inputs, device=self.device)
+
     def list_hidden(self, hidden: VisibleList) -> None:
         """List the culled surfels that lie well behind the surface that ``splat`` just drew."""
         hidden.count.zero_()

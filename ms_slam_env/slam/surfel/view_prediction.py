@@ -24,6 +24,7 @@ from ms_slam_env.slam.surfel.view_warping import EMPTY, PointCloud
 
 MAX_MARGIN = 1.0  # a reference view wider than the views by more than their own size is refused
 NEAREST_M = 0.5  # surfaces closer than this may leave the reference view's margin
+LAYERS = 8.0  # surfaces of discs that are drawn in a view of its own
 SIZE_STEP_PX = 8  # reference views come in such steps, so that few sets of buffers are needed
 
 
@@ -106,7 +107,7 @@ class ViewPredictor:
         self.device = buffers.device
         self.workers = buffers.workers
         self._map = buffers
-        self._hidden = allocate(VisibleList, buffers.batch, buffers.capacity, self.device)
+        self._listed = allocate(VisibleList, buffers.batch, buffers.capacity, self.device)
         self._references: dict[tuple[int, Intrinsics], _Reference] = {}
         self._single: dict[tuple[int, Intrinsics], SplatRenderer] = {}
         self._outputs: dict[tuple[int, Intrinsics], tuple[wp.array, DeviceViews]] = {}
@@ -148,7 +149,11 @@ class ViewPredictor:
         wp.launch(view_warping.resolve_views, dim, inputs, device=self.device)
 
     def _predict_singly(self, poses: Float64, views: DeviceViews, first_env: int) -> None:
-        """Splat the surfels themselves into every view, one view per env at a time."""
+        """Splat the surfels themselves into every view, one view per env at a time.
+
+        Seen from far away, or in small images, there are dozens to a pixel: so many are left out
+        that some are left.
+        """
         envs, count = poses.shape[:2]
         key = (envs, views.intrinsics)
         if key not in self._single:
@@ -156,7 +161,8 @@ class ViewPredictor:
         renderer = self._single[key]
         for n in range(count):
             renderer.cull(self._upload(poses[:, n]), first_env)
-            image = renderer.splat(first_env)
+            renderer.list_enough(LAYERS, self._listed)
+            image = renderer.splat(first_env, self._listed)
             drawn = [image.vertices, image.normals, image.intensity]
             inputs = [*drawn, count, n, views.intensity, views.depth, views.normals]
             dim = (envs, *views.intrinsics.shape)
@@ -173,7 +179,7 @@ class ViewPredictor:
     def _reference(self, envs: int, intrinsics: Intrinsics) -> _Reference:
         key = (envs, intrinsics)
         if key not in self._references:
-            self._references[key] = _Reference(self._renderer(envs, intrinsics), self._hidden)
+            self._references[key] = _Reference(self._renderer(envs, intrinsics), self._listed)
         return self._references[key]
 
     def _buffers(self, count: int, intrinsics: Intrinsics) -> tuple[wp.array, DeviceViews]:
