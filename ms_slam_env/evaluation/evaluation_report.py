@@ -14,12 +14,10 @@ from ms_slam_env.evaluation.map_files import MEASURES, MapOptions, evaluate_maps
 from ms_slam_env.evaluation.map_quality import ComparedMap, share_keys
 from ms_slam_env.evaluation.rerun_file import write_paths
 from ms_slam_env.evaluation.trajectory_charts import error_panel, path_panel, widest_axes
-from ms_slam_env.evaluation.trajectory_files import (
-    Matched,
-    TrajectoryOptions,
+from ms_slam_env.evaluation.trajectory_files import Matched, TrajectoryOptions, match_files
+from ms_slam_env.evaluation.trajectory_measures import (
     absolute,
     absolute_key,
-    match_files,
     measure_matched,
     statistic_keys,
 )

@@ -16,14 +16,8 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.evaluation_report import Evaluation
 from ms_slam_env.evaluation.rerun_file import write_paths
 from ms_slam_env.evaluation.trajectory_charts import path_panel
-from ms_slam_env.evaluation.trajectory_files import (
-    Matched,
-    TrajectoryOptions,
-    absolute,
-    absolute_key,
-    match_files,
-    measure_matched,
-)
+from ms_slam_env.evaluation.trajectory_files import Matched, TrajectoryOptions, match_files
+from ms_slam_env.evaluation.trajectory_measures import absolute, absolute_key, measure_matched
 from ms_slam_env.metrics.registry import metric
 from ms_slam_env.report import figures
 from ms_slam_env.report.charts import Chart

@@ -1,12 +1,11 @@
-"""Two trajectory files compared: every measure of the poses that correspond in time."""
+"""Two trajectory files: the poses that correspond in time, and whether they can."""
 
 from __future__ import annotations
 
 import csv
-import re
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +20,6 @@ from ms_slam_env.metrics.relative import (
     DELTA_UNITS,
     PAIRINGS,
     TOLERANCE,
-    printed_ate,
-    printed_relative_errors,
 )
 from ms_slam_env.metrics.trajectory import ALIGNMENTS, check_first
 from ms_slam_env.sequences import associate, read_trajectory
@@ -36,11 +33,6 @@ _LEAST_SPREAD_M = 0.02  # of a truth that stands still nothing more can be said
 _MOST_SPREAD = 0.7  # an alignment explains less than half of the variance of the positions
 _FRAME_COLUMNS = ("timestamp", "tracking_ok")
 _BESIDE = "frames.csv"  # of ms-slam run, in the folder of the estimate
-_ALIGNED = {
-    **{"se3": "ate", "sim3": "ate_sim3", "yaw": "ate_yaw"},
-    **{"origin": "ate_origin", "none": "ate_unaligned"},
-}
-"""Metric of the absolute error by alignment with all poses."""
 
 
 @dataclass(frozen=True)
@@ -247,194 +239,3 @@ def tracked_at(path: Path, times: Float64) -> NDArray[np.bool_]:
             f"{path} leaves {sum(map(bool, found))} tracked poses; at least 2 are needed"
         )
     return np.array(found, dtype=bool)
-
-
-def evaluate_files(
-    estimate: Path, truth: Path, options: TrajectoryOptions | None = None
-) -> dict[str, Any]:
-    """Compare TUM file ``estimate`` with TUM file ``truth``, both T_world_camera.
-
-    Returns:
-        the metrics of `measure_matched`.
-
-    Raises:
-        InputError: as `match_files`; no two poses ``delta`` apart; more segments than poses.
-    """
-    options = options or TrajectoryOptions()
-    return measure_matched(match_files(estimate, truth, options), options)
-
-
-def measure_matched(matched: Matched, options: TrajectoryOptions) -> dict[str, Any]:
-    """The measures of poses that correspond, by keys of the registry.
-
-    Returns:
-        ``poses`` and ``unmatched_poses`` of the estimate; ``ate_m`` (RMSE),
-        ``ate_mean_m``, ``ate_median_m``, ``ate_std_m``, ``ate_min_m``, ``ate_max_m``, and the same
-        of ``ate_rad`` (None where the path is a line), ``rpe_m`` and ``rpe_rad``; with another
-        alignment than SE(3) by all poses the key of `absolute_key` in the place of ``ate_m``;
-        ``ate_printed_m`` and ``rpe_printed_m`` of USME's equations to the letter;
-        ``tracked_share`` and, after SE(3), ``ate_tracked_m`` where it is known what was tracked;
-        ``scale`` of the alignment, ``path_m``, ``duration_s``, ``pieces`` (the same statistics by
-        piece), ``drift_by_length`` (of sub-trajectories), robustness (USME equations 9 and 10 over
-        gaps in time) and initialisation (12 and 13).
-
-    Raises:
-        InputError: no two poses ``delta`` apart; more segments than poses.
-    """
-    count = len(matched.times)
-    return {
-        "poses": count,
-        "unmatched_poses": matched.unmatched,
-        "tracked_share": matched.tracked_share,
-        "ate_tracked_m": _tracked_error(matched, options),
-        "scale": matched.alignment.scale,
-        "path_m": metrics.path_length(matched.truth),
-        "estimate_path_m": metrics.path_length(matched.raw),
-        "duration_s": float(matched.times[-1] - matched.times[0]),
-        **_absolute_statistics(matched, slice(None), options),
-        **_relative(matched, slice(None), options),
-        **_as_printed(matched, options),
-        "pieces": [
-            {
-                "start_s": float(matched.times[first] - matched.times[0]),
-                "end_s": float(matched.times[end - 1] - matched.times[0]),
-                "poses": int(end - first),
-                **_absolute_statistics(matched, slice(first, end), options),
-                **_relative_or_none(matched, slice(first, end), options),
-            }
-            for first, end in metrics.equal_pieces(count, options.segments)
-        ],
-        "drift_by_length": [
-            {
-                "length_m": drift.length_m,
-                "sub_trajectories": drift.segments,
-                **_named("drift_translation", drift.translation),
-                **_named("drift_rotation_deg_m", drift.rotation_rad_m, np.degrees),
-            }
-            for drift in metrics.drifts(matched.estimate, matched.truth, options.segment_lengths_m)
-        ],
-        **_robustness(matched, options),
-        **_initialisation(matched, options),
-    }
-
-
-def absolute(matched: Matched) -> tuple[Float64, Float64 | None]:
-    """Errors (N,) of the aligned poses: metres, and radians unless the path leaves them open."""
-    ate_m = metrics.absolute_errors(matched.estimate, matched.truth, "none")
-    if not matched.alignment.unique:
-        return ate_m, None
-    return ate_m, metrics.absolute_errors(matched.estimate, matched.truth, "none", "rotation")
-
-
-def statistic_keys(key: str) -> tuple[str, ...]:
-    """Keys of the statistics of an error in the order of `ErrorStatistics`.
-
-    ``ate_m`` itself is the root mean square, ``ate_mean_m`` the mean, and so on.
-    """
-    name, unit = re.fullmatch(r"(.*?)((?:_m|_rad|_deg_m)?)", key).groups()  # type: ignore[union-attr]
-    others = (field.name for field in fields(metrics.ErrorStatistics) if field.name != "rmse")
-    return (key, *(f"{name}_{statistic}{unit}" for statistic in others))
-
-
-def _named(
-    key: str, statistics: metrics.ErrorStatistics, convert: Callable[[float], float] = float
-) -> dict[str, float]:
-    """Statistics by key."""
-    values = asdict(statistics).values()
-    return {of: float(convert(v)) for of, v in zip(statistic_keys(key), values, strict=True)}
-
-
-def absolute_key(options: TrajectoryOptions, unit: str) -> str:
-    """Key of the absolute error, ``unit`` m or rad; one key means one alignment.
-
-    ``ate_m``, ``ate_sim3_m``, ``ate_yaw_m``, ``ate_origin_m`` or ``ate_unaligned_m``;
-    ``ate_first_m`` after an alignment by the first poses, as the options say.
-    """
-    name = _ALIGNED[options.align] if options.align_first is None else "ate_first"
-    return f"{name}_{unit}"
-
-
-def _tracked_error(matched: Matched, options: TrajectoryOptions) -> float | None:
-    """ATE in metres of the tracked frames, aligned by themselves; None where it is not known."""
-    ok = matched.tracked
-    if ok is None or ok.sum() < 2 or absolute_key(options, "m") != "ate_m":
-        return None
-    return metrics.ate_rmse(matched.raw[ok], matched.truth[ok])
-
-
-def _absolute_statistics(
-    matched: Matched, part: slice, options: TrajectoryOptions
-) -> dict[str, float | None]:
-    found: dict[str, float | None] = {}
-    for unit, errors in zip(("m", "rad"), absolute(matched), strict=True):
-        key = absolute_key(options, unit)
-        found |= {key: None} if errors is None else _named(key, metrics.statistics_of(errors[part]))
-    return found
-
-
-def _relative(matched: Matched, part: slice, options: TrajectoryOptions) -> dict[str, Any]:
-    P, Q, times = matched.estimate[part], matched.truth[part], matched.times[part]
-    found: dict[str, Any] = {}
-    for key, kind in (("rpe_m", "translation"), ("rpe_rad", "rotation")):
-        errors = metrics.relative_errors(P, Q, kind=kind, times=times, **options.relative)
-        found |= _named(key, metrics.statistics_of(errors))
-    return found
-
-
-def _relative_or_none(matched: Matched, part: slice, options: TrajectoryOptions) -> dict[str, Any]:
-    """None for a piece too short to hold a pair of poses."""
-    try:
-        return _relative(matched, part, options)
-    except InputError:
-        return {"rpe_m": None, "rpe_rad": None}
-
-
-def _as_printed(matched: Matched, options: TrajectoryOptions) -> dict[str, Any]:
-    """USME's (2), and of its (5) the root mean square and the median, to the letter."""
-    P, Q = matched.estimate, matched.truth
-    relative = printed_relative_errors(P, Q, times=matched.times, **options.relative)
-    return {
-        "ate_printed_m": printed_ate(P, Q, "none").rmse,
-        "rpe_printed_m": metrics.statistics_of(relative).rmse,
-        "rpe_printed_median_m": float(np.median(relative)),
-    }
-
-
-def _robustness(matched: Matched, options: TrajectoryOptions) -> dict[str, Any]:
-    """How well the pieces between gaps in time fit together, USME equations (9) and (10)."""
-    lost_s = float(np.diff(matched.gaps, axis=1).sum())
-    duration = float(matched.times[-1] - matched.times[0])
-    breaks = np.flatnonzero(np.diff(matched.piece)) + 1
-    # A gap stands as one untracked frame between the pieces.
-    rows = np.insert(np.arange(len(matched.piece)), breaks, -1)
-    align = "sim3" if options.align == "sim3" else "se3"
-    gaps = {
-        "gaps": len(matched.gaps),
-        "lost_s": lost_s,
-        "lost_time_share": lost_s / duration if duration > 0 else 0.0,
-    }
-    try:
-        found = metrics.tracking_robustness(
-            matched.raw[rows], matched.truth[rows], rows >= 0, align
-        )
-    except InputError as error:
-        return {"robustness": None, "robustness_reason": str(error), "tracked_pieces": 0, **gaps}
-    return {
-        "robustness": found.error,
-        "robustness_translation_m": found.translation_m,
-        "robustness_rotation_rad": found.rotation_rad,
-        "robustness_log_scale": found.log_scale,
-        "tracked_pieces": len(found.segments),
-        **gaps,
-    }
-
-
-def _initialisation(matched: Matched, options: TrajectoryOptions) -> dict[str, Any]:
-    """When the scale has settled, and how right it is, USME equations (12) and (13)."""
-    known = None if options.align == "sim3" else 1.0
-    found = metrics.initialisation(matched.times, matched.raw, matched.truth, global_scale=known)
-    return {
-        "initialisation_s": found.time_s,
-        "initialisation_scale": found.scale,
-        "scale_error": found.scale_error,
-    }

@@ -23,12 +23,8 @@ from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.map_files import evaluate_maps
 from ms_slam_env.evaluation.run_files import write_ply
-from ms_slam_env.evaluation.trajectory_files import (
-    TrajectoryOptions,
-    absolute_key,
-    evaluate_files,
-    statistic_keys,
-)
+from ms_slam_env.evaluation.trajectory_files import TrajectoryOptions
+from ms_slam_env.evaluation.trajectory_measures import absolute_key, evaluate_files, statistic_keys
 from ms_slam_env.geometry import invert, make_pose, se3_exp, so3_exp, transform_points
 from ms_slam_env.sequences import read_trajectory, write_trajectory
 

@@ -19,7 +19,8 @@ from PIL import Image
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.camera.image_files import read_color, read_depth
 from ms_slam_env.evaluation.map_files import read_surface
-from ms_slam_env.evaluation.trajectory_files import TrajectoryOptions, evaluate_files
+from ms_slam_env.evaluation.trajectory_files import TrajectoryOptions
+from ms_slam_env.evaluation.trajectory_measures import evaluate_files
 from ms_slam_env.scenes.mesh_file import load_soup
 from ms_slam_env.sequences import open_sequence, read_trajectory
 from ms_slam_env.sequences.recording import parse_calibration

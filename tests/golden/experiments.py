@@ -626,7 +626,8 @@ def difficulty(folder: Path) -> Any:
 
 @experiment("trajectory_evaluation", EXACT)
 def trajectory_evaluation(folder: Path) -> Any:
-    from ms_slam_env.evaluation.trajectory_files import TrajectoryOptions, evaluate_files
+    from ms_slam_env.evaluation.trajectory_files import TrajectoryOptions
+    from ms_slam_env.evaluation.trajectory_measures import evaluate_files
     from ms_slam_env.geometry import se3_exp
     from ms_slam_env.sequences import write_trajectory
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.map_files import read_surface
 from ms_slam_env.evaluation.trajectory_charts import path_panel, widest_axes
-from ms_slam_env.evaluation.trajectory_files import evaluate_files
+from ms_slam_env.evaluation.trajectory_measures import evaluate_files
 from ms_slam_env.geometry import check_pose, make_pose
 from ms_slam_env.scenes.mesh_file import load_soup
 from ms_slam_env.sequences import read_trajectory
