@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from ms_slam_env import ENV_IDS, PERTURBED_ENV_IDS
+from ms_slam_env import ENV_IDS, PERTURBED_ENV_IDS, TASK_IDS
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import unknown
 from ms_slam_env.experiments.harness.experiment import Experiment
@@ -17,10 +17,10 @@ from ms_slam_env.metrics.cost.meter import resident_mb
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished, make_table
 
-IDS = (*ENV_IDS, *PERTURBED_ENV_IDS)
+IDS = (*ENV_IDS, *TASK_IDS, *PERTURBED_ENV_IDS)
 
-ARM_FRAMES = 10
-"""Frames of a step of the arm, where other cameras take one."""
+ARM_SHARE = 40
+"""Steps of other cameras for one of the arm, each ten frames and the physics of a motion."""
 
 
 @dataclass(frozen=True)
@@ -40,17 +40,17 @@ class Soak(Experiment, Checked):
     Every number in observation, reward and info is looked at. Memory is that of the process after
     each step: its peak in the second half of a piece over that in the first, which is the warm-up.
     Pieces are finished one by one, and those that are there already are not run again. A step of
-    the arm is ten frames and its physics, ten times the work: pieces of such an environment have a
-    tenth of the steps. So a million steps, about 6,500 for each environment with the arm and 65,000
-    for each of the others, are a night on one core.
+    the arm is ten frames and its physics: pieces of such an environment have a fortieth of the
+    steps. So a million steps, 1,300 for each environment with the arm and 52,000 for each of
+    the others, are half a night on one core.
     """
 
     env_ids: tuple[str, ...] = IDS
-    """Environments; those with the arm have a tenth of the steps of the others."""
+    """Environments; those with the arm have a fortieth of the steps of the others."""
     steps: int = bounded(1_000_000, 1, 10**9)
     """Of all environments together, rounded up to whole pieces of each."""
-    piece_steps: int = bounded(5000, 2, 10**7)
-    """Steps of a piece; a tenth with the arm, at least 2."""
+    piece_steps: int = bounded(13_000, 2, 10**7)
+    """Steps of a piece; a fortieth with the arm, at least 2."""
     image_size: str = "80x60"
     """Of the camera, width x height."""
 
@@ -63,7 +63,7 @@ class Soak(Experiment, Checked):
         for env_id in self.env_ids:
             if env_id not in IDS:
                 raise unknown("environment", env_id, IDS)
-        arm_steps = max(2, self.piece_steps // ARM_FRAMES)
+        arm_steps = max(2, self.piece_steps // ARM_SHARE)
         steps = {one: arm_steps if has_arm(one) else self.piece_steps for one in self.env_ids}
         pieces = -(-self.steps // sum(steps.values()))
         return [
