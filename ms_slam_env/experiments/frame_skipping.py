@@ -92,7 +92,7 @@ class FrameSkipping(Experiment):
 
     scenes: tuple[str, ...] = ("living_room", "corridor", "table")
     """Names of scenes, or mesh files."""
-    intervals: tuple[float, ...] = (1, 2, 3, 4, 5, 6, 8, 10, 12)
+    intervals: tuple[float, ...] = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 30)
     """Every so many frames one is kept; 1.5 drops one in three, 1.333 one in four."""
     frames: int = 240
     """Length of a whole sequence at most; hand-held, at most 1.5 cm and 1 degree a frame."""
