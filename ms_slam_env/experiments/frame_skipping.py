@@ -125,7 +125,7 @@ class FrameSkipping(Experiment):
         if not self.backends:
             raise InputError("backends is empty")
         for text in self.backends:
-            slam.POINT.find(parse_named(text, "backend")[0])
+            slam.check_parameters(*parse_named(text, "backend"))
 
     def specs(self) -> list[SkippingSpec]:
         """Every sequence at every interval."""

@@ -41,8 +41,8 @@ class Soak(Experiment, Checked):
     each step: its peak in the second half of a piece over that in the first, which is the warm-up.
     Pieces are finished one by one, and those that are there already are not run again. A step of
     the arm is ten frames and its physics: pieces of such an environment have a fortieth of the
-    steps. So a million steps, 1,300 for each environment with the arm and 52,000 for each of
-    the others, are half a night on one core.
+    steps. A million steps are 1,300 for each environment with the arm and 52,000 for each of the
+    others.
     """
 
     env_ids: tuple[str, ...] = IDS

@@ -93,6 +93,8 @@ def test_backends_are_compared_on_the_same_frames() -> None:
     assert "suggested_targets" not in experiment.content(rows)
     with pytest.raises(InputError, match="nothing"):
         FrameSkipping(backends=("nothing",))
+    with pytest.raises(InputError, match="nothing"):
+        FrameSkipping(backends=("surfel,nothing=1",))
     with pytest.raises(InputError, match="backends is empty"):
         FrameSkipping(backends=())
 
