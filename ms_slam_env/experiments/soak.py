@@ -19,8 +19,12 @@ from ms_slam_env.report.tables import Table, finished, make_table
 
 IDS = (*ENV_IDS, *TASK_IDS, *PERTURBED_ENV_IDS)
 
-ARM_SHARE = 40
-"""Steps of other cameras for one of the arm, each ten frames and the physics of a motion."""
+PLAIN_IDS = ("MSActiveSLAM-FreeCamera-v0", "MSActiveSLAM-FixedTranslation-v0")
+"""The two whose steps are cheapest: nothing disturbs the camera, and a motion is a frame."""
+
+SHARE, ARM_SHARE = 10, 250
+"""Steps of a plain environment for one of another, and for one of the arm, which is ten frames and
+the physics of a motion."""
 
 
 @dataclass(frozen=True)
@@ -39,18 +43,19 @@ class Soak(Experiment, Checked):
 
     Every number in observation, reward and info is looked at. Memory is that of the process after
     each step: its peak in the second half of a piece over that in the first, which is the warm-up.
-    Pieces are finished one by one, and those that are there already are not run again. A step of
-    the arm is ten frames and its physics: pieces of such an environment have a fortieth of the
-    steps. A million steps are 1,300 for each environment with the arm and 52,000 for each of the
-    others.
+    Pieces are finished one by one, and those that are there already are not run again. Most of the
+    steps are of the two environments whose steps cost least: of a million 272,000 of each, 27,200
+    of each other one without the arm, and 1,088 of each with it, in one piece: there a warm-up of
+    less would end before every scene was seen.
     """
 
     env_ids: tuple[str, ...] = IDS
-    """Environments; those with the arm have a fortieth of the steps of the others."""
+    """Environments."""
     steps: int = bounded(1_000_000, 1, 10**9)
     """Of all environments together, rounded up to whole pieces of each."""
-    piece_steps: int = bounded(13_000, 2, 10**7)
-    """Steps of a piece; a fortieth with the arm, at least 2."""
+    piece_steps: int = bounded(68_000, 2, 10**7)
+    """Of a piece of the free camera; a tenth if it is disturbed or has a task, a 250th for the arm
+    (whose pieces are one); at least 2."""
     image_size: str = "80x60"
     """Of the camera, width x height."""
 
@@ -59,18 +64,20 @@ class Soak(Experiment, Checked):
     fresh_process = True
 
     def specs(self) -> list[SoakSpec]:
-        """Pieces of all environments in turn."""
+        """Pieces of all environments in turn, and one of each with the arm."""
         for env_id in self.env_ids:
             if env_id not in IDS:
                 raise unknown("environment", env_id, IDS)
-        arm_steps = max(2, self.piece_steps // ARM_SHARE)
-        steps = {one: arm_steps if has_arm(one) else self.piece_steps for one in self.env_ids}
+        steps = {one: max(2, self.piece_steps // share(one)) for one in self.env_ids}
         pieces = -(-self.steps // sum(steps.values()))
-        return [
+        in_turn = [
             SoakSpec(env_id, piece, steps[env_id], self.image_size)
             for piece in range(pieces)
             for env_id in steps
+            if share(env_id) < ARM_SHARE
         ]
+        arms = [one for one in steps if share(one) == ARM_SHARE]
+        return in_turn + [SoakSpec(one, 0, pieces * steps[one], self.image_size) for one in arms]
 
     @staticmethod
     def run(spec: SoakSpec) -> dict[str, Any]:
@@ -119,9 +126,11 @@ class Soak(Experiment, Checked):
 _SUMMED = ("measured_steps", "soak_episodes", "not_finite")
 
 
-def has_arm(env_id: str) -> bool:
-    """Whether an arm moves the camera of this environment."""
-    return bool(gym.spec(env_id).kwargs["embodiment"] == "arm")
+def share(env_id: str) -> int:
+    """Steps of the free camera for one of this environment."""
+    if env_id in PLAIN_IDS:
+        return 1
+    return ARM_SHARE if gym.spec(env_id).kwargs["embodiment"] == "arm" else SHARE
 
 
 def _steps(env: gym.Env[Any, Any], spec: SoakSpec) -> Iterator[tuple[Any, ...]]:

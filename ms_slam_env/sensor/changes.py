@@ -90,6 +90,11 @@ class ChangingView:
                 self.plane = wp.zeros(first + more, dtype=wp.float32, device=device)
                 wp.copy(self.normal, surfaces.normal, count=first)
                 wp.copy(self.plane, surfaces.plane, count=first)
+            faces = self._moving_faces
+            middle = self.surfaces.normal, self.surfaces.plane
+            self._in_middle = [_Rows(array, first, faces) for array in middle]
+            self._in_each = [_Rows(array, first, faces) for array in (self.normal, self.plane)]
+            self._light_of_bodies = _Rows(self.surfaces.irradiance, first, faces)
         self.exposure_factor = 1.0
         self._lit: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
 
@@ -108,22 +113,22 @@ class ChangingView:
         is_split = self.posed_face is not self._hits.face
         if is_split:
             wp.copy(self.posed_face, self._hits.face)
+        here = len(times_s) // 2
+        changed = [(self._in_middle, slice(here, here + 1))]
+        if is_split:
+            changed.append((self._in_each, slice(None)))
         for cast in self._bodies:
             T_world_body = cast.body.pose(times_s)
             if not cast.cast(T, T_world_body):
                 continue
             R = T_world_body[:, :3, :3]
-            normals = np.einsum("pij,fj->pfi", R, cast.normals)
-            planes = cast.planes + np.einsum("pfi,pi->pf", normals, T_world_body[:, :3, 3])
-            here = len(times_s) // 2
-            _put(self.surfaces.normal, cast.faces.start, normals[here])
-            _put(self.surfaces.plane, cast.faces.start, planes[here])
-            if is_split:
-                for p in range(len(times_s)):
-                    start = cast.faces.start + p * self._moving_faces
-                    _put(self.normal, start, normals[p])
-                    _put(self.plane, start, planes[p])
-            self._light_body(cast, R[here], middle)
+            normals = cast.normals @ R.swapaxes(1, 2)
+            planes = cast.planes + (normals @ T_world_body[:, :3, 3:])[..., 0]
+            faces = slice(cast.faces.start - self.first_face, cast.faces.stop - self.first_face)
+            for (normal, plane), poses in changed:
+                normal.values[:, faces] = normals[poses]
+                plane.values[:, faces] = planes[poses]
+            self._light_of_bodies.values[:, faces] = _arriving(cast, R[here], middle)
             wp.launch(
                 keep_nearer,
                 dim=(1, int(self._camera.height), int(self._camera.width)),
@@ -131,13 +136,10 @@ class ChangingView:
                 outputs=[self._hits, self.posed_face],
                 device=self._device,
             )
-
-    def _light_body(self, cast: BodyCast, R: Float64, time_s: float) -> None:
-        """Light the faces of a body that is turned by R (3, 3)."""
-        around = cast.body.light(time_s)
-        arriving = around[0] + cast.corner_normals @ (R.T @ around[1:])
-        lit = np.maximum(arriving, 0.0) * cast.body.mesh.irradiance
-        _put(self.surfaces.irradiance, cast.faces.start, lit.astype(np.float32))
+        for (normal, plane), _ in changed:
+            normal.upload()
+            plane.upload()
+        self._light_of_bodies.upload()
 
     def _add_light(self, light: ChangingLight, time_s: float) -> None:
         """Add light to the faces in sight; those of the last image lose theirs."""
@@ -167,10 +169,30 @@ class ChangingView:
         return places.reshape(-1, 3), np.repeat(normal, 3, axis=0)
 
 
-def _put(array: wp.array, start: int, values: NDArray[np.floating]) -> None:
-    """Write rows of an array, on whatever device it lies."""
-    rows = np.ascontiguousarray(values, dtype=np.float32)
-    array[start : start + len(rows)].assign(rows)
+class _Rows:
+    """The bodies' rows, at the end of an array of the surfaces, to be written as NumPy.
+
+    Attributes:
+        values: (P, F, ...) of F faces, once for each of P poses; on the CPU the array itself.
+    """
+
+    def __init__(self, array: wp.array, first: int, faces: int) -> None:
+        """Take the rows from ``first`` on."""
+        self._rows = array[first:]
+        rows = self._rows.numpy()
+        self.values = rows.reshape(-1, faces, *rows.shape[1:])
+
+    def upload(self) -> None:
+        """Bring what was written to where the array lies."""
+        if not self._rows.device.is_cpu:
+            self._rows.assign(self.values.reshape(-1, *self.values.shape[2:]))
+
+
+def _arriving(cast: BodyCast, R: Float64, time_s: float) -> Float64:
+    """Light (F, 3, 3) at the corners of a body that is turned by R (3, 3)."""
+    around = cast.body.light(time_s)
+    arriving = around[0] + cast.corner_normals @ (R.T @ around[1:])
+    return np.maximum(arriving, 0.0) * cast.body.mesh.irradiance
 
 
 def _copy(surfaces: Surfaces) -> Surfaces:
