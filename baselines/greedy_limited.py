@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,6 +43,7 @@ class GreedyLimited(GoalPlanner):
         env: the unwrapped environment, with its targets and its measure of divergence.
         seed: of the goals drawn.
         violations: share of the motions that may exceed M_I or M_D.
+        rho: share of M_I and M_D to aim at, in [0, 1].
         **options: of the goals, see `GoalPlanner`.
 
     Raises:
@@ -49,11 +51,17 @@ class GreedyLimited(GoalPlanner):
     """
 
     def __init__(
-        self, env: ActiveSlamEnv, seed: int = 0, violations: float = 0.05, **options: Any
+        self,
+        env: ActiveSlamEnv,
+        seed: int = 0,
+        violations: float = 0.05,
+        rho: float = 1.0,
+        **options: Any,
     ) -> None:
         super().__init__(env, seed, **options)
-        self.violations = violations
-        self.check({"violations": (0, 1)})
+        self.violations, self.rho = violations, rho
+        self.check({"violations": (0, 1), "rho": (0, 1)})
+        self.targets = replace(env.config.targets, rho_I=self.rho, rho_D=self.rho)
         self.measure = make_divergence(env.config.divergence, env.intrinsics.scaled(SCALE))
 
     def reset(self) -> None:
@@ -85,7 +93,7 @@ class GreedyLimited(GoalPlanner):
         permitted = self.permitted(expected) & ~self.near_loss(poses)
         away = distance_in_steps(poses, goal, *self.steps).sum(axis=1)
         leading = permitted & (away < away[0] - 0.5)
-        distance = distance_to_targets(*expected.T, self.env.config.targets)
+        distance = distance_to_targets(*expected.T, self.targets)
         if not leading.any():  # no line 9: around what is in the way
             leading, distance = permitted, np.where(np.arange(len(away)) == 0, np.inf, away)
         action = int(np.argmin(np.where(leading, distance, np.inf)))

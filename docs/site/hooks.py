@@ -119,7 +119,7 @@ def _api() -> Iterator[tuple[str, str]]:
 
 def _results() -> Iterator[tuple[str, str]]:
     """A page for each folder of committed results, and one that lists them."""
-    from ms_slam_env.metrics.registry import RESULTS_VERSION
+    from ms_slam_env.metrics.registry import RESULTS_VERSION, versions_since
 
     rows, pages = [], []
     for table in sorted(RESULTS.rglob("table.md")):
@@ -131,7 +131,8 @@ def _results() -> Iterator[tuple[str, str]]:
         page = f"# {title}\n\n{about}\n\n{text}\n\n{figures}"
         pages.append((f"results/{name}/index.md", page))
         version = content.get("results_version", 1)
-        age = "today" if version == RESULTS_VERSION else f"version {version} of {RESULTS_VERSION}"
+        is_old = versions_since(version, content.get("kind", ""))
+        age = f"version {version} of {RESULTS_VERSION}" if is_old else "today"
         rows.append((f"[{name}]({name}/index.md)", title, age))
     listing = _table(["results", "what they show", "made by the algorithms of"], rows)
     about = "What the experiments wrote, as it is committed in `docs/results`."

@@ -66,8 +66,8 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
 
     ## Reward
     The sum of these terms (``info["reward_terms"]``), each times its weight (option ``reward``):
-    ``intensity_divergence`` and ``depth_divergence``, -0.1 per M_I and M_D of distance to the
-    target, of each at most 2, depth times lambda (0.1); ``trajectory_error``, -10 per metre that
+    ``intensity_divergence`` and ``depth_divergence``, -0.5 per M_I and M_D of distance to the
+    target, of each at most 0.4, depth times lambda (0.1); ``trajectory_error``, -10 per metre that
     the pose error grew, at most 0.1 m either way; ``new_surface``, +1 per m2 newly mapped in its
     true place; ``lost``, -0.5 a step; ``lost_for_good``, -10 once; ``blocked``, -0.1 a masked
     action; where the agent chooses the SLAM configuration ``compute``, -0.1 times its cost, a

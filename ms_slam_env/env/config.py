@@ -12,7 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics, pinhole
-from ms_slam_env.config import Checked, Named, bounded, check_range, chosen, from_dict
+from ms_slam_env.config import (
+    Checked,
+    Named,
+    bounded,
+    check_range,
+    chosen,
+    from_dict,
+    parse_named,
+)
 from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.env.observations import POINT as OBSERVATION_POINT
 from ms_slam_env.env.observations import Observation
@@ -49,8 +57,8 @@ _OF_STATE = (
 class TargetConfig(Checked):
     """Motion-and-structure parameters and thresholds of the paper's Algorithm 1, line 9.
 
-    M_I and M_D are the maxima of hand-held sequences of which every fourth frame was kept, the
-    sparsest that SLAM tracked without a loss (``ms-slam experiment frame-skipping``).
+    M_I and M_D are the medians of the maxima of hand-held sequences of which every twelfth frame
+    was kept, the sparsest that SLAM tracked without a loss (``ms-slam experiment frame_skipping``).
     The thresholds and lambda were chosen on validation seeds: with larger ones the greedy planner
     loses track as random walk does, with smaller ones it maps little (BENCHMARK.md).
 
@@ -62,10 +70,10 @@ class TargetConfig(Checked):
         depth_weight: lambda, significance of depth over intensity.
     """
 
-    M_I: float = bounded(0.03, 1e-6, 100)
-    M_D: float = bounded(0.06, 1e-6, 100)
-    rho_I: float = bounded(0.35, 0, 1)
-    rho_D: float = bounded(1.0, 0, 1)
+    M_I: float = bounded(0.15, 1e-6, 100)
+    M_D: float = bounded(0.36, 1e-6, 100)
+    rho_I: float = bounded(0.07, 0, 1)
+    rho_D: float = bounded(1 / 6, 0, 1)
     depth_weight: float = bounded(0.1, 0, 1e6)
 
     @property
@@ -98,8 +106,8 @@ class RewardConfig(Checked, Named):
             (``MSActiveSLAM-Adaptive-v0``).
     """
 
-    intensity_divergence: float = bounded(0.1, 0, 1e6)
-    depth_divergence: float = bounded(0.1, 0, 1e6)
+    intensity_divergence: float = bounded(0.5, 0, 1e6)
+    depth_divergence: float = bounded(0.5, 0, 1e6)
     trajectory_error: float = bounded(10.0, 0, 1e6)
     new_surface: float = bounded(1.0, 0, 1e6)
     lost: float = bounded(0.5, 0, 1e6)
@@ -146,7 +154,9 @@ class EnvConfig(Checked):
         pose: where the estimated pose comes from: ``slam``, ``slam-kinematics`` (SLAM that starts
             its search from the arm's forward kinematics), ``kinematics`` (noisy forward kinematics
             alone; SLAM only maps) or ``ground_truth``. Kinematics need an arm.
-        slam: SLAM backend, ``module:Class`` or a class.
+        slam: SLAM backend, ``module:Class`` or a class; options appended as in
+            ``surfel,check_slips=true``, where motions as large as a step slip, are put before
+            those of ``slam_config``.
         adaptation: how the running SLAM changes its configuration: ``none``, ``divergence`` or, as
             ``MSActiveSLAM-Adaptive-v0`` has it, ``agent``; a mapping with the ``name`` of one for
             options. Every frame is processed, whatever ``keep_every`` of a configuration says.
@@ -186,7 +196,7 @@ class EnvConfig(Checked):
     noise: str | NoiseConfig = "kinect"
     arm: ArmConfig = field(default_factory=ArmConfig)
     pose: str = chosen("slam", *POSE_SOURCES)
-    slam: str | type[SlamBackend] = "surfel"
+    slam: str | type[SlamBackend] = "surfel,check_slips=true"
     slam_config: dict[str, object] = field(default_factory=dict)
     adaptation: AdaptationConfig = field(default_factory=NoAdaptationConfig)
     frame_management: FrameSelectionConfig = field(default_factory=EveryFrameConfig)
@@ -229,6 +239,10 @@ class EnvConfig(Checked):
             raise InputError(f"EnvConfig.scene = {self.scene!r} must be a name or several")
         for name in names:
             check_name(name)
+        if isinstance(self.slam, str):
+            name, own = parse_named(self.slam, "backend")
+            object.__setattr__(self, "slam", name)
+            object.__setattr__(self, "slam_config", {**own, **self.slam_config})
         OBSERVATION_POINT.find(self.observation)
         object.__setattr__(self, "reward", _reward(self.reward))
 

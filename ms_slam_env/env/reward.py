@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.env.config import RewardConfig, TargetConfig
 
-_DISTANCE_CAP = 2.0  # in units of M: one violent frame must not outweigh a whole episode
+_DISTANCE_CAP = 0.4  # in units of M: one violent frame must not outweigh a whole episode
 _ERROR_CAP_M = 0.1  # a lost camera's error is arbitrary; the terms for lost tracking judge it
 
 

@@ -19,7 +19,12 @@ from typing import Any
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.input_files import read_json
-from ms_slam_env.metrics.registry import RESULTS_VERSION, RESULTS_VERSIONS, check_keys
+from ms_slam_env.metrics.registry import (
+    RESULTS_VERSION,
+    RESULTS_VERSIONS,
+    check_keys,
+    versions_since,
+)
 from ms_slam_env.output_files import result_folder, write_text
 from ms_slam_env.report.charts import Chart, chart_from_json
 from ms_slam_env.report.provenance import provenance
@@ -62,11 +67,10 @@ class Results:
     @property
     def stale(self) -> str:
         """A sentence where older algorithms than the present ones made the result, else empty."""
-        if self.version >= RESULTS_VERSION:
+        since = versions_since(self.version, self.kind)
+        if not since:
             return ""
-        newer = "; ".join(
-            f"version {v}: {text}" for v, text in RESULTS_VERSIONS.items() if v > self.version
-        )
+        newer = "; ".join(f"version {version}: {text}" for version, text in since.items())
         return (
             f"These figures are older than the code (results version {self.version}, "
             f"{RESULTS_VERSIONS[self.version]}). Since then {newer}."

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
-from ms_slam_env.metrics.registry import RESULTS_VERSION, metric
+from ms_slam_env.metrics.registry import metric
 from ms_slam_env.report.charts import Chart, Guide, Panel, Series
 from ms_slam_env.report.discovery import find_results
 from ms_slam_env.report.page import page, write_report
@@ -174,8 +174,18 @@ def test_the_page_shows_every_row_and_says_once_what_is_the_same(tmp_path: Path)
 def test_results_of_older_algorithms_say_so(tmp_path: Path) -> None:
     path = write_example(tmp_path / "results.json")
     assert 'class="stale"' not in report_of(tmp_path)
-    edit(path, results_version=RESULTS_VERSION - 1)
-    assert escape(read_results(path).stale) in report_of(tmp_path)
+    edit(path, results_version=3)
+    stale = read_results(path).stale
+    assert "version 4: " in stale
+    assert escape(stale) in report_of(tmp_path)
+
+
+def test_only_what_a_version_changed_is_older_than_it(tmp_path: Path) -> None:
+    path = write_example(tmp_path / "results.json")
+    edit(path, results_version=4, kind="planners")
+    assert "version 5: environments have" in read_results(path).stale
+    edit(path, kind="loop_closure")
+    assert read_results(path).stale == ""
 
 
 def test_files_beside_a_result_are_shown_with_it(tmp_path: Path) -> None:

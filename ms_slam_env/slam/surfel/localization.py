@@ -33,6 +33,7 @@ MOSTLY_MOVING = 0.6  # share of the readings: rather the pose is wrong, or too l
 CLEARLY_APART = 30.0  # squared Mahalanobis distance; below 20 where nothing leads a pose
 APART_M, APART_RAD = (0.006, 0.1), np.radians((0.4, 6.0))  # more than noise, less than a jump
 MENDED = 0.9  # of the cost of an alignment that may have slipped
+AS_GOOD = 1.5  # of the cost of one that left a direction open, in which it is no judge
 RETRIES = 2  # further searches within a frame whose tracking failed
 
 
@@ -103,26 +104,35 @@ class Localizer:
     def _mend_slips(
         self, alignment: Alignment, frames: Images, invalid: NDArray[np.bool_]
     ) -> Alignment:
-        """Align anew, at the finest level alone, where the texture all at once fits badly.
+        """Align anew, at the finest level alone, what may have slipped along a surface.
 
         Fine texture that is much the same everywhere, such as a carpet's, is gone at the coarser
-        levels, which then slip along what geometry leaves open. So the frame is aligned from where
-        it was expected, and from where the features of the last one put it, without them.
+        levels, which then slip along what geometry leaves open, and the texture all at once fits
+        badly. So the frame is aligned from where it was expected, and from where the features of
+        the last one put it, without them. Where a direction was left open, the pose along it is
+        the predicted one, and a camera that goes where it likes is not there: the features know.
         """
         states, poses = self._states, self._states.poses
-        slipped = states.started & (states.lost == 0) & ~invalid
-        slipped &= is_leap(states.photometry, alignment.photometry, self._config.cauchy_rgb)
-        if not slipped.any():
+        asked = states.started & (states.lost == 0) & ~invalid
+        is_open = asked & (alignment.statistics["degenerate_directions"] > 0)
+        slipped = asked & is_leap(states.photometry, alignment.photometry, self._config.cauchy_rgb)
+        if not (slipped | is_open).any():
             return alignment
         by_features = np.full_like(poses, np.nan)
-        for env in np.flatnonzero(slipped):
+        for env in np.flatnonzero(slipped | is_open):
             found = self._feature_pose(int(env), frames)
             if found is not None:
                 by_features[env] = found[0]
-        for starts in (states.motions, invert(poses) @ by_features):
-            given = slipped & np.isfinite(starts[:, 0, 0])
+        at_most = np.where(is_open, AS_GOOD, MENDED)
+        for starts, whose, share in (
+            (states.motions, slipped, MENDED),
+            (invert(poses) @ by_features, slipped | is_open, at_most),
+        ):
+            given = whose & np.isfinite(starts[:, 0, 0])
+            if not given.any():
+                continue
             again = self._aligner.refine(np.where(given[:, None, None], starts, np.eye(4)))
-            is_better = again.statistics["cost"] < MENDED * alignment.statistics["cost"]
+            is_better = again.statistics["cost"] < share * alignment.statistics["cost"]
             taken = given & again.tracked & (is_better | ~alignment.tracked)
             alignment = alignment.replace(taken, again)
         return alignment
