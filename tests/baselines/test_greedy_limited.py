@@ -71,8 +71,8 @@ def test_of_the_permitted_motions_towards_the_goal_it_takes_the_one_of_line_9(en
         bound_I, bound_D = 1.3 * (expected[n] + 0.01) - 0.01
         if not info["action_mask"][n] or bound_I > targets.M_I or bound_D > targets.M_D:
             continue
-        distance = abs(delta_I - targets.rho_I * targets.M_I)
-        distance += targets.depth_weight * abs(delta_D - targets.rho_D * targets.M_D)
+        distance = abs(delta_I - planner.rho * targets.M_I)
+        distance += targets.depth_weight * abs(delta_D - planner.rho * targets.M_D)
         if away[n] < away[0] - 0.5 and distance < smallest:
             best, smallest = n, distance
     assert action == best

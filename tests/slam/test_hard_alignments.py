@@ -18,11 +18,13 @@ from ms_slam_env import slam
 from ms_slam_env import slam as slam_backends
 from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import relative_angle, se3_exp
+from ms_slam_env.geometry import make_pose, orthonormal, relative_angle, se3_exp
 from ms_slam_env.sensor import RGBDSensor
+from ms_slam_env.sensor.scene_cache import get_scene
 from ms_slam_env.sequences import HandheldPath, Sequence, open_sequence
 from ms_slam_env.slam import SlamBackend
 from ms_slam_env.slam.alignment_check import TrackingStatus
+from ms_slam_env.slam.surfel import localization
 from ms_slam_env.slam.surfel.acceptance import Alignment, acceptance_thresholds
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.photometry import is_leap, same_exposure
@@ -144,6 +146,29 @@ def test_frames_that_slip_over_a_carpet_are_put_right(carpet):
     slipped, checked = (_errors(carpet, frames, check) for check in (False, True))
     assert slipped.max() > 0.05
     assert checked.max() < 0.005
+
+
+FACING_THE_WALL = make_pose(
+    [[0.9785, -0.0311, 0.2038], [-0.206, -0.1891, 0.9601], [0.0087, -0.9815, -0.1914]],
+    [1.6529, 2.3378, 1.2981],
+)
+
+
+@pytest.mark.parametrize("motion", [(0.0, 0.12, 0.0), (0.0, -0.12, 0.0)])
+def test_what_a_wall_leaves_open_is_found_by_features(motion, monkeypatch):
+    monkeypatch.setattr(localization, "is_leap", lambda before, *_: np.zeros(len(before), bool))
+    T, camera = orthonormal(FACING_THE_WALL), xtion("160x120")
+    sensor = RGBDSensor(get_scene("wall", 1006), camera)
+    poses = np.stack([T, T @ make_pose(np.eye(3), motion)])
+    frames = [sensor.capture(pose, k, k / 30, seed=1) for k, pose in enumerate(poses)]
+    errors = {}
+    for check_slips in (False, True):
+        system = slam.make("surfel", camera, check_slips=check_slips)
+        system.reset(T)
+        found = [system.track(frame) for frame in frames][1]
+        errors[check_slips] = np.linalg.norm((found.T_world_camera - poses[1])[:3, 3])
+    assert errors[False] > 0.1
+    assert errors[True] < 0.01
 
 
 def test_a_leap_is_a_sudden_misfit_of_grey_values_that_were_trusted():
