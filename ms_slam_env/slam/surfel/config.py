@@ -223,7 +223,8 @@ class SurfelConfig(Checked):
         readout_s: time that a rolling shutter takes from the first row to the last, see
             ``rolling_shutter``; 0: all rows are taken at once. It takes frames with their times.
         check_slips: whether a frame whose grey values all at once fit worse, or that leaves a
-            direction open, is aligned anew at the finest level alone; see ``Localizer``.
+            direction open, is aligned anew at the finest level alone; what stays open is refused.
+            See ``Localizer``.
         color_registration: "estimated": where the colour camera is, is found from the edges of the
             first frames, see ``color_cameras``; "given": colour is taken as it comes. Of several
             cameras in lockstep it is.

@@ -110,7 +110,8 @@ class Localizer:
         levels, which then slip along what geometry leaves open, and the texture all at once fits
         badly. So the frame is aligned from where it was expected, and from where the features of
         the last one put it, without them. Where a direction was left open, the pose along it is
-        the predicted one, and a camera that goes where it likes is not there: the features know.
+        the predicted one, and a camera that goes where it likes is not there: if the features do
+        not know better, the pose is refused.
         """
         states, poses = self._states, self._states.poses
         asked = states.started & (states.lost == 0) & ~invalid
@@ -135,7 +136,8 @@ class Localizer:
             is_better = again.statistics["cost"] < share * alignment.statistics["cost"]
             taken = given & again.tracked & (is_better | ~alignment.tracked)
             alignment = alignment.replace(taken, again)
-        return alignment
+            is_open &= ~taken
+        return alignment.with_status(is_open & alignment.tracked, TrackingStatus.UNCONSTRAINED)
 
     def _feature_pose(self, env: int, frames: Images) -> tuple[Float64, FeaturePose] | None:
         """Where (4, 4) the features of an env's last frame put the present one."""
