@@ -37,7 +37,7 @@ A new one is added whenever a change of algorithms changes the numbers of an exp
 RESULTS_VERSION = max(RESULTS_VERSIONS)
 
 _OF_ENVIRONMENTS = (
-    *("arm_experiment", "arm_masks", "env_speed", "lookahead_ranking", "lookahead_speed"),
+    *("arm_experiment", "arm_masks", "env_speed", "lookahead_ranking"),
     *("paper_table2", "planners", "pose_sources", "step_size", "team_mapping", "train"),
 )
 _CHANGED = {5: _OF_ENVIRONMENTS}

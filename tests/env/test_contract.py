@@ -2,6 +2,7 @@
 
 import pickle
 import re
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -10,6 +11,7 @@ from gymnasium.utils.env_checker import check_env
 
 import ms_slam_env
 from ms_slam_env.env import ActiveSlamEnv
+from ms_slam_env.env.config import EnvConfig, make_config
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at
 from ms_slam_env.robot import decompose
@@ -283,6 +285,14 @@ def test_use_before_reset_says_so():
             use()
 
 
+def test_options_of_slam_stand_behind_its_name_and_in_slam_config():
+    assert EnvConfig().slam_config == {"check_slips": True}
+    both = make_config({"slam": "surfel,check_slips=true", "slam_config": {"check_slips": False}})
+    assert (both.slam, both.slam_config) == ("surfel", {"check_slips": False})
+    assert replace(both, step_m=0.1).slam_config == {"check_slips": False}
+    assert make_config({"slam": "sparse"}).slam_config == {}
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -290,6 +300,8 @@ def test_use_before_reset_says_so():
         ({"scene": None}, "scene = None must be a name or several"),
         ({"scene": ()}, "must be a name or several"),
         ({"slam": "orb"}, "valid choices: .*surfel"),
+        ({"slam": "surfel,check"}, "backend 'surfel,check': 'check' is not option=value"),
+        ({"slam": "surfel,slips=1"}, "unknown option of SurfelConfig 'slam_config.slips'"),
         ({"observation": "pixels"}, "valid choices: rgbd, features, lookahead"),
         (
             {"steps": 3},
