@@ -36,10 +36,10 @@ def test_divergence_terms_are_the_summands_of_line_9(delta_I, delta_D):
     outcome = dataclasses.replace(ON_TARGET, divergence=np.array([delta_I, delta_D]))
     terms = reward_terms(outcome, WEIGHTS, TARGETS)
     assert terms["intensity_divergence"] == pytest.approx(
-        -WEIGHTS.intensity_divergence * min(2, abs(delta_I - 0.01) / 0.02)
+        -WEIGHTS.intensity_divergence * min(0.4, abs(delta_I - 0.01) / 0.02)
     )
     assert terms["depth_divergence"] == pytest.approx(
-        -WEIGHTS.depth_divergence * 3 * min(2, abs(delta_D - 0.01) / 0.04)
+        -WEIGHTS.depth_divergence * 3 * min(0.4, abs(delta_D - 0.01) / 0.04)
     )
 
 
