@@ -155,8 +155,8 @@ class EnvConfig(Checked):
             its search from the arm's forward kinematics), ``kinematics`` (noisy forward kinematics
             alone; SLAM only maps) or ``ground_truth``. Kinematics need an arm.
         slam: SLAM backend, ``module:Class`` or a class; options appended as in
-            ``surfel,check_slips=true``, where motions as large as a step slip, are put before
-            those of ``slam_config``.
+            ``surfel,check_slips=true,refuse_open=true``, which suits motions as large as a step,
+            are put before those of ``slam_config``.
         adaptation: how the running SLAM changes its configuration: ``none``, ``divergence`` or, as
             ``MSActiveSLAM-Adaptive-v0`` has it, ``agent``; a mapping with the ``name`` of one for
             options. Every frame is processed, whatever ``keep_every`` of a configuration says.
@@ -196,7 +196,7 @@ class EnvConfig(Checked):
     noise: str | NoiseConfig = "kinect"
     arm: ArmConfig = field(default_factory=ArmConfig)
     pose: str = chosen("slam", *POSE_SOURCES)
-    slam: str | type[SlamBackend] = "surfel,check_slips=true"
+    slam: str | type[SlamBackend] = "surfel,check_slips=true,refuse_open=true"
     slam_config: dict[str, object] = field(default_factory=dict)
     adaptation: AdaptationConfig = field(default_factory=NoAdaptationConfig)
     frame_management: FrameSelectionConfig = field(default_factory=EveryFrameConfig)

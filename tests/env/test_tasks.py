@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from ms_slam_env import ENV_IDS, TASK_IDS, scenes
+from ms_slam_env.env.config import EnvConfig
 from ms_slam_env.errors import InputError
 from ms_slam_env.tasks import OWN, Task, env_id_of, find_task
 
@@ -47,7 +48,7 @@ def test_options_count_more_than_the_tasks_own():
 def test_the_tasks_slam_is_configured_unless_another_is_asked_for():
     name = "MSActiveSLAM-Home-v0"
     room = gym.make(name, **SMALL, slam_config={"submaps": "atlas"}).unwrapped.config.slam_config
-    own = {"max_surfels": 4_000_000, "unstable_window": 2000, "check_slips": True}
+    own = {**EnvConfig().slam_config, "max_surfels": 4_000_000, "unstable_window": 2000}
     assert room == {**own, "submaps": "atlas"}
     fewer = gym.make(name, **SMALL, slam_config={"max_surfels": 5000}).unwrapped.config.slam_config
     assert fewer == {**own, "max_surfels": 5000}

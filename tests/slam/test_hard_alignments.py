@@ -154,21 +154,36 @@ FACING_THE_WALL = make_pose(
 )
 
 
-@pytest.mark.parametrize("motion", [(0.0, 0.12, 0.0), (0.0, -0.12, 0.0)])
-def test_what_a_wall_leaves_open_is_found_by_features(motion, monkeypatch):
+@pytest.fixture(params=[(0.0, 0.12, 0.0), (0.0, -0.12, 0.0)])
+def step_along_a_wall(request, monkeypatch):
+    """Two poses and frames; the grey values' leap is not looked at."""
     monkeypatch.setattr(localization, "is_leap", lambda before, *_: np.zeros(len(before), bool))
-    T, camera = orthonormal(FACING_THE_WALL), xtion("160x120")
-    sensor = RGBDSensor(get_scene("wall", 1006), camera)
-    poses = np.stack([T, T @ make_pose(np.eye(3), motion)])
-    frames = [sensor.capture(pose, k, k / 30, seed=1) for k, pose in enumerate(poses)]
-    errors = {}
-    for check_slips in (False, True):
-        system = slam.make("surfel", camera, check_slips=check_slips)
-        system.reset(T)
-        found = [system.track(frame) for frame in frames][1]
-        errors[check_slips] = np.linalg.norm((found.T_world_camera - poses[1])[:3, 3])
-    assert errors[False] > 0.1
-    assert errors[True] < 0.01
+    T = orthonormal(FACING_THE_WALL)
+    sensor = RGBDSensor(get_scene("wall", 1006), xtion("160x120"))
+    poses = np.stack([T, T @ make_pose(np.eye(3), request.param)])
+    return poses, [sensor.capture(pose, k, k / 30, seed=1) for k, pose in enumerate(poses)]
+
+
+def _tracked_step(poses: np.ndarray, frames: list[RGBDFrame], **options: bool) -> tuple:
+    """What is said of the second frame, and by how much it errs."""
+    system = slam.make("surfel", xtion("160x120"), **options)
+    system.reset(poses[0])
+    _, found = (system.track(frame) for frame in frames)
+    return found, np.linalg.norm((found.T_world_camera - poses[1])[:3, 3])
+
+
+def test_what_a_wall_leaves_open_is_found_by_features(step_along_a_wall):
+    assert _tracked_step(*step_along_a_wall)[1] > 0.1
+    assert _tracked_step(*step_along_a_wall, check_slips=True)[1] < 0.01
+
+
+def test_what_stays_open_can_be_refused(step_along_a_wall, monkeypatch):
+    monkeypatch.setattr(localization.Localizer, "_feature_pose", lambda *_: None)
+    taken, error = _tracked_step(*step_along_a_wall, check_slips=True)
+    assert taken.tracking_ok
+    assert error > 0.1
+    refused, error = _tracked_step(*step_along_a_wall, check_slips=True, refuse_open=True)
+    assert not refused.tracking_ok or error < 0.01
 
 
 def test_a_leap_is_a_sudden_misfit_of_grey_values_that_were_trusted():

@@ -223,8 +223,9 @@ class SurfelConfig(Checked):
         readout_s: time that a rolling shutter takes from the first row to the last, see
             ``rolling_shutter``; 0: all rows are taken at once. It takes frames with their times.
         check_slips: whether a frame whose grey values all at once fit worse, or that leaves a
-            direction open, is aligned anew at the finest level alone; what stays open is refused.
-            See ``Localizer``.
+            direction open, is aligned anew at the finest level alone; see ``Localizer``.
+        refuse_open: with ``check_slips``, whether what stays open is refused: for a camera that can
+            go back to where its pose was known.
         color_registration: "estimated": where the colour camera is, is found from the edges of the
             first frames, see ``color_cameras``; "given": colour is taken as it comes. Of several
             cameras in lockstep it is.
@@ -264,6 +265,7 @@ class SurfelConfig(Checked):
     motion_mask: str = chosen("none", *MOTION_MASKS)
     readout_s: float = bounded(0.0, 0.0, 1.0)
     check_slips: bool = False
+    refuse_open: bool = False
     color_registration: str = chosen("given", *COLOR_REGISTRATIONS)
 
     def __post_init__(self) -> None:

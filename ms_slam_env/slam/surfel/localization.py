@@ -111,7 +111,7 @@ class Localizer:
         badly. So the frame is aligned from where it was expected, and from where the features of
         the last one put it, without them. Where a direction was left open, the pose along it is
         the predicted one, and a camera that goes where it likes is not there: if the features do
-        not know better, the pose is refused.
+        not know better, the pose may be refused.
         """
         states, poses = self._states, self._states.poses
         asked = states.started & (states.lost == 0) & ~invalid
@@ -137,7 +137,8 @@ class Localizer:
             taken = given & again.tracked & (is_better | ~alignment.tracked)
             alignment = alignment.replace(taken, again)
             is_open &= ~taken
-        return alignment.with_status(is_open & alignment.tracked, TrackingStatus.UNCONSTRAINED)
+        is_refused = is_open & alignment.tracked & self._config.refuse_open
+        return alignment.with_status(is_refused, TrackingStatus.UNCONSTRAINED)
 
     def _feature_pose(self, env: int, frames: Images) -> tuple[Float64, FeaturePose] | None:
         """Where (4, 4) the features of an env's last frame put the present one."""
