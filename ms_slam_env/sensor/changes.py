@@ -90,13 +90,16 @@ class ChangingView:
                 self.plane = wp.zeros(first + more, dtype=wp.float32, device=device)
                 wp.copy(self.normal, surfaces.normal, count=first)
                 wp.copy(self.plane, surfaces.plane, count=first)
-            faces = self._moving_faces
-            middle = self.surfaces.normal, self.surfaces.plane
-            self._in_middle = [_Rows(array, first, faces) for array in middle]
-            self._in_each = [_Rows(array, first, faces) for array in (self.normal, self.plane)]
-            self._light_of_bodies = _Rows(self.surfaces.irradiance, first, faces)
+            middle = slice(poses // 2, poses // 2 + 1)
+            self._planes = [(self._rows(self.surfaces.normal, self.surfaces.plane), middle)]
+            if poses > 1:
+                self._planes.append((self._rows(self.normal, self.plane), slice(None)))
+            (self._light_of_bodies,) = self._rows(self.surfaces.irradiance)
         self.exposure_factor = 1.0
         self._lit: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
+
+    def _rows(self, *arrays: wp.array) -> list[_Rows]:
+        return [_Rows(array, self.first_face, self._moving_faces) for array in arrays]
 
     def look(self, cast_scene: Callable[[], None], T: Float64, times_s: Float64) -> None:
         """Find what the image from poses T (P, 4, 4) at times (P,) sees, and how it is lit."""
@@ -110,13 +113,8 @@ class ChangingView:
                 self._add_light(self._light, middle)
 
     def _cast_bodies(self, T: Float64, times_s: Float64, middle: float) -> None:
-        is_split = self.posed_face is not self._hits.face
-        if is_split:
+        if self.posed_face is not self._hits.face:
             wp.copy(self.posed_face, self._hits.face)
-        here = len(times_s) // 2
-        changed = [(self._in_middle, slice(here, here + 1))]
-        if is_split:
-            changed.append((self._in_each, slice(None)))
         for cast in self._bodies:
             T_world_body = cast.body.pose(times_s)
             if not cast.cast(T, T_world_body):
@@ -125,10 +123,10 @@ class ChangingView:
             normals = cast.normals @ R.swapaxes(1, 2)
             planes = cast.planes + (normals @ T_world_body[:, :3, 3:])[..., 0]
             faces = slice(cast.faces.start - self.first_face, cast.faces.stop - self.first_face)
-            for (normal, plane), poses in changed:
+            for (normal, plane), poses in self._planes:
                 normal.values[:, faces] = normals[poses]
                 plane.values[:, faces] = planes[poses]
-            self._light_of_bodies.values[:, faces] = _arriving(cast, R[here], middle)
+            self._light_of_bodies.values[:, faces] = _arriving(cast, R[len(R) // 2], middle)
             wp.launch(
                 keep_nearer,
                 dim=(1, int(self._camera.height), int(self._camera.width)),
@@ -136,7 +134,7 @@ class ChangingView:
                 outputs=[self._hits, self.posed_face],
                 device=self._device,
             )
-        for (normal, plane), _ in changed:
+        for (normal, plane), _ in self._planes:
             normal.upload()
             plane.upload()
         self._light_of_bodies.upload()
