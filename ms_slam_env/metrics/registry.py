@@ -40,8 +40,8 @@ _OF_ENVIRONMENTS = (
     *("arm_experiment", "arm_masks", "env_speed", "lookahead_ranking"),
     *("paper_table2", "planners", "pose_sources", "step_size", "team_mapping", "train"),
 )
-_CHANGED = {5: _OF_ENVIRONMENTS}
-"""Kinds of results that a version changed, where not all."""
+CHANGED_KINDS = {5: _OF_ENVIRONMENTS}
+"""Kinds of results that a version changed; one that is not named here changed all."""
 
 
 def versions_since(version: int, kind: str) -> dict[int, str]:
@@ -49,7 +49,7 @@ def versions_since(version: int, kind: str) -> dict[int, str]:
     return {
         newer: text
         for newer, text in RESULTS_VERSIONS.items()
-        if newer > version and kind in _CHANGED.get(newer, (kind,))
+        if newer > version and kind in CHANGED_KINDS.get(newer, (kind,))
     }
 
 

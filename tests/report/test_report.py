@@ -9,6 +9,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator
 from html import escape, unescape
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,8 @@ from hypothesis import strategies as st
 
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
-from ms_slam_env.metrics.registry import metric
+from ms_slam_env.experiments.harness.experiment import Experiment, experiment_class
+from ms_slam_env.metrics.registry import CHANGED_KINDS, metric
 from ms_slam_env.report.charts import Chart, Guide, Panel, Series
 from ms_slam_env.report.discovery import find_results
 from ms_slam_env.report.page import page, write_report
@@ -186,6 +188,11 @@ def test_only_what_a_version_changed_is_older_than_it(tmp_path: Path) -> None:
     assert "version 5: environments have" in read_results(path).stale
     edit(path, kind="loop_closure")
     assert read_results(path).stale == ""
+
+
+@pytest.mark.parametrize("kind", sorted(set(chain(*CHANGED_KINDS.values())) - {"train"}))
+def test_kinds_that_a_version_changed_are_experiments(kind: str) -> None:
+    assert issubclass(experiment_class(kind), Experiment)
 
 
 def test_files_beside_a_result_are_shown_with_it(tmp_path: Path) -> None:

@@ -33,7 +33,9 @@ MOSTLY_MOVING = 0.6  # share of the readings: rather the pose is wrong, or too l
 CLEARLY_APART = 30.0  # squared Mahalanobis distance; below 20 where nothing leads a pose
 APART_M, APART_RAD = (0.006, 0.1), np.radians((0.4, 6.0))  # more than noise, less than a jump
 MENDED = 0.9  # of the cost of an alignment that may have slipped
-AS_GOOD = 1.5  # of the cost of one that left a direction open, in which it is no judge
+# Of the cost of one that left a direction open, in which it is no judge: of 36 such frames of
+# validation seeds for which features led to an alignment it takes 34, 30 nearer, 2 farther.
+AS_GOOD = 1.5
 RETRIES = 2  # further searches within a frame whose tracking failed
 
 
