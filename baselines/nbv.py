@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,13 +10,18 @@ from ms_slam_baselines.goal_planner import GoalPlanner
 from numpy.typing import NDArray
 
 from ms_slam_env.mapping import expected_gain
-from ms_slam_env.mapping.trackability import SCALE, can_follow, leads_on
+from ms_slam_env.mapping.trackability import SCALE, bearable, follow_risks, leads_on
 from ms_slam_env.mapping.view_goals import distance_in_steps
 
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv
 
 Float64 = NDArray[np.float64]
+
+_FAR_APART_RAD = math.radians(16)
+"""Motions by more than this lead to views of which none shows what all of them show: each is then
+predicted for itself (see `ViewPredictor`), and costs as much as the first."""
+_AT_ONCE = 6  # of such motions are looked at together
 
 
 class NextBestView(GoalPlanner):
@@ -49,6 +55,7 @@ class NextBestView(GoalPlanner):
         super().__init__(env, seed, **options)
         self.overlap, self.risk, self.own_gain = overlap, risk, own_gain
         self.frames = env.config.frames_per_action
+        self.far_apart = self.steps[1] > _FAR_APART_RAD
         self.check({"overlap": (0, 1), "risk": (0, 1), "own_gain": (0, 1000)})
 
     def motion_towards(self, goal: Float64) -> int:
@@ -57,22 +64,48 @@ class NextBestView(GoalPlanner):
         gain = expected_gain(self.map.grid, poses, self.env.intrinsics, (12, 9))
         score = self.own_gain * gain / max(gain.max(), 1e-9)
         score -= distance_in_steps(poses, goal, *self.steps).sum(axis=1)
-        score[~self.admissible(poses)] = -np.inf
+        best_first = np.argsort(-score, kind="stable") if self.far_apart else None
+        score[~self.admissible(poses, best_first)] = -np.inf
         return int(np.argmax(score))
 
-    def admissible(self, poses: Float64) -> NDArray[np.bool_]:
+    def admissible(
+        self, poses: Float64, order: NDArray[np.int64] | None = None
+    ) -> NDArray[np.bool_]:
         """Which motions to poses (n, 4, 4) SLAM can follow; the possible ones if it could none.
 
-        To stay, or but to roll, is none of them, unless there is no other.
+        To stay, or but to roll, is none of them, unless there is no other. With an ``order`` (n,)
+        it is said only of the first that is, and of those before it.
         """
         possible = self.env.action_masks()
-        here = self.env.episode.T_world_camera_estimate
-        seen_from = np.concatenate([here[None], poses])
-        views = self.env.slam.predict(seen_from, SCALE)
-        permitted = np.r_[True, possible & ~self.near_loss(poses)]
+        permitted = possible & ~self.near_loss(poses)
+        leads = leads_on(poses, self.env.episode.T_world_camera_estimate)
         risk = min(self.risk * 2**self.given_up, 1.0)
-        limits = self.overlap, risk, self.frames
-        can = can_follow(views, seen_from, permitted, *limits)[1:]
-        moving = can & leads_on(poses, here)
+        risks = np.full(len(poses), np.inf)
+        for some in _in_turn(order, permitted, leads):
+            risks[some] = self.risks(poses[some], permitted[some])
+            if bearable(risk, risks, leads) == risk:
+                break  # what the others risk changes nothing of these
+        can = risks <= bearable(risk, risks, leads)
+        moving = can & leads
         can = moving if moving.any() else can
         return can if can.any() else possible
+
+    def risks(self, poses: Float64, permitted: NDArray[np.bool_]) -> Float64:
+        """Risk (n,) to slip on the motions to poses (n, 4, 4), by the views that the map predicts.
+
+        Infinite where a motion is not permitted or leads to a view that SLAM cannot follow.
+        """
+        seen_from = np.concatenate([self.env.episode.T_world_camera_estimate[None], poses])
+        views = self.env.slam.predict(seen_from, SCALE)
+        return follow_risks(views, seen_from, np.r_[True, permitted], self.overlap, self.frames)[1:]
+
+
+def _in_turn(
+    order: NDArray[np.int64] | None, permitted: NDArray[np.bool_], leads_on: NDArray[np.bool_]
+) -> list[NDArray[np.int64]]:
+    """Which motions are looked at together: all, or a few at a time, rolls last."""
+    if order is None:
+        return [np.arange(len(permitted))]
+    order = order[permitted[order]]
+    order = order[np.argsort(~leads_on[order], kind="stable")]
+    return np.split(order, range(_AT_ONCE, len(order), _AT_ONCE))

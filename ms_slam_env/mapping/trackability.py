@@ -130,32 +130,39 @@ def risk_of(H: Float64, views: Views, motion_rad: Float64, depth_m: Float64) -> 
     return np.asarray(1 / (1 + np.exp(-log_odds)))
 
 
-def can_follow(
+def follow_risks(
     views: Views,
     poses: Float64,
     permitted: NDArray[np.bool_],
     overlap: float,
-    risk: float,
     frames: int = 1,
-) -> NDArray[np.bool_]:
-    """Which motions (n,) from view 0 to the views from poses (n, 4, 4) SLAM can follow.
+) -> Float64:
+    """Risk (n,) to slip of motions from view 0 to the views from poses (n, 4, 4).
+
+    Infinite for those that are not permitted, show too little of the map or are too near.
 
     Args:
         views: predicted by the map; the first of where the camera is.
         poses: of the views, T_world_camera.
         permitted: (n,) those that come into question.
         overlap: share of a view that the map should fill.
-        risk: of slipping that is permitted for a frame; where all that leads to another view has
-            more, that of the safest such motion and a little more. A roll leads to no other.
         frames: taken on a motion.
     """
     shown = (views.depth > 0).mean(axis=(1, 2))
     near = ((views.depth > 0) & (views.depth < NEAR_M)).mean(axis=(1, 2))
-    risks = slip_risk(views, poses, frames)
-    can: NDArray[np.bool_] = permitted & (shown >= min(overlap, shown[0]))
-    can &= near <= max(NEAR_SHARE, near[0])
-    safest = np.min(risks[can & leads_on(poses, poses[0])], initial=1.0)
-    return can & (risks <= max(risk, _KEPT * safest))
+    can = permitted & (shown >= min(overlap, shown[0])) & (near <= max(NEAR_SHARE, near[0]))
+    return np.where(can, slip_risk(views, poses, frames), np.inf)
+
+
+def bearable(risk: float, risks: Float64, leads_on: NDArray[np.bool_]) -> float:
+    """Risk that may be taken: ``risk``, or a little more than the least where all is riskier.
+
+    Args:
+        risk: of slipping that is permitted for a frame.
+        risks: (n,) of the motions.
+        leads_on: (n,) which of them lead to another view; a roll leads to no other.
+    """
+    return max(risk, _KEPT * np.min(risks[leads_on], initial=1.0))
 
 
 def leads_on(poses: Float64, here: Float64) -> NDArray[np.bool_]:

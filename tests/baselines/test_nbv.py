@@ -1,10 +1,13 @@
 """Next best view: its pieces against slow versions, its motions in a real episode."""
 
 import math
+from unittest.mock import patch
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from ms_slam_baselines.nbv import NextBestView
 from ms_slam_baselines.view_goals import frontiers, poses_between, views_anywhere, views_of
 
@@ -21,8 +24,8 @@ from ms_slam_env.slam.base import Views
 STEPS = 0.12, math.radians(12)
 
 
-def play(seed, steps):
-    env = gym.make("MSActiveSLAM-FreeCamera-v0", scene="living_room", scene_seed=3)
+def play(seed, steps, **options):
+    env = gym.make("MSActiveSLAM-FreeCamera-v0", scene="living_room", scene_seed=3, **options)
     observation, info = env.reset(seed=3)
     planner = NextBestView(env.unwrapped, seed)
     planner.reset()
@@ -85,6 +88,38 @@ def test_where_no_motion_can_be_followed_all_possible_ones_are_allowed(episode):
     before, planner.lost_at = planner.lost_at, poses
     np.testing.assert_array_equal(planner.admissible(poses), planner.env.action_masks())
     planner.lost_at = before
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.05, 0.3, 1.0]), st.sampled_from([0, 3]))
+def test_looking_at_the_best_first_leads_to_the_same_motion(episode, seed, scale, given_up):
+    planner, rng = episode[2], np.random.default_rng(seed)
+    poses = planner.env.candidate_poses()
+    score = rng.normal(size=len(poses)).round(1)
+    table = np.where(rng.random(len(poses)) < 0.5, scale * rng.random(len(poses)), np.inf)
+    asked = []
+
+    def risks(some, permitted):
+        rows = [int(np.flatnonzero((poses == pose).all(axis=(1, 2)))[0]) for pose in some]
+        asked.append(len(rows))
+        return np.where(permitted, table[rows], np.inf)
+
+    with patch.object(planner, "risks", risks), patch.object(planner, "given_up", given_up):
+        found = planner.admissible(poses, np.argsort(-score, kind="stable"))
+        of_all = planner.admissible(poses)
+    assert asked.pop() == len(poses)
+    assert max(asked) <= 6
+    best, best_of_all = (np.argmax(np.where(can, score, -np.inf)) for can in (found, of_all))
+    assert best == best_of_all
+
+
+def test_of_motions_far_apart_only_the_best_are_predicted():
+    planner = play(0, 2, step_m=0.3, step_rad=math.radians(24))[2]
+    slam, here = planner.env.slam, planner.env.episode.T_world_camera_estimate
+    with patch.object(slam, "predict", wraps=slam.predict) as predict:
+        planner.motion_towards(here)
+    assert {len(call.args[0]) for call in predict.call_args_list} == {7}
+    assert predict.call_count < 8
 
 
 def test_where_tracking_was_lost_it_does_not_go_again(episode):
