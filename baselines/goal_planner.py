@@ -26,7 +26,8 @@ KEPT_AWAY = 0.7  # steps from where tracking was lost
 _LOOKAHEAD = 6  # positions of a way that are looked ahead
 _RANGES = {
     **{"goals": (3, 10_000), "radius_m": (0.1, 100), "cost": (0, 100)},
-    **{"replan": (1, 10_000), "cell_m": (0.02, 1), "enough_m3": (0, 1000), "far_m": (0.1, 1000)},
+    **{"replan": (1, 10_000), "cell_m": (0.02, 1), "reach_m": (0.5, 100)},
+    **{"enough_m3": (0, 1000), "far_m": (0.1, 1000)},
 }
 
 
@@ -46,6 +47,7 @@ class GoalPlanner(Planner):
         cost: how much less a view is worth six steps farther away: exp(-cost).
         replan: steps after which a goal is drawn anew.
         cell_m: edge of a cell of the occupancy grid.
+        reach_m: depth up to which a frame tells what is free or occupied.
         enough_m3: unknown volume that a goal near by should show.
         far_m: how far a goal may be where none near by does.
 
@@ -64,12 +66,13 @@ class GoalPlanner(Planner):
         cost: float = 0.7,
         replan: int = 7,
         cell_m: float = 0.1,
+        reach_m: float = 3.5,
         enough_m3: float = 1.0,
         far_m: float = 12.0,
     ) -> None:
         super().__init__(env, seed)
         self.goals, self.radius_m, self.cost = goals, radius_m, cost
-        self.replan, self.cell_m = replan, cell_m
+        self.replan, self.cell_m, self.reach_m = replan, cell_m, reach_m
         self.enough_m3, self.far_m = enough_m3, far_m
         self.check(_RANGES)
         self.steps = env.config.step_m, env.config.step_rad
@@ -82,7 +85,7 @@ class GoalPlanner(Planner):
 
     def reset(self) -> None:
         """Nothing is known yet."""
-        self.map = OccupancyMap(self.cell_m)
+        self.map = OccupancyMap(self.cell_m, self.reach_m)
         self.goal: Float64 | None = None
         self.age = 0
         self.way = np.zeros((0, 3))

@@ -27,7 +27,7 @@ def so3_exp(phi: ArrayLike) -> Float64:
 
 
 def so3_log(R: ArrayLike) -> Float64:
-    """Rotation vector (3,) in radians, of angle at most pi, of the rotation matrix ``R`` (3, 3)."""
+    """Rotation vectors (..., 3) in radians, of angle at most pi, of matrices ``R`` (..., 3, 3)."""
     return Rotation.from_matrix(np.asarray(R, dtype=np.float64)).as_rotvec()
 
 

@@ -169,6 +169,6 @@ def _ways(
 ) -> tuple[Float64, Float64, Float64]:
     """By how many steps motions lead nearer to a goal (n, 2), and the motions (n, 3) and (n, 3)."""
     motions = invert(here) @ poses
-    turns = np.stack([so3_log(R) for R in motions[:, :3, :3]])
+    turns = so3_log(motions[:, :3, :3])
     away = distance_in_steps(here[None], goal, *steps) - distance_in_steps(poses, goal, *steps)
     return away, motions[:, :3, 3] / steps[0], turns / steps[1]

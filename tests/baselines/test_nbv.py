@@ -171,7 +171,7 @@ def test_to_slip_is_likelier_near_a_wall_and_by_large_motions():
 
 
 @pytest.mark.parametrize(
-    "option", ["goals=0", "radius_m=-1", "replan=0", "overlap=1.5", "cell_m=.nan", "cost=much"]
+    "option", ["goals=0", "radius_m=-1", "replan=0", "overlap=1.5", "cell_m=.nan", "reach_m=0"]
 )
 def test_options_out_of_range_are_one_line(episode, option):
     name = option.partition("=")[0]
@@ -258,6 +258,19 @@ def test_a_goal_that_comes_no_nearer_is_given_up_and_more_is_risked(episode):
     planner.given_up, planner.risk = 0, risk
     assert (more >= few).all()
     assert more.sum() > few.sum()
+
+
+def test_nothing_is_known_beyond_the_reach(episode):
+    planner, grids = episode[2], []
+    here = planner.env.episode.T_world_camera_estimate
+    depth = np.full_like(planner.env.episode.last_frame.depth, 3.0)
+    for reach in (2.0, 3.5):
+        near = NextBestView(planner.env, reach_m=reach)
+        near.map.add(planner.env.slam, depth, here, planner.env.intrinsics)
+        grids.append(near.map.grid)
+    at = (here @ [[0, 0], [0, 0], [1.5, 2.5], [1, 1]])[:3].T
+    assert grids[0].states_of(at).tolist() == [FREE, UNKNOWN]
+    assert grids[1].states_of(at).tolist() == [FREE, FREE]
 
 
 def test_the_way_to_a_pose_is_straight_and_even():

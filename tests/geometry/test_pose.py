@@ -45,6 +45,12 @@ def test_so3_log_undoes_exp(phi):
     np.testing.assert_allclose(back, so3_exp(phi), atol=1e-12)
 
 
+@given(arrays(np.float64, (5, 3), elements=st.floats(-1.8, 1.8)))
+def test_so3_log_of_a_stack_is_that_of_each(phi):
+    rotations = np.stack([so3_exp(one) for one in phi])
+    np.testing.assert_array_equal(so3_log(rotations), [so3_log(R) for R in rotations])
+
+
 @given(twists)
 def test_se3_exp_is_the_matrix_exponential(xi):
     generator = np.zeros((4, 4))

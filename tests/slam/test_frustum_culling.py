@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from surfel_scenes import SMALL, device_poses, fuse, live_frame
@@ -257,3 +258,35 @@ def test_a_full_map_closes_its_gaps_now_and_then():
         assert_boxes_hold(surfel_map)
     # First when a sixty-fourth is dead, again only when as many are dead as are free.
     assert slots == [2990] * 5 + [2940] * 6
+
+
+@pytest.mark.parametrize("frames", [50, 200])
+def test_a_crowded_map_forgets_the_oldest_first_and_few_at_once(frames):
+    config = SurfelConfig(max_surfels=4000, compaction_interval=1000, unstable_window=60)
+    surfel_map = SurfelMap(2, SMALL, config)
+    rng = np.random.default_rng(3)
+    maps = []
+    for count in (3700, 3500):  # the second is not crowded
+        surfels = random_surfels(rng, count, 3.0)
+        surfels["position"][:, 2] -= 100  # behind the camera
+        surfels["confidence"] = np.where(rng.random(count) < 0.2, 20, 1).astype(np.float32)
+        surfels["seen"] = rng.integers(max(0, frames - 60), frames, count).astype(np.int32)
+        maps.append(surfels)
+    counts = np.int32([3700, 3500])
+    counters = {"count": counts, "dead": 0 * counts, "dropped": 0 * counts}
+    surfel_map.set_state({"counters": counters, "surfels": maps})
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    nothing = live_frame(poses)
+    nothing.depth.zero_()
+    nothing.normals.zero_()
+    fuse(surfel_map, nothing, poses, frames - 1)
+    left = surfel_map.get_state()["surfels"]
+    assert surfel_map.count(1) == 3500
+    alive = left[0]["confidence"] > 0
+    stable = maps[0]["confidence"] == 20
+    assert alive[stable].all()
+    went = 3700 - surfel_map.count(0)
+    seen = np.sort(maps[0]["seen"][~stable])
+    kept = np.sort(left[0]["seen"][alive & (left[0]["confidence"] < 20)])
+    np.testing.assert_array_equal(kept, seen[went:])  # the oldest went, nothing else
+    assert 250 <= went <= 250 + 2 * (3700 / 50)  # a sixteenth of the slots, and a frame's more

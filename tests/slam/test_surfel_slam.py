@@ -200,7 +200,7 @@ def test_bad_input_is_refused(frames):
         slam.make("surfel", CAMERA, iterations=(1, -1))
 
 
-@pytest.mark.parametrize(("columns", "capacity"), [(80, 400_000), (160, 400_000), (320, 800_000)])
+@pytest.mark.parametrize(("columns", "capacity"), [(80, 500_000), (160, 500_000), (320, 1_000_000)])
 def test_room_in_the_map_grows_with_the_image(columns: int, capacity: int) -> None:
     assert SurfelConfig().capacity(columns) == capacity
     assert SurfelConfig(max_surfels=5000).capacity(columns) == 5000

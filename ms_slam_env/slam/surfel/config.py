@@ -177,7 +177,7 @@ class SurfelConfig(Checked):
             geometry alone, 1 photometry alone; ``normal_equations`` has the exact cost.
         confidence_threshold: observations after which a surfel is stable, [0, 12].
         iterations: Gauss-Newton iterations per pyramid level, finest first.
-        max_surfels: capacity of the map, per env; None for 400,000 with images of up to 160 columns
+        max_surfels: capacity of the map, per env; None for 500,000 with images of up to 160 columns
             and in proportion to the columns beyond.
         coverage_px: a reading starts a new surfel only where none of its surface projects this
             close to its pixel.
@@ -293,4 +293,4 @@ class SurfelConfig(Checked):
         """Surfels that the map of a camera with images of so many columns has room for."""
         if self.max_surfels is not None:
             return self.max_surfels
-        return round(400_000 * max(1.0, columns / 160))
+        return round(500_000 * max(1.0, columns / 160))

@@ -1,7 +1,8 @@
 """Kernels that remove surfels and close the gaps they leave.
 
 A removed surfel is dead: it keeps its slot, and nothing sees it. The gaps are closed when they are
-many.
+many. A crowded map forgets what was not seen for longest, so much at a time that there is room for
+some frames, not all that is out of view: it may be all that a camera has mapped.
 """
 
 from __future__ import annotations
@@ -10,9 +11,18 @@ from ms_slam_env._warp import wp
 from ms_slam_env.slam.surfel.block_bounds import num_blocks
 from ms_slam_env.slam.surfel.device import fetch, put
 from ms_slam_env.slam.surfel.fusion import FusedFrame
-from ms_slam_env.slam.surfel.surfels import BLOCK_SIZE, Compaction, CullingBlocks, Surfels
+from ms_slam_env.slam.surfel.surfels import (
+    BLOCK_SIZE,
+    NUM_AGES,
+    Compaction,
+    CullingBlocks,
+    SurfelAges,
+    Surfels,
+)
 
 NEVER = wp.constant(2**31 - 1)
+AGES = wp.constant(NUM_AGES)
+FORGOTTEN = wp.constant(16)  # a sixteenth of a crowded map's slots at once
 
 
 @wp.struct
@@ -31,6 +41,48 @@ def is_crowded(slots: int, capacity: int):
     return slots > capacity - capacity / 10
 
 
+@wp.func
+def age_span(rule: CullingRule, time: int):
+    """Frames that the ages of unstable surfels are counted over."""
+    return wp.max(wp.min(rule.window, time), 1)
+
+
+@wp.kernel
+def count_ages(
+    surfels: Surfels, rule: CullingRule, frame: FusedFrame, workers: int, ages: SurfelAges
+) -> None:
+    """Count the unstable surfels of crowded maps by the frame that saw them last."""
+    b, worker = wp.tid()
+    time = frame.time[b]
+    count = wp.min(surfels.count[b], rule.capacity)
+    if frame.mask[b] == 0 or not is_crowded(count - surfels.dead[b], rule.capacity):
+        return
+    span = age_span(rule, time)
+    i = int(worker)
+    while i < count:
+        confidence = fetch(surfels.confidence, b, i)
+        seen = fetch(surfels.seen, b, i)
+        if confidence > 0.0 and confidence < rule.confidence_threshold and seen < time:
+            age = wp.max(seen - (time - span), 0) * AGES / span
+            wp.atomic_add(ages.count, b, age, 1)
+        i += workers
+
+
+@wp.func
+def oldest_that_stay(ages: SurfelAges, rule: CullingRule, b: int, time: int):
+    """The frame from which on unstable surfels stay in a crowded map.
+
+    As many have not been seen since as must go, or all that are not in view.
+    """
+    gone = wp.int32(0)
+    k = wp.int32(0)
+    while k < AGES and gone < rule.capacity / FORGOTTEN:
+        gone += ages.count[b, k]
+        k += 1
+    span = age_span(rule, time)
+    return time - span + (k * span + AGES - 1) / AGES
+
+
 @wp.kernel
 def cull_unstable(
     surfels: Surfels,
@@ -39,18 +91,23 @@ def cull_unstable(
     frame: FusedFrame,
     workers: int,
     compaction: Compaction,
+    ages: SurfelAges,
 ) -> None:
     """Let the unstable surfels die that were not seen for long, every ``interval`` frames.
 
     In a map whose living surfels take nine tenths of the slots, at once and whatever their age
-    those that are not in view. Only the blocks are looked at that hold such surfels.
+    those of them that were not seen for longest: a sixteenth of the slots, if there are so many out
+    of view. Only the blocks are looked at that hold such surfels.
     """
     b, worker = wp.tid()
     count = wp.min(surfels.count[b], rule.capacity)
+    time = frame.time[b]
     crowded = is_crowded(count - surfels.dead[b], rule.capacity)
-    if frame.mask[b] == 0 or (frame.time[b] % rule.interval != 0 and not crowded):
+    if frame.mask[b] == 0 or (time % rule.interval != 0 and not crowded):
         return
-    oldest = frame.time[b] - wp.where(crowded, 0, rule.window)
+    oldest = time - rule.window
+    if crowded:
+        oldest = oldest_that_stay(ages, rule, b, time)
     block = int(worker)
     while block < num_blocks(count):
         if blocks.expiry[b, block] < oldest:

@@ -99,8 +99,10 @@ class MapKernels:
         workers, compaction = buffers.workers, buffers.compaction
         due = [rule, self._frame, workers, compaction]
         returned = [spare, surfels, blocks, compaction, rule.capacity, workers]
+        ages = buffers.ages
         return [
-            self._record(surfel_culling.cull_unstable, [surfels, blocks, *due]),
+            self._record(surfel_culling.count_ages, [surfels, *due[:3], ages]),
+            self._record(surfel_culling.cull_unstable, [surfels, blocks, *due, ages]),
             self._record(surfel_culling.list_survivors, [surfels, *due]),
             self._record(surfel_culling.gather, [surfels, spare, compaction, workers]),
             self._record(surfel_culling.put_back, returned),
@@ -129,6 +131,7 @@ class MapKernels:
         self._frame.covered.zero_()
         self._buffers.compaction.kept.zero_()
         self._buffers.compaction.expired.zero_()
+        self._buffers.ages.count.zero_()
         self._bind(live, poses, time, weight, mask)
         for launch in (*self._fusion, *self._culling, *self._bound):
             launch.launch()
@@ -149,7 +152,7 @@ class MapKernels:
         frame.poses, frame.time, frame.weight, frame.mask = poses, time, weight, mask
         frame.depth, frame.normals = live.depth.flatten(), live.normals.flatten()
         frame.color, frame.moving = live.color.flatten(), live.moving.flatten()
-        for launch in (*self._fusion, *self._culling[:2]):
+        for launch in (*self._fusion, *self._culling[:3]):
             launch.set_param("frame", frame)
 
 

@@ -8,6 +8,8 @@ from ms_slam_env._warp import wp
 
 BLOCK_SIZE = wp.constant(128)
 """Surfels of a culling block."""
+NUM_AGES = 256
+"""Ages that unstable surfels are sorted into where some must go."""
 EARLIEST = -(2**31)
 LATEST = 2**31 - 1
 """Bounds of a ``SeenWindow`` that leaves out nothing."""
@@ -94,6 +96,13 @@ class Compaction:
 
 
 @wp.struct
+class SurfelAges:
+    """How many unstable surfels of a crowded map are how old, see ``surfel_culling``."""
+
+    count: wp.array2d(dtype=wp.int32)  # (B, NUM_AGES) the oldest first
+
+
+@wp.struct
 class SeenWindow:
     """Which surfels of B maps take part, by the frame that saw them last."""
 
@@ -133,6 +142,7 @@ class MapBuffers:
         self.visible: VisibleList = allocate(VisibleList, *of_surfels)  # working list
         self.footprints: SplatFootprints = allocate(SplatFootprints, *of_surfels)  # of such a list
         self.compaction: Compaction = allocate(Compaction, *of_surfels)
+        self.ages: SurfelAges = allocate(SurfelAges, batch, NUM_AGES, device)
         # What frames are tracked against and fused into: all, unless its times are set.
         self.active = any_time(batch, device)
 
