@@ -75,7 +75,8 @@ class Recovering(Planner):
     by the covariance of its pose that this is doubtful.
 
     The opposite of [R | t] is taken as the motion with the opposite rotation and translation: off
-    by the step's own rotation of its translation, some 2 cm at 12 cm and 12 deg.
+    by the step's own rotation of its translation, some 2 cm at 12 cm and 12 deg. Where something is
+    in its way, its rotation alone is undone, or its translation.
     """
 
     def __init__(self, env: ActiveSlamEnv, planner: Planner) -> None:
@@ -111,8 +112,10 @@ class Recovering(Planner):
             self.planner.lost_by(self.made[-1])
         self.was_tracked = False
         self.undoing = self.made.pop()
-        undone = opposite(self.undoing, self.env.action_masks().size)
-        return undone if self.env.action_masks()[undone] else 0
+        possible = self.env.action_masks()
+        undone = opposite(self.undoing, possible.size)
+        parts = (undone, undone % 7, undone - undone % 7)  # its rotation takes more out of view
+        return next((part for part in parts if possible[part]), 0)
 
 
 def goal_of(planner: Planner | None) -> NDArray[np.float64] | None:

@@ -84,12 +84,21 @@ def test_a_slam_that_gives_no_covariance_is_believed():
     assert [planner.act(None, infinite) for _ in range(3)] == [1, 2, 3]
 
 
-def test_what_is_blocked_is_not_done():
+@pytest.mark.parametrize(
+    ("made", "blocked", "done"),
+    [
+        (1, [2], 0),
+        (7 * 5 + 1, [7 * 6 + 2], 2),  # forward and roll right: the roll alone
+        (7 * 5 + 1, [7 * 6 + 2, 2], 7 * 6),  # nor that: backward alone
+    ],
+)
+def test_of_what_is_blocked_the_possible_part_is_done(made, blocked, done):
     mask = np.ones(49, bool)
-    mask[opposite(1)] = False
+    mask[blocked] = False
     planner = recovering(mask)
-    planner.act(None, OK)
-    assert planner.act(None, LOST) == 0
+    planner.planner.last = made - 1
+    assert planner.act(None, OK) == made
+    assert planner.act(None, LOST) == done
 
 
 def test_an_episode_begins_without_a_past():
