@@ -35,9 +35,10 @@ def check_file(path: str | Path, kind: str, most_bytes: int) -> None:
         InputError: naming the file.
     """
     try:
-        _check(os.stat(path), path, kind, most_bytes)
+        found = os.stat(path)
     except (OSError, ValueError) as error:
         raise _unreadable(path, kind, error) from None
+    _check(found, path, kind, most_bytes)
 
 
 def read_bytes(path: str | Path, kind: str, most_bytes: int) -> bytes:
