@@ -25,7 +25,7 @@ class Keyframe(NamedTuple):
     """A node of the pose graph."""
 
     T_world_camera: Float64  # (4, 4)
-    surface: Float64  # (n, 3) some of what it sees, in the world
+    surface: Float64  # (n, 3) some of what it sees, in the world; NaN where nothing was read
     weight: float  # D-optimality of the information of its edges
 
 
@@ -72,7 +72,8 @@ class GraphDOptimality(NextBestView):
         """The last frame, taken at a pose (4, 4), as a node."""
         every = (slice(_THUMBNAIL // 2, None, _THUMBNAIL),) * 2
         depth = self.env.episode.last_frame.depth[every]
-        points = (self.env.intrinsics.rays()[every] * depth[..., None])[depth > 0]
+        read = np.where(depth > 0, depth, np.nan)
+        points = (self.env.intrinsics.rays()[every] * read[..., None]).reshape(-1, 3)
         covariance = self.env.episode.pose_covariance
         weight = 1 / d_optimality(_START if covariance is None else covariance)
         return Keyframe(here, transform_points(here, points), weight)
@@ -82,12 +83,13 @@ class GraphDOptimality(NextBestView):
 
         To its first pose there always is one from the last keyframe, of the motion.
         """
-        edges = np.zeros((len(self.keyframes), len(way)))
-        for n, keyframe in enumerate(self.keyframes):
-            shares = shares_seen(keyframe.surface, way, self.env.intrinsics)
-            edges[n] = keyframe.weight * np.where(shares >= _SEEN_AGAIN, shares, 0)
-        if len(edges):
-            edges[-1, 0] = max(edges[-1, 0], _SEEN_AGAIN * self.keyframes[-1].weight)
+        if not self.keyframes:
+            return np.zeros((0, len(way)))
+        surfaces = np.stack([k.surface for k in self.keyframes])
+        shares = shares_seen(surfaces, way, self.env.intrinsics)
+        weights = np.array([[k.weight] for k in self.keyframes])
+        edges = weights * np.where(shares >= _SEEN_AGAIN, shares, 0)
+        edges[-1, 0] = max(edges[-1, 0], _SEEN_AGAIN * weights[-1, 0])
         return edges
 
     def choose_goal(self, here: Float64) -> Float64:
@@ -122,15 +124,19 @@ def extended(weights: Float64, edges: Float64) -> Float64:
 
 
 def shares_seen(points: Float64, poses: Float64, intrinsics: Intrinsics) -> Float64:
-    """Share (P,) of points (n, 3) that lie in the images of cameras at poses (P, 4, 4)."""
+    """Shares (K, P) of the points (K, n, 3) that lie in the images of cameras at poses (P, 4, 4).
+
+    Points that are NaN do not count.
+    """
     T_camera_world = np.linalg.inv(poses)
-    inside = np.einsum("pij,nj->pin", T_camera_world[:, :3, :3], points)
-    x, y, z = np.moveaxis(inside + T_camera_world[:, :3, 3:], 1, 0)
+    inside = points @ T_camera_world[:, :3, :3].reshape(-1, 3).T + T_camera_world[:, :3, 3].ravel()
+    x, y, z = np.moveaxis(inside.reshape(*points.shape[:2], -1, 3), -1, 0)
     ahead = np.maximum(z, 1e-6)
     u = intrinsics.fx * x / ahead + intrinsics.cx
     v = intrinsics.fy * y / ahead + intrinsics.cy
     in_image = (u >= 0) & (u < intrinsics.width) & (v >= 0) & (v < intrinsics.height) & (z > 0)
-    return in_image.sum(axis=1) / max(len(points), 1)
+    known = np.isfinite(points[..., 0]).sum(axis=1)
+    return in_image.sum(axis=1) / np.maximum(known, 1)[:, None]
 
 
 def graph_d_optimality(weights: Float64) -> float:

@@ -48,16 +48,22 @@ def test_a_loop_makes_a_graph_better_and_a_long_arm_worse():
 
 
 def test_shares_are_those_of_points_in_the_image():
-    points = RNG.uniform(-3, 3, (80, 3))
+    surfaces = RNG.uniform(-3, 3, (3, 80, 3))
+    surfaces[1, 10:30] = np.nan  # without a reading
+    surfaces[2] = np.nan
     poses = np.stack([make_pose(so3_exp(v[:3]), v[3:]) for v in RNG.normal(size=(5, 6))])
-    for share, pose in zip(shares_seen(points, poses, K), poses, strict=True):
-        count = 0
-        for point in points:
-            x, y, z = invert(pose)[:3, :3] @ point + invert(pose)[:3, 3]
-            if z > 0:
-                u, v = K.fx * x / z + K.cx, K.fy * y / z + K.cy
-                count += 0 <= u < K.width and 0 <= v < K.height
-        assert share == pytest.approx(count / len(points))
+    shares = shares_seen(surfaces, poses, K)
+    assert shares.shape == (3, 5)
+    for points, row in zip(surfaces, shares, strict=True):
+        known = points[np.isfinite(points[:, 0])]
+        for share, pose in zip(row, poses, strict=True):
+            count = 0
+            for point in known:
+                x, y, z = invert(pose)[:3, :3] @ point + invert(pose)[:3, 3]
+                if z > 0:
+                    u, v = K.fx * x / z + K.cx, K.fy * y / z + K.cy
+                    count += 0 <= u < K.width and 0 <= v < K.height
+            assert share == pytest.approx(count / max(len(known), 1))
 
 
 @pytest.fixture(scope="module")
