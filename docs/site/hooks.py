@@ -96,10 +96,11 @@ def on_page_content(html: str, **_: Any) -> str:
 
 def _root_pages() -> Iterator[tuple[str, str]]:
     """BENCHMARK.md and other texts of the root as pages beside those of docs/."""
-    for name in ("BENCHMARK", "CHANGELOG", "CONTRIBUTING", "SECURITY"):
-        text = (ROOT / f"{name}.md").read_text(encoding="utf-8")
-        text = re.sub(r"\(docs/", "(", text).replace("(README.md", "(index.md")
-        yield f"{name.lower()}.md", re.sub(r"\(CHANGELOG\.md", "(changelog.md", text)
+    names = ("BENCHMARK", "CHANGELOG", "CONTRIBUTING", "SECURITY")
+    page_of = {f"({name}.md": f"({name.lower()}.md" for name in names} | {"(README.md": "(index.md"}
+    for name in names:
+        text = (ROOT / f"{name}.md").read_text(encoding="utf-8").replace("(docs/", "(")
+        yield f"{name.lower()}.md", re.sub(r"\([A-Z]+\.md", lambda m: page_of.get(m[0], m[0]), text)
 
 
 def _table(headings: list[str], rows: Iterable[Sequence[str]]) -> str:
