@@ -16,6 +16,7 @@ from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "docs" / "results"
+ROOT_TEXTS = ("BENCHMARK", "CHANGELOG", "CONTRIBUTING", "SECURITY")
 
 API = {
     "ms_slam_env": "registration of the environments",
@@ -77,11 +78,8 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Lead links that hold in a clone to the pages of the site."""
     up = "../" * page.file.src_uri.count("/")
     for here, there in (
-        (r"\(\.\./BENCHMARK\.md", f"({up}benchmark.md"),
-        (r"\(\.\./CHANGELOG\.md", f"({up}changelog.md"),
-        (r"\(\.\./SECURITY\.md", f"({up}security.md"),
-        (r"\(\.\./CONTRIBUTING\.md", f"({up}contributing.md"),
-        (r"\(\.\./README\.md", f"({up}index.md"),
+        *((rf"\((\.\./)?{name}\.md", f"({up}{name.lower()}.md") for name in ROOT_TEXTS),
+        (r"\((\.\./)?README\.md", f"({up}index.md"),
         (r"\(\.\./notebooks/", f"({up}notebooks/"),
         (r"(\(results/[^)]*/)table\.md", r"\1index.md"),
     ):
@@ -96,11 +94,9 @@ def on_page_content(html: str, **_: Any) -> str:
 
 def _root_pages() -> Iterator[tuple[str, str]]:
     """BENCHMARK.md and other texts of the root as pages beside those of docs/."""
-    names = ("BENCHMARK", "CHANGELOG", "CONTRIBUTING", "SECURITY")
-    page_of = {f"({name}.md": f"({name.lower()}.md" for name in names} | {"(README.md": "(index.md"}
-    for name in names:
-        text = (ROOT / f"{name}.md").read_text(encoding="utf-8").replace("(docs/", "(")
-        yield f"{name.lower()}.md", re.sub(r"\([A-Z]+\.md", lambda m: page_of.get(m[0], m[0]), text)
+    for name in ROOT_TEXTS:
+        text = (ROOT / f"{name}.md").read_text(encoding="utf-8")
+        yield f"{name.lower()}.md", text.replace("(docs/", "(")
 
 
 def _table(headings: list[str], rows: Iterable[Sequence[str]]) -> str:
