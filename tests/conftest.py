@@ -1,5 +1,8 @@
 """Fixtures shared by all tests."""
 
+import same_kernels  # noqa: F401  # before NumPy
+
+# isort: split
 import importlib
 from collections.abc import Iterator
 from pathlib import Path

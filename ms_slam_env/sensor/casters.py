@@ -57,7 +57,9 @@ class EmbreeRayCaster(RayCaster):
         """See the base class; the arrays live on the CPU."""
         batch, height, width = shape
         tiles = (batch, -(-height // TILE_HEIGHT), -(-width // TILE_WIDTH))
-        inputs = [self._scene.intersect, self._scene.scene, poses, camera, hits]
+        scene = self._scene
+        triangles = [scene.vertices, scene.faces]
+        inputs = [scene.intersect, scene.scene, *triangles, poses, camera, hits]
         return RecordedLaunch(cast_tiles, tiles, inputs, "cpu").launch
 
 

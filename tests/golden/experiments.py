@@ -28,6 +28,10 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import same_kernels  # noqa: F401  # before NumPy
+
+# isort: split
 import numpy as np
 
 STORED = Path(__file__).with_name("experiments.json")

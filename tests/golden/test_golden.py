@@ -1,10 +1,11 @@
 """Nothing that users see has changed; ``python tests/golden/update.py`` says that it should have.
 
-Bit by bit only one machine agrees with itself: libraries and kernels are compiled for the processor
-at hand, or choose by it, and a last bit decides now and then whether a pixel counts. Therefore two
-limits for each array: three quarters of the values keep the first, all of them the second. They are
-at least twice what was seen when kernels, BLAS and NumPy were confined to SSE2, and when half of
-the depth readings were one last bit larger. ``update.py --compare`` shows what stays within them.
+On a processor with AVX2 the values are kept to the last bit (``tests/same_kernels.py``, and Embree
+only says which face a ray meets). On others libraries and kernels are compiled or chosen for the
+processor at hand, and a last bit decides now and then whether a pixel counts. Therefore two limits
+for each array: three quarters of the values keep the first, all of them the second. They are at
+least twice what was seen when kernels, BLAS and NumPy were confined to SSE2, and when half of the
+depth readings were one last bit larger. ``update.py --compare`` shows what stays within them.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ RELATIVE = ("map_size", "surface_count", "surface_sum", "energy")  # the others 
 LIMITS = {
     "T_world_camera": (6e-4, 3e-3),  # m
     "T_world_camera_estimate": (6e-4, 3e-3),
-    "corrected_poses": (1e-4, 5e-4),
+    "corrected_poses": (1e-4, 2e-3),
     "pose_error": (6e-4, 3e-3),
     "ate": (6e-4, 3e-3),
     "sigmas": (2e-6, 1e-4),
     "inlier_fraction": (5e-4, 5e-2),
-    "residual_m": (1e-4, 1e-2),
+    "residual_m": (1e-4, 6e-2),
     "degenerate_directions": (0, 2),
     "map_size": (1e-3, 5e-3),
     "surface_count": (1e-3, 5e-3),
@@ -38,6 +39,7 @@ LIMITS = {
     "predicted_normals": (0.1, ANY),
     "energy": (1e-4, 1e-3),
     "mapped_area": (0.02, 0.05),  # m2
+    "mapped_share": (2e-4, 1e-3),
     "divergence": (4e-4, 3e-3),  # nats; the terms below are these by their weights
     "lookahead": (1e-2, 3e-2),
     "reward_terms.intensity_divergence": (7e-4, 3e-3),
@@ -53,16 +55,18 @@ LIMITS = {
 OTHER_FLOATS = (1e-5, 1e-4)
 
 # Where small differences grow from frame to frame, or a lookahead is part of what is seen.
-WIDER = 10
-SENSITIVE = (
-    "slam/odometry/",
-    "slam/volumetric/",
-    f"env/{ARM}",
-    "env/MSActiveSLAM-Adaptive-v0",
-    "env/MSActiveSLAM-DepthQuantisation-v0",
-    "env/MSActiveSLAM-FreeCamera-DepthQuantisation-v0",
-    "env/observation-lookahead",
-)
+WIDER = {
+    "slam/odometry/": 10,
+    "slam/volumetric/": 10,
+    f"env/{ARM}": 10,
+    "env/MSActiveSLAM-Adaptive-v0": 10,
+    "env/MSActiveSLAM-DepthQuantisation-v0": 10,
+    "env/MSActiveSLAM-FreeCamera-DepthQuantisation-v0": 10,
+    "env/MSActiveSLAM-MovingObjects-v0": 50,  # a pose more or less is taken
+    "env/MSActiveSLAM-FreeCamera-RollingShutter-v0": 20,
+    "env/observation-lookahead": 10,
+    "env/slam-sparse": 10,
+}
 
 
 def changes(case: str, stored: Arrays, now: Arrays) -> list[str]:
@@ -89,7 +93,7 @@ def limits(case: str, name: str, values: np.ndarray) -> tuple[float, float]:
     quantity = name.split("/")[-1].removeprefix("info.")
     exact = (0.0, 0.0) if values.dtype.kind in "biu" else OTHER_FLOATS
     most, largest = LIMITS.get(quantity, exact)
-    wider = WIDER if case.startswith(SENSITIVE) else 1
+    wider = max((factor for start, factor in WIDER.items() if case.startswith(start)), default=1)
     scale = np.abs(values).max() if quantity in RELATIVE else 1
     return most * wider * scale, largest * wider * scale
 

@@ -17,9 +17,12 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
-
 sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import same_kernels  # noqa: F401  # before NumPy
+
+# isort: split
+import numpy as np
 from cases import CASES, Arrays, why_not
 from stored import STORED, kept, write
 
