@@ -307,3 +307,12 @@ def test_a_lamp_obeys_the_inverse_square_and_casts_shadows(box_scene) -> None:
     r2 = 1.25**2 + 1.8**2
     assert beside == pytest.approx(median * 1.8 / r2**1.5, rel=1e-2)
     assert below == 0.0
+
+
+def test_a_lamp_finds_a_way_beside_a_camera_that_looks_at_a_wall(box_scene: BoxScene) -> None:
+    """Nothing in view has room for it, as before an arm at a wall."""
+    eye = np.array([ROOM_HIGH[0] - 0.55, 1.0, 1.5])
+    poses = np.stack([look_at(eye, eye + np.array([1.0, 0.0, 0.0]))] * 2)
+    camera = PoseInterpolation([0.0, 1.0], poses)
+    light = Illumination(dim=0.0, lamp=0.3, speed_m_s=0.001).light(box_scene, camera, K, 0)
+    assert light is not None

@@ -69,14 +69,16 @@ class Illumination(Checked, LightPerturbation):
     def _way(
         self, scene: Scene, camera: PoseInterpolation, intrinsics: Intrinsics, seed: int
     ) -> Track:
-        """The first free way that does not come too near to the camera."""
+        """The first free way not too near to the camera, in its view or, failing that, anywhere."""
         rng = random_numbers(seed, self.seed, name="illumination")
         poses = camera.poses
         eyes = poses[:, :3, 3]
-        for track in Places(scene, poses, intrinsics, rng).tracks(_BULB, self.speed_m_s, _TRIES):
-            at, _, _ = track.at(camera.times_s)
-            if np.linalg.norm(at - eyes, axis=1).min() > _SHORTEST_M:
-                return track
+        places = Places(scene, poses, intrinsics, rng)
+        for anywhere in (False, True):
+            for track in places.tracks(_BULB, self.speed_m_s, _TRIES, anywhere):
+                at, _, _ = track.at(camera.times_s)
+                if np.linalg.norm(at - eyes, axis=1).min() > _SHORTEST_M:
+                    return track
         raise InputError(
             f"illumination: found no free way for a lamp in scene {scene.name!r}, seed "
             f"{scene.seed}; try lamp=0 or another seed"

@@ -174,15 +174,20 @@ class Places:
         self._rays = RayCaster(scene.mesh.vertices, scene.mesh.faces)
         self._ground_z = self._ground()
 
-    def tracks(self, shape: Shape, speed_m_s: float, tries: int) -> Iterator[Track]:
-        """Try ``tries`` ways; give those that are free."""
+    def tracks(
+        self, shape: Shape, speed_m_s: float, tries: int, anywhere: bool = False
+    ) -> Iterator[Track]:
+        """Try ``tries`` ways, in view or ``anywhere`` near the camera; give those that are free."""
         if shape.kind == "car" and self._scene.lanes:
             for _ in range(tries):
                 start, end = self._scene.lanes[int(self._rng.integers(len(self._scene.lanes)))]
                 yield straight_track(np.asarray(start), np.asarray(end), speed_m_s)
             return
         draw = self._straight if shape.kind == "car" else self._round
-        middles = self._points_in_view(shape.kind, tries)
+        if anywhere:
+            middles = self._rng.uniform(*self._around(), (tries, 3))
+        else:
+            middles = self._points_in_view(shape.kind, tries)
         free = middles[self._are_free(shape, middles)]
         ways = int(np.clip(tries // max(len(free), 1), *_WAYS_A_PLACE))
         for middle in free:
