@@ -20,6 +20,7 @@ from ms_slam_env.experiments.harness.episodes import (
 )
 from ms_slam_env.experiments.harness.experiment import Experiment
 from ms_slam_env.experiments.harness.planner_tables import (
+    COMPARED,
     DETAILS,
     HEADLINE,
     RANKED_BY,
@@ -161,7 +162,8 @@ def _tables(rows: Sequence[Row], task: str) -> list[Table]:
     tables = [with_losses(headline.table(pairs, title, note), pairs)]
     tables.append(details.table(pairs, f"{prefix}Details"))
     tables += across_scenes(rows, f"{prefix}Across scenes")
-    tables += better_than_each_other(rows, f"{prefix}Better than each other")
+    for metric in COMPARED:
+        tables += better_than_each_other(rows, prefix, metric)
     scenes = list(dict.fromkeys(row["spec"]["scene"] for row in rows))
     if len(scenes) > 1:
         for scene in scenes:

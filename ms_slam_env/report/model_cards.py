@@ -28,7 +28,12 @@ _SCORES = (
     *("planner", "episodes", "f_score_5cm", "f_score_5cm_area", "ate_m", "lost"),
     *("not_recovered_share", "violations", "decision_ms"),
 )
-_ACROSS, _BETTER = "over all scenes", "Better than each other"
+_ACROSS = "over all scenes"
+_VERDICTS = (
+    ("Better than each other", "f_score_5cm", "F-score"),
+    ("Sooner than each other", "f_score_5cm_area", "area under F-score over steps"),
+)
+"""A table of probabilities, by what the best classical planner is chosen, and what it is."""
 _TRAINED = ("agent-", "policy")  # planners that were
 
 
@@ -175,8 +180,8 @@ def _is_of(policy: Policy, planner: Any) -> bool:
     return name == policy.planner or (name == "policy" and f"/{policy.path.name}" in options)
 
 
-def _lines(one: FoundResult, policy: Policy) -> list[tuple[Table, Any, Any]]:
-    """The tables over all scenes that have the policy: its line, and the best classical one's.
+def _lines(one: FoundResult, policy: Policy) -> list[tuple[Table, Any, list[Any]]]:
+    """The tables over all scenes that have the policy: its line, and those of classical planners.
 
     Benchmarks rank their lines, the best first.
     """
@@ -185,24 +190,27 @@ def _lines(one: FoundResult, policy: Policy) -> list[tuple[Table, Any, Any]]:
         own = [row for row in table.rows if _is_of(policy, row.get("planner"))]
         others = [r for r in table.rows if not str(r.get("planner")).startswith(_TRAINED)]
         if own and others and (_ACROSS in table.title or (k == 0 and not table.title)):
-            lines.append((table, own[0], others[0]))
+            lines.append((table, own[0], others))
     return lines
 
 
 def _scores(one: FoundResult, policy: Policy) -> Iterator[str]:
     results = one.results
-    for table, own, best in _lines(one, policy):
+    for table, own, others in _lines(one, policy):
         task = _task(one, table)
         yield f"### In `{task}`\n"
         if results.stale:
             yield f"*{results.stale}*\n"
         columns = tuple(c for c in table.columns if c.name in _SCORES)
-        yield replace(table, title="", columns=columns, rows=(own, best)).as_markdown()
-        chance = _chance(one, policy, task, best["planner"])
-        if chance is not None:
-            shown = format_value(chance, "improvement")
-            verdict = _verdict(chance, best["planner"])
-            yield f"{verdict}: its F-score is the better one in {shown} % of pairs of episodes.\n"
+        yield replace(table, title="", columns=columns, rows=(own, others[0])).as_markdown()
+        for title, metric, what in _VERDICTS:
+            known = [line for line in others if isinstance(line.get(metric), Interval)]
+            best = max(known, key=lambda line: line[metric].value, default=others[0])["planner"]
+            chance = _chance(one, policy, f"{task}: {title}", best)
+            if chance is not None:
+                shown = format_value(chance, "improvement")
+                verdict = _verdict(chance, best)
+                yield f"{verdict}: its {what} is the better one in {shown} % of pairs.\n"
 
 
 def _task(one: FoundResult, table: Table) -> str:
@@ -210,10 +218,10 @@ def _task(one: FoundResult, table: Table) -> str:
     return title if table.title else str(_config(one).get("task", one.title))
 
 
-def _chance(one: FoundResult, policy: Policy, task: str, best: Any) -> Interval | None:
+def _chance(one: FoundResult, policy: Policy, title: str, best: Any) -> Interval | None:
     """Probability that the policy is better than a planner, from the benchmark's own table."""
     for table in one.results.tables:
-        if table.title in (_BETTER, f"{task}: {_BETTER}"):
+        if title.endswith(table.title) and table.title:
             for row in table.rows:
                 value = row.get(str(best))
                 if _is_of(policy, row.get("planner")) and isinstance(value, Interval):

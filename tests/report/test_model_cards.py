@@ -21,11 +21,25 @@ SCENES = ("table", "wall")
 def scores(folder: Path, chance: Interval, planner: str = "agent-hand") -> None:
     """A planner benchmark in which ``planner`` is that much better than ``nbv``."""
     names = ("nbv", planner, "random")
-    lines = [{"planner": name, "f_score_5cm": 0.9 - 0.2 * k} for k, name in enumerate(names)]
-    better = make_table(
-        ["planner", Column("nbv", "improvement", "nbv")],
-        [{"planner": planner, "nbv": chance}],
-        "Better than each other",
+    areas = {"nbv": 0.3, planner: 0.5, "random": 0.4}
+    lines = [
+        {
+            "planner": name,
+            "f_score_5cm": 0.9 - 0.2 * k,
+            "f_score_5cm_area": Interval(areas[name], 0.1, 0.6),
+        }
+        for k, name in enumerate(names)
+    ]
+    better, sooner = (
+        make_table(
+            ["planner", Column(other, "improvement", other)],
+            [{"planner": planner, other: value}],
+            title,
+        )
+        for title, other, value in (
+            ("Better than each other", "nbv", chance),
+            ("Sooner than each other", "random", Interval(0.7, 0.55, 0.8)),
+        )
     )
     rows = [
         {"spec": {"planner": name, "scene": scene}, "result": {}, "error": None}
@@ -37,7 +51,7 @@ def scores(folder: Path, chance: Interval, planner: str = "agent-hand") -> None:
         "planners",
         "Planners",
         "About.",
-        [make_table(["planner", "f_score_5cm"], lines), better],
+        [make_table(["planner", "f_score_5cm", "f_score_5cm_area"], lines), better, sooner],
         rows=rows,
         content={"config": {"task": "kitchen", "seeds": "test"}},
     )
@@ -85,8 +99,9 @@ def test_a_card_says_what_the_file_and_the_results_say(clone: Path) -> None:
     assert "100 steps in 2 minutes, seed 3" in text
     assert "ms-slam train ppo --seed 3\n" in text
     assert "### In `kitchen`" in text
-    assert "| nbv | 90 |" in text
+    assert "| nbv | 90 | 30 [10, 60] |" in text
     assert "| random |" not in text  # the best classical planner alone
+    assert "`random`: its area under F-score over steps is the better one in 70 [55, 80] %" in text
     assert "It does not beat the best classical planner, `nbv`" in text
     assert "10 [2.0, 30] % of pairs" in text
     assert "not trained in wall." in text

@@ -57,6 +57,7 @@ def score_matrices(rows: Sequence[Row], metric: str = RANKED_BY) -> dict[str, ND
                 row["result"][metric]
                 for row in finished(rows)
                 if (_planner(row), row["spec"]["scene"]) == (planner, scene)
+                and metric in row["result"]  # older results have no area
             ]
             for scene in scenes
         ]
@@ -78,12 +79,22 @@ def across_scenes(rows: Sequence[Row], title: str = "") -> list[Table]:
     return [make_table(["planner", "f_score_5cm_iqm"], lines, title)]
 
 
-def better_than_each_other(rows: Sequence[Row], title: str = "") -> list[Table]:
+COMPARED = {
+    RANKED_BY: ("Better than each other", "better F-score"),
+    "f_score_5cm_area": ("Sooner than each other", "larger area under F-score over steps"),
+}
+"""Metrics by which planners are compared two by two; the title of the table, what it is about."""
+
+
+def better_than_each_other(
+    rows: Sequence[Row], prefix: str = "", metric: str = RANKED_BY
+) -> list[Table]:
     """rliable's probability that a line's planner has a better score than a column's.
 
     Nothing without rliable, or of a single planner.
     """
-    scores = score_matrices(rows)
+    title, what = COMPARED[metric]
+    scores = score_matrices(rows, metric)
     if not statistics.has_rliable() or len(scores) < 2:
         return []
     names = _ranked(statistics.interquartile_means(scores))
@@ -93,8 +104,8 @@ def better_than_each_other(rows: Sequence[Row], title: str = "") -> list[Table]:
     lines: list[dict[str, Any]] = [
         {"planner": name, **{other: pairs.get((name, other)) for other in names}} for name in names
     ]
-    note = "Probability that a line's planner has the better F-score, with 95 % intervals."
-    return [make_table(["planner", *columns], lines, title, note)]
+    note = f"Probability that a line's planner has the {what}, with 95 % intervals."
+    return [make_table(["planner", *columns], lines, prefix + title, note)]
 
 
 def _ranked(means: Mapping[str, statistics.Interval]) -> list[str]:
