@@ -120,10 +120,15 @@ def _config(one: FoundResult) -> Mapping[str, Any]:
 
 def _card(policy: Policy, found: Sequence[FoundResult], page: Path) -> str:
     trainings = [one for one in found if policy.is_trained_in(one)]
-    benchmarks = [one for one in found if one.results.kind == "planners" and _lines(one, policy)]
+    benchmarks = [one for one in found if one.results.kind == "planners" and _scores(one, policy)]
     parts = [f"## `{policy.planner}`\n", _facts(policy), _command(policy.known)]
-    for one in benchmarks:
-        parts += list(_scores(one, policy))
+    scores: dict[str, _Score] = {}  # by task, those over most episodes
+    for score in (score for one in benchmarks for score in _scores(one, policy)):
+        known = scores.get(score.task)
+        if known is None or score.episodes > known.episodes:
+            scores[score.task] = score
+    for score in scores.values():
+        parts += list(_score_text(score, policy))
     if not benchmarks:
         parts.append("It has not been benchmarked yet.\n")
     like = {_config(one).get("seed") for one in found if policy.is_trained_as(one, ("seed",))}
@@ -180,37 +185,51 @@ def _is_of(policy: Policy, planner: Any) -> bool:
     return name == policy.planner or (name == "policy" and f"/{policy.path.name}" in options)
 
 
-def _lines(one: FoundResult, policy: Policy) -> list[tuple[Table, Any, list[Any]]]:
-    """The tables over all scenes that have the policy: its line, and those of classical planners.
+@dataclass(frozen=True)
+class _Score:
+    """What a policy reached in one task: its line of a table, and those of classical planners."""
 
-    Benchmarks rank their lines, the best first.
-    """
-    lines = []
+    one: FoundResult
+    table: Table
+    own: Mapping[str, Any]
+    others: Sequence[Mapping[str, Any]]
+
+    @property
+    def task(self) -> str:
+        return _task(self.one, self.table)
+
+    @property
+    def episodes(self) -> int:
+        return int(self.own.get("episodes", 0))
+
+
+def _scores(one: FoundResult, policy: Policy) -> list[_Score]:
+    """The tables over all scenes that have the policy; benchmarks rank their lines, best first."""
+    scores = []
     for k, table in enumerate(one.results.tables):
         own = [row for row in table.rows if _is_of(policy, row.get("planner"))]
         others = [r for r in table.rows if not str(r.get("planner")).startswith(_TRAINED)]
         if own and others and (_ACROSS in table.title or (k == 0 and not table.title)):
-            lines.append((table, own[0], others))
-    return lines
+            scores.append(_Score(one, table, own[0], others))
+    return scores
 
 
-def _scores(one: FoundResult, policy: Policy) -> Iterator[str]:
-    results = one.results
-    for table, own, others in _lines(one, policy):
-        task = _task(one, table)
-        yield f"### In `{task}`\n"
-        if results.stale:
-            yield f"*{results.stale}*\n"
-        columns = tuple(c for c in table.columns if c.name in _SCORES)
-        yield replace(table, title="", columns=columns, rows=(own, others[0])).as_markdown()
-        for title, metric, what in _VERDICTS:
-            known = [line for line in others if isinstance(line.get(metric), Interval)]
-            best = max(known, key=lambda line: line[metric].value, default=others[0])["planner"]
-            chance = _chance(one, policy, f"{task}: {title}", best)
-            if chance is not None:
-                shown = format_value(chance, "improvement")
-                verdict = _verdict(chance, best)
-                yield f"{verdict}: its {what} is the better one in {shown} % of pairs.\n"
+def _score_text(score: _Score, policy: Policy) -> Iterator[str]:
+    others, results = score.others, score.one.results
+    yield f"### In `{score.task}`\n"
+    if results.stale:
+        yield f"*{results.stale}*\n"
+    columns = tuple(c for c in score.table.columns if c.name in _SCORES)
+    rows = (score.own, others[0])
+    yield replace(score.table, title="", columns=columns, rows=rows).as_markdown()
+    for title, metric, what in _VERDICTS:
+        known = [line for line in others if isinstance(line.get(metric), Interval)]
+        best = max(known, key=lambda line: line[metric].value, default=others[0])["planner"]
+        chance = _chance(score.one, policy, f"{score.task}: {title}", best)
+        if chance is not None:
+            shown = format_value(chance, "improvement")
+            verdict = _verdict(chance, best)
+            yield f"{verdict}: its {what} is the better one in {shown} % of pairs.\n"
 
 
 def _task(one: FoundResult, table: Table) -> str:

@@ -18,13 +18,14 @@ OPTIONS = {"out": "runs/a", "seed": 3, "scenes": ["table"], "scene_seeds": 2, "e
 SCENES = ("table", "wall")
 
 
-def scores(folder: Path, chance: Interval, planner: str = "agent-hand") -> None:
+def scores(folder: Path, chance: Interval, planner: str = "agent-hand", episodes: int = 10) -> None:
     """A planner benchmark in which ``planner`` is that much better than ``nbv``."""
     names = ("nbv", planner, "random")
     areas = {"nbv": 0.3, planner: 0.5, "random": 0.4}
     lines = [
         {
             "planner": name,
+            "episodes": episodes,
             "f_score_5cm": 0.9 - 0.2 * k,
             "f_score_5cm_area": Interval(areas[name], 0.1, 0.6),
         }
@@ -46,12 +47,17 @@ def scores(folder: Path, chance: Interval, planner: str = "agent-hand") -> None:
         for name in names
         for scene in SCENES
     ]
+    columns = ["planner", "episodes", "f_score_5cm", "f_score_5cm_area"]
     write_results(
         folder / "results.json",
         "planners",
         "Planners",
         "About.",
-        [make_table(["planner", "f_score_5cm", "f_score_5cm_area"], lines), better, sooner],
+        [
+            make_table(columns, lines),
+            better,
+            sooner,
+        ],
         rows=rows,
         content={"config": {"task": "kitchen", "seeds": "test"}},
     )
@@ -99,7 +105,7 @@ def test_a_card_says_what_the_file_and_the_results_say(clone: Path) -> None:
     assert "100 steps in 2 minutes, seed 3" in text
     assert "ms-slam train ppo --seed 3\n" in text
     assert "### In `kitchen`" in text
-    assert "| nbv | 90 | 30 [10, 60] |" in text
+    assert "| nbv | 10 | 90 | 30 [10, 60] |" in text
     assert "| random |" not in text  # the best classical planner alone
     assert "`random`: its area under F-score over steps is the better one in 70 [55, 80] %" in text
     assert "It does not beat the best classical planner, `nbv`" in text
@@ -127,6 +133,15 @@ def test_scores_of_another_agent_are_not_its_own(clone: Path) -> None:
     text = card(clone)
     assert "It has not been benchmarked yet." in text
     assert "kitchen" not in text
+
+
+def test_of_two_benchmarks_of_a_task_the_one_with_more_episodes_counts(clone: Path) -> None:
+    scores(clone / "docs/results/few", Interval(0.1, 0.02, 0.3), episodes=4)
+    scores(clone / "docs/results/many", Interval(0.8, 0.6, 0.9), episodes=40)
+    scores(clone / "docs/results/some", Interval(0.2, 0.02, 0.3), episodes=8)
+    text = card(clone)
+    assert text.count("### In `kitchen`") == 1
+    assert "80 [60, 90] % of pairs" in text
 
 
 def test_training_seeds_are_counted(clone: Path) -> None:
