@@ -23,8 +23,8 @@ from ms_slam_env.sensor.rays import Hits, Pinhole, pose_of_row
 
 PACKET_FUNCTION = "rtcIntersect8"
 DEVICE = b"threads=1,max_isa=avx2"
-"""Embree's devices: kernels of one kind, so that a seed gives the same images on every processor
-with AVX2 (those for AVX-512 cast packets of eight 6 % faster)."""
+"""Embree's devices: kernels of one kind on every processor with AVX2, so that a ray at an edge
+meets the same face (those for AVX-512 cast packets of eight 6 % faster)."""
 _VERSION_MAJOR = 4
 _RTC_DEVICE_PROPERTY_VERSION_MAJOR = 1
 _RTC_GEOMETRY_TYPE_TRIANGLE = 0

@@ -1,11 +1,12 @@
 """Nothing that users see has changed; ``python tests/golden/update.py`` says that it should have.
 
-On a processor with AVX2 the values are kept to the last bit (``tests/same_kernels.py``, and Embree
-only says which face a ray meets). On others libraries and kernels are compiled or chosen for the
-processor at hand, and a last bit decides now and then whether a pixel counts. Therefore two limits
-for each array: three quarters of the values keep the first, all of them the second. They are at
-least twice what was seen when kernels, BLAS and NumPy were confined to SSE2, and when half of the
-depth readings were one last bit larger. ``update.py --compare`` shows what stays within them.
+Processors with AVX2 run the same kernels (``tests/same_kernels.py``); what is left is which of two
+faces Embree meets at their common edge. On others libraries and kernels are compiled or chosen for
+the processor at hand, and a last bit decides now and then whether a pixel counts. Therefore two
+limits for each array: three quarters of the values keep the first, all of them the second. They are
+beyond what was seen when kernels, BLAS, NumPy and Embree were confined to older processors, and
+when half of the depth readings were one last bit larger. ``update.py --compare`` shows what stays
+within them.
 """
 
 from __future__ import annotations
