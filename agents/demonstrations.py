@@ -17,7 +17,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.output_files import write_bytes
 
 _PLANNER, _POLICY = 1, 2  # streams of an episode's seed; the environment draws from the seed itself
-_ARRAYS = {"observations": 2, "masks": 2, "labels": 1, "rewards": 1, "is_tracked": 1}
+_ARRAYS = {"observations": 2, "masks": 2, "preferences": 2, "rewards": 1, "is_tracked": 1}
 
 
 @dataclass(frozen=True)
@@ -50,14 +50,14 @@ class Demonstration:
     Attributes:
         observations: (T, k) float16.
         masks: (T, n) bool, the actions that were possible.
-        labels: (T,) the teacher's actions.
+        preferences: (T, n) float16, probabilities of the actions as the teacher weighs them.
         rewards: (T,) of the actions that were taken.
         is_tracked: (T,) bool, whether SLAM knew where it was.
     """
 
     observations: NDArray[np.float16]
     masks: NDArray[np.bool_]
-    labels: NDArray[np.int64]
+    preferences: NDArray[np.float16]
     rewards: NDArray[np.float32]
     is_tracked: NDArray[np.bool_]
 
@@ -118,17 +118,20 @@ def play(task: Task) -> Path:
     is_over = False
     while not is_over:
         mask, is_tracked = np.array(info["action_mask"], dtype=bool), info["tracking_ok"]
-        label = action = teacher.act(observation, info)
+        wanted = action = teacher.act(observation, info)
+        preferences = teacher.preferences()
+        if preferences is None:
+            preferences = np.arange(len(mask)) == wanted
         if policy and rng.random() >= task.share:
             action = policy.act(observation, mask, rng)
-            if action != label:
+            if action != wanted:
                 teacher.instead(action)
         seen = np.asarray(observation)
         observation, reward, terminated, truncated, info = env.step(action)
-        steps.append((seen, mask, label, reward, is_tracked))
+        steps.append((seen, mask, preferences, reward, is_tracked))
         is_over = terminated or truncated
     columns = zip(*steps, strict=True)
-    kinds = (np.float16, np.bool_, np.int64, np.float32, np.bool_)
+    kinds = (np.float16, np.bool_, np.float16, np.float32, np.bool_)
     arrays: list[Any] = [
         np.array(column, dtype=kind) for column, kind in zip(columns, kinds, strict=True)
     ]

@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium import spaces
 from ms_slam_agents.demonstrations import Demonstration, Task, play
 from ms_slam_agents.environments import (
     VALIDATION_SEED,
@@ -35,8 +34,6 @@ from ms_slam_agents.options import Problem, check_new, parse_for_task
 from ms_slam_agents.policy import CLIP, EPSILON
 from ms_slam_agents.policy_file import PolicyFile, write_policy
 from ms_slam_agents.training_run import metadata_of, read_run
-from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
-from torch import Tensor
 from tqdm import tqdm
 
 from ms_slam_env.command_line import exit_code
@@ -181,22 +178,11 @@ class Student:
             sums = np.concatenate([d.returns(args.gamma) for d in demonstrations])
             self.returns = Moments.of(sums)
         torch.manual_seed(args.seed)
-        self.network = self._network()
+        width, actions = args.hidden, self.actions
+        self.network = Network(self.inputs, width, actions, 0, args.candidates)
         self.epochs = file.metadata.epochs if file else 0
         if file:
             load_parameters(self.network, file)
-
-    def _network(self) -> MaskableActorCriticPolicy | Network:
-        """Ours where candidates are looked at one by one, Stable-Baselines3's otherwise."""
-        args, candidates = self.args, self.args.candidates
-        if candidates:
-            return Network(self.inputs, args.hidden, self.actions, 0, candidates)
-        return MaskableActorCriticPolicy(
-            spaces.Box(-np.inf, np.inf, (self.inputs,), np.float32),
-            spaces.Discrete(self.actions),
-            lambda _: args.learning_rate,
-            net_arch=[args.hidden, args.hidden],
-        )
 
     def _moments(self, observations: Any) -> Moments:
         """Means and variances of observations (N, inputs), the same for all candidates."""
@@ -207,35 +193,31 @@ class Student:
         mean, var = pooled.pooled(observations.astype(np.float64))
         return Moments(mean, var, float(len(observations)))
 
-    def _evaluate(self, seen: Tensor, labels: Tensor, masks: Any) -> tuple[Tensor, Tensor]:
-        """Values (B,) and log-probabilities (B,) of labelled actions."""
-        if isinstance(self.network, Network):
-            nothing = torch.zeros(len(seen), 0)
-            log_probs, values = self.network(seen, nothing, torch.as_tensor(masks))
-            return values, log_probs.gather(1, labels[:, None].long())[:, 0]
-        values, log_probs, _ = self.network.evaluate_actions(seen, labels, masks)
-        return values.flatten(), log_probs
-
     def fit(self, demonstrations: Sequence[Demonstration]) -> dict[str, float]:
-        """Learn from all episodes; return the loss and the share of actions agreed on at last."""
+        """Learn from all episodes; return the loss and the share of the teacher's choice at last.
+
+        The loss is the cross entropy to what the teacher prefers.
+        """
         args = self.args
         data = _batches(demonstrations, args, np.random.default_rng([args.seed, self.epochs]))
         optimizer = torch.optim.Adam(self.network.parameters(), lr=args.learning_rate)
         said: list[tuple[float, float]] = []
-        for k, (observations, masks, labels, returns) in enumerate(data):
+        nothing = torch.zeros(args.batch_size, 0)
+        for k, (observations, masks, preferences, returns) in enumerate(data):
             optimizer.param_groups[0]["lr"] = args.learning_rate * (1 - k / len(data))
             scaled = np.clip((observations - self.seen.mean) / self.seen.std, -CLIP, CLIP)
-            values, log_probs = self._evaluate(
-                torch.as_tensor(scaled, dtype=torch.float32), torch.as_tensor(labels), masks
-            )
+            seen = torch.as_tensor(scaled, dtype=torch.float32)
+            log_probs, values = self.network(seen, nothing[: len(seen)], torch.as_tensor(masks))
+            wanted = torch.as_tensor(preferences, dtype=torch.float32)
             target = torch.as_tensor(returns / self.returns.std, dtype=torch.float32)
             error = torch.mean((values - target) ** 2)
-            loss = -log_probs.mean() + args.value_weight * error
+            loss = -(wanted * log_probs).sum(dim=1).mean() + args.value_weight * error
             optimizer.zero_grad()
             loss.backward()
             torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
             optimizer.step()
-            said.append((loss.item(), torch.exp(log_probs).mean().item()))
+            chosen = log_probs.gather(1, wanted.argmax(dim=1, keepdim=True))
+            said.append((loss.item(), chosen.exp().mean().item()))
         self.epochs += args.epochs
         last = said[-max(1, len(said) // args.epochs) :]
         loss, probability = np.mean(last, axis=0)
@@ -269,20 +251,20 @@ class _batches:
     rng: np.random.Generator
 
     def __len__(self) -> int:
-        steps = sum(len(d.labels) for d in self.demonstrations)
+        steps = sum(len(d.rewards) for d in self.demonstrations)
         return self.args.epochs * math.ceil(steps / self.args.batch_size)
 
     def __iter__(self) -> Iterator[tuple[Any, ...]]:
         parts = [
-            (d.observations, d.masks, d.labels, d.returns(self.args.gamma))
+            (d.observations, d.masks, d.preferences, d.returns(self.args.gamma))
             for d in self.demonstrations
         ]
-        observations, masks, labels, returns = map(np.concatenate, zip(*parts, strict=True))
+        observations, masks, preferences, returns = map(np.concatenate, zip(*parts, strict=True))
         for _ in range(self.args.epochs):
-            order = self.rng.permutation(len(labels))
+            order = self.rng.permutation(len(returns))
             for chosen in np.array_split(order, math.ceil(len(order) / self.args.batch_size)):
                 seen = observations[chosen].astype(np.float32)
-                yield seen, masks[chosen], labels[chosen], returns[chosen]
+                yield seen, masks[chosen], preferences[chosen], returns[chosen]
 
 
 # -- Training ----------------------------------------------------------------------------------
@@ -329,7 +311,7 @@ def train(args: Args) -> int:
         demonstrations = [Demonstration.read(path) for path in paths]
         student = Student(args, demonstrations[: args.episodes], file)
         said = student.fit(demonstrations)
-        steps = sum(len(d.labels) for d in demonstrations)
+        steps = sum(len(d.rewards) for d in demonstrations)
         file = student.file(steps, (time.monotonic() - started) / 60)
         venv = make_venv(args, "validation", seeds)
         try:

@@ -105,21 +105,25 @@ class GoalPlanner(Planner):
         self.goal = None
 
     def act(self, observation: Any, info: dict[str, Any]) -> int:
-        """Carve the last frame, keep or draw a goal, move towards it."""
+        """Carve the last frame, choose a motion."""
         episode = self.env.episode
         here = episode.T_world_camera_estimate
         if info["tracking_ok"]:
             self.map.add(self.env.slam, episode.last_frame.depth, here, self.env.intrinsics)
+        action = self.choose_motion(here)
+        self.heading_to = self.env.candidate_poses()[action]
+        if action == 0:
+            self.goal = None
+        return action
+
+    def choose_motion(self, here: Float64) -> int:
+        """The motion to make next from a pose (4, 4): towards the goal, which is kept or drawn."""
         if self.goal is not None:
             self.judge_goal(here)
         if self.goal is None:
             self.find_goal(here)
         self.age += 1
-        action = self.motion_towards(self.next_on_way(here))
-        self.heading_to = self.env.candidate_poses()[action]
-        if action == 0:
-            self.goal = None
-        return action
+        return self.motion_towards(self.next_on_way(here))
 
     def find_goal(self, here: Float64) -> None:
         """Take a goal near by, or a far one where that would gain too little, and the way there."""

@@ -64,9 +64,13 @@ class NextBestView(GoalPlanner):
         gain = expected_gain(self.map.grid, poses, self.env.intrinsics, (12, 9))
         score = self.own_gain * gain / max(gain.max(), 1e-9)
         score -= distance_in_steps(poses, goal, *self.steps).sum(axis=1)
+        return self.best_admissible(poses, score)
+
+    def best_admissible(self, poses: Float64, score: Float64) -> int:
+        """The admissible motion to poses (n, 4, 4) with the highest score (n,)."""
         best_first = np.argsort(-score, kind="stable") if self.far_apart else None
-        score[~self.admissible(poses, best_first)] = -np.inf
-        return int(np.argmax(score))
+        self.can = self.admissible(poses, best_first)
+        return int(np.argmax(np.where(self.can, score, -np.inf)))
 
     def admissible(
         self, poses: Float64, order: NDArray[np.int64] | None = None
@@ -80,7 +84,7 @@ class NextBestView(GoalPlanner):
         permitted = possible & ~self.near_loss(poses)
         leads = leads_on(poses, self.env.episode.T_world_camera_estimate)
         risk = min(self.risk * 2**self.given_up, 1.0)
-        risks = np.full(len(poses), np.inf)
+        self.seen_risks = risks = np.full(len(poses), np.inf)
         for some in _in_turn(order, permitted, leads):
             risks[some] = self.risks(poses[some], permitted[some])
             if bearable(risk, risks, leads) == risk:

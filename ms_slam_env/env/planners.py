@@ -61,6 +61,10 @@ class Planner(ABC):
     def act(self, observation: Any, info: dict[str, Any]) -> int:
         """Return the next action, given what ``reset`` or ``step`` last returned."""
 
+    def preferences(self) -> NDArray[np.float64] | None:
+        """Probabilities (n,) of the actions as `act` weighed them; None: all for the one chosen."""
+        return None
+
     def instead(self, action: int) -> None:  # noqa: B027 -- most planners see what came of it
         """Be told that another action was taken than ``act`` returned last."""
 
@@ -99,6 +103,10 @@ class Recovering(Planner):
         before = self.made[:-1] if self.has_chosen else [*self.made, self.undoing]
         self.made = [*before, action]
         self.planner.instead(action)
+
+    def preferences(self) -> NDArray[np.float64] | None:
+        """What the planner says; all for the motion that undoes another."""
+        return self.planner.preferences() if self.has_chosen else None
 
     def act(self, observation: Any, info: dict[str, Any]) -> int:
         """Undo a motion, or what the planner says."""

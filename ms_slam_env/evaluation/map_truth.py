@@ -18,7 +18,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from ms_slam_env.camera import Intrinsics
+from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, transform_points
+from ms_slam_env.robot import Embodiment
+from ms_slam_env.robot.arm.arm import ArmEmbodiment, camera_poses
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.mesh_queries import RayCaster
 from ms_slam_env.sensor.scene_cache import get_scene
@@ -41,6 +44,30 @@ _EVERY = 3
 def true_surface(scene: str, scene_seed: int, spacing_m: float = SURFACE_SPACING_M) -> Float64:
     """The scene's whole surface as points (N, 3), by default about 1 cm apart."""
     return get_scene(scene, scene_seed).surface_points(spacing_m)[0]
+
+
+def reference_surface(
+    kind: str, scene: Scene, start: Float64, embodiment: Embodiment, intrinsics: Intrinsics
+) -> Float64:
+    """Points (N, 3) of true surface that a map should have, by a task's kind of reference.
+
+    Args:
+        kind: ``nearby``, ``scene`` or ``arm``; see :class:`ms_slam_env.tasks.Task`.
+        scene: that is mapped.
+        start: (3,) where the camera starts.
+        embodiment: what carries the camera.
+        intrinsics: of the camera.
+
+    Raises:
+        InputError: kind ``arm`` where no arm carries it.
+    """
+    if kind == "nearby":
+        return surface_nearby(scene, start)
+    if kind == "scene":
+        return surface_of_scene(scene, start)
+    if not isinstance(embodiment, ArmEmbodiment):
+        raise InputError("a task with reference 'arm' needs embodiment 'arm' or 'arm-kinematic'")
+    return surface_of_views(scene, camera_poses(embodiment), intrinsics)
 
 
 def surface_nearby(scene: Scene, start: Float64) -> Float64:

@@ -1,6 +1,6 @@
 """What is known of space: occupancy, what a view would add to it, where a camera can go."""
 
-from ms_slam_env.mapping.expected_gain import expected_gain
+from ms_slam_env.mapping.expected_gain import expected_gain, held_gain
 from ms_slam_env.mapping.occupancy_grid import (
     FREE,
     OCCUPIED,
@@ -20,6 +20,7 @@ __all__ = [
     "OccupancyMap",
     "Ways",
     "expected_gain",
+    "held_gain",
     "reachable_positions",
     "shortest_ways",
     "surrounding_occupancy",

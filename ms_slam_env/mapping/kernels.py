@@ -11,6 +11,7 @@ MARGIN = wp.constant(0.5)  # cells of depth in front of a surface that are not c
 NEAREST_M = wp.constant(0.3)  # a sensor sees nothing nearer
 GAIN_STEP = wp.constant(0.8)  # cells of depth between the points of a ray: none is stepped over
 SEEN_THROUGH = wp.constant(0.85**0.8)  # chance that a step through unknown cells meets nothing
+BLOCK = wp.constant(2.0)  # cells along an edge: rays a few degrees apart pass most of them
 STILL_BLANK = wp.constant(0.7)  # worth of a cell after one more look without a reading
 DEPTH_NOISE = wp.constant(wp.vec3(0.0012, 0.0019, 0.4))  # m, 1/m, m; see view_information
 
@@ -99,6 +100,64 @@ def sum_unknown(
             chance *= SEEN_THROUGH
         z += dz
     gains[pose, ray] = gain
+
+
+@wp.kernel
+def sum_unknown_held(
+    directions: wp.array(dtype=wp.vec3),  # in the camera frame, z = 1 m
+    rotations: wp.array2d(dtype=wp.mat33),  # (motions, steps) to the world, in cells
+    starts: wp.array2d(dtype=wp.vec3),  # in cells
+    log_odds: wp.array3d(dtype=wp.int8),
+    blanks: wp.array3d(dtype=wp.int8),
+    cell_m: float,
+    reach_m: float,
+    low: wp.vec3,  # cell in which the first block begins
+    first_seen: wp.array4d(dtype=wp.int8),  # (motions, blocks) in which step, from 1; 0: in none
+    gains: wp.array2d(dtype=float),  # (motions, steps)
+):
+    """As `sum_unknown`, along motions that are held; a block counts in the first step it is seen.
+
+    A motion ends where the camera would stand in a cell that is not known to be free.
+    """
+    motion = wp.tid()
+    shape = wp.vec3i(log_odds.shape[0], log_odds.shape[1], log_odds.shape[2])
+    blocks = wp.vec3i(first_seen.shape[1], first_seen.shape[2], first_seen.shape[3])
+    dz = GAIN_STEP * cell_m
+    for step in range(starts.shape[1]):
+        here = _cell(starts[motion, step], shape)
+        if step > 0 and (here[0] < 0 or log_odds[here[0], here[1], here[2]] >= wp.int8(0)):
+            break
+        gain = wp.float32(0.0)
+        for ray in range(directions.shape[0]):
+            direction = rotations[motion, step] * directions[ray]
+            chance = wp.float32(1.0)
+            z = wp.float32(NEAREST_M)
+            while z < reach_m:
+                at = starts[motion, step] + z * direction
+                cell = _cell(at, shape)
+                state = wp.int32(0)
+                if cell[0] >= 0:
+                    state = wp.int32(log_odds[cell[0], cell[1], cell[2]])
+                if state > 0:
+                    break
+                if state == 0:
+                    block = _cell((at - low) / BLOCK, blocks)
+                    seen = wp.int32(0)
+                    if block[0] >= 0:
+                        seen = wp.int32(first_seen[motion, block[0], block[1], block[2]])
+                        if seen == 0:
+                            seen = step + 1
+                            first_seen[motion, block[0], block[1], block[2]] = wp.int8(seen)
+                    if seen == step + 1:
+                        worth = chance * z * z * dz
+                        if cell[0] >= 0:
+                            looks = wp.int32(blanks[cell[0], cell[1], cell[2]])
+                            if looks > 0:
+                                worth *= wp.pow(STILL_BLANK, float(looks))
+                        gain += worth
+                    chance *= SEEN_THROUGH
+                z += dz
+        gains[motion, step] = gain
 
 
 @wp.kernel

@@ -9,15 +9,8 @@ from numpy.typing import NDArray
 
 from ms_slam_env import metrics
 from ms_slam_env.env import ActiveSlamEnv
-from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.map_quality import SURFACE_SPACING_M, ScoreCurve, map_quality
-from ms_slam_env.evaluation.map_truth import (
-    surface_nearby,
-    surface_of_scene,
-    surface_of_views,
-    true_surface,
-)
-from ms_slam_env.robot.arm.arm import ArmEmbodiment, camera_poses
+from ms_slam_env.evaluation.map_truth import reference_surface, true_surface
 from ms_slam_env.slam.base import SlamBackend
 
 Float64 = NDArray[np.float64]
@@ -95,18 +88,9 @@ def _reference(world: ActiveSlamEnv, key: tuple[str, int, str]) -> Float64:
     full = (*key, start.tobytes(), world.intrinsics, repr(world.config.arm))
     if full not in _LAST:
         _LAST.clear()
-        _LAST[full] = _new_reference(world, key[-1], start[:3, 3])
+        place = world.scene, start[:3, 3], world.embodiment, world.intrinsics
+        _LAST[full] = reference_surface(key[-1], *place)
     return _LAST[full]
-
-
-def _new_reference(world: ActiveSlamEnv, kind: str, start: Float64) -> Float64:
-    if kind == "nearby":
-        return surface_nearby(world.scene, start)
-    if kind == "scene":
-        return surface_of_scene(world.scene, start)
-    if not isinstance(world.embodiment, ArmEmbodiment):
-        raise InputError("a task with reference 'arm' needs embodiment 'arm' or 'arm-kinematic'")
-    return surface_of_views(world.scene, camera_poses(world.embodiment), world.intrinsics)
 
 
 def measure_trajectory(world: ActiveSlamEnv) -> dict[str, Any]:

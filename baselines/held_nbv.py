@@ -1,0 +1,90 @@
+"""Next best view by motions that are held."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from ms_slam_baselines.nbv import NextBestView
+from numpy.typing import NDArray
+
+from ms_slam_env.mapping import held_gain
+
+if TYPE_CHECKING:
+    from ms_slam_env.env.active_slam import ActiveSlamEnv
+
+Float64 = NDArray[np.float64]
+
+_CHOICE = 0.05  # of what the best motion shows: so much less, and a motion is 1/e as good a choice
+
+
+class HeldNextBestView(NextBestView):
+    """Makes the motion that shows most while it is held for some steps, and looks again.
+
+    As MBPlanner (Dharmadhikari et al., ICRA 2020) it compares motion primitives, not poses: what
+    all views on the way show counts, each part of space once, and the sooner the more. Of those
+    that SLAM can follow, see `nbv`. Where none shows enough it goes to a goal as `nbv` does.
+
+    Args:
+        env: the unwrapped environment.
+        seed: of the goals drawn.
+        horizon: steps that a motion is held.
+        discount: of what one more step shows.
+        least_m3: unknown volume that a motion should show, discounted.
+        enough_m3: unknown volume that a goal near by should show.
+        slip_cost: volume in m3 that a slip would cost: a motion is worth so much less times the
+            risk.
+        **options: see `NextBestView`.
+
+    Raises:
+        InputError: an option out of its range.
+    """
+
+    def __init__(
+        self,
+        env: ActiveSlamEnv,
+        seed: int = 0,
+        horizon: int = 6,
+        discount: float = 0.93,
+        least_m3: float = 0.1,
+        enough_m3: float = 0.3,
+        slip_cost: float = 0.0,
+        **options: Any,
+    ) -> None:
+        super().__init__(env, seed, enough_m3=enough_m3, **options)
+        self.horizon, self.discount = horizon, discount
+        self.least_m3, self.slip_cost = least_m3, slip_cost
+        self.check({"horizon": (1, 100), "discount": (0, 1)})
+        self.check({"least_m3": (0, 1000), "slip_cost": (0, 1000)})
+
+    def reset(self) -> None:
+        """Nothing is known yet."""
+        super().reset()
+        self.weights: Float64 | None = None
+
+    def choose_motion(self, here: Float64) -> int:
+        """The admissible motion that is worth most while it is held, or the one towards a goal."""
+        self.weights = None
+        values = self.values(here)
+        if values.max() >= self.least_m3:
+            best = self.best_admissible(self.env.candidate_poses(), values)
+            values = np.where(self.can, values, 0)
+            if self.slip_cost:
+                values -= self.slip_cost * np.where(self.can, self.seen_risks, 0)
+                best = int(np.argmax(values))
+            if values[best] >= self.least_m3:
+                self.goal, self.given_up = None, 0
+                weights = np.exp((values / values[best] - 1) / _CHOICE)
+                self.weights = np.where(self.can, weights, 0)
+                return best
+        return super().choose_motion(here)
+
+    def preferences(self) -> Float64 | None:
+        """Probabilities (n,) of the motions, by what they are worth beside the best one."""
+        return None if self.weights is None else self.weights / self.weights.sum()
+
+    def values(self, here: Float64) -> Float64:
+        """Discounted volume (n,) in m^3 that each motion shows from a pose (4, 4)."""
+        motions = self.env.embodiment.candidate_motions()
+        gain = held_gain(self.map.grid, here, motions, self.horizon, self.env.intrinsics)
+        return np.asarray(gain @ self.discount ** np.arange(self.horizon))

@@ -1,0 +1,132 @@
+"""A planner that knows the scene: how soon it could be mapped, and a teacher."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from ms_slam_baselines.held_nbv import HeldNextBestView
+from numpy.typing import NDArray
+
+from ms_slam_env.config import check_choice
+from ms_slam_env.evaluation.map_truth import reference_surface
+from ms_slam_env.scenes.mesh_queries import RayCaster
+from ms_slam_env.tasks import REFERENCES
+
+if TYPE_CHECKING:
+    from ms_slam_env.env.active_slam import ActiveSlamEnv
+
+Float64 = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Bool = NDArray[np.bool_]
+
+_NEAREST_M, _FARTHEST_M = 0.3, 4.0  # of what a frame maps well
+_SLACK = 0.01  # share of its distance by which a point may lie behind what hides it
+_PLACED_M = 0.04  # error of the pose up to which a frame maps in the true place
+_CLEARANCE_M = 0.12
+
+
+class Oracle(HeldNextBestView):
+    """`held-nbv` that reads from the scene what each motion would show of the task's surface.
+
+    It moves by the same rules, by motions that SLAM can follow. No rival, since it sees what a
+    robot cannot: it says how much there is to gain, and an agent can learn from it what is worth
+    looking at ("privileged" teacher: Chen et al., "Learning by cheating", CoRL 2020).
+
+    Args:
+        env: the unwrapped environment.
+        seed: of the goals drawn.
+        reference: the surface to be mapped, as a task has it: nearby, scene or arm.
+        points: of that surface that are counted.
+        least: share of them that a motion should show, discounted.
+        slip_cost: share of them that a slip would cost.
+        **options: see `HeldNextBestView`.
+
+    Raises:
+        InputError: an option out of its range.
+    """
+
+    def __init__(
+        self,
+        env: ActiveSlamEnv,
+        seed: int = 0,
+        reference: str = "nearby",
+        points: int = 2000,
+        least: float = 1e-3,
+        slip_cost: float = 1.0,
+        **options: Any,
+    ) -> None:
+        super().__init__(env, seed, least_m3=least, enough_m3=least, slip_cost=slip_cost, **options)
+        self.reference, self.points = reference, points
+        check_choice(self, "reference", REFERENCES)
+        self.check({"points": (1, 1_000_000)})
+
+    def reset(self) -> None:
+        """Nothing is mapped yet."""
+        super().reset()
+        self.looked_at = 0
+        self.left: Float32 | None = None
+        """Points (N, 3) that are not mapped; None before the first decision."""
+
+    def values(self, here: Float64) -> Float64:
+        """Discounted share (n,) of the surface that each motion newly maps."""
+        if self.left is None:
+            self._begin()
+        self._look()
+        assert self.left is not None
+        motions = self.env.embodiment.candidate_motions()
+        poses = [self.env.episode.frames[-1].T_world_camera @ motions]
+        while len(poses) < self.horizon:
+            poses.append(poses[-1] @ motions)
+        way = np.stack(poses, axis=1)
+        fits = self.env.scene.clearance(way[:, :, :3, 3].reshape(-1, 3)) > _CLEARANCE_M
+        goes_on = np.logical_and.accumulate(fits.reshape(way.shape[:2]), axis=1)
+        seen = self._sees(way.reshape(-1, 4, 4)).reshape(*way.shape[:2], -1) & goes_on[..., None]
+        by_then = np.logical_or.accumulate(seen, axis=1).sum(axis=2) / self.total
+        new = np.diff(by_then, axis=1, prepend=0.0)
+        return np.asarray(new @ self.discount ** np.arange(self.horizon))
+
+    def gain_of(self, poses: Float64) -> Float64:
+        """Share (N,) of the surface that is newly mapped from poses (N, 4, 4)."""
+        return np.asarray(self._sees(poses).sum(axis=1) / self.total)
+
+    def _begin(self) -> None:
+        """Draw the points of the surface."""
+        env = self.env
+        start = env.episode.frames[0].T_world_camera[:3, 3]
+        every = reference_surface(self.reference, env.scene, start, env.embodiment, env.intrinsics)
+        drawn = np.random.default_rng(0).permutation(len(every))[: self.points]
+        self.left, self.total = every[drawn].astype(np.float32), len(drawn)
+        self.caster = RayCaster(env.scene.mesh.vertices, env.scene.mesh.faces)
+
+    def _look(self) -> None:
+        """Take away what the frames since the last decision have mapped in its place."""
+        assert self.left is not None
+        frames = self.env.episode.frames
+        for frame in frames[self.looked_at :]:
+            if frame.tracking_ok and frame.pose_error < _PLACED_M:
+                self.left = self.left[~self._sees(frame.T_world_camera[None])[0]]
+        self.looked_at = len(frames)
+
+    def _sees(self, poses: Float64) -> Bool:
+        """Which points (M, N) cameras at poses (M, 4, 4) see."""
+        assert self.left is not None
+        places, which = np.unique(np.round(poses[:, :3, 3], 6), axis=0, return_inverse=True)
+        directions = (self.left - places[:, None].astype(np.float32)).reshape(-1, 3)
+        reached, _ = self.caster.first_hit(
+            np.repeat(places, len(self.left), axis=0), directions.astype(np.float64)
+        )
+        is_open = (reached >= 1 - _SLACK).reshape(len(places), -1)
+        return self._in_view(poses) & is_open[which.ravel()]
+
+    def _in_view(self, poses: Float64) -> Bool:
+        """Which points (M, N) lie in the image of cameras at poses (M, 4, 4)."""
+        assert self.left is not None
+        camera = self.env.intrinsics
+        to_camera = np.linalg.inv(poses).astype(np.float32)
+        x, y, z = np.moveaxis(
+            self.left @ to_camera[:, :3, :3].transpose(0, 2, 1) + to_camera[:, None, :3, 3], 2, 0
+        )
+        across = np.abs(x) <= camera.width / (2 * camera.fx) * z
+        down = np.abs(y) <= camera.height / (2 * camera.fy) * z
+        return np.asarray((z > _NEAREST_M) & (z < _FARTHEST_M) & across & down)
