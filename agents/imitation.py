@@ -207,7 +207,9 @@ class Student:
             optimizer.param_groups[0]["lr"] = args.learning_rate * (1 - k / len(data))
             scaled = np.clip((observations - self.seen.mean) / self.seen.std, -CLIP, CLIP)
             seen = torch.as_tensor(scaled, dtype=torch.float32)
-            log_probs, values = self.network(seen, nothing[: len(seen)], torch.as_tensor(masks))
+            can = torch.as_tensor(masks)
+            log_probs, values = self.network(seen, nothing[: len(seen)], can)
+            log_probs = log_probs.masked_fill(~can, 0)  # nothing is learnt from what cannot be
             wanted = torch.as_tensor(preferences, dtype=torch.float32)
             target = torch.as_tensor(returns / self.returns.std, dtype=torch.float32)
             error = torch.mean((values - target) ** 2)

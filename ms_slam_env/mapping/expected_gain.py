@@ -84,7 +84,7 @@ def held_gain(
     directions, solid_angle = spread_rays(intrinsics, rays)
     starts = way[:, :, :3, 3] / grid.cell_m - grid.first
     reach = grid.reach_m / grid.cell_m * np.linalg.norm(directions, axis=1).max()
-    low = np.floor(starts.min(axis=(0, 1)) - reach)
+    low = np.floor((starts.min(axis=(0, 1)) - reach + grid.first) / BLOCK) * BLOCK - grid.first
     blocks = np.ceil((starts.max(axis=(0, 1)) + reach - low) / BLOCK).astype(int)
     with wp.ScopedDevice("cpu"):
         first_seen = wp.zeros((len(motions), *blocks), dtype=wp.int8)

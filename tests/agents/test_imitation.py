@@ -17,6 +17,19 @@ from ms_slam_env.errors import InputError
 TEACHER = f"{__name__}:Knowing"
 
 
+class Undecided(Planner):
+    """Finds the action before the right one a third as good, where that is possible."""
+
+    def act(self, observation, info):
+        self.label = self.env.right
+        return self.label
+
+    def preferences(self):
+        before = (self.label - 1) % NUM_ACTIONS
+        other = before if self.env.mask[before] else self.label
+        return 0.75 * np.eye(NUM_ACTIONS)[self.label] + 0.25 * np.eye(NUM_ACTIONS)[other]
+
+
 class Knowing(Planner):
     """Knows the right action, and hears what was done instead."""
 
@@ -93,6 +106,17 @@ def test_the_policy_does_as_its_teacher(tmp_path, capsys):
     assert "round 1: 240 steps" in capsys.readouterr().out
 
 
+def test_the_policy_weighs_actions_as_its_teacher(tmp_path):
+    words = arguments(tmp_path, "--teacher", f"{__name__}:Undecided", rounds=1)
+    assert imitation.main(words) == 0
+    policy = Policy.load(tmp_path / "latest.safetensors")
+    seen = (10 * np.eye(NUM_ACTIONS) + 3).astype(np.float32)
+    both = (np.eye(NUM_ACTIONS) + np.roll(np.eye(NUM_ACTIONS), -1, axis=1)).astype(bool)
+    found = policy.probabilities(seen, both)
+    assert abs(np.diag(found).mean() - 0.75) < 0.05
+    np.testing.assert_allclose(np.diag(found), 0.75, atol=0.15)
+
+
 def test_a_run_that_goes_on_is_the_run_that_never_stopped(tmp_path):
     imitation.main(arguments(tmp_path / "whole"))
     imitation.main(arguments(tmp_path / "parts", rounds=1))
@@ -114,9 +138,11 @@ def test_later_rounds_are_played_by_the_policy_and_labelled_by_the_teacher(tmp_p
         policy=tmp_path / "latest.safetensors",
     )
     one = Demonstration.read(play(task))
-    assert all(one.labels == one.observations.argmax(axis=1))
+    labels = one.preferences.argmax(axis=1)
+    assert (one.preferences.sum(axis=1) == 1).all()
+    assert all(labels == one.observations.argmax(axis=1))
     wrong = np.flatnonzero(one.rewards == 0)
-    assert [right for right, _ in Knowing.instead_of] == one.labels[wrong].tolist()
+    assert [right for right, _ in Knowing.instead_of] == labels[wrong].tolist()
     assert all(right != done for right, done in Knowing.instead_of)
 
 

@@ -1,4 +1,4 @@
-"""The observation `goals`: the occupancy grid alone, motion by motion what planners ask it."""
+"""The observations `goals` and `held`: the occupancy grid alone, motion by motion."""
 
 import gymnasium as gym
 import numpy as np
@@ -6,7 +6,7 @@ import pytest
 
 import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env.geometry import invert, relative_angle
-from ms_slam_env.mapping import OccupancyGrid, expected_gain, reachable_positions
+from ms_slam_env.mapping import OccupancyGrid, expected_gain, held_gain, reachable_positions
 from ms_slam_env.mapping.candidates import GRID_NAMES
 from ms_slam_env.mapping.expected_gain import look_from
 from ms_slam_env.mapping.goals_around import NUM_GOALS, gain_around
@@ -82,6 +82,26 @@ def test_a_motion_has_what_the_grid_says_of_where_it_leads(moment):
         turn = relative_angle(poses[0][:3, :3], goal[:3, :3])
         turn -= relative_angle(poses[k][:3, :3], goal[:3, :3])
         assert numbers["goal_rotation"][k] == pytest.approx(turn / steps[1], abs=1e-4)
+
+
+def test_held_is_goals_and_what_each_motion_shows_while_it_is_held(moment):
+    world, observation, grid = moment
+    env = make("held")
+    seen, _ = env.reset(seed=0)
+    for action in (14, 3, 41):
+        seen, *_ = env.step(action)
+    assert env.observation_space.contains(seen)
+    np.testing.assert_array_equal(seen[:STATE], observation[:STATE])
+    rows = seen[STATE:].reshape(49, len(GRID_NAMES) + 4)
+    shown = observation[STATE:].reshape(49, len(GRID_NAMES))
+    np.testing.assert_array_equal(rows[:, : len(GRID_NAMES)], shown)
+    here, motions = world.candidate_poses()[0], world.embodiment.candidate_motions()
+    gain = held_gain(grid, here, motions, 6, world.intrinsics)
+    worth = (gain * 0.93 ** np.arange(6)).sum(axis=1)
+    held = rows[:, len(GRID_NAMES) :]
+    np.testing.assert_allclose(held[:, 0], worth / worth.max(), atol=0.02)
+    np.testing.assert_allclose(held[:, 1], gain[:, 0] + gain[:, 1], atol=0.05 * gain.max())
+    np.testing.assert_allclose(held[:, 3], gain[:, 4] + gain[:, 5], atol=0.05 * gain.max())
 
 
 @pytest.mark.parametrize("env_id", ["MSActiveSLAM-v0", "MSActiveSLAM-FixedTranslation-v0"])

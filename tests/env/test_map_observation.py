@@ -52,7 +52,7 @@ def test_an_episode_forgets_the_one_before():
     np.testing.assert_array_equal(again, first)
 
 
-@pytest.mark.parametrize("observation", ["map", "goals", "candidates"])
+@pytest.mark.parametrize("observation", ["map", "goals", "held", "candidates"])
 def test_a_saved_state_holds_the_grid_and_goes_on_bit_exactly(observation):
     env, other = make(observation), make(observation)
     env.reset(seed=0)

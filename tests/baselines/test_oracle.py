@@ -1,0 +1,76 @@
+"""The oracle sees what the sensor sees, counts what is mapped, and knows better than `held-nbv`."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import ms_slam_env  # noqa: F401 -- registers the environments
+from ms_slam_env.env.planners import make_planner
+from ms_slam_env.errors import InputError
+from ms_slam_env.evaluation.map_truth import surface_nearby
+from ms_slam_env.geometry import invert, transform_points
+
+
+@pytest.fixture(scope="module")
+def start():
+    """An oracle after its first decision, the view from its start and the world."""
+    env = gym.make(
+        "MSActiveSLAM-Room-v0",
+        scene="table",
+        scene_seed=0,
+        image_size="160x120",
+        disable_env_checker=True,
+    )
+    observation, info = env.reset(seed=0)
+    planner = make_planner("oracle", env.unwrapped)
+    planner.reset()
+    action = planner.act(observation, info)
+    return env, planner, action, observation, info
+
+
+def test_it_sees_the_points_that_the_rendered_depth_shows(start):
+    env, planner, *_ = start
+    world, camera = env.unwrapped, env.unwrapped.intrinsics
+    points = surface_nearby(world.scene, world.episode.frames[0].T_world_camera[:3, 3])
+    here = world.episode.frames[0].T_world_camera
+    depth = world.camera_feed.true_depth()
+    local = transform_points(invert(here), points)
+    pixel = np.round(camera.project(np.where(local[:, 2:] > 0, local, (0, 0, 1)))).astype(int)
+    inside = (local[:, 2] > 0.3) & (local[:, 2] < 4.0)
+    inside &= ((pixel >= 0) & (pixel < [camera.width, camera.height])).all(axis=1)
+    shown = np.zeros(len(points), bool)
+    u, v = pixel[inside].T
+    shown[inside] = np.abs(depth[v, u] - local[inside, 2]) < 0.05
+    left, planner.planner.left = planner.planner.left, points.astype(np.float32)
+    seen = planner.planner._sees(here[None])[0]
+    planner.planner.left = left
+    assert shown.sum() > 500
+    assert (seen & shown).sum() > 0.95 * (seen | shown).sum()  # all but points at edges
+
+
+def test_what_a_frame_has_mapped_is_not_left_and_what_is_left_it_goes_for(start):
+    env, planner, action, observation, info = start
+    oracle = planner.planner
+    left = [len(oracle.left)]
+    assert left[0] < oracle.total
+    for _ in range(8):
+        expected = oracle.values(env.unwrapped.episode.T_world_camera_estimate)
+        assert expected.max() > 0.02
+        observation, *_, info = env.step(action)
+        action = planner.act(observation, info)
+        left.append(len(oracle.left))
+    mapped = -np.diff(left) / oracle.total
+    assert (mapped >= 0).all()
+    assert mapped.sum() > 0.05
+    here = env.unwrapped.episode.frames[-1].T_world_camera
+    assert oracle.gain_of(here[None])[0] < 0.01
+
+
+def test_a_reference_that_there_is_not_is_refused(start):
+    env = start[0]
+    with pytest.raises(InputError, match="nearby, scene, arm"):
+        make_planner("oracle,reference=moon", env.unwrapped)
+    planner = make_planner("oracle,reference=arm", env.unwrapped)
+    planner.reset()
+    with pytest.raises(InputError, match="needs embodiment 'arm'"):
+        planner.act(start[3], start[4])
