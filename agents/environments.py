@@ -51,6 +51,8 @@ def problem_options(args: Problem, split: str) -> dict[str, Any]:
         few = {"arm": few}
     if args.image_size is not None:
         few["image_size"] = args.image_size
+    if args.reward != "default":
+        few["reward"] = args.reward
     return {
         "max_episode_steps": args.episode_steps,
         "scene": args.scenes,

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from ms_slam_env.command_line import parse
-from ms_slam_env.config import Checked, bounded, from_dict, load_yaml
+from ms_slam_env.config import Checked, bounded, chosen, from_dict, load_yaml
+from ms_slam_env.env.config import RewardConfig
 from ms_slam_env.env.observations import POINT as OBSERVATIONS
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.input_files import read_text
@@ -38,6 +39,7 @@ class Problem(Checked):
             some ten, of a free camera those of the environment. With ``--embodiment arm-kinematic
             --frames-per-action 1`` a step costs little more than the free camera's: a world to
             train in before the arm itself (``--init``).
+        reward: preset of the environment's reward, `default` or `paper`.
         image_size: of the camera in training and validation, width x height; None: the
             environment's own. At 80x60 a step costs half as much, and SLAM holds on less: a world
             to begin in. Which one it was is no part of the policy.
@@ -60,6 +62,7 @@ class Problem(Checked):
     step_m: float | None = None
     step_deg: float | None = None
     frames_per_action: int | None = bounded(None, 1, 1000)
+    reward: str = chosen("default", *RewardConfig.named())
     image_size: str | None = None
     num_envs: int = bounded(2, 1, 100_000)
     seed: int = 0

@@ -44,7 +44,9 @@ def frontiers(grid: OccupancyGrid, position: Float64, radius_m: float, least: in
     is_frontier = (states < 0) & ndimage.binary_dilation(states == 0)
     parts, count = ndimage.label(is_frontier, np.ones((3, 3, 3)))
     cells = np.argwhere(is_frontier)
-    members = [cells[parts[tuple(cells.T)] == part] for part in range(1, count + 1)]
+    part = parts[tuple(cells.T)]
+    ends = np.cumsum(np.bincount(part, minlength=count + 1)[1:])
+    members = np.split(cells[np.argsort(part, kind="stable")], ends[:-1])
     members = sorted((m for m in members if len(m) >= least), key=len, reverse=True)
     middles = [m[np.argmin(((m - m.mean(axis=0)) ** 2).sum(axis=1))] for m in members]
     return grid.centres_of(np.array(middles).reshape(-1, 3) + low)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import gymnasium
@@ -209,6 +209,13 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         Raises:
             InputError: no action of the action space, or no reset before.
         """
+        reward, lost_for_good = self._advance(action)
+        if self._view is not None:
+            self._view.log()
+        return self._observe(), reward, lost_for_good, self._time_is_up(), self._info()
+
+    def _advance(self, action: Any) -> tuple[float, bool]:
+        """Make a motion and judge it: the reward, and whether the camera is lost for good."""
         episode = self.episode
         episode.action = self._actions.decode(action)
         error_before = episode.pose_error
@@ -224,10 +231,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
             configuration_cost=self._actions.configuration_cost,
         )
         episode.reward_terms = reward_terms(outcome, self.config.reward, self.config.targets)
-        reward = float(sum(episode.reward_terms.values()))
-        if self._view is not None:
-            self._view.log()
-        return self._observe(), reward, lost_for_good, self._time_is_up(), self._info()
+        return float(sum(episode.reward_terms.values())), lost_for_good
 
     def close(self) -> None:
         """Close the viewer's connection; the window stays."""
@@ -373,6 +377,24 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
                     episode.last_frame,
                 )
         return episode.predicted_divergences.copy()
+
+    def foresee(self, actions: Iterable[Any]) -> Float64:
+        """Rewards (k,) that each of some actions would bring now; nothing has changed after it.
+
+        Each is made and taken back, in the order given: what a simulator can tell and a robot
+        cannot. Of use to tree search and to teachers, and some 15 ms an action.
+
+        Raises:
+            InputError: no action of the action space, or no reset before.
+        """
+        state = self.save_state()
+        rewards = []
+        for action in actions:
+            try:
+                rewards.append(self._advance(action)[0])
+            finally:
+                load_state(self.simulation, state, self._settings(), self.np_random)
+        return np.array(rewards)
 
     def perturb(self, *perturbations: Perturbation) -> None:
         """Put perturbations on the camera, after those that it has; from the next reset on.

@@ -34,7 +34,12 @@ _VERDICTS = (
     ("Sooner than each other", "f_score_5cm_area", "area under F-score over steps"),
 )
 """A table of probabilities, by what the best classical planner is chosen, and what it is."""
-_TRAINED = ("agent-", "policy")  # planners that were
+_NO_RIVALS = (
+    "agent-",
+    "policy",
+    "oracle",
+    "foresight",
+)  # planners that were trained, or know the scene
 
 
 @dataclass(frozen=True)
@@ -208,7 +213,7 @@ def _scores(one: FoundResult, policy: Policy) -> list[_Score]:
     scores = []
     for k, table in enumerate(one.results.tables):
         own = [row for row in table.rows if _is_of(policy, row.get("planner"))]
-        others = [r for r in table.rows if not str(r.get("planner")).startswith(_TRAINED)]
+        others = [r for r in table.rows if not str(r.get("planner")).startswith(_NO_RIVALS)]
         if own and others and (_ACROSS in table.title or (k == 0 and not table.title)):
             scores.append(_Score(one, table, own[0], others))
     return scores

@@ -68,12 +68,12 @@ def test_a_motion_is_worth_less_by_what_its_risk_to_slip_costs():
 
     def look(planner, here, action):
         risks = np.where(planner.can, planner.seen_risks, 0)
-        worth = np.where(planner.can, planner.values(here) - 300 * risks, -np.inf)
+        worth = np.where(planner.can, planner.values(here) - 60 * risks, -np.inf)
         assert action == worth.argmax()
         assert planner.preferences().argmax() == action
         chosen.append((planner.seen_risks[action], planner.values(here).argmax() == action))
 
-    play(HeldNextBestView, look=look, slip_cost=300.0)
+    play(HeldNextBestView, look=look, slip_cost=60.0)
     assert not all(as_without for _, as_without in chosen)
 
 

@@ -1,0 +1,81 @@
+"""Motions tried and taken back: their rewards are those of the steps, and nothing has changed."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from ms_slam_baselines.foresight import Foresight
+
+import ms_slam_env  # noqa: F401 -- registers the environments
+from ms_slam_env.env.planners import make_planner
+from ms_slam_env.errors import InputError
+
+
+def make_env(env_id="MSActiveSLAM-FreeCamera-v0", **options):
+    return gym.make(
+        env_id,
+        scene="table",
+        scene_seed=0,
+        image_size="80x60",
+        disable_env_checker=True,
+        **options,
+    )
+
+
+@pytest.mark.parametrize(
+    ("env_id", "options"),
+    [
+        ("MSActiveSLAM-FreeCamera-v0", {"observation": "candidates", "reward": "paper"}),
+        ("MSActiveSLAM-FixedTranslation-v0", {}),
+        ("MSActiveSLAM-Adaptive-v0", {}),
+    ],
+)
+def test_what_is_foreseen_is_what_comes_and_nothing_has_changed(env_id, options):
+    env, other = make_env(env_id, **options), make_env(env_id, **options)
+    for one in (env, other):
+        one.reset(seed=3)
+        one.step(one.unwrapped.action_space.sample() * 0)
+    env.action_space.seed(0)
+    actions = [env.action_space.sample() for _ in range(4)]
+    rewards = env.unwrapped.foresee(actions)
+    np.testing.assert_array_equal(env.unwrapped.foresee(actions[::-1]), rewards[::-1])
+    assert len(set(rewards)) > 1
+    seen, reward, *_, info = env.step(actions[2])
+    expected, *_, expected_info = other.step(actions[2])
+    assert reward == rewards[2]
+    np.testing.assert_array_equal(seen, expected)
+    np.testing.assert_array_equal(info["divergence"], expected_info["divergence"])
+
+
+def test_a_motion_that_there_is_not_changes_nothing():
+    env, other = make_env(), make_env()
+    for one in (env, other):
+        one.reset(seed=3)
+    with pytest.raises(InputError, match="49"):
+        env.unwrapped.foresee([3, 49])
+    np.testing.assert_array_equal(env.step(3)[0], other.step(3)[0])
+    with pytest.raises(InputError, match="reset"):
+        make_env().unwrapped.foresee([0])
+
+
+def test_the_best_of_those_tried_is_made_and_preferred():
+    env = make_env(reward="paper")
+    observation, info = env.reset(seed=3)
+    planner = Foresight(env.unwrapped, seed=1, tried=6)
+    action = planner.act(observation, info)
+    preferred = planner.preferences()
+    tried = np.flatnonzero(preferred)
+    assert len(tried) <= 6
+    assert preferred.sum() == pytest.approx(1)
+    rewards = env.unwrapped.foresee(tried)
+    assert action == tried[rewards.argmax()] == preferred.argmax()
+    weights = np.exp((rewards - rewards.max()) / 0.02)
+    np.testing.assert_allclose(preferred[tried], weights / weights.sum())
+    assert env.step(action)[1] == rewards.max()
+
+
+def test_it_is_found_by_its_name_and_refuses_what_it_cannot():
+    env = make_env().unwrapped
+    assert isinstance(make_planner("foresight,tried=3", env), Foresight)
+    for option in ("tried=0", "temperature=0"):
+        with pytest.raises(InputError, match=option.split("=")[0]):
+            make_planner(f"foresight,{option}", env)
