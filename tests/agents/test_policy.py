@@ -161,7 +161,7 @@ def test_the_planner_refuses_what_it_cannot_run(trained, tmp_path, monkeypatch):
 def test_a_planner_is_shown_what_its_policy_was_trained_on(trained, monkeypatch):
     monkeypatch.delenv("MS_SLAM_POLICY", raising=False)
     assert planner_observation(f"policy,path={trained[1]},deterministic=true") == "features"
-    assert RoomAgent.observation_for(deterministic=True) == "goals"
+    assert RoomAgent.observation_for(deterministic=True) == "held"
     assert planner_observation("greedy,recovery=true") == "features"
     with pytest.raises(InputError, match="MS_SLAM_POLICY"):
         planner_observation("policy")
@@ -186,10 +186,10 @@ def test_the_policy_makes_the_environment_that_fits(trained):
 
 def test_observations_of_another_environment_are_refused():
     policy = Policy.load(SHIPPED)
-    with pytest.raises(InputError, match=r"\(287,\).*|observations of shape \(1, 287\).*'goals'"):
+    with pytest.raises(InputError, match=r"\(287,\).*|observations of shape \(1, 287\).*'held'"):
         policy.act(np.zeros(287), np.ones(49, dtype=bool))
     with pytest.raises(InputError, match=r"masks of shape \(1, 7\)"):
-        policy.act(np.zeros(1119), np.ones(7, dtype=bool))
+        policy.act(np.zeros(1315), np.ones(7, dtype=bool))
 
 
 WITHOUT_TRAINERS = """
@@ -210,7 +210,7 @@ def test_running_a_policy_needs_neither_pytorch_nor_a_trainer():
         f"{WITHOUT_TRAINERS}import numpy as np; from ms_slam_agents.policy import Policy;"
         "from ms_slam_env.env.planners import PLANNERS; PLANNERS.find('agent-room');"
         f"policy = Policy.load({str(SHIPPED)!r});"
-        "print(policy.act(np.zeros(1119), np.ones(49, dtype=bool)))"
+        "print(policy.act(np.zeros(1315), np.ones(49, dtype=bool)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -230,7 +230,7 @@ def test_the_example_of_the_documentation_runs(where, monkeypatch):
         source = re.sub(r"^ {8}", "", text[1], flags=re.MULTILINE)
         names = {"Policy": Policy, "np": np}
     exec(source, names)
-    assert names["policy"].metadata.observation == "goals"
+    assert names["policy"].metadata.observation == "held"
     assert 0 <= names["action"] < 49
     assert np.isfinite(names["reward"])
     names["env"].close()
