@@ -284,7 +284,7 @@ def load_run(args: Args) -> tuple[PolicyFile | None, int]:
         return None, 0
     if not path.exists():
         return None, 0  # interrupted in the first round
-    names = {"env_id", "observation", "hidden", "teacher", "episodes", "epochs", "seed"}
+    names = {"env_id", "observation", "hidden", "teacher", "episodes", "epochs", "seed", "reward"}
     file = read_run(args, "imitation", names)
     return file, file.metadata.epochs // args.epochs
 

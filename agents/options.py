@@ -203,7 +203,16 @@ def of_task(cls: type[P], task: str, trainer: str) -> P:
 SECTIONS = ("problem", "sb3", "imitation", "ppo", "qrdqn", "rllib")
 """Of a file of hyperparameters: the problem, and the options of each trainer."""
 
-KEPT = ("algorithm", "env_id", "embodiment", "observation", "step_m", "step_deg", "hidden")
+KEPT = (
+    "algorithm",
+    "env_id",
+    "embodiment",
+    "observation",
+    "step_m",
+    "step_deg",
+    "reward",
+    "hidden",
+)
 """Options that a run keeps when it is resumed: another network, or another problem."""
 
 
@@ -241,14 +250,15 @@ def check_new(out: Path, *names: str) -> None:
 def check_kept(path: Path, saved: Mapping[str, Any], args: Problem, names: Iterable[str]) -> None:
     """Refuse to go on with a run under options that would make it another one.
 
+    What a run of earlier does not say, it had as an option is by default.
+
     Raises:
         InputError: naming the first option that differs, and both values.
     """
     for name in names:
-        if saved.get(name) != getattr(args, name):
-            raise InputError(
-                f"{path} was trained with {name} {saved.get(name)!r}, not {getattr(args, name)!r}"
-            )
+        had, given = saved.get(name, getattr(type(args), name)), getattr(args, name)
+        if had != given:
+            raise InputError(f"{path} was trained with {name} {had!r}, not {given!r}")
 
 
 def check_steps_left(path: Path, done: int, total: int) -> None:

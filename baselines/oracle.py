@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.config import check_choice
 from ms_slam_env.evaluation.map_truth import reference_surface
+from ms_slam_env.mapping.expected_gain import held_ways
 from ms_slam_env.scenes.mesh_queries import RayCaster
 from ms_slam_env.tasks import REFERENCES
 
@@ -75,10 +76,7 @@ class Oracle(HeldNextBestView):
         self._look()
         assert self.left is not None
         motions = self.env.embodiment.candidate_motions()
-        poses = [self.env.episode.frames[-1].T_world_camera @ motions]
-        while len(poses) < self.horizon:
-            poses.append(poses[-1] @ motions)
-        way = np.stack(poses, axis=1)
+        way = held_ways(self.env.episode.frames[-1].T_world_camera, motions, self.horizon)
         fits = self.env.scene.clearance(way[:, :, :3, 3].reshape(-1, 3)) > _CLEARANCE_M
         goes_on = np.logical_and.accumulate(fits.reshape(way.shape[:2]), axis=1)
         seen = self._sees(way.reshape(-1, 4, 4)).reshape(*way.shape[:2], -1) & goes_on[..., None]
@@ -96,7 +94,7 @@ class Oracle(HeldNextBestView):
         start = env.episode.frames[0].T_world_camera[:3, 3]
         every = reference_surface(self.reference, env.scene, start, env.embodiment, env.intrinsics)
         drawn = np.random.default_rng(0).permutation(len(every))[: self.points]
-        self.left, self.total = every[drawn].astype(np.float32), len(drawn)
+        self.left, self.total = every[drawn].astype(np.float32), max(1, len(drawn))
         self.caster = RayCaster(env.scene.mesh.vertices, env.scene.mesh.faces)
 
     def _look(self) -> None:

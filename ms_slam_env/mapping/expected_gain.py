@@ -77,10 +77,7 @@ def held_gain(
         intrinsics: of the camera.
         rays: of a view, across and down.
     """
-    poses = [here @ motions]
-    while len(poses) < steps:
-        poses.append(poses[-1] @ motions)
-    way = np.stack(poses, axis=1)
+    way = held_ways(here, motions, steps)
     directions, solid_angle = spread_rays(intrinsics, rays)
     starts = way[:, :, :3, 3] / grid.cell_m - grid.first
     reach = grid.reach_m / grid.cell_m * np.linalg.norm(directions, axis=1).max()
@@ -101,6 +98,14 @@ def held_gain(
         ]
         wp.launch(sum_unknown_held, len(motions), given, [first_seen, gains])
     return solid_angle * gains.numpy().astype(np.float64)
+
+
+def held_ways(here: Float64, motions: Float64, steps: int) -> Float64:
+    """Poses (n, steps, 4, 4) after each step of motions (n, 4, 4) made again and again."""
+    poses = [here @ motions]
+    while len(poses) < steps:
+        poses.append(poses[-1] @ motions)
+    return np.stack(poses, axis=1)
 
 
 def spread_rays(intrinsics: Intrinsics, rays: tuple[int, int]) -> tuple[NDArray[np.float32], float]:

@@ -11,7 +11,7 @@ MARGIN = wp.constant(0.5)  # cells of depth in front of a surface that are not c
 NEAREST_M = wp.constant(0.3)  # a sensor sees nothing nearer
 GAIN_STEP = wp.constant(0.8)  # cells of depth between the points of a ray: none is stepped over
 SEEN_THROUGH = wp.constant(0.85**0.8)  # chance that a step through unknown cells meets nothing
-BLOCK = wp.constant(2.0)  # cells along an edge: rays a few degrees apart pass most of them
+BLOCK = wp.constant(2.0)  # cells along an edge of what is seen as one
 STILL_BLANK = wp.constant(0.7)  # worth of a cell after one more look without a reading
 DEPTH_NOISE = wp.constant(wp.vec3(0.0012, 0.0019, 0.4))  # m, 1/m, m; see view_information
 
