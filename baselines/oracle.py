@@ -79,7 +79,8 @@ class Oracle(HeldNextBestView):
         way = held_ways(self.env.episode.frames[-1].T_world_camera, motions, self.horizon)
         fits = self.env.scene.clearance(way[:, :, :3, 3].reshape(-1, 3)) > _CLEARANCE_M
         goes_on = np.logical_and.accumulate(fits.reshape(way.shape[:2]), axis=1)
-        seen = self._sees(way.reshape(-1, 4, 4)).reshape(*way.shape[:2], -1) & goes_on[..., None]
+        seen = np.zeros((*way.shape[:2], len(self.left)), dtype=bool)
+        seen[goes_on] = self._sees(way[goes_on])
         by_then = np.logical_or.accumulate(seen, axis=1).sum(axis=2) / self.total
         new = np.diff(by_then, axis=1, prepend=0.0)
         return np.asarray(new @ self.discount ** np.arange(self.horizon))
@@ -109,13 +110,12 @@ class Oracle(HeldNextBestView):
     def _sees(self, poses: Float64) -> Bool:
         """Which points (M, N) cameras at poses (M, 4, 4) see."""
         assert self.left is not None
-        places, which = np.unique(np.round(poses[:, :3, 3], 6), axis=0, return_inverse=True)
-        directions = (self.left - places[:, None].astype(np.float32)).reshape(-1, 3)
-        reached, _ = self.caster.first_hit(
-            np.repeat(places, len(self.left), axis=0), directions.astype(np.float64)
-        )
-        is_open = (reached >= 1 - _SLACK).reshape(len(places), -1)
-        return self._in_view(poses) & is_open[which.ravel()]
+        sees = self._in_view(poses)
+        pose, point = np.nonzero(sees)
+        places = poses[pose, :3, 3]
+        reached, _ = self.caster.first_hit(places, self.left[point] - places)
+        sees[pose, point] = reached >= 1 - _SLACK
+        return sees
 
     def _in_view(self, poses: Float64) -> Bool:
         """Which points (M, N) lie in the image of cameras at poses (M, 4, 4)."""
