@@ -23,6 +23,7 @@ Float64 = NDArray[np.float64]
 
 ARRIVED = 3  # steps from a goal
 KEPT_AWAY = 0.7  # steps from where tracking was lost
+_SAME = 0.5  # steps within which a pose is one where the camera has been
 _LOOKAHEAD = 6  # positions of a way that are looked ahead
 _RANGES = {
     **{"goals": (3, 10_000), "radius_m": (0.1, 100), "cost": (0, 100)},
@@ -98,11 +99,15 @@ class GoalPlanner(Planner):
         """How many since the last one reached."""
         self.begun = 0.0
         """Motions to the goal when it was chosen, or last looked at."""
+        self.passed: list[Float64] = []
+        """Poses (4, 4) where motions were chosen for what they show near by."""
+        self.leaves = False
+        """Whether it goes to a goal since such motions led back to where it had been."""
 
     def lost_by(self, action: int) -> None:
         """Keep away from where the last motion should have led."""
         self.lost_at = np.concatenate([self.lost_at, self.heading_to[None]])
-        self.goal = None
+        self.goal, self.passed = None, []
 
     def act(self, observation: Any, info: dict[str, Any]) -> int:
         """Carve the last frame, choose a motion."""
@@ -124,6 +129,22 @@ class GoalPlanner(Planner):
             self.find_goal(here)
         self.age += 1
         return self.motion_towards(self.next_on_way(here))
+
+    def must_leave(self, here: Float64) -> bool:
+        """Whether to go to a goal, whatever there is to be seen near by.
+
+        What is best near by may be out of reach for SLAM or for the camera, and the next best lead
+        there and back for ever. Once the camera is where it has been it goes to a goal first.
+        """
+        if self.leaves and self.goal is not None:
+            self.judge_goal(here)
+        self.leaves = self.leaves and self.goal is not None
+        if self.goal is None:
+            passed = np.reshape(self.passed, (-1, 4, 4))
+            away = distance_in_steps(passed, here, *self.steps).max(axis=1)
+            self.leaves = bool((away < _SAME).any())
+            self.passed = [] if self.leaves else [*self.passed, here.copy()]
+        return self.leaves
 
     def find_goal(self, here: Float64) -> None:
         """Take a goal near by, or a far one where that would gain too little, and the way there."""

@@ -66,7 +66,7 @@ class HeldNextBestView(NextBestView):
         """The admissible motion that is worth most while it is held, or the one towards a goal."""
         self.weights = None
         values = self.values(here)
-        if values.max() >= self.least_m3:
+        if not self.must_leave(here) and values.max() >= self.least_m3:
             best = self.best_admissible(self.env.candidate_poses(), values)
             values = np.where(self.can, values, 0)
             if self.slip_cost:

@@ -50,7 +50,8 @@ class RecedingNextBestView(NextBestView):
     def find_goal(self, here: Float64) -> None:
         """Take the best goal near by, straight ahead, or what `nbv` takes."""
         best = best_goal(self.map.grid, here, self.env.intrinsics, self.steps)
-        self.is_near = bool(self.gain_of(best[None])[0] >= self.enough_m3)
+        is_enough = bool(self.gain_of(best[None])[0] >= self.enough_m3)
+        self.is_near = not self.must_leave(here) and is_enough
         if self.is_near:
             self.goal, self.way, self.age = best, best[None, :3, 3], 0
         else:

@@ -59,6 +59,25 @@ def mark_rays(
         z += CARVING_STEP * cell_m
 
 
+@wp.func
+def _value(cells: wp.array3d(dtype=wp.int8), cell: wp.vec3i):
+    """Of a cell; 0 beyond the grid."""
+    value = wp.int32(0)
+    if cell[0] >= 0:
+        value = wp.int32(cells[cell[0], cell[1], cell[2]])
+    return value
+
+
+@wp.func
+def _still_blank(blanks: wp.array3d(dtype=wp.int8), cell: wp.vec3i):
+    """Share of an unknown cell that still counts after the frames that found nothing there."""
+    share = wp.float32(1.0)
+    looks = _value(blanks, cell)
+    if looks > 0:
+        share = wp.pow(STILL_BLANK, float(looks))
+    return share
+
+
 @wp.kernel
 def sum_unknown(
     directions: wp.array(dtype=wp.vec3),  # in the camera frame, z = 1 m
@@ -84,19 +103,12 @@ def sum_unknown(
     z = wp.float32(NEAREST_M)
     while z < reach_m:
         cell = _cell(starts[pose] + z * direction, shape)
-        state = wp.int32(0)
-        if cell[0] >= 0:
-            state = wp.int32(log_odds[cell[0], cell[1], cell[2]])
+        state = _value(log_odds, cell)
         if state > 0:
             depths[pose, ray] = z
             break
         if state == 0:
-            worth = chance * z * z * dz
-            if cell[0] >= 0:
-                looks = wp.int32(blanks[cell[0], cell[1], cell[2]])
-                if looks > 0:
-                    worth *= wp.pow(STILL_BLANK, float(looks))
-            gain += worth
+            gain += chance * z * z * dz * _still_blank(blanks, cell)
             chance *= SEEN_THROUGH
         z += dz
     gains[pose, ray] = gain
@@ -135,9 +147,7 @@ def sum_unknown_held(
             while z < reach_m:
                 at = starts[motion, step] + z * direction
                 cell = _cell(at, shape)
-                state = wp.int32(0)
-                if cell[0] >= 0:
-                    state = wp.int32(log_odds[cell[0], cell[1], cell[2]])
+                state = _value(log_odds, cell)
                 if state > 0:
                     break
                 if state == 0:
@@ -149,12 +159,7 @@ def sum_unknown_held(
                             seen = step + 1
                             first_seen[motion, block[0], block[1], block[2]] = wp.int8(seen)
                     if seen == step + 1:
-                        worth = chance * z * z * dz
-                        if cell[0] >= 0:
-                            looks = wp.int32(blanks[cell[0], cell[1], cell[2]])
-                            if looks > 0:
-                                worth *= wp.pow(STILL_BLANK, float(looks))
-                        gain += worth
+                        gain += chance * z * z * dz * _still_blank(blanks, cell)
                     chance *= SEEN_THROUGH
                 z += dz
         gains[motion, step] = gain

@@ -90,3 +90,26 @@ def test_it_is_found_by_its_name_says_what_it_prefers_and_refuses_what_it_cannot
     for option in ("horizon=0", "discount=1.5", "least_m3=-1", "slip_cost=.nan"):
         with pytest.raises(InputError, match=option.split("=")[0]):
             make_planner(f"held-nbv,{option}", env.unwrapped)
+
+
+def test_where_held_motions_lead_back_it_goes_to_a_goal_until_it_is_reached():
+    env = make_env()
+    observation, info = env.reset(seed=0)
+    planner = HeldNextBestView(env.unwrapped, seed=1)
+    planner.reset()
+    planner.act(observation, info)
+    here = env.unwrapped.episode.T_world_camera_estimate.copy()
+    elsewhere, near_here = here.copy(), here.copy()
+    elsewhere[0, 3] += planner.steps[0]
+    near_here[0, 3] += 0.4 * planner.steps[0]
+    assert [len(planner.passed), planner.leaves] == [1, False]
+    assert not planner.must_leave(elsewhere)
+    assert len(planner.passed) == 2
+    assert planner.must_leave(near_here)
+    assert planner.passed == []
+    planner.find_goal(near_here)
+    goal = planner.goal
+    assert planner.must_leave(near_here)
+    assert planner.goal is goal
+    assert not planner.must_leave(goal)
+    assert planner.goal is None
