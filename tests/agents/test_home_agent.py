@@ -1,7 +1,6 @@
 """The policy near by, goals beyond: which of the two chooses each motion."""
 
 import gymnasium as gym
-import numpy as np
 import pytest
 from ms_slam_agents.home_agent import HomeAgent
 from ms_slam_agents.policy_planner import RoomAgent
