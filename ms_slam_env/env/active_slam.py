@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
@@ -274,11 +273,9 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
 
     def _predicted(self) -> PredictedViews:
         """What the map predicts of here and of the candidates, in units of (M_I, M_D)."""
-        here = self.episode.T_world_camera_estimate
-        found = self._glance.from_here(self.slam, self.candidate_poses(), here)
-        scaled = found.divergences / self.config.targets.maxima
-        frames = self.config.frames_per_action
-        return dataclasses.replace(found, divergences=scaled, frames=frames)
+        here, config = self.episode.T_world_camera_estimate, self.config
+        poses, frames = self.candidate_poses(), config.frames_per_action
+        return self._glance.from_here(self.slam, poses, here, config.targets, frames)
 
     def _lost_share(self) -> float:
         """How much of the patience with a lost camera is used up; 1 or more ends the episode."""

@@ -86,6 +86,10 @@ class TargetConfig(Checked):
         """The divergences to aim at, (rho_I M_I, rho_D M_D)."""
         return np.array([self.rho_I * self.M_I, self.rho_D * self.M_D])
 
+    def distances(self, divergences: NDArray[np.float64]) -> NDArray[np.float64]:
+        """How far divergences (..., 2), nats, are from those to aim at, in units of (M_I, M_D)."""
+        return np.abs(divergences - self.divergence) / self.maxima
+
 
 @dataclass(frozen=True)
 class RewardConfig(Checked, Named):

@@ -234,7 +234,7 @@ class HeldObservation(GoalsObservation):
 
 
 class CandidatesObservation(Observation):
-    """A state of 37 numbers, then 17 for each of the n motions, candidate by candidate: float32.
+    """A state of 37 numbers, then 18 for each of the n motions, candidate by candidate: float32.
 
     The state: the state vector (28), the largest expected gain of a motion, m3, and the best goal
     (`mapping.view_goals.best_goal`): where it is in the camera's frame, in units of 5 m (3), where

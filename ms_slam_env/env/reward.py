@@ -57,8 +57,7 @@ def reward_terms(
         value = weights(outcome)
         terms = value if isinstance(value, Mapping) else {"reward": value}
         return {name: float(term) for name, term in terms.items()}
-    distance = np.abs(outcome.divergence - targets.divergence) / targets.maxima
-    intensity, depth = np.minimum(distance, _DISTANCE_CAP)
+    intensity, depth = np.minimum(targets.distances(outcome.divergence), _DISTANCE_CAP)
     growth = float(np.clip(outcome.pose_error_growth_m, -_ERROR_CAP_M, _ERROR_CAP_M))
     terms = {
         "intensity_divergence": -weights.intensity_divergence * float(intensity),

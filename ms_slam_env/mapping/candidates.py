@@ -25,22 +25,24 @@ from ms_slam_env.slam.base import Views
 Float64 = NDArray[np.float64]
 
 NAMES: tuple[str, ...] = (
-    *("permitted", "intensity_divergence", "depth_divergence", "overlap", "near"),
+    *("permitted", "intensity_divergence", "depth_divergence", "criterion", "overlap", "near"),
     *("d_optimality", "weakest", "slip_risk", "gain", "goal_translation", "goal_rotation"),
     *("step_x", "step_y", "step_z", "turn_x", "turn_y", "turn_z"),
 )
 """What the numbers of a candidate are, in order.
 
 Whether it is possible; the divergences of its view as the map predicts it from that of here, in
-units of M_I and M_D; the share of the view that the map fills, and the share nearer than 0.5 m; of
-the view's information H (`view_information`) log(1 + det(H)^(1/6)) and log(1 + its least
-eigenvalue), each a pixel, in 1/m^2; the probability that SLAM slips, a frame (`trackability`); the
-expected gain relative to the largest; by how many steps it leads nearer to the goal, in translation
-and in rotation; the motion itself, along and about the camera's axes, in steps.
+units of M_I and M_D, and how far they are from the targets (line 9 of Algorithm 1, in these units);
+the share of the view that the map fills, and the share nearer than 0.5 m; of the view's information
+H (`view_information`) log(1 + det(H)^(1/6)) and log(1 + its least eigenvalue), each a pixel, in
+1/m^2; the probability that SLAM slips, a frame (`trackability`); the expected gain relative to the
+largest; by how many steps it leads nearer to the goal, in translation and in rotation; the motion
+itself, along and about the camera's axes, in steps.
 """
 
 _GAIN_RAYS = (8, 6)
-_CAPS = {"intensity_divergence": 5, "depth_divergence": 5, "d_optimality": 20, "weakest": 20}
+_CAPS = dict.fromkeys(("intensity_divergence", "depth_divergence", "criterion"), 5)
+_CAPS |= {"d_optimality": 20, "weakest": 20}
 _BOTH_WAYS = {"goal_translation": 3, "goal_rotation": 3}
 _BOTH_WAYS |= {f"{kind}_{axis}": 2 for kind in ("step", "turn") for axis in "xyz"}
 HIGHS = np.array([_BOTH_WAYS.get(name, _CAPS.get(name, 1)) for name in NAMES], dtype=np.float32)
@@ -73,13 +75,15 @@ class PredictedViews:
         poses: (1 + n, 4, 4) T_world_camera.
         views: 1 + n.
         divergences: (n, 2) of the motions' views from that of here, in units of (M_I, M_D).
+        criterion: (n,) distance to the divergences to aim at in these units, depth times lambda.
         frames: taken on a motion.
     """
 
     poses: Float64
     views: Views
     divergences: Float64
-    frames: int = 1
+    criterion: Float64
+    frames: int
 
 
 def candidate_numbers(
@@ -111,6 +115,7 @@ def candidate_numbers(
         [
             permitted,
             predicted.divergences,
+            predicted.criterion,
             (views.depth > 0).mean(axis=(1, 2))[1:],
             ((views.depth > 0) & (views.depth < NEAR_M)).mean(axis=(1, 2))[1:],
             np.log1p(d_optimality)[1:],

@@ -1,11 +1,13 @@
 """The observation `candidates`: number by number what the planners themselves look at."""
 
+import dataclasses
 import math
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from ms_slam_baselines.belief import d_optimality
+from ms_slam_baselines.greedy import distance_to_targets
 from ms_slam_baselines.greedy_limited import _EMPTY_NATS, GreedyLimited
 
 import ms_slam_env  # noqa: F401 -- registers the environments
@@ -60,6 +62,10 @@ def test_divergences_are_those_of_the_greedy_planner(moment, seen):
         shown, np.clip(expected / world.config.targets.maxima, 0, 5), rtol=1e-5, atol=1e-6
     )
     assert np.ptp(shown, axis=0).min() > 0.1
+    targets = world.config.targets
+    unit = dataclasses.replace(targets, M_I=1, M_D=1)  # whose nats are units of M
+    far = [distance_to_targets(*row, unit) for row in expected / targets.maxima]
+    np.testing.assert_allclose(numbers["criterion"], np.clip(far, 0, 5), rtol=1e-5, atol=1e-6)
 
 
 def test_overlap_nearness_information_and_risk_are_those_of_the_other_planners(moment, seen):
