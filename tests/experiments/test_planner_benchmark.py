@@ -130,6 +130,17 @@ def test_every_planner_is_compared_with_every_other() -> None:
     assert lines[1]["greedy"].value == 0.0
 
 
+def test_planners_are_compared_by_what_the_reward_says_too() -> None:
+    pytest.importorskip("rliable")
+    rows = rows_of(CONFIG)
+    for row in rows:
+        row["result"]["return"] = -row["result"]["f_score_5cm"]
+    tables = {table.title: table for table in CONFIG.tables(rows)}
+    lines: Any = tables["Better rewarded than each other"].rows
+    assert [line["planner"] for line in lines] == ["random", "greedy"]
+    assert lines[0]["greedy"].value == 1.0
+
+
 def test_a_task_says_what_is_not_given() -> None:
     arm = PlannerBenchmark(task="arm", planners=("random",)).specs()
     assert {spec.env_id for spec in arm} == {"MSActiveSLAM-v0"}

@@ -82,6 +82,7 @@ def across_scenes(rows: Sequence[Row], title: str = "") -> list[Table]:
 COMPARED = {
     RANKED_BY: ("Better than each other", "better F-score"),
     "f_score_5cm_area": ("Sooner than each other", "larger area under F-score over steps"),
+    "return": ("Better rewarded than each other", "larger return"),
 }
 """Metrics by which planners are compared two by two; the title of the table, what it is about."""
 
