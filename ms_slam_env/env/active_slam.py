@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ms_slam_env import slam as slam_backends
 from ms_slam_env.env.actions import ActionDecoder, MotionActions, MotionAndConfigurationActions
 from ms_slam_env.env.camera_feed import CameraFeed, make_camera_feed
-from ms_slam_env.env.config import LookaheadConfig, check_reset, make_config
+from ms_slam_env.env.config import check_reset, make_config
 from ms_slam_env.env.coverage import CoverageGrid
 from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.env.episode import Episode
@@ -152,8 +152,6 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         embodiment_type.check(config)
         self.simulation = Simulation(config, embodiment_type, self.slam, self.timings)
         self._lookahead = Lookahead(config.lookahead, config.divergence, self.intrinsics)
-        glance = LookaheadConfig("predicted", SCALE)
-        self._glance = Lookahead(glance, config.divergence, self.intrinsics)
 
         num_motions = embodiment_type.num_motions
         self._actions: ActionDecoder = MotionActions(num_motions)
@@ -273,9 +271,16 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
 
     def _predicted(self) -> PredictedViews:
         """What the map predicts of here and of the candidates, in units of (M_I, M_D)."""
-        here, config = self.episode.T_world_camera_estimate, self.config
-        poses, frames = self.candidate_poses(), config.frames_per_action
-        return self._glance.from_here(self.slam, poses, here, config.targets, frames)
+        targets, poses = self.config.targets, self.candidate_poses()
+        seen_from = np.concatenate([self.episode.T_world_camera_estimate[None], poses])
+        divergences = self.lookahead()
+        return PredictedViews(
+            poses=seen_from,
+            views=self.slam.predict(seen_from, SCALE),
+            divergences=divergences / targets.maxima,
+            criterion=targets.distances(divergences) @ (1.0, targets.depth_weight),
+            frames=self.config.frames_per_action,
+        )
 
     def _lost_share(self) -> float:
         """How much of the patience with a lost camera is used up; 1 or more ends the episode."""

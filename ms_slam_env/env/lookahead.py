@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.divergence import DivergenceConfig, Histograms, make_divergence
-from ms_slam_env.env.config import LookaheadConfig, TargetConfig
-from ms_slam_env.mapping.candidates import PredictedViews
+from ms_slam_env.env.config import LookaheadConfig
 from ms_slam_env.slam.base import SlamBackend, Views
 
 Float64 = NDArray[np.float64]
@@ -48,25 +47,6 @@ class Lookahead:
         views = self.predict(slam, poses)
         histograms = self.measure.histograms(views.intensity, views.depth)
         return self.measure.divergence(histograms, self._live_histograms(live))
-
-    def from_here(
-        self, slam: SlamBackend, poses: Float64, here: Float64, targets: TargetConfig, frames: int
-    ) -> PredictedViews:
-        """What the map predicts of the present pose (4, 4) and of candidates (n, 4, 4).
-
-        Args:
-            slam: that has the map.
-            poses: of the candidates.
-            here: of the camera.
-            targets: by which divergences are measured.
-            frames: taken on a motion.
-        """
-        seen_from = np.concatenate([here[None], poses])
-        views = self.predict(slam, seen_from)
-        histograms = self.measure.histograms(views.intensity, views.depth, views.normals)
-        divergences = self.measure.divergence(histograms, histograms[0])[1:]
-        criterion = targets.distances(divergences) @ (1.0, targets.depth_weight)
-        return PredictedViews(seen_from, views, divergences / targets.maxima, criterion, frames)
 
     def _live_histograms(self, live: RGBDFrame) -> Histograms:
         size = (self.intrinsics.width, self.intrinsics.height)
