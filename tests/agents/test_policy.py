@@ -85,8 +85,10 @@ def test_numpy_agrees_with_stable_baselines3(trained):
     assert np.ptp(expected, axis=0).max() > 0.05  # not just uniform
 
 
-def test_the_shipped_policy_agrees_with_pytorch():
-    file, policy = read_policy(SHIPPED), Policy.load(SHIPPED)
+@pytest.mark.parametrize("name", ["room", "paper"])
+def test_a_shipped_policy_agrees_with_pytorch(name):
+    path = SHIPPED.with_stem(name)
+    file, policy = read_policy(path), Policy.load(path)
     known, rng = policy.metadata, np.random.default_rng(1)
     moments = file.part("observation")
     observations = rng.normal(moments["mean"], np.sqrt(moments["var"]), (500, known.inputs))
@@ -162,6 +164,7 @@ def test_a_planner_is_shown_what_its_policy_was_trained_on(trained, monkeypatch)
     monkeypatch.delenv("MS_SLAM_POLICY", raising=False)
     assert planner_observation(f"policy,path={trained[1]},deterministic=true") == "features"
     assert RoomAgent.observation_for(deterministic=True) == "held"
+    assert planner_observation("agent-paper") == "candidates"
     assert planner_observation("greedy,recovery=true") == "features"
     with pytest.raises(InputError, match="MS_SLAM_POLICY"):
         planner_observation("policy")
