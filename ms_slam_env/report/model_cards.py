@@ -32,6 +32,7 @@ _ACROSS = "over all scenes"
 _VERDICTS = (
     ("Better than each other", "f_score_5cm", "F-score"),
     ("Sooner than each other", "f_score_5cm_area", "area under F-score over steps"),
+    ("Better rewarded than each other", "return", "return"),
 )
 """A table of probabilities, by what the best classical planner is chosen, and what it is."""
 _NO_RIVALS = (
@@ -239,7 +240,8 @@ def _score_text(score: _Score, policy: Policy) -> Iterator[str]:
 
 def _task(one: FoundResult, table: Table) -> str:
     title, _, _ = table.title.partition(":")
-    return title if table.title else str(_config(one).get("task", one.title))
+    changed = "".join(f", {option}" for option in _config(one).get("options") or ())
+    return (title if table.title else str(_config(one).get("task", one.title))) + changed
 
 
 def _chance(one: FoundResult, policy: Policy, title: str, best: Any) -> Interval | None:

@@ -18,7 +18,13 @@ OPTIONS = {"out": "runs/a", "seed": 3, "scenes": ["table"], "scene_seeds": 2, "e
 SCENES = ("table", "wall")
 
 
-def scores(folder: Path, chance: Interval, planner: str = "agent-hand", episodes: int = 10) -> None:
+def scores(
+    folder: Path,
+    chance: Interval,
+    planner: str = "agent-hand",
+    episodes: int = 10,
+    options: tuple[str, ...] = (),
+) -> None:
     """A planner benchmark in which ``planner`` is that much better than ``nbv``."""
     names = ("nbv", planner, "random")
     areas = {"nbv": 0.3, planner: 0.5, "random": 0.4}
@@ -59,7 +65,7 @@ def scores(folder: Path, chance: Interval, planner: str = "agent-hand", episodes
             sooner,
         ],
         rows=rows,
-        content={"config": {"task": "kitchen", "seeds": "test"}},
+        content={"config": {"task": "kitchen", "seeds": "test", "options": options}},
     )
 
 
@@ -142,6 +148,14 @@ def test_of_two_benchmarks_of_a_task_the_one_with_more_episodes_counts(clone: Pa
     text = card(clone)
     assert text.count("### In `kitchen`") == 1
     assert "80 [60, 90] % of pairs" in text
+
+
+def test_a_task_with_other_options_is_another(clone: Path) -> None:
+    scores(clone / "docs/results/usual", Interval(0.1, 0.02, 0.3))
+    scores(clone / "docs/results/paper", Interval(0.8, 0.6, 0.9), options=("reward=paper",))
+    text = card(clone)
+    assert "### In `kitchen`\n" in text
+    assert "### In `kitchen, reward=paper`\n" in text
 
 
 def test_training_seeds_are_counted(clone: Path) -> None:
