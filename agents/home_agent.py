@@ -59,4 +59,4 @@ class HomeAgent(NextBestView):
             if is_safe and self.gain_of(best[None])[0] >= self.enough_m3:
                 self.given_up = 0
                 return self.wanted
-        return super().choose_motion(here)
+        return self.go_to_goal(here)

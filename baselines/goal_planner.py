@@ -125,6 +125,10 @@ class GoalPlanner(Planner):
         """The motion to make next from a pose (4, 4): towards the goal, which is kept or drawn."""
         if self.goal is not None:
             self.judge_goal(here)
+        return self.go_to_goal(here)
+
+    def go_to_goal(self, here: Float64) -> int:
+        """The motion towards the goal, or towards one that is drawn now if there is none."""
         if self.goal is None:
             self.find_goal(here)
         self.age += 1
