@@ -5,15 +5,19 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from ms_slam_baselines.greedy import distance_to_targets
 from numpy.typing import NDArray
 
 from ms_slam_env.config import check_range
 from ms_slam_env.env import Planner
+from ms_slam_env.errors import unknown
 
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv
 
 Float64 = NDArray[np.float64]
+
+ORDERS = ("random", "greedy")
 
 
 class Foresight(Planner):
@@ -25,29 +29,58 @@ class Foresight(Planner):
     Args:
         env: the unwrapped environment.
         seed: of the motions drawn.
-        tried: how many of the possible motions are tried, drawn anew for each decision.
+        tried: how many of the possible motions are tried.
+        order: which: ``random`` draws anew for each decision, ``greedy`` takes those whose
+            predicted divergences are nearest to the targets.
+        noise: by how much the term ``trajectory_error`` counts as nearer to zero than it is: in
+            an episode its sum is the error at the end, so that what is small at one step the next
+            ones take back, and what is large is a slip.
         temperature: reward that a motion may lack to be 1/e as good a choice as the best.
 
     Raises:
-        InputError: an option out of its range.
+        InputError: an option out of its range, or an order that there is not.
     """
 
     def __init__(
-        self, env: ActiveSlamEnv, seed: int = 0, tried: int = 49, temperature: float = 0.02
+        self,
+        env: ActiveSlamEnv,
+        seed: int = 0,
+        tried: int = 49,
+        order: str = "random",
+        noise: float = 0.0,
+        temperature: float = 0.02,
     ) -> None:
         super().__init__(env, seed)
-        self.tried, self.temperature = tried, temperature
+        self.tried, self.order = tried, order
+        self.noise, self.temperature = noise, temperature
         check_range(self, "tried", 1, 1000)
+        check_range(self, "noise", 0, 1000)
         check_range(self, "temperature", 1e-6, 1000)
+        if order not in ORDERS:
+            raise unknown("order of foresight", order, ORDERS)
         self.weights: Float64 | None = None
 
     def act(self, observation: Any, info: dict[str, Any]) -> int:
         """Try some motions, take the best of them."""
-        possible = self.rng.permutation(np.flatnonzero(self.env.action_masks()))[: self.tried]
-        rewards = self.env.foresee(possible)
+        possible = self._first(np.flatnonzero(self.env.action_masks()))
+        rewards = np.array([self._worth(terms) for terms in self.env.foresee_terms(possible)])
         self.weights = np.zeros(len(self.env.action_masks()))
         self.weights[possible] = np.exp((rewards - rewards.max()) / self.temperature)
         return int(possible[np.argmax(rewards)])
+
+    def _first(self, possible: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Those of the possible motions that are tried."""
+        if self.order == "greedy":
+            predicted = self.env.lookahead()[possible].T
+            order = np.argsort(distance_to_targets(*predicted, self.env.config.targets))
+        else:
+            order = self.rng.permutation(len(possible))
+        return possible[order[: self.tried]]
+
+    def _worth(self, terms: dict[str, float]) -> float:
+        """The sum of the terms, without what is noise of one of them."""
+        growth = terms.get("trajectory_error", 0.0)  # a reward of the user's own may have none
+        return sum(terms.values()) - float(np.clip(growth, -self.noise, self.noise))
 
     def preferences(self) -> Float64 | None:
         """Probabilities (n,) of the motions, by their rewards; none of those not tried."""

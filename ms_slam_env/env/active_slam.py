@@ -383,20 +383,29 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
     def foresee(self, actions: Iterable[Any]) -> Float64:
         """Rewards (k,) that each of some actions would bring now; nothing has changed after it.
 
-        Each is made and taken back, in the order given: what a simulator can tell and a robot
-        cannot. Of use to tree search and to teachers, and some 15 ms an action.
+        Raises:
+            InputError: no action of the action space, or no reset before.
+        """
+        return np.array([sum(terms.values()) for terms in self.foresee_terms(actions)])
+
+    def foresee_terms(self, actions: Iterable[Any]) -> list[dict[str, float]]:
+        """The terms of those rewards, name to weighted value, as ``info["reward_terms"]``.
+
+        Each action is made and taken back, in the order given: what a simulator can tell and a
+        robot cannot. Of use to tree search and to teachers, and some 15 ms an action.
 
         Raises:
             InputError: no action of the action space, or no reset before.
         """
         state = self.save_state()
-        rewards = []
+        foreseen = []
         for action in actions:
             try:
-                rewards.append(self._advance(action)[0])
+                self._advance(action)
+                foreseen.append(dict(self.episode.reward_terms))
             finally:
                 load_state(self.simulation, state, self._settings(), self.np_random)
-        return np.array(rewards)
+        return foreseen
 
     def perturb(self, *perturbations: Perturbation) -> None:
         """Put perturbations on the camera, after those that it has; from the next reset on.

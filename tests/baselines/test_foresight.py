@@ -4,10 +4,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from ms_slam_baselines.foresight import Foresight
+from ms_slam_baselines.greedy import GreedyDivergence, distance_to_targets
 
 import ms_slam_env  # noqa: F401 -- registers the environments
+from ms_slam_env.env.config import TargetConfig
 from ms_slam_env.env.planners import make_planner
 from ms_slam_env.errors import InputError
+
+TARGETS = TargetConfig()
 
 
 def make_env(env_id="MSActiveSLAM-FreeCamera-v0", **options):
@@ -39,6 +43,8 @@ def test_what_is_foreseen_is_what_comes_and_nothing_has_changed(env_id, options)
     rewards = env.unwrapped.foresee(actions)
     np.testing.assert_array_equal(env.unwrapped.foresee(actions[::-1]), rewards[::-1])
     assert len(set(rewards)) > 1
+    terms = env.unwrapped.foresee_terms(actions)
+    assert [sum(t.values()) for t in terms] == list(rewards)
     seen, reward, *_, info = env.step(actions[2])
     expected, *_, expected_info = other.step(actions[2])
     assert reward == rewards[2]
@@ -73,9 +79,39 @@ def test_the_best_of_those_tried_is_made_and_preferred():
     assert env.step(action)[1] == rewards.max()
 
 
+def test_in_greedys_order_those_are_tried_that_greedy_ranks_first():
+    env = make_env(reward="paper")
+    observation, info = env.reset(seed=3)
+    greedy = GreedyDivergence(env.unwrapped)
+    possible = np.flatnonzero(info["action_mask"])
+    ranked = possible[np.argsort(distance_to_targets(*greedy.predicted()[possible].T, TARGETS))]
+    for tried in (1, 5):
+        planner = Foresight(env.unwrapped, tried=tried, order="greedy", temperature=10)
+        action = planner.act(observation, info)
+        assert set(np.flatnonzero(planner.preferences())) == set(ranked[:tried])
+        assert tried > 1 or action == greedy.act(observation, info)
+
+
+def test_only_an_error_that_is_no_noise_counts(monkeypatch):
+    env = make_env(reward="paper")
+    observation, info = env.reset(seed=3)
+    terms = [
+        {"depth_divergence": -0.02, "trajectory_error": 0.01},
+        {"depth_divergence": -0.01, "trajectory_error": -0.03},
+        {"depth_divergence": 0.0, "trajectory_error": -0.5},
+    ]
+    monkeypatch.setattr(env.unwrapped, "foresee_terms", lambda actions: terms)
+    best = {}
+    for noise in (0.0, 0.03, 1.0):
+        planner = Foresight(env.unwrapped, tried=3, order="greedy", noise=noise)
+        tried = planner._first(np.flatnonzero(info["action_mask"]))
+        best[noise] = list(tried).index(planner.act(observation, info))
+    assert best == {0.0: 0, 0.03: 1, 1.0: 2}
+
+
 def test_it_is_found_by_its_name_and_refuses_what_it_cannot():
     env = make_env().unwrapped
     assert isinstance(make_planner("foresight,tried=3", env), Foresight)
-    for option in ("tried=0", "temperature=0"):
+    for option in ("tried=0", "temperature=0", "noise=-1", "order=greediest"):
         with pytest.raises(InputError, match=option.split("=")[0]):
             make_planner(f"foresight,{option}", env)
