@@ -64,6 +64,7 @@ class Args(Problem):
         value_weight: of the error of the value in the loss.
         gamma: discount factor of the returns.
         hidden: width of the two hidden layers.
+        dropout: share of what the layers see that is zero, drawn anew for each gradient step.
     """
 
     out: Path = Path("runs/imitation")
@@ -77,6 +78,7 @@ class Args(Problem):
     value_weight: float = bounded(0.1, 0, 1000)
     gamma: float = bounded(0.98, 0, 1)
     hidden: int = bounded(256, 1, 4096)
+    dropout: float = bounded(0.0, 0, 0.99)
 
 
 # -- Episodes ----------------------------------------------------------------------------------
@@ -179,7 +181,9 @@ class Student:
             self.returns = Moments.of(sums)
         torch.manual_seed(args.seed)
         width, actions = args.hidden, self.actions
-        self.network = Network(self.inputs, width, actions, 0, args.candidates)
+        self.network = Network(
+            self.inputs, width, actions, candidates=args.candidates, dropout=args.dropout
+        )
         self.epochs = file.metadata.epochs if file else 0
         if file:
             load_parameters(self.network, file)

@@ -19,6 +19,7 @@ class Network(nn.Module):
     each action's, the layers see the state and the mean and the largest of what it makes of them,
     and one score is given for each: in another order the actions have the same probabilities.
     With ``quantiles`` there is no value: each action has so many quantiles of the return.
+    While it trains, a share ``dropout`` of what the layers see is zero, drawn anew each time.
 
     The names of the parameters are Stable-Baselines3's, ``memory.*``, ``encoder.*``, ``score.*``.
     """
@@ -31,6 +32,7 @@ class Network(nn.Module):
         memory: int = 0,
         candidates: int = 0,
         quantiles: int = 0,
+        dropout: float = 0.0,
     ) -> None:
         super().__init__()
         self.width, self.actions = memory, actions
@@ -38,6 +40,7 @@ class Network(nn.Module):
         encoded = encoded_width(hidden)
         seen = self.num_state + 2 * encoded if candidates else inputs
         heads = (1 if candidates else actions) * (quantiles or 1)
+        self.dropout = nn.Dropout(dropout)
         self.memory = nn.GRUCell(seen, memory) if memory else None
         self.encoder = _layers(candidates, encoded, encoded) if candidates else None
         names = ("policy_net",) if quantiles else ("policy_net", "value_net")
@@ -76,10 +79,10 @@ class Network(nn.Module):
     def _look(self, seen: Tensor) -> tuple[Tensor, Tensor | None]:
         """What the layers see (B, k), and the candidates (B, n, E) as encoded, if there are any."""
         if self.encoder is None:
-            return seen, None
+            return self.dropout(seen), None
         encoded = self.encoder(seen[:, self.num_state :].unflatten(1, (self.actions, -1)))
         parts = [seen[:, : self.num_state], encoded.mean(dim=1), encoded.amax(dim=1)]
-        return torch.cat(parts, dim=1), encoded
+        return self.dropout(torch.cat(parts, dim=1)), encoded
 
     def _score(self, x: Tensor, encoded: Tensor | None) -> Tensor:
         """What the last layer says, of all actions (B, n Q) or of each candidate (B, n, Q)."""

@@ -66,6 +66,24 @@ def file_of(network, memory=0):
     return PolicyFile(metadata, tensors)
 
 
+@pytest.mark.parametrize("numbers", [NUMBERS, 0])
+def test_what_is_dropped_is_dropped_while_it_trains_alone(numbers):
+    torch.manual_seed(0)
+    network = Network(INPUTS, 16, ACTIONS, candidates=numbers, dropout=0.5)
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, 0, 0.5)
+    seen, memory = (1 + torch.rand(INPUTS)).expand(200, -1), torch.zeros(200, 0)
+    can = torch.ones(200, ACTIONS, dtype=torch.bool)
+    trained, _ = network(seen, memory, can)
+    layers, _ = network._look(seen)
+    known, _ = network.eval()._look(seen)
+    dropped = layers == 0
+    assert dropped.double().mean() == pytest.approx(0.5, abs=0.05)
+    torch.testing.assert_close(layers[~dropped], 2 * known[~dropped])
+    assert len(trained.unique(dim=0)) > 100
+    assert len(network(seen, memory, can)[0].unique(dim=0)) == 1
+
+
 @pytest.mark.parametrize("memory", [0, 8])
 def test_the_policy_in_numpy_is_the_network_and_is_read_back(memory, tmp_path):
     network = make_network(memory)

@@ -117,10 +117,11 @@ def test_the_policy_weighs_actions_as_its_teacher(tmp_path):
     np.testing.assert_allclose(np.diag(found), 0.75, atol=0.15)
 
 
-def test_a_run_that_goes_on_is_the_run_that_never_stopped(tmp_path):
-    imitation.main(arguments(tmp_path / "whole"))
-    imitation.main(arguments(tmp_path / "parts", rounds=1))
-    assert imitation.main(arguments(tmp_path / "parts", "--resume")) == 0
+@pytest.mark.parametrize("dropout", ["0", "0.3"])
+def test_a_run_that_goes_on_is_the_run_that_never_stopped(tmp_path, dropout):
+    imitation.main(arguments(tmp_path / "whole", "--dropout", dropout))
+    imitation.main(arguments(tmp_path / "parts", "--dropout", dropout, rounds=1))
+    assert imitation.main(arguments(tmp_path / "parts", "--dropout", dropout, "--resume")) == 0
     whole, parts = (read_policy(tmp_path / p / "latest.safetensors") for p in ("whole", "parts"))
     for name, value in whole.tensors.items():
         np.testing.assert_array_equal(parts.tensors[name], value, err_msg=name)
