@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env.config import check_range
 from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.env import Planner
 from ms_slam_env.env.config import LookaheadConfig, TargetConfig
@@ -26,6 +27,8 @@ PAPER_TARGETS = TargetConfig(M_I=0.19, M_D=0.25, rho_I=1.0, rho_D=1.0, depth_wei
 (``ms-slam experiment frame_skipping --histograms paper``). The paper names no rho and no lambda: at
 1 "the camera moves to the locations where the image will provide maximum allowed information"."""
 
+_FLOOR_NATS = 0.002  # smaller divergences are alike
+
 
 class GreedyDivergence(Planner):
     """Takes the motion whose predicted divergences come closest to their targets.
@@ -42,6 +45,8 @@ class GreedyDivergence(Planner):
         rho_I: share of M_I to aim at, in [0, 1].
         rho_D: share of M_D to aim at, in [0, 1].
         depth_weight: lambda, significance of depth over intensity.
+        calibration: how far each motion moves the logarithm of a factor of the predictions towards
+            that of what it met over what was predicted, in [0, 1]; 0, as in the paper: not at all.
 
     Raises:
         InputError: an option out of its range.
@@ -55,8 +60,11 @@ class GreedyDivergence(Planner):
         rho_I: float | None = None,
         rho_D: float | None = None,
         depth_weight: float | None = None,
+        calibration: float = 0.0,
     ) -> None:
         super().__init__(env, seed)
+        self.calibration = calibration
+        check_range(self, "calibration", 0, 1)
         if preset not in PRESETS:
             raise unknown("preset of greedy", preset, PRESETS)
         options = {"rho_I": rho_I, "rho_D": rho_D, "depth_weight": depth_weight}
@@ -67,13 +75,39 @@ class GreedyDivergence(Planner):
             self.predicted, targets = self._predicted_as_printed, PAPER_TARGETS
             self._lookahead = Lookahead(PAPER_LOOKAHEAD, DivergenceConfig.paper(), env.intrinsics)
         self.targets = replace(targets, **given)
+        self._begin()
+
+    def reset(self) -> None:
+        """Predictions are as they are until it is seen what they are worth."""
+        self._begin()
+
+    def _begin(self) -> None:
+        self.log_factor = np.zeros(2)
+        self._expected: Float64 | None = None
 
     def act(self, observation: Any, info: dict[str, Any]) -> int:
         """Algorithm 1; the loop over candidates, lines 3 to 8, is one batch."""
+        if self.calibration and self._expected is not None and info["tracking_ok"]:
+            self.learn(self._expected, info["divergence"])
         T = np.flatnonzero(self.env.action_masks())  # line 2: motions within reach
-        delta_I, delta_D = self.predicted()[T].T  # lines 1 and 3 to 8: predict and compare
+        predicted = self.predicted()[T]  # lines 1 and 3 to 8: predict and compare
+        delta_I, delta_D = (predicted * np.exp(self.log_factor)).T
         i_star = np.argmin(distance_to_targets(delta_I, delta_D, self.targets))  # line 9
+        self._expected = predicted[i_star]
         return int(T[i_star])  # lines 10 and 11
+
+    def learn(self, predicted: Float64, met: Float64) -> None:
+        """Move the factors (2,) towards ``met`` over ``predicted`` (2,), nats."""
+        ratio = np.log((met + _FLOOR_NATS) / (predicted + _FLOOR_NATS))
+        self.log_factor += self.calibration * (ratio - self.log_factor)
+
+    def instead(self, action: int) -> None:
+        """What is met next is not what was predicted."""
+        self._expected = None
+
+    def lost_by(self, action: int) -> None:
+        """Nothing was met that could be learnt from."""
+        self._expected = None
 
     def _predicted_as_printed(self) -> Float64:
         """Divergences (n, 2) of the predicted images from I_t-1 and D_t-1, the last live ones."""

@@ -130,7 +130,31 @@ def test_greedy_breaks_ties_by_the_lowest_action():
     assert act(GreedyDivergence(env)) == [5]
 
 
-@pytest.mark.parametrize("options", [{"rho_I": 1.5}, {"rho_D": "much"}, {"depth_weight": -1}])
+def test_a_calibrated_greedy_chooses_by_what_is_met():
+    targets = TargetConfig(rho_I=1, rho_D=1)
+    env, met = FakeEnv(3, targets=targets), FakeEnv(3, targets=targets)
+    factors = np.array([2.5, 0.5])
+    env.divergences *= 20
+    met.divergences *= 20 * factors
+    right = GreedyDivergence(met).act(None, {})
+    planner = GreedyDivergence(env, calibration=0.3)
+    action, info = planner.act(None, {}), {"tracking_ok": True}
+    assert action == GreedyDivergence(env).act(None, {}) != right
+    for _ in range(40):
+        action = planner.act(None, info | {"divergence": met.divergences[action]})
+    assert action == right
+    planner.instead(5)  # what comes is of another motion: nothing is learnt from it
+    learnt = planner.log_factor.copy()
+    planner.act(None, info | {"divergence": np.array([9.0, 9.0])})
+    planner.act(None, {"tracking_ok": False, "divergence": np.array([9.0, 9.0])})
+    np.testing.assert_array_equal(planner.log_factor, learnt)
+    planner.reset()
+    assert planner.act(None, {}) == GreedyDivergence(env).act(None, {})
+
+
+@pytest.mark.parametrize(
+    "options", [{"rho_I": 1.5}, {"rho_D": "much"}, {"depth_weight": -1}, {"calibration": 2}]
+)
 def test_greedy_refuses_bad_options(options):
     (name,) = options
     with pytest.raises(InputError, match=name):
