@@ -23,7 +23,8 @@ from ms_slam_env.report.tables import Table, format_value
 SUFFIX = ".safetensors"
 _TEXT = "ms_slam_policy"
 _LARGEST_HEADER = 1_000_000  # bytes
-_NO_MATTER = ("out", "resume")  # options that make no other training
+_NO_MATTER = ("out", "resume", "num_envs", "eval_episodes")  # make no other training
+_MORE_OF_IT = ("rounds", "total_timesteps", "minutes")  # a policy may be taken before its end
 _SCORES = (
     *("planner", "episodes", "f_score_5cm", "f_score_5cm_area", "ate_m", "lost"),
     *("not_recovered_share", "violations", "decision_ms"),
@@ -128,16 +129,20 @@ def _card(policy: Policy, found: Sequence[FoundResult], page: Path) -> str:
     trainings = [one for one in found if policy.is_trained_in(one)]
     benchmarks = [one for one in found if one.results.kind == "planners" and _scores(one, policy)]
     parts = [f"## `{policy.planner}`\n", _facts(policy), _command(policy.known)]
-    scores: dict[str, _Score] = {}  # by task, those over most episodes
+    scores: dict[str, _Score] = {}  # by task, those that say most
     for score in (score for one in benchmarks for score in _scores(one, policy)):
         known = scores.get(score.task)
-        if known is None or score.episodes > known.episodes:
+        if known is None or score.weight > known.weight:
             scores[score.task] = score
     for score in scores.values():
         parts += list(_score_text(score, policy))
     if not benchmarks:
         parts.append("It has not been benchmarked yet.\n")
-    like = {_config(one).get("seed") for one in found if policy.is_trained_as(one, ("seed",))}
+    like = {
+        _config(one).get("seed")
+        for one in found
+        if policy.is_trained_as(one, ("seed", *_MORE_OF_IT))
+    }
     parts += ["### Limits\n", *_limits(policy, benchmarks, trainings, len(like))]
     for one in trainings:
         parts += list(_training(one, page))
@@ -188,7 +193,8 @@ def _command(known: Mapping[str, Any]) -> str:
 
 def _is_of(policy: Policy, planner: Any) -> bool:
     name, _, options = str(planner).partition(",")
-    return name == policy.planner or (name == "policy" and f"/{policy.path.name}" in options)
+    is_named = name == policy.planner and "path=" not in options
+    return is_named or (name == "policy" and f"/{policy.path.name}" in options)
 
 
 @dataclass(frozen=True)
@@ -205,8 +211,9 @@ class _Score:
         return _task(self.one, self.table)
 
     @property
-    def episodes(self) -> int:
-        return int(self.own.get("episodes", 0))
+    def weight(self) -> tuple[int, int]:
+        """Episodes, and among how many rivals."""
+        return int(self.own.get("episodes", 0)), len(self.others)
 
 
 def _scores(one: FoundResult, policy: Policy) -> list[_Score]:
@@ -229,13 +236,14 @@ def _score_text(score: _Score, policy: Policy) -> Iterator[str]:
     rows = (score.own, others[0])
     yield replace(score.table, title="", columns=columns, rows=rows).as_markdown()
     for title, metric, what in _VERDICTS:
-        known = [line for line in others if isinstance(line.get(metric), Interval)]
-        best = max(known, key=lambda line: line[metric].value, default=others[0])["planner"]
-        chance = _chance(score.one, policy, f"{score.task}: {title}", best)
-        if chance is not None:
-            shown = format_value(chance, "improvement")
-            verdict = _verdict(chance, best)
-            yield f"{verdict}: its {what} is the better one in {shown} % of pairs.\n"
+        whole = f"{score.task}: {title}"
+        for table in (t for t in results.tables if t.title and whole.endswith(t.title)):
+            best = _best_rival(score, metric, table)
+            chance = _chance(table, policy, best)
+            if chance is not None:
+                shown = format_value(chance, "improvement")
+                verdict = _verdict(chance, best)
+                yield f"{verdict}: its {what} is the better one in {shown} % of pairs.\n"
 
 
 def _task(one: FoundResult, table: Table) -> str:
@@ -244,14 +252,21 @@ def _task(one: FoundResult, table: Table) -> str:
     return (title if table.title else str(_config(one).get("task", one.title))) + changed
 
 
-def _chance(one: FoundResult, policy: Policy, title: str, best: Any) -> Interval | None:
+def _best_rival(score: _Score, metric: str, table: Table) -> Any:
+    """The classical planner with the largest value; where none is known, the table's first one."""
+    known = [line for line in score.others if isinstance(line.get(metric), Interval)]
+    if known:
+        return max(known, key=lambda line: line[metric].value)["planner"]
+    names = [line["planner"] for line in score.others]
+    return next((row["planner"] for row in table.rows if row["planner"] in names), names[0])
+
+
+def _chance(table: Table, policy: Policy, best: Any) -> Interval | None:
     """Probability that the policy is better than a planner, from the benchmark's own table."""
-    for table in one.results.tables:
-        if title.endswith(table.title) and table.title:
-            for row in table.rows:
-                value = row.get(str(best))
-                if _is_of(policy, row.get("planner")) and isinstance(value, Interval):
-                    return value
+    for row in table.rows:
+        value = row.get(str(best))
+        if _is_of(policy, row.get("planner")) and isinstance(value, Interval):
+            return value
     return None
 
 

@@ -24,9 +24,11 @@ def scores(
     planner: str = "agent-hand",
     episodes: int = 10,
     options: tuple[str, ...] = (),
+    names: tuple[str, ...] = ("nbv", "random"),
+    by_return: Interval | None = None,
 ) -> None:
     """A planner benchmark in which ``planner`` is that much better than ``nbv``."""
-    names = ("nbv", planner, "random")
+    names = (names[0], planner, *names[1:])
     areas = {"nbv": 0.3, planner: 0.5, "random": 0.4}
     lines = [
         {
@@ -48,6 +50,11 @@ def scores(
             ("Sooner than each other", "random", Interval(0.7, 0.55, 0.8)),
         )
     )
+    rewarded = make_table(
+        ["planner", *(Column(name, "improvement", name) for name in ("random", "nbv"))],
+        [{"planner": "random"}, {"planner": planner, "random": by_return}, {"planner": "nbv"}],
+        "Better rewarded than each other",
+    )
     rows = [
         {"spec": {"planner": name, "scene": scene}, "result": {}, "error": None}
         for name in names
@@ -63,6 +70,7 @@ def scores(
             make_table(columns, lines),
             better,
             sooner,
+            *([rewarded] if by_return else []),
         ],
         rows=rows,
         content={"config": {"task": "kitchen", "seeds": "test", "options": options}},
@@ -161,9 +169,30 @@ def test_a_task_with_other_options_is_another(clone: Path) -> None:
 def test_training_seeds_are_counted(clone: Path) -> None:
     assert "One training run" in card(clone)
     training(clone / "docs/results/second", seed=4)
+    training(clone / "docs/results/third", seed=5, rounds=4, eval_episodes=2)
+    training(clone / "docs/results/other_way", seed=6, scenes=["wall"])
     text = card(clone)
-    assert "Trained with 2 seeds" in text
+    assert "Trained with 3 seeds" in text
     assert text.count("### While it learnt") == 1
+
+
+def test_of_equally_many_episodes_those_among_more_rivals_count(clone: Path) -> None:
+    seed = "agent-hand,path=runs/seed1.safetensors"
+    scores(clone / "docs/results/seeds", Interval(0.1, 0.02, 0.3), seed)
+    assert "It has not been benchmarked yet." in card(clone)  # that was another policy
+    scores(clone / "docs/results/few_rivals", Interval(0.8, 0.6, 0.9), names=("nbv",))
+    scores(clone / "docs/results/rivals", Interval(0.1, 0.02, 0.3))
+    assert "10 [2.0, 30] % of pairs" in card(clone)
+
+
+def test_by_return_the_rival_is_the_first_of_the_ranked(clone: Path) -> None:
+    scores(
+        clone / "docs/results/judged", Interval(0.1, 0.02, 0.3), by_return=Interval(0.3, 0.2, 0.4)
+    )
+    assert (
+        "the best classical planner, `random`: its return is the better one in 30 [20, 40] %"
+        in card(clone)
+    )
 
 
 @pytest.mark.parametrize("content", [b"", b"\xff" * 64, as_bytes("[]"), b"{}"])
