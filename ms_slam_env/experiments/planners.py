@@ -26,6 +26,7 @@ from ms_slam_env.experiments.harness.planner_tables import (
     RANKED_BY,
     across_scenes,
     better_than_each_other,
+    policies_together,
     with_losses,
 )
 from ms_slam_env.report.charts import Chart, Panel, by_group, quartile_band, scatter
@@ -164,6 +165,9 @@ def _tables(rows: Sequence[Row], task: str) -> list[Table]:
     tables += across_scenes(rows, f"{prefix}Across scenes")
     for metric in COMPARED:
         tables += better_than_each_other(rows, prefix, metric)
+    together = policies_together(rows)
+    for metric in COMPARED:
+        tables += better_than_each_other(together, f"{prefix}Policies as one: ", metric)
     scenes = list(dict.fromkeys(row["spec"]["scene"] for row in rows))
     if len(scenes) > 1:
         for scene in scenes:

@@ -10,7 +10,12 @@ import numpy as np
 import pytest
 
 from ms_slam_env.experiments.harness.episodes import seed_list, short_planner_names
-from ms_slam_env.experiments.harness.planner_tables import DETAILS, HEADLINE, score_matrices
+from ms_slam_env.experiments.harness.planner_tables import (
+    DETAILS,
+    HEADLINE,
+    policies_together,
+    score_matrices,
+)
 from ms_slam_env.experiments.harness.rows import write_all
 from ms_slam_env.experiments.paper_table2 import METRICS, PaperTable2
 from ms_slam_env.experiments.planners import PlannerBenchmark
@@ -128,6 +133,25 @@ def test_every_planner_is_compared_with_every_other() -> None:
     assert [line["planner"] for line in lines] == ["greedy", "random"]
     assert (lines[0]["greedy"], lines[0]["random"].value) == (None, 1.0)
     assert lines[1]["greedy"].value == 0.0
+
+
+def test_policies_of_one_training_are_judged_together_too() -> None:
+    pytest.importorskip("rliable")
+    scores = {"nbv": 0.5, "agent,path=a": 0.3, "agent,path=b": 0.8, "agent": 0.7, "x,path=c": 0.1}
+    rows: list[Row] = [
+        {"spec": {**row["spec"], "planner": name}, "result": result(score), "error": None}
+        for row in rows_of(PlannerBenchmark(planners=("random",), scenes=("table", "wall")))
+        for name, score in scores.items()
+    ]
+    tables = {table.title: table for table in CONFIG.tables(rows)}
+    lines: Any = tables["Policies as one: Better than each other"].rows
+    found = {line["planner"]: line for line in lines}
+    assert set(found) == {"nbv", "agent, 3 policies", "x,path=c"}
+    assert found["agent, 3 policies"]["nbv"].value == pytest.approx(2 / 3)
+    assert len(tables["Better than each other"].rows) == 5
+    assert not policies_together(
+        [row for row in rows if row["spec"]["planner"] in ("nbv", "agent")]
+    )
 
 
 def test_planners_are_compared_by_what_the_reward_says_too() -> None:

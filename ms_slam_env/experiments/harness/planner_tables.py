@@ -109,6 +109,26 @@ def better_than_each_other(
     return [make_table(["planner", *columns], lines, prefix + title, note)]
 
 
+def policies_together(rows: Sequence[Row]) -> list[Row]:
+    """The rows with planners that differ in ``path`` alone as one; nothing if there are none.
+
+    So several policies of one training, each begun with another seed, are judged as what that
+    training leads to.
+    """
+    members: dict[str, list[str]] = {}
+    for planner in dict.fromkeys(map(_planner, rows)):
+        parts = [part for part in planner.split(",") if not part.startswith("path=")]
+        members.setdefault(",".join(parts), []).append(planner)
+    names = {
+        planner: f"{name}, {len(of)} policies" if len(of) > 1 else planner
+        for name, of in members.items()
+        for planner in of
+    }
+    if all(name == planner for planner, name in names.items()):
+        return []
+    return [{**row, "spec": {**row["spec"], "planner": names[_planner(row)]}} for row in rows]
+
+
 def _ranked(means: Mapping[str, statistics.Interval]) -> list[str]:
     return sorted(means, key=lambda name: -means[name].value)
 
