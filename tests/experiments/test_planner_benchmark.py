@@ -146,8 +146,8 @@ def test_policies_of_one_training_are_judged_together_too() -> None:
     tables = {table.title: table for table in CONFIG.tables(rows)}
     lines: Any = tables["Policies as one: Better than each other"].rows
     found = {line["planner"]: line for line in lines}
-    assert set(found) == {"nbv", "agent, 3 policies", "x,path=c"}
-    assert found["agent, 3 policies"]["nbv"].value == pytest.approx(2 / 3)
+    assert set(found) == {"nbv", "agent (3 policies)", "x,path=c"}
+    assert found["agent (3 policies)"]["nbv"].value == pytest.approx(2 / 3)
     assert len(tables["Better than each other"].rows) == 5
     assert not policies_together(
         [row for row in rows if row["spec"]["planner"] in ("nbv", "agent")]

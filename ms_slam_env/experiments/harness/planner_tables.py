@@ -120,7 +120,7 @@ def policies_together(rows: Sequence[Row]) -> list[Row]:
         parts = [part for part in planner.split(",") if not part.startswith("path=")]
         members.setdefault(",".join(parts), []).append(planner)
     names = {
-        planner: f"{name}, {len(of)} policies" if len(of) > 1 else planner
+        planner: f"{name} ({len(of)} policies)" if len(of) > 1 else planner
         for name, of in members.items()
         for planner in of
     }
