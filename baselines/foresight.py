@@ -21,7 +21,7 @@ ORDERS = ("random", "greedy")
 
 
 class Foresight(Planner):
-    """Makes the motion with the largest reward, having tried them all in the simulator.
+    """Makes the motion with the largest reward, having tried them in the simulator.
 
     One step ahead, whatever the reward is. No rival, since a robot cannot take a motion back: it
     says what there is to gain, and an agent can learn from it (see `oracle`).

@@ -75,13 +75,10 @@ class GreedyDivergence(Planner):
             self.predicted, targets = self._predicted_as_printed, PAPER_TARGETS
             self._lookahead = Lookahead(PAPER_LOOKAHEAD, DivergenceConfig.paper(), env.intrinsics)
         self.targets = replace(targets, **given)
-        self._begin()
+        self.reset()
 
     def reset(self) -> None:
         """Predictions are as they are until it is seen what they are worth."""
-        self._begin()
-
-    def _begin(self) -> None:
         self.log_factor = np.zeros(2)
         self._expected: Float64 | None = None
 
