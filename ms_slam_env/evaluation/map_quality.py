@@ -18,10 +18,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import trapezoid
-from scipy.spatial import cKDTree
 
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.geometry.point_clouds import voxel_downsample
+from ms_slam_env.geometry.point_clouds import IndexedCloud, indexed, voxel_downsample
 from ms_slam_env.metrics.reconstruction import (
     RATIO_THRESHOLD_M,
     harmonic_mean,
@@ -73,7 +72,7 @@ class ComparedMap:
     def __init__(
         self,
         points: ArrayLike,
-        surface: ArrayLike,
+        surface: ArrayLike | IndexedCloud,
         reference: ArrayLike | None = None,
         voxel_m: float = MAP_VOXEL_M,
         registered: bool = False,
@@ -81,7 +80,7 @@ class ComparedMap:
         given = np.asarray(points)
         self.map_points = len(given)
         self.cloud = voxel_downsample(given, voxel_m) if voxel_m > 0 and len(given) else given
-        self.surface = surface
+        self.surface = indexed(surface, "truth")
         self.reference = surface if reference is None else reference
         self.registered = registered
 
@@ -95,7 +94,7 @@ class ComparedMap:
         """(K,) distance of each point of the reference to the map; of an empty map one NaN."""
         return self._search(self.reference, self.cloud)
 
-    def _search(self, points: ArrayLike, target: ArrayLike) -> Float64:
+    def _search(self, points: ArrayLike, target: ArrayLike | IndexedCloud) -> Float64:
         return nearest_distances(points, target) if self.map_points else np.array([np.nan])
 
     def precision(self, threshold_m: float) -> float:
@@ -154,7 +153,7 @@ _MEASURES: Mapping[str, Callable[[ComparedMap], float]] = {
 
 def map_quality(
     points: ArrayLike,
-    surface: ArrayLike,
+    surface: ArrayLike | IndexedCloud,
     keys: Iterable[str] = STANDARD,
     reference: ArrayLike | None = None,
     voxel_m: float = MAP_VOXEL_M,
@@ -201,8 +200,13 @@ class ScoreCurve:
         scores: (S) its F-score, by samples of map and reference.
     """
 
-    def __init__(self, surface: Float64, reference: Float64, threshold_m: float = 0.05) -> None:
-        self._surface = cKDTree(surface, balanced_tree=False, compact_nodes=False)
+    def __init__(
+        self,
+        surface: ArrayLike | IndexedCloud,
+        reference: Float64,
+        threshold_m: float = 0.05,
+    ) -> None:
+        self._surface = indexed(surface, "surface").tree
         self._reference = _evenly(reference)
         self._threshold_m = threshold_m
         self.steps: list[int] = []
@@ -223,8 +227,9 @@ class ScoreCurve:
             return 0.0
         cloud = voxel_downsample(points, _MAP_VOXEL_M)
         to_surface = self._surface.query(_evenly(cloud), distance_upper_bound=self._threshold_m)[0]
-        tree = cKDTree(cloud, balanced_tree=False, compact_nodes=False)
-        to_map = tree.query(self._reference, distance_upper_bound=self._threshold_m)[0]
+        to_map = IndexedCloud(cloud).tree.query(
+            self._reference, distance_upper_bound=self._threshold_m
+        )[0]
         precision, recall = (float(np.isfinite(found).mean()) for found in (to_surface, to_map))
         return harmonic_mean(precision, recall)
 

@@ -20,6 +20,7 @@ from scipy import ndimage
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, transform_points
+from ms_slam_env.geometry.point_clouds import IndexedCloud
 from ms_slam_env.robot import Embodiment
 from ms_slam_env.robot.arm.arm import ArmEmbodiment, camera_poses
 from ms_slam_env.scenes.base import Scene
@@ -41,9 +42,9 @@ _EVERY = 3
 
 
 @lru_cache(maxsize=2)
-def true_surface(scene: str, scene_seed: int, spacing_m: float = SURFACE_SPACING_M) -> Float64:
+def true_surface(scene: str, scene_seed: int, spacing_m: float = SURFACE_SPACING_M) -> IndexedCloud:
     """The scene's whole surface as points (N, 3), by default about 1 cm apart."""
-    return get_scene(scene, scene_seed).surface_points(spacing_m)[0]
+    return IndexedCloud(get_scene(scene, scene_seed).surface_points(spacing_m)[0])
 
 
 def reference_surface(

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.geometry import se3_exp, transform_points
-from ms_slam_env.geometry.point_clouds import check_points
+from ms_slam_env.geometry.point_clouds import IndexedCloud, check_points, indexed
 
 Float64 = NDArray[np.float64]
 
@@ -46,7 +46,7 @@ class CloudRegistration:
 
 def register_clouds(
     source: ArrayLike,
-    target: ArrayLike,
+    target: ArrayLike | IndexedCloud,
     method: str = "icp",
     cutoff_m: float = CUTOFF_M,
     max_points: int = 20_000,
@@ -72,7 +72,7 @@ def register_clouds(
         InputError: bad points, an unknown method, a cut-off that is not positive, too few points
             for ``neighbours``.
     """
-    cloud, fixed = check_points(source, "source"), check_points(target, "target")
+    cloud, fixed = check_points(source, "source"), indexed(target, "target")
     if method not in REGISTRATIONS:
         raise unknown("registration", method, REGISTRATIONS)
     if not (np.isfinite(cutoff_m) and cutoff_m > 0):
@@ -83,24 +83,23 @@ def register_clouds(
     if method != "icp" and min(len(picked), len(fixed)) < neighbours:
         raise InputError(f"{method} needs at least {neighbours} points in either cloud")
     if method == "plane-icp":
-        return _plane_icp(picked, fixed, cutoff_m, neighbours)
+        return _plane_icp(picked, fixed.points, cutoff_m, neighbours)
     return _small_gicp(picked, fixed, method, cutoff_m, neighbours)
 
 
 def _small_gicp(
-    source: Float64, target: Float64, method: str, cutoff_m: float, neighbours: int
+    source: Float64, target: IndexedCloud, method: str, cutoff_m: float, neighbours: int
 ) -> CloudRegistration:
     import small_gicp
 
-    clouds = [small_gicp.PointCloud(points) for points in (source, target)]
-    trees = [small_gicp.KdTree(points) for points in clouds]
+    moving, fixed = IndexedCloud(source).gicp, target.gicp
     if method == "gicp":
-        for points, tree in zip(clouds, trees, strict=True):
-            small_gicp.estimate_covariances(points, tree, neighbours, 1)
+        for cloud, tree in (moving, fixed):
+            small_gicp.estimate_covariances(cloud, tree, neighbours, 1)
     found = small_gicp.align(
-        target=clouds[1],
-        source=clouds[0],
-        target_tree=trees[1],
+        target=fixed[0],
+        source=moving[0],
+        target_tree=fixed[1],
         registration_type=method.upper(),
         max_correspondence_distance=cutoff_m,
         num_threads=1,  # more would not add up in a fixed order

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+from typing import Any
+
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+from scipy.spatial import cKDTree
 
 from ms_slam_env.errors import InputError
 
@@ -27,6 +31,53 @@ def check_points(points: ArrayLike, name: str) -> Float64:
     if not np.isfinite(values).all():
         raise InputError(f"{name} holds values that are not finite")
     return values
+
+
+class IndexedCloud:
+    """Points with the trees that are searched in, each built when it is first asked for.
+
+    Whatever compares clouds takes one in place of an array: where many clouds are compared with
+    the same one its trees are then built once.
+
+    Args:
+        points: (N, 3).
+
+    Raises:
+        InputError: bad points.
+    """
+
+    def __init__(self, points: ArrayLike) -> None:
+        self.points = check_points(points, "points")
+
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
+        """The points."""
+        return np.array(self.points, dtype, copy=copy)
+
+    def __len__(self) -> int:
+        """How many points."""
+        return len(self.points)
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """For the nearest of the points, SciPy's."""
+        return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
+
+    @cached_property
+    def gicp(self) -> tuple[Any, Any]:
+        """The points and their tree, small_gicp's."""
+        import small_gicp
+
+        cloud = small_gicp.PointCloud(self.points)
+        return cloud, small_gicp.KdTree(cloud)
+
+
+def indexed(points: ArrayLike | IndexedCloud, name: str) -> IndexedCloud:
+    """Points (N, 3) with their trees, which are kept where they come with them.
+
+    Raises:
+        InputError: bad points, by their name.
+    """
+    return points if isinstance(points, IndexedCloud) else IndexedCloud(check_points(points, name))
 
 
 def voxel_downsample(points: ArrayLike, voxel_m: float) -> Float64:

@@ -18,16 +18,15 @@ from scipy.spatial import cKDTree
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import Float64, transform_points
 from ms_slam_env.geometry.cloud_registration import CUTOFF_M, register_clouds
-from ms_slam_env.geometry.point_clouds import check_points
+from ms_slam_env.geometry.point_clouds import IndexedCloud, check_points, indexed
 from ms_slam_env.metrics.trajectory import check_count, check_positive
 
 ICP_POINTS = 5000  # of a map, evenly picked, are enough to place it
 
 
-def nearest_distances(points: ArrayLike, truth: ArrayLike) -> Float64:
+def nearest_distances(points: ArrayLike, truth: ArrayLike | IndexedCloud) -> Float64:
     """Distance (N,) in metres from each point (N, 3) to its nearest of ``truth`` (M, 3)."""
-    tree = cKDTree(check_points(truth, "truth"), balanced_tree=False, compact_nodes=False)
-    return tree.query(check_points(points, "points"))[0]
+    return indexed(truth, "truth").tree.query(check_points(points, "points"))[0]
 
 
 def precision(points: ArrayLike, truth: ArrayLike, threshold_m: float) -> float:
@@ -55,7 +54,7 @@ def f_score(points: ArrayLike, truth: ArrayLike, threshold_m: float) -> float:
     return harmonic_mean(precision(points, truth, threshold_m), recall(points, truth, threshold_m))
 
 
-def rer(points: ArrayLike, truth: ArrayLike, registration: str = "icp") -> float:
+def rer(points: ArrayLike, truth: ArrayLike | IndexedCloud, registration: str = "icp") -> float:
     """Reconstruction error: RMS distance in metres of map points to the nearest true point.
 
     Saeedi et al., ICRA 2017, section II-A: "determined by running iterative closest point on the
@@ -66,9 +65,9 @@ def rer(points: ArrayLike, truth: ArrayLike, registration: str = "icp") -> float
     Raises:
         InputError: bad points or an unknown registration.
     """
-    cloud, true_cloud = check_points(points, "points"), check_points(truth, "truth")
+    cloud, true_cloud = check_points(points, "points"), indexed(truth, "truth")
     found = register_clouds(cloud, true_cloud, registration, max_points=ICP_POINTS)
-    distances = cKDTree(true_cloud).query(transform_points(found.T_target_source, cloud))[0]
+    distances = nearest_distances(transform_points(found.T_target_source, cloud), true_cloud)
     return float(np.sqrt(np.mean(distances**2)))
 
 

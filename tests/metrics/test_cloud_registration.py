@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, se3_exp, transform_points
-from ms_slam_env.metrics import completion, register_clouds
+from ms_slam_env.geometry.point_clouds import IndexedCloud
+from ms_slam_env.metrics import completion, nearest_distances, register_clouds, rer
 
 CORNER = np.array([2.0, 1.5, 1.0])
 METHODS = ("icp", "plane-icp", "gicp")
@@ -103,6 +104,22 @@ def test_twice_the_same_to_the_last_bit() -> None:
     for method in METHODS:
         first, second = (register_clouds(source, target, method) for _ in range(2))
         np.testing.assert_array_equal(first.T_target_source, second.T_target_source)
+
+
+def test_a_cloud_with_its_trees_serves_again_and_again() -> None:
+    points, target = transform_points(motion(1), room(1, 3000)), room(0, 3000)
+    kept = IndexedCloud(target)
+    for method in (*METHODS, *METHODS):
+        first, second = (register_clouds(points, to, method) for to in (target, kept))
+        np.testing.assert_array_equal(first.T_target_source, second.T_target_source)
+    assert rer(points, kept) == rer(points, target)
+    np.testing.assert_array_equal(
+        nearest_distances(points, kept), nearest_distances(points, target)
+    )
+    np.testing.assert_array_equal(kept, target)
+    assert (len(kept), kept.tree, kept.gicp) == (3000, kept.tree, kept.gicp)
+    with pytest.raises(InputError, match="truth is empty"):
+        nearest_distances(points, np.empty((0, 3)))
 
 
 def test_nothing_near_leaves_the_cloud_where_it_is() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ms_slam_env._warp import wp
+from ms_slam_env._warp import roomy_zeros, wp
 
 BLOCK_SIZE = wp.constant(128)
 """Surfels of a culling block."""
@@ -123,7 +123,7 @@ def allocate(struct: Any, batch: int, size: int, device: str) -> Any:
     arrays = struct()
     for name, member in struct.vars.items():
         shape = (batch, size)[: member.type.ndim]
-        setattr(arrays, name, wp.zeros(shape, dtype=member.type.dtype, device=device))
+        setattr(arrays, name, roomy_zeros(shape, member.type.dtype, device))
     return arrays
 
 
