@@ -25,7 +25,7 @@ class Arguments:
     """Reduce the images to this size, such as 160x120, or 160x120+crop for their largest central
     part of that aspect."""
     layout: str = "auto"
-    """auto, tum, icl-nuim, 7-scenes or folder."""
+    """auto, tum, icl-nuim, 7-scenes, folder, euroc, kitti or bag."""
     every: int = 1
     """Take every n-th frame."""
     paper: bool = False

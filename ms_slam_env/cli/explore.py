@@ -29,7 +29,8 @@ class Arguments:
     """Sequences to judge the front and the chosen configurations on."""
     objectives: tuple[str, ...] = ("ate_m", "ext_ms")
     """What to minimise: ate_m, ate_max_m, ate_worst_m (of all sequences), ate_worst_ratio (to the
-    default's), ext_ms, load_ms, mem_mb, energy_j, map_error_mm, lost; M_I and M_D are maximised."""
+    default's), ext_ms, load_ms, mem_mb, energy_j, energy_model_j,
+    map_error_mm, lost; M_I and M_D are maximised."""
     constraints: tuple[str, ...] = ()
     """What to demand, as in "ate_m<0.01", "M_I<0.02" or "M_I>0.02"."""
     parameters: tuple[str, ...] = ("algorithm",)

@@ -73,6 +73,7 @@ class FrameSelection(Experiment, Checked):
         "none",
         *(f"regular,every={n}" for n in (2, 3, 4)),
         *(f"divergence,threshold={t}" for t in (0.005, 0.01, 0.02, 0.04)),
+        *(f"divergence,threshold={t},reference=previous" for t in (0.001, 0.0025, 0.005, 0.01)),
         *(f"budget,share={s}" for s in (0.5, 0.33, 0.25)),
     )
     """NAME,option=value,... as the option frame_management of an environment has them."""

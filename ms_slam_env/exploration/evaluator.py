@@ -92,11 +92,12 @@ class SlamEvaluator(Checked):
             ``ate_m`` (RMSE, SE(3)-aligned), ``ate_tracked_m`` and ``tracked_share`` of the tracked
             frames, ``ate_max_m``, ``ext_ms`` (median time of a processed
             frame), ``load_ms`` (mean time by all frames, those left out included), ``mem_mb`` (peak
-            of the SLAM's own), ``energy_j`` (a processed frame), ``map_error_mm``, ``lost`` (share
-            of the processed frames), ``M_I``, ``M_D`` and ``largest_change`` (largest divergences
-            between processed neighbours, nats, the last as adaptation and frame management measure
-            it), ``frames``; None or missing where it cannot be had. ``failure`` in
-            words if tracking was lost too often, or SLAM broke down.
+            of the SLAM's own), ``energy_j`` and ``energy_model_j`` (a processed frame; the
+            latter where the former cannot be had, see `CostMeter`), ``map_error_mm``, ``lost``
+            (share of the processed frames), ``M_I``, ``M_D`` and ``largest_change`` (largest
+            divergences between processed neighbours, nats, the last as adaptation and frame
+            management measure it), ``frames``; None or missing where it cannot be had.
+            ``failure`` in words if tracking was lost too often, or SLAM broke down.
 
         Raises:
             InputError: a sequence that cannot be read, or parameters that the backend refuses.
@@ -136,6 +137,7 @@ class SlamEvaluator(Checked):
             "load_ms": ext_ms * len(run) / len(given.frames),
             "mem_mb": costs["mem_peak_mb"],
             "energy_j": costs["ene_frame_j"],
+            "energy_model_j": costs.get("ene_model_frame_j"),
             "lost": run.lost,
         }
         if self.map_error:
@@ -155,7 +157,7 @@ def summarise(rows: Sequence[Row], baseline: Sequence[Row] = ()) -> Row:
     """
     largest = ("ate_max_m", "mem_mb", "lost", "M_I", "M_D", "largest_change")
     errors = ("ate_m", "ate_tracked_m", "tracked_share", "map_error_mm")
-    means = (*errors, "ext_ms", "load_ms", "energy_j")
+    means = (*errors, "ext_ms", "load_ms", "energy_j", "energy_model_j")
     result: Row = {}
     for name in (*means, *largest):
         values = [row.get(name) for row in rows]

@@ -48,6 +48,7 @@ METRICS: dict[str, Metric] = {
     "load_ms": Metric("load_cpu_ms", 1e3, False, "load_ext_ms"),
     "mem_mb": Metric("mem_peak_mb", 1e5, False),
     "energy_j": Metric("ene_frame_j", 1e3, False),
+    "energy_model_j": Metric("ene_model_frame_j", 1e3, False),
     "map_error_mm": Metric("map_error_median_m", 1e3, True, scale=1e-3),
     "lost": Metric("lost_share", 1.0, False),
     "ate_worst_m": Metric("worst_ate_m", 1.0, True),

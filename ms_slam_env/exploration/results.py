@@ -25,7 +25,7 @@ ABOUT = (
 )
 _SHOWN = (
     *("ate_m", "ate_max_m", "ate_worst_m", "ate_worst_ratio", "ext_ms", "mem_mb", "energy_j"),
-    *("map_error_mm", "M_I", "M_D"),
+    *("energy_model_j", "map_error_mm", "M_I", "M_D"),
 )
 _PARAMETERS_DRAWN = 4
 _RATE = "keep_every"

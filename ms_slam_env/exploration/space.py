@@ -277,7 +277,7 @@ def why_absent(name: str, base: SlamConfiguration) -> str:
     """Why parameter ``name`` does nothing to ``base`` on this machine; empty where it does."""
     is_surfel = base.slam == "surfel"
     if name.startswith("compiler.") and not is_surfel:
-        return f"backend {base.slam!r} has no kernels that are compiled here"
+        return f"backend {base.slam!r} takes no options of the compiler"
     on_gpu = str(base.slam_config.get("device", "cpu")).startswith("cuda")
     if name == "threads" and is_surfel:
         return "Warp runs a kernel on one thread of the CPU, or on a GPU"

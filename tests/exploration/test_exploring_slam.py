@@ -21,6 +21,7 @@ from ms_slam_env.exploration import (
     run_exploration,
 )
 from ms_slam_env.exploration import evaluator as evaluator_module
+from ms_slam_env.exploration import exploration as exploration_module
 from ms_slam_env.exploration.evaluator import CLOCKS, summarise, worst_ratio
 from ms_slam_env.exploration.held_out import compare_configurations
 from ms_slam_env.exploration.objectives import METRICS, as_metrics, key_of
@@ -29,6 +30,7 @@ from ms_slam_env.geometry import look_at
 from ms_slam_env.geometry.point_clouds import voxel_downsample
 from ms_slam_env.metrics import ate_rmse
 from ms_slam_env.metrics.cost import energy_counters
+from ms_slam_env.metrics.cost.energy import NoEnergy
 from ms_slam_env.metrics.registry import metric
 from ms_slam_env.report.results import read_results
 from ms_slam_env.sequences import open_sequence, render_sequence
@@ -305,11 +307,21 @@ def test_bad_input_is_one_line(options, message, tmp_path, capsys):
     assert not (tmp_path / "out").exists()  # a study there would keep the bad input
 
 
-def test_energy_is_refused_where_there_is_none(sequences):
+def test_energy_is_refused_where_there_is_none(sequences, monkeypatch):
     if not all(counter.reason for counter in energy_counters("cpu").values()):
         pytest.skip("this machine counts energy")
     with pytest.raises(InputError, match="energy_j is not available: "):
         Exploration(SlamEvaluator(sequences), ExplorationSettings(("ate_m", "energy_j")))
+    modelled = ExplorationSettings(("ate_m", "energy_model_j"))
+    row = Exploration(SlamEvaluator(sequences, "native"), modelled).evaluator.measure(
+        SlamConfiguration(), sequences[0]
+    )
+    assert row["energy_j"] is None
+    assert row["energy_model_j"] > 0
+    counted = {"cpu": NoEnergy("")}
+    monkeypatch.setattr(exploration_module, "energy_counters", lambda device: counted)
+    with pytest.raises(InputError, match="take energy_j"):
+        Exploration(SlamEvaluator(sequences), modelled)
     with pytest.raises(InputError, match="ate_worst_ratio is not measured"):
         Exploration(SlamEvaluator(sequences), ExplorationSettings(("ate_worst_ratio", "ext_ms")))
     with pytest.raises(InputError, match="map_error_mm is not measured"):

@@ -336,5 +336,13 @@ def test_a_model_stands_only_where_nothing_is_measured(monkeypatch) -> None:
     found = measured.summary()
     assert found["ene_j"] == 2.0
     assert not [key for key in found if "model" in key or key == "energy_source"]
+    monkeypatch.setattr(meter.time, "process_time", lambda: 0.0)
+    part = CostMeter("cuda", counters={"cpu": NoEnergy("no RAPL"), "gpu": _Counted()})
+    with part.frame():
+        pass
+    found = part.summary()
+    assert (found["ene_j"], found["ene_cpu_j"], found["ene_gpu_j"]) == (None, None, 2.0)
+    assert "ene_model_j" not in found
+    assert np.isnan(part.frames[0].joules)
     with pytest.raises(InputError, match="core_watts"):
         CostMeter(core_watts=0)

@@ -86,9 +86,11 @@ class FrameCost:
 
     @property
     def joules(self) -> float:
-        """Energy of all counters that there are; NaN without any."""
-        known = [joules for joules in self.ene_j.values() if math.isfinite(joules)]
-        return sum(known) if known else math.nan
+        """Energy of all counters; NaN where one is missing, since a part would look as the whole.
+
+        A GPU that the work does not use has no counter to miss.
+        """
+        return sum(self.ene_j.values()) if self.ene_j else math.nan
 
 
 class CostMeter:
@@ -119,6 +121,7 @@ class CostMeter:
         self._core_watts = core_watts
         self.frames: list[FrameCost] = []
         self._counters = dict(energy_counters(device) if counters is None else counters)
+        self._used = [name for name in self._counters if name != "gpu" or "cuda" in device]
         self._start_mb = forget_peak_memory()
 
     @contextmanager
@@ -132,7 +135,7 @@ class CostMeter:
         now = resident_mb()
         known = now is not None and self._start_mb is not None
         mem = now - self._start_mb if known else math.nan  # type: ignore[operator]
-        self.frames.append(FrameCost(ext_s, cpu_s, mem, taken))
+        self.frames.append(FrameCost(ext_s, cpu_s, mem, {name: taken[name] for name in self._used}))
 
     def summary(self, skip: int = 0) -> dict[str, Any]:
         """Costs by flat names; None where a figure cannot be had.
@@ -141,7 +144,8 @@ class CostMeter:
         ``cpu_ms_mean`` (processor time of all threads), ``cpu_ms_median``, ``cpu_ms_p95``;
         ``mem_peak_mb`` and ``mem_mb`` (peak, and mean over the frames, above what was in use when
         the meter was made: the SLAM's own), ``mem_process_mb`` (peak of the whole process);
-        ``ene_j`` (of the frames together), ``ene_frame_j`` (mean), ``ene_cpu_j``, ``ene_gpu_j``
+        ``ene_j`` (of the frames together), ``ene_frame_j`` (mean), both None where a counter of
+        what was used is missing, ``ene_cpu_j``, ``ene_gpu_j``
         and so on for every counter, and ``ene_source``, which says what was read or why not.
         Where nothing could be read, ``ene_model_j`` and ``ene_model_frame_j`` by the stated model,
         which ``energy_source`` names; never both.
@@ -177,21 +181,22 @@ class CostMeter:
         }
 
     def _energy(self, counted: list[FrameCost]) -> dict[str, Any]:
-        by_counter = {
-            name: float(np.sum([cost.ene_j[name] for cost in counted])) for name in self._counters
-        }
-        known = [joules for joules in by_counter.values() if math.isfinite(joules)]
-        total = sum(known) if known else None
+        by_counter = dict.fromkeys(self._counters, math.nan)
+        for name in self._used:
+            by_counter[name] = float(np.sum([cost.ene_j[name] for cost in counted]))
+        total = float(np.sum([cost.joules for cost in counted]))
+        is_whole = math.isfinite(total)
+        is_known = any(map(math.isfinite, by_counter.values()))
         said = [
             f"{name}: {f'not available: {counter.reason}' if counter.reason else counter.source}"
             for name, counter in self._counters.items()
         ]
         return {
-            "ene_j": total,
-            "ene_frame_j": None if total is None else total / len(counted),
+            "ene_j": total if is_whole else None,
+            "ene_frame_j": total / len(counted) if is_whole else None,
             **{f"ene_{k}_j": v if math.isfinite(v) else None for k, v in by_counter.items()},
             "ene_source": "; ".join(said),
-            **(self._estimate(counted) if total is None else {}),
+            **({} if is_known else self._estimate(counted)),
         }
 
     def _estimate(self, counted: list[FrameCost]) -> dict[str, Any]:
