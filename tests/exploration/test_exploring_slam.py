@@ -313,9 +313,8 @@ def test_energy_is_refused_where_there_is_none(sequences, monkeypatch):
     with pytest.raises(InputError, match="energy_j is not available: "):
         Exploration(SlamEvaluator(sequences), ExplorationSettings(("ate_m", "energy_j")))
     modelled = ExplorationSettings(("ate_m", "energy_model_j"))
-    row = Exploration(SlamEvaluator(sequences, "native"), modelled).evaluator.measure(
-        SlamConfiguration(), sequences[0]
-    )
+    small = SlamEvaluator(sequences, image_size="80x60")
+    row = Exploration(small, modelled).evaluator.measure(SlamConfiguration(), sequences[0])
     assert row["energy_j"] is None
     assert row["energy_model_j"] > 0
     counted = {"cpu": NoEnergy("")}
