@@ -156,19 +156,25 @@ class ExploreRates(Checked, Experiment):
         return [make_table(columns, lines, note=note)]
 
     def charts(self, rows: Sequence[Row]) -> list[Chart]:
-        """The fronts, overlaid, with every trial."""
-        fronts, defaults = [], []
+        """The fronts of all rates overlaid, beside their defaults; a panel for each sampler."""
+        drawn: dict[str, list[Series]] = {}
         for (every, sampler), results in _studies(rows).items():
-            name = f"every {every}, {sampler}"
             front, default = front_of_trials(_trials(results)), results[0]["trials"][0]
-            x, y = ([t[key] for t in front] for key in (COST, ERROR))
-            fronts.append(Series(name, x, y, mode="lines+markers"))
-            if sampler == self.samplers[0]:
-                label = f"default, every {every}"
-                defaults.append(Series(label, [default[COST]], [default[ERROR]], mode="markers"))
-        panel = Panel(COST, ERROR, [*fronts, *defaults], "xy")
-        caption = "A line each frame rate and sampler: what no other trial beats there."
-        return [Chart("fronts", "Fronts of the frame rates", caption, [panel])]
+            drawn.setdefault(sampler, []).extend(
+                [
+                    _series(f"every {every}", front, "lines+markers"),
+                    _series(f"default, every {every}", [default], "markers"),
+                ]
+            )
+        caption = "A line: what no other trial of that frame rate beats."
+        panels = [Panel(COST, ERROR, series, "xy", title=name) for name, series in drawn.items()]
+        return [Chart("fronts", "Fronts of the frame rates", caption, panels)]
+
+
+def _series(name: str, trials: Sequence[Row], mode: str) -> Series:
+    """Error over time of some trials."""
+    x, y = ([trial[key] for trial in trials] for key in (COST, ERROR))
+    return Series(name, x, y, mode=mode)
 
 
 def _studies(rows: Sequence[Row]) -> dict[tuple[int, str], list[Row]]:
