@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -107,7 +106,8 @@ class FrameSelection(Experiment, Checked):
         path = UnevenPath(spec.frames)
         opened = open_sequence(spec.sequence, spec.image_size, path=path, with_truth=True)
         surface = seen_surface(opened)
-        sequence = dataclasses.replace(opened, frames=tuple(opened.frames))
+        frames = tuple(opened.frames)
+        sequence = FrameSequence(frames, opened.poses, opened.intrinsics, opened.name)
         runs = []
         for text in spec.managements:
             config = parse_frame_selection(text)
@@ -202,12 +202,18 @@ def _pairs(runs: Sequence[Row]) -> Table:
     return make_table(columns, lines, "At equal share", note)
 
 
+def _kind(name: str) -> str:
+    """A selection without its first option, which is what differs along a line."""
+    kind, _, options = name.partition(",")
+    return ",".join([kind, *options.split(",")[1:]])
+
+
 def _panel(runs: Sequence[Row], key: str) -> Panel:
     """A measure over the share processed; a dot a run, a line the medians of each kind."""
     by_kind: dict[str, dict[str, list[Row]]] = {}
     for run in (run["result"] for run in runs):
         name = run["frame_selection"]
-        by_kind.setdefault(name.partition(",")[0], {}).setdefault(name, []).append(run)
+        by_kind.setdefault(_kind(name), {}).setdefault(name, []).append(run)
     everything = by_kind.pop("none", {})
     series = []
     for kind, groups in by_kind.items():

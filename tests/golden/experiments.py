@@ -61,7 +61,7 @@ _UNREPEATABLE = re.compile(
     r"(^|\.)(cpu|ext|ene|mem|load)_"  # of the meters of cost
     r"|(^|[._])ms([._]|$)"
     r"|(^|\.)(merge_cpu_s|memory_mb|mb_per_env|frames_per_s|frames_per_cpu_s)$"
-    r"|^(rows\.\d+|tracked|blind|trials\.\d+|held_out\.\d+)\.energy_j"  # an arm's work is kept
+    r"|^(rows\.\d+|tracked|blind|trials\.\d+|held_out\.\d+)\.energy(_model)?_j"  # an arm's is kept
 )
 
 
