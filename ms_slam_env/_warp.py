@@ -78,7 +78,7 @@ def roomy_zeros(shape: int | tuple[int, ...], dtype: Any, device: str) -> Any:
     """Zeros of a Warp type, of which a CPU gives memory to what is written alone.
 
     For arrays that have room for far more than they will hold. Warp writes all of its zeros: for
-    the four million surfels of a home's map that took 3 s of every episode, and a gigabyte.
+    the four million surfels of a home's map 703 MB in 0.5 s, here 3 MB in 4 ms.
     """
     if not wp.get_device(device).is_cpu:
         return wp.zeros(shape, dtype=dtype, device=device)

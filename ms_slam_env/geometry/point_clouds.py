@@ -41,13 +41,14 @@ class IndexedCloud:
 
     Args:
         points: (N, 3).
+        name: of the points, for the message where they are bad.
 
     Raises:
-        InputError: bad points.
+        InputError: bad points, by their name.
     """
 
-    def __init__(self, points: ArrayLike) -> None:
-        self.points = check_points(points, "points")
+    def __init__(self, points: ArrayLike, name: str = "points") -> None:
+        self.points = check_points(points, name)
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
         """The points."""
@@ -77,7 +78,7 @@ def indexed(points: ArrayLike | IndexedCloud, name: str) -> IndexedCloud:
     Raises:
         InputError: bad points, by their name.
     """
-    return points if isinstance(points, IndexedCloud) else IndexedCloud(check_points(points, name))
+    return points if isinstance(points, IndexedCloud) else IndexedCloud(points, name)
 
 
 def voxel_downsample(points: ArrayLike, voxel_m: float) -> Float64:

@@ -66,6 +66,8 @@ def test_rows_are_kept_and_only_failed_ones_run_again(tmp_path: Path) -> None:
     outcome = run_experiment(Wobbles(scenes=("table", "mars")), tmp_path, workers=1)
     assert len(outcome.failures) == 2
     before = (tmp_path / "rows.jsonl").read_text()
+    assert "Traceback" in before
+    assert "Traceback" not in (tmp_path / "results.json").read_text()  # paths of a machine
     again = run_experiment(Wobbles(), tmp_path, workers=1)
     assert not again.failures
     assert (tmp_path / "rows.jsonl").read_text().startswith(before)

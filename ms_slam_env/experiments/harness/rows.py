@@ -205,6 +205,8 @@ def run_experiment(
 
 def write_all(experiment: Experiment, rows: Sequence[Row], out: Path) -> Results:
     """Write everything that is made of the rows into folder ``out``."""
+    # Where in the code a row failed is for who runs it, with the paths of that machine.
+    rows = [{k: v for k, v in row.items() if k != "traceback"} for row in rows]
     rows = from_plain(to_plain(rows))
     return write_result_folder(
         out,
