@@ -233,10 +233,14 @@ def make_space(texts: Sequence[str], base: SlamConfiguration | None = None) -> S
 
 
 def absences(texts: Sequence[str], base: SlamConfiguration) -> list[str]:
-    """Of the groups among ``texts`` what is absent here, and why; a line each."""
+    """Of the groups among ``texts`` what is absent here, a line for each reason why."""
     members = [member for text in texts for member in GROUPS.get(text, ())]
-    found = {member: why_absent(member, base) for member in members}
-    return [f"{member} is absent: {why}" for member, why in found.items() if why]
+    absent: dict[str, list[str]] = {}
+    for member in members:
+        absent.setdefault(why_absent(member, base), []).append(member)
+    absent.pop("", None)
+    verb = {why: "is" if len(names) == 1 else "are" for why, names in absent.items()}
+    return [f"{', '.join(names)} {verb[why]} absent: {why}" for why, names in absent.items()]
 
 
 def _parse_values(name: str, text: str, default: Any) -> Parameter:
