@@ -9,10 +9,9 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from ms_slam_agents.policy import Policy
 from numpy.typing import NDArray
 
-from ms_slam_env.env.planners import make_planner
+from ms_slam_env.env.planners import Planner, make_planner
 from ms_slam_env.errors import InputError
 from ms_slam_env.output_files import write_bytes
 
@@ -32,6 +31,8 @@ class Task:
         teacher: a planner, ``NAME,option=value,...``.
         policy: file of the policy that acts; None: the teacher does.
         share: of the episode's decisions that are the teacher's where a policy acts.
+        through: planner with the option ``path`` that the policy acts through; of decisions that
+            the teacher does not weigh nothing is learnt then. None: the policy acts by itself.
     """
 
     path: Path
@@ -41,6 +42,7 @@ class Task:
     teacher: str
     policy: Path | None = None
     share: float = 0.0
+    through: str | None = None
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,8 @@ class Demonstration:
     Attributes:
         observations: (T, k) float16.
         masks: (T, n) bool, the actions that were possible.
-        preferences: (T, n) float16, probabilities of the actions as the teacher weighs them.
+        preferences: (T, n) float16, probabilities of the actions as the teacher weighs them; all
+            zero where nothing is to be learnt.
         rewards: (T,) of the actions that were taken.
         is_tracked: (T,) bool, whether SLAM knew where it was.
     """
@@ -112,19 +115,22 @@ def play(task: Task) -> Path:
     stream = np.random.default_rng([task.seed, _PLANNER])
     teacher = make_planner(task.teacher, env.unwrapped, seed=int(stream.integers(2**31)))
     teacher.reset()
-    policy = Policy.load(task.policy) if task.policy else None
+    actor = _actor(task, env.unwrapped, int(stream.integers(2**31)))
     rng = np.random.default_rng([task.seed, _POLICY])
     steps: list[tuple[Any, ...]] = []
     is_over = False
     while not is_over:
         mask, is_tracked = np.array(info["action_mask"], dtype=bool), info["tracking_ok"]
-        wanted = action = teacher.act(observation, info)
+        wanted = teacher.act(observation, info)
         preferences = teacher.preferences()
         if preferences is None:
-            preferences = np.arange(len(mask)) == wanted
-        if policy and rng.random() >= task.share:
-            action = policy.act(observation, mask, rng)
-            if action != wanted:
+            preferences = (np.arange(len(mask)) == wanted) & (task.through is None)
+        action = actor.act(observation, info) if actor else wanted
+        if actor and action != wanted:
+            if rng.random() < task.share:
+                action = wanted
+                actor.instead(action)
+            else:
                 teacher.instead(action)
         seen = np.asarray(observation)
         observation, reward, terminated, truncated, info = env.step(action)
@@ -137,3 +143,12 @@ def play(task: Task) -> Path:
     ]
     Demonstration(*arrays).write(task.path)
     return task.path
+
+
+def _actor(task: Task, env: Any, seed: int) -> Planner | None:
+    """The planner that the policy acts through, ready; None where the teacher acts."""
+    if task.policy is None:
+        return None
+    actor = make_planner(f"{task.through or 'policy'},path={task.policy}", env, seed)
+    actor.reset()
+    return actor

@@ -9,10 +9,18 @@ from ms_slam_agents.policy_planner import RoomAgent
 from ms_slam_baselines.nbv import NextBestView
 from numpy.typing import NDArray
 
+from ms_slam_env.errors import unknown
+from ms_slam_env.mapping.candidates import GRID_NAMES
+from ms_slam_env.mapping.trackability import NEAR_SHARE, bearable, leads_on
 from ms_slam_env.mapping.view_goals import best_goal
 
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv
+
+
+_REMAINS = 0.3
+"""Share of what the camera sees that should remain in its image, or as much as there can."""
+_OBSERVATIONS = ("goals", "held")
 
 
 class HomeAgent(NextBestView):
@@ -20,8 +28,10 @@ class HomeAgent(NextBestView):
 
     A policy that sees some metres around does not find its way to the next room. As in Active
     Neural SLAM (Chaplot et al., ICLR 2020) goals are what is above it: where the best view near by
-    would show too little, where the policy comes back to where it has been, or wants the motion
-    that lost tracking before, this planner goes to a goal and there gives the camera back.
+    would show too little, or where the policy comes back to where it has been, this planner goes to
+    a goal and there gives the camera back. The policy chooses among the motions that are not likely
+    to slip by what it is shown of them itself, and not among those that lost tracking before (a
+    shield, Alshiekh et al., AAAI 2018): the view from here is all that is asked of the map.
 
     Args:
         env: the unwrapped environment.
@@ -30,33 +40,54 @@ class HomeAgent(NextBestView):
         **options: see `NextBestView`; ``enough_m3`` is what the best view near by should show.
 
     Raises:
-        InputError: an option out of its range, or a policy that does not fit the environment.
+        InputError: an option out of its range, or a policy that does not fit the environment or
+            is not shown the risks.
     """
 
     def __init__(
         self, env: ActiveSlamEnv, seed: int = 0, path: str | None = None, **options: Any
     ) -> None:
-        super().__init__(env, seed, **options)
         self.near = RoomAgent(env, seed, path)
+        super().__init__(env, seed, **options)
+        if self.near.policy.metadata.observation not in _OBSERVATIONS:
+            seen = self.near.policy.metadata.observation
+            raise unknown("observation of the policy under agent-home", seen, _OBSERVATIONS)
 
     @classmethod
     def observation_for(cls, path: str | None = None, **options: Any) -> str:
         """What the policy was trained on."""
         return RoomAgent.observation_for(path)
 
+    def reset(self) -> None:
+        """Nothing is known yet."""
+        super().reset()
+        self.near.reset()
+
     def act(self, observation: Any, info: dict[str, Any]) -> int:
         """Carve the last frame, choose a motion."""
-        self.wanted = int(self.near.act(observation, info))
+        self.seen = np.asarray(observation)
         return super().act(observation, info)
 
     def choose_motion(self, here: NDArray[np.float64]) -> int:
         """The policy's motion, or the one towards a goal."""
+        safe = self.safe_motions(here)
+        wanted = self.near.policy.act(self.seen, safe if safe.any() else self.env.action_masks())
         if self.goal is not None:
             self.judge_goal(here)
-        if self.goal is None and not self.must_leave(here):
+        if self.goal is None and not self.must_leave(here) and safe.any():
             best = best_goal(self.map.grid, here, self.env.intrinsics, self.steps)
-            is_safe = not self.near_loss(self.env.candidate_poses())[self.wanted]
-            if is_safe and self.gain_of(best[None])[0] >= self.enough_m3:
+            if self.gain_of(best[None])[0] >= self.enough_m3:
                 self.given_up = 0
-                return self.wanted
+                return int(wanted)
         return self.go_to_goal(here)
+
+    def safe_motions(self, here: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which motions (n,) are not likely to slip, as far as the policy's observation says."""
+        poses = self.env.candidate_poses()
+        rows = self.seen[self.near.policy.metadata.num_state :].reshape(len(poses), -1)
+        of = dict(zip(GRID_NAMES, rows.T.astype(np.float64), strict=False))
+        can = self.env.action_masks() & ~self.near_loss(poses)
+        can &= of["remains"] >= min(_REMAINS, of["remains"][can].max(initial=0))
+        can &= of["near"] <= max(NEAR_SHARE, of["near"][0])
+        risks = np.where(can, of["slip_risk"], np.inf)
+        return np.asarray(can & (risks <= bearable(self.risk, risks, leads_on(poses, here))))

@@ -33,7 +33,7 @@ from ms_slam_agents.normalization import PooledMoments
 from ms_slam_agents.options import Problem, check_new, parse_for_task
 from ms_slam_agents.policy import CLIP, EPSILON
 from ms_slam_agents.policy_file import PolicyFile, write_policy
-from ms_slam_agents.training_run import metadata_of, read_run
+from ms_slam_agents.training_run import metadata_of, read_run, read_similar
 from tqdm import tqdm
 
 from ms_slam_env.command_line import exit_code
@@ -54,6 +54,10 @@ class Args(Problem):
 
     Attributes:
         teacher: a planner, NAME,option=value,...
+        init: policy file to begin with, its network and normalisation; it may be of another task.
+        through: planner that the policy acts through in the rounds after the first, as its option
+            ``path``: `agent-home` has goals for the way to what is not near by. Then only the
+            decisions count that the teacher weighs. None: the policy acts by itself.
         rounds: of episodes and fitting; in the first the teacher acts.
         episodes: of each round.
         share: of the decisions that are the teacher's in the second round; half as many in each
@@ -69,6 +73,8 @@ class Args(Problem):
 
     out: Path = Path("runs/imitation")
     teacher: str = "nbv"
+    init: Path | None = None
+    through: str | None = None
     rounds: int = bounded(5, 1, 1000)
     episodes: int = bounded(40, 1, 100_000)
     share: float = bounded(0.5, 0, 1)
@@ -97,6 +103,7 @@ def tasks(args: Args, number: int) -> list[Task]:
             teacher=args.teacher,
             policy=args.out / LATEST if number else None,
             share=args.share / 2 ** (number - 1) if number else 1.0,
+            through=args.through,
         )
         for k in range(args.episodes)
     ]
@@ -165,10 +172,18 @@ class Student:
         args: of the training.
         demonstrations: of the first round, which the normalisation is taken from.
         file: to go on from.
+        epochs: done before.
+
+    Raises:
+        InputError: a file for other observations or actions.
     """
 
     def __init__(
-        self, args: Args, demonstrations: Sequence[Demonstration], file: PolicyFile | None
+        self,
+        args: Args,
+        demonstrations: Sequence[Demonstration],
+        file: PolicyFile | None,
+        epochs: int = 0,
     ) -> None:
         self.args = args
         first = demonstrations[0]
@@ -184,8 +199,11 @@ class Student:
         self.network = Network(
             self.inputs, width, actions, candidates=args.candidates, dropout=args.dropout
         )
-        self.epochs = file.metadata.epochs if file else 0
+        self.epochs = epochs
         if file:
+            known = file.metadata
+            if (known.inputs, known.actions) != (self.inputs, (self.actions,)):
+                raise InputError(f"{args.init} is for {known.inputs} numbers and {known.actions}")
             load_parameters(self.network, file)
 
     def _moments(self, observations: Any) -> Moments:
@@ -302,6 +320,11 @@ def train(args: Args) -> int:
     """
     torch.set_num_threads(1)
     check_planner(args.teacher)
+    if args.through:
+        check_planner(f"{args.through},path={args.out / LATEST}")
+    begun = None
+    if args.init:
+        begun = read_similar(args.init, args, args.hidden, ["observation"])
     file, done = load_run(args)
     check_problem(args)
     curve = Curve(args.eval_episodes, {}, config=to_plain(asdict(args)))
@@ -315,7 +338,9 @@ def train(args: Args) -> int:
         play_round(args, number)
         paths = [task.path for n in range(number + 1) for task in tasks(args, n)]
         demonstrations = [Demonstration.read(path) for path in paths]
-        student = Student(args, demonstrations[: args.episodes], file)
+        student = Student(
+            args, demonstrations[: args.episodes], file or begun, number * args.epochs
+        )
         said = student.fit(demonstrations)
         steps = sum(len(d.rewards) for d in demonstrations)
         file = student.file(steps, (time.monotonic() - started) / 60)

@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 import torch
@@ -283,12 +284,21 @@ def read_init(args: Training) -> PolicyFile:
         InputError: no policy, or one of another network or problem.
     """
     assert args.init
-    file = read_policy(args.init)
+    return read_similar(args.init, args, args.hidden, ("env_id", "observation"))
+
+
+def read_similar(path: Path, args: Problem, hidden: int, names: Sequence[str]) -> PolicyFile:
+    """A policy with layers as wide as ``hidden`` and the options ``names`` of ``args``.
+
+    Raises:
+        InputError: no policy, or another one.
+    """
+    file = read_policy(path)
     known = file.metadata
-    for name in ("env_id", "observation"):
+    for name in names:
         own = getattr(args, name)
         if getattr(known, name) != own:
-            raise InputError(f"{args.init} is for {name} {getattr(known, name)!r}, not {own!r}")
-    if tuple(known.hidden) != (args.hidden, args.hidden):
-        raise InputError(f"{args.init} has layers of {known.hidden}: give --hidden that")
+            raise InputError(f"{path} is for {name} {getattr(known, name)!r}, not {own!r}")
+    if tuple(known.hidden) != (hidden, hidden):
+        raise InputError(f"{path} has layers of {known.hidden}: give --hidden that")
     return file

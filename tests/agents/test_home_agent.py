@@ -3,12 +3,13 @@
 import gymnasium as gym
 import pytest
 from ms_slam_agents.home_agent import HomeAgent
-from ms_slam_agents.policy_planner import RoomAgent
+from ms_slam_agents.policy_planner import SHIPPED, RoomAgent
 from ms_slam_baselines.nbv import NextBestView
 
 import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env.env.planners import make_planner, planner_observation
 from ms_slam_env.errors import InputError
+from ms_slam_env.mapping.candidates import GRID_NAMES
 
 
 def make_env():
@@ -32,7 +33,7 @@ def play(planner_class, steps=8, before=lambda *_: None, **options):
 
 
 def test_while_there_is_something_to_see_near_by_it_is_the_policy():
-    actions, has_goal = play(HomeAgent, enough_m3=0.0)
+    actions, has_goal = play(HomeAgent, enough_m3=0.0, risk=1.0)
     assert actions == play(RoomAgent)[0]
     assert not any(has_goal)
 
@@ -69,7 +70,29 @@ def test_the_motion_that_lost_tracking_is_not_made_again():
     planner.lost_by(wanted)
     planner.passed = []
     assert planner.act(observation, info) != wanted
-    assert planner.goal is not None
+
+
+def test_the_policy_chooses_among_the_motions_that_are_not_likely_to_slip():
+    risks, safe = [], []
+
+    def before(planner, step):
+        if step:
+            here = planner.env.episode.T_world_camera_estimate
+            safe.append(planner.safe_motions(here))
+            rows = planner.seen[planner.near.policy.metadata.num_state :].reshape(49, -1)
+            risks.append(rows[:, GRID_NAMES.index("slip_risk")])
+
+    play(HomeAgent, 8, before, enough_m3=0.0, risk=0.0)
+    for risk, can in zip(risks, safe, strict=True):
+        assert 0 < can.sum() < 49
+        assert risk[can].max() <= 1.3 * risk[1:].min() or not can[1:].any()
+
+
+def test_a_policy_that_is_not_shown_the_risks_is_refused():
+    env = gym.make("MSActiveSLAM-Room-v0", scene="table", image_size="80x60",
+                   observation="candidates", disable_env_checker=True).unwrapped  # fmt: skip
+    with pytest.raises(InputError, match=r"agent-home.*'candidates'; valid choices: goals, held"):
+        HomeAgent(env, path=str(SHIPPED / "paper.safetensors"))
 
 
 def test_it_is_found_by_its_name_with_options_and_the_observation_of_its_policy():

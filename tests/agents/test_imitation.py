@@ -10,6 +10,7 @@ from ms_slam_agents import imitation, train_sb3
 from ms_slam_agents.demonstrations import Demonstration, Task, play
 from ms_slam_agents.policy import Policy
 from ms_slam_agents.policy_file import read_policy
+from ms_slam_agents.policy_planner import TrainedPolicy
 
 from ms_slam_env.env import Planner
 from ms_slam_env.errors import InputError
@@ -41,6 +42,29 @@ class Knowing(Planner):
 
     def instead(self, action):
         self.instead_of.append((self.label, action))
+
+
+class Through(TrainedPolicy):
+    """The policy, but every third motion is the first that is possible."""
+
+    taken: list = []  # noqa: RUF012 -- the tests look at it
+    instead_of: list = []  # noqa: RUF012
+
+    def act(self, observation, info):
+        action = super().act(observation, info)
+        first = int(np.flatnonzero(self.env.mask)[0])
+        self.taken.append(first if len(self.taken) % 3 == 2 else action)
+        return self.taken[-1]
+
+    def instead(self, action):
+        self.instead_of.append(action)
+
+
+class Sometimes(Undecided):
+    """Weighs the motions where the first is not the right one."""
+
+    def preferences(self):
+        return super().preferences() if self.label else None
 
 
 @pytest.fixture(autouse=True)
@@ -145,6 +169,43 @@ def test_later_rounds_are_played_by_the_policy_and_labelled_by_the_teacher(tmp_p
     wrong = np.flatnonzero(one.rewards == 0)
     assert [right for right, _ in Knowing.instead_of] == labels[wrong].tolist()
     assert all(right != done for right, done in Knowing.instead_of)
+
+
+def test_the_policy_acts_through_a_planner_and_only_weighed_decisions_count(tmp_path):
+    imitation.main(arguments(tmp_path, rounds=1))
+    Through.taken.clear(), Through.instead_of.clear()
+    task = Task(
+        path=tmp_path / "one.npz",
+        env_id=ENV_ID,
+        options=(("max_episode_steps", 60),),
+        seed=3,
+        teacher=f"{__name__}:Sometimes",
+        policy=tmp_path / "latest.safetensors",
+        share=0.5,
+        through=f"{__name__}:Through",
+    )
+    one = Demonstration.read(play(task))
+    assert len(Through.taken) == 60
+    right = one.observations.argmax(axis=1)
+    done = np.array(Through.taken)
+    wrong = done != right
+    assert 0 < len(Through.instead_of) < wrong.sum()  # the teacher's share of them
+    assert one.rewards.sum() == 60 - wrong.sum() + len(Through.instead_of)
+    np.testing.assert_array_equal(one.preferences.sum(axis=1), right > 0)
+
+
+def test_it_begins_with_a_policy_that_there_is(tmp_path, capsys):
+    imitation.main(arguments(tmp_path / "first", rounds=1))
+    init = tmp_path / "first/latest.safetensors"
+    words = ["--init", str(init), "--epochs", "1", "--learning-rate", "0"]
+    assert imitation.main(arguments(tmp_path / "second", *words, rounds=1)) == 0
+    first, second = (read_policy(path) for path in (init, tmp_path / "second/latest.safetensors"))
+    for name, value in first.tensors.items():
+        np.testing.assert_array_equal(second.tensors[name], value, err_msg=name)
+    assert (first.metadata.epochs, second.metadata.epochs) == (30, 1)
+    assert imitation.main(arguments(tmp_path / "second", *words, "--resume")) == 0
+    assert imitation.main(arguments(tmp_path / "other", *words, "--hidden", "8")) == 2
+    assert "give --hidden that" in capsys.readouterr().err
 
 
 def test_returns_are_those_of_a_loop(tmp_path):
