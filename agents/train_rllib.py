@@ -274,7 +274,6 @@ class Run(TrainingRun):
         result = self.ppo.train()
         played = result.get("env_runners", {}).get("num_env_steps_sampled", 0)
         learnt = result.get("learners", {}).get(MODULE, {})
-        self.timers = result.get("timers", {})
         self.steps += int(played)
         self.epochs += self.ppo.config.num_epochs if learnt else 0
         names = {"policy_loss": "policy_loss", "value_loss": "vf_loss", "entropy": "entropy"}

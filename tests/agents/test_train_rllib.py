@@ -21,7 +21,7 @@ import learnable_fake
 import ray
 import torch
 from learnable_fake import ENV_ID, NUM_ACTIONS, LearnableFake, read_curve
-from ms_slam_agents import train_rllib, training_run
+from ms_slam_agents import rllib_scaling, train_rllib, training_run
 from ms_slam_agents.normalization import moment_tensors
 from ms_slam_agents.policy import Policy
 from ms_slam_agents.policy_file import Metadata, PolicyFile, read_policy
@@ -214,3 +214,8 @@ def test_a_runner_is_killed_the_training_goes_on_and_is_resumed(cluster, tmp_pat
         after.metadata.timesteps,
     ]
     assert points[-1]["return"] > 6
+
+
+def test_by_default_a_round_of_one_runner_of_the_scaling_fills_a_batch():
+    args = rllib_scaling.Scaling()
+    assert args.batch_size <= args.n_steps
