@@ -307,7 +307,7 @@ def load_run(args: Args) -> tuple[PolicyFile | None, int]:
     if not path.exists():
         return None, 0  # interrupted in the first round
     names = {"env_id", "observation", "hidden", "teacher", "episodes", "epochs", "seed", "reward"}
-    file = read_run(args, "imitation", names)
+    file = read_run(args, "imitation", names | {"through"})
     return file, file.metadata.epochs // args.epochs
 
 
@@ -322,10 +322,10 @@ def train(args: Args) -> int:
     check_planner(args.teacher)
     if args.through:
         check_planner(f"{args.through},path={args.out / LATEST}")
-    begun = None
-    if args.init:
-        begun = read_similar(args.init, args, args.hidden, ["observation"])
     file, done = load_run(args)
+    begun = None
+    if args.init and not done:
+        begun = read_similar(args.init, args, args.hidden, ["observation"])
     check_problem(args)
     curve = Curve(args.eval_episodes, {}, config=to_plain(asdict(args)))
     if done and (args.out / RESULTS).is_file():

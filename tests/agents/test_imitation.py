@@ -251,6 +251,7 @@ def test_runs_that_are_not_to_be_gone_on_with_are_refused(tmp_path, capsys):
         (arguments(tmp_path), "holds a training run already"),
         (arguments(tmp_path, "--resume", rounds=1), "has 1 rounds already"),
         (arguments(tmp_path, "--resume", "--hidden", "32"), "trained with hidden 16, not 32"),
+        (arguments(tmp_path, "--resume", "--through", "policy"), "through None, not 'policy'"),
         (arguments(tmp_path, "--resume", "--reward", "paper"), "reward 'default', not 'paper'"),
         (arguments(tmp_path / "new", "--teacher", "nobody"), "unknown planner 'nobody'"),
         (arguments(tmp_path / "new", "--observation", "x:Y"), "unknown observation 'x:Y'"),
