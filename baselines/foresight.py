@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.config import check_range
 from ms_slam_env.env import Planner
+from ms_slam_env.env.config import RewardConfig
 from ms_slam_env.errors import unknown
 
 if TYPE_CHECKING:
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
 Float64 = NDArray[np.float64]
 
 ORDERS = ("random", "greedy")
+TERMS = tuple(field.name for field in fields(RewardConfig))
 
 
 class Foresight(Planner):
@@ -36,9 +39,10 @@ class Foresight(Planner):
             an episode its sum is the error at the end, so that what is small at one step the next
             ones take back, and what is large is a slip.
         temperature: reward that a motion may lack to be 1/e as good a choice as the best.
+        without: terms of the reward that do not count, joined by ``+``: what does each buy?
 
     Raises:
-        InputError: an option out of its range, or an order that there is not.
+        InputError: an option out of its range, an order or a term that there is not.
     """
 
     def __init__(
@@ -49,6 +53,7 @@ class Foresight(Planner):
         order: str = "random",
         noise: float = 0.0,
         temperature: float = 0.02,
+        without: str = "",
     ) -> None:
         super().__init__(env, seed)
         self.tried, self.order = tried, order
@@ -58,6 +63,10 @@ class Foresight(Planner):
         check_range(self, "temperature", 1e-6, 1000)
         if order not in ORDERS:
             raise unknown("order of foresight", order, ORDERS)
+        self.without = tuple(filter(None, without.split("+")))
+        for name in self.without:
+            if name not in TERMS:
+                raise unknown("term of the reward", name, TERMS)
         self.weights: Float64 | None = None
 
     def act(self, observation: Any, info: dict[str, Any]) -> int:
@@ -78,7 +87,8 @@ class Foresight(Planner):
         return possible[order[: self.tried]]
 
     def _worth(self, terms: dict[str, float]) -> float:
-        """The sum of the terms, without what is noise of one of them."""
+        """The sum of the terms that count, without what is noise of one of them."""
+        terms = {name: term for name, term in terms.items() if name not in self.without}
         growth = terms.get("trajectory_error", 0.0)  # a reward of the user's own may have none
         return sum(terms.values()) - float(np.clip(growth, -self.noise, self.noise))
 

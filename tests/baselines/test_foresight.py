@@ -109,9 +109,24 @@ def test_only_an_error_that_is_no_noise_counts(monkeypatch):
     assert best == {0.0: 0, 0.03: 1, 1.0: 2}
 
 
+def test_terms_left_out_do_not_count():
+    env = make_env()
+    observation, info = env.reset(seed=3)
+    tried = np.flatnonzero(info["action_mask"])
+    terms = env.unwrapped.foresee_terms(tried)
+    chosen = set()
+    for without in ("", "new_surface", "intensity_divergence+depth_divergence+trajectory_error"):
+        left = [{k: v for k, v in t.items() if k not in without.split("+")} for t in terms]
+        best = tried[np.argmax([sum(t.values()) for t in left])]
+        planner = Foresight(env.unwrapped, without=without)
+        assert planner.act(observation, info) == best
+        chosen.add(best)
+    assert len(chosen) > 1
+
+
 def test_it_is_found_by_its_name_and_refuses_what_it_cannot():
     env = make_env().unwrapped
     assert isinstance(make_planner("foresight,tried=3", env), Foresight)
-    for option in ("tried=0", "temperature=0", "noise=-1", "order=greediest"):
-        with pytest.raises(InputError, match=option.split("=")[0]):
+    for option in ("tried=0", "temperature=0", "noise=-1", "order=greediest", "without=surface"):
+        with pytest.raises(InputError, match=option.split("=")[option.startswith("without")]):
             make_planner(f"foresight,{option}", env)
