@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections import OrderedDict
+from threading import RLock
+from typing import Any
 
 from ms_slam_env import scenes
 from ms_slam_env.camera import Intrinsics
@@ -11,18 +13,45 @@ from ms_slam_env.scenes.registry import SceneName
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sensor.noise import NoiseConfig
 
-_SCENES_KEPT = 32  # a scene with its textures takes tens of megabytes
+FACES_KEPT = 2_000_000
+"""Faces of all scenes that are kept, the last one used in any case.
+
+With textures, trees and surfaces a room of 50,000 faces takes some 90 MB, a home of 180,000 some
+250 MB: about 3 GB for 40 rooms or 11 homes.
+"""
+
+_kept: OrderedDict[tuple[SceneName, int], tuple[Scene, dict[Any, RGBDSensor]]] = OrderedDict()
+_lock = RLock()
 
 
-@lru_cache(maxsize=_SCENES_KEPT)
 def get_scene(name: SceneName, seed: int) -> Scene:
-    """The scene ``name`` with ``seed``; built at the first call."""
-    return scenes.make(name, seed=seed)
+    """The scene ``name`` with ``seed``; built at the first call, and where it is no longer kept."""
+    return _place(name, seed)[0]
 
 
-@lru_cache(maxsize=_SCENES_KEPT)
 def get_sensor(
     name: SceneName, seed: int, intrinsics: Intrinsics, noise: str | NoiseConfig
 ) -> RGBDSensor:
     """A sensor looking at that scene; its noise seed is set by each environment."""
-    return RGBDSensor(get_scene(name, seed), intrinsics, noise=noise)
+    with _lock:
+        scene, sensors = _place(name, seed)
+        key = intrinsics, noise
+        if key not in sensors:
+            sensors[key] = RGBDSensor(scene, intrinsics, noise=noise)
+        return sensors[key]
+
+
+def _place(name: SceneName, seed: int) -> tuple[Scene, dict[Any, RGBDSensor]]:
+    """A scene and its sensors; those longest not asked for go where there are too many faces."""
+    key = name, seed
+    with _lock:
+        if key not in _kept:
+            _kept[key] = scenes.make(name, seed=seed), {}
+        _kept.move_to_end(key)
+        while len(_kept) > 1 and _faces_kept() > FACES_KEPT:
+            _kept.popitem(last=False)
+        return _kept[key]
+
+
+def _faces_kept() -> int:
+    return sum(len(scene.mesh.faces) for scene, _ in _kept.values())
