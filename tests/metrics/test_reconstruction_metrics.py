@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from ms_slam_env.errors import InputError
@@ -79,13 +79,13 @@ def test_icp_undoes_a_small_motion():
 
 @settings(max_examples=20)
 @given(st.integers(0, 100), st.floats(0.02, 0.5))
-def test_thinning_leaves_one_point_of_the_input_in_each_voxel(seed, voxel_m):
+@example(0, 2e-6)  # so many voxels that a number cannot say voxel and point
+def test_thinning_leaves_the_first_point_of_the_input_in_each_voxel(seed, voxel_m):
     points = box(seed, 300) - 0.7
-    thinned = voxel_downsample(points, voxel_m)
-    cells = {tuple(cell) for cell in np.floor(points / voxel_m).astype(int)}
-    assert len(thinned) == len(cells)
-    assert {tuple(cell) for cell in np.floor(thinned / voxel_m).astype(int)} == cells
-    assert {tuple(p) for p in thinned} <= {tuple(p) for p in points}
+    firsts = {}
+    for point in points:
+        firsts.setdefault(tuple(np.floor(point / voxel_m).astype(int)), point)
+    np.testing.assert_array_equal(voxel_downsample(points, voxel_m), list(firsts.values()))
 
 
 GOOD = box(0, 50)
