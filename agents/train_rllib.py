@@ -68,6 +68,20 @@ class Args(PpoTraining):
     address: str | None = None
     value_weight: float = bounded(0.5, 0, 1000)
 
+    def __post_init__(self) -> None:
+        """Refuse values out of range, and a batch that is larger than a round."""
+        super().__post_init__()
+        if self.batch_size > self.round_steps:
+            raise InputError(
+                f"batch_size = {self.batch_size} is larger than a round of {self.round_steps} "
+                "steps (n_steps x num_envs x envs_per_runner)"
+            )
+
+    @property
+    def round_steps(self) -> int:
+        """Steps of all environments between updates."""
+        return self.n_steps * max(1, self.num_envs) * self.envs_per_runner
+
 
 # -- Environment and network -------------------------------------------------------------------
 
@@ -201,7 +215,7 @@ def make_config(args: Args, space: gym.Space[Any], actions: int, done: int) -> P
     config.learners(num_learners=0, learner_connector=lambda *_: Normalize())
     config.rl_module(rl_module_spec=RLModuleSpec(module_class=MaskedModule, model_config=given))
     config.training(
-        train_batch_size_per_learner=args.n_steps * max(1, args.num_envs) * args.envs_per_runner,
+        train_batch_size_per_learner=args.round_steps,
         minibatch_size=args.batch_size,
         num_epochs=args.n_epochs,
         lr=[[0, rate], [left, 0.0]],

@@ -28,6 +28,8 @@ from ms_slam_agents.policy_file import Metadata, PolicyFile, read_policy
 from ray.cluster_utils import Cluster
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 
+from ms_slam_env.errors import InputError
+
 INPUTS, CANDIDATES = 4 + NUM_ACTIONS * 3, 3
 
 
@@ -43,6 +45,13 @@ def make_module(candidates):
     for parameter in module.parameters():
         torch.nn.init.normal_(parameter, 0, 0.5)
     return module
+
+
+def test_a_batch_larger_than_a_round_is_refused():
+    fits = train_rllib.Args(n_steps=32, num_envs=2, envs_per_runner=2, batch_size=128)
+    assert fits.round_steps == 128
+    with pytest.raises(InputError, match=r"batch_size = 129 .* 128 steps"):
+        replace(fits, batch_size=129)
 
 
 @pytest.mark.parametrize("candidates", [0, CANDIDATES])
