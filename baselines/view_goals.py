@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ms_slam_env.geometry import look_at, so3_exp, so3_log
+from ms_slam_env.geometry import look_at, make_pose, so3_exp, so3_log
 from ms_slam_env.mapping import OccupancyGrid
 from ms_slam_env.mapping.view_goals import upright_poses
 
@@ -24,24 +24,11 @@ def views_anywhere(rng: np.random.Generator, positions: Float64) -> Float64:
 
 def poses_between(start: Float64, end: Float64, number: int) -> Float64:
     """``number`` poses (number, 4, 4) on the straight way to ``end`` (4, 4), the end the last."""
-    shares = np.arange(1, number + 1) / number
-    return poses_along(np.stack([start[:3, 3], end[:3, 3]]), start, end, shares)
-
-
-def poses_along(way: Float64, start: Float64, end: Float64, shares: Float64) -> Float64:
-    """Poses (N, 4, 4) at ``shares`` (N,) of a way.
-
-    Args:
-        way: (K, 3) its positions, from the start to the end.
-        start, end: (4, 4) how the camera is turned there; in between it turns evenly.
-        shares: of the way's length, and of the turn.
-    """
-    at = np.concatenate([[0.0], np.linalg.norm(np.diff(way, axis=0), axis=1).cumsum()])
     turn = so3_log(start[:3, :3].T @ end[:3, :3])
-    poses = np.tile(np.eye(4), (len(shares), 1, 1))
-    poses[:, :3, :3] = start[:3, :3] @ so3_exp(shares[:, None] * turn)
-    poses[:, :3, 3] = np.stack([np.interp(shares * at[-1], at, x) for x in way.T], axis=1)
-    return poses
+    shares = np.arange(1, number + 1) / number
+    places = start[:3, 3] + shares[:, None] * (end[:3, 3] - start[:3, 3])
+    turns = [start[:3, :3] @ so3_exp(share * turn) for share in shares]
+    return np.stack([make_pose(R, place) for R, place in zip(turns, places, strict=True)])
 
 
 def frontiers(grid: OccupancyGrid, position: Float64, radius_m: float, least: int = 10) -> Float64:

@@ -22,7 +22,7 @@ def hat(phi: ArrayLike) -> Float64:
 
 
 def so3_exp(phi: ArrayLike) -> Float64:
-    """Rotation matrices (..., 3, 3) of rotation vectors ``phi`` (..., 3) in radians."""
+    """Rotation matrix (3, 3) of the rotation vector ``phi`` (3,) in radians."""
     return Rotation.from_rotvec(np.asarray(phi, dtype=np.float64)).as_matrix()
 
 

@@ -1,6 +1,6 @@
 """What is known of space: occupancy, what a view would add to it, where a camera can go."""
 
-from ms_slam_env.mapping.expected_gain import expected_gain, held_gain, way_gain
+from ms_slam_env.mapping.expected_gain import expected_gain, held_gain
 from ms_slam_env.mapping.occupancy_grid import (
     FREE,
     OCCUPIED,
@@ -25,5 +25,4 @@ __all__ = [
     "shortest_ways",
     "surrounding_occupancy",
     "view_information",
-    "way_gain",
 ]

@@ -64,36 +64,31 @@ def held_gain(
     intrinsics: Intrinsics,
     rays: tuple[int, int] = (8, 6),
 ) -> Float64:
-    """`way_gain` (n, steps) of motions (n, 4, 4) each made ``steps`` times from ``here`` (4, 4)."""
-    return way_gain(grid, held_ways(here, motions, steps), intrinsics, rays)
+    """Unknown volume (n, steps) in m^3 that each step of a motion shows while it is held.
 
-
-def way_gain(
-    grid: OccupancyGrid, ways: Float64, intrinsics: Intrinsics, rays: tuple[int, int] = (8, 6)
-) -> Float64:
-    """Unknown volume (n, steps) in m^3 that each pose of ways (n, steps, 4, 4) newly shows.
-
-    As `expected_gain` of every pose, but what an earlier pose of the way shows counts no more, in
-    blocks of two cells. Nothing from where the camera would leave what is known to be free; where
-    a way begins it may stand anywhere.
+    As `expected_gain` of every pose on the way, but what an earlier step shows counts no more, in
+    blocks of two cells. Nothing once the camera would leave what is known to be free.
 
     Args:
         grid: what is known.
-        ways: of at most 127 steps.
+        here: (4, 4) where the camera is.
+        motions: (n, 4, 4) each made again and again.
+        steps: how often.
         intrinsics: of the camera.
         rays: of a view, across and down.
     """
+    way = held_ways(here, motions, steps)
     directions, solid_angle = spread_rays(intrinsics, rays)
-    starts = ways[:, :, :3, 3] / grid.cell_m - grid.first
+    starts = way[:, :, :3, 3] / grid.cell_m - grid.first
     reach = grid.reach_m / grid.cell_m * np.linalg.norm(directions, axis=1).max()
     low = np.floor((starts.min(axis=(0, 1)) - reach + grid.first) / BLOCK) * BLOCK - grid.first
     blocks = np.ceil((starts.max(axis=(0, 1)) + reach - low) / BLOCK).astype(int)
     with wp.ScopedDevice("cpu"):
-        first_seen = wp.zeros((len(ways), *blocks), dtype=wp.int8)
-        gains = wp.zeros(ways.shape[:2], dtype=float)
+        first_seen = wp.zeros((len(motions), *blocks), dtype=wp.int8)
+        gains = wp.zeros((len(motions), steps), dtype=float)
         given = [
             wp.array(directions, dtype=wp.vec3),
-            wp.array((ways[:, :, :3, :3] / grid.cell_m).astype(np.float32), dtype=wp.mat33),
+            wp.array((way[:, :, :3, :3] / grid.cell_m).astype(np.float32), dtype=wp.mat33),
             wp.array(starts.astype(np.float32), dtype=wp.vec3),
             wp.array(grid.log_odds, dtype=wp.int8, copy=False),
             wp.array(grid.blanks, dtype=wp.int8, copy=False),
@@ -101,7 +96,7 @@ def way_gain(
             grid.reach_m,
             wp.vec3(*low),
         ]
-        wp.launch(sum_unknown_held, len(ways), given, [first_seen, gains])
+        wp.launch(sum_unknown_held, len(motions), given, [first_seen, gains])
     return solid_angle * gains.numpy().astype(np.float64)
 
 
