@@ -26,6 +26,7 @@ from ms_slam_env.experiments.harness.planner_tables import (
     RANKED_BY,
     across_scenes,
     better_than_each_other,
+    from_the_same_start,
     policies_together,
     with_losses,
 )
@@ -165,6 +166,7 @@ def _tables(rows: Sequence[Row], task: str) -> list[Table]:
     tables += across_scenes(rows, f"{prefix}Across scenes")
     for metric in COMPARED:
         tables += better_than_each_other(rows, prefix, metric)
+    tables += from_the_same_start(pairs, prefix)
     together = policies_together(rows)
     for metric in COMPARED:
         tables += better_than_each_other(together, f"{prefix}Policies as one: ", metric)

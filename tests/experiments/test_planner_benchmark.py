@@ -13,6 +13,7 @@ from ms_slam_env.experiments.harness.episodes import seed_list, short_planner_na
 from ms_slam_env.experiments.harness.planner_tables import (
     DETAILS,
     HEADLINE,
+    from_the_same_start,
     policies_together,
     score_matrices,
 )
@@ -22,7 +23,7 @@ from ms_slam_env.experiments.planners import PlannerBenchmark
 from ms_slam_env.experiments.step_size import StepSize
 from ms_slam_env.report.records import Row, spec_key
 from ms_slam_env.report.results import read_results
-from ms_slam_env.report.statistics import Interval
+from ms_slam_env.report.statistics import Interval, share_interval
 from ms_slam_env.tasks import OWN
 
 CONFIG = PlannerBenchmark(planners=("random", "greedy"), scenes=("table", "wall"), episodes=3)
@@ -133,6 +134,29 @@ def test_every_planner_is_compared_with_every_other() -> None:
     assert [line["planner"] for line in lines] == ["greedy", "random"]
     assert (lines[0]["greedy"], lines[0]["random"].value) == (None, 1.0)
     assert lines[1]["greedy"].value == 0.0
+
+
+def test_from_the_same_start_pairs_are_compared_one_by_one() -> None:
+    areas = {"a": [0.5, 0.9, 0.3, 0.4], "b": [0.4, 0.8, 0.2, 0.4], "c": [0.9, 0.1, 0.9, 0.9]}
+    rows: list[Row] = [
+        {
+            "spec": {"planner": name, "scene": "table", "seed": 2000 + k},
+            "result": {"f_score_5cm_area": area},
+            "error": None,
+        }
+        for name, of in areas.items()
+        for k, area in enumerate(of)
+    ]
+    (table,) = from_the_same_start(rows)
+    lines: Any = {line["planner"]: line for line in table.rows}
+    assert list(lines) == ["c", "a", "b"]
+    assert lines["a"]["b"] == share_interval([True] * 3)  # the fourth is equal
+    assert lines["b"]["a"].value == 0
+    assert lines["c"]["a"] == share_interval([True, False, True, True])
+    assert lines["a"]["a"] is None
+    assert "4 starts" in table.note
+    assert from_the_same_start(rows[:4]) == []
+    assert "Sooner from the same start" in [t.title for t in CONFIG.tables(rows_of(CONFIG))]
 
 
 def test_policies_of_one_training_are_judged_together_too() -> None:
