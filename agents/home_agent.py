@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from ms_slam_agents.policy_planner import RoomAgent
+from ms_slam_agents.policy_planner import SHIPPED, ShippedAgent
 from ms_slam_baselines.nbv import NextBestView
 from numpy.typing import NDArray
 
@@ -23,8 +23,14 @@ _REMAINS = 0.3
 _OBSERVATIONS = ("goals", "held")
 
 
+class HomePolicy(ShippedAgent):
+    """The policy of `agent-home`, which begins as that of `agent-room` and was taught in homes."""
+
+    default_path = SHIPPED / "home.safetensors"
+
+
 class HomeAgent(NextBestView):
-    """The policy of `agent-room` while there is something to see near by; goals as `nbv` has them.
+    """A policy while there is something to see near by; goals as `nbv` has them.
 
     A policy that sees some metres around does not find its way to the next room. As in Active
     Neural SLAM (Chaplot et al., ICLR 2020) goals are what is above it: where the best view near by
@@ -47,7 +53,7 @@ class HomeAgent(NextBestView):
     def __init__(
         self, env: ActiveSlamEnv, seed: int = 0, path: str | None = None, **options: Any
     ) -> None:
-        self.near = RoomAgent(env, seed, path)
+        self.near = HomePolicy(env, seed, path)
         super().__init__(env, seed, **options)
         if self.near.policy.metadata.observation not in _OBSERVATIONS:
             seen = self.near.policy.metadata.observation
@@ -56,7 +62,7 @@ class HomeAgent(NextBestView):
     @classmethod
     def observation_for(cls, path: str | None = None, **options: Any) -> str:
         """What the policy was trained on."""
-        return RoomAgent.observation_for(path)
+        return HomePolicy.observation_for(path)
 
     def reset(self) -> None:
         """Nothing is known yet."""

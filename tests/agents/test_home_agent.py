@@ -2,8 +2,8 @@
 
 import gymnasium as gym
 import pytest
-from ms_slam_agents.home_agent import HomeAgent
-from ms_slam_agents.policy_planner import SHIPPED, RoomAgent
+from ms_slam_agents.home_agent import HomeAgent, HomePolicy
+from ms_slam_agents.policy_planner import SHIPPED
 from ms_slam_baselines.nbv import NextBestView
 
 import ms_slam_env  # noqa: F401 -- registers the environments
@@ -34,7 +34,7 @@ def play(planner_class, steps=8, before=lambda *_: None, **options):
 
 def test_while_there_is_something_to_see_near_by_it_is_the_policy():
     actions, has_goal = play(HomeAgent, enough_m3=0.0, risk=1.0)
-    assert actions == play(RoomAgent)[0]
+    assert actions == play(HomePolicy)[0]
     assert not any(has_goal)
 
 
@@ -56,7 +56,7 @@ def test_where_it_has_been_before_it_goes_to_a_goal_and_then_the_policy_goes_on(
     actions, has_goal = play(HomeAgent, 30, before, enough_m3=0.0, replan=3)
     assert not any(has_goal[:2])
     assert has_goal[2]
-    assert actions[:2] == play(RoomAgent, 2)[0]
+    assert actions[:2] == play(HomePolicy, 2)[0]
     assert not all(has_goal[3:])
     assert any(chosen)
 
