@@ -76,7 +76,7 @@ class Policy:
     def is_trained_in(self, one: FoundResult) -> bool:
         """Whether a training run led to it."""
         steps = [(row["result"] or {}).get("timesteps") for row in one.results.rows]
-        return self.is_trained_as(one) and self.known["timesteps"] in steps
+        return self.is_trained_as(one, _MORE_OF_IT) and self.known["timesteps"] in steps
 
 
 def read_policy_text(path: Path) -> Policy:

@@ -176,6 +176,17 @@ def test_training_seeds_are_counted(clone: Path) -> None:
     assert text.count("### While it learnt") == 1
 
 
+def test_a_policy_taken_before_its_run_went_on_has_the_curve_of_the_run(clone: Path) -> None:
+    (policy,) = (clone / "agents/policies").iterdir()
+    known = replace(METADATA, options={**OPTIONS, "rounds": 4})
+    policy.write_bytes(as_bytes(json.dumps(asdict(known)), **dict.fromkeys(["optimizer.step"])))
+    training(clone / "docs/results/own", rounds=7)
+    training(clone / "docs/results/not_so_far", rounds=2, steps=50)
+    text = card(clone)
+    assert text.count("### While it learnt") == 1
+    assert "The curve of its training is not" not in text
+
+
 def test_of_equally_many_episodes_those_among_more_rivals_count(clone: Path) -> None:
     seed = "agent-hand,path=runs/seed1.safetensors"
     scores(clone / "docs/results/seeds", Interval(0.1, 0.02, 0.3), seed)
