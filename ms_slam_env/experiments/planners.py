@@ -166,7 +166,7 @@ def _tables(rows: Sequence[Row], task: str) -> list[Table]:
     tables += across_scenes(rows, f"{prefix}Across scenes")
     for metric in COMPARED:
         tables += better_than_each_other(rows, prefix, metric)
-    tables += from_the_same_start(pairs, prefix)
+    tables += from_the_same_start(rows, prefix)
     together = policies_together(rows)
     for metric in COMPARED:
         tables += better_than_each_other(together, f"{prefix}Policies as one: ", metric)

@@ -156,6 +156,10 @@ def test_from_the_same_start_pairs_are_compared_one_by_one() -> None:
     assert lines["a"]["a"] is None
     assert "4 starts" in table.note
     assert from_the_same_start(rows[:4]) == []
+    (fewer,) = from_the_same_start(rows[::-1][1:])  # c has not finished the last
+    assert "3 starts" in fewer.note
+    del rows[0]["result"]["f_score_5cm_area"]
+    assert "3 starts" in from_the_same_start(rows)[0].note
     assert "Sooner from the same start" in [t.title for t in CONFIG.tables(rows_of(CONFIG))]
 
 

@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 
 from ms_slam_env.experiments.harness.episodes import short_planner_names
 from ms_slam_env.report import statistics
-from ms_slam_env.report.tables import Column, Row, Table, finished, grouped, make_table
+from ms_slam_env.report.tables import (
+    Column,
+    Row,
+    Table,
+    complete_cases,
+    finished,
+    grouped,
+    make_table,
+)
 
 RANKED_BY = "f_score_5cm"
 """Standing still loses it by recall, getting lost by precision."""
@@ -109,27 +117,23 @@ def better_than_each_other(
     return [make_table(["planner", *columns], lines, prefix + title, note)]
 
 
-def from_the_same_start(pairs: Sequence[Row], prefix: str = "") -> list[Table]:
+def from_the_same_start(rows: Sequence[Row], prefix: str = "") -> list[Table]:
     """Share of starts from which a line's planner has the larger area than a column's.
 
     Where a seed makes another place, as in `home`, this is what tells planners apart: between two
-    places the areas differ more than between two planners. Starts with equal areas do not count.
-    Nothing of a single planner.
-
-    Args:
-        pairs: rows of the starts that every planner finished.
-        prefix: of the title.
+    places the areas differ more than between two planners. Only the starts count that every planner
+    finished, and of two planners those with other areas. Nothing of a single planner.
     """
-    area, values = "f_score_5cm_area", {}
-    for name in dict.fromkeys(map(_planner, pairs)):
-        of = [row for row in pairs if _planner(row) == name and area in row["result"]]
-        of = sorted(of, key=lambda row: (row["spec"]["scene"], row["spec"]["seed"]))
-        values[name] = np.array([row["result"][area] for row in of])
-    count = min(map(len, values.values()), default=0)
-    if len(values) < 2 or not count:
+    area = "f_score_5cm_area"
+    known = [row for row in finished(rows) if area in row["result"]]  # older results have no area
+    pairs = complete_cases(known, ("scene", "seed"), "planner")
+    pairs.sort(key=lambda row: (row["spec"]["scene"], row["spec"]["seed"]))
+    results = {name: of for (name,), of in grouped(pairs, ("planner",)).items()}
+    if len(results) < 2:
         return []
+    values = {name: np.array([result[area] for result in of]) for name, of in results.items()}
     names = sorted(values, key=lambda name: -float(np.median(values[name])))
-    label = short_planner_names(names)
+    label, count = short_planner_names(names), len(values[names[0]])
 
     def share(one: str, other: str) -> statistics.Interval | None:
         more = np.sign(values[one] - values[other])
