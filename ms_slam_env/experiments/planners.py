@@ -189,17 +189,18 @@ def _charts(rows: Sequence[Row], task: str) -> list[Chart]:
         return [r["result"][key] for r in finished(rows) if r["spec"]["planner"] == name]
 
     looks = max((row["result"]["looks_at_steps"] for row in finished(rows)), key=len)
-    curves = [
-        quartile_band(label(name), runs(name, "f_score_5cm_over_steps"), steps=looks)
-        for name in best
+    scores = [quartile_band(label(n), looks, runs(n, "f_score_5cm_over_steps")) for n in best]
+    errors = [
+        # Nothing is off at step 0, which a logarithmic axis does not show.
+        quartile_band(label(n), looks[1:], [ate[1:] for ate in runs(n, "ate_over_steps")], _FLOOR_M)
+        for n in best
     ]
-    errors = [quartile_band(label(name), runs(name, "ate_over_time"), _FLOOR_M) for name in best]
     return [
         Chart(
             f"{prefix}f_score_over_steps",
             f"{title}F-score over the steps",
             "Line: median over episodes; band: between their quartiles.",
-            [Panel("looks_at_steps", "f_score_5cm_over_steps", curves)],
+            [Panel("looks_at_steps", "f_score_5cm_over_steps", scores)],
         ),
         Chart(
             f"{prefix}planners",
@@ -214,9 +215,9 @@ def _charts(rows: Sequence[Row], task: str) -> list[Chart]:
             [scatter(rows, "ate_m", RANKED_BY, "planner", "x", _FLOOR_M, label)],
         ),
         Chart(
-            f"{prefix}ate_over_time",
-            f"{title}Error over time",
+            f"{prefix}ate_over_steps",
+            f"{title}Error over the steps",
             "Line: median over episodes; band: between their quartiles.",
-            [Panel("steps", "ate_over_time", errors, "y")],
+            [Panel("looks_at_steps", "ate_over_steps", errors, "y")],
         ),
     ]

@@ -297,17 +297,13 @@ def scatter(
 
 
 def quartile_band(
-    name: str,
-    runs: Sequence[Sequence[float]],
-    floor: float = 0.0,
-    steps: Sequence[float] | None = None,
+    name: str, steps: Sequence[float], runs: Sequence[Sequence[float]], floor: float = 0.0
 ) -> Series:
     """Median over runs at each step and its quartiles; one that ends early keeps its last value.
 
-    ``steps`` are those of the values of the longest run, by default 1, 2, 3, ...
+    ``steps`` are those of the values of the longest run.
     """
     length = max(map(len, runs))
     padded = np.array([[*run, *[run[-1]] * (length - len(run))] for run in runs])
     low, middle, high = np.percentile(np.maximum(padded, floor), [25, 50, 75], axis=0)
-    at = list(range(1, length + 1) if steps is None else steps[:length])
-    return Series(name, at, middle.tolist(), low.tolist(), high.tolist(), "lines")
+    return Series(name, list(steps[:length]), middle.tolist(), low.tolist(), high.tolist(), "lines")

@@ -134,7 +134,7 @@ def test_failed_episodes_are_code_1_and_stay_in_the_results(
 ) -> None:
     result = dict.fromkeys((*HEADLINE, *DETAILS), 0.5)
     curve = {"looks_at_steps": [0, 5], "f_score_5cm_over_steps": [0.0, 0.5]}
-    finished = {"result": {**result, "ate_over_time": [0.1], **curve}, "error": None}
+    finished = {"result": {**result, "ate_over_steps": [0.0, 0.1], **curve}, "error": None}
     monkeypatch.setattr(harness_rows, "run_all", made_up_rows(failed(), finished))
     assert main([*TWO_EPISODES, "--out", str(tmp_path)]) == 1
     assert "1 failed, the first: planner random, scene table, seed 2000" in capsys.readouterr().err

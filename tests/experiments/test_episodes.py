@@ -34,7 +34,10 @@ def result() -> dict[str, Any]:
 
 def test_result_has_every_reported_metric(result: dict[str, Any]) -> None:
     assert all(np.isfinite(result[key]) for key in (*HEADLINE, *DETAILS))
-    assert result["steps"] == len(result["ate_over_time"]) == 4
+    assert result["steps"] == 4
+    assert len(result["ate_over_steps"]) == len(result["looks_at_steps"])
+    assert result["ate_over_steps"][0] == 0
+    assert result["ate_over_steps"][-1] == pytest.approx(result["ate_unaligned_m"], abs=1e-6)
     assert result["rcm"] == result["recall_5cm"]
 
 

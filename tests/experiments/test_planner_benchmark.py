@@ -33,7 +33,7 @@ def result(score: float) -> dict[str, Any]:
     metrics: dict[str, Any] = dict.fromkeys((*HEADLINE, *DETAILS), score)
     curve = {"looks_at_steps": [0, 5], "f_score_5cm_over_steps": [0.1, score]}
     losses = {"losses": 2, "losses_not_recovered": int(score < 0.3)}
-    over_time = {"ate_over_time": [0.001, 0.002, score]}
+    over_time = {"ate_over_steps": [0.001, score]}
     return {**metrics, **curve, **losses, **over_time, "lost": score < 0.3, "energy_j": 0.0}
 
 
@@ -95,7 +95,7 @@ def test_results_table_and_figures_are_written(tmp_path: Path) -> None:
     assert table.index("| greedy | 6 |") < table.index("| random | 6 |")
     assert "### wall" in table
     assert "commit abc" in table
-    names = {"f_score_over_steps.png", "planners.png", "f_score_ate.png", "ate_over_time.png"}
+    names = {"f_score_over_steps.png", "planners.png", "f_score_ate.png", "ate_over_steps.png"}
     assert names <= {path.name for path in tmp_path.iterdir()}
     again = read_results(tmp_path / "results.json")
     assert [t.as_markdown() for t in again.tables] == [

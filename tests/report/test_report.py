@@ -80,7 +80,7 @@ def write_example(path: Path, **more: Any) -> Path:
         {
             "key": str(seed),
             "spec": {"planner": "greedy", "seed": seed, "step_m": 0.1, "options": {}},
-            "result": {"ate_m": 0.01 * seed, "ate_over_time": [0.1, 0.2]},
+            "result": {"ate_m": 0.01 * seed, "ate_over_steps": [0.1, 0.2]},
             "error": None,
         }
         for seed in (1, 2)

@@ -96,9 +96,9 @@ def run_episode(spec: EpisodeSpec) -> dict[str, Any]:
 
     Returns:
         the metrics by name, see :mod:`.episode_scores`, with
-        ``steps``, ``return``, ``decision_ms`` (mean time of a decision), ``ate_over_time``
-        (running RMSE after each step, unaligned, metres), ``time_s`` (simulated) and ``energy_j``
-        (mechanical work of the motion).
+        ``steps``, ``return``, ``decision_ms`` (mean time of a decision), ``ate_over_steps``
+        (running RMSE, unaligned, metres, when the map was looked at), ``time_s`` (simulated) and
+        ``energy_j`` (mechanical work of the motion).
     """
     env = make_env(spec)
     try:
@@ -110,7 +110,9 @@ def run_episode(spec: EpisodeSpec) -> dict[str, Any]:
         trajectory["lost"] |= progress["lost_steps_share"] > 0
         planned = spec.steps if progress["terminated"] else progress["steps"]
         map_scores = maps.result(progress["steps"], planned)
-        return {**progress, **trajectory, **measure_losses(world), **map_scores}
+        ate = [0.0, *progress.pop("ate_over_time")]
+        at_looks = {"ate_over_steps": [ate[step] for step in map_scores["looks_at_steps"]]}
+        return {**progress, **trajectory, **measure_losses(world), **map_scores, **at_looks}
     finally:
         env.close()
 
