@@ -18,10 +18,12 @@ from ms_slam_env.metrics.registry import metric
 from ms_slam_env.output_files import write_bytes
 from ms_slam_env.report.charts import Chart, Panel, Series
 
+_PALETTE = matplotlib.color_sequences["petroff10"]
+_DASHES = ("-", "--", ":", "-.")
 _LOOKS: dict[str, dict[str, Any]] = {
-    "lines": {"linestyle": "-"},
+    "lines": {},
     "dashes": {"linestyle": "--", "color": "0.1", "zorder": 3},
-    "lines+markers": {"linestyle": "-", "marker": "o", "markersize": 4},
+    "lines+markers": {"marker": "o", "markersize": 4},
     "markers": {"linestyle": "", "marker": "o"},
     "dots": {"linestyle": "", "marker": ".", "markersize": 5, "alpha": 0.35},
 }
@@ -112,6 +114,9 @@ def _draw_series(
         x = list(places)
     else:
         look = {"color": color, **_LOOKS[series.mode]}
+        if series.mode.startswith("lines"):
+            again = names.index(series.name) // len(_PALETTE)  # how often colours have come before
+            look["linestyle"] = _DASHES[again % len(_DASHES)]
         ax.plot(x, y, label=None if series.mode == "dots" else label, **look)
     if not series.low:
         return
@@ -172,5 +177,4 @@ def save(figure: Figure, path: Path, dpi: int = 120) -> Path:
 
 def colour(index: int) -> str:
     """One colour a series, distinguishable with common colour-vision deficiencies."""
-    palette = matplotlib.color_sequences["petroff10"]
-    return matplotlib.colors.to_hex(palette[index % len(palette)])
+    return matplotlib.colors.to_hex(_PALETTE[index % len(_PALETTE)])

@@ -45,3 +45,11 @@ def test_many_panels_stand_in_rows_of_four_and_a_truth_is_dashed():
     estimate, truth = plots_of(chart)[0].data
     assert (estimate["line"]["dash"], truth["line"]["dash"]) == ("solid", "dash")
     assert truth["mode"] == "lines"
+
+
+def test_lines_of_more_series_than_colours_are_told_apart():
+    lines = [Series(f"planner {n}", [0, 1], [n, n], mode="lines") for n in range(12)]
+    figure = figures.draw(Chart("many", "Many", "", [Panel("steps", "ate_m", lines)]))
+    drawn = figure.axes[0].get_lines()
+    looks = {(line.get_color(), line.get_linestyle()) for line in drawn}
+    assert len(drawn) == len(looks) == 12
