@@ -111,8 +111,8 @@ def run_episode(spec: EpisodeSpec) -> dict[str, Any]:
         planned = spec.steps if progress["terminated"] else progress["steps"]
         map_scores = maps.result(progress["steps"], planned)
         ate = [0.0, *progress.pop("ate_over_time")]
-        at_looks = {"ate_over_steps": [ate[step] for step in map_scores["looks_at_steps"]]}
-        return {**progress, **trajectory, **measure_losses(world), **map_scores, **at_looks}
+        map_scores["ate_over_steps"] = [ate[step] for step in map_scores["looks_at_steps"]]
+        return {**progress, **trajectory, **measure_losses(world), **map_scores}
     finally:
         env.close()
 
