@@ -14,6 +14,7 @@ from ms_slam_env.mapping.expected_gain import expected_gain
 from ms_slam_env.mapping.occupancy_grid import OccupancyGrid
 
 Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
 
 _NEIGHBOURS = ndimage.generate_binary_structure(3, 1)
 
@@ -24,17 +25,43 @@ def reachable_positions(grid: OccupancyGrid, position: Float64, radius_m: float)
     Free cells within a cube of half edge ``radius_m`` whose six neighbours are free too, joined to
     the one nearest to ``position``. Empty if there is none.
     """
-    here = grid.cells_of(position)
+    return grid.centres_of(_reachable_cells(grid, grid.cells_of(position), radius_m))
+
+
+def _reachable_cells(grid: OccupancyGrid, here: Int64, radius_m: float) -> Int64:
+    """Indices (N, 3) of the cells of `reachable_positions`, from one (3,)."""
     reach = int(radius_m / grid.cell_m)
     low = np.maximum(here - reach, 0)
     high = np.maximum(np.minimum(here + reach + 1, grid.log_odds.shape), low)
     free = grid.log_odds[tuple(map(slice, low, high))] < 0
-    regions, _ = ndimage.label(ndimage.binary_erosion(free, _NEIGHBOURS), _NEIGHBOURS)
+    if not free.any():
+        return np.zeros((0, 3), np.int64)
+    box = _box_of(free)  # a small part of the grid, which grows by what a view might reach
+    low = low + [along.start for along in box]
+    regions, _ = ndimage.label(_inner(free[box]), _NEIGHBOURS)
     inside = np.argwhere(regions > 0)
     if not len(inside):
-        return np.zeros((0, 3))
+        return inside
     nearest = inside[np.argmin(((inside + low - here) ** 2).sum(axis=1))]
-    return grid.centres_of(np.argwhere(regions == regions[tuple(nearest)]) + low)
+    return np.argwhere(regions == regions[tuple(nearest)]) + low
+
+
+def _box_of(mask: NDArray[np.bool_]) -> tuple[slice, ...]:
+    """The smallest box around what is true in a mask (X, Y, Z)."""
+    along = [np.any(mask, axis=others) for others in ((1, 2), (0, 2), (0, 1))]
+    ends = [np.flatnonzero(some)[[0, -1]] for some in along]
+    return tuple(slice(int(first), int(last) + 1) for first, last in ends)
+
+
+def _inner(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """What is true with its six neighbours, (X, Y, Z); nothing is beyond the border."""
+    inner = mask.copy()
+    for axis in range(3):
+        along, of = np.moveaxis(inner, axis, 0), np.moveaxis(mask, axis, 0)
+        along[1:] &= of[:-1]
+        along[:-1] &= of[1:]
+        along[[0, -1]] = False
+    return inner
 
 
 @dataclass(frozen=True)
@@ -66,8 +93,9 @@ def shortest_ways(grid: OccupancyGrid, position: Float64, radius_m: float) -> Wa
     free neighbours have none but free cells between them. Of the nodes only those that can be come
     to are kept.
     """
-    cells = grid.cells_of(reachable_positions(grid, position, radius_m))
-    nodes = cells[(cells % 2 == grid.cells_of(position) % 2).all(axis=1)] // 2
+    here = grid.cells_of(position)
+    cells = _reachable_cells(grid, here, radius_m)
+    nodes = cells[((cells - here) % 2 == 0).all(axis=1)] // 2
     if not len(nodes):
         return Ways(position[None].copy(), np.zeros(1), np.full(1, -1, np.int32))
     low = nodes.min(axis=0) - 1
@@ -79,7 +107,7 @@ def shortest_ways(grid: OccupancyGrid, position: Float64, radius_m: float) -> Wa
     metres = 2 * grid.cell_m * np.linalg.norm(_HALF_OF_26, axis=1)[step]
     edges = metres, (node, others[step, node])
     lengths = sparse.csr_array(edges, shape=(len(nodes), len(nodes)))
-    centres = grid.centres_of(2 * nodes + grid.cells_of(position) % 2)
+    centres = grid.centres_of(2 * nodes + here % 2)
     first = int(np.argmin(((centres - position) ** 2).sum(axis=1)))
     found, before = dijkstra(lengths, directed=False, indices=first, return_predecessors=True)
     order = np.argsort(found, kind="stable")[: np.isfinite(found).sum()]

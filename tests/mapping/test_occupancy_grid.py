@@ -109,6 +109,20 @@ def test_what_can_be_reached_is_what_a_flood_fill_reaches():
     assert len(found) > 100
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_what_can_be_reached_among_scattered_cells_up_to_the_edge_of_the_grid(seed):
+    rng = np.random.default_rng(seed)
+    grid = OccupancyGrid()
+    grid.first = np.array([-4, 7, 0])
+    grid.log_odds = np.where(rng.random((30, 24, 14)) < 0.06, 3, -1).astype(np.int8)
+    grid.log_odds[:, :, 10:] = 0
+    grid.log_odds[8:13, 8:13, 3:8] = -1
+    start = grid.centres_of(np.array([10, 10, 5]))
+    found = reachable_positions(grid, start, 1.1)
+    assert {tuple(cell) for cell in grid.cells_of(found)} == flood_fill(grid, start, 1.1)
+    assert len(found) > 100
+
+
 def flood_fill(grid, start, radius):
     axes = [
         np.array(a) for a in ([1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1])

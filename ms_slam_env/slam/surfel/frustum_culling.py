@@ -6,6 +6,8 @@ See ``block_bounds`` for the boxes.
 
 from __future__ import annotations
 
+import math
+
 from ms_slam_env._warp import RecordedLaunch, wp
 from ms_slam_env.slam.surfel.block_bounds import num_blocks
 from ms_slam_env.slam.surfel.surfels import (
@@ -34,6 +36,8 @@ class Frustum:
     high_v: float
     z_near: float
     z_far: float
+    focal: float  # px
+    layers: float  # surfaces of discs that are enough; infinite: all are listed
 
 
 @wp.func
@@ -48,6 +52,8 @@ def frustum_of(T_world_camera: wp.mat44, camera: SplatCamera, margin_px: float):
     frustum.high_v = (float(camera.height) - 0.5 + margin_px - camera.centre[1]) / camera.focal[1]
     frustum.z_near = camera.z_near
     frustum.z_far = camera.z_far
+    frustum.focal = camera.focal[0]
+    frustum.layers = wp.inf
     return frustum
 
 
@@ -174,6 +180,14 @@ for (int k = 0; k < n; ++k) {
     nz[k] = R.data[2][0] * px + R.data[2][1] * py + R.data[2][2] * pz;
     inside[k] &= nx[k] * x[k] + ny[k] * y[k] + nz[k] * z[k] < 0.0f;
 }
+if (frustum.layers < INFINITY) {
+    const float* radius = surfels.radius.data + start;
+    for (int k = 0; k < n; ++k) {
+        const float radius_px = radius[k] * frustum.focal / z[k];
+        const float draw = (((unsigned)(first + k) * 2654435769u) >> 8) / 16777216.0f;
+        inside[k] &= draw < frustum.layers * radius_px * radius_px;
+    }
+}
 int which[LANES];
 found = 0;
 for (int k = 0; k < n; ++k) {
@@ -205,6 +219,10 @@ def list_some_visible(
     """List the visible ones of the surfels from ``first`` on; how many were looked at.
 
     Several at a time on the CPU, at most to ``end``; a thread of a GPU looks at one.
+
+    Discs of radius r pixels that make one surface number about 1 / r^2 a pixel: where ``layers``
+    of the frustum is finite one of them is listed with the probability ``layers`` r^2, by its slot
+    in the map, so always or never.
     """
 
 
@@ -217,17 +235,20 @@ def cull(
     camera: SplatCamera,
     margin_px: float,
     workers: int,
+    layers: float,
     window: SeenWindow,
     visible: VisibleList,
 ) -> None:
     """List the living surfels of a window in front of the camera, facing it, within its frustum.
 
     Those of the blocks that ``list_visible_blocks`` listed; ``poses[k]`` is T_world_camera of env
-    ``first_env + k``. A single worker, as on the CPU, keeps the order of the map.
+    ``first_env + k``. A single worker, as on the CPU, keeps the order of the map. Of more than
+    ``layers`` surfaces of discs so many are left.
     """
     k, worker = wp.tid()
     b = first_env + k
     frustum = frustum_of(poses[k], camera, margin_px)
+    frustum.layers = layers
     count = surfels.count[b]
     seen_from = window.seen_from[b]
     seen_to = window.seen_to[b]
@@ -263,12 +284,19 @@ class FrustumCuller:
         dim, device = (envs, buffers.workers), buffers.device
         self._launches = [
             RecordedLaunch(list_visible_blocks, dim, shared, device),
-            RecordedLaunch(cull, dim, [*shared, window, buffers.visible], device),
+            RecordedLaunch(cull, dim, [*shared, math.inf, window, buffers.visible], device),
         ]
 
-    def __call__(self, poses: wp.array, first_env: int = 0, margin_px: float = 0.0) -> None:
+    def __call__(
+        self,
+        poses: wp.array,
+        first_env: int = 0,
+        margin_px: float = 0.0,
+        layers: float = math.inf,
+    ) -> None:
         """Fill the list for ``poses`` (envs,) T_world_camera of the envs from ``first_env`` on."""
         self.list_blocks(poses, first_env, margin_px)
+        self._launches[1].set_param("layers", layers)
         self._buffers.visible.count.zero_()
         self._launches[1].launch()
 

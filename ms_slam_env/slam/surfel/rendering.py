@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -88,9 +89,18 @@ class SplatRenderer:
 
         return ModelView(image(wp.vec3), image(wp.vec3), image(wp.float32), image(wp.vec3))
 
-    def cull(self, poses: wp.array, first_env: int = 0, margin_px: float = 1.0) -> None:
-        """List the surfels that the cameras at ``poses`` (envs,) T_world_camera can see."""
-        self._culler(poses, first_env, margin_px)
+    def cull(
+        self,
+        poses: wp.array,
+        first_env: int = 0,
+        margin_px: float = 1.0,
+        layers: float = math.inf,
+    ) -> None:
+        """List the surfels that the cameras at ``poses`` (envs,) T_world_camera can see.
+
+        Of many discs to a pixel only so many that ``layers`` surfaces of them are left.
+        """
+        self._culler(poses, first_env, margin_px, layers)
 
     def splat(self, first_env: int = 0, listed: VisibleList | None = None) -> ModelView:
         """Draw the surfels that ``cull`` listed, or those of another list."""
@@ -117,13 +127,6 @@ class SplatRenderer:
         )
         dim = (self.envs, workers)
         return [RecordedLaunch(kernel, dim, inputs, self.device) for kernel, inputs in passes]
-
-    def list_enough(self, layers: float, kept: VisibleList) -> None:
-        """List so many of the culled surfels that ``layers`` surfaces of them are left."""
-        kept.count.zero_()
-        workers = self._buffers.workers
-        inputs = [self.visible, self.camera, workers, layers, kept]
-        wp.launch(splatting.list_enough, (self.envs, workers), inputs, device=self.device)
 
     def list_hidden(self, hidden: VisibleList) -> None:
         """List the culled surfels that lie well behind the surface that ``splat`` just drew."""

@@ -235,29 +235,6 @@ def splat_attributes(
 
 
 @wp.kernel
-def list_enough(
-    visible: VisibleList, camera: SplatCamera, workers: int, layers: float, kept: VisibleList
-) -> None:
-    """List so many of the visible surfels that ``layers`` whole surfaces of them are left.
-
-    Discs of radius r pixels that make one surface number about 1 / r^2 a pixel; one of them stays
-    with the probability ``layers`` r^2, by its slot in the map, so always or never.
-    """
-    k, worker = wp.tid()
-    for j in range(worker, visible.count[k], workers):
-        p = visible.position[k, j]
-        radius_px = visible.radius[k, j] * camera.focal[0] / p[2]
-        slot = wp.uint32(visible.index[k, j])
-        draw = float((slot * wp.uint32(2654435769)) >> wp.uint32(8)) / 16777216.0
-        if draw < layers * radius_px * radius_px:
-            place = wp.atomic_add(kept.count, k, 1)
-            kept.index[k, place] = visible.index[k, j]
-            kept.position[k, place] = p
-            kept.normal[k, place] = visible.normal[k, j]
-            kept.radius[k, place] = visible.radius[k, j]
-
-
-@wp.kernel
 def list_hidden(
     visible: VisibleList,
     camera: SplatCamera,

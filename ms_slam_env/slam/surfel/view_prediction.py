@@ -107,7 +107,7 @@ class ViewPredictor:
         self.device = buffers.device
         self.workers = buffers.workers
         self._map = buffers
-        self._listed = allocate(VisibleList, buffers.batch, buffers.capacity, self.device)
+        self._hidden = allocate(VisibleList, buffers.batch, buffers.capacity, self.device)
         self._references: dict[tuple[int, Intrinsics], _Reference] = {}
         self._single: dict[tuple[int, Intrinsics], SplatRenderer] = {}
         self._outputs: dict[tuple[int, Intrinsics], tuple[wp.array, DeviceViews]] = {}
@@ -160,9 +160,8 @@ class ViewPredictor:
             self._single[key] = self._renderer(envs, views.intrinsics)
         renderer = self._single[key]
         for n in range(count):
-            renderer.cull(self._upload(poses[:, n]), first_env)
-            renderer.list_enough(LAYERS, self._listed)
-            image = renderer.splat(first_env, self._listed)
+            renderer.cull(self._upload(poses[:, n]), first_env, layers=LAYERS)
+            image = renderer.splat(first_env)
             drawn = [image.vertices, image.normals, image.intensity]
             inputs = [*drawn, count, n, views.intensity, views.depth, views.normals]
             dim = (envs, *views.intrinsics.shape)
@@ -179,7 +178,7 @@ class ViewPredictor:
     def _reference(self, envs: int, intrinsics: Intrinsics) -> _Reference:
         key = (envs, intrinsics)
         if key not in self._references:
-            self._references[key] = _Reference(self._renderer(envs, intrinsics), self._listed)
+            self._references[key] = _Reference(self._renderer(envs, intrinsics), self._hidden)
         return self._references[key]
 
     def _buffers(self, count: int, intrinsics: Intrinsics) -> tuple[wp.array, DeviceViews]:
