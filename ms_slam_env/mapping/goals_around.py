@@ -53,11 +53,13 @@ def gain_around(
         free: centres (N, 3) of the cells that it can go to, `reachable_positions`.
     """
     goals = goals_around(here)
-    gain = expected_gain(grid, goals, intrinsics, _RAYS)
     is_free = np.zeros_like(grid.log_odds, dtype=np.bool_)
     is_free[tuple(grid.cells_of(free).T)] = True
     cells = grid.cells_of(goals[::_HEADINGS, :3, 3])
     led_to = np.asarray(((cells >= 0) & (cells < is_free.shape)).all(axis=1))
     led_to[led_to] = is_free[tuple(cells[led_to].T)]
     stays = (goals[:, :3, 3] == here[:3, 3]).all(axis=1)
-    return np.asarray(gain * (stays | np.repeat(led_to, _HEADINGS)))
+    can = stays | np.repeat(led_to, _HEADINGS)
+    gain = np.zeros(len(goals))
+    gain[can] = expected_gain(grid, goals[can], intrinsics, _RAYS)
+    return gain

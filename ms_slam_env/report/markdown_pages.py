@@ -8,8 +8,7 @@ Between two comments, each on a line of its own, stands what a result says::
 The first word is a folder of results, whose ``results.json`` is read, or a JSON file in one. The
 options: ``table``, number or title of a table (by default the first); ``columns``, their names (by
 default all); ``where``, a column and the text that it must have, as in ``where=sequence=median``;
-``rows``, at most so many of the first; ``made_by=yes``, the command in a line below;
-``optional=yes``, a page may be written before there is such a table.
+``rows``, at most so many of the first; ``made_by=yes``, the command in a line below.
 Where the result is older than the code, the first of its tables on the page says so above.
 
 After ``agents:`` in place of ``results:`` stand policy files or folders of them, from the root of
@@ -34,8 +33,7 @@ from ms_slam_env.report.tables import Table
 
 _START = re.compile(r"^<!-- (?P<kind>results|agents): (?P<what>.*) -->$")
 _END = "<!-- end -->"
-_OPTIONS = ("table", "columns", "where", "rows", "made_by", "optional")
-_ABSENT = "*Not run yet.*"
+_OPTIONS = ("table", "columns", "where", "rows", "made_by")
 
 
 def update_pages(pages: Iterable[Path], results: Path, write: bool = True) -> list[Path]:
@@ -140,14 +138,8 @@ def _inserted(what: str, folder: Path, warned: set[Path]) -> str:
             raise unknown("option", option, _OPTIONS)
     path = folder / place
     path = path if path.suffix == ".json" else path / RESULTS
-    may_lack = options.get("optional") == "yes"
-    if may_lack and not path.is_file():
-        return _ABSENT
     results = read_results(path)
-    which = options.get("table", "0")
-    if may_lack and which not in _tables(results):
-        return _ABSENT
-    table = _cut(_chosen(results, which), options)
+    table = _cut(_chosen(results, options.get("table", "0")), options)
     parts = [f"*{results.stale}*\n"] if results.stale and path not in warned else []
     warned.add(path)
     parts.append(table.as_markdown())
@@ -157,16 +149,12 @@ def _inserted(what: str, folder: Path, warned: set[Path]) -> str:
 
 
 def _chosen(results: Results, which: str) -> Table:
-    tables = _tables(results)
+    """The table of that number or title."""
+    tables = {str(n): table for n, table in enumerate(results.tables)}
+    tables |= {table.title: table for table in results.tables if table.title}
     if which not in tables:
         raise unknown("table", which, tables)
     return tables[which]
-
-
-def _tables(results: Results) -> dict[str, Table]:
-    """The tables by number and by title."""
-    tables = {str(n): table for n, table in enumerate(results.tables)}
-    return {**tables, **{table.title: table for table in results.tables if table.title}}
 
 
 def _cut(table: Table, options: dict[str, str]) -> Table:

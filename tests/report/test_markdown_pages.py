@@ -46,15 +46,6 @@ def test_a_table_is_written_between_its_comments(clone: Path) -> None:
     assert beside.read_text() == now
 
 
-def test_a_table_that_is_not_there_yet_may_be_optional(clone: Path) -> None:
-    results = clone / "docs/results"
-    for what in ("later optional=yes", "x table=Later optional=yes"):
-        assert "*Not run yet.*" in with_tables(PAGE.format(what, "old\n"), results)
-    there = with_tables(PAGE.format("x optional=yes", ""), results)
-    assert "Not run yet" not in there
-    assert "|" in there
-
-
 def test_age_and_command_stand_with_the_table(clone: Path) -> None:
     path = clone / "docs/results/x/results.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"results_version": 1}))
