@@ -182,6 +182,15 @@ def test_policies_of_one_training_are_judged_together_too() -> None:
     )
 
 
+def test_policies_in_several_folders_are_of_several_trainings() -> None:
+    names = ["p,path=x/1", "p,path=x/2", "p,path=y/1", "p,path=y/2,recovery=true", "p"]
+    rows: list[Row] = [{"spec": {"planner": name}, "result": {}, "error": None} for name in names]
+    assert [row["spec"]["planner"] for row in policies_together(rows)] == [
+        *("p,path=x (2 policies)",) * 2,
+        *names[2:],
+    ]
+
+
 def test_planners_are_compared_by_what_the_reward_says_too() -> None:
     pytest.importorskip("rliable")
     rows = rows_of(CONFIG)

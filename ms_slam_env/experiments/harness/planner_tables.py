@@ -153,20 +153,34 @@ def policies_together(rows: Sequence[Row]) -> list[Row]:
     """The rows with planners that differ in ``path`` alone as one; nothing if there are none.
 
     So several policies of one training, each begun with another seed, are judged as what that
-    training leads to.
+    training leads to. Files in several folders are those of several trainings.
     """
     members: dict[str, list[str]] = {}
     for planner in dict.fromkeys(map(_planner, rows)):
-        parts = [part for part in planner.split(",") if not part.startswith("path=")]
-        members.setdefault(",".join(parts), []).append(planner)
+        members.setdefault(_without_path(planner)[0], []).append(planner)
+    trainings: dict[str, list[str]] = {}
+    for name, of in members.items():
+        folders = {_without_path(planner)[1] for planner in of} - {None}
+        for planner in of:
+            folder = _without_path(planner)[1]
+            several = len(folders) > 1 and folder is not None
+            trainings.setdefault(f"{name},path={folder}" if several else name, []).append(planner)
     names = {
         planner: f"{name} ({len(of)} policies)" if len(of) > 1 else planner
-        for name, of in members.items()
+        for name, of in trainings.items()
         for planner in of
     }
     if all(name == planner for planner, name in names.items()):
         return []
     return [{**row, "spec": {**row["spec"], "planner": names[_planner(row)]}} for row in rows]
+
+
+def _without_path(planner: str) -> tuple[str, str | None]:
+    """A planner without its option ``path``, and the folder of that file; None without one."""
+    parts = planner.split(",")
+    folders = [part[5:].rpartition("/")[0] for part in parts if part.startswith("path=")]
+    rest = [part for part in parts if not part.startswith("path=")]
+    return ",".join(rest), folders[0] if folders else None
 
 
 def _ranked(means: Mapping[str, statistics.Interval]) -> list[str]:
