@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,13 +100,14 @@ def shortest_ways(grid: OccupancyGrid, position: Float64, radius_m: float) -> Wa
     if not len(nodes):
         return Ways(position[None].copy(), np.zeros(1), np.full(1, -1, np.int32))
     low = nodes.min(axis=0) - 1
-    index = np.full(nodes.max(axis=0) - low + 2, -1)
-    index[tuple((nodes - low).T)] = np.arange(len(nodes))
-    around = nodes[None] - low + _HALF_OF_26[:, None]
-    others = index[tuple(np.moveaxis(around, -1, 0))]
-    step, node = np.nonzero(others >= 0)
-    metres = 2 * grid.cell_m * np.linalg.norm(_HALF_OF_26, axis=1)[step]
-    edges = metres, (node, others[step, node])
+    shape = nodes.max(axis=0) - low + 2
+    index = np.full(math.prod(shape), -1)
+    flat = np.ravel_multi_index(tuple((nodes - low).T), tuple(shape))
+    index[flat] = np.arange(len(nodes))
+    others = index[flat[:, None] + _HALF_OF_26 @ [shape[1] * shape[2], shape[2], 1]]
+    joined = others >= 0
+    metres = np.broadcast_to(2 * grid.cell_m * np.linalg.norm(_HALF_OF_26, axis=1), joined.shape)
+    edges = metres[joined], others[joined], np.append(0, np.cumsum(joined.sum(axis=1)))
     lengths = sparse.csr_array(edges, shape=(len(nodes), len(nodes)))
     centres = grid.centres_of(2 * nodes + here % 2)
     first = int(np.argmin(((centres - position) ** 2).sum(axis=1)))
