@@ -28,8 +28,9 @@ class Problem(Checked):
             of your own; what is given beside it counts more.
         env_id: id of the environment.
         embodiment: what carries the camera; None: what the id says.
-        observation: a variant by name; `lookahead` shows the agent what the greedy planner
-            sees, `map` what is known of space around it, and both take longer than `features`.
+        observation: a variant by name; `held` shows what the motions would show if they were
+            held for some steps, and taught most of those that were compared; `features` takes
+            the least time.
         scenes: trained and validated on, with training and validation seeds.
         scene_seeds: seeds of each scene, from the split's first; a scene takes seconds to build.
         episode_steps: time limit of an episode.

@@ -167,9 +167,7 @@ def _tables(rows: Sequence[Row], task: str) -> list[Table]:
     for metric in COMPARED:
         tables += better_than_each_other(rows, prefix, metric)
     tables += from_the_same_start(rows, prefix)
-    together = policies_together(rows)
-    for metric in COMPARED:
-        tables += better_than_each_other(together, f"{prefix}Policies as one: ", metric)
+    tables += _policies_as_one(rows, pairs, f"{prefix}Policies as one")
     scenes = list(dict.fromkeys(row["spec"]["scene"] for row in rows))
     if len(scenes) > 1:
         for scene in scenes:
@@ -178,8 +176,24 @@ def _tables(rows: Sequence[Row], task: str) -> list[Table]:
     return tables
 
 
+def _policies_as_one(
+    rows: Sequence[Row], pairs: Sequence[Mapping[str, Any]], title: str
+) -> list[Table]:
+    """Tables of trainings in place of their policies; none if there are none of several."""
+    together = policies_together(rows)
+    if not together:
+        return []
+    grouping = Grouping(("planner",), HEADLINE, rank_by=RANKED_BY, count="episodes")
+    of_pairs = policies_together(pairs)
+    tables = [with_losses(grouping.table(of_pairs, title), of_pairs)]
+    for metric in COMPARED:
+        tables += better_than_each_other(together, f"{title}: ", metric)
+    return tables
+
+
 def _charts(rows: Sequence[Row], task: str) -> list[Chart]:
-    """The charts of one task, whose name they have if there are several."""
+    """The charts of one task, whose name they have if there are several; of trainings."""
+    rows = policies_together(rows) or rows
     ranking = Grouping(("planner",), (RANKED_BY,), rank_by=RANKED_BY).table(rows)
     best = [str(line["planner"]) for line in ranking.rows]
     label = short_planner_names(best).__getitem__

@@ -177,6 +177,11 @@ def test_policies_of_one_training_are_judged_together_too() -> None:
     assert set(found) == {"nbv", "agent (3 policies)", "x,path=c"}
     assert found["agent (3 policies)"]["nbv"].value == pytest.approx(2 / 3)
     assert len(tables["Better than each other"].rows) == 5
+    medians: Any = {line["planner"]: line for line in tables["Policies as one"].rows}
+    assert medians["agent (3 policies)"]["episodes"] == 3 * medians["nbv"]["episodes"]
+    assert medians["agent (3 policies)"]["f_score_5cm"].value == pytest.approx(0.7)
+    over_steps = CONFIG.charts(rows)[0].panels[0]
+    assert {series.name for series in over_steps.series} == {"nbv", "agent (3 policies)", "x"}
     assert not policies_together(
         [row for row in rows if row["spec"]["planner"] in ("nbv", "agent")]
     )
@@ -236,6 +241,10 @@ def test_names_are_as_long_as_it_takes_to_tell_planners_apart() -> None:
         "greedy": "greedy",
         "greedy,rho_I=0.3,file=a/b": "greedy, rho_I=0.3, file=b",
     }
+    apart = {"policy,path=x/a/1": "policy, path=a/1", "policy,path=x/b/1": "policy, path=b/1"}
+    assert short_planner_names(apart) == apart
+    farther = ["policy,path=x/a/1", "policy,path=y/a/1"]
+    assert list(short_planner_names(farther).values()) == [n.replace(",", ", ") for n in farther]
 
 
 def test_every_planner_starts_from_the_same_seeds() -> None:

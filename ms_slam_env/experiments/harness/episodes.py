@@ -282,16 +282,24 @@ def seed_list(split: str, count: int) -> list[int]:
 def short_planner_names(planners: Iterable[str]) -> dict[str, str]:
     """A short text for each planner: its name, with options only where names are the same.
 
-    Paths among the options lose their folders.
+    Paths among the options lose the folders that are not needed to tell planners apart.
     """
     names = {planner: planner.split(",") for planner in planners}
     count = Counter(name for name, *_ in names.values())
-    return {
-        planner: name if count[name] == 1 else ", ".join([name, *map(_without_folders, options)])
-        for planner, (name, *options) in names.items()
-    }
+
+    def texts(folders: int | None) -> dict[str, str]:
+        return {
+            planner: ", ".join([name, *(_with_folders(option, folders) for option in options)])
+            if count[name] > 1
+            else name
+            for planner, (name, *options) in names.items()
+        }
+
+    short = map(texts, (0, 1))
+    return next((found for found in short if len(set(found.values())) == len(names)), texts(None))
 
 
-def _without_folders(option: str) -> str:
+def _with_folders(option: str, count: int | None) -> str:
+    """An option whose value has the last ``count`` of its folders; None: all."""
     name, equals, value = option.partition("=")
-    return name + equals + value.rpartition("/")[2]
+    return name + equals + "/".join(value.split("/")[0 if count is None else -1 - count :])

@@ -149,7 +149,7 @@ def from_the_same_start(rows: Sequence[Row], prefix: str = "") -> list[Table]:
     return [make_table(["planner", *columns], lines, title, note)]
 
 
-def policies_together(rows: Sequence[Row]) -> list[Row]:
+def policies_together(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """The rows with planners that differ in ``path`` alone as one; nothing if there are none.
 
     So several policies of one training, each begun with another seed, are judged as what that
