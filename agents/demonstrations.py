@@ -149,6 +149,6 @@ def _actor(task: Task, env: Any, seed: int) -> Planner | None:
     """The planner that the policy acts through, ready; None where the teacher acts."""
     if task.policy is None:
         return None
-    actor = make_planner(f"{task.through or 'policy'},path={task.policy}", env, seed)
+    actor = make_planner(task.through or "policy", env, seed, path=str(task.policy))
     actor.reset()
     return actor

@@ -201,9 +201,7 @@ class Student:
         )
         self.epochs = epochs
         if file:
-            known = file.metadata
-            if (known.inputs, known.actions) != (self.inputs, (self.actions,)):
-                raise InputError(f"{args.init} is for {known.inputs} numbers and {known.actions}")
+            file.metadata.check_sizes(args.init or args.out, self.inputs, self.actions)
             load_parameters(self.network, file)
 
     def _moments(self, observations: Any) -> Moments:
@@ -241,10 +239,11 @@ class Student:
             torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
             optimizer.step()
             chosen = log_probs.gather(1, wanted.argmax(dim=1, keepdim=True))
-            said.append((loss.item(), chosen.exp().mean().item()))
+            weighed = wanted.sum(dim=1) > 0
+            said.append((loss.item(), chosen[weighed].exp().mean().item()))
         self.epochs += args.epochs
         last = said[-max(1, len(said) // args.epochs) :]
-        loss, probability = np.mean(last, axis=0)
+        loss, probability = np.nanmean(last, axis=0)
         return {"loss": float(loss), "probability": float(probability)}
 
     def file(self, timesteps: int, minutes: float) -> PolicyFile:
@@ -321,11 +320,12 @@ def train(args: Args) -> int:
     torch.set_num_threads(1)
     check_planner(args.teacher)
     if args.through:
-        check_planner(f"{args.through},path={args.out / LATEST}")
+        check_planner(args.through, path="")
     file, done = load_run(args)
     begun = None
     if args.init and not done:
-        begun = read_similar(args.init, args, args.hidden, ["observation"])
+        own = {"memory": 0, "candidates": args.candidates, "quantiles": 0}
+        begun = read_similar(args.init, args, args.hidden, ["observation"], **own)
     check_problem(args)
     curve = Curve(args.eval_episodes, {}, config=to_plain(asdict(args)))
     if done and (args.out / RESULTS).is_file():
@@ -338,6 +338,11 @@ def train(args: Args) -> int:
         play_round(args, number)
         paths = [task.path for n in range(number + 1) for task in tasks(args, n)]
         demonstrations = [Demonstration.read(path) for path in paths]
+        if not any(np.any(d.preferences) for d in demonstrations):
+            raise InputError(
+                f"teacher {args.teacher} weighs no decision of a policy that acts through "
+                f"{args.through}; oracle, held-nbv and foresight do"
+            )
         student = Student(
             args, demonstrations[: args.episodes], file or begun, number * args.epochs
         )

@@ -34,7 +34,6 @@ from torch import Tensor, nn
 from torch.nn.functional import kl_div, mse_loss
 
 from ms_slam_env.config import bounded
-from ms_slam_env.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -269,13 +268,9 @@ class Run(TrainingRun):
         args = self.args
         if args.init is None:
             return None
-        file = read_init(args)
+        file = read_init(args, memory=0, candidates=args.candidates, quantiles=0)
         known = file.metadata
-        fits = (tuple(known.actions), known.inputs) == ((self.actions,), self.inputs)
-        if known.memory or known.quantiles or not fits:
-            raise InputError(f"{args.init} is a policy with a memory, or of other actions")
-        if known.candidates != args.candidates:
-            raise InputError(f"{args.init} does not look at the candidates one by one")
+        known.check_sizes(args.init, self.inputs, self.actions)
         if not args.pull:
             return None
         first = Network(self.inputs, args.hidden, self.actions, 0, known.candidates)

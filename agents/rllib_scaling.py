@@ -40,6 +40,11 @@ class Scaling(Args):
     n_steps: int = bounded(128, 2, 1_000_000)
     batch_size: int = bounded(128, 2, 1_000_000)
 
+    @property
+    def fewest_runners(self) -> int:
+        """See `Args`."""
+        return min(self.runners, default=1)
+
 
 def main(words: Sequence[str]) -> int:
     """Measure as the command line says; return the exit code.
@@ -75,7 +80,7 @@ def main(words: Sequence[str]) -> int:
 
 def measure(args: Scaling, count: int) -> dict[str, Any]:
     """Steps a second with ``count`` runners, updates of the network among them."""
-    own: dict[str, Any] = {"num_envs": count, "total_timesteps": 1_000_000_000}
+    own: dict[str, Any] = {"num_envs": count, "runners": (count,), "total_timesteps": 1_000_000_000}
     with ExitStack() as stack:
         run = make_run(replace(args, **own), None, stack)
         run.advance(bool)

@@ -63,7 +63,7 @@ class Foresight(Planner):
         check_range(self, "temperature", 1e-6, 1000)
         if order not in ORDERS:
             raise unknown("order of foresight", order, ORDERS)
-        self.without = tuple(filter(None, without.split("+")))
+        self.without = tuple(filter(None, str(without or "").split("+")))
         for name in self.without:
             if name not in TERMS:
                 raise unknown("term of the reward", name, TERMS)

@@ -104,6 +104,10 @@ class GoalPlanner(Planner):
         self.leaves = False
         """Whether it goes to a goal since such motions led back to where it had been."""
 
+    def instead(self, action: int) -> None:
+        """Remember where the motion that was made leads."""
+        self.heading_to = self.env.candidate_poses()[action]
+
     def lost_by(self, action: int) -> None:
         """Keep away from where the last motion should have led."""
         self.lost_at = np.concatenate([self.lost_at, self.heading_to[None]])

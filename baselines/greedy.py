@@ -13,7 +13,7 @@ from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.env import Planner
 from ms_slam_env.env.config import LookaheadConfig, TargetConfig
 from ms_slam_env.env.lookahead import Lookahead
-from ms_slam_env.errors import unknown
+from ms_slam_env.errors import InputError, unknown
 
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv
@@ -71,6 +71,10 @@ class GreedyDivergence(Planner):
         given: dict[str, Any] = {k: _number(v) for k, v in options.items() if v is not None}
         self.predicted = env.lookahead
         targets = env.config.targets
+        if preset == "paper" and calibration:
+            raise InputError(
+                "greedy calibrates what it meets: preset=environment only"
+            )
         if preset == "paper":
             self.predicted, targets = self._predicted_as_printed, PAPER_TARGETS
             self._lookahead = Lookahead(PAPER_LOOKAHEAD, DivergenceConfig.paper(), env.intrinsics)

@@ -81,6 +81,11 @@ class GreedyLimited(GoalPlanner):
         ratio = np.log((met + _FLOOR_NATS) / (expected + _FLOOR_NATS))
         self.log_factor += _LEARNT * ((ratio > self.log_factor) - self.violations / 2)
 
+    def instead(self, action: int) -> None:
+        """What is met next is not what was expected."""
+        super().instead(action)
+        self.expected = None
+
     def lost_by(self, action: int) -> None:
         """Nothing was met that could be learnt from."""
         super().lost_by(action)

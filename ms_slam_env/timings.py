@@ -45,7 +45,3 @@ class Timings:
         self.own.clear()
         self.calls.clear()
         self.last.clear()
-
-    def mean_ms(self) -> dict[str, float]:
-        """Mean milliseconds a call of each stage."""
-        return {name: 1e3 * self.total[name] / self.calls[name] for name in self.total}

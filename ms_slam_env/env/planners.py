@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -155,15 +156,21 @@ PLANNERS = ExtensionPoint("planner", "ms_slam_env.planners", Planner)
 """Where planners are found."""
 
 
-def make_planner(text: str, env: Any, seed: int = 0) -> Planner:
+def make_planner(text: str, env: Any, seed: int = 0, **more: Any) -> Planner:
     """Build the planner that ``NAME,option=value,...`` describes for the unwrapped ``env``.
 
     Every planner has the option ``recovery``: while tracking is lost its last motions are undone.
 
+    Args:
+        text: what to build.
+        env: the unwrapped environment.
+        seed: of the planner's draws.
+        **more: options beside those of the text, as paths with commas in them.
+
     Raises:
         InputError: an unknown planner or option, or a value that the planner refuses.
     """
-    cls, options = _parsed(text)
+    cls, options = _parsed(text, more)
     recovery = options.pop(RECOVERY, cls.recovers)
     planner: Planner = cls(env, seed=seed, **options)
     return Recovering(env, planner) if recovery else planner
@@ -175,23 +182,24 @@ def planner_observation(text: str) -> str:
     Raises:
         InputError: an unknown planner or option, or what the planner refuses.
     """
-    cls, options = _parsed(text)
+    cls, options = _parsed(text, {})
     options.pop(RECOVERY, None)
     return cls.observation_for(**options)
 
 
-def check_planner(text: str) -> None:
+def check_planner(text: str, **more: Any) -> None:
     """Refuse what ``make_planner`` would refuse, without an environment.
 
     Raises:
         InputError: an unknown planner or option.
     """
-    _parsed(text)
+    _parsed(text, more)
 
 
-def _parsed(text: str) -> tuple[type[Planner], dict[str, Any]]:
-    """Class and options that ``text`` describes."""
+def _parsed(text: str, more: Mapping[str, Any]) -> tuple[type[Planner], dict[str, Any]]:
+    """Class and options that ``text`` describes, with ``more`` of these."""
     name, options = parse_named(text, "planner")
+    options = {**options, **more}
     cls: type[Planner] = PLANNERS.find(name)
     check_options(f"planner {name}", cls, options, ("env", "seed"), (RECOVERY,))
     if not isinstance(options.get(RECOVERY, False), bool):

@@ -180,12 +180,12 @@ def _policies_as_one(
     rows: Sequence[Row], pairs: Sequence[Mapping[str, Any]], title: str
 ) -> list[Table]:
     """Tables of trainings in place of their policies; none if there are none of several."""
-    together = policies_together(rows)
+    together = policies_together(finished(rows))
     if not together:
         return []
     grouping = Grouping(("planner",), HEADLINE, rank_by=RANKED_BY, count="episodes")
     of_pairs = policies_together(pairs)
-    tables = [with_losses(grouping.table(of_pairs, title), of_pairs)]
+    tables = [with_losses(grouping.table(of_pairs, title), of_pairs)] if of_pairs else []
     for metric in COMPARED:
         tables += better_than_each_other(together, f"{title}: ", metric)
     return tables
@@ -193,7 +193,7 @@ def _policies_as_one(
 
 def _charts(rows: Sequence[Row], task: str) -> list[Chart]:
     """The charts of one task, whose name they have if there are several; of trainings."""
-    rows = policies_together(rows) or rows
+    rows = policies_together(finished(rows)) or rows
     ranking = Grouping(("planner",), (RANKED_BY,), rank_by=RANKED_BY).table(rows)
     best = [str(line["planner"]) for line in ranking.rows]
     label = short_planner_names(best).__getitem__

@@ -236,8 +236,8 @@ def _score_text(score: _Score, policy: Policy) -> Iterator[str]:
     rows = (score.own, others[0])
     yield replace(score.table, title="", columns=columns, rows=rows).as_markdown()
     for title, metric, what in _VERDICTS:
-        whole = f"{score.task}: {title}"
-        for table in (t for t in results.tables if t.title and whole.endswith(t.title)):
+        of_task = f"{score.table.title.partition(':')[0]}: {title}"
+        for table in (t for t in results.tables if t.title in (title, of_task)):
             best = _best_rival(score, metric, table)
             chance = _chance(table, policy, best)
             if chance is not None:

@@ -194,6 +194,18 @@ def test_the_policy_acts_through_a_planner_and_only_weighed_decisions_count(tmp_
     np.testing.assert_array_equal(one.preferences.sum(axis=1), right > 0)
 
 
+def test_a_teacher_that_weighs_nothing_teaches_no_policy_under_a_planner(tmp_path, capsys):
+    words = ["--teacher", f"{__name__}:Knowing", "--through", f"{__name__}:Through"]
+    words = arguments(tmp_path, *words)
+    words.remove("--teacher"), words.remove(TEACHER)
+    assert imitation.main(words) == 2
+    assert "Knowing weighs no decision of a policy that acts through" in capsys.readouterr().err
+
+
+def test_folders_may_have_any_name(tmp_path):
+    assert imitation.main(arguments(tmp_path / "lr=1,h=2 #a: b")) == 0
+
+
 def test_it_begins_with_a_policy_that_there_is(tmp_path, capsys):
     imitation.main(arguments(tmp_path / "first", rounds=1))
     init = tmp_path / "first/latest.safetensors"

@@ -228,3 +228,9 @@ def test_a_runner_is_killed_the_training_goes_on_and_is_resumed(cluster, tmp_pat
 def test_by_default_a_round_of_one_runner_of_the_scaling_fills_a_batch():
     args = rllib_scaling.Scaling()
     assert args.batch_size <= args.n_steps
+
+
+def test_a_batch_of_the_scaling_is_a_round_of_the_fewest_runners_at_most():
+    rllib_scaling.Scaling(runners=(4, 8), n_steps=128, batch_size=512)
+    with pytest.raises(InputError, match="batch_size = 512"):
+        rllib_scaling.Scaling(runners=(4, 1), num_envs=4, n_steps=128, batch_size=512)

@@ -127,8 +127,11 @@ def test_terms_left_out_do_not_count():
 def test_it_is_found_by_its_name_and_refuses_what_it_cannot():
     env = make_env().unwrapped
     assert isinstance(make_planner("foresight,tried=3", env), Foresight)
+    assert make_planner("foresight,without=", env).without == ()
     for option in ("tried=0", "temperature=0", "noise=-1", "order=greediest"):
         with pytest.raises(InputError, match=option.split("=")[0]):
             make_planner(f"foresight,{option}", env)
     with pytest.raises(InputError, match=r"term of the reward 'surface'; valid .* new_surface"):
         make_planner("foresight,without=lost+surface", env)
+    with pytest.raises(InputError, match="term of the reward '1'"):
+        make_planner("foresight,without=1", env)

@@ -129,7 +129,10 @@ def test_where_tracking_was_lost_it_does_not_go_again(episode):
     planner.lost_by(3)
     assert planner.goal is None
     assert not planner.admissible(poses)[3]
-    planner.lost_at = planner.lost_at[:-1]
+    planner.instead(1)  # of what it chose
+    planner.lost_by(1)
+    np.testing.assert_array_equal(planner.lost_at[-2:], poses[[3, 1]])
+    planner.lost_at = planner.lost_at[:-2]
 
 
 def wall(distance, poses):

@@ -89,6 +89,8 @@ def test_greedy_names_its_presets():
     env = SimpleNamespace(lookahead=None, config=SimpleNamespace(targets=TargetConfig()))
     with pytest.raises(InputError, match=r"preset of greedy 'icra'.*environment, paper"):
         GreedyDivergence(env, preset="icra")
+    with pytest.raises(InputError, match="preset=environment only"):
+        GreedyDivergence(env, preset="paper", calibration=0.3)
 
 
 def test_greedy_with_targets_of_zero_stands_still():

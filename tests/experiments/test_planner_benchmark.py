@@ -196,6 +196,36 @@ def test_policies_in_several_folders_are_of_several_trainings() -> None:
     ]
 
 
+def test_policies_that_lie_where_their_trainings_left_them_are_told_apart() -> None:
+    names = [f"p,path=runs/{o}/{seed}/latest" for o in ("held", "map") for seed in (1, 2)]
+    rows: list[Row] = [{"spec": {"planner": name}, "result": {}, "error": None} for name in names]
+
+    def found(rows: list[Row]) -> list[str]:
+        return [row["spec"]["planner"] for row in policies_together(rows)]
+
+    assert found(rows) == [f"p,path=runs/{o} (2 policies)" for o in ("held", "map") for _ in "12"]
+    assert found(rows[:2]) == ["p (2 policies)"] * 2
+
+
+def test_a_policy_that_finished_nothing_is_none_of_its_training() -> None:
+    rows: list[Row] = [
+        {
+            "spec": {**row["spec"], "planner": f"p,path=a/{seed}"},
+            "result": row["result"] if seed < 2 else None,
+            "error": None if seed < 2 else "x",
+        }
+        for row in rows_of(PlannerBenchmark(planners=("random",), scenes=("table", "wall")))
+        for seed in range(3)
+    ]
+    tables = {table.title: table for table in CONFIG.tables(rows)}
+    (line,) = tables["Policies as one"].rows
+    assert line["planner"] == "p (2 policies)"
+    for row in rows:
+        if row["spec"]["planner"] == "p,path=a/1":
+            row["result"], row["error"] = None, "x"
+    assert not [title for title in (t.title for t in CONFIG.tables(rows)) if "as one" in title]
+
+
 def test_planners_are_compared_by_what_the_reward_says_too() -> None:
     pytest.importorskip("rliable")
     rows = rows_of(CONFIG)
@@ -243,8 +273,12 @@ def test_names_are_as_long_as_it_takes_to_tell_planners_apart() -> None:
     }
     apart = {"policy,path=x/a/1": "policy, path=a/1", "policy,path=x/b/1": "policy, path=b/1"}
     assert short_planner_names(apart) == apart
-    farther = ["policy,path=x/a/1", "policy,path=y/a/1"]
-    assert list(short_planner_names(farther).values()) == [n.replace(",", ", ") for n in farther]
+    farther = ["policy,path=/r/x/a/1", "policy,path=/r/y/a/1"]
+    assert list(short_planner_names(farther).values()) == [
+        "policy, path=x/a/1",
+        "policy, path=y/a/1",
+    ]
+    assert short_planner_names(["p,a=/r", "p,a=r"]) == {"p,a=/r": "p, a=/r", "p,a=r": "p, a=r"}
 
 
 def test_every_planner_starts_from_the_same_seeds() -> None:

@@ -26,6 +26,7 @@ def scores(
     options: tuple[str, ...] = (),
     names: tuple[str, ...] = ("nbv", "random"),
     by_return: Interval | None = None,
+    task: str = "",
 ) -> None:
     """A planner benchmark in which ``planner`` is that much better than ``nbv``."""
     names = (names[0], planner, *names[1:])
@@ -43,7 +44,7 @@ def scores(
         make_table(
             ["planner", Column(other, "improvement", other)],
             [{"planner": planner, other: value}],
-            title,
+            task + title,
         )
         for title, other, value in (
             ("Better than each other", "nbv", chance),
@@ -67,7 +68,7 @@ def scores(
         "Planners",
         "About.",
         [
-            make_table(columns, lines),
+            make_table(columns, lines, f"{task}over all scenes" if task else ""),
             better,
             sooner,
             *([rewarded] if by_return else []),
@@ -164,6 +165,14 @@ def test_a_task_with_other_options_is_another(clone: Path) -> None:
     text = card(clone)
     assert "### In `kitchen`\n" in text
     assert "### In `kitchen, reward=paper`\n" in text
+
+
+def test_of_several_tasks_with_options_each_has_its_verdict(clone: Path) -> None:
+    chance = Interval(0.8, 0.6, 0.9)
+    scores(clone / "docs/results/x", chance, options=("reward=paper",), task="kitchen: ")
+    text = card(clone)
+    assert "### In `kitchen, reward=paper`\n" in text
+    assert "80 [60, 90] % of pairs" in text
 
 
 def test_training_seeds_are_counted(clone: Path) -> None:

@@ -52,9 +52,11 @@ def set_surfels(surfels: list[dict[str, np.ndarray]]) -> None:
     )
 
 
-def visible(poses: np.ndarray, first_env: int, margin_px: float) -> list[dict[str, np.ndarray]]:
+def visible(
+    poses: np.ndarray, first_env: int, margin_px: float, **more: float
+) -> list[dict[str, np.ndarray]]:
     """What is listed for each pose."""
-    MAPS.kernels._model_renderer.cull(device_poses(poses), first_env, margin_px)
+    MAPS.kernels._model_renderer.cull(device_poses(poses), first_env, margin_px, **more)
     listed = MAPS.kernels._model_renderer.visible
     names = ("index", "position", "normal", "radius")
     return [
@@ -91,6 +93,22 @@ def test_the_visible_surfels_are_those_of_the_loop_over_all(seed, margin_px, ext
         assert set(fast[env]["index"]) >= set(expected) - set(doubtful)
         assert (np.diff(fast[env]["index"]) > 0).all()  # the order of the map
         assert looked_at[env] >= len(expected) - len(doubtful)
+
+
+def test_of_many_discs_to_a_pixel_a_share_is_listed_by_their_slots():
+    rng = np.random.default_rng(0)
+    set_surfels([random_surfels(rng, 2500, 8.0) for _ in range(2)])
+    MAPS.active.seen_from.fill_(0)
+    MAPS.active.seen_to.fill_(9)
+    poses = np.stack([random_pose(rng, 8.0) for _ in range(2)])
+    focal = MAPS.kernels._model_renderer.intrinsics.fx
+    left_out = 0
+    for every, some in zip(visible(poses, 0, 0), visible(poses, 0, 0, layers=2.0), strict=True):
+        likely = 2.0 * (every["radius"] * focal / every["position"][:, 2]) ** 2
+        draw = ((every["index"].astype(np.uint32) * np.uint32(2654435769)) >> 8) / 2**24
+        np.testing.assert_array_equal(some["index"], every["index"][draw < likely])
+        left_out += len(every["index"]) - len(some["index"])
+    assert left_out > 20
 
 
 def visible_by_definition(

@@ -287,7 +287,7 @@ def short_planner_names(planners: Iterable[str]) -> dict[str, str]:
     names = {planner: planner.split(",") for planner in planners}
     count = Counter(name for name, *_ in names.values())
 
-    def texts(folders: int | None) -> dict[str, str]:
+    def texts(folders: int) -> dict[str, str]:
         return {
             planner: ", ".join([name, *(_with_folders(option, folders) for option in options)])
             if count[name] > 1
@@ -295,11 +295,12 @@ def short_planner_names(planners: Iterable[str]) -> dict[str, str]:
             for planner, (name, *options) in names.items()
         }
 
-    short = map(texts, (0, 1))
-    return next((found for found in short if len(set(found.values())) == len(names)), texts(None))
+    most = max((planner.count("/") for planner in names), default=0)
+    some = map(texts, range(most))
+    return next((found for found in some if len(set(found.values())) == len(names)), texts(most))
 
 
-def _with_folders(option: str, count: int | None) -> str:
-    """An option whose value has the last ``count`` of its folders; None: all."""
+def _with_folders(option: str, count: int) -> str:
+    """An option whose value has the last ``count`` of its folders."""
     name, equals, value = option.partition("=")
-    return name + equals + "/".join(value.split("/")[0 if count is None else -1 - count :])
+    return name + equals + "/".join(value.split("/")[-1 - count :])

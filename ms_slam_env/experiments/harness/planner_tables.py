@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -153,18 +155,24 @@ def policies_together(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """The rows with planners that differ in ``path`` alone as one; nothing if there are none.
 
     So several policies of one training, each begun with another seed, are judged as what that
-    training leads to. Files in several folders are those of several trainings.
+    training leads to. Files in several folders are those of several trainings; of a file that is
+    the only one in its folder, as a training leaves it, the folder above counts.
     """
     members: dict[str, list[str]] = {}
     for planner in dict.fromkeys(map(_planner, rows)):
         members.setdefault(_without_path(planner)[0], []).append(planner)
     trainings: dict[str, list[str]] = {}
     for name, of in members.items():
-        folders = {_without_path(planner)[1] for planner in of} - {None}
-        for planner in of:
-            folder = _without_path(planner)[1]
-            several = len(folders) > 1 and folder is not None
-            trainings.setdefault(f"{name},path={folder}" if several else name, []).append(planner)
+        paths = {planner: _without_path(planner)[1] for planner in of}
+        files = Counter(path.parent for path in paths.values() if path)
+        folders = {
+            planner: path and (path.parent if files[path.parent] > 1 else path.parent.parent)
+            for planner, path in paths.items()
+        }
+        several = len(set(folders.values()) - {None}) > 1
+        for planner, folder in folders.items():
+            training = f"{name},path={folder}" if several and folder else name
+            trainings.setdefault(training, []).append(planner)
     names = {
         planner: f"{name} ({len(of)} policies)" if len(of) > 1 else planner
         for name, of in trainings.items()
@@ -175,12 +183,12 @@ def policies_together(rows: Sequence[Row]) -> list[dict[str, Any]]:
     return [{**row, "spec": {**row["spec"], "planner": names[_planner(row)]}} for row in rows]
 
 
-def _without_path(planner: str) -> tuple[str, str | None]:
-    """A planner without its option ``path``, and the folder of that file; None without one."""
+def _without_path(planner: str) -> tuple[str, PurePosixPath | None]:
+    """A planner without its option ``path``, and that; None without one."""
     parts = planner.split(",")
-    folders = [part[5:].rpartition("/")[0] for part in parts if part.startswith("path=")]
+    paths = [PurePosixPath(part[5:]) for part in parts if part.startswith("path=")]
     rest = [part for part in parts if not part.startswith("path=")]
-    return ",".join(rest), folders[0] if folders else None
+    return ",".join(rest), paths[0] if paths else None
 
 
 def _ranked(means: Mapping[str, statistics.Interval]) -> list[str]:
