@@ -243,7 +243,7 @@ def _score_text(score: _Score, policy: Policy) -> Iterator[str]:
             if chance is not None:
                 shown = format_value(chance, "improvement")
                 verdict = _verdict(chance, best)
-                yield f"{verdict}: its {what} is the better one in {shown} % of pairs.\n"
+                yield f"By {what} {verdict}: its own is better in {shown} % of pairs.\n"
 
 
 def _task(one: FoundResult, table: Table) -> str:
@@ -272,10 +272,10 @@ def _chance(table: Table, policy: Policy, best: Any) -> Interval | None:
 
 def _verdict(chance: Interval, best: Any) -> str:
     if chance.low > 0.5:
-        return f"It beats the best classical planner, `{best}`"
+        return f"it beats `{best}`, the best classical planner"
     if chance.high < 0.5:
-        return f"It does not beat the best classical planner, `{best}`"
-    return f"Neither it nor the best classical planner, `{best}`, is shown to be better"
+        return f"it does not beat `{best}`, the best classical planner"
+    return f"neither it nor `{best}`, the best classical planner, is shown to be better"
 
 
 # -- Where it ends ---------------------------------------------------------------------------------
