@@ -200,16 +200,18 @@ def _charts(rows: Sequence[Row], task: str) -> list[Chart]:
     prefix, title = (f"{task}_", f"{task}: ") if task else ("", "")
 
     def runs(name: str, key: str) -> list[Any]:
-        return [r["result"][key] for r in finished(rows) if r["spec"]["planner"] == name]
+        done = [r["result"] for r in finished(rows) if r["spec"]["planner"] == name]
+        return [result[key] for result in done if key in result]
 
     looks = max((row["result"]["looks_at_steps"] for row in finished(rows)), key=len)
     scores = [quartile_band(label(n), looks, runs(n, "f_score_5cm_over_steps")) for n in best]
     errors = [
         # Nothing is off at step 0, which a logarithmic axis does not show.
-        quartile_band(label(n), looks[1:], [ate[1:] for ate in runs(n, "ate_over_steps")], _FLOOR_M)
+        quartile_band(label(n), looks[1:], [ate[1:] for ate in ates], _FLOOR_M)
         for n in best
+        if (ates := runs(n, "ate_over_steps"))  # older rows have none
     ]
-    return [
+    charts = [
         Chart(
             f"{prefix}f_score_over_steps",
             f"{title}F-score over the steps",
@@ -235,3 +237,4 @@ def _charts(rows: Sequence[Row], task: str) -> list[Chart]:
             [Panel("looks_at_steps", "ate_over_steps", errors, "y")],
         ),
     ]
+    return charts if errors else charts[:-1]

@@ -70,6 +70,17 @@ def test_failed_episodes_do_not_count() -> None:
     assert score_matrices(rows)["random"].shape == (2, 2)
 
 
+def test_rows_of_a_time_without_errors_over_steps_are_left_out_of_that_chart() -> None:
+    rows = rows_of(CONFIG)
+    for row in rows:
+        if row["spec"]["planner"] == "random":
+            del row["result"]["ate_over_steps"]
+    assert [series.name for series in CONFIG.charts(rows)[-1].panels[0].series] == ["greedy"]
+    for row in rows:
+        row["result"].pop("ate_over_steps", None)
+    assert [chart.name for chart in CONFIG.charts(rows)][-1] == "f_score_ate"
+
+
 def test_an_empty_map_has_no_rer_and_no_f_score() -> None:
     rows = rows_of(CONFIG)
     for row in rows:
