@@ -72,9 +72,7 @@ class GreedyDivergence(Planner):
         self.predicted = env.lookahead
         targets = env.config.targets
         if preset == "paper" and calibration:
-            raise InputError(
-                "greedy calibrates what it meets: preset=environment only"
-            )
+            raise InputError("greedy calibrates what it meets: preset=environment only")
         if preset == "paper":
             self.predicted, targets = self._predicted_as_printed, PAPER_TARGETS
             self._lookahead = Lookahead(PAPER_LOOKAHEAD, DivergenceConfig.paper(), env.intrinsics)
