@@ -66,7 +66,7 @@ def draw(chart: Chart) -> Figure:
     named = {name: line for name, line in handles.items() if name not in categories}
     if len(named) > 1:
         is_long = max(map(len, named)) > _LONG_NAME
-        place: Any = "outside lower left" if is_long else "outside right upper"
+        place: Any = "outside lower left" if is_long else "outside right center"
         beside = max(1, columns - 1) if is_long else 1
         figure.legend(list(named.values()), list(named), loc=place, fontsize="small", ncols=beside)
         if is_long:
