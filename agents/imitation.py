@@ -242,9 +242,8 @@ class Student:
             weighed = wanted.sum(dim=1) > 0
             said.append((loss.item(), chosen[weighed].exp().mean().item()))
         self.epochs += args.epochs
-        last = said[-max(1, len(said) // args.epochs) :]
-        loss, probability = np.nanmean(last, axis=0)
-        return {"loss": float(loss), "probability": float(probability)}
+        losses, probabilities = np.transpose(said[-max(1, len(said) // args.epochs) :])
+        return {"loss": float(losses.mean()), "probability": float(np.nanmean(probabilities))}
 
     def file(self, timesteps: int, minutes: float) -> PolicyFile:
         """The policy as it is now."""
@@ -324,8 +323,7 @@ def train(args: Args) -> int:
     file, done = load_run(args)
     begun = None
     if args.init and not done:
-        own = {"memory": 0, "candidates": args.candidates, "quantiles": 0}
-        begun = read_similar(args.init, args, args.hidden, ["observation"], **own)
+        begun = read_similar(args.init, args, args.hidden, ["observation"])
     check_problem(args)
     curve = Curve(args.eval_episodes, {}, config=to_plain(asdict(args)))
     if done and (args.out / RESULTS).is_file():

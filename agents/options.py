@@ -83,6 +83,11 @@ class Problem(Checked):
         """Numbers of each action that our own networks look at one by one; 0 without any."""
         return int(getattr(OBSERVATIONS.find(self.observation), "candidate_numbers", 0))
 
+    @property
+    def layers(self) -> dict[str, int]:
+        """What the file of a policy to begin with has to say of its layers, beside their width."""
+        return {"memory": 0, "candidates": self.candidates, "quantiles": 0}
+
 
 @dataclass(frozen=True)
 class Training(Problem):
@@ -157,6 +162,11 @@ class Args(PpoTraining):
     n_epochs: int = bounded(8, 1, 1000)
     learning_rate: float = bounded(3e-4, 0, 1)
     hidden: int = bounded(128, 1, 4096)
+
+    @property
+    def layers(self) -> dict[str, int]:
+        """See `Problem`; Stable-Baselines3 looks at no candidates one by one."""
+        return {**super().layers, "candidates": 0}
 
 
 TASKS = Path(__file__).parent / "hyperparameters"

@@ -268,7 +268,7 @@ class Run(TrainingRun):
         args = self.args
         if args.init is None:
             return None
-        file = read_init(args, memory=0, candidates=args.candidates, quantiles=0)
+        file = read_init(args)
         known = file.metadata
         known.check_sizes(args.init, self.inputs, self.actions)
         if not args.pull:

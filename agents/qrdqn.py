@@ -37,7 +37,6 @@ from torch import Tensor
 from torch.nn.functional import huber_loss
 
 from ms_slam_env.config import bounded
-from ms_slam_env.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -70,6 +69,11 @@ class Args(Training):
     save_every: int = bounded(2_000, 1, 1_000_000_000)
 
     kept: ClassVar[tuple[str, ...]] = ("quantiles",)
+
+    @property
+    def layers(self) -> dict[str, int]:
+        """See `Problem`."""
+        return {**super().layers, "quantiles": self.quantiles}
 
 
 # -- Replay ------------------------------------------------------------------------------------
@@ -264,9 +268,8 @@ class Run(TrainingRun):
         self.args, self.venv = args, venv
         begun = file or (read_init(args).untrained() if args.init else None)
         normalization = Normalization(self.inputs, self.actions, args.candidates, args.gamma)
-        known, own = begun and begun.metadata, (args.quantiles, self.inputs, (self.actions,))
-        if known and (known.quantiles, known.inputs, tuple(known.actions)) != own:
-            raise InputError(f"{args.init} has not {args.quantiles} quantiles of each action")
+        if begun:
+            begun.metadata.check_sizes(args.init or args.out, self.inputs, self.actions)
         self.learner = Learner(args, normalization, self.actions, begun)
         self.rng = np.random.default_rng([args.seed, self.steps])
         self.replay = Replay(args.buffer_size, self.inputs, self.actions)

@@ -196,11 +196,6 @@ class Normalize(ConnectorV2):
         return batch
 
 
-def _begin(args: Args) -> PolicyFile:
-    """The policy to begin with, without the state of its training."""
-    return read_init(args, memory=0, candidates=args.candidates, quantiles=0).untrained()
-
-
 def make_config(args: Args, space: gym.Space[Any], actions: int, done: int) -> PPOConfig:
     """RLlib's options, of a run that has made ``done`` steps."""
     assert space.shape
@@ -264,7 +259,7 @@ class Run(TrainingRun):
         env = make_env(args, "train", ())
         env.close()
         super().__init__(args, env.observation_space, env.action_space, file)
-        begun = file or (_begin(args) if args.init else None)
+        begun = file or (read_init(args).untrained() if args.init else None)
         register_env(_ENV, lambda _: make_masked(args))
         config = make_config(args, env.observation_space, self.actions, self.steps)
         self.ppo: Any = config.build_algo()

@@ -64,7 +64,7 @@ def make_model(args: Args, venv: VecEnv, file: PolicyFile | None) -> Model:
     if file:
         restore(model, file)
     elif args.init:
-        restore(model, _begin(args).untrained())
+        restore(model, read_init(args).untrained())
     return model
 
 
@@ -97,11 +97,6 @@ def load_run(args: Args) -> PolicyFile | None:
     return file
 
 
-def _begin(args: Args) -> PolicyFile:
-    """The policy to begin with; candidates are encoded one by one in `ms-slam train ppo` alone."""
-    return read_init(args, memory=0, candidates=0, quantiles=0)
-
-
 def train(args: Args) -> int:
     """Train as ``args`` say; return the exit status, 130 after an interrupt.
 
@@ -112,7 +107,7 @@ def train(args: Args) -> int:
     torch.set_num_threads(1)
     file = load_run(args)
     if args.init and file is None:
-        _begin(args)  # refused before anything is written
+        read_init(args)  # refused before anything is written
     check_problem(args)  # here, not in a worker process
     args.out.mkdir(parents=True, exist_ok=True)
     seeds = range(VALIDATION_SEED, VALIDATION_SEED + args.eval_episodes)

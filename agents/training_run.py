@@ -277,27 +277,18 @@ def load_curve(args: Training, validation: VecEnv) -> Curve:
     return Curve(args.eval_episodes, known, config=config)
 
 
-def read_init(args: Training, **network: int) -> PolicyFile:
-    """The policy to begin with, with what ``network`` says of its layers.
+def read_init(args: Training) -> PolicyFile:
+    """The policy to begin with.
 
     Raises:
         InputError: no policy, or one of another network or problem.
     """
     assert args.init
-    return read_similar(args.init, args, args.hidden, ("env_id", "observation"), **network)
+    return read_similar(args.init, args, args.hidden, ("env_id", "observation"))
 
 
-def read_similar(
-    path: Path, args: Problem, hidden: int, names: Sequence[str], **network: int
-) -> PolicyFile:
-    """A policy with layers as wide as ``hidden`` and the options ``names`` of ``args``.
-
-    Args:
-        path: of its file.
-        args: of the training.
-        hidden: width of the layers.
-        names: options that have to be the same.
-        **network: what else its file has to say of its layers, as ``memory=0``.
+def read_similar(path: Path, args: Problem, hidden: int, names: Sequence[str]) -> PolicyFile:
+    """A policy with layers as those of ``args``, ``hidden`` wide, and its options ``names``.
 
     Raises:
         InputError: no policy, or another one.
@@ -310,7 +301,7 @@ def read_similar(
             raise InputError(f"{path} is for {name} {getattr(known, name)!r}, not {own!r}")
     if tuple(known.hidden) != (hidden, hidden):
         raise InputError(f"{path} has layers of {known.hidden}: give --hidden that")
-    for name, own in network.items():
+    for name, own in args.layers.items():
         if getattr(known, name) != own:
             raise InputError(
                 f"{path} has a network with {name} = {getattr(known, name)}; this one has {own}"

@@ -196,9 +196,7 @@ def test_the_policy_acts_through_a_planner_and_only_weighed_decisions_count(tmp_
 
 def test_a_teacher_that_weighs_nothing_teaches_no_policy_under_a_planner(tmp_path, capsys):
     words = ["--teacher", f"{__name__}:Knowing", "--through", f"{__name__}:Through"]
-    words = arguments(tmp_path, *words)
-    words.remove("--teacher"), words.remove(TEACHER)
-    assert imitation.main(words) == 2
+    assert imitation.main(arguments(tmp_path, *words)) == 2
     assert "Knowing weighs no decision of a policy that acts through" in capsys.readouterr().err
 
 

@@ -8,7 +8,7 @@ from learnable_fake import ENV_ID, LearnableFake, arguments, read_curve
 
 pytest.importorskip("sb3_contrib")
 
-from ms_slam_agents import ppo, train_sb3
+from ms_slam_agents import ppo, qrdqn, train_sb3
 from ms_slam_agents.network import Network
 from ms_slam_agents.policy import Policy
 from ms_slam_agents.policy_file import Metadata, PolicyFile, read_policy
@@ -214,6 +214,23 @@ def test_the_pull_keeps_it_near_the_policy_that_it_began_with(tmp_path):
         difference = other.probabilities(seen, masks) - first.probabilities(seen, masks)
         moved[pull] = np.abs(difference).sum()
     assert moved["20"] < 0.5 * moved["0"]
+
+
+def test_a_policy_with_other_layers_is_not_begun_with(tmp_path, capsys):
+    for name, more in (("plain", ()), ("recurrent", ("--memory", "4"))):
+        assert ppo.main(words(tmp_path / name, *more)) == 0
+    given = ["--env-id", ENV_ID, "--hidden", "16", "--out", str(tmp_path / "out"), "--init"]
+    for trainer, name, said in (
+        (ppo, "recurrent", "memory = 4; this one has 0"),
+        (train_sb3, "recurrent", "memory = 4; this one has 0"),
+        (qrdqn, "plain", "quantiles = 0; this one has 32"),
+    ):
+        capsys.readouterr()
+        assert trainer.main([*given, str(tmp_path / name / "latest.safetensors")]) == 2
+        assert said in capsys.readouterr().err
+        assert not (tmp_path / "out").exists()
+    assert train_sb3.Args(observation="held").layers["candidates"] == 0
+    assert ppo.Args(observation="held").layers["candidates"] > 0
 
 
 @pytest.mark.parametrize(

@@ -80,9 +80,9 @@ def _alike(old: Any, new: Any) -> bool:
     return bool(old == new)
 
 
+_FOLDERS = {"planners": "room_task"}  # that are not called as the experiment is
+
+
 def committed_results(name: str) -> Path:
     """Where the results of an experiment are committed, seen from the root of a clone."""
     return Path("docs") / "results" / _FOLDERS.get(name, name)
-
-
-_FOLDERS = {"planners": "room_task"}  # that are not called as the experiment is
