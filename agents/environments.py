@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import signal
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import gymnasium as gym
@@ -17,6 +18,7 @@ from ms_slam_agents.options import Problem
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 import ms_slam_env  # registers the ids, in a worker process too
+from ms_slam_env.env.config import RewardConfig
 from ms_slam_env.errors import InputError, unknown
 
 VALIDATION_SEED = 1_000_000  # of the first validation episode; training draws from small seeds
@@ -51,8 +53,9 @@ def problem_options(args: Problem, split: str) -> dict[str, Any]:
         few = {"arm": few}
     if args.image_size is not None:
         few["image_size"] = args.image_size
-    if args.reward != "default":
-        few["reward"] = args.reward
+    if args.reward != "default" or args.without:
+        weights = asdict(RewardConfig.named()[args.reward])
+        few["reward"] = weights | dict.fromkeys(args.without, 0.0)
     return {
         "max_episode_steps": args.episode_steps,
         "scene": args.scenes,

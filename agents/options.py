@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
@@ -41,6 +41,7 @@ class Problem(Checked):
             --frames-per-action 1`` a step costs little more than the free camera's: a world to
             train in before the arm itself (``--init``).
         reward: preset of the environment's reward, `default` or `paper`.
+        without: terms of the reward that count nothing.
         image_size: of the camera in training and validation, width x height; None: the
             environment's own. At 80x60 a step costs half as much, and SLAM holds on less: a world
             to begin in. Which one it was is no part of the policy.
@@ -64,6 +65,7 @@ class Problem(Checked):
     step_deg: float | None = None
     frames_per_action: int | None = bounded(None, 1, 1000)
     reward: str = chosen("default", *RewardConfig.named())
+    without: tuple[str, ...] = ()
     image_size: str | None = None
     num_envs: int = bounded(2, 1, 100_000)
     seed: int = 0
@@ -75,6 +77,10 @@ class Problem(Checked):
         super().__post_init__()
         if not self.scenes:
             raise InputError("Args.scenes names no scene")
+        terms = [term.name for term in fields(RewardConfig)]
+        for name in self.without:
+            if name not in terms:
+                raise unknown("term of the reward", name, terms)
         if self.observation not in OBSERVATIONS.names():  # a policy file names no module
             raise unknown("observation", self.observation, OBSERVATIONS.names())
 
@@ -222,6 +228,7 @@ KEPT = (
     "step_m",
     "step_deg",
     "reward",
+    "without",
     "hidden",
 )
 """Options that a run keeps when it is resumed: another network, or another problem."""
@@ -268,6 +275,7 @@ def check_kept(path: Path, saved: Mapping[str, Any], args: Problem, names: Itera
     """
     for name in names:
         had, given = saved.get(name, getattr(type(args), name)), getattr(args, name)
+        had = tuple(had) if isinstance(had, list) else had  # as JSON has it
         if had != given:
             raise InputError(f"{path} was trained with {name} {had!r}, not {given!r}")
 
