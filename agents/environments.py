@@ -56,6 +56,8 @@ def problem_options(args: Problem, split: str) -> dict[str, Any]:
     if args.reward != "default" or args.without:
         weights = asdict(RewardConfig.named()[args.reward])
         few["reward"] = weights | dict.fromkeys(args.without, 0.0)
+    if split == "train":
+        few["episodes_per_scene"] = getattr(args, "episodes_per_scene", 1)
     return {
         "max_episode_steps": args.episode_steps,
         "scene": args.scenes,

@@ -112,6 +112,8 @@ class Training(Problem):
         gamma: discount factor.
         hidden: width of the two hidden layers.
         curriculum: YAML file of stages, from easy to the problem itself: see ``curriculum.py``.
+        episodes_per_scene: episodes in a row in a scene, which takes a second to build where it is
+            not one of the last 40 or so.
     """
 
     init: Path | None = None
@@ -123,6 +125,7 @@ class Training(Problem):
     gamma: float = bounded(0.98, 0, 1)
     hidden: int = bounded(256, 1, 4096)
     curriculum: Path | None = None
+    episodes_per_scene: int = bounded(1, 1, 1_000_000)
 
     kept: ClassVar[tuple[str, ...]] = ()
     """Options beside ``KEPT`` that a run keeps when it is resumed."""

@@ -161,6 +161,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
             config.observation, self.intrinsics, num_motions, self._actions.num_configurations
         )
         self.simulation.carves = self._observation.needs_occupancy
+        self._episodes_left = 0  # in the scene that was drawn last
         self.action_space = self._actions.space
         self.observation_space = self._observation.space
         self.on_load: Callable[[int], None] = _nothing
@@ -185,7 +186,11 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         """
         check_reset(seed, options)
         super().reset(seed=seed)
-        self.simulation.enter(*self.config.draw_scene(self.np_random))
+        if seed is not None or not self._episodes_left or self.simulation.place is None:
+            self.simulation.place = self.config.draw_scene(self.np_random)
+            self._episodes_left = self.config.episodes_per_scene
+        self._episodes_left -= 1
+        self.simulation.enter(*self.simulation.place)
         start = (options or {}).get("T_world_camera")
         if start is None:
             self.simulation.start_somewhere(self.np_random)

@@ -150,6 +150,8 @@ class EnvConfig(Checked):
         split: which seeds to draw from: train, validation or test.
         num_scene_seeds: how many seeds of the split are used; a scene takes seconds to build, so
             a small pool is kept in memory.
+        episodes_per_scene: episodes in a row in a scene that was drawn; one that is reset with a
+            seed draws in any case.
         image_size: of the camera, WIDTHxHEIGHT pixels.
         field_of_view_deg: of the camera, from left to right; None for that of the Xtion, 58.6.
         noise: sensor noise: ``kinect``, ``range`` or ``none``; a mapping with the ``name`` of one,
@@ -195,6 +197,7 @@ class EnvConfig(Checked):
     scene_seed: int | None = None
     split: str = chosen("train", *SEED_SPLITS)
     num_scene_seeds: int = 4
+    episodes_per_scene: int = bounded(1, 1, 1_000_000)
     image_size: str = "160x120"
     field_of_view_deg: float | None = bounded(None, 10, 150)
     noise: str | NoiseConfig = "kinect"

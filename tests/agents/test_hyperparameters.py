@@ -107,3 +107,20 @@ def test_the_size_of_the_images_is_that_of_the_environments_and_no_part_of_the_p
     assert environments.problem_options(ppo.Args(), "train").get("image_size") is None
     with pytest.raises(InputError, match="image size"):
         environments.check_problem(ppo.Args(image_size="64"))
+
+
+def test_terms_of_the_reward_are_left_out_by_name():
+    args = parsed(["--without", "intensity_divergence", "lost", "--reward", "paper"])
+    weights = environments.problem_options(args, "train")["reward"]
+    assert weights["intensity_divergence"] == weights["lost"] == weights["new_surface"] == 0
+    assert (weights["depth_divergence"], weights["trajectory_error"]) == (0.5, 10.0)
+    environments.check_problem(args)
+    with pytest.raises(InputError, match=r"term of the reward 'los'.*lost_for_good"):
+        parsed(["--without", "los"])
+
+
+def test_a_run_keeps_the_terms_that_it_leaves_out(tmp_path):
+    args = parsed(["--without", "lost"])
+    options.check_kept(tmp_path, {"without": ["lost"]}, args, ["without"])
+    with pytest.raises(InputError, match="trained with without"):
+        options.check_kept(tmp_path, {}, args, ["without"])
