@@ -105,7 +105,7 @@ def play(task: Task) -> Path:
     The teacher is asked at every step and told what was done instead (DAgger's queries of the
     expert, Ross et al., AISTATS 2011).
     """
-    key = (task.env_id, task.options)
+    key = (task.env_id, repr(task.options))  # a reward's weights are a dictionary
     if key not in _ENVS:
         import ms_slam_env  # noqa: F401 -- registers the ids, in a worker process too
 

@@ -53,11 +53,14 @@ def problem_options(args: Problem, split: str) -> dict[str, Any]:
         few = {"arm": few}
     if args.image_size is not None:
         few["image_size"] = args.image_size
-    if args.reward != "default" or args.without:
+    if args.without:
         weights = asdict(RewardConfig.named()[args.reward])
         few["reward"] = weights | dict.fromkeys(args.without, 0.0)
-    if split == "train":
-        few["episodes_per_scene"] = getattr(args, "episodes_per_scene", 1)
+    elif args.reward != "default":
+        few["reward"] = args.reward
+    stays = getattr(args, "episodes_per_scene", 1)
+    if split == "train" and stays > 1:
+        few["episodes_per_scene"] = stays
     return {
         "max_episode_steps": args.episode_steps,
         "scene": args.scenes,

@@ -69,6 +69,8 @@ class Args(Problem):
         gamma: discount factor of the returns.
         hidden: width of the two hidden layers.
         dropout: share of what the layers see that is zero, drawn anew for each gradient step.
+        memory: width of the recurrent unit; 0: the policy sees the present observation alone. With
+            one, whole episodes are fitted to, so many as make a batch.
     """
 
     out: Path = Path("runs/imitation")
@@ -85,6 +87,12 @@ class Args(Problem):
     gamma: float = bounded(0.98, 0, 1)
     hidden: int = bounded(256, 1, 4096)
     dropout: float = bounded(0.0, 0, 0.99)
+    memory: int = bounded(0, 0, 4096)
+
+    @property
+    def layers(self) -> dict[str, int]:
+        """See the base class; a policy to begin with has the same memory."""
+        return {**super().layers, "memory": self.memory}
 
 
 # -- Episodes ----------------------------------------------------------------------------------
@@ -197,7 +205,7 @@ class Student:
         torch.manual_seed(args.seed)
         width, actions = args.hidden, self.actions
         self.network = Network(
-            self.inputs, width, actions, candidates=args.candidates, dropout=args.dropout
+            self.inputs, width, actions, args.memory, args.candidates, dropout=args.dropout
         )
         self.epochs = epochs
         if file:
@@ -219,17 +227,18 @@ class Student:
         The loss is the cross entropy to what the teacher prefers.
         """
         args = self.args
-        data = _batches(demonstrations, args, np.random.default_rng([args.seed, self.epochs]))
+        data = _Batches(demonstrations, args, np.random.default_rng([args.seed, self.epochs]))
         optimizer = torch.optim.Adam(self.network.parameters(), lr=args.learning_rate)
         said: list[tuple[float, float]] = []
-        nothing = torch.zeros(args.batch_size, 0)
-        for k, (observations, masks, preferences, returns) in enumerate(data):
+        for k, (observations, masks, is_step, preferences, returns) in enumerate(data):
             optimizer.param_groups[0]["lr"] = args.learning_rate * (1 - k / len(data))
             scaled = np.clip((observations - self.seen.mean) / self.seen.std, -CLIP, CLIP)
             seen = torch.as_tensor(scaled, dtype=torch.float32)
             can = torch.as_tensor(masks)
-            log_probs, values = self.network(seen, nothing[: len(seen)], can)
-            log_probs = log_probs.masked_fill(~can, 0)  # nothing is learnt from what cannot be
+            empty, begins = torch.zeros(seen.shape[1], args.memory), torch.zeros(seen.shape[:2])
+            log_probs, values = self.network.along(seen, empty, begins, can)
+            log_probs = log_probs.masked_fill(~can.flatten(0, 1), 0)  # of what cannot be: nothing
+            log_probs, values = log_probs[is_step], values[is_step]
             wanted = torch.as_tensor(preferences, dtype=torch.float32)
             target = torch.as_tensor(returns / self.returns.std, dtype=torch.float32)
             error = torch.mean((values - target) ** 2)
@@ -253,6 +262,7 @@ class Student:
             "imitation",
             inputs=self.inputs,
             actions=(self.actions,),
+            memory=args.memory,
             candidates=args.candidates,
             timesteps=timesteps,
             epochs=self.epochs,
@@ -264,29 +274,43 @@ class Student:
         return PolicyFile(metadata, network | moments)
 
 
-@dataclass(frozen=True)
-class _batches:
-    """Batches of all steps of all episodes, shuffled anew in each epoch."""
+class _Batches:
+    """All episodes in batches, shuffled anew in each epoch: steps, or whole episodes if a memory
+    learns from them.
 
-    demonstrations: Sequence[Demonstration]
-    args: Args
-    rng: np.random.Generator
+    A batch is observations (L, B, k) and masks (L, B, n), where episodes that are shorter than the
+    longest are filled up, which of these L B are steps, and their preferences and returns.
+    """
+
+    def __init__(
+        self, demonstrations: Sequence[Demonstration], args: Args, rng: np.random.Generator
+    ) -> None:
+        self.args, self.rng = args, rng
+        parts = [
+            (d.observations, d.masks, d.preferences, d.returns(args.gamma)) for d in demonstrations
+        ]
+        self._columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+        steps = np.array([len(d.rewards) for d in demonstrations])
+        self._lengths = steps if args.memory else np.ones(steps.sum(), int)
+        self._starts = np.cumsum(self._lengths) - self._lengths
+        at_once = max(1, args.batch_size // int(self._lengths.max()))
+        self._batches = math.ceil(len(self._lengths) / at_once)
 
     def __len__(self) -> int:
-        steps = sum(len(d.rewards) for d in self.demonstrations)
-        return self.args.epochs * math.ceil(steps / self.args.batch_size)
+        return self.args.epochs * self._batches
 
     def __iter__(self) -> Iterator[tuple[Any, ...]]:
-        parts = [
-            (d.observations, d.masks, d.preferences, d.returns(self.args.gamma))
-            for d in self.demonstrations
-        ]
-        observations, masks, preferences, returns = map(np.concatenate, zip(*parts, strict=True))
+        observations, masks, preferences, returns = self._columns
         for _ in range(self.args.epochs):
-            order = self.rng.permutation(len(returns))
-            for chosen in np.array_split(order, math.ceil(len(order) / self.args.batch_size)):
-                seen = observations[chosen].astype(np.float32)
-                yield seen, masks[chosen], preferences[chosen], returns[chosen]
+            order = self.rng.permutation(len(self._lengths))
+            for chosen in np.array_split(order, self._batches):
+                lengths = self._lengths[chosen]
+                step = np.arange(lengths.max())[:, None]
+                at = self._starts[chosen] + np.minimum(step, lengths - 1)
+                is_step = (step < lengths).ravel()
+                steps = at.ravel()[is_step]
+                seen = observations[at].astype(np.float32)
+                yield seen, masks[at], is_step, preferences[steps], returns[steps]
 
 
 # -- Training ----------------------------------------------------------------------------------
@@ -305,7 +329,7 @@ def load_run(args: Args) -> tuple[PolicyFile | None, int]:
     if not path.exists():
         return None, 0  # interrupted in the first round
     names = {"env_id", "observation", "hidden", "teacher", "episodes", "epochs", "seed", "reward"}
-    file = read_run(args, "imitation", names | {"through"})
+    file = read_run(args, "imitation", names | {"through", "without"})
     return file, file.metadata.epochs // args.epochs
 
 

@@ -71,6 +71,24 @@ class Network(nn.Module):
         values = self.value_net(self.mlp_extractor["value_net"](x))
         return log_softmax(logits.masked_fill(~masks, BLOCKED), dim=1), values.flatten()
 
+    def along(
+        self, seen: Tensor, memory: Tensor, begins: Tensor, masks: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """``forward`` of L steps of B episodes, (L, B, ...) flattened to (L B, ...).
+
+        Args:
+            seen: observations (L, B, k).
+            memory: (B, M) before the first step.
+            begins: (L, B) where an episode begins.
+            masks: (L, B, n) of the actions that are possible.
+        """
+        rows = []
+        for now, first, possible in zip(seen, begins, masks, strict=True):
+            memory = self.remember(now, memory, first)
+            rows.append(self(now, memory, possible))
+        log_probs, values = (torch.cat(column) for column in zip(*rows, strict=True))
+        return log_probs, values
+
     def quantiles(self, seen: Tensor) -> Tensor:
         """Quantiles (B, n, Q) of the return after each action."""
         scores = self._score(*self._look(seen))

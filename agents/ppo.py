@@ -202,11 +202,9 @@ def update(
 
 def _losses(network: Network, batch: dict[str, Tensor], args: Args) -> tuple[Tensor, ...]:
     """Policy, value, entropy and divergence from the first policy, of chunks (L, C, ...)."""
-    memory, rows = batch["memory"][0], []
-    for t in range(len(batch["rewards"])):
-        memory = network.remember(batch["seen"][t], memory, batch["begins"][t])
-        rows.append(network(batch["seen"][t], memory, batch["masks"][t]))
-    log_probs, values = (torch.cat(column) for column in zip(*rows, strict=True))
+    log_probs, values = network.along(
+        batch["seen"], batch["memory"][0], batch["begins"], batch["masks"]
+    )
     flat = {name: part.flatten(0, 1) for name, part in batch.items()}
     advantages = flat["advantages"]
     targets = advantages + flat["values"]

@@ -11,6 +11,7 @@ from ms_slam_env.env.config import TargetConfig
 
 NUM_ACTIONS = 7
 ENV_ID = "LearnableFake-v0"
+RECALL_ID = "LearnableRecall-v0"
 
 
 class LearnableFake(gym.Env):
@@ -65,7 +66,23 @@ class LearnableFake(gym.Env):
         }
 
 
+class Recall(LearnableFake):
+    """The right action is what was named two steps before: without a memory nobody knows it."""
+
+    def reset(self, *, seed=None, options=None):
+        self.named = []
+        return super().reset(seed=seed)
+
+    def _next(self):
+        observation = super()._next()
+        self.named.append(self.right)
+        self.right = self.named[max(0, len(self.named) - 3)]
+        self.mask[:] = True
+        return observation
+
+
 gym.register(ENV_ID, LearnableFake)
+gym.register(RECALL_ID, Recall)
 
 
 def arguments(out, *extra, steps=64, algorithm="maskable_ppo"):

@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("sb3_contrib")
 
-from learnable_fake import ENV_ID, NUM_ACTIONS, read_curve
+from learnable_fake import ENV_ID, NUM_ACTIONS, RECALL_ID, read_curve
 from ms_slam_agents import imitation, train_sb3
 from ms_slam_agents.demonstrations import Demonstration, Task, play
 from ms_slam_agents.policy import Policy
@@ -141,11 +141,48 @@ def test_the_policy_weighs_actions_as_its_teacher(tmp_path):
     np.testing.assert_allclose(np.diag(found), 0.75, atol=0.15)
 
 
-@pytest.mark.parametrize("dropout", ["0", "0.3"])
-def test_a_run_that_goes_on_is_the_run_that_never_stopped(tmp_path, dropout):
-    imitation.main(arguments(tmp_path / "whole", "--dropout", dropout))
-    imitation.main(arguments(tmp_path / "parts", "--dropout", dropout, rounds=1))
-    assert imitation.main(arguments(tmp_path / "parts", "--dropout", dropout, "--resume")) == 0
+def test_only_a_memory_learns_what_needs_one(tmp_path):
+    for memory, more in ((0, ()), (32, ("--batch-size", "40", "--hidden", "32"))):
+        own = ("--env-id", RECALL_ID, "--memory", str(memory), "--episodes", "150", *more)
+        assert imitation.main(arguments(tmp_path / str(memory), *own, rounds=1)) == 0
+    assert read_curve(tmp_path / "0").points[-1]["return"] < 4  # three of ten need none
+    assert read_curve(tmp_path / "32").points[-1]["return"] > 9
+    policy = Policy.load(tmp_path / "32" / "latest.safetensors")
+    assert policy.metadata.memory == 32
+    named = [3, 5, 1, 6, 0]
+    seen = [(10 * np.eye(NUM_ACTIONS)[one] + 3).astype(np.float32) for one in named]
+    done = [policy.act(one, np.ones(NUM_ACTIONS, bool)) for one in seen]
+    assert done[2:] == named[:3]
+
+
+def test_episodes_of_different_lengths_are_fitted_to_whole():
+    rng = np.random.default_rng(0)
+    lengths = (3, 7, 1, 5)
+
+    def demonstration(k, length):
+        named = 100 * k + np.arange(length)
+        preferences = np.tile(named[:, None], 2).astype(np.float16)
+        masks, none = np.ones((length, 2), bool), np.zeros(length, np.float32)
+        return Demonstration(named[:, None], masks, preferences, none, none > 1)
+
+    given = [demonstration(k, length) for k, length in enumerate(lengths)]
+    batches = imitation._Batches(given, imitation.Args(memory=1, batch_size=14, epochs=2), rng)
+    assert len(batches) == len(list(batches)) == 4
+    for seen, _, is_step, preferences, returns in batches:
+        columns = seen[..., 0].T.astype(int)
+        for column, used in zip(columns, is_step.reshape(seen.shape[:2]).T, strict=True):
+            k, length = column[0] // 100, int(used.sum())
+            assert length == lengths[k]
+            assert column[:length].tolist() == [100 * k + t for t in range(length)]
+        np.testing.assert_array_equal(seen.reshape(-1)[is_step], preferences[:, 0])
+        assert len(returns) == is_step.sum()
+
+
+@pytest.mark.parametrize("more", [("--dropout", "0"), ("--dropout", "0.3"), ("--memory", "4")])
+def test_a_run_that_goes_on_is_the_run_that_never_stopped(tmp_path, more):
+    imitation.main(arguments(tmp_path / "whole", *more))
+    imitation.main(arguments(tmp_path / "parts", *more, rounds=1))
+    assert imitation.main(arguments(tmp_path / "parts", *more, "--resume")) == 0
     whole, parts = (read_policy(tmp_path / p / "latest.safetensors") for p in ("whole", "parts"))
     for name, value in whole.tensors.items():
         np.testing.assert_array_equal(parts.tensors[name], value, err_msg=name)

@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from learnable_fake import ENV_ID, LearnableFake, arguments, read_curve
+from learnable_fake import ENV_ID, RECALL_ID, LearnableFake, arguments, read_curve
 
 pytest.importorskip("sb3_contrib")
 
@@ -13,26 +13,6 @@ from ms_slam_agents.network import Network
 from ms_slam_agents.policy import Policy
 from ms_slam_agents.policy_file import Metadata, PolicyFile, read_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
-
-RECALL_ID = "LearnableRecall-v0"
-
-
-class Recall(LearnableFake):
-    """The right action is what was named two steps before: without a memory nobody knows it."""
-
-    def reset(self, *, seed=None, options=None):
-        self.named = []
-        return super().reset(seed=seed)
-
-    def _next(self):
-        observation = super()._next()
-        self.named.append(self.right)
-        self.right = self.named[max(0, len(self.named) - 3)]
-        self.mask[:] = True
-        return observation
-
-
-gym.register(RECALL_ID, Recall)
 
 
 def words(out, *more, steps=64, env_id=ENV_ID):
