@@ -29,7 +29,7 @@ from ms_slam_agents.options import PpoTraining
 from ms_slam_agents.policy_file import Metadata, PolicyFile, Tensors, read_policy
 from ms_slam_agents.sb3_state import optimizer_tensors, restore_adam
 from ms_slam_agents.training_run import TrainingRun, read_init, run_command_line
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 from torch import Tensor, nn
 from torch.nn.functional import kl_div, mse_loss
 
@@ -121,13 +121,14 @@ class Player:
         self.seen = _tensor(venv.reset())
         self.begins = torch.ones(venv.num_envs)
         self.memory = torch.zeros(venv.num_envs, network.width)
-        self.infos: list[dict[str, Any]] = []
+        self.returns: list[float] = []
+        """Of the episodes that ended in the last rollout, as the environments reward them."""
 
     @torch.no_grad()
     def play(self, steps: int, stop: Any) -> Rollout | None:
         """A rollout; None where ``stop()`` says so before its end."""
         rows: list[tuple[Tensor, ...]] = []
-        self.infos = []
+        self.returns = []
         for _ in range(steps):
             if stop():
                 return None
@@ -144,7 +145,7 @@ class Player:
             gained = _tensor(rewards) + self._cut_off(dones, infos)
             rows.append((seen, masks, begins, before, actions, chosen, values, gained, pulled_to))
             self.seen, self.begins = _tensor(observations), _tensor(dones)
-            self.infos += infos
+            self.returns += [info["episode"]["r"] for info in infos if "episode" in info]
         rollout = Rollout(*(torch.stack(column) for column in zip(*rows, strict=True)))
         memory = self.network.remember(self.seen, self.memory, self.begins)
         _, last = self.network(self.seen, memory, torch.ones_like(masks))
@@ -296,12 +297,14 @@ class Run(TrainingRun):
         said = update(self.network, self.optimizer, rollout, args, pull, self.rng)
         self.steps += rollout.rewards.numel()
         self.epochs += args.n_epochs
+        if self.player.returns:
+            said["return"] = float(np.mean(self.player.returns))
         return said
 
 
 def make_run(args: Args, file: PolicyFile | None, stack: ExitStack) -> Run:
     """A run in environments of its own."""
-    venv = VecNormalize(make_venv(args, "train"), gamma=args.gamma)
+    venv = VecNormalize(VecMonitor(make_venv(args, "train")), gamma=args.gamma)
     stack.callback(venv.close)
     return Run(args, venv, file)
 

@@ -1,5 +1,7 @@
 """PPO of our own: parts against slow versions and PyTorch, learning against Stable-Baselines3."""
 
+from contextlib import ExitStack
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -170,6 +172,16 @@ def test_a_memory_is_trained_saved_and_resumed(tmp_path, capsys):
     assert [p["timesteps"] for p in read_curve(tmp_path / "a").points] == [0, 64, 128]
     assert ppo.main(words(tmp_path / "a", "--resume", steps=256)) == 2
     assert "trained with memory 8, not 0" in capsys.readouterr().err
+
+
+def test_progress_says_what_the_episodes_returned(tmp_path):
+    with ExitStack() as stack:
+        args = ppo.Args(out=tmp_path, env_id=ENV_ID, n_steps=80, num_envs=1, episode_steps=10)
+        run = ppo.make_run(args, None, stack)
+        said = run.advance(lambda: False)
+    assert len(run.player.returns) == 8
+    assert said["return"] == np.mean(run.player.returns)
+    assert 0 < said["return"] < 10
 
 
 def test_two_runs_of_one_seed_are_one(tmp_path):
