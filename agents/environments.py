@@ -85,6 +85,11 @@ def check_problem(args: Problem) -> None:
             if isinstance(env, Staged):
                 env.check()
             env.close()
+            if env.observation_space.shape is None:
+                raise InputError(
+                    f"observation {args.observation!r} has several parts, which no trainer takes; "
+                    "'pixels' has its images, smaller, in one vector"
+                )
     except gym.error.UnregisteredEnv:
         raise unknown("environment", args.env_id, ms_slam_env.ENV_IDS) from None
     except gym.error.Error as error:

@@ -90,7 +90,7 @@ class Args(Problem):
     memory: int = bounded(0, 0, 4096)
 
     @property
-    def layers(self) -> dict[str, int]:
+    def layers(self) -> dict[str, Any]:
         """See the base class; a policy to begin with has the same memory."""
         return {**super().layers, "memory": self.memory}
 
@@ -205,7 +205,13 @@ class Student:
         torch.manual_seed(args.seed)
         width, actions = args.hidden, self.actions
         self.network = Network(
-            self.inputs, width, actions, args.memory, args.candidates, dropout=args.dropout
+            self.inputs,
+            width,
+            actions,
+            args.memory,
+            args.candidates,
+            dropout=args.dropout,
+            image=args.image,
         )
         self.epochs = epochs
         if file:
@@ -264,6 +270,7 @@ class Student:
             actions=(self.actions,),
             memory=args.memory,
             candidates=args.candidates,
+            image=args.image,
             timesteps=timesteps,
             epochs=self.epochs,
             minutes=minutes,

@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
-from ms_slam_agents.policy_file import PolicyFile, Tensors, encoded_width
+from ms_slam_agents.policy_file import (
+    CONVOLUTIONS,
+    PolicyFile,
+    Tensors,
+    encoded_width,
+    image_width,
+)
 from torch import Tensor, nn
 from torch.nn.functional import log_softmax
 
@@ -19,9 +26,12 @@ class Network(nn.Module):
     each action's, the layers see the state and the mean and the largest of what it makes of them,
     and one score is given for each: in another order the actions have the same probabilities.
     With ``quantiles`` there is no value: each action has so many quantiles of the return.
+    With an ``image`` (channels, rows, columns) at the end of an observation, convolutions look at
+    it, and the layers see the state and what these make of it.
     While it trains, a share ``dropout`` of what the layers see is zero, drawn anew each time.
 
-    The names of the parameters are Stable-Baselines3's, ``memory.*``, ``encoder.*``, ``score.*``.
+    The names of the parameters are Stable-Baselines3's, ``memory.*``, ``encoder.*``, ``score.*``,
+    ``image.*``.
     """
 
     def __init__(
@@ -33,16 +43,19 @@ class Network(nn.Module):
         candidates: int = 0,
         quantiles: int = 0,
         dropout: float = 0.0,
+        image: Sequence[int] = (),
     ) -> None:
         super().__init__()
-        self.width, self.actions = memory, actions
-        self.num_state = inputs - actions * candidates
+        self.width, self.actions, self.shape = memory, actions, tuple(image)
+        self.num_state = inputs - actions * candidates - (math.prod(image) if image else 0)
         encoded = encoded_width(hidden)
-        seen = self.num_state + 2 * encoded if candidates else inputs
+        seen = self.num_state + (2 * encoded if candidates else 0)
+        seen += image_width(image) if image else 0
         heads = (1 if candidates else actions) * (quantiles or 1)
         self.dropout = nn.Dropout(dropout)
         self.memory = nn.GRUCell(seen, memory) if memory else None
         self.encoder = _layers(candidates, encoded, encoded) if candidates else None
+        self.image = _convolutions(image[0]) if image else None
         names = ("policy_net",) if quantiles else ("policy_net", "value_net")
         self.mlp_extractor = nn.ModuleDict(
             {name: _layers(seen + memory, hidden, hidden) for name in names}
@@ -50,11 +63,13 @@ class Network(nn.Module):
         self.score = nn.Linear(encoded + hidden, encoded) if candidates else None
         self.action_net = nn.Linear(encoded if candidates else hidden, heads)
         self.value_net = None if quantiles else nn.Linear(hidden, 1)
+        gains: dict[nn.Module | None, float] = {self.action_net: 0.01, self.value_net: 1.0}
         for module in self.modules():
-            if isinstance(module, nn.Linear):
-                gain = {self.action_net: 0.01, self.value_net: 1.0}.get(module, math.sqrt(2))
+            if isinstance(module, nn.Linear | nn.Conv2d):
+                gain = gains.get(module, math.sqrt(2))
                 nn.init.orthogonal_(module.weight, gain)
-                nn.init.zeros_(module.bias)
+                if module.bias is not None:
+                    nn.init.zeros_(module.bias)
 
     def remember(self, seen: Tensor, memory: Tensor, begins: Tensor) -> Tensor:
         """The memory (B, M) after observations (B, k); empty where an episode ``begins`` (B,)."""
@@ -96,6 +111,9 @@ class Network(nn.Module):
 
     def _look(self, seen: Tensor) -> tuple[Tensor, Tensor | None]:
         """What the layers see (B, k), and the candidates (B, n, E) as encoded, if there are any."""
+        if self.image is not None:
+            made = self.image(seen[:, self.num_state :].unflatten(1, self.shape)).flatten(1)
+            return self.dropout(torch.cat([seen[:, : self.num_state], made], dim=1)), None
         if self.encoder is None:
             return self.dropout(seen), None
         encoded = self.encoder(seen[:, self.num_state :].unflatten(1, (self.actions, -1)))
@@ -118,6 +136,15 @@ class Network(nn.Module):
 def load_parameters(network: nn.Module, file: PolicyFile, part: str = "policy") -> None:
     """Put the parameters where they stood when the file was written."""
     network.load_state_dict({name: torch.from_numpy(v) for name, v in file.part(part).items()})
+
+
+def _convolutions(channels: int) -> nn.Sequential:
+    """Those of ``CONVOLUTIONS``, rectified."""
+    made: list[nn.Module] = []
+    for more, edge, stride in CONVOLUTIONS:
+        made += [nn.Conv2d(channels, more, edge, stride), nn.ReLU()]
+        channels = more
+    return nn.Sequential(*made)
 
 
 def _layers(inputs: int, first: int, second: int) -> nn.Sequential:

@@ -90,9 +90,14 @@ class Problem(Checked):
         return int(getattr(OBSERVATIONS.find(self.observation), "candidate_numbers", 0))
 
     @property
-    def layers(self) -> dict[str, int]:
+    def image(self) -> tuple[int, ...]:
+        """Channels, rows and columns of an image that convolutions look at; empty without one."""
+        return tuple(getattr(OBSERVATIONS.find(self.observation), "image_shape", ()))
+
+    @property
+    def layers(self) -> dict[str, Any]:
         """What the file of a policy to begin with has to say of its layers, beside their width."""
-        return {"memory": 0, "candidates": self.candidates, "quantiles": 0}
+        return {"memory": 0, "candidates": self.candidates, "image": self.image, "quantiles": 0}
 
 
 @dataclass(frozen=True)
@@ -173,9 +178,9 @@ class Args(PpoTraining):
     hidden: int = bounded(128, 1, 4096)
 
     @property
-    def layers(self) -> dict[str, int]:
-        """See `Problem`; Stable-Baselines3 looks at no candidates one by one."""
-        return {**super().layers, "candidates": 0}
+    def layers(self) -> dict[str, Any]:
+        """See `Problem`; Stable-Baselines3 sees one long vector."""
+        return {**super().layers, "candidates": 0, "image": ()}
 
 
 TASKS = Path(__file__).parent / "hyperparameters"

@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from ms_slam_agents.policy_file import Metadata, PolicyFile, read_policy
+from ms_slam_agents.policy_file import CONVOLUTIONS, Metadata, PolicyFile, read_policy
 from numpy.typing import NDArray
 
 import ms_slam_env
@@ -63,6 +63,8 @@ class Policy:
         has_candidates = file.metadata.candidates > 0
         self._encoder = [_layer(network, f"encoder.{i}") for i in (0, 2) if has_candidates]
         self._score = [_layer(network, "score") for _ in range(has_candidates)]
+        filters = [f"image.{2 * i}" for i in range(len(CONVOLUTIONS)) if file.metadata.image]
+        self._image = [(network[f"{name}.weight"], network[f"{name}.bias"]) for name in filters]
         moments = file.part("observation")
         self._mean, self._std = moments["mean"], np.sqrt(moments["var"] + EPSILON)
         self.reset()
@@ -109,9 +111,15 @@ class Policy:
 
         The state, and the mean and the largest of the encoded candidates: none comes first.
         """
+        start = self.metadata.num_state
+        if self._image:
+            image = scaled[:, start:].reshape(len(scaled), *self.metadata.image)
+            for (weight, bias), (_, _, stride) in zip(self._image, CONVOLUTIONS, strict=True):
+                image = np.maximum(_convolved(image, weight, stride) + bias[:, None, None], 0)
+            seen = np.concatenate([scaled[:, :start], image.reshape(len(scaled), -1)], axis=1)
+            return seen, np.zeros((len(scaled), 0, 0))
         if not self._encoder:
             return scaled, np.zeros((len(scaled), 0, 0))
-        start = self.metadata.num_state
         encoded = scaled[:, start:].reshape(len(scaled), self.num_actions, -1)
         for weight, bias in self._encoder:
             encoded = np.tanh(encoded @ weight + bias)
@@ -228,6 +236,13 @@ class Policy:
                 f"{self.metadata.inputs} numbers; the environment's observations have shape "
                 f"{env.observation_space.shape}"
             )
+
+
+def _convolved(images: Float64, weight: Float64, stride: int) -> Float64:
+    """Images (B, C, H, W) seen through filters (O, C, K, K), as PyTorch's ``conv2d``."""
+    windows = np.lib.stride_tricks.sliding_window_view(images, weight.shape[2:], axis=(2, 3))
+    near = windows[:, :, ::stride, ::stride]  # (B, C, rows, columns, K, K)
+    return np.moveaxis(np.tensordot(near, weight, axes=((1, 4, 5), (1, 2, 3))), 3, 1)
 
 
 def _layer(network: dict[str, Float64], name: str) -> tuple[Float64, Float64]:

@@ -59,6 +59,8 @@ class Metadata:
         memory: width of the recurrent unit before the layers; 0 without one.
         candidates: numbers of each action at the end of an observation, which one encoder sees,
             the same for all, and one score is given for; 0: the layers see it all as it is.
+        image: channels, rows and columns of an image at the end of an observation, which
+            convolutions see (``CONVOLUTIONS``); empty: the layers see it all as it is.
         quantiles: of the return, that the network says of each action; 0: it says how probable
             each is, and beside it a value.
         timesteps: environment steps trained.
@@ -80,6 +82,7 @@ class Metadata:
     minutes: float
     memory: int = 0
     candidates: int = 0
+    image: Sequence[int] = ()
     quantiles: int = 0
     env_options: dict[str, Any] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
@@ -88,7 +91,7 @@ class Metadata:
 
     def __post_init__(self) -> None:
         """Hold sequences as tuples, however they came."""
-        for name in ("hidden", "actions"):
+        for name in ("hidden", "actions", "image"):
             if isinstance(getattr(self, name), list):
                 object.__setattr__(self, name, tuple(getattr(self, name)))
 
@@ -121,6 +124,14 @@ class Metadata:
             raise InputError(
                 f"{self.inputs} numbers do not hold {self.candidates} for each of {self.actions}"
             )
+        if self.image and (
+            len(self.image) != 3
+            or self.candidates
+            or not all(0 < size <= self.inputs for size in self.image)
+            or self.num_state < 0
+            or image_width(self.image) <= 0
+        ):
+            raise InputError(f"image = {str(self.image)[:80]} is none in {self.inputs} numbers")
         if self.quantiles and (self.memory or len(self.actions) > 1):
             raise InputError("quantiles go with one number an action, and with no memory")
         counts = (self.timesteps, self.epochs, self.minutes)
@@ -141,8 +152,9 @@ class Metadata:
 
     @property
     def num_state(self) -> int:
-        """Numbers of an observation before those of the candidates."""
-        return self.inputs - sum(self.actions) * self.candidates
+        """Numbers of an observation before those of the candidates or of the image."""
+        image = math.prod(self.image) if self.image else 0
+        return self.inputs - sum(self.actions) * self.candidates - image
 
     @property
     def encoded(self) -> int:
@@ -153,6 +165,18 @@ class Metadata:
 def encoded_width(hidden: int) -> int:
     """Width of what the encoder makes of a candidate, beside a hidden layer of some width."""
     return max(8, hidden // 4)
+
+
+CONVOLUTIONS = ((16, 5, 2), (32, 3, 2), (32, 3, 2))
+"""Channels, edge and stride of the layers that look at an image, a rectifier after each."""
+
+
+def image_width(image: Sequence[int]) -> int:
+    """Numbers that the last convolution makes of an image (channels, rows, columns); 0: none."""
+    rows, columns = image[1:]
+    for _, edge, stride in CONVOLUTIONS:
+        rows, columns = ((max(0, size - edge + stride) // stride) for size in (rows, columns))
+    return CONVOLUTIONS[-1][0] * rows * columns
 
 
 @dataclass(frozen=True)
@@ -200,6 +224,13 @@ def network_shapes(metadata: Metadata) -> Shapes:
         shapes |= _linear("encoder.2", encoded, encoded)
         shapes |= _linear("score", encoded, encoded + metadata.hidden[-1])
         head = (1, encoded)
+    if metadata.image:
+        seen = metadata.num_state + image_width(metadata.image)
+        before = metadata.image[0]
+        for i, (channels, edge, _) in enumerate(CONVOLUTIONS):  # rectifiers at the odd places
+            shapes[f"image.{2 * i}.weight"] = (channels, before, edge, edge)
+            shapes[f"image.{2 * i}.bias"] = (channels,)
+            before = channels
     if width:  # three gates one above the other, as PyTorch has them
         shapes |= {"memory.weight_ih": (3 * width, seen)}
         shapes |= {"memory.weight_hh": (3 * width, width)}

@@ -241,7 +241,7 @@ class Run(TrainingRun):
         torch.manual_seed(args.seed)
         if args.candidates:
             venv.obs_rms = PooledMoments(self.inputs, self.actions, args.candidates)
-        self.network = Network(self.inputs, args.hidden, self.actions, args.memory, args.candidates)
+        self.network = self._network(args.memory)
         self.optimizer = torch.optim.Adam(self.network.parameters(), args.learning_rate, eps=1e-5)
         first = self._first_policy()
         begun = file or (read_policy(args.init) if args.init else None)
@@ -253,6 +253,11 @@ class Run(TrainingRun):
             restore_adam(self.optimizer, file.part("optimizer"), self._names)
         self.player = Player(venv, self.network, args, first, args.seed + self.steps)
         self.rng = np.random.default_rng([args.seed, self.steps])
+
+    def _network(self, memory: int) -> Network:
+        args = self.args
+        layers = (self.inputs, args.hidden, self.actions, memory, args.candidates)
+        return Network(*layers, image=args.image)
 
     @property
     def _names(self) -> list[str]:
@@ -272,7 +277,7 @@ class Run(TrainingRun):
         known.check_sizes(args.init, self.inputs, self.actions)
         if not args.pull:
             return None
-        first = Network(self.inputs, args.hidden, self.actions, 0, known.candidates)
+        first = self._network(memory=0)
         load_parameters(first, file)
         return first
 

@@ -196,7 +196,7 @@ class Learner:
         inputs = len(normalization.obs_rms.mean)
         shape = (inputs, args.hidden, actions, 0, args.candidates, args.quantiles)
         torch.manual_seed(args.seed)
-        self.network, self.target = Network(*shape), Network(*shape)
+        self.network, self.target = (Network(*shape, image=args.image) for _ in range(2))
         self.optimizer = torch.optim.Adam(self.network.parameters(), args.learning_rate)
         self.updates = 0
         if file:

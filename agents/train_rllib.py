@@ -127,7 +127,9 @@ class MaskedModule(TorchRLModule, ValueFunctionAPI):
         """Build it; called by RLlib."""
         given: Any = self.model_config
         self.network = Network(
-            given["inputs"], given["hidden"], given["actions"], 0, given["candidates"]
+            *(given[name] for name in ("inputs", "hidden", "actions")),
+            candidates=given["candidates"],
+            image=given["image"],
         )
         fresh = self.fresh_normalization()
         for name, value in moment_tensors(fresh).items():
@@ -206,6 +208,7 @@ def make_config(args: Args, space: gym.Space[Any], actions: int, done: int) -> P
         "actions": actions,
         "hidden": args.hidden,
         "candidates": args.candidates,
+        "image": args.image,
         "gamma": args.gamma,
     }
     config = PPOConfig()

@@ -62,11 +62,11 @@ class TrainingRun(ABC):
     def __init__(
         self, args: Training, observations: spaces.Space, actions: spaces.Space, file: Any
     ) -> None:
-        if not isinstance(actions, spaces.Discrete) or not observations.shape:
+        if not isinstance(actions, spaces.Discrete):
             raise InputError(
-                f"{args.env_id} has actions of several numbers, or no vector as its observation: "
-                "ms-slam train sb3 takes the first, nothing the second"
+                f"{args.env_id} has actions of several numbers: ms-slam train sb3 takes them"
             )
+        assert observations.shape
         self.options = args
         self.inputs, self.actions = observations.shape[0], int(actions.n)
         self.steps = file.metadata.timesteps if file else 0
@@ -98,6 +98,7 @@ class TrainingRun(ABC):
             inputs=self.inputs,
             actions=(self.actions,),
             candidates=self.options.candidates,
+            image=self.options.image,
             timesteps=self.steps,
             epochs=self.epochs,
             minutes=self.minutes,

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any
 
+import cv2
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
@@ -69,6 +70,8 @@ class Observation(ABC):
     """Whether an occupancy grid is to be carved from the frames."""
     candidate_numbers: int = 0
     """Numbers of each motion at the end, motion by motion, for networks that look at them so."""
+    image_shape: tuple[int, ...] = ()
+    """Channels, rows and columns of an image at the end, for networks that look at it so."""
 
     @abstractmethod
     def build(self, knowledge: RobotKnowledge) -> Any:
@@ -94,6 +97,38 @@ class RGBDObservation(Observation):
             "depth": np.minimum(knowledge.frame.depth, _MAX_DEPTH_M),
             "state": state_vector(knowledge),
         }
+
+
+class PixelsObservation(Observation):
+    """State vector (28), then small colour and depth images, channel by channel: float32.
+
+    Red, green, blue / 255 and depth / 4 m (4, 30, 40), each the mean of its part of the live image;
+    of depth, of the readings there, 0 without any.
+    """
+
+    image_shape = (4, 30, 40)
+
+    def __init__(self, intrinsics: Intrinsics, num_motions: int) -> None:
+        pixels = self.image_shape[1] * self.image_shape[2]
+        highs = [*(1,) * (3 * pixels), *(_DEPTH_CAP,) * pixels]
+        self.space = space = _longer(spaces.Box(*STATE_BOUNDS), highs)
+        self._bounds = space.low, space.high
+
+    def build(self, knowledge: RobotKnowledge) -> Float32:
+        """Return the vector."""
+        depth = np.minimum(knowledge.frame.depth, _MAX_DEPTH_M).astype(np.float32)
+        color = self._small(knowledge.frame.color.astype(np.float32)) / 255
+        readings = self._small((depth > 0).astype(np.float32))
+        mean_depth = self._small(depth) / np.maximum(readings, 1e-6) / _DEPTH_SCALE_M
+        image = np.concatenate([color.transpose(2, 0, 1), mean_depth[None]])
+        vector = np.concatenate([state_vector(knowledge), image.ravel()]).astype(np.float32)
+        return np.clip(vector, *self._bounds)
+
+    def _small(self, image: Float32) -> Float32:
+        """Means of the parts of an image (H, W, ...)."""
+        _, rows, columns = self.image_shape
+        small = cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA)
+        return np.asarray(small, dtype=np.float32)
 
 
 class FeaturesObservation(Observation):
@@ -293,6 +328,7 @@ class WithConfiguration(Observation):
 
 OBSERVATIONS: dict[str, Callable[[Intrinsics, int], Observation]] = {
     "rgbd": RGBDObservation,
+    "pixels": PixelsObservation,
     "features": FeaturesObservation,
     "lookahead": LookaheadObservation,
     "map": MapObservation,

@@ -158,6 +158,8 @@ def _facts(policy: Policy) -> str:
     network = f"tanh layers of {layers}"
     if known.get("candidates"):
         network += f", one encoder for all candidates ({known['candidates']} numbers each)"
+    if known.get("image"):
+        network += f", convolutions for an image of {' x '.join(map(str, known['image']))}"
     if known.get("memory"):
         network += f", a gated recurrent unit of {known['memory']}"
     changed = "".join(f", {key} {value}" for key, value in known.get("env_options", {}).items())

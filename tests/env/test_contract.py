@@ -57,7 +57,8 @@ def env():
 
 @pytest.mark.parametrize("env_id", IDS)
 @pytest.mark.parametrize(
-    "observation", ["rgbd", "features", "lookahead", "map", "goals", "held", "candidates"]
+    "observation",
+    ["rgbd", "pixels", "features", "lookahead", "map", "goals", "held", "candidates"],
 )
 def test_gymnasium_checker_finds_nothing(env_id, observation, recwarn):
     env = gym.make(env_id, observation=observation, **OPTIONS)

@@ -1,0 +1,155 @@
+"""A network that looks at an image by convolutions: NumPy against PyTorch, a run, bad files."""
+
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from learnable_fake import NUM_ACTIONS, LearnableFake, read_curve
+
+pytest.importorskip("sb3_contrib")
+
+from ms_slam_agents import options, ppo, qrdqn
+from ms_slam_agents.network import Network
+from ms_slam_agents.policy import Policy
+from ms_slam_agents.policy_file import Metadata, PolicyFile, image_width, read_policy, write_policy
+
+from ms_slam_env.errors import InputError
+
+IMAGE = (2, 17, 22)
+STATE = 3
+INPUTS = STATE + 2 * 17 * 22
+ENV_ID = "LearnableImage-v0"
+
+
+class Bright(LearnableFake):
+    """The right action says in which part of the image something is bright, somewhere in it."""
+
+    def __init__(self, **more):
+        super().__init__(**more)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (INPUTS,), np.float32)
+
+    def _next(self):
+        super()._next()
+        image = self.np_random.uniform(0, 0.2, IMAGE)
+        row = int(self.np_random.integers(14))
+        image[:, row : row + 3, 3 * self.right : 3 * self.right + 3] = 1
+        state = self.np_random.uniform(size=STATE)
+        return np.concatenate([state, image.ravel()]).astype(np.float32)
+
+
+gym.register(ENV_ID, Bright)
+
+
+@pytest.fixture(autouse=True)
+def image_of_the_fake(monkeypatch):
+    own = property(lambda args: IMAGE if args.observation == "pixels" else ())
+    monkeypatch.setattr(options.Problem, "image", own)
+
+
+def make_network(memory=0):
+    torch.manual_seed(0)
+    network = Network(INPUTS, 16, NUM_ACTIONS, memory, image=IMAGE)
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, 0, 0.3)
+    return network
+
+
+def file_of(network, memory=0):
+    metadata = Metadata(
+        *("masked_ppo", ENV_ID, "pixels", INPUTS, (16, 16), (NUM_ACTIONS,), 1, 1, 0.0),
+        memory=memory,
+        image=IMAGE,
+    )
+    tensors = {f"policy.{n}": p.detach().numpy() for n, p in network.named_parameters()}
+    for name, shape in (("observation", (INPUTS,)), ("return", ())):
+        tensors |= {f"{name}.mean": np.full(shape, 0.5), f"{name}.var": np.full(shape, 4.0)}
+        tensors |= {f"{name}.count": np.array(9.0)}
+    return PolicyFile(metadata, tensors)
+
+
+@pytest.mark.parametrize("memory", [0, 6])
+def test_the_policy_in_numpy_is_the_network_and_is_read_back(memory, tmp_path):
+    network = make_network(memory)
+    write_policy(tmp_path / "policy.safetensors", file_of(network, memory))
+    policy = Policy.load(tmp_path / "policy.safetensors")
+    assert policy.metadata.image == IMAGE
+    rng = np.random.default_rng(0)
+    own, theirs = policy.empty_memory(4), torch.zeros(4, memory)
+    for _ in range(3):
+        seen, masks = rng.normal(size=(4, INPUTS)), rng.random((4, NUM_ACTIONS)) < 0.6
+        masks[:, 0] = True
+        own = policy.remember(seen, own)
+        scaled = torch.as_tensor((seen - 0.5) / 2, dtype=torch.float32)
+        with torch.no_grad():
+            theirs = network.remember(scaled, theirs, torch.zeros(4))
+            expected = network(scaled, theirs, torch.as_tensor(masks))[0].exp().numpy()
+        np.testing.assert_allclose(policy.probabilities(seen, masks, own), expected, atol=1e-5)
+    assert expected.max() > 1.5 / NUM_ACTIONS
+
+
+@pytest.mark.parametrize("image", [(1, 17, 17), (4, 30, 40), (3, 19, 18), (2, 16, 30)])
+def test_the_width_is_what_the_convolutions_make(image):
+    width = image_width(image)
+    if min(image[1:]) < 17:
+        assert width == 0
+    else:
+        made = Network(4 + int(np.prod(image)), 8, 3, image=image).image(torch.zeros(1, *image))
+        assert made.numel() == width
+
+
+def words(out, *more, steps):
+    given = {
+        "out": out,
+        "env-id": ENV_ID,
+        "observation": "pixels",
+        "total-timesteps": steps,
+        "num-envs": 1,
+        "episode-steps": 10,
+        "eval-episodes": 6,
+        "eval-every": 0,
+        "hidden": 16,
+        "learning-rate": 0.003,
+    }
+    return [w for name, value in given.items() for w in (f"--{name}", str(value))] + [*more]
+
+
+def test_ppo_learns_where_to_look_and_goes_on(tmp_path, capsys):
+    more = ("--n-steps", "256", "--batch-size", "64", "--n-epochs", "8", "--gamma", "0.1")
+    assert ppo.main(words(tmp_path / "a", *more, steps=3072)) == 0
+    first, last = (p["return"] for p in read_curve(tmp_path / "a").points)
+    assert last > first + 2
+    assert ppo.main(words(tmp_path / "a", *more, "--resume", steps=3328)) == 0
+    best = tmp_path / "a" / "latest.safetensors"
+    assert read_policy(best).metadata.image == IMAGE
+    own = ("--init", str(best), *more)
+    assert ppo.main(words(tmp_path / "b", *own, steps=256)) == 0
+    capsys.readouterr()
+    assert ppo.main(words(tmp_path / "c", *own, "--observation", "features", steps=64)) == 2
+    assert "is for observation 'pixels', not 'features'" in capsys.readouterr().err
+
+
+def test_quantiles_are_learnt_of_images_too(tmp_path):
+    more = ("--learning-starts", "20", "--batch-size", "8", "--buffer-size", "100")
+    assert qrdqn.main(words(tmp_path, *more, steps=60)) == 0
+    policy = Policy.load(tmp_path / "latest.safetensors")
+    seen = np.random.default_rng(0).uniform(size=INPUTS)
+    assert policy.act(seen, np.arange(NUM_ACTIONS) == 3) == 3
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"image": (2, 17)},
+        {"image": (2, 17, 4)},
+        {"image": (0, 17, 22)},
+        {"image": (2, 17, 40)},
+        {"inputs": STATE + 2 * 17 * 22 + 7, "candidates": 1},
+    ],
+)
+def test_files_with_another_image_are_refused(change):
+    file = file_of(make_network())
+    file.metadata.check()
+    with pytest.raises(InputError, match=r"image = \("):
+        replace(file.metadata, **change).check()
