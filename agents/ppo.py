@@ -57,6 +57,11 @@ class Args(PpoTraining):
 
     kept: ClassVar[tuple[str, ...]] = ("memory",)
 
+    @property
+    def layers(self) -> dict[str, Any]:
+        """See the base class; a policy to begin with has the same memory."""
+        return {**super().layers, "memory": self.memory}
+
 
 # -- Experience --------------------------------------------------------------------------------
 
@@ -120,7 +125,7 @@ class Player:
         venv.seed(seed)
         self.seen = _tensor(venv.reset())
         self.begins = torch.ones(venv.num_envs)
-        self.memory = torch.zeros(venv.num_envs, network.width)
+        self.memory = self.first_memory = torch.zeros(venv.num_envs, network.width)
         self.returns: list[float] = []
         """Of the episodes that ended in the last rollout, as the environments reward them."""
 
@@ -139,7 +144,8 @@ class Player:
             actions = torch.multinomial(log_probs.exp(), 1, generator=self.generator)[:, 0]
             pulled_to = torch.zeros(len(actions), 0)
             if self.first is not None:
-                pulled_to = self.first(seen, before[:, :0], masks)[0].exp()
+                self.first_memory = self.first.remember(seen, self.first_memory, begins)
+                pulled_to = self.first(seen, self.first_memory, masks)[0].exp()
             observations, rewards, dones, infos = self.venv.step(actions.numpy())
             chosen = log_probs.gather(1, actions[:, None])[:, 0]
             gained = _tensor(rewards) + self._cut_off(dones, infos)
@@ -241,22 +247,21 @@ class Run(TrainingRun):
         torch.manual_seed(args.seed)
         if args.candidates:
             venv.obs_rms = PooledMoments(self.inputs, self.actions, args.candidates)
-        self.network = self._network(args.memory)
+        self.network = self._network()
         self.optimizer = torch.optim.Adam(self.network.parameters(), args.learning_rate, eps=1e-5)
         first = self._first_policy()
         begun = file or (read_policy(args.init) if args.init else None)
         if begun:
             restore_moments(venv, begun)
-        if begun and (file or not args.memory):
             load_parameters(self.network, begun)
         if file and file.can_resume:
             restore_adam(self.optimizer, file.part("optimizer"), self._names)
         self.player = Player(venv, self.network, args, first, args.seed + self.steps)
         self.rng = np.random.default_rng([args.seed, self.steps])
 
-    def _network(self, memory: int) -> Network:
+    def _network(self) -> Network:
         args = self.args
-        layers = (self.inputs, args.hidden, self.actions, memory, args.candidates)
+        layers = (self.inputs, args.hidden, self.actions, args.memory, args.candidates)
         return Network(*layers, image=args.image)
 
     @property
@@ -277,7 +282,7 @@ class Run(TrainingRun):
         known.check_sizes(args.init, self.inputs, self.actions)
         if not args.pull:
             return None
-        first = self._network(memory=0)
+        first = self._network()
         load_parameters(first, file)
         return first
 

@@ -171,7 +171,7 @@ class EnvConfig(Checked):
             of a dropped frame is predicted, its surface is not mapped.
         slam_config: options of the backend, or a configuration file (YAML), which also says what
             ``slam`` is and what ``image_size`` is where that is not given.
-        observation: ``rgbd``, ``features``, ``lookahead``, ``map``, ``candidates``,
+        observation: ``rgbd``, ``pixels``, ``features``, ``lookahead``, ``map``, ``candidates``,
             ``module:Class`` or a class.
         step_m: translation of a motion, metres.
         step_rad: rotation of a motion, radians.

@@ -208,6 +208,33 @@ def test_the_pull_keeps_it_near_the_policy_that_it_began_with(tmp_path):
     assert moved["20"] < 0.5 * moved["0"]
 
 
+@pytest.mark.parametrize("memory", [0, 4])
+def test_it_is_pulled_to_what_it_still_is(memory, tmp_path):
+    more = ("--memory", str(memory), "--learning-rate", "0.05")
+    assert ppo.main(words(tmp_path / "a", *more, env_id=RECALL_ID, steps=256)) == 0
+    args = ppo.Args(
+        out=tmp_path / "b",
+        env_id=RECALL_ID,
+        init=tmp_path / "a" / "latest.safetensors",
+        learning_rate=0.0,
+        pull=1.0,
+        memory=memory,
+        hidden=16,
+        num_envs=1,
+        episode_steps=10,
+        n_steps=25,
+    )
+    with ExitStack() as stack:
+        run = ppo.make_run(args, None, stack)
+        run.venv.training = False  # the moments stay
+        rollout = run.player.play(25, lambda: False)
+        said = run.advance(lambda: False)
+    chosen = rollout.pulled_to.gather(2, rollout.actions[..., None])[..., 0]
+    torch.testing.assert_close(chosen.log(), rollout.log_probs)
+    assert rollout.pulled_to.std(dim=0).max() > 0.02
+    assert said["pull"] == pytest.approx(0, abs=1e-5)
+
+
 def test_a_policy_with_other_layers_is_not_begun_with(tmp_path, capsys):
     for name, more in (("plain", ()), ("recurrent", ("--memory", "4"))):
         assert ppo.main(words(tmp_path / name, *more)) == 0
