@@ -30,7 +30,14 @@ from ms_slam_env.experiments.harness.planner_tables import (
     policies_together,
     with_losses,
 )
-from ms_slam_env.report.charts import Chart, Panel, by_group, quartile_band, scatter
+from ms_slam_env.report.charts import (
+    Chart,
+    Panel,
+    by_group,
+    quartile_band,
+    scatter,
+    without_long_tail,
+)
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Grouping, Table, complete_cases, finished
 from ms_slam_env.tasks import OWN, find_task
@@ -45,6 +52,7 @@ PLANNERS = (
 EPISODES, LEADERBOARD_EPISODES = 10, 25
 _PANELS = ("f_score_5cm_area", "f_score_5cm", "ate_m", "path_length_m")
 _FLOOR_M = 5e-5  # errors below are drawn here on logarithmic axes
+_BANDS = "Line: median over episodes; band: between their quartiles."
 
 
 @dataclass(frozen=True)
@@ -215,8 +223,8 @@ def _charts(rows: Sequence[Row], task: str) -> list[Chart]:
         Chart(
             f"{prefix}f_score_over_steps",
             f"{title}F-score over the steps",
-            "Line: median over episodes; band: between their quartiles.",
-            [Panel("looks_at_steps", "f_score_5cm_over_steps", scores)],
+            _BANDS,
+            [Panel("looks_at_steps", "f_score_5cm_over_steps", without_long_tail(scores))],
         ),
         Chart(
             f"{prefix}planners",
@@ -233,8 +241,8 @@ def _charts(rows: Sequence[Row], task: str) -> list[Chart]:
         Chart(
             f"{prefix}ate_over_steps",
             f"{title}Error over the steps",
-            "Line: median over episodes; band: between their quartiles.",
-            [Panel("looks_at_steps", "ate_over_steps", errors, "y")],
+            _BANDS,
+            [Panel("looks_at_steps", "ate_over_steps", without_long_tail(errors), "y")],
         ),
     ]
     return charts if errors else charts[:-1]

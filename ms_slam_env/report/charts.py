@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -294,6 +294,22 @@ def scatter(
             )
         )  # fmt: skip
     return Panel(x, y, series, log)
+
+
+def without_long_tail(lines: Sequence[Series], times: float = 2.0) -> list[Series]:
+    """Lines, the longest cut to the end of the next where it is more than so many times as long.
+
+    One run that goes on long after all others would leave these a strip of the chart.
+    """
+    ends = sorted(len(line.x) for line in lines)
+    if len(ends) < 2 or ends[-1] <= times * ends[-2]:
+        return list(lines)
+
+    def cut(values: Sequence[Any]) -> Sequence[Any]:
+        return values[: ends[-2]]
+
+    parts = ("x", "y", "low", "high", "text")
+    return [replace(line, **{name: cut(getattr(line, name)) for name in parts}) for line in lines]
 
 
 def quartile_band(

@@ -344,3 +344,16 @@ def test_table_two_compares_pairs() -> None:
     assert [panel.title for panel in chart.panels] == ["free motion"] * 2 + [
         "fixed translation"
     ] * 2
+
+
+def test_one_long_line_does_not_squeeze_the_others() -> None:
+    rows = rows_of(CONFIG)
+    for row in rows:
+        is_long = row["spec"]["planner"] == "random" and row["spec"]["seed"] == 2001
+        steps = 90 if is_long else 3
+        row["result"] |= {"looks_at_steps": list(range(0, 5 * steps, 5))}
+        row["result"] |= {"f_score_5cm_over_steps": [0.1] * steps, "ate_over_steps": [0.1] * steps}
+    for chart in (CONFIG.charts(rows)[0], CONFIG.charts(rows)[-1]):
+        for series in chart.panels[0].series:
+            assert max(series.x) == 10
+            assert len(series.x) == len(series.y) == len(series.low) == len(series.high)
