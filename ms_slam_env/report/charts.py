@@ -305,11 +305,18 @@ def without_long_tail(lines: Sequence[Series], times: float = 2.0) -> list[Serie
     if len(ends) < 2 or ends[-1] <= times * ends[-2]:
         return list(lines)
 
-    def cut(values: Sequence[Any]) -> Sequence[Any]:
-        return values[: ends[-2]]
-
-    parts = ("x", "y", "low", "high", "text")
-    return [replace(line, **{name: cut(getattr(line, name)) for name in parts}) for line in lines]
+    end = slice(ends[-2])
+    return [
+        replace(
+            line,
+            x=line.x[end],
+            y=line.y[end],
+            low=line.low[end],
+            high=line.high[end],
+            text=line.text[end],
+        )
+        for line in lines
+    ]
 
 
 def quartile_band(
