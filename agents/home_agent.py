@@ -74,6 +74,10 @@ class HomeAgent(NextBestView):
         self.seen = np.asarray(observation)
         return super().act(observation, info)
 
+    def see(self, observation: Any, info: dict[str, Any]) -> None:
+        """See the base class."""
+        self.near.see(observation, info)
+
     def choose_motion(self, here: NDArray[np.float64]) -> int:
         """The policy's motion, or the one towards a goal."""
         safe = self.safe_motions(here)

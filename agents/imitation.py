@@ -70,7 +70,8 @@ class Args(Problem):
         hidden: width of the two hidden layers.
         dropout: share of what the layers see that is zero, drawn anew for each gradient step.
         memory: width of the recurrent unit; 0: the policy sees the present observation alone. With
-            one, whole episodes are fitted to, so many as make a batch.
+            one, a batch is of whole episodes, as many as have ``batch_size`` steps together, one
+            at least.
     """
 
     out: Path = Path("runs/imitation")
@@ -336,7 +337,7 @@ def load_run(args: Args) -> tuple[PolicyFile | None, int]:
     if not path.exists():
         return None, 0  # interrupted in the first round
     names = {"env_id", "observation", "hidden", "teacher", "episodes", "epochs", "seed", "reward"}
-    file = read_run(args, "imitation", names | {"through", "without"})
+    file = read_run(args, "imitation", names | {"through", "without", "memory"})
     return file, file.metadata.epochs // args.epochs
 
 

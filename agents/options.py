@@ -28,11 +28,11 @@ class Problem(Checked):
             of your own; what is given beside it counts more.
         env_id: id of the environment.
         embodiment: what carries the camera; None: what the id says.
-        observation: a variant by name; `held` shows what the motions would show if they were
-            held for some steps, and taught most of those that were compared; `features` takes
-            the least time.
+        observation: a variant by name, of one vector; `held` shows what the motions would show if
+            they were held for some steps, and taught most of those that were compared; `features`
+            takes the least time.
         scenes: trained and validated on, with training and validation seeds.
-        scene_seeds: seeds of each scene, from the split's first; a scene takes seconds to build.
+        scene_seeds: seeds of each scene, from the split's first.
         episode_steps: time limit of an episode.
         step_m: translation of a motion; None: the environment's default.
         step_deg: rotation of a motion; None: the environment's default.
@@ -78,9 +78,12 @@ class Problem(Checked):
         if not self.scenes:
             raise InputError("Args.scenes names no scene")
         terms = [term.name for term in fields(RewardConfig)]
+        if not isinstance(self.without, tuple):
+            raise InputError(f"Args.without = {self.without!r} must be a list of terms")
         for name in self.without:
             if name not in terms:
                 raise unknown("term of the reward", name, terms)
+        object.__setattr__(self, "without", tuple(sorted(set(self.without))))
         if self.observation not in OBSERVATIONS.names():  # a policy file names no module
             raise unknown("observation", self.observation, OBSERVATIONS.names())
 
@@ -117,8 +120,9 @@ class Training(Problem):
         gamma: discount factor.
         hidden: width of the two hidden layers.
         curriculum: YAML file of stages, from easy to the problem itself: see ``curriculum.py``.
-        episodes_per_scene: episodes in a row in a scene, which takes a second to build where it is
-            not one of the last 40 or so.
+        episodes_per_scene: episodes in a row in a scene that was drawn. To build a room takes a
+            second, a home longer, where it is not one of the last 40 rooms or 11 homes. Episodes of
+            a stage that draws noise or perturbations draw a scene each.
     """
 
     init: Path | None = None

@@ -199,6 +199,10 @@ class Policy:
             (action,) = sample(probabilities, [rng], self.parts)
         return action if np.ndim(action) else int(action)
 
+    def see(self, observation: NDArray[Any]) -> None:
+        """Keep in mind an observation (k,) in whose step another chooses."""
+        self._memory = self.remember(np.asarray(observation)[None], self._memory)
+
     def make_env(self, **options: Any) -> gym.Env[Any, Any]:
         """The environment that fits: ``gym.make`` with the id, observation and steps of training.
 

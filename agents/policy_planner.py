@@ -84,6 +84,10 @@ class TrainedPolicy(Planner):
         rng = None if self.deterministic else self.rng
         return self.policy.act(observation, self.env.action_masks(), rng)
 
+    def see(self, observation: Any, info: dict[str, Any]) -> None:
+        """See the base class."""
+        self.policy.see(observation)
+
 
 class ShippedAgent(TrainedPolicy):
     """A policy that comes with the package; it takes the most probable action unless told not to.

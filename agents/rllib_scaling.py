@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from ms_slam_agents.environments import check_problem
 from ms_slam_agents.train_rllib import Args, make_run
 from tqdm import tqdm
 
@@ -55,6 +56,7 @@ def main(words: Sequence[str]) -> int:
     args = parse(Scaling, words, "ms-slam train rllib scaling")
     if not args.runners or min(args.runners) < 1:
         raise InputError(f"runners = {args.runners} must be numbers from 1 on")
+    check_problem(args)
     rows = [measure(args, count) for count in tqdm(args.runners, unit="number of runners")]
     alone = rows[0]["steps_per_s"] / rows[0]["runners"]
     for row in rows:

@@ -58,8 +58,9 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
     ## Observation space
     Option ``observation``: ``features`` (vector: state, grey histogram, coarse depth, action mask),
     ``lookahead`` (features and the predicted divergences of every action), ``map`` (features and
-    the space around), ``candidates`` (state, and what the planners look at of every action) or
-    ``rgbd`` (images and state). Only what the robot itself has; see
+    the space around), ``goals``, ``held`` and ``candidates`` (state, and what the planners look at
+    of every action), ``pixels`` (a vector of state and small images) or ``rgbd`` (images and
+    state). Only what the robot itself has; see
     :mod:`ms_slam_env.env.observations`. Where the agent chooses the SLAM configuration, also the
     one in force, one-hot (K,): at the end of the vector, or as ``slam_configuration``.
 
@@ -432,13 +433,15 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         """Go on from a state that ``save_state`` of an env with the same world and robot returned.
 
         No reset is needed before. Gymnasium's own wrappers of an environment made by ``gym.make``
-        follow: the time limit counts the steps of the state's episode.
+        follow: the time limit counts the steps of the state's episode. The next reset draws a
+        scene, whatever ``episodes_per_scene`` is.
 
         Raises:
             InputError: options that shape the state differ, or it is not such a state; the
                 environment is as it was.
         """
         load_state(self.simulation, state, self._settings(), self.np_random)
+        self._episodes_left = 0
         self.on_load(len(self.episode.divergences_of_steps) - 1)
 
     def _settings(self) -> dict[str, Any]:
@@ -452,6 +455,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
             "arguments": self._arguments,
             "perturbations": self.camera_feed.perturbations,
             "state": None if self.simulation.episode is None else self.save_state(),
+            "episodes_left": self._episodes_left,
         }
 
     def __setstate__(self, pickled: dict[str, Any]) -> None:
@@ -461,6 +465,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         self.perturb(*pickled["perturbations"])
         if pickled["state"] is not None:
             self.load_state(pickled["state"])
+            self._episodes_left = pickled["episodes_left"]
 
 
 def _nothing(steps: int) -> None:

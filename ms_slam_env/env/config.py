@@ -148,8 +148,8 @@ class EnvConfig(Checked):
         scene: a scene's name, a mesh file, or several to draw from at each reset.
         scene_seed: one seed, or None to draw from ``split`` at each reset.
         split: which seeds to draw from: train, validation or test.
-        num_scene_seeds: how many seeds of the split are used; a scene takes seconds to build, so
-            a small pool is kept in memory.
+        num_scene_seeds: how many seeds of the split are used. To build a room takes a second, a
+            home longer; the last 40 rooms or 11 homes are kept.
         episodes_per_scene: episodes in a row in a scene that was drawn; one that is reset with a
             seed draws in any case.
         image_size: of the camera, WIDTHxHEIGHT pixels.
@@ -171,8 +171,8 @@ class EnvConfig(Checked):
             of a dropped frame is predicted, its surface is not mapped.
         slam_config: options of the backend, or a configuration file (YAML), which also says what
             ``slam`` is and what ``image_size`` is where that is not given.
-        observation: ``rgbd``, ``pixels``, ``features``, ``lookahead``, ``map``, ``candidates``,
-            ``module:Class`` or a class.
+        observation: ``rgbd``, ``pixels``, ``features``, ``lookahead``, ``map``, ``goals``,
+            ``held``, ``candidates``, ``module:Class`` or a class.
         step_m: translation of a motion, metres.
         step_rad: rotation of a motion, radians.
         frames_per_action: frames that a camera which nothing holds takes on a motion, at 30 Hz; an

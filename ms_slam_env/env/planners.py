@@ -69,6 +69,9 @@ class Planner(ABC):
     def instead(self, action: int) -> None:  # noqa: B027 -- most planners see what came of it
         """Be told that another action was taken than ``act`` returned last."""
 
+    def see(self, observation: Any, info: dict[str, Any]) -> None:  # noqa: B027 -- see `instead`
+        """Be shown, in place of ``act``, a step in which another chooses."""
+
     def lost_by(self, action: int) -> None:  # noqa: B027 -- most planners learn nothing from it
         """Be told that its last action lost tracking; SLAM holds the pose from before it."""
 
@@ -120,6 +123,7 @@ class Recovering(Planner):
         if self.was_tracked:  # the motions undone after the first lost nothing
             self.planner.lost_by(self.made[-1])
         self.was_tracked = False
+        self.planner.see(observation, info)
         self.undoing = self.made.pop()
         possible = self.env.action_masks()
         undone = opposite(self.undoing, possible.size)

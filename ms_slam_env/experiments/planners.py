@@ -33,6 +33,7 @@ from ms_slam_env.experiments.harness.planner_tables import (
 from ms_slam_env.report.charts import (
     Chart,
     Panel,
+    Series,
     by_group,
     quartile_band,
     scatter,
@@ -199,6 +200,13 @@ def _policies_as_one(
     return tables
 
 
+def _bands(metric: str, lines: list[Series], log: str = "") -> tuple[str, list[Panel]]:
+    """What is said above lines over the steps, and their panel."""
+    cut = without_long_tail(lines)
+    more = "" if cut == lines else " One goes on, cut here."
+    return _BANDS + more, [Panel("looks_at_steps", metric, cut, log)]
+
+
 def _charts(rows: Sequence[Row], task: str) -> list[Chart]:
     """The charts of one task, whose name they have if there are several; of trainings."""
     rows = policies_together(finished(rows)) or rows
@@ -223,8 +231,7 @@ def _charts(rows: Sequence[Row], task: str) -> list[Chart]:
         Chart(
             f"{prefix}f_score_over_steps",
             f"{title}F-score over the steps",
-            _BANDS,
-            [Panel("looks_at_steps", "f_score_5cm_over_steps", without_long_tail(scores))],
+            *_bands("f_score_5cm_over_steps", scores),
         ),
         Chart(
             f"{prefix}planners",
@@ -241,8 +248,7 @@ def _charts(rows: Sequence[Row], task: str) -> list[Chart]:
         Chart(
             f"{prefix}ate_over_steps",
             f"{title}Error over the steps",
-            _BANDS,
-            [Panel("looks_at_steps", "ate_over_steps", without_long_tail(errors), "y")],
+            *_bands("ate_over_steps", errors, "y"),
         ),
     ]
     return charts if errors else charts[:-1]

@@ -67,6 +67,9 @@ def test_a_file_of_ones_own(tmp_path):
         ("ppo: {gamma: 7}", "gamma"),
         ("ppo: {gamma: high}", "gamma"),
         ("problem: {scenes: 3}", "scenes"),
+        ("problem: {without: 3}", "without = 3 must be a list of terms"),
+        ("problem: {without: null}", "without = None must be a list of terms"),
+        ("problem: {without: lost}", "without = 'lost' must be a list of terms"),
         ("pro: {gamma: 0.7}", "'pro' must be one of problem, sb3, imitation, ppo"),
         ("ppo: 3", "'ppo' must be one of"),
         ("- ppo", "must be one of"),
@@ -122,6 +125,7 @@ def test_terms_of_the_reward_are_left_out_by_name():
 def test_a_run_keeps_the_terms_that_it_leaves_out(tmp_path):
     args = parsed(["--without", "lost"])
     options.check_kept(tmp_path, {"without": ["lost"]}, args, ["without"])
+    assert parsed(["--without", "lost", "blocked", "lost"]).without == ("blocked", "lost")
     with pytest.raises(InputError, match="trained with without"):
         options.check_kept(tmp_path, {}, args, ["without"])
 

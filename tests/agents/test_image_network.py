@@ -11,7 +11,7 @@ from learnable_fake import NUM_ACTIONS, LearnableFake, read_curve
 pytest.importorskip("sb3_contrib")
 
 from ms_slam_agents import options, ppo, qrdqn
-from ms_slam_agents.network import Network
+from ms_slam_agents.network import Network, load_parameters
 from ms_slam_agents.policy import Policy
 from ms_slam_agents.policy_file import Metadata, PolicyFile, image_width, read_policy, write_policy
 
@@ -133,9 +133,17 @@ def test_ppo_learns_where_to_look_and_goes_on(tmp_path, capsys):
 def test_quantiles_are_learnt_of_images_too(tmp_path):
     more = ("--learning-starts", "20", "--batch-size", "8", "--buffer-size", "100")
     assert qrdqn.main(words(tmp_path, *more, steps=60)) == 0
-    policy = Policy.load(tmp_path / "latest.safetensors")
-    seen = np.random.default_rng(0).uniform(size=INPUTS)
-    assert policy.act(seen, np.arange(NUM_ACTIONS) == 3) == 3
+    file = read_policy(tmp_path / "latest.safetensors")
+    rng, policy = np.random.default_rng(0), Policy(file)
+    network = Network(INPUTS, 16, NUM_ACTIONS, quantiles=file.metadata.quantiles, image=IMAGE)
+    load_parameters(network, file)
+    seen, masks = rng.uniform(size=(20, INPUTS)), rng.random((20, NUM_ACTIONS)) < 0.5
+    masks[:, 2] = True
+    scaled = torch.as_tensor(policy._scaled(seen), dtype=torch.float32)
+    worth = network.quantiles(scaled).mean(dim=2).masked_fill(~torch.as_tensor(masks), -1e9)
+    found = policy.probabilities(seen, masks).argmax(axis=1)
+    np.testing.assert_array_equal(found, worth.argmax(dim=1))
+    assert len(set(found)) > 1
 
 
 @pytest.mark.parametrize(

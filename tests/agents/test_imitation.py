@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("sb3_contrib")
 
 from learnable_fake import ENV_ID, NUM_ACTIONS, RECALL_ID, read_curve
-from ms_slam_agents import imitation, train_sb3
+from ms_slam_agents import demonstrations, imitation, train_sb3
 from ms_slam_agents.demonstrations import Demonstration, Task, play
 from ms_slam_agents.policy import Policy
 from ms_slam_agents.policy_file import read_policy
@@ -186,6 +186,29 @@ def test_a_run_that_goes_on_is_the_run_that_never_stopped(tmp_path, more):
     whole, parts = (read_policy(tmp_path / p / "latest.safetensors") for p in ("whole", "parts"))
     for name, value in whole.tensors.items():
         np.testing.assert_array_equal(parts.tensors[name], value, err_msg=name)
+
+
+def test_another_memory_is_not_gone_on_with(tmp_path, capsys):
+    assert imitation.main(arguments(tmp_path, rounds=1)) == 0
+    assert imitation.main(arguments(tmp_path, "--resume", "--memory", "8")) == 2
+    assert "trained with memory 0, not 8" in capsys.readouterr().err
+    assert not list((tmp_path / "episodes").glob("001*"))
+
+
+def test_weights_of_the_reward_are_an_option_of_an_episode(tmp_path, monkeypatch):
+    given = []
+    make = demonstrations.gym.make
+    monkeypatch.setattr(
+        demonstrations.gym,
+        "make",
+        lambda env_id, reward, **options: given.append(reward) or make(env_id, **options),
+    )
+    weights = {"new_surface": 0.25}
+    options = (("max_episode_steps", 3), ("reward", weights))
+    for seed in range(2):
+        task = Task(tmp_path / f"{seed}.npz", ENV_ID, options, seed, TEACHER)
+        assert len(Demonstration.read(play(task)).rewards) == 3
+    assert given == [weights]  # one environment for both
 
 
 def test_later_rounds_are_played_by_the_policy_and_labelled_by_the_teacher(tmp_path):

@@ -208,6 +208,23 @@ def test_the_pull_keeps_it_near_the_policy_that_it_began_with(tmp_path):
     assert moved["20"] < 0.5 * moved["0"]
 
 
+def test_what_is_seen_without_acting_is_remembered_as_well():
+    network = Network(5, 16, 7, 8)
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, 0, 0.5)
+    acts, sees = policy_of(network, 8), policy_of(network, 8)
+    rng, mask = np.random.default_rng(0), np.ones(7, bool)
+    before, last = rng.normal(size=(2, 5))
+    for policy in (acts, sees):
+        policy.reset()
+    acts.act(before, mask)
+    sees.see(before)
+    chances = [p.probabilities(last[None], mask[None], p._memory) for p in (acts, sees)]
+    np.testing.assert_array_equal(*chances)
+    nothing = sees.probabilities(last[None], mask[None])
+    assert np.abs(chances[0] - nothing).max() > 1e-3
+
+
 @pytest.mark.parametrize("memory", [0, 4])
 def test_it_is_pulled_to_what_it_still_is(memory, tmp_path):
     more = ("--memory", str(memory), "--learning-rate", "0.05")

@@ -100,6 +100,29 @@ def test_two_envs_with_one_seed_agree_to_the_bit(env_id):
         assert_same(a.step(action), b.step(action))
 
 
+def test_episodes_in_a_row_are_in_one_scene_until_a_seed_draws_another():
+    options = {"scene": ("table", "wall"), "num_scene_seeds": 3, "episodes_per_scene": 2}
+    env = gym.make("MSActiveSLAM-FreeCamera-v0", **options)
+
+    def place(seed=None):
+        env.reset(seed=seed)
+        return env.unwrapped.simulation.place
+
+    places = [place(0), *(place() for _ in range(7))]
+    assert places[::2] == places[1::2]
+    assert len(set(places)) > 1
+    assert [place(0), *(place() for _ in range(7))] == places
+    assert [place(0), place(0)] == places[:2]
+    assert place() == places[0]
+    place(0)
+    env = pickle.loads(pickle.dumps(env))
+    assert [place(), place()] == places[1:3]
+    state = env.unwrapped.save_state()
+    env.unwrapped.load_state(state)
+    after = [place() for _ in range(4)]
+    assert after[::2] == after[1::2]  # the first of them draws
+
+
 def test_another_seed_gives_another_episode(env):
     first, _ = env.reset(seed=1)
     second, _ = env.reset(seed=2)
@@ -303,7 +326,7 @@ def test_options_of_slam_stand_behind_its_name_and_in_slam_config():
         ({"slam": "orb"}, "valid choices: .*surfel"),
         ({"slam": "surfel,check"}, "backend 'surfel,check': 'check' is not option=value"),
         ({"slam": "surfel,slips=1"}, "unknown option of SurfelConfig 'slam_config.slips'"),
-        ({"observation": "pixels"}, "valid choices: rgbd, features, lookahead"),
+        ({"observation": "pixel"}, "valid choices: rgbd, pixels, features"),
         (
             {"steps": 3},
             "'steps'; valid choices: embodiment, render_mode, task, max_episode_steps, scene",

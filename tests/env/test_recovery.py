@@ -19,6 +19,10 @@ class Counting(Planner):
     def reset(self):
         self.last = 0
         self.losses = []
+        self.seen = []
+
+    def see(self, observation, info):
+        self.seen.append(observation)
 
     def lost_by(self, action):
         self.losses.append(action)
@@ -64,6 +68,13 @@ def test_a_planner_is_told_of_the_action_that_lost_tracking_and_of_no_other():
         planner.act(None, info)
     # 1 and 2 made, 2 lost, both undone; 3 made, lost, undone; 4, 5 and 6 made while lost.
     assert planner.planner.losses == [2, 3]
+
+
+def test_a_planner_sees_the_way_back():
+    planner = recovering()
+    for name, info in zip("abcdefgh", (OK, OK, LOST, LOST, OK, LOST, LOST, LOST), strict=True):
+        planner.act(name, info)
+    assert planner.planner.seen == ["c", "d", "f", "h"]  # at "g" nothing was left to undo
 
 
 def doubtful(sigma_m):

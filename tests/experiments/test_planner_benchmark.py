@@ -354,6 +354,7 @@ def test_one_long_line_does_not_squeeze_the_others() -> None:
         row["result"] |= {"looks_at_steps": list(range(0, 5 * steps, 5))}
         row["result"] |= {"f_score_5cm_over_steps": [0.1] * steps, "ate_over_steps": [0.1] * steps}
     for chart in (CONFIG.charts(rows)[0], CONFIG.charts(rows)[-1]):
+        assert chart.caption.endswith("One goes on, cut here.")
         for series in chart.panels[0].series:
             assert max(series.x) == 10
             assert len(series.x) == len(series.y) == len(series.low) == len(series.high)
