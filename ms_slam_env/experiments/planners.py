@@ -30,15 +30,7 @@ from ms_slam_env.experiments.harness.planner_tables import (
     policies_together,
     with_losses,
 )
-from ms_slam_env.report.charts import (
-    Chart,
-    Panel,
-    Series,
-    by_group,
-    quartile_band,
-    scatter,
-    without_long_tail,
-)
+from ms_slam_env.report.charts import Chart, by_group, quartile_band, quartile_bands, scatter
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Grouping, Table, complete_cases, finished
 from ms_slam_env.tasks import OWN, find_task
@@ -53,7 +45,6 @@ PLANNERS = (
 EPISODES, LEADERBOARD_EPISODES = 10, 25
 _PANELS = ("f_score_5cm_area", "f_score_5cm", "ate_m", "path_length_m")
 _FLOOR_M = 5e-5  # errors below are drawn here on logarithmic axes
-_BANDS = "Line: median over episodes; band: between their quartiles."
 
 
 @dataclass(frozen=True)
@@ -200,13 +191,6 @@ def _policies_as_one(
     return tables
 
 
-def _bands(metric: str, lines: list[Series], log: str = "") -> tuple[str, list[Panel]]:
-    """What is said above lines over the steps, and their panel."""
-    cut = without_long_tail(lines)
-    more = "" if cut == lines else " One goes on, cut here."
-    return _BANDS + more, [Panel("looks_at_steps", metric, cut, log)]
-
-
 def _charts(rows: Sequence[Row], task: str) -> list[Chart]:
     """The charts of one task, whose name they have if there are several; of trainings."""
     rows = policies_together(finished(rows)) or rows
@@ -231,7 +215,7 @@ def _charts(rows: Sequence[Row], task: str) -> list[Chart]:
         Chart(
             f"{prefix}f_score_over_steps",
             f"{title}F-score over the steps",
-            *_bands("f_score_5cm_over_steps", scores),
+            *quartile_bands("looks_at_steps", "f_score_5cm_over_steps", scores),
         ),
         Chart(
             f"{prefix}planners",
@@ -248,7 +232,7 @@ def _charts(rows: Sequence[Row], task: str) -> list[Chart]:
         Chart(
             f"{prefix}ate_over_steps",
             f"{title}Error over the steps",
-            *_bands("ate_over_steps", errors, "y"),
+            *quartile_bands("looks_at_steps", "ate_over_steps", errors, "y"),
         ),
     ]
     return charts if errors else charts[:-1]

@@ -319,6 +319,16 @@ def without_long_tail(lines: Sequence[Series], times: float = 2.0) -> list[Serie
     ]
 
 
+def quartile_bands(
+    x: str, y: str, bands: Sequence[Series], log: str = ""
+) -> tuple[str, list[Panel]]:
+    """Caption and panel of metric ``y`` over ``x``, of lines as `quartile_band` makes them."""
+    cut = without_long_tail(bands)
+    caption = "Line: median over episodes; band: between their quartiles."
+    caption += "" if cut == list(bands) else " One goes on, cut here."
+    return caption, [Panel(x, y, cut, log)]
+
+
 def quartile_band(
     name: str, steps: Sequence[float], runs: Sequence[Sequence[float]], floor: float = 0.0
 ) -> Series:
