@@ -187,11 +187,12 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         """
         check_reset(seed, options)
         super().reset(seed=seed)
-        if seed is not None or not self._episodes_left or self.simulation.place is None:
-            self.simulation.place = self.config.draw_scene(self.np_random)
+        place = self.simulation.place
+        if seed is not None or not self._episodes_left or place is None:
+            place = self.config.draw_scene(self.np_random)
             self._episodes_left = self.config.episodes_per_scene
         self._episodes_left -= 1
-        self.simulation.enter(*self.simulation.place)
+        self.simulation.enter(*place)
         start = (options or {}).get("T_world_camera")
         if start is None:
             self.simulation.start_somewhere(self.np_random)

@@ -6,6 +6,7 @@ from typing import ClassVar
 import gymnasium as gym
 import numpy as np
 from ms_slam_agents.learning_curve import read_curve as read_curve_file
+from ms_slam_agents.policy_file import PolicyFile
 
 from ms_slam_env.env.config import TargetConfig
 
@@ -104,6 +105,15 @@ def arguments(out, *extra, steps=64, algorithm="maskable_ppo"):
     return [word for name, value in options.items() for word in (f"--{name}", str(value))] + [
         *extra
     ]
+
+
+def with_moments(network, metadata):
+    """The policy file of a network whose inputs have mean 0.5 and standard deviation 2."""
+    tensors = {f"policy.{n}": p.detach().numpy() for n, p in network.named_parameters()}
+    for name, shape in (("observation", (metadata.inputs,)), ("return", ())):
+        tensors |= {f"{name}.mean": np.full(shape, 0.5), f"{name}.var": np.full(shape, 4.0)}
+        tensors |= {f"{name}.count": np.array(9.0)}
+    return PolicyFile(metadata, tensors)
 
 
 def read_curve(out):

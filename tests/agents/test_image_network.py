@@ -6,14 +6,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from learnable_fake import NUM_ACTIONS, LearnableFake, read_curve
+from learnable_fake import NUM_ACTIONS, LearnableFake, read_curve, with_moments
 
 pytest.importorskip("sb3_contrib")
 
 from ms_slam_agents import options, ppo, qrdqn
 from ms_slam_agents.network import Network, load_parameters
 from ms_slam_agents.policy import Policy
-from ms_slam_agents.policy_file import Metadata, PolicyFile, image_width, read_policy, write_policy
+from ms_slam_agents.policy_file import Metadata, image_width, read_policy, write_policy
 
 from ms_slam_env.errors import InputError
 
@@ -62,11 +62,7 @@ def file_of(network, memory=0):
         memory=memory,
         image=IMAGE,
     )
-    tensors = {f"policy.{n}": p.detach().numpy() for n, p in network.named_parameters()}
-    for name, shape in (("observation", (INPUTS,)), ("return", ())):
-        tensors |= {f"{name}.mean": np.full(shape, 0.5), f"{name}.var": np.full(shape, 4.0)}
-        tensors |= {f"{name}.count": np.array(9.0)}
-    return PolicyFile(metadata, tensors)
+    return with_moments(network, metadata)
 
 
 @pytest.mark.parametrize("memory", [0, 6])
