@@ -55,9 +55,17 @@ class HomeAgent(NextBestView):
     ) -> None:
         self.near = HomePolicy(env, seed, path)
         super().__init__(env, seed, **options)
-        if self.near.policy.metadata.observation not in _OBSERVATIONS:
-            seen = self.near.policy.metadata.observation
-            raise unknown("observation of the policy under agent-home", seen, _OBSERVATIONS)
+        self.check_policy(self.near.policy.metadata.observation)
+
+    @staticmethod
+    def check_policy(observation: str) -> None:
+        """Refuse a policy that sees an observation without the risks.
+
+        Raises:
+            InputError: naming the ones that have them.
+        """
+        if observation not in _OBSERVATIONS:
+            raise unknown("observation of the policy under agent-home", observation, _OBSERVATIONS)
 
     @classmethod
     def observation_for(cls, path: str | None = None, **options: Any) -> str:

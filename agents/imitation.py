@@ -10,10 +10,9 @@ far: to the teacher's actions, and its value to the returns met. Writes into ``o
 
 from __future__ import annotations
 
-import math
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,20 +27,17 @@ from ms_slam_agents.environments import (
     problem_options,
 )
 from ms_slam_agents.learning_curve import LATEST, Curve, read_curve
-from ms_slam_agents.network import Network, load_parameters
-from ms_slam_agents.normalization import PooledMoments
 from ms_slam_agents.options import Problem, check_new, parse_for_task
-from ms_slam_agents.policy import CLIP, EPSILON
 from ms_slam_agents.policy_file import PolicyFile, write_policy
-from ms_slam_agents.training_run import metadata_of, read_run, read_similar
+from ms_slam_agents.student import Student
+from ms_slam_agents.training_run import read_run, read_similar
 from tqdm import tqdm
 
 from ms_slam_env.command_line import exit_code
-from ms_slam_env.config import bounded
-from ms_slam_env.env.planners import check_planner
+from ms_slam_env.config import bounded, parse_named
+from ms_slam_env.env.planners import PLANNERS, check_planner
 from ms_slam_env.errors import InputError
 from ms_slam_env.parallel import one_thread_unless_set, open_pool, run_each
-from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import to_plain
 from ms_slam_env.report.results import RESULTS
 
@@ -139,188 +135,6 @@ def play_round(args: Args, number: int) -> None:
                 raise kind(f"episode {outcome.key.name}: {outcome.message or outcome.error}")
 
 
-# -- Fitting -----------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Moments:
-    """Means and variances by which observations and returns are normalised, as SB3 does it."""
-
-    mean: Any
-    var: Any
-    count: float
-
-    @classmethod
-    def of(cls, values: Any) -> Moments:
-        """Of the rows of an array."""
-        wide = values.astype(np.float64)
-        return cls(wide.mean(axis=0), wide.var(axis=0), float(len(values)))
-
-    @classmethod
-    def read(cls, file: PolicyFile, name: str) -> Moments:
-        """As ``tensors`` wrote them."""
-        part = file.part(name)
-        return cls(part["mean"], part["var"], float(part["count"]))
-
-    def tensors(self, name: str) -> dict[str, Any]:
-        """For a policy file."""
-        count = np.array(self.count)
-        parts = {"mean": self.mean, "var": self.var, "count": count}
-        return {f"{name}.{part}": np.asarray(v, np.float64) for part, v in parts.items()}
-
-    @property
-    def std(self) -> Any:
-        """Standard deviations, never zero."""
-        return np.sqrt(self.var + EPSILON)
-
-
-class Student:
-    """The network that learns, with its normalisation.
-
-    Args:
-        args: of the training.
-        demonstrations: of the first round, which the normalisation is taken from.
-        file: to go on from.
-        epochs: done before.
-
-    Raises:
-        InputError: a file for other observations or actions.
-    """
-
-    def __init__(
-        self,
-        args: Args,
-        demonstrations: Sequence[Demonstration],
-        file: PolicyFile | None,
-        epochs: int = 0,
-    ) -> None:
-        self.args = args
-        first = demonstrations[0]
-        self.inputs, self.actions = first.observations.shape[1], first.masks.shape[1]
-        if file:
-            self.seen, self.returns = (Moments.read(file, n) for n in ("observation", "return"))
-        else:
-            self.seen = self._moments(np.concatenate([d.observations for d in demonstrations]))
-            sums = np.concatenate([d.returns(args.gamma) for d in demonstrations])
-            self.returns = Moments.of(sums)
-        torch.manual_seed(args.seed)
-        width, actions = args.hidden, self.actions
-        self.network = Network(
-            self.inputs,
-            width,
-            actions,
-            args.memory,
-            args.candidates,
-            dropout=args.dropout,
-            image=args.image,
-        )
-        self.epochs = epochs
-        if file:
-            file.metadata.check_sizes(args.init or args.out, self.inputs, self.actions)
-            load_parameters(self.network, file)
-
-    def _moments(self, observations: Any) -> Moments:
-        """Means and variances of observations (N, inputs), the same for all candidates."""
-        candidates = self.args.candidates
-        if not candidates:
-            return Moments.of(observations)
-        pooled = PooledMoments(self.inputs, self.actions, candidates)
-        mean, var = pooled.pooled(observations.astype(np.float64))
-        return Moments(mean, var, float(len(observations)))
-
-    def fit(self, demonstrations: Sequence[Demonstration]) -> dict[str, float]:
-        """Learn from all episodes; return the loss and the share of the teacher's choice at last.
-
-        The loss is the cross entropy to what the teacher prefers.
-        """
-        args = self.args
-        data = _Batches(demonstrations, args, np.random.default_rng([args.seed, self.epochs]))
-        optimizer = torch.optim.Adam(self.network.parameters(), lr=args.learning_rate)
-        said: list[tuple[float, float]] = []
-        for k, (observations, masks, is_step, preferences, returns) in enumerate(data):
-            optimizer.param_groups[0]["lr"] = args.learning_rate * (1 - k / len(data))
-            scaled = np.clip((observations - self.seen.mean) / self.seen.std, -CLIP, CLIP)
-            seen = torch.as_tensor(scaled, dtype=torch.float32)
-            can = torch.as_tensor(masks)
-            empty, begins = torch.zeros(seen.shape[1], args.memory), torch.zeros(seen.shape[:2])
-            log_probs, values = self.network.along(seen, empty, begins, can)
-            log_probs = log_probs.masked_fill(~can.flatten(0, 1), 0)  # of what cannot be: nothing
-            log_probs, values = log_probs[is_step], values[is_step]
-            wanted = torch.as_tensor(preferences, dtype=torch.float32)
-            target = torch.as_tensor(returns / self.returns.std, dtype=torch.float32)
-            error = torch.mean((values - target) ** 2)
-            loss = -(wanted * log_probs).sum(dim=1).mean() + args.value_weight * error
-            optimizer.zero_grad()
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
-            optimizer.step()
-            chosen = log_probs.gather(1, wanted.argmax(dim=1, keepdim=True))
-            weighed = wanted.sum(dim=1) > 0
-            said.append((loss.item(), chosen[weighed].exp().mean().item()))
-        self.epochs += args.epochs
-        losses, probabilities = np.transpose(said[-max(1, len(said) // args.epochs) :])
-        return {"loss": float(losses.mean()), "probability": float(np.nanmean(probabilities))}
-
-    def file(self, timesteps: int, minutes: float) -> PolicyFile:
-        """The policy as it is now."""
-        args = self.args
-        metadata = metadata_of(
-            args,
-            "imitation",
-            inputs=self.inputs,
-            actions=(self.actions,),
-            memory=args.memory,
-            candidates=args.candidates,
-            image=args.image,
-            timesteps=timesteps,
-            epochs=self.epochs,
-            minutes=minutes,
-            provenance=provenance(),
-        )
-        network = {f"policy.{n}": p.numpy() for n, p in self.network.state_dict().items()}
-        moments = self.seen.tensors("observation") | self.returns.tensors("return")
-        return PolicyFile(metadata, network | moments)
-
-
-class _Batches:
-    """All episodes in batches, shuffled anew in each epoch: steps, or whole episodes if a memory
-    learns from them.
-
-    A batch is observations (L, B, k) and masks (L, B, n), where episodes that are shorter than the
-    longest are filled up, which of these L B are steps, and their preferences and returns.
-    """
-
-    def __init__(
-        self, demonstrations: Sequence[Demonstration], args: Args, rng: np.random.Generator
-    ) -> None:
-        self.args, self.rng = args, rng
-        parts = [
-            (d.observations, d.masks, d.preferences, d.returns(args.gamma)) for d in demonstrations
-        ]
-        self._columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
-        steps = np.array([len(d.rewards) for d in demonstrations])
-        self._lengths = steps if args.memory else np.ones(steps.sum(), int)
-        self._starts = np.cumsum(self._lengths) - self._lengths
-        at_once = max(1, args.batch_size // int(self._lengths.max()))
-        self._batches = math.ceil(len(self._lengths) / at_once)
-
-    def __len__(self) -> int:
-        return self.args.epochs * self._batches
-
-    def __iter__(self) -> Iterator[tuple[Any, ...]]:
-        observations, masks, preferences, returns = self._columns
-        for _ in range(self.args.epochs):
-            order = self.rng.permutation(len(self._lengths))
-            for chosen in np.array_split(order, self._batches):
-                lengths = self._lengths[chosen]
-                step = np.arange(lengths.max())[:, None]
-                at = self._starts[chosen] + np.minimum(step, lengths - 1)
-                is_step = (step < lengths).ravel()
-                steps = at.ravel()[is_step]
-                seen = observations[at].astype(np.float32)
-                yield seen, masks[at], is_step, preferences[steps], returns[steps]
-
-
 # -- Training ----------------------------------------------------------------------------------
 
 
@@ -352,6 +166,9 @@ def train(args: Args) -> int:
     check_planner(args.teacher)
     if args.through:
         check_planner(args.through, path="")
+        layer = PLANNERS.find(parse_named(args.through, "planner")[0])
+        if hasattr(layer, "check_policy"):
+            layer.check_policy(args.observation)
     file, done = load_run(args)
     begun = None
     if args.init and not done:

@@ -127,7 +127,7 @@ class Metadata:
         if self.image and (
             len(self.image) != 3
             or self.candidates
-            or not all(0 < size <= self.inputs for size in self.image)
+            or not all(type(size) is int and 0 < size <= self.inputs for size in self.image)
             or self.num_state < 0
             or image_width(self.image) <= 0
         ):

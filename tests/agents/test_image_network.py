@@ -148,6 +148,7 @@ def test_quantiles_are_learnt_of_images_too(tmp_path):
         {"image": (2, 17)},
         {"image": (2, 17, 4)},
         {"image": (0, 17, 22)},
+        {"image": (True, 17, 22)},
         {"image": (2, 17, 40)},
         {"inputs": STATE + 2 * 17 * 22 + 7, "candidates": 1},
     ],

@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("sb3_contrib")
 
 from learnable_fake import ENV_ID, NUM_ACTIONS, RECALL_ID, read_curve
-from ms_slam_agents import demonstrations, imitation, train_sb3
+from ms_slam_agents import demonstrations, imitation, student, train_sb3
 from ms_slam_agents.demonstrations import Demonstration, Task, play
 from ms_slam_agents.policy import Policy
 from ms_slam_agents.policy_file import read_policy
@@ -166,7 +166,7 @@ def test_episodes_of_different_lengths_are_fitted_to_whole():
         return Demonstration(named[:, None], masks, preferences, none, none > 1)
 
     given = [demonstration(k, length) for k, length in enumerate(lengths)]
-    batches = imitation._Batches(given, imitation.Args(memory=1, batch_size=14, epochs=2), rng)
+    batches = student.Batches(given, imitation.Args(memory=1, batch_size=14, epochs=2), rng)
     assert len(batches) == len(list(batches)) == 4
     for seen, _, is_step, preferences, returns in batches:
         columns = seen[..., 0].T.astype(int)
@@ -322,6 +322,10 @@ def test_runs_that_are_not_to_be_gone_on_with_are_refused(tmp_path, capsys):
         (arguments(tmp_path, "--resume", rounds=1), "has 1 rounds already"),
         (arguments(tmp_path, "--resume", "--hidden", "32"), "trained with hidden 16, not 32"),
         (arguments(tmp_path, "--resume", "--through", "policy"), "through None, not 'policy'"),
+        (
+            arguments(tmp_path / "new", "--through", "agent-home"),
+            "observation of the policy under agent-home 'features'",
+        ),
         (arguments(tmp_path, "--resume", "--reward", "paper"), "reward 'default', not 'paper'"),
         (arguments(tmp_path / "new", "--teacher", "nobody"), "unknown planner 'nobody'"),
         (arguments(tmp_path / "new", "--observation", "x:Y"), "unknown observation 'x:Y'"),
