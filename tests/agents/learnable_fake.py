@@ -19,6 +19,7 @@ class LearnableFake(gym.Env):
     """The observation names the right action, which is never blocked; half of the others are."""
 
     log: ClassVar[list] = []
+    inputs: ClassVar[int] = NUM_ACTIONS
 
     def __init__(
         self,
@@ -28,7 +29,7 @@ class LearnableFake(gym.Env):
         observation="features",
         frame_divergences=True,
     ):
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (NUM_ACTIONS,), np.float32)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (self.inputs,), np.float32)
         self.action_space = gym.spaces.Discrete(NUM_ACTIONS)
         self.config = SimpleNamespace(targets=TargetConfig(rho_I=0, rho_D=0))
         self.split = split
@@ -86,25 +87,24 @@ gym.register(ENV_ID, LearnableFake)
 gym.register(RECALL_ID, Recall)
 
 
-def arguments(out, *extra, steps=64, algorithm="maskable_ppo"):
-    options = {
+def words_of(out, more, env_id=ENV_ID, **options):
+    """A trainer's command line: a small network, one environment, short episodes, ``options``."""
+    said = {
         "out": out,
-        "env-id": ENV_ID,
-        "algorithm": algorithm,
-        "observation": "features",
-        "total-timesteps": steps,
+        "env-id": env_id,
         "num-envs": 1,
         "episode-steps": 10,
-        "eval-episodes": 3,
-        "eval-every": 32,
-        "n-steps": 32,
         "batch-size": 16,
-        "n-epochs": 2,
         "hidden": 16,
+        **{name.replace("_", "-"): value for name, value in options.items()},
     }
-    return [word for name, value in options.items() for word in (f"--{name}", str(value))] + [
-        *extra
-    ]
+    return [word for name, value in said.items() for word in (f"--{name}", str(value))] + [*more]
+
+
+def arguments(out, *more, steps=64, algorithm="maskable_ppo"):
+    learns = {"total_timesteps": steps, "eval_every": 32, "n_steps": 32, "n_epochs": 2}
+    judged = {"algorithm": algorithm, "observation": "features", "eval_episodes": 3}
+    return words_of(out, more, **learns, **judged)
 
 
 def with_moments(network, metadata):

@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from learnable_fake import LearnableFake, read_curve, with_moments
+from learnable_fake import LearnableFake, read_curve, with_moments, words_of
 
 pytest.importorskip("sb3_contrib")
 
@@ -24,9 +24,7 @@ ENV_ID = "LearnableCandidates-v0"
 class Candidates(LearnableFake):
     """The right action is the one whose second number is the largest; the state says nothing."""
 
-    def __init__(self, **options):
-        super().__init__(**options)
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (INPUTS,), np.float32)
+    inputs = INPUTS
 
     def _next(self):
         super()._next()
@@ -132,26 +130,12 @@ def test_moments_are_those_of_all_candidates_together():
 
 
 def test_ppo_learns_by_it_and_goes_on(tmp_path):
-    words = {
-        "out": tmp_path / "run",
-        "env-id": ENV_ID,
-        "observation": "candidates",
-        "total-timesteps": 2048,
-        "num-envs": 1,
-        "episode-steps": 10,
-        "eval-episodes": 6,
-        "eval-every": 0,
-        "n-steps": 256,
-        "batch-size": 64,
-        "n-epochs": 8,
-        "hidden": 32,
-        "gamma": 0.5,
-        "learning-rate": 0.003,
-    }
+    learns = {"total_timesteps": 2048, "n_steps": 256, "n_epochs": 8, "batch_size": 64}
+    more = {"observation": "candidates", "hidden": 32, "gamma": 0.5, "learning_rate": 0.003}
 
-    def run(*more):
-        given = [word for name, value in words.items() for word in (f"--{name}", str(value))]
-        return ppo.main([*given, *more])
+    def run(*words):
+        judged = {"eval_episodes": 6, "eval_every": 0}
+        return ppo.main(words_of(tmp_path / "run", words, ENV_ID, **learns | more | judged))
 
     assert run() == 0
     points = read_curve(tmp_path / "run").points
@@ -160,8 +144,7 @@ def test_ppo_learns_by_it_and_goes_on(tmp_path):
     assert file.metadata.candidates == NUMBERS
     mean = file.part("observation")["mean"][STATE:].reshape(ACTIONS, NUMBERS)
     np.testing.assert_array_equal(mean, np.tile(mean[0], (ACTIONS, 1)))
-    words["total-timesteps"] = 2304
-    assert run("--resume") == 0
+    assert run("--resume", "--total-timesteps", "2304") == 0
     assert read_policy(tmp_path / "run" / "latest.safetensors").metadata.timesteps == 2304
 
 

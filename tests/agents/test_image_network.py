@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from learnable_fake import NUM_ACTIONS, LearnableFake, read_curve, with_moments
+from learnable_fake import NUM_ACTIONS, LearnableFake, read_curve, with_moments, words_of
 
 pytest.importorskip("sb3_contrib")
 
@@ -26,9 +26,7 @@ ENV_ID = "LearnableImage-v0"
 class Bright(LearnableFake):
     """The right action says in which part of the image something is bright, somewhere in it."""
 
-    def __init__(self, **more):
-        super().__init__(**more)
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (INPUTS,), np.float32)
+    inputs = INPUTS
 
     def _next(self):
         super()._next()
@@ -96,23 +94,13 @@ def test_the_width_is_what_the_convolutions_make(image):
 
 
 def words(out, *more, steps):
-    given = {
-        "out": out,
-        "env-id": ENV_ID,
-        "observation": "pixels",
-        "total-timesteps": steps,
-        "num-envs": 1,
-        "episode-steps": 10,
-        "eval-episodes": 6,
-        "eval-every": 0,
-        "hidden": 16,
-        "learning-rate": 0.003,
-    }
-    return [w for name, value in given.items() for w in (f"--{name}", str(value))] + [*more]
+    learns = {"total_timesteps": steps, "batch_size": 64, "learning_rate": 0.003}
+    judged = {"observation": "pixels", "eval_episodes": 6, "eval_every": 0}
+    return words_of(out, more, ENV_ID, **learns | judged)
 
 
 def test_ppo_learns_where_to_look_and_goes_on(tmp_path, capsys):
-    more = ("--n-steps", "256", "--batch-size", "64", "--n-epochs", "8", "--gamma", "0.1")
+    more = ("--n-steps", "256", "--n-epochs", "8", "--gamma", "0.1")
     assert ppo.main(words(tmp_path / "a", *more, steps=3072)) == 0
     first, last = (p["return"] for p in read_curve(tmp_path / "a").points)
     assert last > first + 2

@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("sb3_contrib")
 
-from learnable_fake import ENV_ID, NUM_ACTIONS, RECALL_ID, read_curve
+from learnable_fake import ENV_ID, NUM_ACTIONS, RECALL_ID, read_curve, words_of
 from ms_slam_agents import demonstrations, imitation, student, train_sb3
 from ms_slam_agents.demonstrations import Demonstration, Task, play
 from ms_slam_agents.policy import Policy
@@ -97,23 +97,9 @@ class InThisProcess:
         return done
 
 
-def arguments(out, *extra, rounds=2):
-    options = {
-        "out": out,
-        "env-id": ENV_ID,
-        "teacher": TEACHER,
-        "episodes": 12,
-        "rounds": rounds,
-        "num-envs": 1,
-        "episode-steps": 10,
-        "eval-episodes": 4,
-        "epochs": 30,
-        "batch-size": 16,
-        "learning-rate": 0.01,
-        "hidden": 16,
-    }
-    words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
-    return [*words, *extra]
+def arguments(out, *more, rounds=2):
+    taught = {"teacher": TEACHER, "episodes": 12, "rounds": rounds, "epochs": 30}
+    return words_of(out, more, eval_episodes=4, learning_rate=0.01, **taught)
 
 
 def test_the_policy_does_as_its_teacher(tmp_path, capsys):

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from learnable_fake import ENV_ID, RECALL_ID, LearnableFake, arguments, read_curve
+from learnable_fake import ENV_ID, RECALL_ID, LearnableFake, arguments, read_curve, words_of
 
 pytest.importorskip("sb3_contrib")
 
@@ -18,20 +18,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 
 def words(out, *more, steps=64, env_id=ENV_ID):
-    options = {
-        "out": out,
-        "env-id": env_id,
-        "total-timesteps": steps,
-        "num-envs": 1,
-        "episode-steps": 10,
-        "eval-episodes": 6,
-        "eval-every": 0,
-        "n-steps": 32,
-        "batch-size": 16,
-        "n-epochs": 4,
-        "hidden": 16,
-    }
-    return [w for name, value in options.items() for w in (f"--{name}", str(value))] + [*more]
+    learns = {"total_timesteps": steps, "eval_every": 0, "n_steps": 32, "n_epochs": 4}
+    return words_of(out, more, env_id, eval_episodes=6, **learns)
 
 
 def last_return(out):

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from learnable_fake import ENV_ID, LearnableFake, read_curve
+from learnable_fake import ENV_ID, LearnableFake, read_curve, words_of
 
 pytest.importorskip("sb3_contrib")
 
@@ -26,9 +26,10 @@ LEFT, RIGHT, AHEAD = 0, 1, 2
 class Walk(LearnableFake):
     """A row of places: 0.2 for leaving it on the left, 1 on the right, 9 for what is blocked."""
 
+    inputs = PLACES
+
     def __init__(self, **options):
         super().__init__(**options)
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (PLACES,), np.float32)
         self.action_space = gym.spaces.Discrete(3)
 
     def reset(self, *, seed=None, options=None):
@@ -55,24 +56,16 @@ gym.register(WALK_ID, Walk)
 
 
 def words(out, *more, steps=64, env_id=ENV_ID, **options):
-    options = {
-        "out": out,
-        "env-id": env_id,
-        "total-timesteps": steps,
-        "num-envs": 1,
-        "episode-steps": 10,
-        "eval-episodes": 6,
-        "eval-every": 0,
-        "hidden": 16,
+    learns = {
+        "total_timesteps": steps,
+        "eval_every": 0,
         "quantiles": 5,
-        "learning-starts": 32,
-        "save-every": 32,
-        "batch-size": 16,
-        "train-every": 1,
-        "target-every": 20,
-        **{name.replace("_", "-"): value for name, value in options.items()},
+        "learning_starts": 32,
+        "save_every": 32,
+        "train_every": 1,
+        "target_every": 20,
     }
-    return [w for name, value in options.items() for w in (f"--{name}", str(value))] + [*more]
+    return words_of(out, more, env_id, eval_episodes=6, **learns | options)
 
 
 def test_the_loss_is_that_of_loops_over_its_definition():

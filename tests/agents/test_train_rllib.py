@@ -20,7 +20,7 @@ import gymnasium as gym
 import learnable_fake
 import ray
 import torch
-from learnable_fake import ENV_ID, NUM_ACTIONS, LearnableFake, read_curve
+from learnable_fake import ENV_ID, NUM_ACTIONS, LearnableFake, read_curve, words_of
 from ms_slam_agents import rllib_scaling, train_rllib, training_run
 from ms_slam_agents.normalization import moment_tensors
 from ms_slam_agents.policy import Policy
@@ -129,22 +129,9 @@ def make_strict(args):
 
 
 def words(out, *more, steps):
-    options = {
-        "out": out,
-        "env-id": ENV_ID,
-        "total-timesteps": steps,
-        "num-envs": 2,
-        "episode-steps": 10,
-        "eval-episodes": 6,
-        "eval-every": 0,
-        "n-steps": 64,
-        "batch-size": 32,
-        "n-epochs": 6,
-        "hidden": 16,
-        "gamma": 0.5,
-        "learning-rate": 0.01,
-    }
-    return [w for name, value in options.items() for w in (f"--{name}", str(value))] + [*more]
+    learns = {"total_timesteps": steps, "n_steps": 64, "n_epochs": 6, "batch_size": 32}
+    judged = {"num_envs": 2, "eval_episodes": 6, "eval_every": 0}
+    return words_of(out, more, gamma=0.5, learning_rate=0.01, **learns | judged)
 
 
 @pytest.fixture
