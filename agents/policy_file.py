@@ -316,7 +316,7 @@ def _check_file(path: Path) -> None:
         if file.read(4) == b"PK\x03\x04":
             raise InputError(
                 f"{str(path)!r} is an archive of Stable-Baselines3, which can hold code: "
-                "convert it with ms-slam train sb3 convert"
+                "a planner of your own can load it, see docs/rl.md"
             )
 
 

@@ -17,7 +17,6 @@ from collections.abc import Sequence
 from dataclasses import asdict
 
 import torch
-from ms_slam_agents import convert_sb3
 from ms_slam_agents.environments import VALIDATION_SEED, check_problem, make_venv
 from ms_slam_agents.learning_curve import LATEST
 from ms_slam_agents.options import (
@@ -172,8 +171,6 @@ def parse_options(argv: Sequence[str] | None) -> Args:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status: 0, 1 if nothing was learnt, 2, 130."""
     words = list(sys.argv[1:] if argv is None else argv)
-    if words[:1] == ["convert"]:
-        return exit_code(lambda: convert_sb3.main(words[1:]), "ms-slam train sb3 convert")
     return exit_code(lambda: train(parse_options(words)), "ms-slam train")
 
 

@@ -39,7 +39,7 @@ ALL = "all"
 """Stands for all our tasks."""
 PLANNERS = (
     *("random", "stationary", "greedy", "greedy-limited", "max-information"),
-    *("nbv", "receding-nbv", "belief", "graph-dopt"),
+    *("nbv", "receding-nbv", "held-nbv", "belief", "graph-dopt"),
 )
 """Those that need no extra."""
 EPISODES, LEADERBOARD_EPISODES = 10, 25
@@ -157,8 +157,8 @@ def _tables(rows: Sequence[Row], task: str) -> list[Table]:
     spec = rows[0]["spec"]
     note = (
         "Medians with 95 % bootstrap intervals over the episodes that every planner finished, "
-        f"of at most {spec['steps']} steps of {100 * spec['step_m']:g} cm / "
-        f"{spec['step_deg']:g} deg; best F-score first."
+        f"of {_length(spec)} of {100 * spec['step_m']:g} cm / {spec['step_deg']:g} deg; "
+        "best F-score first."
     )
     title = f"{prefix}over all scenes" if prefix else ""
     tables = [with_losses(headline.table(pairs, title, note), pairs)]
@@ -174,6 +174,15 @@ def _tables(rows: Sequence[Row], task: str) -> list[Table]:
             of_scene = [row for row in pairs if row["spec"]["scene"] == scene]
             tables.append(with_losses(headline.table(of_scene, prefix + scene), of_scene))
     return tables
+
+
+def _length(spec: Mapping[str, Any]) -> str:
+    """How long an episode is, in words: the time that it has, or else its steps."""
+    task = OWN.get(spec.get("task", ""))
+    seconds = {**(task().options if task else {}), **spec["options"]}.get("seconds")
+    return (
+        f"{seconds:g} simulated seconds in motions" if seconds else f"at most {spec['steps']} steps"
+    )
 
 
 def _policies_as_one(

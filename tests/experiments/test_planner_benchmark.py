@@ -358,3 +358,16 @@ def test_one_long_line_does_not_squeeze_the_others() -> None:
         for series in chart.panels[0].series:
             assert max(series.x) == 10
             assert len(series.x) == len(series.y) == len(series.low) == len(series.high)
+
+
+@pytest.mark.parametrize(
+    ("more", "length"),
+    [
+        ({}, "of at most 100 steps of 12 cm / 12 deg"),
+        ({"task": "arm"}, "of 60 simulated seconds in motions of 12 cm / 12 deg"),
+        ({"task": "arm", "options": ("seconds=5",)}, "of 5 simulated seconds in motions of 12 cm"),
+    ],
+)
+def test_the_table_says_how_long_an_episode_is(more: dict[str, Any], length: str) -> None:
+    config = PlannerBenchmark(planners=("random", "greedy"), episodes=3, **more)
+    assert length in config.tables(rows_of(config))[0].note
