@@ -10,7 +10,7 @@ stage, as always. Validation knows no stages: it is the problem itself.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -25,6 +25,8 @@ from ms_slam_env.sequences.perturbations import make_perturbation
 
 P = TypeVar("P")
 Range = tuple[float, float]
+Between = Callable[[float, float], float]
+"""Takes a number between two, as ``rng.uniform`` does."""
 
 _STREAM = 2  # of an episode's seed; the environment draws from the seed itself
 
@@ -48,7 +50,7 @@ class Stage(Checked):
     """
 
     until: float | None = bounded(None, 0, 1)
-    above: float | None = None
+    above: float | None = bounded(None, -1e9, 1e9)
     scenes: tuple[str, ...] | None = None
     scene_seeds: int | None = bounded(None, 1, 100_000)
     episode_steps: int | None = bounded(None, 1, 100_000)
@@ -69,19 +71,19 @@ class Stage(Checked):
         by_share = self.until is not None and share >= self.until
         return by_share or (self.above is not None and score > self.above)
 
-    def draw(self, rng: np.random.Generator) -> tuple[dict[str, Any], list[tuple[str, Any]]]:
+    def draw(self, between: Between) -> tuple[dict[str, Any], list[tuple[str, Any]]]:
         """Options of ``gym.make`` and perturbations of an episode."""
         noise = {} if self.noise is None else {"noise": {"name": "kinect", "strength": self.noise}}
-        drawn = _drawn({"options": noise, "perturbations": self.perturbations}, rng)
+        drawn = _drawn({"options": noise, "perturbations": self.perturbations}, between)
         return drawn["options"], list(drawn["perturbations"].items())
 
 
-def _drawn(value: Any, rng: np.random.Generator) -> Any:
+def _drawn(value: Any, between: Between) -> Any:
     """``value`` with a number for each pair of numbers."""
     if isinstance(value, Mapping):
-        return {name: _drawn(part, rng) for name, part in value.items()}
+        return {name: _drawn(part, between) for name, part in value.items()}
     is_range = isinstance(value, (tuple, list)) and len(value) == 2
-    return float(rng.uniform(*value)) if is_range else value
+    return float(between(*value)) if is_range else value
 
 
 def read_curriculum(path: Path) -> tuple[Stage, ...]:
@@ -95,8 +97,11 @@ def read_curriculum(path: Path) -> tuple[Stage, ...]:
         if not isinstance(content, list) or not content:
             raise InputError("a list of stages is wanted")
         stages = tuple(_stage(one, f"stage {k}") for k, one in enumerate(content, 1))
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         raise InputError(f"{path}: {error}") from None
+    for k, stage in enumerate(stages[:-1], 1):
+        if stage.until is None and stage.above is None:
+            raise InputError(f"{path}: stage {k} has neither until nor above: it never ends")
     shares = [stage.until for stage in stages if stage.until is not None]
     if shares != sorted(shares):
         raise InputError(f"{path}: stages end at {shares}, one before the one before it")
@@ -113,9 +118,10 @@ def _stage(content: Any, name: str) -> Stage:
         len(made.noise) == 2 and 0 <= made.noise[0] <= made.noise[1]
     ):
         raise InputError(f"{name}: noise = {list(made.noise)} must be two numbers, the lower first")
-    _, perturbations = made.draw(np.random.default_rng(0))
-    for perturbation, options in perturbations:
-        make_perturbation(perturbation, options)
+    for end in (min, max):
+        _, perturbations = made.draw(end)
+        for perturbation, options in perturbations:
+            make_perturbation(perturbation, options)
     return made
 
 
@@ -164,13 +170,13 @@ class Staged(gym.Wrapper[Any, Any, Any, Any]):
         """
         for stage, one in enumerate(self.stages):
             self.stage = stage
-            self._enter(*one.draw(self._rng))
+            self._enter(*one.draw(self._rng.uniform))
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode of the stage."""
         if seed is not None:
             self._rng = np.random.default_rng([seed, _STREAM])
-        drawn = self.stages[self.stage].draw(self._rng)
+        drawn = self.stages[self.stage].draw(self._rng.uniform)
         if (self.stage, *drawn) != self._made:
             self._enter(*drawn)
             seed = int(self._rng.integers(2**31)) if seed is None else seed

@@ -6,11 +6,13 @@ import math
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import torch
 from ms_slam_agents.curriculum import Staged, read_curriculum
 from ms_slam_agents.evaluation import FixedEpisodes
@@ -71,6 +73,31 @@ def problem_options(args: Problem, split: str) -> dict[str, Any]:
         **few,
         **env_options(args),
     }
+
+
+def first_seed(seed: int, steps: int = 0) -> int:
+    """Seed of the first of a training's environments, whose others have those that follow.
+
+    Far from what other seeds have, and from what this one had before its first ``steps`` steps:
+    with the seeds themselves two trainings would meet nearly the same episodes.
+    """
+    return int(np.random.SeedSequence([seed, steps]).generate_state(1)[0]) >> 2
+
+
+@contextmanager
+def opened(venv: VecEnv) -> Iterator[VecEnv]:
+    """Close the environments at the end, even where the process of one has ended.
+
+    Raises:
+        RuntimeError: one has ended, in place of what the connection to it says.
+    """
+    try:
+        yield venv
+    except (EOFError, ConnectionError):
+        raise RuntimeError("the process of an environment has ended; above it says why") from None
+    finally:
+        with suppress(EOFError, ConnectionError):
+            venv.close()
 
 
 def check_problem(args: Problem) -> None:

@@ -61,7 +61,7 @@ def evaluate(
 
     Args:
         venv: of ``FixedEpisodes``.
-        num_episodes: in all environments together.
+        num_episodes: in all environments together, as many as these have.
         choose: see ``Choose``.
         played_one: called after each episode.
     """

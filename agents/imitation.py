@@ -13,7 +13,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +24,14 @@ from ms_slam_agents.environments import (
     VALIDATION_SEED,
     check_problem,
     make_venv,
+    opened,
     problem_options,
 )
 from ms_slam_agents.learning_curve import LATEST, Curve, read_curve
-from ms_slam_agents.options import Problem, check_new, parse_for_task
+from ms_slam_agents.options import KEPT, Problem, check_kept, check_new, parse_for_task
 from ms_slam_agents.policy_file import PolicyFile, write_policy
 from ms_slam_agents.student import Student
-from ms_slam_agents.training_run import read_run, read_similar
+from ms_slam_agents.training_run import read_run, read_similar, saved_curve
 from tqdm import tqdm
 
 from ms_slam_env.command_line import exit_code
@@ -41,7 +42,9 @@ from ms_slam_env.parallel import one_thread_unless_set, open_pool, run_each
 from ms_slam_env.report.records import to_plain
 from ms_slam_env.report.results import RESULTS
 
-_TRAINING_SEED = 500_000  # of the first episode; far from validation's
+_TRAINING_SEED = 500_000  # of the first episode
+_OWN_PROBLEM = {*KEPT, "teacher", "episodes", "epochs", "seed", "through", "memory"} - {"algorithm"}
+"""Options that all rounds of a run have in common."""
 
 
 @dataclass(frozen=True)
@@ -144,14 +147,15 @@ def load_run(args: Args) -> tuple[PolicyFile | None, int]:
     Raises:
         InputError: a new run where there is one already, nothing to resume from, or another one.
     """
-    path = args.out / LATEST
     if not args.resume:
         check_new(args.out, LATEST, "episodes")
         return None, 0
-    if not path.exists():
-        return None, 0  # interrupted in the first round
-    names = {"env_id", "observation", "hidden", "teacher", "episodes", "epochs", "seed", "reward"}
-    file = read_run(args, "imitation", names | {"through", "without", "memory"})
+    if not (args.out / LATEST).exists():  # interrupted in the first round
+        if (args.out / RESULTS).is_file():
+            begun = read_curve(args.out / RESULTS)
+            check_kept(args.out / RESULTS, begun.config, args, sorted(_OWN_PROBLEM))
+        return None, 0
+    file = read_run(args, "imitation", _OWN_PROBLEM)
     return file, file.metadata.epochs // args.epochs
 
 
@@ -170,18 +174,18 @@ def train(args: Args) -> int:
         if hasattr(layer, "check_policy"):
             layer.check_policy(args.observation)
     file, done = load_run(args)
+    curve = saved_curve(args) or Curve(args.eval_episodes, {}, config=to_plain(asdict(args)))
     begun = None
     if args.init and not done:
         begun = read_similar(args.init, args, args.hidden, ["observation"])
     check_problem(args)
-    curve = Curve(args.eval_episodes, {}, config=to_plain(asdict(args)))
-    if done and (args.out / RESULTS).is_file():
-        curve = replace(read_curve(args.out / RESULTS), config=curve.config)
     if done >= args.rounds:
         raise InputError(f"{args.out} has {done} rounds already: give more than --rounds {done}")
     seeds = range(VALIDATION_SEED, VALIDATION_SEED + args.eval_episodes)
-    started = time.monotonic() - 60 * curve.minutes
+    minutes = curve.minutes
+    curve.write(args.out)  # before the first episode: what the run is of
     for number in range(done, args.rounds):
+        started = time.monotonic()
         play_round(args, number)
         paths = [task.path for n in range(number + 1) for task in tasks(args, n)]
         demonstrations = [Demonstration.read(path) for path in paths]
@@ -195,12 +199,10 @@ def train(args: Args) -> int:
         )
         said = student.fit(demonstrations)
         steps = sum(len(d.rewards) for d in demonstrations)
-        file = student.file(steps, (time.monotonic() - started) / 60)
-        venv = make_venv(args, "validation", seeds)
-        try:
+        minutes += (time.monotonic() - started) / 60
+        file = student.file(steps, minutes)
+        with opened(make_venv(args, "validation", seeds)) as venv:
             point = curve.judge(file, venv, args.out, args.deterministic_eval)
-        finally:
-            venv.close()
         write_policy(args.out / LATEST, file)  # last: a round without it is done again
         print(
             f"round {number}: {steps} steps, loss {said['loss']:.3f}, the teacher's action has "

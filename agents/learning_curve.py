@@ -97,7 +97,7 @@ class Curve:
             about="Scores on validation episodes, always the same with the same random numbers, "
             "beside planners that are not trained.",
             tables=self._tables(),
-            charts=[self._chart()],
+            charts=[self._chart()] if self.points else [],
             rows=self._rows(),
             content={"config": self.config, "episodes": self.episodes},
         )
@@ -149,6 +149,7 @@ def read_curve(path: Path) -> Curve:
     curve = Curve(0)
     try:
         curve.episodes = int(results.content["episodes"])
+        curve.config = {**results.content.get("config", {}), "eval_episodes": curve.episodes}
         for row in results.rows:
             if row["spec"]["planner"] == POLICY:
                 curve.points.append(_checked(row["result"], "timesteps", "training_min"))

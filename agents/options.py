@@ -68,7 +68,7 @@ class Problem(Checked):
     without: tuple[str, ...] = ()
     image_size: str | None = None
     num_envs: int = bounded(2, 1, 100_000)
-    seed: int = 0
+    seed: int = bounded(0, 0, 2**31 - 1)
     eval_episodes: int = bounded(24, 1, 100_000)
     deterministic_eval: bool = False
 
@@ -245,6 +245,17 @@ KEPT = (
 )
 """Options that a run keeps when it is resumed: another network, or another problem."""
 
+JUDGED_WITH = (
+    "eval_episodes",
+    "deterministic_eval",
+    "scenes",
+    "scene_seeds",
+    "episode_steps",
+    "frames_per_action",
+    "image_size",
+)
+"""Options that the points of a learning curve have in common."""
+
 
 def resumed(given: Args, saved: Mapping[str, Any]) -> Args:
     """The options of the run to resume, for what the command line does not say.
@@ -277,10 +288,23 @@ def check_new(out: Path, *names: str) -> None:
         raise InputError(f"{out} holds a training run already: add --resume, or change --out")
 
 
-def check_kept(path: Path, saved: Mapping[str, Any], args: Problem, names: Iterable[str]) -> None:
+def check_kept(
+    path: Path,
+    saved: Mapping[str, Any],
+    args: Problem,
+    names: Iterable[str],
+    was: str = "was trained with",
+) -> None:
     """Refuse to go on with a run under options that would make it another one.
 
     What a run of earlier does not say, it had as an option is by default.
+
+    Args:
+        path: of the run.
+        saved: its options.
+        args: those given.
+        names: of the options that must be the same.
+        was: what the run or a part of it has to do with them.
 
     Raises:
         InputError: naming the first option that differs, and both values.
@@ -289,7 +313,7 @@ def check_kept(path: Path, saved: Mapping[str, Any], args: Problem, names: Itera
         had, given = saved.get(name, getattr(type(args), name)), getattr(args, name)
         had = tuple(had) if isinstance(had, list) else had  # as JSON has it
         if had != given:
-            raise InputError(f"{path} was trained with {name} {had!r}, not {given!r}")
+            raise InputError(f"{path} {was} {name} {had!r}, not {given!r}")
 
 
 def check_steps_left(path: Path, done: int, total: int) -> None:

@@ -138,16 +138,16 @@ class Metadata:
         if not all(0 <= count < math.inf for count in counts):
             raise InputError(f"timesteps, epochs, minutes = {counts} are no counts")
 
-    def check_sizes(self, path: Path, inputs: int, actions: int) -> None:
+    def check_sizes(self, path: Path, inputs: int, *actions: int) -> None:
         """Refuse another number of inputs or of actions than a training has.
 
         Raises:
             InputError: naming the ``path`` of the file, what it has and what the training has.
         """
-        if (self.inputs, tuple(self.actions)) != (inputs, (actions,)):
+        if (self.inputs, tuple(self.actions)) != (inputs, actions):
             raise InputError(
                 f"{path} is for {self.inputs} numbers and {math.prod(self.actions)} actions, "
-                f"not for {inputs} and {actions}"
+                f"not for {inputs} and {math.prod(actions)}"
             )
 
     @property

@@ -22,11 +22,16 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from ms_slam_agents.environments import make_venv
+from ms_slam_agents.environments import first_seed, make_venv, opened
 from ms_slam_agents.network import Network, load_parameters
-from ms_slam_agents.normalization import PooledMoments, moment_tensors, restore_moments
+from ms_slam_agents.normalization import (
+    Normalization,
+    PooledMoments,
+    moment_tensors,
+    restore_moments,
+)
 from ms_slam_agents.options import PpoTraining
-from ms_slam_agents.policy_file import Metadata, PolicyFile, Tensors, read_policy
+from ms_slam_agents.policy_file import Metadata, PolicyFile, Tensors
 from ms_slam_agents.sb3_state import optimizer_tensors, restore_adam
 from ms_slam_agents.training_run import TrainingRun, read_init, run_command_line
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
@@ -34,6 +39,7 @@ from torch import Tensor, nn
 from torch.nn.functional import kl_div, mse_loss
 
 from ms_slam_env.config import bounded
+from ms_slam_env.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -44,7 +50,7 @@ class Args(PpoTraining):
         pull: weight of the divergence from the first policy, at the start; it falls to 0 linearly.
         pull_steps: environment steps until then.
         memory: width of the recurrent unit; 0: the policy sees the present observation alone.
-        chunk: steps over which gradients go back through the memory.
+        chunk: steps over which gradients go back through the memory; ``n_steps`` is a multiple.
         value_weight: of the error of the value in the loss.
     """
 
@@ -56,6 +62,14 @@ class Args(PpoTraining):
     value_weight: float = bounded(0.5, 0, 1000)
 
     kept: ClassVar[tuple[str, ...]] = ("memory",)
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range, chunks that leave steps over, a pull to nothing."""
+        super().__post_init__()
+        if self.memory and self.n_steps % min(self.chunk, self.n_steps):
+            raise InputError(f"n_steps = {self.n_steps} is no multiple of chunk = {self.chunk}")
+        if self.pull and self.init is None:
+            raise InputError("pull needs init, the policy to be near")
 
     @property
     def layers(self) -> dict[str, Any]:
@@ -106,6 +120,26 @@ class Rollout:
         return {name: cut(values) for name, values in vars(self).items()}
 
 
+class FirstPolicy:
+    """The policy that pulls, as it sees the world.
+
+    Args:
+        network: with its parameters.
+        normalization: its own, which does not move with what is met.
+        num_envs: environments at once.
+    """
+
+    def __init__(self, network: Network, normalization: Normalization, num_envs: int) -> None:
+        self.network, self.normalization = network, normalization
+        self.memory = torch.zeros(num_envs, network.width)
+
+    def probabilities(self, observations: Any, begins: Tensor, masks: Tensor) -> Tensor:
+        """Of the actions (B, n), by observations (B, k) that are not normalised."""
+        seen = torch.as_tensor(self.normalization.scaled(observations))
+        self.memory = self.network.remember(seen, self.memory, begins)
+        return self.network(seen, self.memory, masks)[0].exp()
+
+
 class Player:
     """Plays the environments with the network as it is.
 
@@ -114,18 +148,25 @@ class Player:
         network: that chooses.
         args: of the training.
         first: the policy that pulls, if one does.
-        seed: of the draws.
+        steps: made before.
     """
 
+    seen: Tensor
+
     def __init__(
-        self, venv: VecNormalize, network: Network, args: Args, first: Network | None, seed: int
+        self,
+        venv: VecNormalize,
+        network: Network,
+        args: Args,
+        first: FirstPolicy | None = None,
+        steps: int = 0,
     ) -> None:
         self.venv, self.network, self.args, self.first = venv, network, args, first
-        self.generator = torch.Generator().manual_seed(seed)
-        venv.seed(seed)
-        self.seen = _tensor(venv.reset())
+        self.generator = torch.Generator().manual_seed(args.seed + steps)
+        venv.seed(first_seed(args.seed, steps))
+        self.has_begun = False
         self.begins = torch.ones(venv.num_envs)
-        self.memory = self.first_memory = torch.zeros(venv.num_envs, network.width)
+        self.memory = torch.zeros(venv.num_envs, network.width)
         self.returns: list[float] = []
         """Of the episodes that ended in the last rollout, as the environments reward them."""
 
@@ -134,6 +175,8 @@ class Player:
         """A rollout; None where ``stop()`` says so before its end."""
         rows: list[tuple[Tensor, ...]] = []
         self.returns = []
+        if not self.has_begun:  # not before: the environments are told of their stage first
+            self.seen, self.has_begun = _tensor(self.venv.reset()), True
         for _ in range(steps):
             if stop():
                 return None
@@ -144,8 +187,8 @@ class Player:
             actions = torch.multinomial(log_probs.exp(), 1, generator=self.generator)[:, 0]
             pulled_to = torch.zeros(len(actions), 0)
             if self.first is not None:
-                self.first_memory = self.first.remember(seen, self.first_memory, begins)
-                pulled_to = self.first(seen, self.first_memory, masks)[0].exp()
+                as_met = self.venv.get_original_obs()
+                pulled_to = self.first.probabilities(as_met, begins, masks)
             observations, rewards, dones, infos = self.venv.step(actions.numpy())
             chosen = log_probs.gather(1, actions[:, None])[:, 0]
             gained = _tensor(rewards) + self._cut_off(dones, infos)
@@ -197,7 +240,7 @@ def update(
             batch = {name: values[:, torch.as_tensor(chosen)] for name, values in data.items()}
             losses = _losses(network, batch, args)
             weights = (1.0, args.value_weight, -args.ent_coef, pull)
-            loss = sum(w * part for w, part in zip(weights, losses, strict=True) if w)
+            loss = sum(w * part for w, part in zip(weights, losses, strict=True))
             optimizer.zero_grad()
             loss.backward()
             nn.utils.clip_grad_norm_(network.parameters(), 0.5)
@@ -249,14 +292,17 @@ class Run(TrainingRun):
             venv.obs_rms = PooledMoments(self.inputs, self.actions, args.candidates)
         self.network = self._network()
         self.optimizer = torch.optim.Adam(self.network.parameters(), args.learning_rate, eps=1e-5)
-        first = self._first_policy()
-        begun = file or (read_policy(args.init) if args.init else None)
+        init = read_init(args) if args.init else None
+        if init:
+            init.metadata.check_sizes(args.init, self.inputs, self.actions)
+        begun = file or init
         if begun:
             restore_moments(venv, begun)
             load_parameters(self.network, begun)
         if file and file.can_resume:
             restore_adam(self.optimizer, file.part("optimizer"), self._names)
-        self.player = Player(venv, self.network, args, first, args.seed + self.steps)
+        first = self._first_policy(init) if init and args.pull else None
+        self.player = Player(venv, self.network, args, first, self.steps)
         self.rng = np.random.default_rng([args.seed, self.steps])
 
     def _network(self) -> Network:
@@ -268,23 +314,13 @@ class Run(TrainingRun):
     def _names(self) -> list[str]:
         return [name for name, _ in self.network.named_parameters()]
 
-    def _first_policy(self) -> Network | None:
-        """The policy of ``init`` as it pulls; None without a pull.
-
-        Raises:
-            InputError: one that does not fit.
-        """
-        args = self.args
-        if args.init is None:
-            return None
-        file = read_init(args)
-        known = file.metadata
-        known.check_sizes(args.init, self.inputs, self.actions)
-        if not args.pull:
-            return None
-        first = self._network()
-        load_parameters(first, file)
-        return first
+    def _first_policy(self, file: PolicyFile) -> FirstPolicy:
+        """The policy of ``init`` as it pulls."""
+        args, network = self.args, self._network()
+        load_parameters(network, file)
+        normalization = Normalization(self.inputs, self.actions, args.candidates, args.gamma)
+        restore_moments(normalization, file)
+        return FirstPolicy(network, normalization, self.venv.num_envs)
 
     def tensors(self) -> Tensors:
         """See the base class."""
@@ -314,9 +350,8 @@ class Run(TrainingRun):
 
 def make_run(args: Args, file: PolicyFile | None, stack: ExitStack) -> Run:
     """A run in environments of its own."""
-    venv = VecNormalize(VecMonitor(make_venv(args, "train")), gamma=args.gamma)
-    stack.callback(venv.close)
-    return Run(args, venv, file)
+    venv = stack.enter_context(opened(make_venv(args, "train")))
+    return Run(args, VecNormalize(VecMonitor(venv), gamma=args.gamma), file)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -24,7 +24,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from ms_slam_agents.environments import make_venv
+from ms_slam_agents.environments import first_seed, make_venv, opened
 from ms_slam_agents.network import BLOCKED, Network, load_parameters
 from ms_slam_agents.normalization import Normalization, moment_tensors, restore_moments
 from ms_slam_agents.options import Training
@@ -274,11 +274,10 @@ class Run(TrainingRun):
         self.rng = np.random.default_rng([args.seed, self.steps])
         self.replay = Replay(args.buffer_size, self.inputs, self.actions)
         self.returns = [Returns(args.n_step, args.gamma) for _ in range(venv.num_envs)]
-        venv.seed(args.seed + self.steps)
-        self.seen = np.asarray(venv.reset())
-        normalization.obs_rms.update(self.seen)
+        venv.seed(first_seed(args.seed, self.steps))
         self.sums = np.zeros(venv.num_envs)
         self.played = 0
+        """Steps since this run began."""
 
     def tensors(self) -> Tensors:
         """See the base class."""
@@ -298,6 +297,9 @@ class Run(TrainingRun):
     def advance(self, stop: Callable[[], bool]) -> dict[str, float] | None:
         """Play ``save_every`` steps, learning after every ``train_every``."""
         args, losses = self.args, []
+        if not self.played:  # not before: the environments are told of their stage first
+            self.seen = np.asarray(self.venv.reset())
+            self.learner.normalization.obs_rms.update(self.seen)
         until = min(self.steps + args.save_every, args.total_timesteps)
         while self.steps < until:
             if stop():
@@ -343,9 +345,7 @@ class Run(TrainingRun):
 
 def make_run(args: Args, file: PolicyFile | None, stack: ExitStack) -> Run:
     """A run in environments of its own."""
-    venv = make_venv(args, "train")
-    stack.callback(venv.close)
-    return Run(args, venv, file)
+    return Run(args, stack.enter_context(opened(make_venv(args, "train"))), file)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 import time
 
@@ -43,6 +44,7 @@ class Supervisor(BaseCallback):
         self.validation = validation
         self.curve = curve
         self.stop_reason = ""
+        self.signal: signal.Signals | None = None
         self.unlearnt_steps = 0
         self._minutes_before = minutes_before
         self._evaluation_s = 0.0
@@ -58,6 +60,11 @@ class Supervisor(BaseCallback):
     def stop(self, reason: str) -> None:
         """End training after the current step."""
         self.stop_reason = self.stop_reason or reason
+
+    def interrupt(self, number: signal.Signals) -> None:
+        """End training after the current step, since a signal came."""
+        self.signal = number
+        self.stop(f"interrupted by {number.name}")
 
     @property
     def minutes(self) -> float:
@@ -87,12 +94,12 @@ class Supervisor(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         self._save_latest()
-        if self.args.curriculum:
-            stage = stage_of(self.args, self.num_timesteps, self.curve)
-            self.training_env.env_method("enter_stage", stage)
         if self.num_timesteps >= self._next_evaluation:
             self._evaluate()
             self._plan_evaluation()
+        if self.args.curriculum:
+            stage = stage_of(self.args, self.num_timesteps, self.curve)
+            self.training_env.env_method("enter_stage", stage)
 
     def _on_step(self) -> bool:
         self._show_progress()
@@ -120,8 +127,7 @@ class Supervisor(BaseCallback):
             buffer = self.model.rollout_buffer
             self.unlearnt_steps = 0 if buffer.full else buffer.pos * buffer.n_envs
         self._save_latest()
-        is_interrupted = self.stop_reason.startswith("interrupt")
-        if self.has_learnt and not is_interrupted and not self._is_evaluated():
+        if self.has_learnt and not self.signal and not self._is_evaluated():
             self._evaluate()
         self._bar.close()
 

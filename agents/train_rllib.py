@@ -24,7 +24,7 @@ import gymnasium as gym
 import numpy as np
 import ray
 import torch
-from ms_slam_agents.environments import make_env
+from ms_slam_agents.environments import first_seed, make_env
 from ms_slam_agents.network import Network, load_parameters
 from ms_slam_agents.normalization import Normalization, moment_tensors, restore_moments
 from ms_slam_agents.options import PpoTraining, Problem
@@ -56,8 +56,7 @@ class Args(PpoTraining):
     """Train with masked PPO on Ray; these options are the command line.
 
     Attributes:
-        num_envs: environment runners, one process and one thread each, on all machines together; 0
-            would be this process alone.
+        num_envs: environment runners, one process and one thread each, on all machines together.
         envs_per_runner: environments that a runner steps one after the other.
         address: of a Ray cluster, or ``auto``; None: one on this machine, for this run.
         value_weight: of the error of the value in the loss.
@@ -92,10 +91,17 @@ class Args(PpoTraining):
 
 
 class Masked(gym.Wrapper[Any, Any, Any, Any]):
-    """Shows the action mask beside the observation, where RLlib's modules can see it."""
+    """Shows the action mask beside the observation, where RLlib's modules can see it.
 
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
+    Args:
+        env: environment.
+        runner: number of the runner that it is in; RLlib's seeds of one runner are the next one's
+            too.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], runner: int = 0) -> None:
         super().__init__(env)
+        self.runner = runner
         count = int(env.action_space.n)  # type: ignore[attr-defined]
         masks = gym.spaces.MultiBinary(count)
         self.observation_space = gym.spaces.Dict(
@@ -104,6 +110,8 @@ class Masked(gym.Wrapper[Any, Any, Any, Any]):
 
     def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
         """See Gymnasium."""
+        if options.get("seed") is not None:
+            options["seed"] = first_seed(options["seed"], self.runner)
         observation, _ = self.env.reset(**options)
         return self._beside(observation), {}
 
@@ -238,7 +246,7 @@ def make_config(args: Args, space: gym.Space[Any], actions: int, done: int) -> P
         grad_clip=0.5,
         grad_clip_by="global_norm",
     )
-    config.debugging(seed=args.seed + done, log_level="ERROR")
+    config.debugging(seed=first_seed(args.seed, done), log_level="ERROR")
     return config
 
 
@@ -263,7 +271,7 @@ class Run(TrainingRun):
         env.close()
         super().__init__(args, env.observation_space, env.action_space, file)
         begun = file or (read_init(args).untrained() if args.init else None)
-        register_env(_ENV, lambda _: make_masked(args))
+        register_env(_ENV, lambda context: make_masked(args, context.worker_index))
         config = make_config(args, env.observation_space, self.actions, self.steps)
         self.ppo: Any = config.build_algo()
         if begun:
@@ -312,10 +320,10 @@ class Run(TrainingRun):
         self.ppo.stop()
 
 
-def make_masked(args: Problem) -> gym.Env[Any, Any]:
+def make_masked(args: Problem, runner: int) -> gym.Env[Any, Any]:
     """A training environment, in a runner."""
     torch.set_num_threads(1)
-    return Masked(make_env(args, "train", ()))
+    return Masked(make_env(args, "train", ()), runner)
 
 
 def learner_tensors(learner: Any) -> Tensors:

@@ -17,25 +17,37 @@ from collections.abc import Sequence
 from dataclasses import asdict
 
 import torch
-from ms_slam_agents.environments import VALIDATION_SEED, check_problem, make_venv
+from ms_slam_agents.environments import (
+    VALIDATION_SEED,
+    check_problem,
+    first_seed,
+    make_venv,
+    opened,
+)
 from ms_slam_agents.learning_curve import LATEST
 from ms_slam_agents.options import (
     KEPT,
     Args,
     check_kept,
     check_new,
-    check_steps_left,
     parse_for_task,
     resumed,
 )
+from ms_slam_agents.policy import action_parts
 from ms_slam_agents.policy_file import PolicyFile, read_policy
 from ms_slam_agents.sb3_state import ALGORITHMS, Model, restore, whole_batches
 from ms_slam_agents.supervisor import Supervisor
-from ms_slam_agents.training_run import caught_signals, load_curve, read_init
+from ms_slam_agents.training_run import (
+    caught_signals,
+    check_can_resume,
+    new_curve,
+    read_init,
+    saved_curve,
+    stage_of,
+)
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
 from ms_slam_env.command_line import exit_code, parse
-from ms_slam_env.errors import InputError
 from ms_slam_env.interrupts import kept
 
 
@@ -60,10 +72,15 @@ def make_model(args: Args, venv: VecEnv, file: PolicyFile | None) -> Model:
         seed=args.seed + done,  # a resumed run goes on with new episodes
         device="cpu",
     )
+    venv.seed(first_seed(args.seed, done))
     if file:
         restore(model, file)
     elif args.init:
-        restore(model, read_init(args).untrained())
+        init = read_init(args)
+        assert venv.observation_space.shape
+        actions = action_parts(venv.action_space)
+        init.metadata.check_sizes(args.init, venv.observation_space.shape[0], *actions)
+        restore(model, init.untrained())
     return model
 
 
@@ -87,9 +104,7 @@ def load_run(args: Args) -> PolicyFile | None:
     file = read_policy(path)
     saved = resumed(args, file.metadata.options)
     check_kept(path, asdict(saved), args, KEPT)
-    check_steps_left(path, file.metadata.timesteps, args.total_timesteps)
-    if file.metadata.epochs and not file.can_resume:
-        raise InputError(f"{path} has no state of the optimiser to resume from")
+    check_can_resume(path, file, args.total_timesteps)
     for name, value in asdict(args).items():
         if value != getattr(saved, name):
             print(f"{name} is {value!r} from now on, {getattr(saved, name)!r} so far")
@@ -97,38 +112,38 @@ def load_run(args: Args) -> PolicyFile | None:
 
 
 def train(args: Args) -> int:
-    """Train as ``args`` say; return the exit status, 130 after an interrupt.
+    """Train as ``args`` say; return the exit status, 130 after Ctrl-C, 143 after SIGTERM.
 
     Raises:
         InputError: bad options, or nothing to train.
-        RuntimeError: time was up before the first update.
+        RuntimeError: time was up before the first update, or a process has ended.
     """
     torch.set_num_threads(1)
+    curve = saved_curve(args)
     file = load_run(args)
     if args.init and file is None:
         read_init(args)  # refused before anything is written
     check_problem(args)  # here, not in a worker process
     args.out.mkdir(parents=True, exist_ok=True)
     seeds = range(VALIDATION_SEED, VALIDATION_SEED + args.eval_episodes)
-    validation = make_venv(args, "validation", seeds)
-    training = make_venv(args, "train")
-    try:
+    with (
+        opened(make_venv(args, "validation", seeds)) as validation,
+        opened(make_venv(args, "train")) as training,
+    ):
         model = make_model(args, training, file)
         minutes = file.metadata.minutes if file else 0.0
-        curve = load_curve(args, validation)
+        curve = curve or new_curve(args, validation)
         supervisor = Supervisor(args, validation, curve, minutes)
+        if args.curriculum:  # before the first reset
+            training.env_method("enter_stage", stage_of(args, model.num_timesteps, curve))
         what = f"what was trained before the last update is kept in {args.out}"
-        tell = lambda name: supervisor.stop(f"interrupted by {name}")  # noqa: E731
-        with caught_signals(tell), kept(what), supervisor:
+        with caught_signals(supervisor.interrupt), kept(what), supervisor:
             model.learn(
                 max(0, args.total_timesteps - model.num_timesteps),
                 callback=supervisor,
                 tb_log_name=args.algorithm,
                 reset_num_timesteps=not args.resume,
             )
-    finally:
-        training.close()
-        validation.close()
     return report(supervisor)
 
 
@@ -140,8 +155,7 @@ def report(supervisor: Supervisor) -> int:
     """
     args, steps = supervisor.args, supervisor.num_timesteps
     ended = supervisor.stop_reason or "done"
-    is_interrupted = ended.startswith("interrupt")
-    if not supervisor.has_learnt and not is_interrupted:
+    if not supervisor.has_learnt and not supervisor.signal:
         raise RuntimeError(
             f"{ended}, but nothing was learnt: {supervisor.unlearnt_steps} steps are less than a "
             f"batch of {args.batch_size}; give more --minutes or a smaller --batch-size"
@@ -150,7 +164,7 @@ def report(supervisor: Supervisor) -> int:
     if supervisor.unlearnt_steps:
         learnt += f"; the last {supervisor.unlearnt_steps} steps, less than a batch, are not in it"
     print(f"{ended}: {steps} steps, policy in {args.out}{learnt}")
-    return 130 if is_interrupted else 0
+    return 128 + supervisor.signal if supervisor.signal else 0
 
 
 def parse_options(argv: Sequence[str] | None) -> Args:
@@ -169,7 +183,7 @@ def parse_options(argv: Sequence[str] | None) -> Args:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit status: 0, 1 if nothing was learnt, 2, 130."""
+    """Run the command line; return the exit status: 0, 1 if nothing was learnt, 2, 130, 143."""
     words = list(sys.argv[1:] if argv is None else argv)
     return exit_code(lambda: train(parse_options(words)), "ms-slam train")
 

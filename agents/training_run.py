@@ -9,17 +9,24 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 import torch
 from gymnasium import spaces
 from ms_slam_agents.curriculum import read_curriculum, stage_now
-from ms_slam_agents.environments import VALIDATION_SEED, check_problem, env_options, make_venv
+from ms_slam_agents.environments import (
+    VALIDATION_SEED,
+    check_problem,
+    env_options,
+    make_venv,
+    opened,
+)
 from ms_slam_agents.evaluation import references
 from ms_slam_agents.learning_curve import LATEST, Curve, read_curve
 from ms_slam_agents.options import (
+    JUDGED_WITH,
     KEPT,
     Problem,
     Training,
@@ -109,21 +116,28 @@ class TrainingRun(ABC):
         """The policy as it is now, with the state of the optimiser."""
         return PolicyFile(self.metadata(), self.tensors())
 
-    def learn(self, curve: Curve, validation: VecEnv, signals: Sequence[str]) -> None:
-        """Advance until the steps are made, time is up or there are ``signals``."""
+    def learn(self, curve: Curve, validation: VecEnv) -> signal.Signals | None:
+        """Advance until the steps are made, or time is up.
+
+        Returns:
+            The signal that ended it sooner, if one did. One that comes during an evaluation ends
+            that by KeyboardInterrupt: it may take minutes.
+        """
         args, before = self.options, self.minutes
         board = SummaryWriter(str(args.out / "tensorboard"))
         bar = tqdm(total=args.total_timesteps, initial=self.steps, unit="step", smoothing=0.1)
+        signals: list[signal.Signals] = []
         with board, bar:
             if not curve.points:
                 self._judge(curve, validation, board)
-            while self.steps < args.total_timesteps and not signals:
+            while self.steps < args.total_timesteps:
                 if args.minutes is not None and self.minutes - before >= args.minutes:
                     break
                 steps, begun = self.steps, time.monotonic()
                 if args.curriculum:
                     self.enter_stage(stage_of(args, self.steps, curve))
-                said = self.advance(lambda: bool(signals))
+                with caught_signals(signals.append):
+                    said = self.advance(lambda: bool(signals))
                 if said is None:
                     break
                 self.minutes += (time.monotonic() - begun) / 60
@@ -132,10 +146,13 @@ class TrainingRun(ABC):
                 for name, value in said.items():
                     board.add_scalar(f"train/{name}", value, self.steps)
                 write_policy(args.out / LATEST, self.file())
+                if signals:
+                    break
                 if args.eval_every and self.steps // args.eval_every > steps // args.eval_every:
                     self._judge(curve, validation, board)
             if not signals and curve.points[-1]["timesteps"] < self.steps:
                 self._judge(curve, validation, board)
+        return signals[0] if signals else None
 
     def _judge(self, curve: Curve, validation: VecEnv, board: SummaryWriter) -> None:
         """Evaluate, and keep what is best so far."""
@@ -149,7 +166,7 @@ class TrainingRun(ABC):
 def train(
     args: T, algorithm: str, make: Callable[[T, PolicyFile | None, ExitStack], TrainingRun]
 ) -> int:
-    """Train as ``args`` say; return the exit status, 130 after an interrupt.
+    """Train as ``args`` say; return the exit status, 130 after Ctrl-C, 143 after SIGTERM.
 
     Args:
         args: of the training.
@@ -158,25 +175,23 @@ def train(
 
     Raises:
         InputError: bad options, or nothing to train.
+        RuntimeError: the process of an environment has ended.
     """
     torch.set_num_threads(1)
     file = load_run(args, algorithm)
+    curve = saved_curve(args)
     if args.init:
         read_init(args)  # refused before anything is written
     check_problem(args)
-    signals: list[str] = []
     with ExitStack() as stack:
         seeds = range(VALIDATION_SEED, VALIDATION_SEED + args.eval_episodes)
-        validation = make_venv(args, "validation", seeds)
-        stack.callback(validation.close)
-        stack.enter_context(caught_signals(signals.append))
+        validation = stack.enter_context(opened(make_venv(args, "validation", seeds)))
         run = make(args, file, stack)
         args.out.mkdir(parents=True, exist_ok=True)
-        curve = load_curve(args, validation)
         with kept(f"what was trained before the last update is kept in {args.out}"):
-            run.learn(curve, validation, signals)
-    print(f"{'interrupted' if signals else 'done'}: {run.steps} steps, policy in {args.out}")
-    return 130 if signals else 0
+            ended_by = run.learn(curve or new_curve(args, validation), validation)
+    print(f"{'interrupted' if ended_by else 'done'}: {run.steps} steps, policy in {args.out}")
+    return 128 + ended_by if ended_by else 0
 
 
 def run_command_line(
@@ -186,20 +201,20 @@ def run_command_line(
     make: Callable[[T, PolicyFile | None, ExitStack], TrainingRun],
     argv: Sequence[str] | None,
 ) -> int:
-    """Run ``ms-slam train NAME``; return the exit status: 0, 2 or 130."""
+    """Run ``ms-slam train NAME``; return the exit status: 0, 1, 2, 130 or 143."""
     words = list(sys.argv[1:] if argv is None else argv)
     prog = f"ms-slam train {name}"
     return exit_code(lambda: train(parse_for_task(args, words, prog, name), algorithm, make), prog)
 
 
 @contextmanager
-def caught_signals(tell: Callable[[str], Any]) -> Iterator[None]:
-    """While this lasts, SIGINT and SIGTERM ``tell`` their name; a second one ends at once."""
+def caught_signals(tell: Callable[[signal.Signals], Any]) -> Iterator[None]:
+    """While this lasts, SIGINT and SIGTERM are but told; a second one ends at once."""
     before: dict[int, Any] = {}
 
     def handle(number: int, _: object) -> None:
         signal.signal(number, before[number])
-        tell(signal.Signals(number).name)
+        tell(signal.Signals(number))
 
     for name in (signal.SIGINT, signal.SIGTERM):
         before[name] = signal.signal(name, handle)
@@ -240,8 +255,19 @@ def load_run(args: Training, algorithm: str) -> PolicyFile | None:
         check_new(args.out, LATEST)
         return None
     file = read_run(args, algorithm, {*KEPT, *args.kept} - {"algorithm"})
-    check_steps_left(args.out / LATEST, file.metadata.timesteps, args.total_timesteps)
+    check_can_resume(args.out / LATEST, file, args.total_timesteps)
     return file
+
+
+def check_can_resume(path: Path, file: PolicyFile, total: int) -> None:
+    """Refuse to go on from a file without the state of training, or with all its steps.
+
+    Raises:
+        InputError: naming the ``path``.
+    """
+    check_steps_left(path, file.metadata.timesteps, total)
+    if file.metadata.epochs and not file.can_resume:
+        raise InputError(f"{path} has no state of the optimiser to resume from")
 
 
 def read_run(args: Problem, algorithm: str, names: set[str]) -> PolicyFile:
@@ -258,24 +284,24 @@ def read_run(args: Problem, algorithm: str, names: set[str]) -> PolicyFile:
     return file
 
 
-def load_curve(args: Training, validation: VecEnv) -> Curve:
-    """Return the learning curve so far: that of the run to resume, or references and no points.
+def saved_curve(args: Problem) -> Curve | None:
+    """The learning curve of the run to resume; None where there is none yet.
 
     Raises:
-        InputError: the run to resume was evaluated on another number of episodes.
+        InputError: its points are of other episodes than those to come would be.
     """
-    path, config = args.out / RESULTS, to_plain(asdict(args))
-    if args.resume and path.is_file():
-        curve = read_curve(path)
-        if curve.episodes != args.eval_episodes:
-            raise InputError(
-                f"{path} has points of eval_episodes = {curve.episodes} each, "
-                f"not {args.eval_episodes}"
-            )
-        curve.config = config
-        return curve
+    path = args.out / RESULTS
+    if not (args.resume and path.is_file()):
+        return None
+    curve = read_curve(path)
+    check_kept(path, curve.config, args, JUDGED_WITH, "has points judged with")
+    return replace(curve, config=to_plain(asdict(args)))
+
+
+def new_curve(args: Training, validation: VecEnv) -> Curve:
+    """A learning curve without points, with the references that are asked for."""
     known = references(validation, args.eval_episodes) if args.references else {}
-    return Curve(args.eval_episodes, known, config=config)
+    return Curve(args.eval_episodes, known, config=to_plain(asdict(args)))
 
 
 def read_init(args: Training) -> PolicyFile:

@@ -7,7 +7,8 @@ import inspect
 import numbers
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeGuard, TypeVar, get_origin, get_type_hints
+from pathlib import Path
+from typing import Any, TypeGuard, TypeVar, get_args, get_origin, get_type_hints
 
 import yaml
 
@@ -92,8 +93,8 @@ def from_dict(cls: type[T], values: Mapping[str, Any], path: str = "") -> T:
     Args:
         cls: a dataclass; fields that are themselves dataclasses take nested mappings. Of a
             :class:`Family` the variant that ``name`` names.
-        values: field name to value; missing fields keep their default, and a :class:`Named` or
-            :class:`Family` field may be given by name.
+        values: field name to value; missing fields keep their default, a :class:`Named` or
+            :class:`Family` field may be given by name, a path as text.
         path: dotted prefix used in error messages.
 
     Raises:
@@ -122,6 +123,8 @@ def from_dict(cls: type[T], values: Mapping[str, Any], path: str = "") -> T:
             value = from_dict(hint, value, where)
         elif isinstance(value, str) and value in names:
             value = names[value]
+        elif isinstance(value, str) and Path in (hint, *get_args(hint)):
+            value = Path(value)
         elif (nested and not isinstance(value, hint)) or (
             get_origin(hint) is dict and not is_options(value)
         ):

@@ -48,7 +48,7 @@ def load_state(
     own, blank = simulation.episode, simulation.blank
     check_episode(state["episode"], own, blank, shape, motions, simulation.carves)
     episode = state["episode"]
-    place = episode.scene, episode.scene_seed
+    place = simulation.place_of(episode)
     stays = place == simulation.place
     world = simulation.world if stays else simulation.world_of(*place)
     _check_parts_of(state, simulation, world, rng)

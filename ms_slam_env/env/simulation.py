@@ -22,7 +22,7 @@ from ms_slam_env.geometry import invert
 from ms_slam_env.mapping import OccupancyGrid
 from ms_slam_env.robot import Embodiment, MotionResult
 from ms_slam_env.scenes.base import Scene
-from ms_slam_env.scenes.registry import SceneName
+from ms_slam_env.scenes.registry import SceneName, name_of
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sensor.scene_cache import get_scene, get_sensor
 from ms_slam_env.slam.base import SlamBackend, TrackResult
@@ -95,6 +95,11 @@ class Simulation:
         self.place = name, scene_seed
         self.world = self.world_of(name, scene_seed)
 
+    def place_of(self, episode: Episode) -> tuple[SceneName, int]:
+        """Where an episode is: a scene of the options, even if a function, or one by its name."""
+        own = {name_of(name): name for name in self.config.scenes}
+        return own.get(episode.scene, episode.scene), episode.scene_seed
+
     def world_of(self, name: SceneName, scene_seed: int) -> World:
         """A scene and what stands in it."""
         scene = get_scene(name, scene_seed)
@@ -135,7 +140,7 @@ class Simulation:
         self.T_world_kinematic = here @ invert(robot.T_world_camera_kinematic)
         assert self.place is not None
         name, scene_seed = self.place
-        self.episode = Episode(getattr(name, "__name__", str(name)), scene_seed, noise_seed)
+        self.episode = Episode(name_of(name), scene_seed, noise_seed)
         self.episode.occupancy = OccupancyGrid() if self.carves else None
         self._track_frame(self.episode, here, here, time_s=0.0)
         self._end_step(self.episode, np.zeros(2), energy_j=0.0)

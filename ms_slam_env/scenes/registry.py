@@ -95,6 +95,11 @@ def check_name(name: object) -> None:
         POINT.find(name)
 
 
+def name_of(scene: SceneName) -> str:
+    """A scene's name; of a function, that function's."""
+    return str(getattr(scene, "__name__", scene))
+
+
 def make(name: SceneName | Path = "living_room", seed: int = 0) -> Scene:
     """Build a scene; the same name and seed give the same scene, bit for bit.
 

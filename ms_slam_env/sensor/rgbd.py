@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import threading
 from collections.abc import Sequence
@@ -253,6 +254,18 @@ class RGBDSensor:
         for pose in flat if not is_rigid else ():
             check_pose(pose, "T_world_camera")
         return flat
+
+    def with_noise(self, noise: str | NoiseConfig) -> RGBDSensor:
+        """The same sensor with another noise; both look at the same copy of the scene.
+
+        Raises:
+            InputError: unknown noise model.
+        """
+        made = copy.copy(self)
+        made.noise = noise_config(noise)
+        made._depth_noise = make_depth_noise(made.noise, self.intrinsics)
+        made._of_thread = _OfThread()
+        return made
 
     @property
     def caster(self) -> RayCaster:

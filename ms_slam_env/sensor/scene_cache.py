@@ -20,6 +20,9 @@ With textures, trees and surfaces a room of 50,000 faces takes some 90 MB, a hom
 250 MB: about 3 GB for 40 rooms or 11 homes.
 """
 
+SENSORS_KEPT = 2
+"""Of a scene, those used last: a curriculum draws noise for each episode."""
+
 _kept: OrderedDict[tuple[SceneName, int], tuple[Scene, dict[Any, RGBDSensor]]] = OrderedDict()
 _lock = RLock()
 
@@ -36,9 +39,16 @@ def get_sensor(
     with _lock:
         scene, sensors = _place(name, seed)
         key = intrinsics, noise
-        if key not in sensors:
-            sensors[key] = RGBDSensor(scene, intrinsics, noise=noise)
-        return sensors[key]
+        sensor = sensors.pop(key, None)
+        if sensor is None:
+            alike = next(
+                (one for (camera, _), one in sensors.items() if camera == intrinsics), None
+            )
+            sensor = alike.with_noise(noise) if alike else RGBDSensor(scene, intrinsics, noise)
+        while len(sensors) >= SENSORS_KEPT:
+            del sensors[next(iter(sensors))]
+        sensors[key] = sensor
+        return sensor
 
 
 def _place(name: SceneName, seed: int) -> tuple[Scene, dict[Any, RGBDSensor]]:

@@ -55,13 +55,13 @@ def test_a_stage_ends_by_its_share_of_the_steps_or_by_the_return_on_validation()
 
 def test_what_is_drawn_lies_between_the_numbers_and_depends_on_the_seed():
     stage = Stage(noise=(0.5, 1.5), perturbations={"illumination": {"dim": [0.1, 0.4], "lamp": 0}})
-    drawn = [stage.draw(np.random.default_rng(seed)) for seed in range(200)]
+    drawn = [stage.draw(np.random.default_rng(seed).uniform) for seed in range(200)]
     strengths = np.array([options["noise"]["strength"] for options, _ in drawn])
     dims = np.array([made[0][1]["dim"] for _, made in drawn])
     for values, low, high in ((strengths, 0.5, 1.5), (dims, 0.1, 0.4)):
         assert low <= values.min() < low + 0.1 * (high - low)
         assert high - 0.1 * (high - low) < values.max() <= high
-    assert drawn[7] == stage.draw(np.random.default_rng(7))
+    assert drawn[7] == stage.draw(np.random.default_rng(7).uniform)
     assert drawn[0][1][0] == ("illumination", {"dim": dims[0], "lamp": 0})
 
 
@@ -92,6 +92,11 @@ def test_episodes_are_of_the_stage_and_of_what_was_drawn(tmp_path):
     assert environments.make_env(args, "validation", ()).unwrapped.own["noise"] is None
 
 
+def played():
+    """Scene seeds and episodes of the environments that something was played in."""
+    return [(one["scene_seeds"], one["episodes"]) for one in Made.made if one["episodes"]]
+
+
 @pytest.mark.parametrize("trainer", [ppo, qrdqn, train_sb3])
 def test_trainers_go_from_stage_to_stage_and_are_validated_on_the_problem(tmp_path, trainer):
     path = tmp_path / "stages.yaml"
@@ -106,9 +111,12 @@ def test_trainers_go_from_stage_to_stage_and_are_validated_on_the_problem(tmp_pa
         words += ["--learning-starts", "16", "--save-every", "32"]
     Made.made.clear()
     assert trainer.main(words) == 0
-    played = [(one["scene_seeds"], one["episodes"]) for one in Made.made if one["episodes"]]
-    assert [seeds for seeds, _ in played] == [2, 3]
-    assert all(4 <= episodes <= 9 for _, episodes in played)  # of ten steps each
+    assert [seeds for seeds, _ in played()] == [2, 3]
+    assert all(4 <= episodes <= 9 for _, episodes in played())  # of ten steps each
+    Made.made.clear()
+    longer = {"64": "160", "128": "160"}
+    assert trainer.main([*(longer.get(word, word) for word in words), "--resume"]) == 0
+    assert [seeds for seeds, _ in played()] == [3]  # not one episode of the first stage
 
 
 @pytest.mark.parametrize(
@@ -121,6 +129,11 @@ def test_trainers_go_from_stage_to_stage_and_are_validated_on_the_problem(tmp_pa
         ("- {noise: [2, 1]}", "the lower first"),
         ("- {perturbations: {fog: {}}}", "unknown perturbation 'fog'"),
         ("- {step_m: fast}", "step_m"),
+        ("- {above: high}", "above"),
+        ("- {perturbations: {illumination: {dim: [0.2, 1.3]}}}", "dim = 1.3"),
+        ("- {perturbations: {illumination: {dim: [-0.1, 0.3]}}}", "dim = -0.1"),
+        ("- {perturbations: {illumination: {dim: [0, .inf]}}}", "dim = inf"),
+        ("- {until: 0.5}\n- {}\n- {}", "stage 2 has neither until nor above"),
     ],
 )
 def test_what_is_no_curriculum_is_refused_in_one_line(tmp_path, text, said, capsys):

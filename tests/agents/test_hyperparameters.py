@@ -1,8 +1,11 @@
 """Options of a task: from its YAML file, before those of the command line."""
 
 import math
+from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
+import numpy as np
 import pytest
 from ms_slam_agents import environments, imitation, options, ppo, qrdqn, train_sb3
 
@@ -84,6 +87,38 @@ def test_what_a_file_cannot_say_is_one_line_with_its_name(tmp_path, text, said, 
     assert ppo.main(["--task", str(path), "--out", str(tmp_path / "out")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_a_file_may_name_files(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("ppo: {init: runs/first.safetensors, pull: 1, curriculum: stages.yaml}\n")
+    args = parsed(["--task", str(path)])
+    assert args.init == Path("runs/first.safetensors")
+    assert args.curriculum == Path("stages.yaml")
+
+
+def test_trainings_and_their_environments_meet_other_episodes():
+    firsts = [environments.first_seed(seed, steps) for seed in range(40) for steps in (0, 1000)]
+    assert np.diff(sorted(firsts)).min() > 1000  # environments at once
+    assert max(firsts) < 2**30
+    assert environments.first_seed(3) == environments.first_seed(3)
+
+
+def test_an_environment_whose_process_has_ended_is_said_in_a_line():
+    closed = []
+
+    def close():
+        closed.append(True)
+        raise BrokenPipeError
+
+    venv = SimpleNamespace(close=close)
+    for error in (EOFError(), ConnectionResetError()):
+        said = pytest.raises(RuntimeError, match="process of an environment")
+        with said, environments.opened(venv):
+            raise error
+    with pytest.raises(KeyError), environments.opened(venv):
+        raise KeyError
+    assert len(closed) == 3
 
 
 def test_an_unknown_task_lists_those_that_there_are():

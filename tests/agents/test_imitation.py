@@ -313,12 +313,32 @@ def test_runs_that_are_not_to_be_gone_on_with_are_refused(tmp_path, capsys):
             "observation of the policy under agent-home 'features'",
         ),
         (arguments(tmp_path, "--resume", "--reward", "paper"), "reward 'default', not 'paper'"),
+        (arguments(tmp_path, "--resume", "--step-m", "0.06"), "step_m None, not 0.06"),
+        (arguments(tmp_path, "--resume", "--eval-episodes", "9"), "eval_episodes 4, not 9"),
         (arguments(tmp_path / "new", "--teacher", "nobody"), "unknown planner 'nobody'"),
         (arguments(tmp_path / "new", "--observation", "x:Y"), "unknown observation 'x:Y'"),
     ):
         assert imitation.main(words) == 2
         assert said in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
+
+
+def test_an_interrupted_first_round_is_gone_on_with_as_what_it_was(tmp_path, monkeypatch, capsys):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(imitation, "Student", interrupt)
+        assert imitation.main(arguments(tmp_path, rounds=1)) == 130
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "episodes",
+        "results.json",
+        "table.md",
+    ]
+    other = arguments(tmp_path, "--resume", "--hidden", "32", rounds=1)
+    assert imitation.main(other) == 2
+    assert "trained with hidden 16, not 32" in capsys.readouterr().err
+    assert imitation.main(arguments(tmp_path, "--resume", rounds=1)) == 0
 
 
 def test_what_is_no_demonstration_is_refused(tmp_path):

@@ -62,7 +62,7 @@ def test_what_a_time_limit_cuts_off_is_the_value_of_the_last_observation(monkeyp
     network = Network(7, 16, 7)
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, 0, 1.0)
-    player = ppo.Player(venv, network, ppo.Args(gamma=0.5), None, seed=0)
+    player = ppo.Player(venv, network, ppo.Args(gamma=0.5))
     rollout = player.play(1, lambda: False)
     _, last, _ = observations
     scaled = torch.as_tensor((last - 2) / 5)[None]
@@ -227,17 +227,48 @@ def test_it_is_pulled_to_what_it_still_is(memory, tmp_path):
         hidden=16,
         num_envs=1,
         episode_steps=10,
-        n_steps=25,
+        n_steps=32,
     )
     with ExitStack() as stack:
         run = ppo.make_run(args, None, stack)
         run.venv.training = False  # the moments stay
         rollout = run.player.play(25, lambda: False)
         said = run.advance(lambda: False)
+        run.venv.obs_rms.mean += 3  # no concern of what pulls
+        moved = run.player.play(9, lambda: False)
     chosen = rollout.pulled_to.gather(2, rollout.actions[..., None])[..., 0]
     torch.testing.assert_close(chosen.log(), rollout.log_probs)
     assert rollout.pulled_to.std(dim=0).max() > 0.02
     assert said["pull"] == pytest.approx(0, abs=1e-5)
+    policy = Policy.load(args.init)
+    remembered = policy.empty_memory(1)
+    rms = run.venv.obs_rms
+    for k in range(1, 9 if not memory else 0):  # the first was met before
+        met = moved.seen[k].numpy() * np.sqrt(rms.var + 1e-8) + rms.mean
+        found = policy.probabilities(met, moved.masks[k].numpy(), remembered)
+        np.testing.assert_allclose(moved.pulled_to[k], found, atol=1e-5)
+
+
+def test_without_weight_the_value_is_left_as_it_is(tmp_path):
+    more = ("--value-weight", "0", "--learning-rate", "0.01")
+    assert ppo.main(words(tmp_path, *more)) == 0
+    assert ppo.main(words(tmp_path, *more, "--resume", steps=96)) == 0
+    value = read_policy(tmp_path / "latest.safetensors").part("policy")["value_net.bias"]
+    assert abs(value).max() < 1
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (("--pull", "1"), "pull needs init"),
+        (("--memory", "4", "--n-steps", "40", "--chunk", "16"), "no multiple of chunk = 16"),
+        (("--seed", "-1"), "seed = -1"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(more, said, tmp_path, capsys):
+    assert ppo.main(["--out", str(tmp_path / "out"), *more]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_policy_with_other_layers_is_not_begun_with(tmp_path, capsys):

@@ -4,6 +4,7 @@ import errno
 import os
 import signal
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -108,7 +109,7 @@ def test_what_an_episode_draws_depends_on_its_seed_alone():
 
 def test_same_seed_same_training(run, tmp_path):
     assert train_sb3.main(arguments(tmp_path, algorithm=run.algorithm)) == 0
-    first, second = read_curve(run.out), read_curve(tmp_path)
+    first, second = (replace(read_curve(out), config={}) for out in (run.out, tmp_path))
     for point in first.points + second.points:
         del point["training_min"]
     assert first == second
@@ -157,21 +158,22 @@ def test_the_return_rises_above_random_walk(tmp_path):
     assert read_policy(tmp_path / "best.safetensors").metadata.timesteps == 768
 
 
-def test_interrupt_saves_and_says_so(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupt_saves_and_says_so(number, tmp_path, monkeypatch, capsys):
     step = LearnableFake.step
 
     def step_and_interrupt(self, action):
         if self.split == "train" and len(steps_seen) == 40:
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), number)
         if self.split == "train":
             steps_seen.append(action)
         return step(self, action)
 
     steps_seen = []
     monkeypatch.setattr(LearnableFake, "step", step_and_interrupt)
-    before = signal.getsignal(signal.SIGINT)
-    assert train_sb3.main(arguments(tmp_path, steps=1000)) == 130
-    assert signal.getsignal(signal.SIGINT) is before
+    before = signal.getsignal(number)
+    assert train_sb3.main(arguments(tmp_path, steps=1000)) == 128 + number
+    assert signal.getsignal(number) is before
     metadata = read_policy(tmp_path / "latest.safetensors").metadata
     assert (metadata.timesteps, metadata.epochs) == (41, 2)
     assert "the last 8 steps, less than a batch, are not in it" in capsys.readouterr().out
@@ -302,7 +304,24 @@ def test_resume_needs_a_run_with_the_same_options(run, tmp_path, capsys):
         run.out, "--resume", "--eval-episodes", "5", steps=128, algorithm=run.algorithm
     )
     assert train_sb3.main(other) == 2
-    assert "eval_episodes = " in capsys.readouterr().err
+    assert "judged with eval_episodes 3, not 5" in capsys.readouterr().err
+    assert train_sb3.main([*other[:-2], "--episode-steps", "5"]) == 2
+    assert "judged with episode_steps 10, not 5" in capsys.readouterr().err
+
+
+def test_a_run_that_began_with_a_policy_is_resumed(run, tmp_path, capsys):
+    init = ("--init", str(run.out / "latest.safetensors"))
+    assert train_sb3.main(arguments(tmp_path, *init, algorithm=run.algorithm)) == 0
+    more = arguments(tmp_path, "--resume", steps=96, algorithm=run.algorithm)
+    assert train_sb3.main(more) == 0
+    assert read_policy(tmp_path / "latest.safetensors").metadata.timesteps == 96
+
+
+def test_a_policy_of_other_actions_is_not_begun_with(run, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(LearnableFake, "inputs", 9)
+    init = ("--init", str(run.out / "latest.safetensors"))
+    assert train_sb3.main(arguments(tmp_path, *init, algorithm=run.algorithm)) == 2
+    assert "is for 7 numbers and 7 actions, not for 9 and 7" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("option", ["num-envs", "n-steps", "gamma", "minutes"])

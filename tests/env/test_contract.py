@@ -10,6 +10,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import ms_slam_env
+from ms_slam_env import scenes
 from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.env.config import EnvConfig, make_config
 from ms_slam_env.errors import InputError
@@ -146,6 +147,30 @@ def test_saved_state_goes_on_to_the_bit_in_a_fresh_env(env_id):
     for action, outcome in zip(actions, expected, strict=True):
         assert_same(fresh.step(action), outcome)
     np.testing.assert_array_equal(fresh.unwrapped.lookahead(), expected_lookahead)
+
+
+def table(seed):  # the name of a scene that there is
+    """A scene as a function: a wall."""
+    return scenes.make("wall", seed=seed)
+
+
+def test_a_scene_that_is_a_function_is_gone_back_to():
+    options = {"scene": (table, "corridor"), "num_scene_seeds": 1}
+    env = gym.make("MSActiveSLAM-FreeCamera-v0", **options)
+    for seed in range(9):
+        _, info = env.reset(seed=seed)
+        if info["scene"] == "table":
+            break
+    state = env.unwrapped.save_state()
+    outcome = env.step(5)
+    world = env.unwrapped.simulation.world
+    env.unwrapped.load_state(state)
+    assert env.unwrapped.simulation.world is world
+    assert_same(env.step(5), outcome)
+    other = gym.make("MSActiveSLAM-FreeCamera-v0", **options)
+    other.unwrapped.load_state(state)
+    assert other.unwrapped.simulation.place == (table, state["episode"].scene_seed)
+    assert_same(other.step(5), outcome)
 
 
 def test_a_state_of_another_camera_is_refused_and_changes_nothing(env):

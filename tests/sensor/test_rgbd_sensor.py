@@ -13,6 +13,7 @@ from ms_slam_env._warp import wp
 from ms_slam_env.camera import Intrinsics, xtion
 from ms_slam_env.errors import InputError
 from ms_slam_env.sensor import RGBDSensor, depth_noise, images, rays, shading
+from ms_slam_env.sensor.noise import noise_config
 
 K = xtion("80x60")
 
@@ -95,6 +96,15 @@ def test_many_batch_sizes_keep_few_buffers(box_scene: BoxScene, pose) -> None:
         assert same(frames[0], first)
     assert len(sensor._of_thread.images) == 8
     assert same(sensor.capture(pose, 0), first)
+
+
+def test_a_sensor_with_another_noise_is_one_made_with_it(box_scene, sensor, pose) -> None:
+    strong = noise_config({"name": "kinect", "strength": 1.5})
+    before = sensor.capture(pose, 3).depth.copy()
+    frame = sensor.with_noise(strong).capture(pose, 3)
+    assert same(frame, RGBDSensor(box_scene, K, strong).capture(pose, 3))
+    np.testing.assert_array_equal(sensor.capture(pose, 3).depth, before)
+    assert (before != frame.depth).any()
 
 
 def test_frames_do_not_share_memory(sensor: RGBDSensor, pose) -> None:

@@ -1,11 +1,25 @@
 """Scenes are built once while they are kept; the ones longest not asked for go first."""
 
+from copy import copy
 from types import SimpleNamespace
 
 import pytest
 
 from ms_slam_env.camera import xtion
 from ms_slam_env.sensor import scene_cache
+
+
+class Sensor:
+    made = 0
+
+    def __init__(self, scene, intrinsics, noise):
+        self.noise = noise
+        Sensor.made += 1
+
+    def with_noise(self, noise):
+        made = copy(self)
+        made.noise = noise
+        return made
 
 
 @pytest.fixture
@@ -20,7 +34,7 @@ def built(monkeypatch):
     monkeypatch.setattr(scene_cache, "_kept", type(scene_cache._kept)())
     monkeypatch.setattr(scene_cache, "FACES_KEPT", 100)
     monkeypatch.setattr(scene_cache.scenes, "make", make)
-    monkeypatch.setattr(scene_cache, "RGBDSensor", lambda *_, **__: SimpleNamespace())
+    monkeypatch.setattr(scene_cache, "RGBDSensor", Sensor)
     return made
 
 
@@ -55,3 +69,13 @@ def test_a_sensor_lives_as_long_as_its_scene(built):
     assert scene_cache.get_sensor("room", 60, xtion("160x120"), "kinect") is not first
     scene_cache.get_scene("room", 61)
     assert scene_cache.get_sensor("room", 60, camera, "kinect") is not first
+
+
+def test_drawn_noise_keeps_two_sensors_that_look_at_one_copy_of_the_scene(built):
+    before, camera = Sensor.made, xtion("80x60")
+    sensors = [scene_cache.get_sensor("room", 60, camera, k) for k in range(9)]
+    assert [sensor.noise for sensor in sensors] == list(range(9))
+    assert Sensor.made == before + 1
+    assert scene_cache.get_sensor("room", 60, camera, 8) is sensors[8]
+    ((_, kept),) = scene_cache._kept.values()
+    assert list(kept.values()) == [sensors[7], sensors[8]]
