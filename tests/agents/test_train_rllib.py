@@ -110,10 +110,21 @@ def test_moments_and_rewards_are_those_of_what_was_met_without_the_step_that_rll
     np.testing.assert_allclose(episodes[1].get_rewards()[:7], rewards[1, :7] / scale, rtol=1e-5)
 
 
-def make_fake(args):
+def make_fake(args, runner=0):
     """In a runner's process, to which the fake environment is new."""
     assert learnable_fake.ENV_ID in gym.registry
-    return train_rllib.Masked(train_rllib.make_env(args, "train", ()))
+    return train_rllib.Masked(train_rllib.make_env(args, "train", ()), runner)
+
+
+def test_a_seed_means_other_episodes_in_another_runner():
+    args = train_rllib.Args(env_id=ENV_ID, episode_steps=10)
+    first, other = make_fake(args, 1), make_fake(args, 2)
+    for env in (first, other):
+        env.reset(seed=3)
+        env.seen = [env.step(env.unwrapped.right)[0]["observations"] for _ in range(9)]
+    assert not np.array_equal(first.seen, other.seen)
+    again = first.reset(seed=3)[0]["observations"]
+    np.testing.assert_array_equal(again, first.reset(seed=3)[0]["observations"])
 
 
 class Strict(gym.Wrapper):
@@ -124,8 +135,9 @@ class Strict(gym.Wrapper):
         return self.env.step(action)
 
 
-def make_strict(args):
-    return train_rllib.Masked(Strict(make_fake(args).env))
+def make_strict(args, runner):
+    assert runner > 0
+    return train_rllib.Masked(Strict(make_fake(args).env), runner)
 
 
 def words(out, *more, steps):

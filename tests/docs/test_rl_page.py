@@ -15,14 +15,19 @@ BLOCKS = re.findall(
 SMALL = f"OPTIONS = {dict(scene='table', scene_seed=0, image_size='80x60', observation='features')}"
 
 
-def test_the_examples_run(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_examples_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     for name in ("torch", "sb3_contrib", "stable_baselines3"):
         pytest.importorskip(name)
     monkeypatch.chdir(ROOT)
     sources = [source for _, source in BLOCKS if source]
-    assert len(sources) == 8
+    assert len(sources) == 9
     names: dict[str, Any] = {}
     for source in sources:
         small = re.sub(r"^OPTIONS = .*$", SMALL, source, flags=re.MULTILINE)
         exec(compile(small, "docs/rl.md", "exec"), names)
     assert len(names["best"]) == 4
+    names["model"].save(tmp_path / "model.zip")
+    env = names["gym"].make(names["ID"], **names["OPTIONS"])
+    observation, info = env.reset(seed=0)
+    planner = names["MySb3"](env.unwrapped, path=str(tmp_path / "model.zip"))
+    assert info["action_mask"][planner.act(observation, info)]
