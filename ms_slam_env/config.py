@@ -271,6 +271,19 @@ def parse_named(text: str, kind: str) -> tuple[str, dict[str, Any]]:
     return name, options
 
 
+def free_options(texts: Sequence[str], taken: Sequence[str]) -> dict[str, Any]:
+    """``nested_options`` of an environment, but for those that the command has options for itself.
+
+    Raises:
+        InputError: as there, or one that is ``taken``.
+    """
+    found = nested_options(texts)
+    for name in found:
+        if name in (*taken, "max_episode_steps"):
+            raise InputError(f"option {name!r} is not free: the command sets it")
+    return found
+
+
 def nested_options(texts: Sequence[str]) -> dict[str, Any]:
     """Nested mapping from texts ``name.name=value``; values are YAML.
 

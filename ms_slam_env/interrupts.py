@@ -67,6 +67,22 @@ class Interrupts:
 
 
 @contextmanager
+def sigterm_exits() -> Iterator[None]:
+    """Let SIGTERM end the process as ``sys.exit`` does: what is to be done at the end is done.
+
+    Workers are ended by it. Outside the main thread this changes nothing.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
 def kept(what: str) -> Iterator[None]:
     """Let an interrupt in here say ``what`` is kept of the work."""
     try:

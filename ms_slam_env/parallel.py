@@ -211,9 +211,15 @@ class Pool:
         return len(self._working)
 
     def give(self, key: Any, spec: Any) -> None:
-        """Let an idle worker run ``spec``; there must be one."""
+        """Let an idle worker run ``spec``; there must be one; if it died, another in its place."""
         worker = self._resting.pop() if self._resting else self._start()
-        self._working[worker.send(spec)] = (worker, key, time.perf_counter())
+        try:
+            sent = worker.send(spec)
+        except BrokenPipeError:
+            worker.stop()
+            worker = self._start()
+            sent = worker.send(spec)
+        self._working[sent] = (worker, key, time.perf_counter())
 
     def take(self, timeout_s: float | None = None) -> list[Outcome]:
         """Wait for outcomes, at most so long; those that are there, none if no worker is busy.

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -85,6 +87,21 @@ def test_waiting_ends_at_its_limit_and_without_work() -> None:
         assert (pool.idle, pool.busy) == (0, 1)
         assert pool.take(timeout_s=0.0) == []
         assert [outcome.key for outcome in pool.take()] == ["a"]
+
+
+def test_a_worker_that_died_while_it_rested_is_replaced() -> None:
+    with open_pool(work, workers=1) as pool:
+        pool.give("a", 2)
+        (first,) = pool.take()
+        os.kill(first.value["pid"], signal.SIGKILL)
+        for _ in range(100):  # until its end of the pipe is gone
+            if not Path(f"/proc/{first.value['pid']}/fd/0").exists():
+                break
+            time.sleep(0.05)
+        pool.give("b", 3)
+        (second,) = pool.take()
+    assert (second.key, second.value["square"]) == ("b", 9)
+    assert second.value["pid"] != first.value["pid"]
 
 
 def test_there_must_be_a_worker() -> None:

@@ -112,6 +112,10 @@ def main(arguments: Sequence[str]) -> int:
             "Missing files: ESTIMATE GROUNDTRUTH, --runs FILE ... --truth GROUNDTRUTH, or "
             "--map ESTIMATE --true-map GROUNDTRUTH"
         )
+    for name in () if args.runs else ("deltas",):
+        _refuse_given(args, name, "--runs")
+    for name in () if args.map else _OF_MAPS:
+        _refuse_given(args, name, "--map")
     if (args.tables or args.rerun) and args.out is None:
         raise InputError("--tables and --rerun write files: they need --out FOLDER")
     from ms_slam_env.evaluation import evaluation_report as report
@@ -137,6 +141,18 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
+_OF_MAPS = (
+    *("register", "cutoff_m", "remove_outliers", "neighbours", "std_ratio", "two_sided"),
+    *("thresholds_m", "voxel_m", "samples"),
+)
+
+
+def _refuse_given(args: Arguments, name: str, needed: str) -> None:
+    """Refuse an option that would change nothing."""
+    if getattr(args, name) != getattr(Arguments, name):
+        raise InputError(f"--{name.replace('_', '-')} needs {needed}")
+
+
 def _trajectory_options(args: Arguments) -> TrajectoryOptions:
     from ms_slam_env.evaluation.trajectory_files import TrajectoryOptions
 
@@ -158,14 +174,4 @@ def _trajectory_options(args: Arguments) -> TrajectoryOptions:
 def _map_options(args: Arguments) -> MapOptions:
     from ms_slam_env.evaluation.map_files import MapOptions
 
-    return MapOptions(
-        register=args.register,
-        cutoff_m=args.cutoff_m,
-        remove_outliers=args.remove_outliers,
-        neighbours=args.neighbours,
-        std_ratio=args.std_ratio,
-        two_sided=args.two_sided,
-        thresholds_m=args.thresholds_m,
-        voxel_m=args.voxel_m,
-        samples=args.samples,
-    )
+    return MapOptions(**{name: getattr(args, name) for name in _OF_MAPS})

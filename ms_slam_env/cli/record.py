@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 import ms_slam_env
 from ms_slam_env.command_line import parse
-from ms_slam_env.config import Checked, bounded, chosen, nested_options
+from ms_slam_env.config import Checked, bounded, chosen, free_options
 from ms_slam_env.env.lerobot_dataset import DatasetWriter, Steps
 from ms_slam_env.env.planners import check_planner, make_planner, planner_observation
 from ms_slam_env.errors import InputError
@@ -37,6 +37,7 @@ _INFOS = (
 )
 """What is kept of ``info`` at every step."""
 
+_OWN_OPTIONS = ("scene", "split", "num_scene_seeds", "observation")
 _MARKERS = {"minari": "data/metadata.json", "lerobot": "meta/info.json"}
 """Format to the file that a whole dataset has."""
 _NEEDS = {"minari": "minari", "lerobot": "pyarrow"}
@@ -159,7 +160,7 @@ def _environment(args: Args) -> gym.Env[Any, Any]:
         split=args.seeds,
         num_scene_seeds=args.scene_seeds,
         observation=args.observation or planner_observation(args.planner),
-        **nested_options(args.options),
+        **free_options(args.options, _OWN_OPTIONS),
     )
 
 

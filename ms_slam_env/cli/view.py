@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 import ms_slam_env
 from ms_slam_env.command_line import parse
-from ms_slam_env.config import Checked, bounded, chosen, nested_options
+from ms_slam_env.config import Checked, bounded, chosen, free_options
 from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.env.planners import check_planner, make_planner, planner_observation
 from ms_slam_env.env.rerun_view import EpisodeView
@@ -59,7 +59,7 @@ def main(arguments: Sequence[str]) -> int:
         scene=args.scene,
         scene_seed=args.scene_seed,
         observation=planner_observation(args.planner),
-        **nested_options(args.options),
+        **free_options(args.options, ("scene", "scene_seed", "observation")),
     )
     try:
         _play(env, args)

@@ -100,12 +100,18 @@ class Compare(Experiment, Checked):
             if is_command(text):
                 check_command(text)
             else:
-                slam.POINT.find(parse_named(text, "backend")[0])
+                slam.check_parameters(*parse_named(text, "backend"))
         for size in self.image_sizes:
             parse_image_size(size)
         names = [*self.backends, *(pattern.name for pattern in self._patterns())]
         if len(set(names)) < len(names):
             raise InputError(f"backends and trajectories {', '.join(names)} must differ")
+        for pattern in self._patterns():
+            files = {pattern.file(sequence) for sequence in self.sequences}
+            if len(files) < len(set(self.sequences)):
+                raise InputError(
+                    f"trajectories {pattern.pattern!r}: two of the sequences have the same file"
+                )
         if self.reference and self.reference not in names:
             raise unknown("reference", self.reference, names)
 

@@ -91,10 +91,8 @@ class DifficultyErrors(Experiment, Checked):
         path = HandheldPath(spec.frames)
         opened = open_sequence(spec.sequence, spec.image_size, path=path, with_truth=True)
         opened = opened.where_known()
-        frames = tuple(opened.frames)
-        sequence = RGBDSequence(frames, opened.poses, opened.intrinsics, opened.name)
-        watched = watch_frames(sequence, HISTOGRAMS)
-        distances = consecutive_distances(frames, sequence.poses, sequence.intrinsics)
+        watched = watch_frames(opened, HISTOGRAMS)
+        distances = consecutive_distances(tuple(opened.frames), opened.poses, opened.intrinsics)
         values = {
             **{(name, kind): watched.divergences[name][:, k]
                for name in HISTOGRAMS for k, kind in enumerate(KINDS)},
@@ -102,12 +100,12 @@ class DifficultyErrors(Experiment, Checked):
             **{("motion", name): watched.motion[name] for name in MOTIONS},
         }  # fmt: skip
         return {
-            "frames": len(frames),
+            "frames": len(opened),
             "measures": [
                 {"measure": name, "divergence": kind, "difficulty": float(np.mean(of))}
                 for (name, kind), of in values.items()
             ],
-            "backends": [_errors(text, sequence) for text in spec.backends],
+            "backends": [_errors(text, opened) for text in spec.backends],
         }
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
@@ -134,13 +132,18 @@ def correlations(rows: Sequence[Row]) -> list[dict[str, Any]]:
         return []
     lines = []
     for m, of in enumerate(results[0]["measures"]):
-        hard = [result["measures"][m]["difficulty"] for result in results]
         for b, backend in enumerate(results[0]["backends"]):
-            errors = {key: [r["backends"][b][key] for r in results] for key in ERRORS}
-            found = {ERRORS[key]: rank_correlation(hard, of_key) for key, of_key in errors.items()}
+            found = {ERRORS[key]: _correlation(results, m, b, key) for key in ERRORS}
             labels = {key: of[key] for key in ("measure", "divergence")}
             lines.append({**labels, "backend": backend["backend"], **found})
     return lines
+
+
+def _correlation(results: Sequence[Row], m: int, b: int, key: str) -> float:
+    """Of a measure and an error, over the sequences that have both; NaN of fewer than three."""
+    pairs = [(r["measures"][m]["difficulty"], r["backends"][b][key]) for r in results]
+    known = [pair for pair in pairs if None not in pair and np.isfinite(pair).all()]
+    return rank_correlation(*zip(*known, strict=True)) if len(known) > 2 else float("nan")
 
 
 def _errors(backend: str, sequence: RGBDSequence) -> dict[str, Any]:

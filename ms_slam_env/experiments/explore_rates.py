@@ -136,12 +136,13 @@ class ExploreRates(Checked, Experiment):
         for (every, sampler), results in _studies(rows).items():
             default = results[0]["trials"][0]
             front = front_of_trials(_trials(results))
-            no_slower = [t[ERROR] for t in front if t[COST] <= default[COST]]
-            no_worse = [t[COST] for t in front if t[ERROR] <= default[ERROR]]
+            error, cost = default.get(ERROR), default.get(COST)  # none where it broke down
+            no_slower = [t[ERROR] for t in front if cost is not None and t[COST] <= cost]
+            no_worse = [t[COST] for t in front if error is not None and t[ERROR] <= error]
             lines.append({
                 **{"keep_every": every, "sampler": sampler, "count": len(_trials(results))},
                 **{name: results[0][name] for name in ("M_I", "M_D")},
-                **{"default_error": default[ERROR], "default_cost": default[COST]},
+                **{"default_error": error, "default_cost": cost},
                 "error": min(no_slower, default=None),
                 "cost": min(no_worse, default=None),
             })  # fmt: skip
@@ -163,7 +164,7 @@ class ExploreRates(Checked, Experiment):
             drawn.setdefault(sampler, []).extend(
                 [
                     _series(f"every {every}", front, "lines+markers"),
-                    _series(f"default, every {every}", [default], "markers"),
+                    _series(f"default, every {every}", _trials([{"trials": [default]}]), "markers"),
                 ]
             )
         caption = "A line: what no other trial of that frame rate beats."

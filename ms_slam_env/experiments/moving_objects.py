@@ -17,6 +17,7 @@ from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.evaluation.moving_objects import found_masks, mask_measures, true_masks
 from ms_slam_env.evaluation.run_sequence import run_sequence
 from ms_slam_env.experiments.harness.experiment import Experiment
+from ms_slam_env.experiments.pictures.drawing import save_image
 from ms_slam_env.report.charts import Chart, scatter
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished, make_table, summary
@@ -156,8 +157,7 @@ class MovingObjectsExperiment(Experiment, Checked):
             return
         most = max(moving, key=lambda row: row["result"]["moving_share"])["spec"]["sequence"]
         spec = MovingObjectsSpec(most, (), self.image_size, self.frames)
-        compression = [cv2.IMWRITE_PNG_COMPRESSION, 9]
-        cv2.imwrite(str(out / "mask.png"), _picture(_rendered(spec))[..., ::-1], compression)
+        save_image(out / "mask.png", _picture(_rendered(spec)), compression=9)
 
 
 def _rendered(spec: MovingObjectsSpec) -> RenderedSequence:

@@ -130,7 +130,8 @@ class PlannerBenchmark(Experiment):
         if len(self.tasks) > 1:
             return seeds
         grouping = Grouping(("planner",), (*HEADLINE, *DETAILS), rank_by=RANKED_BY)
-        lines: Sequence[Mapping[str, Any]] = grouping.table(rows).rows
+        pairs = complete_cases(rows, ("scene", "seed"), "planner")
+        lines: Sequence[Mapping[str, Any]] = grouping.table(pairs).rows
         return {
             **seeds,
             "summary": {

@@ -158,6 +158,8 @@ def _guides(panel: Panel) -> list[dict[str, Any]]:
         along = "x" if guide.axis == "y" else "y"
         key = panel.y if guide.axis == "y" else panel.x
         value = guide.value * (metric(key).scale if key else 1)
+        if not math.isfinite(value):
+            continue
         lines.append(
             {
                 "type": "line",

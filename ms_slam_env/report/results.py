@@ -154,12 +154,25 @@ def write_result_folder(
     """
     from ms_slam_env.report.figures import save_charts
 
+    before = _figures_of(out / name)
     with result_folder(out, name) as folder:
         results = write_results(folder / name, **result)
         write_text(folder / TABLE, results.as_markdown())
         save_charts(results.charts, folder)
         write_more(folder)
+    for figure in before - {f"{chart.name}.png" for chart in results.charts}:
+        (out / figure).unlink(missing_ok=True)
     return results
+
+
+def _figures_of(path: Path) -> set[str]:
+    """Files of the charts that a result before had, which the next one may not have."""
+    try:
+        return (
+            {f"{chart.name}.png" for chart in read_results(path).charts} if path.exists() else set()
+        )
+    except InputError:
+        return set()
 
 
 def read_results(path: Path) -> Results:
@@ -168,7 +181,10 @@ def read_results(path: Path) -> Results:
     Raises:
         InputError: no such file, not a result, or keys that the registry does not know.
     """
-    content = from_plain(read_json(path, "result", _MAX_BYTES))
+    try:
+        content = from_plain(read_json(path, "result", _MAX_BYTES))
+    except RecursionError:
+        raise InputError(f"{path} is not a result of ms-slam: it is nested too deeply") from None
     if not is_result(content):
         raise InputError(f"{path} is not a result of ms-slam: it has no kind and tables")
     try:

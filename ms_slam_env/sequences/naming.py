@@ -179,6 +179,8 @@ def open_sequence(
         raise InputError(f"every = {every} must be at least 1")
     named = parse_sequence(name)
     if isinstance(named, SequenceName):
+        if layout != "auto" or intrinsics is not None or register is not None:
+            raise InputError(f"{name} is rendered: layout, intrinsics and register are of folders")
         size = RENDERED_SIZE if image_size in (None, NATIVE) else image_size
         sequence = _rendered(named, size, path or HandheldPath())
     else:

@@ -224,7 +224,11 @@ def render(
 
 
 def describe(
-    name: str, image_size: str = "160x120", seed: int = 2000, frames_scale: float = 1.0
+    name: str,
+    image_size: str = "160x120",
+    seed: int = 2000,
+    frames_scale: float = 1.0,
+    with_truth: bool = False,
 ) -> dict[str, Any]:
     """What makes a sequence, for its folder."""
     return {
@@ -234,6 +238,7 @@ def describe(
         "image_size": image_size,
         "seed": seed,
         "frames_scale": frames_scale,
+        **({"truth": True} if with_truth else {}),
     }
 
 
@@ -260,7 +265,7 @@ def make_suite(
         if entry.scene not in made:
             made = {entry.scene: scenes.make(entry.scene, seed)}  # one is large enough
         sequence = render(entry, made[entry.scene], image_size, frames_scale)
-        about = describe(name, image_size, seed, frames_scale)
+        about = describe(name, image_size, seed, frames_scale, with_truth)
         write_sequence(sequence, out / name, about, with_truth)
         folders.append(out / name)
     return folders

@@ -364,6 +364,8 @@ def test_two_poses_and_a_camera_that_stands_still(tmp_path: Path) -> None:
         (["--align", "origin", "--align-first", "3"], "se3, sim3, yaw align by the first poses"),
         (["--align-first", "0"], "align_first = 0 is outside"),
         (["--map", "map.ply"], "maps are given as --map ESTIMATE --true-map GROUNDTRUTH"),
+        (["--deltas", "1", "2"], "--deltas needs --runs"),
+        (["--cutoff-m", "0.1"], "--cutoff-m needs --map"),
     ],
 )
 def test_bad_options_are_one_line_and_code_2(

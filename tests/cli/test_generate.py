@@ -137,6 +137,7 @@ def test_an_interrupted_command_goes_on_to_the_same_files(tmp_path) -> None:
         (["--planner", "greedy,depth=3"], "unknown option of planner greedy 'depth'"),
         (["--planner", "greedy", "--trajectory", "t.txt"], "exclude each other"),
         (["--steps", "5"], "the options of an episode need --planner"),
+        (["--scale", "0.5"], "--scale is of the motion of a --trajectory"),
         (["--planner", "greedy", "--steps", "0"], "steps = 0 is outside"),
         (["--planner", "greedy", "--options", "speed=3"], "speed"),
         (["--planner", "greedy", "--env-id", "Mars-v0"], "Mars-v0"),

@@ -96,6 +96,7 @@ def test_a_network_learns_from_it(tmp_path, monkeypatch):
         (("--scenes", "kitchn"), "unknown scene 'kitchn'"),
         (("--observation", "smell"), "unknown observation 'smell'"),
         (("--options", "colour"), "not name=value"),
+        (("--options", "scene=wall"), "option 'scene' is not free"),
         (("--episodes", "0"), "episodes"),
         (("--name", "../x-v0"), "not of the form NAME-v0"),
     ],

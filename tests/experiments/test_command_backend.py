@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
+import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -91,6 +95,45 @@ def test_a_program_that_takes_too_long_is_stopped(program, tmp_path) -> None:
     with pytest.raises(InputError, match=r"was stopped after 1 s"):
         run_command(program.format("sleeps"), opened(), tmp_path / "t.txt", 1.0)
     assert time.monotonic() - began < 30
+
+
+def test_what_a_program_started_ends_with_it(tmp_path) -> None:
+    known = tmp_path / "pid"
+    words = f"sleep 60 & echo $! > {known}; wait # {{sequence}} {{trajectory}}"
+    with pytest.raises(InputError, match=r"was stopped after 1 s"):
+        run_command(f"command:sh -c '{words}'", opened(), tmp_path / "t.txt", 1.0)
+    _ends(int(known.read_text()))
+
+
+def test_a_worker_that_is_ended_ends_its_program_and_leaves_no_frames(tmp_path) -> None:
+    known = tmp_path / "pid"
+    words = f"pwd > {tmp_path}/folder; echo $$ > {known}; sleep 60 # {{sequence}} {{trajectory}}"
+    code = (
+        "from pathlib import Path; from test_command_backend import opened;"
+        "from ms_slam_env.experiments.harness.command_runs import run_command;"
+        f"run_command({f'command:sh -c {words!r}'!r}, opened(), Path('x'), 60.0)"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    worker = subprocess.Popen([sys.executable, "-c", code], env=environment)
+    began = time.monotonic()
+    while not (known.exists() and known.read_text()) and time.monotonic() - began < 60:
+        time.sleep(0.1)
+    worker.terminate()
+    assert worker.wait(30) == 128 + signal.SIGTERM
+    _ends(int(known.read_text()))
+    assert not Path((tmp_path / "folder").read_text().strip()).exists()
+
+
+def _ends(pid: int) -> None:
+    """Wait until a process is gone, or a zombie that nobody asks for."""
+    status, began = Path(f"/proc/{pid}/status"), time.monotonic()
+    while time.monotonic() - began < 20:
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+            if "State:\tZ" not in status.read_text():
+                time.sleep(0.1)
+                continue
+        return
+    raise AssertionError(f"process {pid} goes on")
 
 
 @pytest.mark.parametrize(

@@ -8,12 +8,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from ms_slam_env.cli import main
+from ms_slam_env.errors import InputError
 from ms_slam_env.experiments import compare
 from ms_slam_env.experiments.compare import PEERS, Compare
 from ms_slam_env.experiments.harness.compare_runs import CompareSpec
-from ms_slam_env.experiments.harness.compare_tables import METRICS, comparison_tables
+from ms_slam_env.experiments.harness.compare_tables import (
+    METRICS,
+    comparison_tables,
+    distinct_names,
+)
 from ms_slam_env.geometry import invert, se3_exp
 from ms_slam_env.metrics import ate_rmse
 from ms_slam_env.report.statistics import median_interval, share_interval
@@ -107,6 +114,38 @@ def test_the_trajectory_of_a_backend_has_the_numbers_of_the_backend(
     assert part["ate_m"] == pytest.approx(ate_rmse(held, truth), abs=1e-6)
     first = ate_rmse(truth[3] @ invert(held[3]) @ held, truth, align="none")
     assert part["ate_unaligned_m"] == pytest.approx(first, abs=1e-6)
+
+
+@given(st.lists(st.lists(st.sampled_from("ab"), min_size=2, max_size=4).map("/".join), unique=True))
+def test_folders_have_names_of_their_own(folders: list[str]) -> None:
+    names = distinct_names([*folders, "table:1"])
+    ends = [folder for folder in folders if not any(o.endswith("/" + folder) for o in folders)]
+    assert len({names[folder] for folder in ends}) == len(ends)
+    assert all(folder.endswith(names[folder]) for folder in folders)
+    assert names["table:1"] == "table:1"
+
+
+def test_folders_of_one_name_are_two_sequences() -> None:
+    rows = []
+    for row in ROWS:
+        name = {"a:1": "x/s", "b:1": "y/s", "c:1": "c:1"}[row["spec"]["sequence"]]
+        rows.append({**row, "spec": {**row["spec"], "sequence": name}})
+    table, _ = Compare().tables(rows)
+    assert {line["sequence"] for line in table.rows} == {"x/s", "y/s", "c:1", "median"}
+    assert "over 2 of 3 sequences" in table.note
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        ({"backends": ("surfel,loop_closur=deformation",)}, "loop_closur"),
+        ({"sequences": ("x/s", "y/s"), "trajectories": ("orb=o/{sequence}.txt",)}, "same file"),
+    ],
+)
+def test_what_no_run_could_use_is_refused(more, said, monkeypatch) -> None:
+    monkeypatch.setattr(compare, "check_sequence", lambda text: None)
+    with pytest.raises(InputError, match=said):
+        Compare(**more)
 
 
 def test_a_system_without_any_trajectory_is_refused(

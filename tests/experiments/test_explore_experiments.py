@@ -108,6 +108,11 @@ def test_rates_have_a_front_each(sequence, tmp_path):
         assert line["error"] <= line["default_error"]
         assert line["cost"] <= line["default_cost"]
     assert (tmp_path / "fronts.png").stat().st_size > 0
+    for row in rows:  # the default broke down: the others stand
+        row["result"]["trials"][0] = {"parameters": default, "failed": True}
+    (table,) = experiment.tables(rows)
+    assert [(line["default_error"], line["cost"]) for line in table.rows] == [(None, None)] * 4
+    assert len(experiment.charts(rows)[0].panels) == 2
 
 
 def test_a_front_of_trials_is_what_none_beats():

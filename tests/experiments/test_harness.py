@@ -122,6 +122,17 @@ def test_a_check_finds_what_changed(
     ):
         with pytest.raises(InputError, match=message):
             check_results(Wobbles, wrong)
+    ran = []
+    monkeypatch.setattr(Wobbles, "run", staticmethod(lambda spec: ran.append(spec)))
+    for code in (
+        "command:touch x {sequence} {trajectory}",
+        "os:abort",
+        {"planner": "mine:Own,a=1"},
+    ):
+        rows = [{**row, "spec": {**row["spec"], "scene": code}} for row in committed.rows]
+        with pytest.raises(InputError, match="name code, .*not run"):
+            check_results(Wobbles, replace(committed, rows=rows))
+    assert not ran
     changed = lambda spec: {"ate_m": 0.5, "cpu_ms_median": 9.0, "lost": False}  # noqa: E731
     changed.__annotations__ = {"spec": Wobble}
     monkeypatch.setattr(Wobbles, "run", staticmethod(changed))

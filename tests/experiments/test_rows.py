@@ -19,8 +19,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ms_slam_env.errors import InputError, InputWarning
+from ms_slam_env.experiments.harness import rows as rows_module
 from ms_slam_env.experiments.harness.episodes import EpisodeSpec
 from ms_slam_env.experiments.harness.rows import RECORDS, failures, names, run_all
+from ms_slam_env.metrics.registry import RESULTS_VERSION
 from ms_slam_env.report.records import RecordFile, spec_key, write_json
 
 
@@ -39,6 +41,28 @@ def test_finished_work_is_not_done_again(tmp_path: Path) -> None:
     rows = run_all(specs, square, tmp_path / "out", workers=1)
     assert sorted(log.read_text().split()) == ["0", "1", "2", "3"]
     assert [row["result"]["square"] for row in rows] == [0, 1, 4, 9]
+
+
+def test_what_is_given_twice_counts_once(tmp_path: Path) -> None:
+    rows = run_all([Square(2), Square(3), Square(2)], square, tmp_path, workers=1)
+    assert [row["result"]["square"] for row in rows] == [4, 9]
+
+
+def test_rows_of_an_older_algorithm_are_made_again(tmp_path, monkeypatch, capsys) -> None:
+    log, specs = tmp_path / "log", [Square(1, log=str(tmp_path / "log"))]
+    given = {"workers": 1, "kind": "planners"}
+    run_all(specs, square, tmp_path / "out", **given)
+    monkeypatch.setattr(rows_module, "git_commit", lambda: "another")
+    run_all(specs, square, tmp_path / "out", **given)
+    assert log.read_text().split() == ["1"]
+    assert "1 of 1 already in" in capsys.readouterr().err
+    known = {RESULTS_VERSION + 1: ("planners",)}
+    since = lambda version, kind: {n: "" for n, of in known.items() if n > version and kind in of}  # noqa: E731
+    monkeypatch.setattr(rows_module, "versions_since", since)
+    run_all(specs, square, tmp_path / "out", workers=1, kind="compare")
+    assert log.read_text().split() == ["1"]
+    run_all(specs, square, tmp_path / "out", **given)
+    assert log.read_text().split() == ["1", "1"]
 
 
 def test_a_changed_spec_is_other_work(tmp_path: Path) -> None:

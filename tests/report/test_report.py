@@ -8,6 +8,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from html import escape, unescape
 from itertools import chain
 from pathlib import Path
@@ -26,7 +27,7 @@ from ms_slam_env.report.charts import Chart, Guide, Panel, Series
 from ms_slam_env.report.discovery import find_results
 from ms_slam_env.report.page import page, write_report
 from ms_slam_env.report.plotly_charts import PALETTE, plots_of
-from ms_slam_env.report.results import read_results, write_results
+from ms_slam_env.report.results import RESULTS, read_results, write_result_folder, write_results
 from ms_slam_env.report.statistics import Interval
 from ms_slam_env.report.tables import Column, make_table
 
@@ -211,6 +212,32 @@ def test_files_beside_a_result_are_shown_with_it(tmp_path: Path) -> None:
     assert [(missing.name, missing.reason) for missing in absent] == [("long.txt", "is too large")]
 
 
+def test_figures_that_the_next_result_has_not_go(tmp_path: Path) -> None:
+    first, second = (replace(example_charts()[0], name=name) for name in ("first", "second"))
+    for charts in ([first, second], [second]):
+        write_result_folder(
+            tmp_path,
+            RESULTS,
+            kind="planners",
+            title="",
+            about="",
+            tables=[],
+            charts=charts,
+            rows=[],
+        )
+        (tmp_path / "mine.png").write_bytes(b"a picture")
+    assert sorted(path.name for path in tmp_path.glob("*.png")) == ["mine.png", "second.png"]
+
+
+@pytest.mark.parametrize("value", ["Infinity", float("nan")])
+def test_a_guide_without_a_place_is_left_out(tmp_path: Path, value: Any) -> None:
+    path = write_example(tmp_path / "results.json")
+    charts = json.loads(path.read_text())["charts"]
+    charts[0]["panels"][0]["guides"][0]["value"] = value
+    edit(path, charts=charts)
+    assert '"name":"target"' not in report_of(tmp_path)
+
+
 def test_a_file_outside_the_folder_is_not_shown(tmp_path: Path) -> None:
     (tmp_path / "secret.yaml").write_text("not of this folder")
     write_example(tmp_path / "a/results.json")
@@ -222,10 +249,11 @@ def test_what_is_no_result_is_named_and_not_guessed_at(tmp_path: Path) -> None:
     write_example(tmp_path / "a/results.json")
     (tmp_path / "list.json").write_text('[{"ate_m": 0.123456}]')
     (tmp_path / "broken.json").write_text('{"a": ')
+    (tmp_path / "deep.json").write_text(600 * "[" + 600 * "]")
     edit(write_example(tmp_path / "b/unknown.json"), tables=[{"columns": [{"name": "zz"}]}])
     text = report_of(tmp_path)
     shown = text.partition("Not shown")[2]
-    for name in ("list.json", "broken.json", "b/unknown.json"):
+    for name in ("list.json", "broken.json", "deep.json", "b/unknown.json"):
         assert name in shown
     assert "0.123456" not in text
 

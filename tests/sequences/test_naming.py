@@ -82,6 +82,12 @@ def test_bad_names_are_refused_in_one_line(text: str, message: str) -> None:
         check_sequence(text)
 
 
+@pytest.mark.parametrize("more", [{"layout": "tum"}, {"register": True}, {"layout": "nonsense"}])
+def test_a_rendered_sequence_has_no_options_of_folders(more) -> None:
+    with pytest.raises(InputError, match="layout, intrinsics and register are of folders"):
+        open_sequence("table:1", "80x60", **more)
+
+
 def test_a_generated_sequence_is_that_of_its_parts() -> None:
     path = HandheldPath(4)
     sequence = open_sequence("table:1000:none+depth-dropout", "80x60", path=path)

@@ -416,6 +416,21 @@ def test_parts_follow_each_other(tum, tmp_path):
     np.testing.assert_allclose(sequence.poses, whole.truth)
 
 
+def test_parts_whose_truth_is_of_another_time_have_none(tum, tmp_path):
+    folder = shutil.copytree(tum, tmp_path / "unix")
+    lines = (folder / "groundtruth.txt").read_text().splitlines()
+    moved = [
+        f"{float(line.split()[0]) + 1e9} {line.split(' ', 1)[1]}"
+        for line in lines
+        if line[0] != "#"
+    ]
+    (folder / "groundtruth.txt").write_text("\n".join(moved))
+    again = shutil.copytree(folder, tmp_path / "again")
+    whole = open_recording(f"{folder},{again}")
+    assert whole.truth is None
+    assert not open_sequence(f"{folder},{again}", "16x12").known.any()
+
+
 def test_parts_whose_times_go_on_keep_them(tum, tmp_path):
     later = shutil.copytree(tum, tmp_path / "later")
     for name in ("rgb.txt", "depth.txt", "groundtruth.txt"):

@@ -103,6 +103,12 @@ def test_the_command_runs_on_both(euroc, kitti, tmp_path, capsys):
         ("mav0/cam0/sensor.yaml", "radial-tangential", "fov", "distortion model 'fov'; valid choi"),
         ("mav0/cam1/sensor.yaml", "T_BS", "T_SB", "T_BS, the pose of the sensor, is missing"),
         ("mav0/cam1/sensor.yaml", "intrinsics:", "K:", "intrinsics must be a list of 4 numbers"),
+        (
+            "mav0/cam1/sensor.yaml",
+            "intrinsics:",
+            "a: &a [1]\nb: *a\nintrinsics:",
+            "not a YAML file",
+        ),
         ("mav0/cam1/sensor.yaml", "- 320", f"- 1{400 * '0'}", "resolution: 10* is not finite"),
         ("mav0/cam1/sensor.yaml", "- 320", "- 321", r"images of \(240, 320\) and \(240, 321\)"),
         ("mav0/cam0/data.csv", ".png", "", "cam0/data/.* No such file"),

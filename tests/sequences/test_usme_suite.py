@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from ms_slam_env import scenes
 from ms_slam_env.geometry import look_at
 from ms_slam_env.sequences import MotionBlur, MovingObjects
-from ms_slam_env.sequences.usme_suite import SUITE, find, render
+from ms_slam_env.sequences.usme_suite import NAMES, SUITE, describe, find, render
 
 WITHOUT_BLUR = "residential-three-loops-blur"  # has the path of another
 LARGE = [e for e in SUITE if e.scene in scenes.LARGE_SCENES and e.name != WITHOUT_BLUR]
@@ -126,6 +126,12 @@ def test_the_fast_sequence_is_fast_and_the_black_frames_are_there():
     dark = [not black.frames[k].color.any() for k in (124, 125, 134, 135)]
     assert dark == [False, True, True, False]
     assert fast.frames[130].color.any()
+
+
+def test_what_was_made_without_its_truth_is_not_taken_for_it():
+    plain, true = (describe(NAMES[0], with_truth=given) for given in (False, True))
+    assert plain != true
+    assert {**plain, "truth": True} == true
 
 
 def test_moving_objects_are_in_the_hall():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import typing
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 
 from ms_slam_env.config import from_dict
 from ms_slam_env.errors import InputError
+from ms_slam_env.experiments.harness.command_runs import is_command
 from ms_slam_env.experiments.harness.experiment import Experiment
 from ms_slam_env.metrics.registry import metric
 from ms_slam_env.report.records import from_plain, to_plain
@@ -19,6 +21,8 @@ from ms_slam_env.report.tables import finished
 TOLERANCE = 0.02
 """Relative difference that other processors cause: rounding of the last bits, amplified."""
 _SMALLEST = 1e-6
+_OTHERS_CODE = re.compile(r"(?!ms_slam_(env|baselines|agents)\b)[A-Za-z_][\w.]*:[A-Za-z_]")
+"""As ``module:Class``; a sequence, ``scene:seed``, goes on with a digit."""
 
 
 def check_results(cls: type[Experiment], committed: Results) -> tuple[int, list[str]]:
@@ -43,6 +47,8 @@ def check_results(cls: type[Experiment], committed: Results) -> tuple[int, list[
     chosen = list(different.values())
     chosen += [row for row in rows if row not in chosen]
     chosen = chosen[: cls.check_rows]
+    for row in chosen:
+        _check_is_ours(row["spec"])
     differences = []
     for row in chosen:
         spec = from_dict(spec_type(cls), row["spec"])
@@ -50,6 +56,22 @@ def check_results(cls: type[Experiment], committed: Results) -> tuple[int, list[
         what = ", ".join(f"{key} {value}" for key, value in row["spec"].items())
         differences += [f"{what}: {text}" for text in compare(row["result"], again)]
     return len(chosen), differences
+
+
+def _check_is_ours(spec: Mapping[str, Any]) -> None:
+    """Refuse a specification that names a program, or code that does not come with the package.
+
+    Raises:
+        InputError: naming it.
+    """
+    for key, value in spec.items():
+        for text in value if isinstance(value, (list, tuple)) else (value,):
+            if isinstance(text, Mapping):
+                _check_is_ours(text)
+            elif isinstance(text, str) and (is_command(text) or _OTHERS_CODE.match(text)):
+                raise InputError(
+                    f"the committed results name code, {key} = {text[:80]!r}, which is not run"
+                )
 
 
 def spec_type(cls: type[Experiment]) -> type[Any]:

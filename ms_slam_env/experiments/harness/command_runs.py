@@ -7,9 +7,12 @@ no shell sees it, and the frames stand in a folder without true poses.
 
 from __future__ import annotations
 
+import contextlib
+import os
 import resource
 import shlex
 import shutil
+import signal
 import subprocess
 import tempfile
 import time
@@ -18,6 +21,7 @@ from pathlib import Path
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.input_files import is_named
+from ms_slam_env.interrupts import sigterm_exits
 from ms_slam_env.sequences import Sequence, associate, read_trajectory
 from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S
 from ms_slam_env.sequences.writing import write_frames
@@ -89,7 +93,7 @@ def run_command(
     """
     words = check_command(backend)
     about = f"command {backend.removeprefix(PREFIX)!r}"
-    with tempfile.TemporaryDirectory(prefix="ms-slam-command-") as name:
+    with sigterm_exits(), tempfile.TemporaryDirectory(prefix="ms-slam-command-") as name:
         folder, made = Path(name) / "sequence", Path(name) / "trajectory.txt"
         write_frames(sequence, folder)
         blanks = {SEQUENCE: str(folder), TRAJECTORY: str(made)}
@@ -108,23 +112,28 @@ def _run(words: list[str], folder: Path, about: str, timeout_s: float) -> Comman
     said = folder / "output.txt"
     with said.open("wb") as output:
         try:
-            done = subprocess.run(
+            program = subprocess.Popen(
                 words,
                 cwd=folder,
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                timeout=timeout_s,
-                check=False,
+                start_new_session=True,  # what it starts in turn ends with it
             )
-        except subprocess.TimeoutExpired:
-            raise InputError(f"{about} was stopped after {timeout_s:g} s") from None
         except OSError as error:
             raise InputError(f"{about} cannot be run: {error.strerror}") from None
-    if done.returncode:
+        try:
+            exit_code = program.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            raise InputError(f"{about} was stopped after {timeout_s:g} s") from None
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(program.pid, signal.SIGKILL)
+            program.wait()
+    if exit_code:
         words_said = " ".join(said.read_bytes()[-4096:].decode(errors="replace").split())
         last = f": {words_said[-_LAST_WORDS:]}" if words_said else ""
-        raise InputError(f"{about} failed with exit code {done.returncode}{last}")
+        raise InputError(f"{about} failed with exit code {exit_code}{last}")
     return CommandCost(time.perf_counter() - began, _children_s() - used)
 
 

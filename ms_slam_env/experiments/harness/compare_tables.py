@@ -30,7 +30,7 @@ Cell = Mapping[str, Any]
 
 def comparison_tables(rows: Sequence[Row], reference: str) -> list[Table]:
     """Of each image size: every sequence with medians, then differences from ``reference``."""
-    cells = [cell_of(group) for group in groups_of(rows)]
+    cells = cells_of(rows)
     tables = []
     for size in dict.fromkeys(cell["image_size"] for cell in cells):
         own = [cell for cell in cells if cell["image_size"] == size]
@@ -49,13 +49,31 @@ def groups_of(rows: Sequence[Row]) -> list[list[Row]]:
     return list(groups.values())
 
 
-def cell_of(repeats: Sequence[Row]) -> dict[str, Any]:
+def cells_of(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """One of each image size, sequence and system."""
+    shown = distinct_names([row["spec"]["sequence"] for row in rows])
+    return [_cell_of(group, shown) for group in groups_of(rows)]
+
+
+def distinct_names(sequences: Sequence[str]) -> dict[str, str]:
+    """Names of sequences: of folders, as much of the ends of their paths as tells them apart."""
+    paths = {text: Path(text).parts if "/" in text else (text,) for text in sequences}
+    names: dict[str, str] = {}
+    for text, parts in paths.items():
+        others = [other for name, other in paths.items() if name != text]
+        for count in range(1, len(parts) + 1):
+            if all(other[-count:] != parts[-count:] for other in others):
+                break
+        names[text] = "/".join(parts[-count:])
+    return names
+
+
+def _cell_of(repeats: Sequence[Row], shown: Mapping[str, str]) -> dict[str, Any]:
     """Medians over repeats; the error where all failed."""
     spec = repeats[0]["spec"]
-    text = spec["sequence"]
     cell: dict[str, Any] = {
         "image_size": spec["image_size"],
-        "sequence": Path(text).name if "/" in text else text,
+        "sequence": shown[spec["sequence"]],
         "backend": spec["backend"],
     }
     results = [row["result"] for row in finished(repeats)]

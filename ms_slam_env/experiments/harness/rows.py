@@ -15,6 +15,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.run_sequence import lost_throughout
 from ms_slam_env.experiments.harness.experiment import Experiment
 from ms_slam_env.interrupts import kept
+from ms_slam_env.metrics.registry import RESULTS_VERSION, versions_since
 from ms_slam_env.output_files import check_out_folder
 from ms_slam_env.parallel import Outcome as Done
 from ms_slam_env.parallel import one_thread_unless_set, open_pool, run_each
@@ -37,13 +38,17 @@ def run_all(
     ray: str | None = None,
     fresh: bool = False,
     environment: Mapping[str, str] | None = None,
+    kind: str = "",
 ) -> list[Row]:
     """Run every spec once, in parallel, and return one row for each, in the order of ``specs``.
 
+    One that is given twice has one row: twice it would count twice.
+
     Rows that an earlier call left in ``out`` are taken from there, except failed ones, which are
-    tried again. A row has ``key``, ``spec``, ``result`` (what ``run`` returned, None if it
-    raised or its process died), ``error`` (None or the message), ``elapsed_s`` and ``commit``
-    (of the code that made it).
+    tried again, and those whose numbers an algorithm of today would make otherwise. A row has
+    ``key``, ``spec``, ``result`` (what ``run`` returned, None if it raised or its process died),
+    ``error`` (None or the message), ``elapsed_s``, ``commit`` (of the code that made it) and
+    ``results_version``.
 
     Args:
         specs: dataclasses; the key of the work is made of all their fields.
@@ -54,6 +59,7 @@ def run_all(
         ray: address of a Ray cluster whose workers run the specs; None: processes of this machine.
         fresh: whether each spec has a process of its own.
         environment: variables of the processes; None: one thread each, unless set already.
+        kind: of the result, by which it is known what has changed since a row was made.
 
     Raises:
         InputError: fewer than one worker, no Ray or no cluster at the address, a folder that cannot
@@ -64,20 +70,27 @@ def run_all(
     check_out_folder(out)
     records = RecordFile(out / RECORDS)
     keys = [spec_key(spec) for spec in specs]
-    rows = {key: row for key, row in records.load().items() if row.get("error", "") is None}
+    rows = {
+        key: row
+        for key, row in records.load().items()
+        if row.get("error", "") is None
+        and not versions_since(row.get("results_version", RESULTS_VERSION), kind)
+    }
     todo = {key: spec for key, spec in zip(keys, specs, strict=True) if key not in rows}
     done = len(set(keys)) - len(todo)
+    commit = git_commit()
     if done:
-        print(f"{description}: {done} of {len(set(keys))} already in {out}", file=sys.stderr)
+        older = sum(rows[key].get("commit") != commit for key in set(keys) & rows.keys())
+        by = f", {older} of them made by other code" if older else ""
+        print(f"{description}: {done} of {len(set(keys))} already in {out}{by}", file=sys.stderr)
     if todo:
         with tqdm(total=len(set(keys)), initial=done, desc=description, unit="") as bar:
-            commit = git_commit()
             name_of = names(
                 {key: dataclasses.asdict(spec) for key, spec in zip(keys, specs, strict=True)}
             )
 
             def finish(row: Row) -> None:
-                row["commit"] = commit
+                row |= {"commit": commit, "results_version": RESULTS_VERSION}
                 records.append(row)
                 rows[row["key"]] = row
                 bar.update()
@@ -90,7 +103,7 @@ def run_all(
             with kept(f"finished {description} are kept in {out}; the same command goes on"), pool:
                 for outcome in run_each(pool, todo):
                     finish(_row(outcome, todo[outcome.key]))
-    return [rows[key] for key in keys]
+    return [rows[key] for key in dict.fromkeys(keys)]
 
 
 def failures(rows: Sequence[Row]) -> list[str]:
@@ -197,6 +210,7 @@ def run_experiment(
         ray=ray,
         fresh=experiment.fresh_process,
         environment=experiment.environment(),
+        kind=_kind(experiment),
     )
     check_any_finished(rows)
     wrong = [*failures(rows), *(lost_runs(rows) if experiment.tracks else [])]
@@ -205,14 +219,16 @@ def run_experiment(
 
 def write_all(experiment: Experiment, rows: Sequence[Row], out: Path) -> Results:
     """Write everything that is made of the rows into folder ``out``."""
-    # Where in the code a row failed is for who runs it, with the paths of that machine.
-    rows = [{k: v for k, v in row.items() if k != "traceback"} for row in rows]
+    # Where in the code a row failed is for who runs it, with the paths of that machine; the version
+    # is that of the whole.
+    left_out = ("traceback", "results_version")
+    rows = [{k: v for k, v in row.items() if k not in left_out} for row in rows]
     rows = from_plain(to_plain(rows))
     return write_result_folder(
         out,
         RESULTS,
         lambda folder: experiment.write_pictures(rows, folder),
-        kind=type(experiment).__module__.rpartition(".")[2],
+        kind=_kind(experiment),
         title=experiment.title(),
         about=experiment.about(),
         tables=experiment.tables(rows),
@@ -221,6 +237,10 @@ def write_all(experiment: Experiment, rows: Sequence[Row], out: Path) -> Results
         rows_key=experiment.rows_key,
         content={"config": as_config(experiment), **experiment.content(rows)},
     )
+
+
+def _kind(experiment: Experiment) -> str:
+    return type(experiment).__module__.rpartition(".")[2]
 
 
 def as_config(experiment: Any) -> dict[str, Any]:

@@ -18,7 +18,7 @@ import numpy as np
 from PIL import Image as Pillow
 from tqdm import tqdm
 
-from ms_slam_env.config import Checked, bounded, chosen, nested_options
+from ms_slam_env.config import Checked, bounded, chosen, free_options
 from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.env.planners import make_planner, planner_observation
 from ms_slam_env.errors import InputError
@@ -80,7 +80,7 @@ def save_film(options: Options) -> str:
         render_mode="rgb_array",
         observation=planner_observation(options.planner),
         **scene,
-        **nested_options(options.options),
+        **free_options(options.options, ("scene", "scene_seed", "observation", "render_mode")),
     )
     try:
         pictures = [narrowed(picture, options.width) for picture in play(env, options)]

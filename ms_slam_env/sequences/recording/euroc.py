@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from ms_slam_env.camera import Distortion, Intrinsics
+from ms_slam_env.config import load_yaml
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import Float64, check_pose, invert, make_pose, pose_from_quaternion
 from ms_slam_env.input_files import is_named, read_text
@@ -82,8 +82,8 @@ def _listed(camera: Path) -> list[tuple[float, Path, str]]:
 def _sensor(path: Path) -> dict[str, Any]:
     """What a ``sensor.yaml`` says."""
     try:
-        read = yaml.safe_load(read_text(path, "calibration"))
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        read = load_yaml(read_text(path, "calibration"))
+    except (RecursionError, ValueError) as error:
         raise InputError(f"{path} is not a YAML file: {str(error).splitlines()[0]}") from None
     if not isinstance(read, dict):
         raise InputError(f"{path} is not a mapping of options")
@@ -96,7 +96,7 @@ def _numbers(sensor: dict[str, Any], key: str, count: int | None, path: Path) ->
     is_right = bool(values) and (count is None or len(values) == count)
     if not is_right or not all(type(value) in (int, float) for value in values):
         many = "numbers" if count is None else f"{count} numbers"
-        raise InputError(f"{path}: {key} must be a list of {many}, got {given!r}")
+        raise InputError(f"{path}: {key} must be a list of {many}, got {str(given)[:80]}")
     return [number(str(value), f"{path}: {key}") for value in values]
 
 

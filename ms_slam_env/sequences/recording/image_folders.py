@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -63,7 +64,10 @@ def images(folder: Path) -> list[Path]:
     found = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
     if not found:
         raise InputError(f"{folder} holds no image; valid kinds: {', '.join(SUFFIXES)}")
-    return sorted(found, key=lambda path: [int(n) for n in re.findall(r"\d{1,30}", path.stem)])
+    if all(re.fullmatch(r"\d{1,30}\.\d{1,30}", path.stem) for path in found):  # seconds
+        return sorted(found, key=lambda path: (Decimal(path.stem), path.name))
+    key = lambda path: [int(n) for n in re.findall(r"\d{1,30}", path.stem)]  # noqa: E731
+    return sorted(found, key=lambda path: (key(path), path.name))
 
 
 def find_color(folder: Path) -> Path | None:

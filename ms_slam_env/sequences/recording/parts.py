@@ -61,6 +61,8 @@ def join_parts(parts: Sequence[Recording]) -> Recording:
     if times is not None and poses is not None:
         times, order = np.unique(times, return_index=True)
         poses = poses[order]
+        if not len(times):  # all before or after the frames
+            times = poses = None
     name = f"{first.name}_and_{len(parts) - 1}_more"
     return dataclasses.replace(
         first, name=name, entries=tuple(entries), truth_times=times, truth=poses
