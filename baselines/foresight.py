@@ -9,7 +9,7 @@ import numpy as np
 from ms_slam_baselines.greedy import distance_to_targets
 from numpy.typing import NDArray
 
-from ms_slam_env.config import check_range
+from ms_slam_env.config import check_range, check_whole
 from ms_slam_env.env import Planner
 from ms_slam_env.env.config import RewardConfig
 from ms_slam_env.errors import unknown
@@ -59,6 +59,7 @@ class Foresight(Planner):
         self.tried, self.order = tried, order
         self.noise, self.temperature = noise, temperature
         check_range(self, "tried", 1, 1000)
+        check_whole(self, "tried")
         check_range(self, "noise", 0, 1000)
         check_range(self, "temperature", 1e-6, 1000)
         if order not in ORDERS:

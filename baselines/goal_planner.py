@@ -10,7 +10,7 @@ import numpy as np
 from ms_slam_baselines.view_goals import views_anywhere
 from numpy.typing import NDArray
 
-from ms_slam_env.config import check_range
+from ms_slam_env.config import check_range, check_whole
 from ms_slam_env.env import Planner
 from ms_slam_env.geometry import look_at, make_pose
 from ms_slam_env.mapping import FREE, OccupancyMap, expected_gain, shortest_ways
@@ -23,6 +23,7 @@ Float64 = NDArray[np.float64]
 
 ARRIVED = 3  # steps from a goal
 KEPT_AWAY = 0.7  # steps from where tracking was lost
+_LEAST = 1e-6  # metres or radians of a step, which is divided by
 _SAME = 0.5  # steps within which a pose is one where the camera has been
 _LOOKAHEAD = 6  # positions of a way that are looked ahead
 _RANGES = {
@@ -30,6 +31,9 @@ _RANGES = {
     **{"replan": (1, 10_000), "cell_m": (0.02, 1), "reach_m": (0.5, 100)},
     **{"enough_m3": (0, 1000), "far_m": (0.1, 1000)},
 }
+
+
+_COUNTED = ("goals", "replan", "horizon", "points")
 
 
 class GoalPlanner(Planner):
@@ -76,13 +80,15 @@ class GoalPlanner(Planner):
         self.replan, self.cell_m, self.reach_m = replan, cell_m, reach_m
         self.enough_m3, self.far_m = enough_m3, far_m
         self.check(_RANGES)
-        self.steps = env.config.step_m, env.config.step_rad
+        self.steps = max(env.config.step_m, _LEAST), max(env.config.step_rad, _LEAST)
         self.reset()
 
     def check(self, ranges: Mapping[str, tuple[float, float]]) -> None:
-        """Refuse options outside ``ranges``."""
+        """Refuse options outside ``ranges``, and fractions of what is counted."""
         for name, (low, high) in ranges.items():
             check_range(self, name, low, high)
+            if name in _COUNTED:
+                check_whole(self, name)
 
     def reset(self) -> None:
         """Nothing is known yet."""
@@ -121,7 +127,7 @@ class GoalPlanner(Planner):
             self.map.add(self.env.slam, episode.last_frame.depth, here, self.env.intrinsics)
         action = self.choose_motion(here)
         self.heading_to = self.env.candidate_poses()[action]
-        if action == 0:
+        if np.array_equal(self.heading_to, here):  # it stays
             self.goal = None
         return action
 

@@ -72,7 +72,7 @@ class HeldNextBestView(NextBestView):
             if self.slip_cost:
                 values -= self.slip_cost * np.where(self.can, self.seen_risks, 0)
                 best = int(np.argmax(values))
-            if values[best] >= self.least_m3:
+            if values[best] >= self.least_m3 and values[best] > 0:
                 self.goal, self.given_up = None, 0
                 weights = np.exp((values / values[best] - 1) / _CHOICE)
                 self.weights = np.where(self.can, weights, 0)

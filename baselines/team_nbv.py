@@ -24,8 +24,8 @@ _LOOK_M = 1.5  # in front of a goal: what it is there to see
 class SharedMap:
     """One occupancy grid of all robots, whose poses are in one frame."""
 
-    def __init__(self, cell_m: float) -> None:
-        self.grid = OccupancyGrid(cell_m)
+    def __init__(self, cell_m: float, reach_m: float) -> None:
+        self.grid = OccupancyGrid(cell_m, reach_m)
 
     def add(
         self, slam: Any, depth: NDArray[np.float32], pose: Float64, intrinsics: Intrinsics
@@ -66,7 +66,7 @@ class TeamNextBestView(NextBestView):
     def reset(self) -> None:
         """Nothing is known yet, nobody is there."""
         super().reset()
-        self.map = SharedMap(self.cell_m)
+        self.map = SharedMap(self.cell_m, self.reach_m)
         self.mates = []
 
     def join(self, team: Sequence[TeamNextBestView]) -> None:

@@ -179,8 +179,18 @@ def check_range(owner: object, name: str, low: float, high: float) -> None:
             f"{type(owner).__name__}.{name} = {value!r} is outside [{low:g}, {high:g}]"
         )
     field = getattr(owner, "__dataclass_fields__", {}).get(name)
-    declared_int = field is not None and field.type in (int, "int", "int | None")
-    if declared_int and not isinstance(value, numbers.Integral):
+    if field is not None and field.type in (int, "int", "int | None"):
+        check_whole(owner, name)
+
+
+def check_whole(owner: object, name: str) -> None:
+    """Refuse ``owner.name`` if it is no whole number.
+
+    Raises:
+        InputError: naming the class, the field and its value.
+    """
+    value = getattr(owner, name)
+    if not isinstance(value, numbers.Integral):
         raise InputError(f"{type(owner).__name__}.{name} = {value!r} must be an integer")
 
 

@@ -267,6 +267,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
                     motion_mask=self.embodiment.action_masks(),
                     configuration=self._actions.configuration,
                     lookahead=lambda: self.lookahead() / maxima,
+                    here=episode.T_world_camera_estimate,
                     candidates=self.candidate_poses,
                     view=lambda: self.slam.predict(episode.T_world_camera_estimate[None], SCALE),
                     predicted=self._predicted,

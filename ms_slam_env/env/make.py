@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ms_slam_env.config import is_options
+from ms_slam_env.config import is_options, parse_named
 from ms_slam_env.env.active_slam import ActiveSlamEnv
 from ms_slam_env.env.config import EnvConfig
 from ms_slam_env.env.rerun_view import EpisodeView
@@ -47,7 +47,9 @@ def _make_for(task: Task, perturbed_by: str | None, **options: Any) -> ActiveSla
     """
     own: dict[str, Any] = {"scene": task.scenes, **task.options}
     configured, given = own.pop("slam_config", {}), options.get("slam_config", {})
-    if options.get("slam", "surfel") == "surfel" and is_options(given):
+    slam = options.get("slam", "surfel")
+    is_surfel = isinstance(slam, str) and parse_named(slam, "backend")[0] == "surfel"
+    if is_surfel and is_options(given):
         options = {**options, "slam_config": {**configured, **given}}
     env = _make(None, perturbed_by, **{**own, **options})
     for name, strength in task.perturbations.items():
@@ -86,4 +88,5 @@ def _hurried(strength: Mapping[str, Any], options: Mapping[str, Any]) -> dict[st
         raise InputError("fast-motion needs a free camera: an arm moves as fast as its joints")
     factor = FastMotion(factor=strength.get("factor", _FASTER)).factor
     steps = {name: options.get(name, getattr(EnvConfig, name)) for name in ("step_m", "step_rad")}
+    EnvConfig(**steps)  # refuses what is no length
     return {**options, **{name: factor * step for name, step in steps.items()}}

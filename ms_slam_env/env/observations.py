@@ -190,7 +190,7 @@ class MapObservation(Observation):
         grid, poses = knowledge.occupancy, knowledge.candidates()
         assert grid is not None
         parts = _relative_gain(grid, poses, self._intrinsics)
-        parts += [surrounding_occupancy(grid, poses[0], *each).ravel() for each in _BLOCKS]
+        parts += [surrounding_occupancy(grid, knowledge.here, *each).ravel() for each in _BLOCKS]
         return np.concatenate([self._features.build(knowledge), *parts]).astype(np.float32)
 
 
@@ -225,11 +225,11 @@ class GoalsObservation(Observation):
         """The state (k,), and the numbers of each motion (n, numbers)."""
         grid, poses, steps = knowledge.occupancy, knowledge.candidates(), _least(knowledge.steps)
         assert grid is not None
-        here, camera = poses[0], self._intrinsics
+        here, camera = knowledge.here, self._intrinsics
         free = reachable_positions(grid, here[:3, 3], GOAL_RADIUS_M)
         goal = best_goal(grid, here, camera, steps, free)
         known = knowledge.motion_mask, grid, goal, camera, steps, knowledge.frames
-        numbers, most = grid_numbers(poses, knowledge.view(), *known)
+        numbers, most = grid_numbers(here, poses, knowledge.view(), *known)
         features = self._features.build(knowledge)[: -len(knowledge.motion_mask)]
         parts: list[Any] = [features, here[2, :3]]
         parts += [gain_around(grid, here, camera, free), [most], _seen_goal(here, goal, steps)]
@@ -258,10 +258,10 @@ class HeldObservation(GoalsObservation):
     def _parts(self, knowledge: RobotKnowledge) -> tuple[Float64, Float64]:
         """See the base class."""
         state, numbers = super()._parts(knowledge)
-        grid, poses = knowledge.occupancy, knowledge.candidates()
+        grid, here = knowledge.occupancy, knowledge.here
         assert grid is not None
-        motions = invert(poses[0]) @ poses
-        gain = held_gain(grid, poses[0], motions, _HELD_STEPS, self._intrinsics)
+        motions = invert(here) @ knowledge.candidates()
+        gain = held_gain(grid, here, motions, _HELD_STEPS, self._intrinsics)
         worth = gain @ _HELD_DISCOUNT ** np.arange(_HELD_STEPS)
         pairs = gain.reshape(len(gain), -1, 2).sum(axis=2)
         held = np.column_stack([worth / max(worth.max(), 1e-9), pairs])

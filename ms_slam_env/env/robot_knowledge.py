@@ -62,7 +62,8 @@ class RobotKnowledge:
         motion_mask: (n,) which motions are possible now.
         configuration: index of the SLAM configuration in force; 0 where there is only one.
         lookahead: predicts the divergences (n, 2) of the candidates, in units of (M_I, M_D).
-        candidates: the poses (n, 4, 4) that the motions would lead to; the first is the present.
+        here: (4, 4) estimated pose.
+        candidates: the poses (n, 4, 4) that the motions would lead to.
         view: what the map predicts of here, at `trackability.SCALE`.
         predicted: what the map predicts of here and of the candidates, divergences in those units.
         steps: translation, metres, and rotation, radians, of a motion.
@@ -80,6 +81,7 @@ class RobotKnowledge:
     motion_mask: NDArray[np.bool_]
     configuration: int
     lookahead: Callable[[], Float64]
+    here: Float64
     candidates: Callable[[], Float64]
     view: Callable[[], Views]
     predicted: Callable[[], PredictedViews]

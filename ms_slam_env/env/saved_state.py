@@ -58,6 +58,7 @@ def load_state(
     simulation.T_world_kinematic = state["T_world_kinematic"].copy()
     rng.bit_generator.state = state["random"]
     simulation.episode = episode.copy()
+    simulation.episode.predicted_divergences = None  # of the options that it was saved with
 
 
 def _check_parts_of(

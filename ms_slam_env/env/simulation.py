@@ -97,6 +97,10 @@ class Simulation:
 
     def place_of(self, episode: Episode) -> tuple[SceneName, int]:
         """Where an episode is: a scene of the options, even if a function, or one by its name."""
+        if self.place is not None:
+            name, seed = self.place
+            if (name_of(name), seed) == (episode.scene, episode.scene_seed):
+                return self.place
         own = {name_of(name): name for name in self.config.scenes}
         return own.get(episode.scene, episode.scene), episode.scene_seed
 
@@ -180,9 +184,10 @@ class Simulation:
         return new_surface
 
     def _end_step(self, episode: Episode, divergence: Float64, energy_j: float) -> None:
-        """Close a step; its last frame is carved where it was tracked."""
+        """Close a step; its last frame, if there was one, is carved where it was tracked."""
         episode.end_step(divergence, energy_j)
-        if episode.occupancy is not None and episode.tracking_ok:
+        came = episode.frames[-1].processed
+        if episode.occupancy is not None and episode.tracking_ok and came:
             with self.timings.stage("occupancy"):
                 seen = episode.last_frame.depth, episode.T_world_camera_estimate
                 episode.occupancy.integrate(*seen, self.intrinsics)

@@ -83,6 +83,7 @@ def evaluate_runs(
     if len(set(texts)) < len(texts):
         raise InputError(f"a run is given twice: {', '.join(texts)}")
     asked = [replace(options, delta=delta) for delta in deltas or (options.delta,)]
+    options = asked[0]
     runs = [_measured(*parse_run(text), truth, options, asked) for text in texts]
     tables = [systems_table(runs, options), boxes_table(runs, options), runs_table(runs, options)]
     paths = {"truth": max((run.matched.true_path for run in runs), key=len)}

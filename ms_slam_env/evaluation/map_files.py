@@ -141,7 +141,7 @@ def read_surface(path: Path, samples: int, seed: int = 0) -> SurfaceFile:
 
     Args:
         path: of the file; or of a sequence's folder, for the surface that its depth images show
-            from its true poses, up to 4 m away. Those of ``depth_true`` are taken if
+            from its true poses, up to 5 m away. Those of ``depth_true`` are taken if
             ``ms-slam generate --truth`` wrote them, else the recorded ones with their noise.
         samples: points taken evenly from the surface of a mesh.
         seed: of that choice.

@@ -129,6 +129,7 @@ def candidate_numbers(
 
 
 def grid_numbers(
+    here: Float64,
     poses: Float64,
     view: Views,
     permitted: NDArray[np.bool_],
@@ -141,7 +142,8 @@ def grid_numbers(
     """The numbers (n, ``GRID_NAMES``) of the motions, within bounds, and the largest gain, m^3.
 
     Args:
-        poses: (n, 4, 4) that the motions lead to; the first is here.
+        here: (4, 4) where the motions begin.
+        poses: (n, 4, 4) that they lead to.
         view: one, predicted from here.
         permitted: (n,) which motions are possible.
         grid: what is known of space.
@@ -151,8 +153,8 @@ def grid_numbers(
         frames: taken on a motion.
     """
     gain, depth = look_from(grid, poses, intrinsics, _GAIN_RAYS)
-    H, remains, near = remaining(view, invert(poses[0]) @ poses)
-    motion_rad = image_motion(view, poses) / frames
+    H, remains, near = remaining(view, invert(here) @ poses)
+    motion_rad = image_motion(view, np.concatenate([here[None], poses]))[1:] / frames
     meets = depth > 0
     numbers = np.column_stack(
         [
@@ -163,7 +165,7 @@ def grid_numbers(
             remains,
             near,
             risk_of(H, view, motion_rad, mean_depth(view)[0]),
-            *_ways(poses[0], poses, goal, steps),
+            *_ways(here, poses, goal, steps),
         ]
     )
     return np.clip(numbers, GRID_LOWS, GRID_HIGHS), float(gain.max())

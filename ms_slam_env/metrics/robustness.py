@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import logm
 
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.geometry import Float64, check_pose
+from ms_slam_env.geometry import Float64
 from ms_slam_env.geometry.point_clouds import umeyama
 from ms_slam_env.metrics.trajectory import check_pair, check_positions, check_positive
 
@@ -89,8 +89,7 @@ def tracking_robustness(
         raise unknown("alignment", align, SEGMENT_ALIGNMENTS)
     if not (np.isfinite(lever_m) and lever_m >= 0):
         raise InputError(f"lever_m must be finite and >= 0, got {lever_m}")
-    poses = np.stack([check_pose(T, "estimate") for T in np.asarray(estimate, dtype=np.float64)])
-    true_poses = np.stack([check_pose(T, "truth") for T in np.asarray(truth, dtype=np.float64)])
+    poses, true_poses = check_pair(estimate, truth)
     segments = tracked_segments(tracked)
     if not len(poses) == len(true_poses) == len(np.asarray(tracked)):
         raise InputError(

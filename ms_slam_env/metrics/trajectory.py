@@ -333,6 +333,8 @@ def tracked_errors(
     """
     own, true = check_pair(estimate, truth, need_poses=False)
     ok = np.asarray(tracked, dtype=bool)
+    if ok.shape != (len(own),):
+        raise InputError(f"{len(own)} poses, but tracked of shape {ok.shape}")
     return {
         "ate_tracked_m": ate_rmse(own[ok], true[ok]) if ok.sum() > 1 else None,
         "tracked_share": float(ok.mean()),

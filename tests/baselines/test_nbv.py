@@ -182,6 +182,25 @@ def test_options_out_of_range_are_one_line(episode, option):
         make_planner(f"nbv,{option}", episode[2].env)
 
 
+@pytest.mark.parametrize(
+    "planner",
+    ["nbv,goals=10.5", "held-nbv,horizon=2.5", "oracle,points=9.5", "foresight,tried=3.5"],
+)
+def test_what_is_counted_takes_no_fractions(episode, planner):
+    with pytest.raises(InputError, match=r"\.5 must be an integer"):
+        make_planner(planner, episode[2].env)
+
+
+def test_steps_of_no_length_are_no_division_by_it():
+    env = gym.make("MSActiveSLAM-FreeCamera-v0", scene="table", image_size="80x60", step_rad=0.0)
+    observation, info = env.reset(seed=0)
+    planner = make_planner("nbv", env.unwrapped)
+    planner.reset()
+    with np.errstate(all="raise", under="ignore"):
+        for _ in range(3):
+            observation, *_, info = env.step(planner.act(observation, info))
+
+
 def test_options_of_its_goals_are_known_and_others_are_refused(episode):
     env = episode[2].env
     assert make_planner("nbv,recovery=false,replan=3,risk=0.1", env).replan == 3

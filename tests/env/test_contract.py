@@ -173,6 +173,32 @@ def test_a_scene_that_is_a_function_is_gone_back_to():
     assert_same(other.step(5), outcome)
 
 
+def test_functions_of_one_name_are_two_scenes():
+    one, other = (
+        lambda seed, name=name: scenes.make(name, seed=seed) for name in ("wall", "table")
+    )
+    env = gym.make("MSActiveSLAM-FreeCamera-v0", scene=(one, other), num_scene_seeds=1)
+    env.reset(seed=0)
+    place = env.unwrapped.simulation.place
+    env.unwrapped.foresee([1, 2])
+    assert env.unwrapped.simulation.place == place
+
+
+def test_a_prediction_is_by_the_options_of_who_goes_on():
+    options = {**OPTIONS, "image_size": "80x60"}
+    one, other = (
+        gym.make("MSActiveSLAM-FreeCamera-v0", **options, lookahead={"reference": name}).unwrapped
+        for name in ("predicted", "live")
+    )
+    one.reset(seed=3)
+    one.step(5)
+    before = one.lookahead()
+    other.load_state(one.save_state())
+    assert (other.lookahead() != before).any()
+    one.load_state(other.save_state())
+    np.testing.assert_array_equal(one.lookahead(), before)
+
+
 def test_a_state_of_another_camera_is_refused_and_changes_nothing(env):
     env.reset(seed=5)
     before = env.unwrapped.episode.trajectory_truth

@@ -21,6 +21,26 @@ def make(observation="goals", env_id="MSActiveSLAM-FreeCamera-v0", **options):
     return gym.make(env_id, observation=observation, **{**OPTIONS, **options})
 
 
+@pytest.mark.parametrize("observation", ["goals", "held"])
+def test_on_a_line_no_motion_stays(observation):
+    env = make(observation, "MSActiveSLAM-FixedTranslation-v0")
+    env.reset(seed=0)
+    seen = env.step(0)[0]
+    rows = seen[STATE:].reshape(7, -1)
+    of = dict(zip(GRID_NAMES, rows.T, strict=False))
+    moved = np.stack([of[f"step_{axis}"] for axis in "xyz"])
+    np.testing.assert_allclose(np.linalg.norm(moved, axis=0), 1, atol=1e-4)
+    turned = np.stack([of[f"turn_{axis}"] for axis in "xyz"])
+    np.testing.assert_allclose(np.linalg.norm(turned, axis=0), [0, *[1] * 6], atol=1e-4)
+    world = env.unwrapped
+    here = world.episode.T_world_camera_estimate
+    np.testing.assert_allclose(seen[140:143], here[2, :3], atol=1e-6)
+    view = world.slam.predict(here[None], SCALE)
+    _, remains, near = remaining(view, invert(here) @ world.candidate_poses())
+    np.testing.assert_allclose(of["remains"], remains, atol=1e-6)
+    np.testing.assert_allclose(of["near"], near, atol=1e-6)
+
+
 @pytest.fixture(scope="module")
 def moment():
     """An environment after a few steps, what it showed, and a grid carved from the same frames."""

@@ -249,6 +249,12 @@ def test_ids_can_be_made(env_id) -> None:
         assert isinstance(perturbations[0], PERTURBATIONS[env.spec.kwargs["perturbed_by"]])
 
 
+@pytest.mark.parametrize("given", [{"step_m": "0.1"}, {"step_rad": None}, {"step_m": -1}])
+def test_a_faster_motion_of_no_length_is_refused(given) -> None:
+    with pytest.raises(InputError, match=next(iter(given))):
+        gymnasium.make("MSActiveSLAM-FreeCamera-FastMotion-v0", **given)
+
+
 def test_an_id_passes_the_checker_and_takes_options() -> None:
     env = gymnasium.make(
         "MSActiveSLAM-FreeCamera-MotionBlur-v0", perturbation={"exposure_s": 0.01}, **OPTIONS

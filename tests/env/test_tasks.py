@@ -53,6 +53,8 @@ def test_the_tasks_slam_is_configured_unless_another_is_asked_for():
     fewer = gym.make(name, **SMALL, slam_config={"max_surfels": 5000}).unwrapped.config.slam_config
     assert fewer == {**own, "max_surfels": 5000}
     assert gym.make(name, **SMALL, slam="odometry").unwrapped.config.slam_config == {}
+    named = gym.make(name, **SMALL, slam="surfel,submaps=atlas").unwrapped.config.slam_config
+    assert named == {"submaps": "atlas", "max_surfels": 4_000_000, "unstable_window": 2000}
 
 
 def test_the_arms_task_ends_with_its_time():

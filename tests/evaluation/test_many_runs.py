@@ -62,6 +62,15 @@ def evo_errors(estimate: Path, truth: Path, delta: int) -> np.ndarray:
     return rpe.error
 
 
+def test_deltas_stand_in_the_place_of_the_delta(files, tmp_path) -> None:
+    more = ["--delta-unit", "m", "--delta", "1000", "--deltas", "0.3", "--out", str(tmp_path / "o")]
+    assert main([*options(files), *more]) == 0
+    first = json.loads((tmp_path / "o" / "evaluation.json").read_text())["runs"][0]
+    assert main([*options(files), *more[:2], "--delta", "0.3", "--out", str(tmp_path / "p")]) == 0
+    second = json.loads((tmp_path / "p" / "evaluation.json").read_text())["runs"][0]
+    assert first["rpe_m"] == second["rpe_m"]
+
+
 def test_runs_of_a_system_stand_together_with_their_interval(files, tmp_path, capsys) -> None:
     out = tmp_path / "out"
     more = ["--deltas", "1", "5", "--tables", "csv", "latex", "--out", str(out)]

@@ -130,7 +130,7 @@ def test_a_check_finds_what_changed(
         {"planner": "mine:Own,a=1"},
     ):
         rows = [{**row, "spec": {**row["spec"], "scene": code}} for row in committed.rows]
-        with pytest.raises(InputError, match="name code, .*not run"):
+        with pytest.raises(InputError, match=r"name code, .*not run"):
             check_results(Wobbles, replace(committed, rows=rows))
     assert not ran
     changed = lambda spec: {"ate_m": 0.5, "cpu_ms_median": 9.0, "lost": False}  # noqa: E731

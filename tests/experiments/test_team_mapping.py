@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,12 @@ from ms_slam_env.env.coverage import CoverageGrid, team_share
 from ms_slam_env.experiments.team_mapping import TeamMapping, TeamMappingSpec, nearby_starts
 from ms_slam_env.geometry import look_at, make_pose
 from ms_slam_env.sensor import RGBDSensor
+
+
+def test_the_reach_is_that_of_the_shared_map() -> None:
+    config = SimpleNamespace(step_m=0.1, step_rad=0.2, frames_per_action=1)
+    env: Any = SimpleNamespace(config=config)
+    assert TeamNextBestView(env, reach_m=5.0).map.grid.reach_m == 5.0
 
 
 def planner(spread_m: float) -> TeamNextBestView:

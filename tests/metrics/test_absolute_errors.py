@@ -160,6 +160,8 @@ def test_tracked_frames_are_aligned_by_themselves() -> None:
         "tracked_share": tracked.mean(),
     }
     assert ate_rmse(held, truth) > 2 * found["ate_tracked_m"]
+    with pytest.raises(InputError, match=r"tracked of shape \(3,\)"):
+        tracked_errors(held, truth, np.ones(3))
     few = tracked_errors(held, truth, np.arange(len(truth)) == 3)
     assert few == {"ate_tracked_m": None, "tracked_share": 0.02}
 

@@ -79,6 +79,11 @@ def test_a_common_world_costs_nothing_and_neither_does_the_choice_of_it() -> Non
     assert tracking_robustness(poses, poses, np.ones(60, bool)).error == 0  # one piece
 
 
+def test_no_poses_are_no_trajectory() -> None:
+    with pytest.raises(InputError, match="estimate"):
+        tracking_robustness(np.zeros((0, 4, 4)), np.zeros((0, 4, 4)), [])
+
+
 def test_scale_that_changes_between_pieces() -> None:
     poses = winding()
     estimate = poses.copy()

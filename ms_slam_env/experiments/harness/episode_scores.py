@@ -98,10 +98,10 @@ def measure_trajectory(world: ActiveSlamEnv) -> dict[str, Any]:
 
     ``ate_m`` (RMSE) and ``ate_max_m`` after SE(3) alignment, ``ate_tracked_m`` and
     ``tracked_share`` of the tracked frames, ``ate_unaligned_m`` with the common
-    start as the only tie, ``rpe_m`` and ``rpe_rad`` per step, ``path_length_m`` of the true
+    start as the only tie, ``rpe_m`` and ``rpe_rad`` per frame, ``path_length_m`` of the true
     trajectory, ``M_I`` and ``M_D`` (equations 11 and 12), ``violations`` (share of the frames after
-    the first that exceed the environment's M_I or M_D), and ``lost``: SLAM reported lost tracking
-    at some step, or was off by more than ``LOST_ERROR_M`` without noticing.
+    the first that exceed the environment's M_I or M_D), and ``lost``: some frame was off by more
+    than ``LOST_ERROR_M``.
     """
     truth, estimate = world.episode.trajectory_truth, world.episode.trajectory_estimate
     aligned = metrics.ate_statistics(estimate, truth)

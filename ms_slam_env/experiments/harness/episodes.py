@@ -43,7 +43,7 @@ DEFAULT_STEP_DEG = 12.0
 
 OWN_OPTIONS = (
     *("scene", "scene_seed", "split", "observation", "step_m", "step_rad"),
-    *("render_mode", "max_episode_steps"),
+    *("render_mode", "max_episode_steps", "frame_divergences"),
 )
 """Options of ``gym.make`` that an episode has other options for, or that its planner decides."""
 
