@@ -45,6 +45,8 @@ class Foresight(Planner):
         InputError: an option out of its range, an order or a term that there is not.
     """
 
+    motions_only = True
+
     def __init__(
         self,
         env: ActiveSlamEnv,

@@ -61,6 +61,7 @@ class GoalPlanner(Planner):
     """
 
     recovers = True
+    motions_only = True
 
     def __init__(
         self,

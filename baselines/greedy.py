@@ -52,6 +52,8 @@ class GreedyDivergence(Planner):
         InputError: an option out of its range.
     """
 
+    motions_only = True
+
     def __init__(
         self,
         env: ActiveSlamEnv,

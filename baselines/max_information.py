@@ -17,6 +17,8 @@ class MaxInformation(Planner):
     predicts no depth: there lies surface not yet seen, or nothing within the sensor's range.
     """
 
+    motions_only = True
+
     def act(self, observation: Any, info: dict[str, Any]) -> int:
         """Choose the unmasked action with the largest gain, ties drawn at random."""
         depth = self.env.predict_candidates().depth  # (n, h, w) metres, 0 = the map is empty

@@ -14,6 +14,8 @@ class Stationary(Planner):
     that ranks it first does not measure active SLAM.
     """
 
+    motions_only = True
+
     def act(self, observation: Any, info: dict[str, Any]) -> int:
         """Return action 0, neither translation nor rotation."""
         return 0

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from gymnasium.spaces import MultiDiscrete
 from numpy.typing import NDArray
 
 from ms_slam_env.config import parse_named
@@ -44,6 +45,8 @@ class Planner(ABC):
     """The observation variant that ``act`` expects, unless ``observation_for`` says otherwise."""
     recovers: bool = False
     """Whether it undoes its last motions while tracking is lost, unless told not to."""
+    motions_only: bool = False
+    """Whether it cannot choose a SLAM configuration beside the motion."""
 
     def __init__(self, env: ActiveSlamEnv, seed: int = 0) -> None:
         self.env = env
@@ -172,10 +175,18 @@ def make_planner(text: str, env: Any, seed: int = 0, **more: Any) -> Planner:
         **more: options beside those of the text, as paths with commas in them.
 
     Raises:
-        InputError: an unknown planner or option, or a value that the planner refuses.
+        InputError: an unknown planner or option, a value that the planner refuses, or an
+            environment that wants more than motions of one that has no more.
     """
     cls, options = _parsed(text, more)
     recovery = options.pop(RECOVERY, cls.recovers)
+    if isinstance(getattr(env, "action_space", None), MultiDiscrete) and (
+        cls.motions_only or recovery
+    ):
+        raise InputError(
+            f"planner {text!r} chooses motions only; this environment asks for a SLAM "
+            "configuration too, as random, policy or one of your own chooses it"
+        )
     planner: Planner = cls(env, seed=seed, **options)
     return Recovering(env, planner) if recovery else planner
 

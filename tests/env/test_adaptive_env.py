@@ -11,6 +11,7 @@ from gymnasium.utils.env_checker import check_env
 
 import ms_slam_env
 from ms_slam_env.env import ActiveSlamEnv
+from ms_slam_env.env.planners import make_planner
 from ms_slam_env.errors import InputError
 
 ID = "MSActiveSLAM-Adaptive-v0"
@@ -159,3 +160,14 @@ def test_bad_options(options, message):
     with pytest.raises(InputError, match=message) as caught:
         gym.make(ID, **OPTIONS, **options)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "planner",
+    ["nbv", "greedy", "stationary", "foresight", "max-information", "random,recovery=true"],
+)
+def test_planners_of_motions_alone_are_refused(planner):
+    world = gym.make(ID, **OPTIONS).unwrapped
+    with pytest.raises(InputError, match=r"chooses motions only; .*as random, policy or one"):
+        make_planner(planner, world)
+    assert make_planner("random", world)
