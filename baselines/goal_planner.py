@@ -33,9 +33,6 @@ _RANGES = {
 }
 
 
-_COUNTED = ("goals", "replan", "horizon", "points")
-
-
 class GoalPlanner(Planner):
     """Carves the frames that were tracked, draws a goal now and then, and moves towards it.
 
@@ -80,16 +77,16 @@ class GoalPlanner(Planner):
         self.goals, self.radius_m, self.cost = goals, radius_m, cost
         self.replan, self.cell_m, self.reach_m = replan, cell_m, reach_m
         self.enough_m3, self.far_m = enough_m3, far_m
-        self.check(_RANGES)
+        self.check(_RANGES, "goals", "replan")
         self.steps = max(env.config.step_m, _LEAST), max(env.config.step_rad, _LEAST)
         self.reset()
 
-    def check(self, ranges: Mapping[str, tuple[float, float]]) -> None:
-        """Refuse options outside ``ranges``, and fractions of what is counted."""
+    def check(self, ranges: Mapping[str, tuple[float, float]], *counted: str) -> None:
+        """Refuse options outside ``ranges``, and fractions of those that are ``counted``."""
         for name, (low, high) in ranges.items():
             check_range(self, name, low, high)
-            if name in _COUNTED:
-                check_whole(self, name)
+        for name in counted:
+            check_whole(self, name)
 
     def reset(self) -> None:
         """Nothing is known yet."""
@@ -128,7 +125,7 @@ class GoalPlanner(Planner):
             self.map.add(self.env.slam, episode.last_frame.depth, here, self.env.intrinsics)
         action = self.choose_motion(here)
         self.heading_to = self.env.candidate_poses()[action]
-        if np.array_equal(self.heading_to, here):  # it stays
+        if np.allclose(self.heading_to, here):  # it stays
             self.goal = None
         return action
 

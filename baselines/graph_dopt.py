@@ -75,7 +75,7 @@ class GraphDOptimality(NextBestView):
         read = np.where(depth > 0, depth, np.nan)
         points = (self.env.intrinsics.rays()[every] * read[..., None]).reshape(-1, 3)
         covariance = self.env.episode.pose_covariance
-        weight = 1 / max(d_optimality(_START if covariance is None else covariance), 1e-9)
+        weight = 1 / max(d_optimality(_START if covariance is None else covariance), 1e-30)
         return Keyframe(here, transform_points(here, points), weight)
 
     def edges_to(self, way: Float64) -> Float64:

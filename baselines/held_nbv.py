@@ -54,7 +54,7 @@ class HeldNextBestView(NextBestView):
         super().__init__(env, seed, enough_m3=enough_m3, **options)
         self.horizon, self.discount = horizon, discount
         self.least_m3, self.slip_cost = least_m3, slip_cost
-        self.check({"horizon": (1, 100), "discount": (0, 1)})
+        self.check({"horizon": (1, 100), "discount": (0, 1)}, "horizon")
         self.check({"least_m3": (0, 1000), "slip_cost": (0, 1000)})
 
     def reset(self) -> None:

@@ -60,7 +60,7 @@ class Oracle(HeldNextBestView):
         super().__init__(env, seed, least_m3=least, enough_m3=least, slip_cost=slip_cost, **options)
         self.reference, self.points = reference, points
         check_choice(self, "reference", REFERENCES)
-        self.check({"points": (1, 1_000_000)})
+        self.check({"points": (1, 1_000_000)}, "points")
 
     def reset(self) -> None:
         """Nothing is mapped yet."""

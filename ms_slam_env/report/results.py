@@ -161,7 +161,8 @@ def write_result_folder(
         save_charts(results.charts, folder)
         write_more(folder)
     for figure in before - {f"{chart.name}.png" for chart in results.charts}:
-        (out / figure).unlink(missing_ok=True)
+        if Path(figure).name == figure:  # a file may name another folder's
+            (out / figure).unlink(missing_ok=True)
     return results
 
 

@@ -214,6 +214,9 @@ def test_files_beside_a_result_are_shown_with_it(tmp_path: Path) -> None:
 
 def test_figures_that_the_next_result_has_not_go(tmp_path: Path) -> None:
     first, second = (replace(example_charts()[0], name=name) for name in ("first", "second"))
+    outside = tmp_path.parent / f"{tmp_path.name}_outside.png"
+    outside.write_bytes(b"not of this result")
+    hostile = replace(first, name=f"../{outside.stem}")
     for charts in ([first, second], [second]):
         write_result_folder(
             tmp_path,
@@ -226,7 +229,10 @@ def test_figures_that_the_next_result_has_not_go(tmp_path: Path) -> None:
             rows=[],
         )
         (tmp_path / "mine.png").write_bytes(b"a picture")
+        if len(charts) == 2:
+            edit(tmp_path / RESULTS, charts=[chart.as_json() for chart in (*charts, hostile)])
     assert sorted(path.name for path in tmp_path.glob("*.png")) == ["mine.png", "second.png"]
+    assert outside.exists()
 
 
 @pytest.mark.parametrize("value", ["Infinity", float("nan")])

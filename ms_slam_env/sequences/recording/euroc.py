@@ -83,8 +83,8 @@ def _sensor(path: Path) -> dict[str, Any]:
     """What a ``sensor.yaml`` says."""
     try:
         read = load_yaml(read_text(path, "calibration"))
-    except (RecursionError, ValueError) as error:
-        raise InputError(f"{path} is not a YAML file: {str(error).splitlines()[0]}") from None
+    except ValueError as error:
+        raise InputError(f"{path} is not a YAML file: {error}") from None
     if not isinstance(read, dict):
         raise InputError(f"{path} is not a mapping of options")
     return read
