@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from ms_slam_agents.curriculum import Staged, read_curriculum
 from ms_slam_agents.evaluation import FixedEpisodes
-from ms_slam_agents.options import Problem
+from ms_slam_agents.options import Problem, world_of
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 import ms_slam_env  # registers the ids, in a worker process too
@@ -26,18 +26,23 @@ from ms_slam_env.errors import InputError, unknown
 VALIDATION_SEED = 1_000_000  # of the first validation episode; training draws from small seeds
 
 
-def make_env(args: Problem, split: str, seeds: Sequence[int]) -> gym.Env[Any, Any]:
+def make_env(
+    args: Problem, split: str, seeds: Sequence[int] = (), environment: int = 0
+) -> gym.Env[Any, Any]:
     """Build one environment; with ``seeds`` it plays those episodes only.
 
-    One to train in follows the curriculum, if there is one.
+    One to train in follows the curriculum, if there is one, and is of the world that its number
+    among the parallel ones has.
     """
+    if split == "train":
+        args = world_of(args, environment)
     if multiprocessing.parent_process() is not None:  # in a worker Ctrl-C is the main's to answer
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         torch.set_num_threads(1)
 
     def make(problem: Problem, more: Mapping[str, Any]) -> gym.Env[Any, Any]:
         options = problem_options(problem, split)
-        return gym.make(args.env_id, disable_env_checker=True, **options, **more)
+        return gym.make(problem.env_id, disable_env_checker=True, **options, **more)
 
     path = getattr(args, "curriculum", None)
     if path and split == "train":
@@ -106,12 +111,15 @@ def check_problem(args: Problem) -> None:
     Raises:
         InputError: an unknown environment, or options that it refuses.
     """
+    spaces = []
     try:
-        for split in ("train", "validation"):
-            env = make_env(args, split, ())
+        further = range(1 + len(getattr(args, "also", ())))
+        for split, environment in [*(("train", k) for k in further), ("validation", 0)]:
+            env = make_env(args, split, environment=environment)
             if isinstance(env, Staged):
                 env.check()
             env.close()
+            spaces.append((env.observation_space, env.action_space))
             if env.observation_space.shape is None:
                 raise InputError(
                     f"observation {args.observation!r} has several parts, which no trainer takes; "
@@ -121,6 +129,14 @@ def check_problem(args: Problem) -> None:
         raise unknown("environment", args.env_id, ms_slam_env.ENV_IDS) from None
     except gym.error.Error as error:
         raise InputError(f"environment {args.env_id!r} cannot be made: {error}") from None
+    for name, own in zip(getattr(args, "also", ()), spaces[1:], strict=False):
+        if own != spaces[0]:
+            raise InputError(f"task {name!r} has other observations or actions than {args.env_id}")
+    if len(spaces) - 1 > args.num_envs:
+        raise InputError(
+            f"{len(spaces) - 1} tasks to train in, and num_envs = {args.num_envs}: it must be at "
+            "least as many"
+        )
 
 
 def env_options(args: Problem) -> dict[str, Any]:
@@ -135,7 +151,7 @@ def make_venv(args: Problem, split: str, seeds: Sequence[int] = ()) -> VecEnv:
     num_envs = min(args.num_envs, len(seeds)) if seeds else args.num_envs
 
     def maker(rank: int) -> Callable[[], gym.Env[Any, Any]]:
-        return lambda: make_env(args, split, seeds[rank::num_envs])
+        return lambda: make_env(args, split, seeds[rank::num_envs], rank)
 
     makers = [maker(rank) for rank in range(num_envs)]
     if num_envs == 1:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
@@ -123,6 +123,9 @@ class Training(Problem):
         episodes_per_scene: episodes in a row in a scene that was drawn. To build a room takes a
             second, a home longer, where it is not one of the last 40 rooms or 11 homes. Episodes of
             a stage that draws noise or perturbations draw a scene each.
+        also: further tasks to train in, named as ``task`` is: the parallel environments are of the
+            problem itself and of these in turn. Of them count where they are, how long and with
+            which motions. Validation knows the problem alone.
     """
 
     init: Path | None = None
@@ -135,6 +138,7 @@ class Training(Problem):
     hidden: int = bounded(256, 1, 4096)
     curriculum: Path | None = None
     episodes_per_scene: int = bounded(1, 1, 1_000_000)
+    also: tuple[str, ...] = ()
 
     kept: ClassVar[tuple[str, ...]] = ()
     """Options beside ``KEPT`` that a run keeps when it is resumed."""
@@ -227,6 +231,32 @@ def of_task(cls: type[P], task: str, trainer: str) -> P:
         return _of_types(from_dict(cls, values), "option")
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+
+
+WORLD = (
+    "env_id",
+    "embodiment",
+    "scenes",
+    "episode_steps",
+    "step_m",
+    "step_deg",
+    "frames_per_action",
+)
+"""Options that a further task to train in has of its own."""
+
+
+def world_of(args: P, environment: int) -> P:
+    """The problem that a training's parallel environment plays, by its number from 0.
+
+    Raises:
+        InputError: an unknown task, or a file that does not hold such options.
+    """
+    also: tuple[str, ...] = getattr(args, "also", ())
+    place = environment % (1 + len(also))
+    if place == 0:
+        return args
+    other = of_task(Problem, also[place - 1], "problem")
+    return replace(args, **{name: getattr(other, name) for name in WORLD})
 
 
 SECTIONS = ("problem", "sb3", "imitation", "ppo", "qrdqn", "rllib")

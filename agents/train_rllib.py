@@ -267,7 +267,7 @@ class Run(TrainingRun):
     algorithm = "rllib_ppo"
 
     def __init__(self, args: Args, file: PolicyFile | None) -> None:
-        env = make_env(args, "train", ())
+        env = make_env(args, "train")
         env.close()
         super().__init__(args, env.observation_space, env.action_space, file)
         begun = file or (read_init(args).untrained() if args.init else None)
@@ -323,7 +323,7 @@ class Run(TrainingRun):
 def make_masked(args: Problem, runner: int) -> gym.Env[Any, Any]:
     """A training environment, in a runner."""
     torch.set_num_threads(1)
-    return Masked(make_env(args, "train", ()), runner)
+    return Masked(make_env(args, "train", environment=max(0, runner - 1)), runner)
 
 
 def learner_tensors(learner: Any) -> Tensors:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from ms_slam_agents import environments, imitation, options, ppo, qrdqn, train_sb3
 
+from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.errors import InputError
 from ms_slam_env.tasks import OWN, env_id_of
 
@@ -171,3 +172,44 @@ def test_an_observation_of_several_parts_is_refused(trainer, tmp_path, capsys):
     assert main(["--observation", "rgbd", "--out", str(tmp_path / "run")]) == 2
     assert "observation 'rgbd' has several parts" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
+
+
+def test_the_parallel_environments_are_of_several_tasks_in_turn(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("problem: {scenes: [wall], episode_steps: 7}\nppo: {gamma: 0.5}\n")
+    args = parsed(["--task", "room", "--also", "arm-kinematic", str(path), "--num-envs", "4"])
+    worlds = [options.world_of(args, k) for k in range(4)]
+    assert worlds[0] == worlds[3] == args
+    arm = parsed(["--task", "arm-kinematic"])
+    for name in options.WORLD:
+        assert getattr(worlds[1], name) == getattr(arm, name)
+    assert (worlds[1].observation, worlds[1].gamma) == (args.observation, args.gamma)
+    assert (worlds[2].scenes, worlds[2].episode_steps, worlds[2].gamma) == (("wall",), 7, 0.98)
+    held = environments.make_env(args, "train", environment=1).unwrapped
+    assert held.simulation.embodiment_type is EMBODIMENTS["arm-kinematic"]
+    assert held.config.arm.frames_per_action == 1
+    # Validation is the problem itself, in whichever process.
+    judged = environments.make_env(args, "validation", [1_000_000], environment=1).unwrapped
+    assert judged.simulation.embodiment_type is EMBODIMENTS["free"]
+    environments.check_problem(args)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["rooms"], "unknown task 'rooms'; valid choices: .*arm-kinematic"),
+        (["other.yaml"], "task 'other.yaml' has other observations or actions"),
+        (["room", "arm", "arm-kinematic"], "4 tasks to train in, and num_envs = 3"),
+    ],
+)
+def test_tasks_that_cannot_be_trained_in_together_are_refused(
+    words, said, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    Path("other.yaml").write_text("problem: {env_id: MSActiveSLAM-FixedTranslation-v0}\n")
+    args = ["--num-envs", "3", "--observation", "features", "--out", "out", "--also", *words]
+    with pytest.raises(InputError, match=said):
+        environments.check_problem(parsed(args))
+    assert ppo.main(args) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not Path("out").exists()

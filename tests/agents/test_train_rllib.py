@@ -116,6 +116,12 @@ def make_fake(args, runner=0):
     return train_rllib.Masked(train_rllib.make_env(args, "train", ()), runner)
 
 
+def test_runners_are_of_several_tasks_in_turn():
+    args = train_rllib.Args(scenes=("table",), also=("arm-kinematic",))
+    held = [train_rllib.make_masked(args, k).unwrapped.config.arm.frames_per_action for k in (1, 2)]
+    assert held[1] == 1 != held[0]
+
+
 def test_a_seed_means_other_episodes_in_another_runner():
     args = train_rllib.Args(env_id=ENV_ID, episode_steps=10)
     first, other = make_fake(args, 1), make_fake(args, 2)
