@@ -21,6 +21,13 @@ class Square:
     log: str = ""
 
 
+@dataclass(frozen=True)
+class Named(Square):
+    """The same, of a planner."""
+
+    planner: str = ""
+
+
 def square(spec: Square) -> dict[str, Any]:
     if spec.number == 1313:
         os._exit(3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import random
@@ -9,18 +10,19 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import fake_work
 import pytest
-from fake_work import Square, square
+from fake_work import Named, Square, square
 from hypothesis import given
 from hypothesis import strategies as st
 
 from ms_slam_env.errors import InputError, InputWarning
 from ms_slam_env.experiments.harness import rows as rows_module
 from ms_slam_env.experiments.harness.episodes import EpisodeSpec
+from ms_slam_env.experiments.harness.named_files import file_hashes
 from ms_slam_env.experiments.harness.rows import RECORDS, failures, names, run_all
 from ms_slam_env.metrics.registry import RESULTS_VERSION
 from ms_slam_env.report.records import RecordFile, spec_key, write_json
@@ -63,6 +65,65 @@ def test_rows_of_an_older_algorithm_are_made_again(tmp_path, monkeypatch, capsys
     assert log.read_text().split() == ["1"]
     run_all(specs, square, tmp_path / "out", **given)
     assert log.read_text().split() == ["1", "1"]
+
+
+def test_rows_are_made_again_where_a_file_that_they_name_has_changed(
+    tmp_path, monkeypatch, capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    policy, module, log = Path("runs/best.safetensors"), Path("rowplanners.py"), Path("log")
+    policy.parent.mkdir()
+    policy.write_bytes(b"one")
+    module.write_text("class Mine: ...\n")
+    names = (f"policy,path={policy},deterministic=true", "rowplanners:Mine", "greedy")
+    specs = [Named(k, log=str(log), planner=name) for k, name in enumerate(names)]
+    run_all(specs, square, Path("out"), workers=1)
+    run_all(specs, square, Path("out"), workers=1)
+    assert log.read_text().split() == ["0", "1", "2"]
+    policy.write_bytes(b"another")
+    capsys.readouterr()
+    run_all(specs, square, Path("out"), workers=1)
+    assert log.read_text().split() == ["0", "1", "2", "0"]
+    assert "1 of 3 are made again: a file that they name has changed" in capsys.readouterr().err
+    module.write_text("class Mine: pass\n")
+    run_all(specs, square, Path("out"), workers=1)
+    assert log.read_text().split() == ["0", "1", "2", "0", "1"]
+    run_all(specs, square, Path("out"), workers=1)
+    assert log.read_text().split() == ["0", "1", "2", "0", "1"]
+
+
+def test_files_that_a_spec_names(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("greedy").write_text("no file is meant")
+    Path("house.glb").write_text("mesh")
+    Path("tracker").write_text("program")
+    assert file_hashes(EpisodeSpec("greedy", "house.glb")) == {"house.glb": hash_of("mesh")}
+    command = Backend("command:./tracker --in {sequence} --out {trajectory}")
+    assert file_hashes(command) == {"./tracker": hash_of("program")}
+    for text in (
+        "",
+        "a,b=c",
+        "no_such_module:Class",
+        "os.path:x:y",
+        "x" * 5000 + "/",
+        "a/\0",
+        "./",
+    ):
+        assert file_hashes(Backend(text)) == {}
+    assert list(file_hashes(Backend("ms_slam_env.tasks:room"))) == ["ms_slam_env.tasks:room"]
+    assert file_hashes(Square(1, log="house.glb")) == {}
+
+
+def hash_of(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class Backend:
+    """A piece of work that names a SLAM."""
+
+    backend: str
 
 
 def test_a_changed_spec_is_other_work(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from tqdm import tqdm
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.run_sequence import lost_throughout
 from ms_slam_env.experiments.harness.experiment import Experiment
+from ms_slam_env.experiments.harness.named_files import file_hashes
 from ms_slam_env.interrupts import kept
 from ms_slam_env.metrics.registry import RESULTS_VERSION, versions_since
 from ms_slam_env.output_files import check_out_folder
@@ -45,10 +46,11 @@ def run_all(
     One that is given twice has one row: twice it would count twice.
 
     Rows that an earlier call left in ``out`` are taken from there, except failed ones, which are
-    tried again, and those whose numbers an algorithm of today would make otherwise. A row has
-    ``key``, ``spec``, ``result`` (what ``run`` returned, None if it raised or its process died),
-    ``error`` (None or the message), ``elapsed_s``, ``commit`` (of the code that made it) and
-    ``results_version``.
+    tried again, and those whose numbers an algorithm of today would make otherwise, or that were
+    made when a file that they name held something else. A row has ``key``, ``spec``, ``result``
+    (what ``run`` returned, None if it raised or its process died), ``error`` (None or the message),
+    ``elapsed_s``, ``commit`` (of the code that made it), ``results_version`` and ``files`` (hashes
+    by name).
 
     Args:
         specs: dataclasses; the key of the work is made of all their fields.
@@ -70,12 +72,18 @@ def run_all(
     check_out_folder(out)
     records = RecordFile(out / RECORDS)
     keys = [spec_key(spec) for spec in specs]
+    files = {key: file_hashes(spec) for key, spec in zip(keys, specs, strict=True)}
     rows = {
         key: row
         for key, row in records.load().items()
         if row.get("error", "") is None
         and not versions_since(row.get("results_version", RESULTS_VERSION), kind)
     }
+    changed = [key for key, now in files.items() if rows.get(key, {}).get("files", now) != now]
+    rows = {key: row for key, row in rows.items() if key not in changed}
+    if changed:
+        again = f"{len(changed)} of {len(files)} are made again: a file that they name has changed"
+        print(f"{description}: {again}", file=sys.stderr)
     todo = {key: spec for key, spec in zip(keys, specs, strict=True) if key not in rows}
     done = len(set(keys)) - len(todo)
     commit = git_commit()
@@ -91,6 +99,7 @@ def run_all(
 
             def finish(row: Row) -> None:
                 row |= {"commit": commit, "results_version": RESULTS_VERSION}
+                row |= {"files": files[row["key"]]} if files[row["key"]] else {}
                 records.append(row)
                 rows[row["key"]] = row
                 bar.update()
@@ -220,8 +229,8 @@ def run_experiment(
 def write_all(experiment: Experiment, rows: Sequence[Row], out: Path) -> Results:
     """Write everything that is made of the rows into folder ``out``."""
     # Where in the code a row failed is for who runs it, with the paths of that machine; the version
-    # is that of the whole.
-    left_out = ("traceback", "results_version")
+    # is that of the whole, and what files held tells whether a row is to be made again.
+    left_out = ("traceback", "results_version", "files")
     rows = [{k: v for k, v in row.items() if k not in left_out} for row in rows]
     rows = from_plain(to_plain(rows))
     return write_result_folder(
