@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 PATH_VARIABLE = "MS_SLAM_POLICY"
 SHIPPED = Path(__file__).parent / "policies"
-"""The policies that come with the package, by the task that they were trained for."""
+"""The policies that come with the package, by the agent's name."""
 
 
 class TrainedPolicy(Planner):
@@ -111,6 +111,13 @@ class RoomAgent(ShippedAgent):
 
     recovers = True
     default_path = SHIPPED / "room.safetensors"
+
+
+class PpoAgent(ShippedAgent):
+    """A policy that PPO made from nothing, in rooms and with the arm; it goes back when lost."""
+
+    recovers = True
+    default_path = SHIPPED / "ppo.safetensors"
 
 
 class PaperAgent(ShippedAgent):

@@ -54,9 +54,13 @@ class NextBestView(GoalPlanner):
     ) -> None:
         super().__init__(env, seed, **options)
         self.overlap, self.risk, self.own_gain = overlap, risk, own_gain
-        self.frames = env.config.frames_per_action
         self.far_apart = self.steps[1] > _FAR_APART_RAD
         self.check({"overlap": (0, 1), "risk": (0, 1), "own_gain": (0, 1000)})
+
+    @property
+    def frames(self) -> int:
+        """Frames that a motion has: each has its part of the way, and its risk to slip."""
+        return self.env.embodiment.frames_per_motion
 
     def motion_towards(self, goal: Float64) -> int:
         """The admissible motion that comes nearest to a goal (4, 4) and gains something itself."""

@@ -178,6 +178,9 @@ def _facts(policy: Policy) -> str:
     if scenes:
         seeds, steps = options.get("scene_seeds", "?"), options.get("episode_steps", "?")
         lines["In"] = f"{scenes}, {seeds} training seeds each, episodes of {steps} steps"
+    if options.get("also"):
+        tasks = ", ".join(f"`{name}`" for name in options["also"])
+        lines["And in"] = f"{tasks}, of the parallel environments in turn"
     if options.get("init"):
         lines["Begun from"] = f"`{options['init']}`"
     return "".join(f"- {what}: {value}\n" for what, value in lines.items())
@@ -295,7 +298,7 @@ def _limits(
     rows = [row for one in benchmarks for row in one.results.rows]
     met = {row["spec"].get("scene") for row in rows if _is_of(policy, row["spec"].get("planner"))}
     new = sorted(str(name) for name in met - set(options.get("scenes") or ()))
-    if options.get("scenes") and new:
+    if options.get("scenes") and new and not options.get("also"):  # whose scenes it does not say
         yield f"- Of the scenes of its scores it was not trained in {', '.join(new)}."
     if benchmarks and all(_config(one).get("seeds") != "train" for one in benchmarks):
         yield "- No score is on a seed that it was trained with."

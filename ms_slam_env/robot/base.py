@@ -58,11 +58,17 @@ class Embodiment(ABC):
 
     T_world_camera: Float64
     num_actions: int
+    _frames: int = 1
 
     @property
     def T_world_camera_kinematic(self) -> Float64:
         """(4, 4) the camera by the carrier's kinematics; the truth for a carrier without joints."""
         return self.T_world_camera
+
+    @property
+    def frames_per_motion(self) -> int:
+        """Frames that a motion from here has, as far as can be known before it is made."""
+        return self._frames
 
     @abstractmethod
     def reset(self, T_world_camera: Float64, rng: np.random.Generator) -> None:

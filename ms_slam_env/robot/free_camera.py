@@ -51,7 +51,7 @@ class FreeCamera(Embodiment):
     def __init__(self, scene: Scene, step_m: float, step_rad: float, frames: int = 1) -> None:
         self.scene = scene
         self.step_m = step_m
-        self.frames = frames
+        self._frames = frames
         self._motions = decompose(step_m, step_rad)
         self._motions.flags.writeable = False
         self._masks: NDArray[np.bool_] | None = None  # of the current pose
@@ -83,7 +83,7 @@ class FreeCamera(Embodiment):
         """Make motion ``action`` if nothing blocks it."""
         made = bool(self.action_masks()[action])
         motion = self._motions[action] if made else np.eye(4)
-        result = MotionResult.along(made, self.T_world_camera, motion, self.frames)
+        result = MotionResult.along(made, self.T_world_camera, motion, self._frames)
         if made:
             self.T_world_camera = result.T_world_camera[-1].copy()
             self._masks = None
@@ -112,7 +112,7 @@ class FixedTranslation(Embodiment):
     def __init__(self, scene: Scene, step_m: float, step_rad: float, frames: int = 1) -> None:
         self.scene = scene
         self.step_m = step_m
-        self.frames = frames
+        self._frames = frames
         self._rotations = decompose(0.0, step_rad)[:NUM_ROTATIONS]
         self.T_world_camera = np.eye(4)
         self._direction = np.zeros(3)
@@ -160,7 +160,7 @@ class FixedTranslation(Embodiment):
     def move(self, action: int) -> MotionResult:
         """Step along the line and turn; always possible."""
         step, motion = self._translation(), self.candidate_motions()[action]
-        result = MotionResult.along(True, self.T_world_camera, motion, self.frames)
+        result = MotionResult.along(True, self.T_world_camera, motion, self._frames)
         self.T_world_camera = result.T_world_camera[-1].copy()
         if step @ self._direction < 0:
             self._direction = -self._direction

@@ -52,6 +52,29 @@ def test_it_maps_much_without_losing_track(episode):
     assert len(set(actions)) > 5
 
 
+def test_what_a_motion_risks_is_what_its_frames_do():
+    """One that an arm makes in a dozen frames risks less than in one."""
+    env = gym.make("MSActiveSLAM-Arm-v0", scene="table", scene_seed=3, embodiment="arm-kinematic")
+    env.reset(seed=3)
+    planner = NextBestView(env.unwrapped)
+    assert planner.frames == env.unwrapped.embodiment.frames_per_motion > 5
+    poses, possible = env.unwrapped.candidate_poses(), env.unwrapped.action_masks()
+    risks = planner.risks(poses, possible)
+    with patch.object(NextBestView, "frames", 1):
+        at_once = planner.risks(poses, possible)
+    moves = possible & np.isfinite(at_once)
+    moves[0] = False  # to stay
+    assert moves.sum() > 10
+    assert (risks[moves] < at_once[moves]).all()
+    assert np.median(risks[moves] / at_once[moves]) < 0.5
+
+
+def test_frames_of_a_free_camera_are_those_that_it_was_given():
+    env = gym.make("MSActiveSLAM-FreeCamera-v0", scene="table", scene_seed=3, frames_per_action=3)
+    env.reset(seed=3)
+    assert NextBestView(env.unwrapped).frames == 3
+
+
 def test_one_seed_one_episode(episode):
     again, info, _ = play(seed=0, steps=8)
     assert again == episode[0][:8]

@@ -200,6 +200,19 @@ def test_a_policy_taken_before_its_run_went_on_has_the_curve_of_the_run(clone: P
     assert "The curve of its training is not" not in text
 
 
+def test_a_policy_trained_in_further_tasks_names_them_and_no_scene_that_it_missed(
+    clone: Path,
+) -> None:
+    (policy,) = (clone / "agents/policies").iterdir()
+    scores(clone / "docs/results/judged", Interval(0.1, 0.02, 0.3))
+    assert "not trained in" in card(clone)
+    known = replace(METADATA, options={**OPTIONS, "also": ["arm-kinematic", "x.yaml"]})
+    policy.write_bytes(as_bytes(json.dumps(asdict(known)), **dict.fromkeys(["optimizer.step"])))
+    text = card(clone)
+    assert "- And in: `arm-kinematic`, `x.yaml`, of the parallel environments in turn\n" in text
+    assert "not trained in" not in text
+
+
 def test_of_equally_many_episodes_those_among_more_rivals_count(clone: Path) -> None:
     seed = "agent-hand,path=runs/seed1.safetensors"
     scores(clone / "docs/results/seeds", Interval(0.1, 0.02, 0.3), seed)

@@ -129,6 +129,21 @@ def test_a_chosen_number_of_frames_divides_the_motion(box_scene, count):
     assert len(arm.move(0).times_s) == count
 
 
+def test_how_many_frames_a_motion_has_is_known_before_it_is_made(box_scene):
+    arm = make_arm(box_scene, camera_hz=30.0)
+    told = arm.frames_per_motion
+    start = arm.get_state()
+    made = []
+    for action in np.flatnonzero(arm.action_masks())[1:]:
+        arm.set_state(start)
+        made.append(len(arm.move(int(action)).times_s))
+    made.sort()
+    assert made[0] < made[-1]
+    assert made[(len(made) - 1) // 2] <= told <= made[len(made) // 2]
+    assert told > 3
+    assert make_arm(box_scene, frames_per_action=4).frames_per_motion == 4
+
+
 @given(st.floats(0, 5), st.floats(0.1, 30), st.one_of(st.none(), st.integers(1, 50)))
 def test_frames_are_regular_and_the_last_is_not_before_the_end(duration, hz, count):
     times = frame_times(duration, ArmConfig(camera_hz=hz, frames_per_action=count))

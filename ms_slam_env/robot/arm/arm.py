@@ -108,6 +108,13 @@ class ArmEmbodiment(Embodiment):
                 self._probe = self.feasibility.probe(q, T_base_camera @ self.motions)
         return self._probe
 
+    @property
+    def frames_per_motion(self) -> int:
+        """Of the motion of median length among those that the arm can make from here."""
+        probe = self.probe()
+        durations = probe.duration_s[probe.ok & (probe.duration_s > 0)]
+        return len(frame_times(float(np.median(durations)) if len(durations) else 0.0, self.config))
+
     def candidate_motions(self) -> Float64:
         """The 49 motions ``T_camera_next`` (49, 4, 4), the same everywhere."""
         return self.motions
