@@ -111,32 +111,36 @@ def check_problem(args: Problem) -> None:
     Raises:
         InputError: an unknown environment, or options that it refuses.
     """
-    spaces = []
+    also = getattr(args, "also", ())
+    if len(also) >= args.num_envs:
+        raise InputError(
+            f"{1 + len(also)} tasks to train in, and num_envs = {args.num_envs}: it must be at "
+            "least as many"
+        )
+    own = _spaces_in(args, "train")
+    _spaces_in(args, "validation")
+    for k, name in enumerate(also, 1):
+        if _spaces_in(world_of(args, k), "train") != own:
+            raise InputError(f"task {name!r} has other observations or actions than {args.env_id}")
+
+
+def _spaces_in(args: Problem, split: str) -> tuple[Any, Any]:
+    """Of observations and actions, from an environment that is made for it."""
     try:
-        further = range(1 + len(getattr(args, "also", ())))
-        for split, environment in [*(("train", k) for k in further), ("validation", 0)]:
-            env = make_env(args, split, environment=environment)
-            if isinstance(env, Staged):
-                env.check()
-            env.close()
-            spaces.append((env.observation_space, env.action_space))
-            if env.observation_space.shape is None:
-                raise InputError(
-                    f"observation {args.observation!r} has several parts, which no trainer takes; "
-                    "'pixels' has its images, smaller, in one vector"
-                )
+        env = make_env(args, split)
+        if isinstance(env, Staged):
+            env.check()
+        env.close()
     except gym.error.UnregisteredEnv:
         raise unknown("environment", args.env_id, ms_slam_env.ENV_IDS) from None
     except gym.error.Error as error:
         raise InputError(f"environment {args.env_id!r} cannot be made: {error}") from None
-    for name, own in zip(getattr(args, "also", ()), spaces[1:], strict=False):
-        if own != spaces[0]:
-            raise InputError(f"task {name!r} has other observations or actions than {args.env_id}")
-    if len(spaces) - 1 > args.num_envs:
+    if env.observation_space.shape is None:
         raise InputError(
-            f"{len(spaces) - 1} tasks to train in, and num_envs = {args.num_envs}: it must be at "
-            "least as many"
+            f"observation {args.observation!r} has several parts, which no trainer takes; "
+            "'pixels' has its images, smaller, in one vector"
         )
+    return env.observation_space, env.action_space
 
 
 def env_options(args: Problem) -> dict[str, Any]:

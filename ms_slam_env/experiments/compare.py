@@ -14,7 +14,6 @@ from ms_slam_env.experiments.harness.command_runs import check_command, is_comma
 from ms_slam_env.experiments.harness.compare_runs import (
     CompareSpec,
     TrajectoryPattern,
-    digest,
     judge_command,
     judge_trajectory,
     parse_trajectories,
@@ -22,6 +21,7 @@ from ms_slam_env.experiments.harness.compare_runs import (
 )
 from ms_slam_env.experiments.harness.compare_tables import comparison_tables
 from ms_slam_env.experiments.harness.experiment import Experiment
+from ms_slam_env.experiments.harness.named_files import digest
 from ms_slam_env.parallel import limit_threads, thread_environment
 from ms_slam_env.report.charts import Chart, scatter
 from ms_slam_env.report.records import Row

@@ -199,6 +199,7 @@ def test_the_parallel_environments_are_of_several_tasks_in_turn(tmp_path):
     [
         (["rooms"], "unknown task 'rooms'; valid choices: .*arm-kinematic"),
         (["other.yaml"], "task 'other.yaml' has other observations or actions"),
+        (["unknown.yaml"], "unknown environment 'MSActiveSLAM-Nowhere-v0'"),
         (["room", "arm", "arm-kinematic"], "4 tasks to train in, and num_envs = 3"),
     ],
 )
@@ -206,6 +207,7 @@ def test_tasks_that_cannot_be_trained_in_together_are_refused(
     words, said, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
+    Path("unknown.yaml").write_text("problem: {env_id: MSActiveSLAM-Nowhere-v0}\n")
     Path("other.yaml").write_text("problem: {env_id: MSActiveSLAM-FixedTranslation-v0}\n")
     args = ["--num-envs", "3", "--observation", "features", "--out", "out", "--also", *words]
     with pytest.raises(InputError, match=said):

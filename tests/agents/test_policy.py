@@ -21,7 +21,7 @@ from ms_slam_agents.policy_planner import RoomAgent, TrainedPolicy
 from ms_slam_agents.sb3_state import ALGORITHMS, restore, tensors_of
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from ms_slam_env.env.planners import planner_observation
+from ms_slam_env.env.planners import make_planner, planner_observation
 from ms_slam_env.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -193,6 +193,20 @@ def test_observations_of_another_environment_are_refused():
         policy.act(np.zeros(287), np.ones(49, dtype=bool))
     with pytest.raises(InputError, match=r"masks of shape \(1, 7\)"):
         policy.act(np.zeros(1315), np.ones(7, dtype=bool))
+
+
+@pytest.mark.parametrize("env_id", ["MSActiveSLAM-Room-v0", "MSActiveSLAM-Arm-v0"])
+def test_the_agent_of_ppo_moves_a_free_camera_and_the_arm(env_id):
+    seen = planner_observation("agent-ppo")
+    env = gym.make(env_id, scene="table", scene_seed=3, observation=seen)
+    observation, info = env.reset(seed=3)
+    planner = make_planner("agent-ppo", env.unwrapped)
+    planner.reset()
+    for _ in range(2):
+        action = planner.act(observation, info)
+        assert info["action_mask"][action]
+        assert action != 0  # it does not stay
+        observation, _, _, _, info = env.step(action)
 
 
 WITHOUT_TRAINERS = """

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -100,11 +99,6 @@ def parse_trajectories(text: str, several: bool) -> TrajectoryPattern:
     if several and _BLANK not in pattern:
         raise InputError(f"trajectories {text!r}: of several sequences the file needs {_BLANK}")
     return TrajectoryPattern(name, pattern)
-
-
-def digest(path: Path) -> str:
-    """Of a file's bytes; empty where there is none, which is said when it is judged."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:16] if path.is_file() else ""
 
 
 def run_backend(spec: CompareSpec) -> dict[str, Any]:

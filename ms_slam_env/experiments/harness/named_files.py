@@ -22,13 +22,28 @@ def file_hashes(spec: Any) -> dict[str, str]:
     of the module, which may have imported what is not looked at. Folders count for nothing.
     """
     texts = [getattr(spec, name, None) for name in _NAMING]
-    parts = [part for text in texts if isinstance(text, str) for part in _parts(text)]
-    hashes = {part: _hash(path) for part in parts if (path := _file(part))}
+    parts = [
+        part
+        for text in texts
+        if isinstance(text, str)
+        for part in _BETWEEN.split(text.removeprefix("command:"))
+    ]
+    hashes = {part: digest(path) for part in parts if (path := _file(part))}
     return {part: text for part, text in hashes.items() if text}
 
 
-def _parts(text: str) -> list[str]:
-    return _BETWEEN.split(text.removeprefix("command:"))
+def digest(path: Path) -> str:
+    """Of a file's bytes; empty where there is none, or it cannot be read."""
+    with suppress(OSError):
+        found = path.stat()
+        return _digest(path.resolve(), found.st_mtime_ns, found.st_size)
+    return ""
+
+
+@lru_cache(maxsize=1024)
+def _digest(path: Path, _mtime: int, _size: int) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:16]
 
 
 def _file(part: str) -> Path | None:
@@ -42,16 +57,3 @@ def _file(part: str) -> Path | None:
             if found and found.has_location and found.origin:
                 return Path(found.origin)
     return None
-
-
-def _hash(path: Path) -> str:
-    with suppress(OSError):
-        found = path.stat()
-        return _hash_of(path.resolve(), found.st_mtime_ns, found.st_size)
-    return ""
-
-
-@lru_cache(maxsize=1024)
-def _hash_of(path: Path, _mtime: int, _size: int) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()[:16]

@@ -79,7 +79,7 @@ def run_all(
         if row.get("error", "") is None
         and not versions_since(row.get("results_version", RESULTS_VERSION), kind)
     }
-    changed = [key for key, now in files.items() if rows.get(key, {}).get("files", now) != now]
+    changed = {key for key, now in files.items() if rows.get(key, {}).get("files", now) != now}
     rows = {key: row for key, row in rows.items() if key not in changed}
     if changed:
         again = f"{len(changed)} of {len(files)} are made again: a file that they name has changed"
