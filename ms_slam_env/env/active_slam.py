@@ -272,7 +272,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
                     view=lambda: self.slam.predict(episode.T_world_camera_estimate[None], SCALE),
                     predicted=self._predicted,
                     steps=(self.config.step_m, self.config.step_rad),
-                    frames=self.config.frames_per_action,
+                    frames=self.embodiment.frames_per_motion,
                     occupancy=episode.occupancy,
                 )
             )
@@ -287,7 +287,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
             views=self.slam.predict(seen_from, SCALE),
             divergences=divergences / targets.maxima,
             criterion=targets.distances(divergences) @ (1.0, targets.depth_weight),
-            frames=self.config.frames_per_action,
+            frames=self.embodiment.frames_per_motion,
         )
 
     def _lost_share(self) -> float:

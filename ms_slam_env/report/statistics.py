@@ -102,55 +102,65 @@ def has_rliable() -> bool:
     return importlib.util.find_spec("rliable") is not None
 
 
-def interquartile_means(scores: dict[str, Float64]) -> dict[str, Interval]:
+def interquartile_mean(scores: Float64) -> float:
+    """Mean of the middle half of scores (episodes, scenes): rliable's ``aggregate_iqm``, faster."""
+    ordered = np.sort(scores, axis=None)
+    cut = len(ordered) // 4
+    return float(ordered[cut : len(ordered) - cut].mean())
+
+
+def interquartile_means(scores: Mapping[str, Float64]) -> dict[str, Interval]:
     """Interquartile mean across scenes and its stratified-bootstrap interval, by planner.
 
     Args:
         scores: planner to (episodes, scenes).
     """
-    from rliable import metrics
-
-    return _rliable_intervals(
-        scores, lambda x: np.array([metrics.aggregate_iqm(x)]), resamples=_RESAMPLES
-    )
+    found = _rliable_intervals(scores, lambda x: np.array([interquartile_mean(x)]))
+    return {name: of for name, (of,) in found.items()}
 
 
-def improvement_matrix(scores: dict[str, Float64]) -> dict[tuple[str, str], Interval]:
+def improvement_matrix(scores: Mapping[str, Float64]) -> dict[tuple[str, str], Interval]:
     """P(one planner scores higher than another), averaged across scenes, of all ordered pairs.
 
-    Equal scores count half, so that both ways of a pair add up to 1.
+    Equal scores count half, so that both ways of a pair add up to 1. A resample is one of all
+    planners, each by itself, in which all pairs are compared.
 
     Args:
-        scores: planner to (episodes, scenes).
+        scores: planner to (episodes, scenes); planners may differ in their episodes.
     """
-    pairs = {(a, b): [scores[a], scores[b]] for a, b in combinations(scores, 2)}
-    found = _rliable_intervals(pairs, _improvement, resamples=_RESAMPLES)
+
+    def of_all(*resampled: Float64) -> Float64:
+        by_scene = [np.ascontiguousarray(of.T) for of in resampled]  # long rows compare faster
+        return np.array([_improvement(a, b) for a, b in combinations(by_scene, 2)])
+
+    found = _rliable_intervals({"all": list(scores.values())}, of_all)["all"]
+    pairs = dict(zip(combinations(scores, 2), found, strict=True))
     ways_back = {(b, a): Interval(1 - of.value, 1 - of.high, 1 - of.low)
-                 for (a, b), of in found.items()}  # fmt: skip
-    return {**found, **ways_back}
+                 for (a, b), of in pairs.items()}  # fmt: skip
+    return {**pairs, **ways_back}
 
 
-def _improvement(a: Float64, b: Float64) -> Float64:
-    """(1,) rliable's ``probability_of_improvement`` of (m, scenes) over (n, scenes), faster."""
-    more, equal = a[:, None] > b[None], a[:, None] == b[None]
-    return np.array([more.mean() + 0.5 * equal.mean()])
+def _improvement(a: Float64, b: Float64) -> float:
+    """rliable's ``probability_of_improvement`` of (scenes, m) over (scenes, n), faster."""
+    a, b = a[:, :, None], b[:, None]
+    more, less = np.count_nonzero(a > b), np.count_nonzero(a < b)
+    return 0.5 + 0.5 * (more - less) / (a.size * b.shape[2])
 
 
 def _rliable_intervals(
-    scores: Mapping[Key, Float64 | list[Float64]],
-    aggregate: Callable[..., Float64],
-    resamples: int,
-) -> dict[Key, Interval]:
+    scores: Mapping[Key, Float64 | list[Float64]], aggregate: Callable[..., Float64]
+) -> dict[Key, list[Interval]]:
+    """Intervals of what ``aggregate`` makes of scores, (k,), by key."""
     from rliable import library
 
     with _global_numpy_seed(0), warnings.catch_warnings():
         # The generator that rliable passes on is one that the library below wants to drop.
         warnings.simplefilter("ignore", FutureWarning)
         values, intervals = library.get_interval_estimates(
-            scores, aggregate, reps=resamples, random_state=np.random.RandomState(0)
+            scores, aggregate, reps=_RESAMPLES, random_state=np.random.RandomState(0)
         )
     return {
-        name: Interval(float(values[name][0]), *map(float, intervals[name][:, 0]))
+        name: [Interval(*map(float, of)) for of in zip(values[name], *intervals[name], strict=True)]
         for name in scores
     }
 

@@ -1,5 +1,7 @@
 """The observations `goals` and `held`: the occupancy grid alone, motion by motion."""
 
+from unittest.mock import patch
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ import pytest
 import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env.geometry import invert, relative_angle
 from ms_slam_env.mapping import OccupancyGrid, expected_gain, held_gain, reachable_positions
-from ms_slam_env.mapping.candidates import GRID_NAMES
+from ms_slam_env.mapping.candidates import GRID_NAMES, NAMES
 from ms_slam_env.mapping.expected_gain import look_from
 from ms_slam_env.mapping.goals_around import NUM_GOALS, gain_around
 from ms_slam_env.mapping.trackability import SCALE, remaining, slip_risk
@@ -130,3 +132,26 @@ def test_arm_and_straight_line_show_it_within_its_space(env_id):
     observation, _ = env.reset(seed=0)
     assert env.observation_space.contains(observation)
     assert env.observation_space.contains(env.step(1)[0])
+
+
+@pytest.mark.parametrize("observation", ["goals", "candidates"])
+def test_the_risk_of_a_motion_is_that_of_the_frames_that_the_arm_takes_on_it(observation):
+    """A motion of a dozen frames risks less than one of one, and the agent is told so."""
+    env = make(observation, "MSActiveSLAM-Arm-v0", embodiment="arm-kinematic")
+    seen, _ = env.reset(seed=0)
+    arm = type(env.unwrapped.embodiment)
+    assert env.unwrapped.embodiment.frames_per_motion > 5
+    with patch.object(arm, "frames_per_motion", 1):
+        at_once, _ = env.reset(seed=0)
+    names, rest = (GRID_NAMES, STATE) if observation == "goals" else (NAMES, 37)
+    risks, risks_at_once = (
+        rows[rest:].reshape(49, -1)[:, names.index("slip_risk")] for rows in (seen, at_once)
+    )
+    others = np.arange(len(seen) - rest).reshape(49, -1) + rest
+    others = np.delete(others, names.index("slip_risk"), axis=1).ravel()
+    np.testing.assert_array_equal(seen[:rest], at_once[:rest])
+    np.testing.assert_array_equal(seen[others], at_once[others])
+    moves = risks_at_once > risks_at_once.min()  # the others stay, or cannot be seen from
+    assert moves.sum() > 10
+    assert (risks <= risks_at_once).all()
+    assert np.median(risks[moves] / risks_at_once[moves]) < 0.5

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from itertools import permutations
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from scipy import stats
 
 from ms_slam_env.report import statistics
 from ms_slam_env.report.statistics import Interval
+
+SCORES = st.floats(-1e3, 1e3)
 
 
 def test_median_interval_has_the_coverage_of_order_statistics() -> None:
@@ -87,6 +92,34 @@ def test_improvement_probability_is_rliables_and_adds_up_to_one() -> None:
     assert there.value == pytest.approx(metrics.probability_of_improvement(a, b))
     assert (there.value + back.value, there.low + back.high) == pytest.approx((1, 1))
     assert there.low < there.value < there.high
+
+
+@given(
+    arrays(
+        np.float64, st.tuples(st.integers(1, 9), st.integers(1, 4)), elements=st.floats(-1e3, 1e3)
+    )
+)
+def test_interquartile_mean_is_rliables(scores: np.ndarray) -> None:
+    metrics = pytest.importorskip("rliable.metrics")
+    assert statistics.interquartile_mean(scores) == pytest.approx(metrics.aggregate_iqm(scores))
+
+
+def test_pairs_of_many_planners_have_what_rliable_says_of_two() -> None:
+    """All are resampled at once; rliable's own bootstrap of one pair differs by its draws alone."""
+    library = pytest.importorskip("rliable.library")
+    metrics = pytest.importorskip("rliable.metrics")
+    rng = np.random.default_rng(2)
+    scores = {name: np.round(rng.normal(k / 3, 1, (20 + k, 3)), 1) for k, name in enumerate("abcd")}
+    found = statistics.improvement_matrix(scores)
+    assert set(found) == set(permutations(scores, 2))
+    for a, b in (("a", "d"), ("c", "b")):
+        values, intervals = library.get_interval_estimates(
+            {"": [scores[a], scores[b]]},
+            lambda x, y: np.array([metrics.probability_of_improvement(x, y)]),
+            reps=500,
+        )
+        assert found[a, b].value == pytest.approx(values[""][0])
+        assert (found[a, b].low, found[a, b].high) == pytest.approx(intervals[""][:, 0], abs=0.03)
 
 
 def test_rliables_intervals_are_the_same_twice_and_leave_the_global_generator_alone() -> None:

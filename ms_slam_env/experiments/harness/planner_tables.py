@@ -84,7 +84,8 @@ def across_scenes(rows: Sequence[Row], title: str = "") -> list[Table]:
         return []
     means = statistics.interquartile_means(scores)
     lines: list[dict[str, Any]] = [
-        {"planner": name, "f_score_5cm_iqm": means[name]} for name in _ranked(means)
+        {"planner": name, "f_score_5cm_iqm": means[name]}
+        for name in _ranked({name: of.value for name, of in means.items()})
     ]
     return [make_table(["planner", "f_score_5cm_iqm"], lines, title)]
 
@@ -108,7 +109,7 @@ def better_than_each_other(
     scores = score_matrices(rows, metric)
     if not statistics.has_rliable() or len(scores) < 2:
         return []
-    names = _ranked(statistics.interquartile_means(scores))
+    names = _ranked({name: statistics.interquartile_mean(of) for name, of in scores.items()})
     pairs = statistics.improvement_matrix({name: scores[name] for name in names})
     label = short_planner_names(names)
     columns = [Column(name, "improvement", label[name]) for name in names]
@@ -191,8 +192,8 @@ def _without_path(planner: str) -> tuple[str, PurePosixPath | None]:
     return ",".join(rest), paths[0] if paths else None
 
 
-def _ranked(means: Mapping[str, statistics.Interval]) -> list[str]:
-    return sorted(means, key=lambda name: -means[name].value)
+def _ranked(means: Mapping[str, float]) -> list[str]:
+    return sorted(means, key=lambda name: -means[name])
 
 
 def _planner(row: Mapping[str, Any]) -> str:
