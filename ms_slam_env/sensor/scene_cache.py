@@ -13,11 +13,11 @@ from ms_slam_env.scenes.registry import SceneName
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sensor.noise import NoiseConfig
 
-FACES_KEPT = 2_000_000
+FACES_KEPT = 1_000_000
 """Faces of all scenes that are kept, the last one used in any case.
 
-With textures, trees and surfaces a room of 50,000 faces takes some 90 MB, a home of 180,000 some
-250 MB: about 3 GB for 40 rooms or 11 homes.
+With textures, trees and surfaces a room of 50,000 faces takes 35 to 75 MB, a home of 180,000 some
+250 MB: at most 1.5 GB for 20 rooms or five homes, in each of the processes of a training.
 """
 
 SENSORS_KEPT = 2
