@@ -149,7 +149,7 @@ class EnvConfig(Checked):
         scene_seed: one seed, or None to draw from ``split`` at each reset.
         split: which seeds to draw from: train, validation or test.
         num_scene_seeds: how many seeds of the split are used. To build a room takes a second, a
-            home longer; the last 40 rooms or 11 homes are kept.
+            home longer; the last 20 rooms or five homes are kept.
         episodes_per_scene: episodes in a row in a scene that was drawn; one that is reset with a
             seed draws in any case.
         image_size: of the camera, WIDTHxHEIGHT pixels.
