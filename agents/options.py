@@ -121,8 +121,8 @@ class Training(Problem):
         hidden: width of the two hidden layers.
         curriculum: YAML file of stages, from easy to the problem itself: see ``curriculum.py``.
         episodes_per_scene: episodes in a row in a scene that was drawn. To build a room takes a
-            second, a home longer, where it is not one of the last 20 rooms or five homes. Episodes of
-            a stage that draws noise or perturbations draw a scene each.
+            second, a home longer, where it is not one of the last 20 rooms or five homes. Episodes
+            of a stage that draws noise or perturbations draw a scene each.
         also: further tasks to train in, named as ``task`` is: the parallel environments are of the
             problem itself and of these in turn. Of them count where they are, how long and with
             which motions. Validation knows the problem alone.
