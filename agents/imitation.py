@@ -177,7 +177,7 @@ def train(args: Args) -> int:
     curve = saved_curve(args) or Curve(args.eval_episodes, {}, config=to_plain(asdict(args)))
     begun = None
     if args.init and not done:
-        begun = read_similar(args.init, args, args.hidden, ["observation"])
+        begun = read_similar(args.init, args, args.hidden)
     check_problem(args)
     if done >= args.rounds:
         raise InputError(f"{args.out} has {done} rounds already: give more than --rounds {done}")

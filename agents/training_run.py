@@ -311,21 +311,21 @@ def read_init(args: Training) -> PolicyFile:
         InputError: no policy, or one of another network or problem.
     """
     assert args.init
-    return read_similar(args.init, args, args.hidden, ("env_id", "observation"))
+    return read_similar(args.init, args, args.hidden)
 
 
-def read_similar(path: Path, args: Problem, hidden: int, names: Sequence[str]) -> PolicyFile:
-    """A policy with layers as those of ``args``, ``hidden`` wide, and its options ``names``.
+def read_similar(path: Path, args: Problem, hidden: int) -> PolicyFile:
+    """A policy of any task, with the observation and layers of ``args``, ``hidden`` wide.
 
     Raises:
         InputError: no policy, or another one.
     """
     file = read_policy(path)
     known = file.metadata
-    for name in names:
-        own = getattr(args, name)
-        if getattr(known, name) != own:
-            raise InputError(f"{path} is for {name} {getattr(known, name)!r}, not {own!r}")
+    if known.observation != args.observation:
+        raise InputError(
+            f"{path} is for observation {known.observation!r}, not {args.observation!r}"
+        )
     if tuple(known.hidden) != (hidden, hidden):
         raise InputError(f"{path} has layers of {known.hidden}: give --hidden that")
     for name, own in args.layers.items():

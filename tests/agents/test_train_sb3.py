@@ -14,7 +14,7 @@ pytest.importorskip("sb3_contrib")
 
 from learnable_fake import ENV_ID, LearnableFake, arguments, read_curve
 from ms_slam_agents import environments, evaluation, learning_curve, supervisor, train_sb3
-from ms_slam_agents.policy_file import read_policy
+from ms_slam_agents.policy_file import read_policy, write_policy
 from ms_slam_agents.sb3_state import whole_batches
 from scipy.stats import sem
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -315,6 +315,16 @@ def test_a_run_that_began_with_a_policy_is_resumed(run, tmp_path, capsys):
     more = arguments(tmp_path, "--resume", steps=96, algorithm=run.algorithm)
     assert train_sb3.main(more) == 0
     assert read_policy(tmp_path / "latest.safetensors").metadata.timesteps == 96
+
+
+def test_a_policy_of_another_task_is_begun_with(run, tmp_path):
+    own = read_policy(run.out / "latest.safetensors")
+    elsewhere = replace(own, metadata=replace(own.metadata, env_id="MSActiveSLAM-Home-v0"))
+    write_policy(tmp_path / "home.safetensors", elsewhere)
+    init = ("--init", str(tmp_path / "home.safetensors"))
+    assert train_sb3.main(arguments(tmp_path / "on", *init, algorithm=run.algorithm)) == 0
+    begun = read_policy(tmp_path / "on" / "latest.safetensors").metadata
+    assert begun.env_id != "MSActiveSLAM-Home-v0"
 
 
 def test_a_policy_of_other_actions_is_not_begun_with(run, tmp_path, monkeypatch, capsys):
