@@ -308,7 +308,7 @@ def read_init(args: Training) -> PolicyFile:
     """The policy to begin with.
 
     Raises:
-        InputError: no policy, or one of another network or problem.
+        InputError: no policy, or one of another network or observation.
     """
     assert args.init
     return read_similar(args.init, args, args.hidden)
