@@ -28,6 +28,7 @@ from ms_slam_env.experiments.harness.planner_tables import (
     better_than_each_other,
     from_the_same_start,
     policies_together,
+    trainings_compared,
     with_losses,
 )
 from ms_slam_env.report.charts import Chart, by_group, quartile_band, quartile_bands, scatter
@@ -190,14 +191,13 @@ def _policies_as_one(
     rows: Sequence[Row], pairs: Sequence[Mapping[str, Any]], title: str
 ) -> list[Table]:
     """Tables of trainings in place of their policies; none if there are none of several."""
-    together = policies_together(finished(rows))
-    if not together:
+    if not policies_together(finished(rows)):
         return []
     grouping = Grouping(("planner",), HEADLINE, rank_by=RANKED_BY, count="episodes")
     of_pairs = policies_together(pairs)
     tables = [with_losses(grouping.table(of_pairs, title), of_pairs)] if of_pairs else []
     for metric in COMPARED:
-        tables += better_than_each_other(together, f"{title}: ", metric)
+        tables += trainings_compared(finished(rows), f"{title}: ", metric)
     return tables
 
 

@@ -186,7 +186,9 @@ def test_policies_of_one_training_are_judged_together_too() -> None:
     lines: Any = tables["Policies as one: Better than each other"].rows
     found = {line["planner"]: line for line in lines}
     assert set(found) == {"nbv", "agent (3 policies)", "x,path=c"}
-    assert found["agent (3 policies)"]["nbv"].value == pytest.approx(2 / 3)
+    of_trainings = found["agent (3 policies)"]["nbv"]
+    assert of_trainings.value == pytest.approx(2 / 3)
+    assert (of_trainings.low, of_trainings.high) == pytest.approx((0, 1))  # by one policy and all
     assert len(tables["Better than each other"].rows) == 5
     medians: Any = {line["planner"]: line for line in tables["Policies as one"].rows}
     assert medians["agent (3 policies)"]["episodes"] == 3 * medians["nbv"]["episodes"]

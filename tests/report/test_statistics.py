@@ -132,3 +132,29 @@ def test_rliables_intervals_are_the_same_twice_and_leave_the_global_generator_al
     assert before[0] == after[0]
     np.testing.assert_array_equal(before[1], after[1])
     assert before[2:] == after[2:]
+
+
+def test_of_one_policy_each_the_episodes_alone_are_resampled() -> None:
+    pytest.importorskip("rliable")
+    rng = np.random.default_rng(3)
+    scores = {name: np.round(rng.normal(k / 3, 1, (20, 3)), 1) for k, name in enumerate("abc")}
+    found = statistics.improvement_of_trainings({name: of[None] for name, of in scores.items()})
+    theirs = statistics.improvement_matrix(scores)
+    assert set(found) == set(theirs)
+    for pair, of in theirs.items():
+        assert found[pair].value == pytest.approx(of.value)
+        assert (found[pair].low, found[pair].high) == pytest.approx((of.low, of.high), abs=0.02)
+
+
+@given(st.integers(2, 20), st.data())
+def test_policies_are_resampled_as_a_binomial_distribution_says(
+    policies: int, data: st.DataObject
+) -> None:
+    """Each policy is better in all episodes or worse: how many better ones are drawn is left."""
+    better = data.draw(st.integers(0, policies))
+    ours = np.repeat(np.arange(policies)[:, None, None] < better, 4, axis=1).repeat(3, axis=2)
+    scores = {"ours": ours.astype(float), "theirs": np.full((1, 5, 3), 0.5)}
+    found = statistics.improvement_of_trainings(scores)["ours", "theirs"]
+    expected = stats.binom.ppf([0.025, 0.975], policies, better / policies) / policies
+    assert found.value == pytest.approx(better / policies)
+    assert (found.low, found.high) == pytest.approx(expected, abs=1 / policies + 1e-9)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import PurePosixPath
 from typing import Any
@@ -109,15 +109,56 @@ def better_than_each_other(
     scores = score_matrices(rows, metric)
     if not statistics.has_rliable() or len(scores) < 2:
         return []
+    ranked = _best_first(scores)
+    note = f"Probability that a line's planner has the {what}, with 95 % intervals."
+    return [_two_by_two(ranked, statistics.improvement_matrix(ranked), prefix + title, note)]
+
+
+def trainings_compared(
+    rows: Sequence[Row], prefix: str = "", metric: str = RANKED_BY
+) -> list[Table]:
+    """``better_than_each_other`` of trainings, of which the policies are resampled, too.
+
+    Nothing without rliable, or of a single training or planner.
+    """
+    title, what = COMPARED[metric]
+    name_of = _names_of_trainings(rows)
+    members: dict[str, list[NDArray[np.float64]]] = {}
+    for planner, of in score_matrices(rows, metric).items():
+        members.setdefault(name_of[planner], []).append(of)
+    if not statistics.has_rliable() or len(members) < 2:
+        return []
+    scores = {
+        name: np.stack([of[: min(map(len, policies))] for of in policies])
+        for name, policies in members.items()
+    }
+    ranked = _best_first(scores)
+    note = (
+        f"Probability that a line's planner has the {what}, with 95 % intervals over episodes "
+        "and, of several policies, over these."
+    )
+    return [_two_by_two(ranked, statistics.improvement_of_trainings(ranked), prefix + title, note)]
+
+
+def _best_first(scores: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
     names = _ranked({name: statistics.interquartile_mean(of) for name, of in scores.items()})
-    pairs = statistics.improvement_matrix({name: scores[name] for name in names})
+    return {name: scores[name] for name in names}
+
+
+def _two_by_two(
+    names: Iterable[str],
+    pairs: Mapping[tuple[str, str], statistics.Interval],
+    title: str,
+    note: str,
+) -> Table:
+    """A line and a column for each planner, in this order."""
+    names = tuple(names)
     label = short_planner_names(names)
     columns = [Column(name, "improvement", label[name]) for name in names]
     lines: list[dict[str, Any]] = [
         {"planner": name, **{other: pairs.get((name, other)) for other in names}} for name in names
     ]
-    note = f"Probability that a line's planner has the {what}, with 95 % intervals."
-    return [make_table(["planner", *columns], lines, prefix + title, note)]
+    return make_table(["planner", *columns], lines, title, note)
 
 
 def from_the_same_start(rows: Sequence[Row], prefix: str = "") -> list[Table]:
@@ -159,6 +200,14 @@ def policies_together(rows: Sequence[Row]) -> list[dict[str, Any]]:
     training leads to. Files in several folders are those of several trainings; of a file that is
     the only one in its folder, as a training leaves it, the folder above counts.
     """
+    names = _names_of_trainings(rows)
+    if all(name == planner for planner, name in names.items()):
+        return []
+    return [{**row, "spec": {**row["spec"], "planner": names[_planner(row)]}} for row in rows]
+
+
+def _names_of_trainings(rows: Sequence[Row]) -> dict[str, str]:
+    """What planners are called in ``policies_together``: as before those that stand alone."""
     members: dict[str, list[str]] = {}
     for planner in dict.fromkeys(map(_planner, rows)):
         members.setdefault(_without_path(planner)[0], []).append(planner)
@@ -174,14 +223,11 @@ def policies_together(rows: Sequence[Row]) -> list[dict[str, Any]]:
         for planner, folder in folders.items():
             training = f"{name},path={folder}" if several and folder else name
             trainings.setdefault(training, []).append(planner)
-    names = {
+    return {
         planner: f"{name} ({len(of)} policies)" if len(of) > 1 else planner
         for name, of in trainings.items()
         for planner in of
     }
-    if all(name == planner for planner, name in names.items()):
-        return []
-    return [{**row, "spec": {**row["spec"], "planner": names[_planner(row)]}} for row in rows]
 
 
 def _without_path(planner: str) -> tuple[str, PurePosixPath | None]:
