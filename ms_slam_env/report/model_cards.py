@@ -237,7 +237,11 @@ def _score_text(score: _Score, policy: Policy) -> Iterator[str]:
     yield f"### In `{score.task}`\n"
     if results.stale:
         yield f"*{results.stale}*\n"
+    seeds = _config(score.one).get("seeds", "test")
+    if seeds != "test":
+        yield f"On {seeds} seeds:\n"
     columns = tuple(c for c in score.table.columns if c.name in _SCORES)
+    which = "the best classical planner" if others[1:] else "the only classical planner judged"
     rows = (score.own, others[0])
     yield replace(score.table, title="", columns=columns, rows=rows).as_markdown()
     for title, metric, what in _VERDICTS:
@@ -247,7 +251,7 @@ def _score_text(score: _Score, policy: Policy) -> Iterator[str]:
             chance = _chance(table, policy, best)
             if chance is not None:
                 shown = format_value(chance, "improvement")
-                verdict = _verdict(chance, best)
+                verdict = _verdict(chance, f"`{best}`, {which}")
                 yield f"By {what} {verdict}: its own is better in {shown} % of pairs.\n"
 
 
@@ -275,12 +279,12 @@ def _chance(table: Table, policy: Policy, best: Any) -> Interval | None:
     return None
 
 
-def _verdict(chance: Interval, best: Any) -> str:
+def _verdict(chance: Interval, rival: str) -> str:
     if chance.low > 0.5:
-        return f"it beats `{best}`, the best classical planner"
+        return f"it beats {rival}"
     if chance.high < 0.5:
-        return f"it does not beat `{best}`, the best classical planner"
-    return f"neither it nor `{best}`, the best classical planner, is shown to be better"
+        return f"it does not beat {rival}"
+    return f"neither it nor {rival}, is shown to be better"
 
 
 # -- Where it ends ---------------------------------------------------------------------------------

@@ -27,6 +27,7 @@ def scores(
     names: tuple[str, ...] = ("nbv", "random"),
     by_return: Interval | None = None,
     task: str = "",
+    seeds: str = "test",
 ) -> None:
     """A planner benchmark in which ``planner`` is that much better than ``nbv``."""
     names = (names[0], planner, *names[1:])
@@ -74,7 +75,7 @@ def scores(
             *([rewarded] if by_return else []),
         ],
         rows=rows,
-        content={"config": {"task": "kitchen", "seeds": "test", "options": options}},
+        content={"config": {"task": "kitchen", "seeds": seeds, "options": options}},
     )
 
 
@@ -145,6 +146,19 @@ def test_a_card_says_what_the_file_and_the_results_say(clone: Path) -> None:
 def test_the_interval_decides(clone: Path, chance: Interval, verdict: str) -> None:
     scores(clone / "docs/results/judged", chance)
     assert verdict in card(clone)
+
+
+@pytest.mark.parametrize("seeds", ["test", "validation"])
+def test_a_score_on_other_seeds_than_those_of_tests_says_so(clone: Path, seeds: str) -> None:
+    scores(clone / "docs/results/judged", Interval(0.8, 0.6, 0.9), seeds=seeds)
+    assert ("On validation seeds:\n" in card(clone)) == (seeds == "validation")
+
+
+def test_one_rival_is_not_called_the_best(clone: Path) -> None:
+    scores(clone / "docs/results/judged", Interval(0.8, 0.6, 0.9), names=("nbv",))
+    text = card(clone)
+    assert "it beats `nbv`, the only classical planner judged: " in text
+    assert "the best classical planner" not in text
 
 
 def test_scores_of_another_agent_are_not_its_own(clone: Path) -> None:

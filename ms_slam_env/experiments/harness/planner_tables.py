@@ -119,14 +119,14 @@ def trainings_compared(
 ) -> list[Table]:
     """``better_than_each_other`` of trainings, of which the policies are resampled, too.
 
-    Nothing without rliable, or of a single training or planner.
+    Nothing of a single training or planner.
     """
     title, what = COMPARED[metric]
     name_of = _names_of_trainings(rows)
     members: dict[str, list[NDArray[np.float64]]] = {}
     for planner, of in score_matrices(rows, metric).items():
         members.setdefault(name_of[planner], []).append(of)
-    if not statistics.has_rliable() or len(members) < 2:
+    if len(members) < 2:
         return []
     scores = {
         name: np.stack([of[: min(map(len, policies))] for of in policies])
