@@ -165,7 +165,10 @@ class _Worker(Protocol):
         """Begin with a spec; what tells when it is done (a pipe, a future)."""
 
     def receive(self) -> Outcome:
-        """What came of the spec, without key; `_DiedError` if the worker died on it."""
+        """What came of the spec, without key; `_DiedError` if the worker died on it.
+
+        `_DiedAtRestError` if it died before it began with it.
+        """
 
     def stop(self) -> None:
         """End the worker, whatever it is doing."""
@@ -173,6 +176,10 @@ class _Worker(Protocol):
 
 class _DiedError(Exception):
     """A worker died; the message says how."""
+
+
+class _DiedAtRestError(Exception):
+    """A worker died between two specs: the second is untouched."""
 
 
 class Pool:
@@ -192,7 +199,7 @@ class Pool:
         self._start, self._wait_for, self._leave = start, wait_for, leave
         self._workers, self._fresh = workers, fresh
         self._resting: list[_Worker] = []
-        self._working: dict[Any, tuple[_Worker, Any, float]] = {}  # with key and start of its spec
+        self._working: dict[Any, tuple[_Worker, Any, Any, float]] = {}  # key, spec and its start
 
     def __enter__(self) -> Pool:
         return self
@@ -211,27 +218,33 @@ class Pool:
         return len(self._working)
 
     def give(self, key: Any, spec: Any) -> None:
-        """Let an idle worker run ``spec``; there must be one; if it died, another in its place."""
+        """Let an idle worker run ``spec``; there must be one."""
         worker = self._resting.pop() if self._resting else self._start()
-        try:
-            sent = worker.send(spec)
-        except BrokenPipeError:
-            worker.stop()
-            worker = self._start()
-            sent = worker.send(spec)
-        self._working[sent] = (worker, key, time.perf_counter())
+        self._working[worker.send(spec)] = (worker, key, spec, time.perf_counter())
 
     def take(self, timeout_s: float | None = None) -> list[Outcome]:
         """Wait for outcomes, at most so long; those that are there, none if no worker is busy.
 
-        A worker that died is replaced.
+        A worker that died is replaced. What it had not begun with is given to another, but on a
+        cluster, which does not tell whether it had.
         """
-        done = self._wait_for(list(self._working), timeout_s) if self._working else ()
-        return [self._outcome(*self._working.pop(each)) for each in done]
+        outcomes: list[Outcome] = []
+        while self._working and not outcomes:
+            for done in self._wait_for(list(self._working), timeout_s):
+                outcome = self._outcome(*self._working.pop(done))
+                outcomes += [outcome] if outcome else []
+            if timeout_s is not None:
+                break
+        return outcomes
 
-    def _outcome(self, worker: _Worker, key: Any, start: float) -> Outcome:
+    def _outcome(self, worker: _Worker, key: Any, spec: Any, start: float) -> Outcome | None:
+        """None if the spec is with another worker now."""
         try:
             outcome = replace(worker.receive(), key=key)
+        except _DiedAtRestError:
+            worker.stop()
+            self.give(key, spec)
+            return None
         except _DiedError as error:
             message = f"the process died{error}"
             elapsed_s = round(time.perf_counter() - start, 3)
@@ -244,7 +257,7 @@ class Pool:
 
     def stop(self) -> None:
         """End the workers; what runs at this moment is lost."""
-        for worker in (*self._resting, *(worker for worker, _, _ in self._working.values())):
+        for worker in (*self._resting, *(each[0] for each in self._working.values())):
             worker.stop()
         self._resting, self._working = [], {}
         self._leave()
@@ -309,20 +322,26 @@ class _Process:
     def __init__(self, run: Run, environment: Mapping[str, str]) -> None:
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs, run), daemon=True)
+        self._sent, self._begun = 0, context.RawValue("Q", 0)  # specs; the process counts its own
+        arguments = (theirs, run, self._begun)
+        self._process = context.Process(target=_serve, args=arguments, daemon=True)
         with _environment(environment):  # inherited, and read when libraries are loaded
             self._process.start()
         theirs.close()  # so that reading ends when the process does
 
     def send(self, spec: Any) -> Connection:
-        self._pipe.send(spec)
+        self._sent += 1
+        with contextlib.suppress(ConnectionError):  # it died: `receive` says so
+            self._pipe.send(spec)
         return self._pipe
 
     def receive(self) -> Outcome:
         try:
             return self._pipe.recv()
-        except (EOFError, ConnectionResetError):
+        except (EOFError, ConnectionError):
             self._process.join()
+            if 0 < self._begun.value < self._sent:  # else it cannot begin at all
+                raise _DiedAtRestError from None
             raise _DiedError(f", exit code {self._process.exitcode}") from None
 
     def stop(self) -> None:
@@ -344,7 +363,7 @@ def _environment(variables: Mapping[str, str]) -> Iterator[None]:
         os.environ.update(before)
 
 
-def _serve(pipe: Connection, run: Run) -> None:
+def _serve(pipe: Connection, run: Run, begun: Any) -> None:
     """Run what comes through ``pipe``; leave Ctrl-C to the parent, and end when it does."""
     tqdm.set_lock(threading.RLock())  # its own is a semaphore, left behind by who is terminated
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -361,6 +380,7 @@ def _serve(pipe: Connection, run: Run) -> None:
             spec = pipe.recv()
         except EOFError:
             return
+        begun.value += 1
         pipe.send(attempt(run, None, spec))
 
 

@@ -23,6 +23,13 @@ from ms_slam_env.parallel import (
 )
 
 
+class Unreadable:
+    """Ends the process that unpickles it."""
+
+    def __reduce__(self) -> tuple:
+        return os._exit, (3,)
+
+
 def outcomes(specs: list[int], **options) -> dict[int, Outcome]:
     with open_pool(work, **options) as pool:
         found = {outcome.key: outcome for outcome in run_each(pool, {spec: spec for spec in specs})}
@@ -89,19 +96,32 @@ def test_waiting_ends_at_its_limit_and_without_work() -> None:
         assert [outcome.key for outcome in pool.take()] == ["a"]
 
 
-def test_a_worker_that_died_while_it_rested_is_replaced() -> None:
+@pytest.mark.parametrize("seen", [True, False], ids=["death seen", "death after giving"])
+def test_a_worker_that_died_while_it_rested_is_replaced(seen: bool) -> None:
     with open_pool(work, workers=1) as pool:
         pool.give("a", 2)
         (first,) = pool.take()
-        os.kill(first.value["pid"], signal.SIGKILL)
-        for _ in range(100):  # until its end of the pipe is gone
-            if not Path(f"/proc/{first.value['pid']}/fd/0").exists():
-                break
-            time.sleep(0.05)
-        pool.give("b", 3)
+        if seen:
+            os.kill(first.value["pid"], signal.SIGKILL)
+            time.sleep(0.5)
+            pool.give("b", 3)
+        else:
+            os.kill(first.value["pid"], signal.SIGSTOP)
+            pool.give("b", 3)
+            os.kill(first.value["pid"], signal.SIGKILL)
         (second,) = pool.take()
     assert (second.key, second.value["square"]) == ("b", 9)
     assert second.value["pid"] != first.value["pid"]
+
+
+def test_a_worker_that_cannot_begin_costs_its_spec_and_is_not_tried_for_ever() -> None:
+    with open_pool(work, workers=1) as pool:
+        pool.give("a", Unreadable())
+        (outcome,) = pool.take()
+        assert (outcome.key, outcome.died) == ("a", True)
+        pool.give("b", 3)
+        (outcome,) = pool.take()
+    assert outcome.value["square"] == 9
 
 
 def test_there_must_be_a_worker() -> None:
