@@ -16,7 +16,8 @@ import numpy as np
 import torch
 from ms_slam_agents.curriculum import Staged, read_curriculum
 from ms_slam_agents.evaluation import FixedEpisodes
-from ms_slam_agents.options import Problem, world_of
+from ms_slam_agents.options import Problem, Training, world_of
+from ms_slam_agents.through_planner import ThroughPlanner
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 import ms_slam_env  # registers the ids, in a worker process too
@@ -42,7 +43,9 @@ def make_env(
 
     def make(problem: Problem, more: Mapping[str, Any]) -> gym.Env[Any, Any]:
         options = problem_options(problem, split)
-        return gym.make(problem.env_id, disable_env_checker=True, **options, **more)
+        env = gym.make(problem.env_id, disable_env_checker=True, **options, **more)
+        through = problem.through if isinstance(problem, Training) else None
+        return ThroughPlanner(env, through) if through else env
 
     path = getattr(args, "curriculum", None)
     if path and split == "train":

@@ -76,6 +76,7 @@ class HomeAgent(NextBestView):
         """Nothing is known yet."""
         super().reset()
         self.near.reset()
+        self._choices: NDArray[np.bool_] | None = None
 
     def act(self, observation: Any, info: dict[str, Any]) -> int:
         """Carve the last frame, choose a motion."""
@@ -90,14 +91,19 @@ class HomeAgent(NextBestView):
         """The policy's motion, or the one towards a goal."""
         safe = self.safe_motions(here)
         wanted = self.near.policy.act(self.seen, safe if safe.any() else self.env.action_masks())
+        self._choices = None
         if self.goal is not None:
             self.judge_goal(here)
         if self.goal is None and not self.must_leave(here) and safe.any():
             best = best_goal(self.map.grid, here, self.env.intrinsics, self.steps)
             if self.gain_of(best[None])[0] >= self.enough_m3:
                 self.given_up = 0
-                return int(wanted)
-        return self.go_to_goal(here)
+                self._choices = safe
+        return self.go_to_goal(here) if self._choices is None else int(wanted)
+
+    def choices(self) -> NDArray[np.bool_] | None:
+        """The motions that are not likely to slip; None on the way to a goal."""
+        return self._choices
 
     def safe_motions(self, here: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Which motions (n,) are not likely to slip, as far as the policy's observation says."""

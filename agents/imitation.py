@@ -43,7 +43,7 @@ from ms_slam_env.report.records import to_plain
 from ms_slam_env.report.results import RESULTS
 
 _TRAINING_SEED = 500_000  # of the first episode
-_OWN_PROBLEM = {*KEPT, "teacher", "episodes", "epochs", "seed", "through", "memory"} - {"algorithm"}
+_OWN_PROBLEM = {*KEPT, "teacher", "episodes", "epochs", "seed", "memory"} - {"algorithm"}
 """Options that all rounds of a run have in common."""
 
 

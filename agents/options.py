@@ -110,6 +110,9 @@ class Training(Problem):
     Attributes:
         init: policy file to begin with, as of ``ms-slam train imitation``; its network and
             normalisation, not its steps.
+        through: planner that the policy acts through, in validation too: `agent-home` has goals for
+            the way to what is not near by, and lets the policy choose among motions that are not
+            likely to slip. None: the policy acts by itself.
         total_timesteps: environment steps, all runs of a resumed training together.
         minutes: stop this run after training for so much wall-clock time; evaluations and the
             episodes of the references come on top. None: by steps alone.
@@ -129,6 +132,7 @@ class Training(Problem):
     """
 
     init: Path | None = None
+    through: str | None = None
     total_timesteps: int = bounded(200_000, 2, 1_000_000_000)
     minutes: float | None = bounded(None, 0, 1_000_000)
     eval_every: int = bounded(20_000, 0, 1_000_000_000)
@@ -271,6 +275,7 @@ KEPT = (
     "step_deg",
     "reward",
     "without",
+    "through",
     "hidden",
 )
 """Options that a run keeps when it is resumed: another network, or another problem."""

@@ -69,6 +69,10 @@ class Planner(ABC):
         """Probabilities (n,) of the actions as `act` weighed them; None: all for the one chosen."""
         return None
 
+    def choices(self) -> NDArray[np.bool_] | None:
+        """Actions (n,) of which `act` let a policy within choose; None: it chose by itself."""
+        return None
+
     def instead(self, action: int) -> None:  # noqa: B027 -- most planners see what came of it
         """Be told that another action was taken than ``act`` returned last."""
 
@@ -114,6 +118,10 @@ class Recovering(Planner):
     def preferences(self) -> NDArray[np.float64] | None:
         """What the planner says; all for the motion that undoes another."""
         return self.planner.preferences() if self.has_chosen else None
+
+    def choices(self) -> NDArray[np.bool_] | None:
+        """What the planner says; None where a motion is undone."""
+        return self.planner.choices() if self.has_chosen else None
 
     def act(self, observation: Any, info: dict[str, Any]) -> int:
         """Undo a motion, or what the planner says."""

@@ -151,3 +151,12 @@ def test_planner_and_environment_draw_differently_from_one_seed():
     of_env, _ = gymnasium.utils.seeding.np_random(7)
     assert not np.isclose(drawn, of_env.uniform(size=4)).any()
     np.testing.assert_array_equal(Still(None, 7).rng.uniform(size=4), drawn)
+
+
+def test_on_the_way_back_no_policy_within_has_a_choice():
+    planner = recovering()
+    planner.planner.choices = lambda: np.arange(49) < 3
+    planner.act(None, OK)
+    assert planner.choices().sum() == 3
+    planner.act(None, LOST)
+    assert planner.choices() is None
