@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from ms_slam_agents import ppo
+from ms_slam_agents.environments import VALIDATION_SEED, make_venv
 from ms_slam_agents.home_agent import HomePolicy
 from ms_slam_agents.network import Network
 from ms_slam_agents.through_planner import ThroughPlanner
@@ -79,6 +80,22 @@ def test_the_planner_is_told_of_what_was_done_in_its_place():
     other = (env._wanted + 1) % 49
     env.step(other)
     assert told == [other]
+
+
+def test_training_and_validation_are_through_the_planner():
+    args = ppo.Args(
+        env_id="MSActiveSLAM-Room-v0",
+        scenes=("table",),
+        observation="held",
+        image_size="80x60",
+        through="agent-home,enough_m3=1000",
+        num_envs=1,
+    )
+    for split, seeds in (("train", ()), ("validation", (VALIDATION_SEED,))):
+        venv = make_venv(args, split, seeds)
+        venv.reset()
+        assert venv.env_method("action_masks")[0].sum() == 1  # all ways lead to goals
+        venv.close()
 
 
 def test_what_had_no_choice_teaches_the_policy_nothing():
