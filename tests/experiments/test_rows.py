@@ -186,7 +186,7 @@ def heed_interrupts() -> None:
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
 def test_interruption_loses_and_repeats_nothing(tmp_path: Path, how: signal.Signals) -> None:
     out, log, count = tmp_path / "out", tmp_path / "log", 24
-    command = [sys.executable, fake_work.__file__, str(out), str(count), "0.1", str(log)]
+    command = [sys.executable, fake_work.__file__, str(out), str(count), "0.2", str(log)]
     process = subprocess.Popen(
         command, stderr=subprocess.DEVNULL, start_new_session=True, preexec_fn=heed_interrupts
     )
