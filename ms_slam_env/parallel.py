@@ -322,32 +322,45 @@ class _Process:
     def __init__(self, run: Run, environment: Mapping[str, str]) -> None:
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
-        self._sent, self._begun = 0, context.RawValue("Q", 0)  # specs; the process counts its own
-        arguments = (theirs, run, self._begun)
+        self._begun, begins = context.Pipe(duplex=False)  # a word of each spec that it takes
+        self._has_rested = False
+        arguments = (theirs, begins, run)
         self._process = context.Process(target=_serve, args=arguments, daemon=True)
         with _environment(environment):  # inherited, and read when libraries are loaded
             self._process.start()
         theirs.close()  # so that reading ends when the process does
+        begins.close()
 
     def send(self, spec: Any) -> Connection:
-        self._sent += 1
         with contextlib.suppress(ConnectionError):  # it died: `receive` says so
             self._pipe.send(spec)
         return self._pipe
 
     def receive(self) -> Outcome:
         try:
-            return self._pipe.recv()
+            outcome: Outcome = self._pipe.recv()
+            self._begun.recv_bytes()
         except (EOFError, ConnectionError):
             self._process.join()
-            if 0 < self._begun.value < self._sent:  # else it cannot begin at all
+            if self._has_rested and not self._has_begun():  # else it cannot begin at all
                 raise _DiedAtRestError from None
             raise _DiedError(f", exit code {self._process.exitcode}") from None
+        self._has_rested = True
+        return outcome
+
+    def _has_begun(self) -> bool:
+        """Whether the process, which is dead, had begun with what it was sent last."""
+        try:
+            self._begun.recv_bytes()
+        except (EOFError, ConnectionError):
+            return False
+        return True
 
     def stop(self) -> None:
         self._process.terminate()
         self._process.join()
         self._pipe.close()
+        self._begun.close()
 
 
 @contextmanager
@@ -363,7 +376,7 @@ def _environment(variables: Mapping[str, str]) -> Iterator[None]:
         os.environ.update(before)
 
 
-def _serve(pipe: Connection, run: Run, begun: Any) -> None:
+def _serve(pipe: Connection, begun: Connection, run: Run) -> None:
     """Run what comes through ``pipe``; leave Ctrl-C to the parent, and end when it does."""
     tqdm.set_lock(threading.RLock())  # its own is a semaphore, left behind by who is terminated
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -380,7 +393,7 @@ def _serve(pipe: Connection, run: Run, begun: Any) -> None:
             spec = pipe.recv()
         except EOFError:
             return
-        begun.value += 1
+        begun.send_bytes(b"1")
         pipe.send(attempt(run, None, spec))
 
 
