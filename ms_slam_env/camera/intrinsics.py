@@ -24,6 +24,9 @@ XTION_SIZES: dict[str, tuple[int, int]] = {
 LARGEST_SIDE = 4096
 """Pixels of a side of an image, more than any RGB-D camera has."""
 
+SMALLEST_LEVEL = 2
+"""Pixels of a side of the coarsest level of a pyramid: what interpolation needs."""
+
 LARGEST_NUMBER = 1e6
 """Largest focal length, and farthest centre from the corner, in pixels; the least focal length is
 its inverse."""
@@ -124,6 +127,33 @@ class Intrinsics:
             width=round(self.width * factor),
             height=round(self.height * factor),
         )
+
+    def level_size(self, level: int) -> tuple[int, int]:
+        """(width, height) of level ``level`` of an image pyramid; level 0 is the image itself.
+
+        A pixel of a level is a whole block of 2x2 of the one below; a column or row left over at
+        the right or the bottom is dropped. All pyramids ask here.
+
+        Raises:
+            InputError: the level would have a side of less than `SMALLEST_LEVEL` pixels.
+        """
+        width, height = self.width >> level, self.height >> level
+        if min(width, height) < SMALLEST_LEVEL:
+            least = SMALLEST_LEVEL << level
+            raise InputError(
+                f"images of {self.width}x{self.height} are too small for a pyramid of {level + 1} "
+                f"levels, which needs {least}x{least}"
+            )
+        return width, height
+
+    def pyramid_level(self, level: int) -> Intrinsics:
+        """Intrinsics of level ``level`` of a pyramid whose pixels are means of blocks.
+
+        Raises:
+            InputError: the image is too small for that level.
+        """
+        width, height = self.level_size(level)
+        return replace(self.scaled(0.5**level), width=width, height=height)
 
     def resized(self, width: int, height: int) -> Intrinsics:
         """Intrinsics of the image resampled to ``width`` x ``height``, same field of view."""

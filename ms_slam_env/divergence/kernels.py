@@ -11,14 +11,10 @@ indexing, with any strides, takes longer than what they compute. So images must 
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
+from ms_slam_env.native import native_source
 
 
-@wp.func_native("""
-for (int u = 0; u < width; ++u) {
-    const float z = depth.data[u];
-    inverse.data[u] = 1.0f / (z > 1.0e-20f ? z : 1.0e-20f);
-}
-""")
+@wp.func_native(native_source("histograms", "invert_row"))
 def invert_row(depth: wp.array(dtype=wp.float32), width: int, inverse: wp.array(dtype=wp.float32)):
     """Inverse depth of a row of pixels."""
 
@@ -106,15 +102,7 @@ def direction_cell(n: wp.vec3, size: int):
     return row * size + wp.clamp(int(x + half), 0, size - 1)
 
 
-@wp.func_native("""
-const int* listed = near.data + size_t(cell) * near.shape[1];
-float* out = sums.data + first;
-for (int k = 1; k <= listed[0]; ++k) {
-    const wp::vec3& d = directions.data[listed[k]];
-    const float cosine = (n[0] * d[0] + n[1] * d[1] + n[2] * d[2]) * inverse;
-    out[listed[k]] += cosine > cos_alpha ? cosine - cos_alpha : 0.0f;
-}
-""")
+@wp.func_native(native_source("histograms", "add_to_bins"))
 def add_to_bins(
     n: wp.vec3,
     inverse: float,
@@ -143,16 +131,7 @@ def add_weights(
     add_to_bins(n, inverse, directions, near, cell, cos_alpha, first, sums)
 
 
-@wp.func_native("""
-const float* grey = intensity.data;
-const float* z = depth.data;
-for (int u = 0; u < width; ++u) {
-    if (only_with_depth && !(z[u] > 0.0f)) continue;
-    int level = (int)(grey[u] + 0.5f);
-    level = level < 0 ? 0 : level > 255 ? 255 : level;
-    wp::atomic_add(counts.data + first + 256 * column_window.data[u] + level, 1);
-}
-""")
+@wp.func_native(native_source("histograms", "count_row"))
 def count_row(
     intensity: wp.array(dtype=wp.float32),
     depth: wp.array(dtype=wp.float32),

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env._warp import RecordedLaunch, wp
+from ms_slam_env.native import native_source
 from ms_slam_env.scenes.base import Scene
 
 Float64 = NDArray[np.float64]
@@ -79,37 +80,7 @@ class VoxelGrid:
     voxel_m: wp.float64
 
 
-# The products of a matrix and a vector are summed in the order of BLAS, with its fused additions
-# where the processor has them, so that they are what NumPy makes of them, bit for bit.
-@wp.func_native("""
-#pragma clang fp contract(off)
-auto product = [](const double* row, const double* p) {
-#pragma clang fp contract(on)
-    return row[2] * p[2] + (row[1] * p[1] + row[0] * p[0]);
-};
-const wp::mat_t<4, 4, double>& T_true = poses.data[0];
-const wp::mat_t<4, 4, double>& T_estimate = poses.data[1];
-for (int i = 0; i < depth.shape[0]; ++i) {
-    const double z = (double)depth.data[i];
-    if (!(z > 0.0)) continue;
-    const double p[3] = {rays.data[3 * i] * z, rays.data[3 * i + 1] * z, rays.data[3 * i + 2] * z};
-    double squared = 0.0;
-    long long flat = 0;
-    bool inside = true;
-    for (int k = 0; k < 3; ++k) {
-        const double at = product(T_true.data[k], p) + T_true.data[k][3];
-        const double off = product(T_estimate.data[k], p) + T_estimate.data[k][3] - at;
-        squared += off * off;
-        const double cell = floor((at - grid.origin[k]) / grid.voxel_m);
-        inside = inside && cell >= 0.0 && cell < (double)grid.shape[k];
-        flat = flat * grid.shape[k] + (inside ? (long long)cell : 0);
-    }
-    if (!inside || !(sqrt(squared) < grid.voxel_m) || mapped.data[flat]) continue;
-    mapped.data[flat] = 1;
-    counts.data[0] += 1;
-    counts.data[1] += reachable.data[flat];
-}
-""")
+@wp.func_native(native_source("coverage", "mark_points"))
 def mark_points(
     depth: wp.array(dtype=wp.float32),
     rays: wp.array(dtype=wp.float64),

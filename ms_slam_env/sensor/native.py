@@ -1,4 +1,4 @@
-"""What native kernels share: vector loops over a row, and random numbers that need no state."""
+"""What the sensor's native kernels share: compiler flags, spans, keys of random numbers."""
 
 from __future__ import annotations
 
@@ -8,15 +8,8 @@ from scipy.special import ndtri
 
 from ms_slam_env.errors import InputError
 
-VECTORISE = """
-#if defined(__clang__) && !defined(__CUDA_ARCH__)
-#pragma clang loop vectorize(assume_safety) vectorize_width(8) interleave(disable)
-#endif
-"""
-"""Put before a loop in native code whose turns are independent: eight at a time."""
-
 VECTOR_FLAGS = {"cpu_compiler_flags": "-march=native"}
-"""Options of a module with such loops: under Warp's default flags Clang does not vectorise them."""
+"""Options of a module whose native loops vectorise; Warp's default flags keep Clang from it."""
 
 
 def span_of(width: int, device: str) -> int:
@@ -43,18 +36,3 @@ def frame_key(seed: int, index: int) -> NDArray[np.uint32]:
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
             raise InputError(f"sensor {name} must be an integer >= 0, got {value!r}")
     return np.random.SeedSequence([int(seed), int(index)]).generate_state(2).astype(np.uint32)
-
-
-PCG = """
-auto pcg = [](unsigned x) {
-    const unsigned state = x * 747796405u + 2891336453u;
-    const unsigned word = ((state >> ((state >> 28) + 4u)) ^ state) * 277803737u;
-    return (word >> 22) ^ word;
-};
-auto first_word = [&](int pixel) { return pcg(pcg((unsigned)pixel ^ key_0) + key_1); };
-"""
-"""C++: a hash of 32 bits, and the first random word of a pixel under the frame's key.
-
-Further words follow by ``pcg(word + stream)``. The low and the high 16 bits of a word each index
-``normal_table``. Source: Jarzynski and Olano, "Hash Functions for GPU Rendering", JCGT 2020.
-"""

@@ -56,10 +56,7 @@ class SemiDenseAligner:
     def __init__(self, intrinsics: Intrinsics) -> None:
         shortest = min(intrinsics.shape)
         levels = [k for k in range(len(ITERATIONS)) if not k or shortest >> k >= _SMALLEST_SIDE]
-        self._cameras = [
-            intrinsics.resized(intrinsics.width >> level, intrinsics.height >> level)
-            for level in levels
-        ]
+        self._cameras = [intrinsics.resized(*intrinsics.level_size(k)) for k in levels]
 
     def prepare(self, image: DepthImage) -> list[SemiDenseLevel]:
         """An image at all levels, finest first."""

@@ -138,7 +138,9 @@ def _downsample(vertices: np.ndarray, intensity: np.ndarray) -> tuple[np.ndarray
 def test_pyramid_equals_the_slow_version_and_leaks_nothing_invalid():
     color, depth = _random_frame(1)
     live = Preprocessor(1, CAMERA, CONFIG)(color[None], depth[None])
-    levels = Pyramid(1, CAMERA.shape, 3, True).build(live.vertices, live.normals, live.intensity)
+    levels = Pyramid(1, [CAMERA.pyramid_level(n).shape for n in range(3)], True).build(
+        live.vertices, live.normals, live.intensity
+    )
     vertices, intensity = live.vertices.numpy()[0], live.intensity.numpy()[0]
     for level in levels[1:]:
         vertices, intensity = _downsample(vertices, intensity)
@@ -152,7 +154,7 @@ def test_gradient_is_exact_on_a_ramp():
     v, u = np.mgrid[:16, :24].astype(np.float32)
     vertices = wp.zeros((1, 16, 24), dtype=wp.vec3)
     ramp = wp.array((3 * u - 2 * v)[None], dtype=wp.float32)
-    (level,) = Pyramid(1, (16, 24), 1, True).build(vertices, vertices, ramp)
+    (level,) = Pyramid(1, [(16, 24)], True).build(vertices, vertices, ramp)
     expected = np.stack([3 * u - 2 * v, np.full_like(u, 3), np.full_like(u, -2)], -1)
     np.testing.assert_allclose(level.gradient.numpy()[0], expected)
 

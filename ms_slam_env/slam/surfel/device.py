@@ -7,7 +7,8 @@ arithmetic here, and keeps the compiler from working on eight pixels at once. So
 ``for ... in range``, whose step is a variable: inner loops that matter are ``while`` loops. On one
 core of an AMD EPYC a loop over 19,200 pixels with five operations each took 43 microseconds with
 indexing and ``for``, 32 with ``while``, 5 with ``while``, ``fetch`` and ``put``. Their arrays are
-one-dimensional and contiguous, such as ``array.flatten()``, or rows; indices are not checked.
+one-dimensional and contiguous, such as ``array.flatten()``, or rows; indices are checked in a
+checked build alone (``ms_slam_env.native``).
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import Any
 
 from ms_slam_env import _warp
 from ms_slam_env._warp import RecordedLaunch, wp
+from ms_slam_env.native import native_source
 from ms_slam_env.slam.state import Stateful
 
 Dim = int | Sequence[int]
@@ -73,36 +75,26 @@ def threads_per_row(width: int, device: str, gpu_columns: int = 1) -> tuple[int,
     return columns, -(-width // columns)
 
 
-def _native(dtype: Any, place: str) -> tuple[str, str]:
-    """C++ that returns the value at a place, and that sets it."""
-    if dtype is not wp.vec3:
-        return f"return values.data[{place}];", f"values.data[{place}] = value;"
-    p = f"float* p = (float*)values.data + 3 * ({place}); "
-    get = f"const {p}return wp::vec_t<3, float>(p[0], p[1], p[2]);"
-    return get, f"{p}p[0] = value.c[0]; p[1] = value.c[1]; p[2] = value.c[2];"
-
-
 for _dtype in (wp.float32, wp.int32, wp.uint8, wp.vec3):
-    _get, _set = _native(_dtype, "i")
-    _get_in_row, _set_in_row = _native(_dtype, "size_t(row) * values.shape[1] + i")
+    _kind = "vec3" if _dtype is wp.vec3 else "number"
 
-    @wp.func_native(_get)
+    @wp.func_native(native_source("arrays", f"fetch_{_kind}"))
     def fetch(values: wp.array(dtype=_dtype), i: int) -> _dtype:
         """Value ``i``."""
 
-    @wp.func_native(_get_in_row)
+    @wp.func_native(native_source("arrays", f"fetch_{_kind}_in_row"))
     def fetch(values: wp.array2d(dtype=_dtype), row: int, i: int) -> _dtype:
         """Value ``i`` of a row."""
 
-    @wp.func_native(_set)
+    @wp.func_native(native_source("arrays", f"put_{_kind}"))
     def put(values: wp.array(dtype=_dtype), i: int, value: _dtype):
         """Set value ``i``."""
 
-    @wp.func_native(_set_in_row)
+    @wp.func_native(native_source("arrays", f"put_{_kind}_in_row"))
     def put(values: wp.array2d(dtype=_dtype), row: int, i: int, value: _dtype):
         """Set value ``i`` of a row."""
 
 
-@wp.func_native("wp::atomic_max(values.data + i, value);")
+@wp.func_native(native_source("arrays", "raise_to"))
 def raise_to(values: wp.array(dtype=wp.float32), i: int, value: wp.float32):
     """Make value ``i`` at least ``value``, also when other threads do so at the same time."""

@@ -7,6 +7,7 @@ its 2x2 block that are valid and lie near the front-most of them.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -132,13 +133,19 @@ class Pyramid:
     def __init__(
         self,
         batch: int,
-        shape: tuple[int, int],
-        num_levels: int,
+        shapes: Sequence[tuple[int, int]],
         with_gradient: bool,
         device: str = "cpu",
     ) -> None:
+        """Allocate for images of ``shapes`` (height, width), finest first.
+
+        Raises:
+            ValueError: a level is not half of the one before it, rounded down.
+        """
+        if any(coarse != (h // 2, w // 2) for (h, w), coarse in pairwise(shapes)):
+            raise ValueError(f"levels must halve, rounded down: {list(shapes)}")
         self._device = device
-        self._columns, _ = threads_per_row(shape[1], device)
+        self._columns, _ = threads_per_row(shapes[0][1], device)
         self._launches: list[RecordedLaunch] = []
         self._levels: list[Level] = []
 
@@ -150,11 +157,11 @@ class Pyramid:
         def gradient() -> wp.array:
             return image(wp.vec3) if with_gradient else wp.empty(0, dtype=wp.vec3, device=device)
 
-        size = (batch, *shape)
+        size = (batch, *shapes[0])
         self._gradient = gradient()
         self._coarse: list[Level] = []
-        for _ in range(1, num_levels):
-            size = (batch, size[1] // 2, size[2] // 2)
+        for shape in shapes[1:]:
+            size = (batch, *shape)
             images = image(wp.vec3), image(wp.vec3), image(wp.float32)
             self._coarse.append(Level(*images, gradient()))
 

@@ -8,6 +8,7 @@ Lie theory" (2018), equations (172) and (174).
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
+from ms_slam_env.native import native_source
 from ms_slam_env.slam.surfel.alignment_arrays import (
     NUM_SUMS,
     RESTING,
@@ -38,17 +39,7 @@ def reduce_sum(hypotheses: Hypotheses, slots: int, b: int, k: int, i: int):
     hypotheses.sums[b, k, i] = total
 
 
-@wp.func_native(
-    f"constexpr int SUMS = {NUM_SUMS};"
-    + """
-const size_t which = size_t(b) * hypotheses.sums.shape[1] + k;
-const float* partial = hypotheses.partial.data + which * hypotheses.partial.shape[2] * SUMS;
-double total[SUMS] = {};
-for (int slot = 0; slot < slots; ++slot, partial += SUMS)
-    for (int i = 0; i < SUMS; ++i) total[i] += (double)partial[i];
-for (int i = 0; i < SUMS; ++i) hypotheses.sums.data[which * SUMS + i] = total[i];
-"""
-)
+@wp.func_native(native_source("sum_reduction", "reduce_all_sums", SUMS=NUM_SUMS))
 def reduce_all_sums(hypotheses: Hypotheses, slots: int, b: int, k: int):
     """The same for all of them, several at a time."""
 

@@ -16,6 +16,7 @@ arithmetic.
 from __future__ import annotations
 
 from ms_slam_env._warp import wp
+from ms_slam_env.native import native_source
 from ms_slam_env.slam.surfel.device import fetch, put, raise_to
 from ms_slam_env.slam.surfel.surfels import (
     SplatCamera,
@@ -261,31 +262,7 @@ def list_hidden(
                     hidden.radius[k, slot] = visible.radius[k, j]
 
 
-@wp.func_native("""
-const float* s = (const float*)sums.data + 8 * size_t(first);
-float* __restrict v = (float*)vertices.data + 3 * size_t(first);
-float* __restrict n = (float*)normals.data + 3 * size_t(first);
-float* __restrict c = (float*)color.data + 3 * size_t(first);
-float* __restrict grey = intensity.data + first;
-const float per_column = 1.0f / camera.focal[0];
-for (int u = 0; u < camera.width; ++u, s += 8, v += 3, n += 3, c += 3) {
-    const bool is_covered = s[3] > 0.0f;
-    const float scale = is_covered ? 1.0f / s[3] : 0.0f;
-    const float z = s[7] * scale;
-    v[0] = is_covered ? z * ((float)u - camera.centre[0]) * per_column : 0.0f;
-    v[1] = is_covered ? z * y : 0.0f;
-    v[2] = z;
-    const float length = sqrtf(s[0] * s[0] + s[1] * s[1] + s[2] * s[2]);
-    const float size = length > 0.0f ? length : 1.0f;
-    n[0] = s[0] / size;
-    n[1] = s[1] / size;
-    n[2] = s[2] / size;
-    c[0] = s[4] * scale;
-    c[1] = s[5] * scale;
-    c[2] = s[6] * scale;
-    grey[u] = 0.299f * c[0] + 0.587f * c[1] + 0.114f * c[2];  // ITU-R BT.601 luma
-}
-""")
+@wp.func_native(native_source("splatting", "resolve_row"))
 def resolve_row(
     sums: wp.array(dtype=Sums),
     camera: SplatCamera,

@@ -72,18 +72,15 @@ class Tracker:
         self.device = device
         self.batch = batch
         num_levels = len(config.iterations)
-        cameras = [intrinsics.scaled(0.5**level) for level in range(num_levels)]
-        self._live = Pyramid(batch, intrinsics.shape, num_levels, True, device)
+        cameras = [intrinsics.pyramid_level(level) for level in range(num_levels)]
+        self._live = Pyramid(batch, [camera.shape for camera in cameras], True, device)
         # A level takes the model's image of its own spacing, or else the finest.
         skipped = model_stride.bit_length() - 1
         self._model_level = [max(0, level - skipped) for level in range(num_levels)]
-        self._model_shapes = [
-            tuple(-(-size // model_stride) // 2**level for size in intrinsics.shape)
-            for level in self._model_level
-        ]
-        self._model = Pyramid(
-            batch, self._model_shapes[0], self._model_level[-1] + 1, False, device
-        )
+        drawn = intrinsics.every_nth(model_stride)
+        shapes = [drawn.pyramid_level(n).shape for n in range(self._model_level[-1] + 1)]
+        self._model_shapes = [shapes[level] for level in self._model_level]
+        self._model = Pyramid(batch, shapes, False, device)
         self.gauss_newton = GaussNewton(config, cameras, self._model_shapes, device)
         passes = [(level, self._stride(level)) for level in range(num_levels)]
         slots = self.gauss_newton.slots([*passes, (num_levels - 1, self._search_stride())])

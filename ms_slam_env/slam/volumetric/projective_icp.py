@@ -52,7 +52,7 @@ def frame_pyramid(depth: Float32, intrinsics: Intrinsics, levels: int) -> list[S
     for level in range(levels):
         K = intrinsics
         if level:
-            K = intrinsics.resized(intrinsics.width >> level, intrinsics.height >> level)
+            K = intrinsics.resized(*intrinsics.level_size(level))
             filtered = reduce_depth(filtered, (K.width, K.height))
         points = K.rays() * filtered[..., None]
         made.append(Surface.of(points, _normals(points, filtered > 0)))
