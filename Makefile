@@ -9,6 +9,12 @@ SYSTEM_LIBRARIES := libusb-1.0-0 libgl1
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
+# What also runs in a checked build, where every index of a kernel is compared with its array.
+CHECKED_TESTS := tests/slam/test_any_size.py tests/slam/test_splatting.py \
+    tests/slam/test_frustum_culling.py tests/slam/test_fusion.py tests/sensor/test_depth_noise.py \
+    tests/sensor/test_shading.py tests/divergence/test_batched_divergence.py \
+    tests/mapping/test_occupancy_grid.py tests/env/test_reward_and_coverage.py
+
 .PHONY: install test benchmark docs lint types clean
 
 install: $(STAMP)
@@ -39,6 +45,7 @@ types: $(STAMP)
 
 test: lint types
 	$(BIN)/pytest -n $(WORKERS)
+	MS_SLAM_ENV_CHECKED=1 $(BIN)/pytest -n $(WORKERS) $(CHECKED_TESTS)
 
 # Planners in four rooms: the ends of what there is, the paper's, the classical one, the agent shipped.
 benchmark: $(STAMP)

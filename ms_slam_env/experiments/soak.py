@@ -56,8 +56,8 @@ class Soak(Experiment, Checked):
     piece_steps: int = bounded(68_000, 2, 10**7)
     """Of a piece of the free camera; a tenth if it is disturbed or has a task, a 250th for the arm
     (whose pieces are one); at least 2."""
-    image_size: str = "80x60"
-    """Of the camera, width x height."""
+    image_sizes: tuple[str, ...] = ("80x60",)
+    """Of the camera, width x height: environments and their pieces take them in turn."""
 
     unit = "pieces"
     workers = 1
@@ -70,14 +70,21 @@ class Soak(Experiment, Checked):
                 raise unknown("environment", env_id, IDS)
         steps = {one: max(2, self.piece_steps // share(one)) for one in self.env_ids}
         pieces = -(-self.steps // sum(steps.values()))
-        in_turn = [
-            SoakSpec(env_id, piece, steps[env_id], self.image_size)
-            for piece in range(pieces)
-            for env_id in steps
-            if share(env_id) < ARM_SHARE
-        ]
         arms = [one for one in steps if share(one) == ARM_SHARE]
-        return in_turn + [SoakSpec(one, 0, pieces * steps[one], self.image_size) for one in arms]
+        found = [
+            *(
+                (one, piece, steps[one])
+                for piece in range(pieces)
+                for one in steps
+                if one not in arms
+            ),
+            *((one, 0, pieces * steps[one]) for one in arms),
+        ]
+        sizes = self.image_sizes
+        return [
+            SoakSpec(one, piece, count, sizes[(piece + list(steps).index(one)) % len(sizes)])
+            for one, piece, count in found
+        ]
 
     @staticmethod
     def run(spec: SoakSpec) -> dict[str, Any]:

@@ -61,8 +61,9 @@ def native_source(header: str, function: str, **given: int | float) -> str:
             *(["#define MS_SLAM_CHECKED"] if CHECKED else []),
             *(f'#line 1 "{name}.h"\n{_without_guard(name)}' for name in included),
             *(_constant(name, value) for name, value in given.items()),
+            "{",  # what a body has to say first, as a pragma of Clang, still comes first
             f'#line {line} "{header}.h"',
-            body,
+            f"{body}}}",
         ]
     )
 

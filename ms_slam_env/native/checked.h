@@ -6,7 +6,10 @@
 //     WITHIN(i, count, what)        index i, which must be in [0, count)
 //     PACKED(T, pointer)            several values as one vector
 //     RESTRICT(T)                   type of a pointer that aliases no other one
+//     GIVEN(T, name)                a constant whose value Python gives (`native_source`)
 #pragma once
+
+#define GIVEN(T, name) constexpr T name = T(1)  // for who reads a header by itself
 
 #if !defined(MS_SLAM_CHECKED)
 
