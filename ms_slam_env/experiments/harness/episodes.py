@@ -262,7 +262,7 @@ def check_names(planners: Sequence[str], scenes: Sequence[str]) -> None:
     for scene in scenes:
         check_name(scene)
         if is_mesh_file(scene):
-            load_soup(Path(scene))
+            load_soup(scene)
 
 
 def seed_list(split: str, count: int) -> list[int]:
