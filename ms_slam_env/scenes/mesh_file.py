@@ -59,7 +59,9 @@ def load_soup(name: str | Path) -> Soup:
     if file is None:
         raise InputError(f"{str(name)!r} is no mesh file ({', '.join(MESH_SUFFIXES)})")
     corners, uvs, texture, label = [], [], [], []
-    images: dict[object, NDArray[np.uint8]] = {}
+    images: list[NDArray[np.uint8]] = []
+    place: dict[object, int] = {}  # of an image, for parts share them
+    texels = 0
     labels: list[str] = []
     for part in file.read():
         if not len(part.faces):
@@ -73,19 +75,22 @@ def load_soup(name: str | Path) -> Soup:
         area = np.linalg.norm(face_cross(triangles), axis=1)
         keep = np.isfinite(triangles).all((1, 2)) & (area > 1e-12)
         key, uv, image = _appearance(part)
-        images.setdefault(key, image)
-        if sum(one.shape[0] * one.shape[1] for one in images.values()) > MAX_TEXELS:
-            raise InputError(f"mesh file {str(file.path)!r} has too many textures")
+        if key not in place:
+            place[key] = len(images)
+            images.append(image)
+            texels += image.shape[0] * image.shape[1]
+        if texels > MAX_TEXELS:
+            raise InputError(f"mesh file {str(file.path)!r}: its textures are too large together")
         corners.append(triangles[keep])
         uvs.append(uv[keep])
-        texture.append(np.full(keep.sum(), list(images).index(key)))
+        texture.append(np.full(keep.sum(), place[key]))
         label.append(np.full(keep.sum(), len(labels)))
         labels.append(part.name)
     if sum(len(c) for c in corners) == 0:
         raise InputError(f"mesh file {str(file.path)!r} has no triangles")
     joined = map(np.concatenate, (corners, uvs, texture, label))
     of_corners, of_uv, of_texture, of_label = joined
-    return Soup(of_corners, of_uv, of_texture, of_label, tuple(images.values()), tuple(labels))
+    return Soup(of_corners, of_uv, of_texture, of_label, tuple(images), tuple(labels))
 
 
 def split_long_edges(soup: Soup, max_edge_m: float) -> Soup:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import stat
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -118,15 +117,13 @@ class MeshFolder:
         """
         folder = Path(os.path.abspath(self.mesh)).parent
         given = PurePosixPath(name.strip().strip('"').replace("\\", "/"))
+        why = "is not in its folder"
         for parts in (given.parts, given.parts[-1:]):
             found = None if "\0" in name else _matching(folder, parts)
             if found is not None and found.resolve().is_relative_to(folder.resolve()):
                 return found
-        there = found is not None or ("\0" not in name and os.path.lexists(folder / given))
-        raise MissingFileError(
-            f"{self.mesh.name} names {name!r}, which "
-            + ("lies outside of its folder" if there else "is not in its folder")
-        )
+            why = why if found is None else "lies outside of its folder"
+        raise MissingFileError(f"{self.mesh.name} names {name!r}, which {why}")
 
     def read(self, name: str, kind: str, most_bytes: int = MAX_MESH_BYTES) -> bytes:
         """What a file holds.
@@ -182,14 +179,7 @@ def _matching(folder: Path, parts: tuple[str, ...]) -> Path | None:
                 return None
             part = names[0]
         here = here / part
-    return here if parts and not stat.S_ISDIR(_mode(here)) else None
-
-
-def _mode(path: Path) -> int:
-    try:
-        return os.stat(path).st_mode
-    except OSError:
-        return 0
+    return here if parts else None
 
 
 def text_of(data: bytes) -> str:
