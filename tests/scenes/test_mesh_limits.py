@@ -14,7 +14,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mesh_writers import ROOM, TRIANGLES, glb, gltf, ply, write_gltf, write_obj, write_png
+from mesh_writers import (
+    ROOM,
+    TRIANGLES,
+    glb,
+    gltf,
+    ply,
+    textured_gltf,
+    write_gltf,
+    write_obj,
+    write_png,
+)
 from PIL import Image
 
 from ms_slam_env.errors import InputError
@@ -84,10 +94,7 @@ def test_what_a_mesh_names_is_a_regular_file_of_its_folder(
         path = write_gltf(tmp_path, tree, None)
         put(tmp_path / "room.bin", kind)
     elif what == "image":
-        tree["meshes"][0]["primitives"][0] |= {"material": 0}
-        tree["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"] = 1
-        tree["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}]
-        tree["textures"], tree["images"] = [{"source": 0}], [{"uri": "wood.png"}]
+        tree, buffer = textured_gltf()
         path = write_gltf(tmp_path, tree, buffer)
         put(tmp_path / "wood.png", kind)
     else:
@@ -116,11 +123,9 @@ def test_a_texture_is_bounded_before_it_is_decoded(tmp_path: Path, read: Read) -
     path = write_obj(tmp_path, "map_Kd wood.png")
     (tmp_path / "wood.png").write_bytes(bomb(13300))
     refused(read, path, "13300x13300 pixels: more than 8192x8192")
-    tree, buffer = gltf()
-    tree["meshes"][0]["primitives"][0] |= {"material": 0}
-    tree["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}]
+    tree, buffer = textured_gltf()
     uri = "data:image/png;base64," + base64.b64encode(bomb(13300)).decode()
-    tree["textures"], tree["images"] = [{"source": 0}], [{"uri": uri}]
+    tree["images"] = [{"uri": uri}]
     refused(read, write_gltf(tmp_path, tree, buffer), "13300x13300 pixels")
 
 
@@ -141,14 +146,7 @@ def test_textures_together_are_bounded(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_an_image_of_many_parts_is_kept_once(tmp_path: Path) -> None:
-    tree, buffer = gltf()
-    primitive = tree["meshes"][0]["primitives"][0]
-    primitive["material"] = 0
-    primitive["attributes"]["TEXCOORD_0"] = 2
-    tree["bufferViews"].append({"buffer": 0, "byteLength": 64})
-    tree["accessors"].append({"bufferView": 2, "componentType": 5126, "count": 8, "type": "VEC2"})
-    tree["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}]
-    tree["textures"], tree["images"] = [{"source": 0}], [{"uri": "wood.png"}]
+    tree, buffer = textured_gltf()
     tree["nodes"] = [{"mesh": 0, "translation": [k, 0, 0]} for k in range(1000)]
     tree["scenes"] = [{"nodes": list(range(1000))}]
     write_png(tmp_path / "wood.png", side=1024)

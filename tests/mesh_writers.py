@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import struct
 from pathlib import Path
@@ -93,6 +94,24 @@ def gltf(**more: Any) -> tuple[dict[str, Any], bytes]:
         "buffers": [{"byteLength": len(indices) + len(vertices), "uri": "room.bin"}],
     }
     return tree | more, indices + vertices
+
+
+def textured_gltf() -> tuple[dict[str, Any], bytes]:
+    """The room with the texture ``wood.png``, whose coordinates are as good as any."""
+    tree, buffer = gltf()
+    primitive = tree["meshes"][0]["primitives"][0]
+    primitive["material"] = 0
+    primitive["attributes"]["TEXCOORD_0"] = 2
+    tree["accessors"].append({"bufferView": 1, "componentType": 5126, "count": 8, "type": "VEC2"})
+    tree["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}]
+    tree["textures"], tree["images"] = [{"source": 0}], [{"uri": "wood.png"}]
+    return tree, buffer
+
+
+def embedded(buffer: bytes) -> dict[str, Any]:
+    """A buffer within the text of a glTF."""
+    uri = "data:application/octet-stream;base64," + base64.b64encode(buffer).decode()
+    return {"byteLength": len(buffer), "uri": uri}
 
 
 def write_gltf(folder: Path, tree: dict[str, Any], buffer: bytes | None) -> Path:
