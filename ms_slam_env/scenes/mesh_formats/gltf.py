@@ -30,6 +30,7 @@ from ms_slam_env.scenes.mesh_formats.part import (
 _MAGIC, _JSON, _BIN = b"glTF", b"JSON", b"BIN\0"
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_MOST_COPIES = 2_000_000  # triangles that a file may place beyond those that it holds
 _TRIANGLES, _STRIP, _FAN, _POINTS = 4, 5, 6, 0
 
 _PLAIN = ("KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp")
@@ -146,9 +147,13 @@ class _Reader:
                     check_size(vertices // 3)
                     moved[id(part.vertices)] = _moved(part.vertices, T_scene_node)
                 triangles += len(part.faces)
-                check_size(triangles)
+                check_size(triangles, _MOST_COPIES + self._stored() // 3)
                 found.append(_placed(part, moved[id(part.vertices)], T_scene_node))
         return found
+
+    def _stored(self) -> int:
+        """Bytes that were read; a triangle has three at least."""
+        return self._size + sum(map(len, self._buffers.values()))
 
     def _get(self, kind: str, index: Any) -> dict[str, Any]:
         items = self._tree.get(kind, [])

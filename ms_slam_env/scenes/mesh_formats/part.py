@@ -21,7 +21,7 @@ Int64 = NDArray[np.int64]
 Image = NDArray[np.uint8]
 
 MAX_TRIANGLES = 10_000_000
-"""Of a mesh file, as placed: a file may place one mesh many times."""
+"""Of a mesh file: some 4 GB of memory."""
 
 MAX_TEXELS = 2**28
 """Of all textures of a mesh file, shrunk."""
@@ -83,10 +83,15 @@ class Polygons:
         return cls(np.stack([start, second, second + 1], -1), polygon)
 
 
-def check_size(triangles: int) -> None:
-    """Refuse more triangles than a mesh may have."""
-    if triangles > MAX_TRIANGLES:
-        raise InputError(f"it has {triangles} triangles, more than {MAX_TRIANGLES}")
+def check_size(triangles: int, most: int | None = None) -> None:
+    """Refuse more triangles than a mesh may have: ``MAX_TRIANGLES``, or ``most`` if that is less.
+
+    Raises:
+        InputError: with both numbers.
+    """
+    most = MAX_TRIANGLES if most is None else min(most, MAX_TRIANGLES)
+    if triangles > most:
+        raise InputError(f"it has {triangles} triangles, more than {most}")
 
 
 class MissingFileError(InputError):
