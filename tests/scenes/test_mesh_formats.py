@@ -206,6 +206,33 @@ def test_other_formats(tmp_path: Path, kind: str) -> None:
     check_room(load_soup(path))
 
 
+def test_what_is_not_read_is_said(tmp_path: Path) -> None:
+    (tmp_path / "a.off").write_text(
+        "COFF\n3 1 0\n0 0 0 9 9 9 255\n1 0 0 0 0 0 0\n0 1 0 0 0 0 0\n3 0 1 2\n"
+    )
+    with pytest.warns(InputWarning, match=r"a\.off': its colours are not read"):
+        load_soup(tmp_path / "a.off")
+    data = ply(QUADS, "ascii", ("float", "uchar", "int"))
+    (tmp_path / "a.ply").write_bytes(data.replace(b"made by hand", b"TextureFile wood.png"))
+    with pytest.warns(InputWarning, match=r"'wood\.png' is not read, for there are no texture coo"):
+        load_soup(tmp_path / "a.ply")
+    tree, buffer = textured_gltf()
+    tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = 1
+    write_png(tmp_path / "wood.png")
+    with pytest.warns(InputWarning, match="room has a texture: its colours of corners are not"):
+        load_soup(write_gltf(tmp_path, tree, buffer))
+
+
+def test_colours_of_16_bits_of_a_ply(tmp_path: Path) -> None:
+    data = ply(QUADS, "ascii", ("float", "uchar", "int")).replace(
+        b"property uchar", b"property ushort"
+    )
+    (tmp_path / "a.ply").write_bytes(data.replace(b"255", b"65535").replace(b"250", b"64250"))
+    soup = load_soup(tmp_path / "a.ply")
+    np.testing.assert_array_equal(colour_at(soup, ROOM[0]), [255, 0, 0])
+    np.testing.assert_array_equal(colour_at(soup, ROOM[7]), [250, 250, 250])
+
+
 def test_gltf_is_y_up_unless_said_otherwise(tmp_path: Path) -> None:
     path = write_gltf(tmp_path, *gltf())
     check_room(load_soup(path))

@@ -29,6 +29,8 @@ def _by_trimesh(kind: str) -> Reader:
     def read(data: bytes, folder: MeshFolder) -> list[Part]:
         import trimesh
 
+        if data.lstrip().startswith(b"COFF"):
+            folder.warn("its colours are not read: the surface stays plain")
         loaded = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False)
         return [
             Part(folder.mesh.stem, np.asarray(one.vertices, np.float64), np.asarray(one.faces))

@@ -268,6 +268,8 @@ class _Reader:
         image, tint, choice, place = self._material(entry.get("material"))
         if image is not None and (uv := attributes.get(f"TEXCOORD_{choice}")) is not None:
             corners = place(self._array(uv, (2,)).astype(np.float64))
+            if "COLOR_0" in attributes:
+                self._folder.warn(f"{name} has a texture: its colours of corners are not read")
             return Part(name, vertices, faces, self._of(corners, part), image, tint)
         if "COLOR_0" not in attributes:
             return Part(name, vertices, faces, tint=tint)

@@ -50,7 +50,8 @@ class Part:
     colours: Float64 | None = None
 
     def __post_init__(self) -> None:
-        """Refuse faces of vertices that are not there."""
+        """Refuse too many faces, and those of vertices that are not there."""
+        check_size(len(self.faces))
         if self.faces.size and not 0 <= self.faces.min() <= self.faces.max() < len(self.vertices):
             raise InputError(f"a face has a vertex beyond the {len(self.vertices)} that there are")
 
@@ -196,8 +197,10 @@ def text_of(data: bytes) -> str:
 
 
 def bytes_of_colours(values: NDArray[Any]) -> Float64:
-    """Colours in [0, 255] of integers as they are, or of floats in [0, 1]."""
+    """Colours in [0, 255] of integers of 8 or 16 bits, or of floats in [0, 1]."""
     colours = np.nan_to_num(np.asarray(values, dtype=np.float64))
+    if values.dtype.kind == "u" and values.dtype.itemsize == 2:
+        colours = colours / 257.0
     if values.dtype.kind == "f" and colours.size and colours.max() <= 1.0:
         colours = 255.0 * colours
     return np.clip(colours, 0.0, 255.0)

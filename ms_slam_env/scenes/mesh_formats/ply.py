@@ -221,6 +221,8 @@ def _parts(elements: dict[str, _Element], textures: list[str], folder: MeshFolde
             Part(texture, vertices, faces[which == k], uv[which == k], folder.texture(texture))
             for k, texture in enumerate(textures)
         ]
+    if textures:
+        folder.warn(f"{textures[0]!r} is not read, for there are no texture coordinates")
     colours = columns_of(of_vertex, *_COLOURS)
     if colours is not None:
         return [Part(name, vertices, faces, colours=bytes_of_colours(colours)[faces])]
