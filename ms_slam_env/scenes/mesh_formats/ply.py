@@ -196,6 +196,8 @@ def _walk(
 def _parts(elements: dict[str, _Element], textures: list[str], folder: MeshFolder) -> list[Part]:
     if "vertex" not in elements:
         raise InputError("it has no vertices")
+    if not elements["vertex"].length:
+        return []
     of_vertex = elements["vertex"].numbers
     vertices = columns_of(of_vertex, ("x", "y", "z"))
     if vertices is None:
