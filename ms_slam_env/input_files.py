@@ -49,10 +49,13 @@ def read_bytes(path: str | Path, kind: str, most_bytes: int) -> bytes:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
         with os.fdopen(descriptor, "rb") as file:
             _check(os.fstat(descriptor), path, kind, most_bytes)
-            data = file.read(most_bytes + 1)
+            size = os.fstat(descriptor).st_size
+            data = file.read(size + 1)  # as much is allocated as is asked for
+            if len(data) > size:  # it grew meanwhile, or the system does not tell its size
+                data += file.read(most_bytes + 1 - len(data))
     except OSError as error:
         raise _unreadable(path, kind, error) from None
-    if len(data) > most_bytes:  # grew meanwhile, or the system does not tell its size
+    if len(data) > most_bytes:
         raise _too_large(path, kind, most_bytes)
     return data
 

@@ -9,6 +9,7 @@ import zlib
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
@@ -119,3 +120,44 @@ def check_size(path: str, size: tuple[int, int], intrinsics: Intrinsics) -> None
             f"{path} is {size[0]}x{size[1]} but the intrinsics say "
             f"{intrinsics.width}x{intrinsics.height}"
         )
+
+
+_TEXTURES = ("PNG", "JPEG", "BMP", "TGA", "TIFF", "WEBP", "PPM")
+_MAX_TEXELS = 8192 * 8192
+_MAX_TEXTURE = 1024
+
+
+def decode_texture(data: bytes, name: str) -> NDArray[np.uint8]:
+    """Image (h, w, 3) in RGB of a mesh's texture, shrunk to at most 1024 pixels a side.
+
+    Args:
+        data: what the file holds.
+        name: for errors.
+
+    Raises:
+        InputError: no image of a common format, damaged, or of more than 8192 x 8192 pixels.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what is wrong with the file is said below
+            with Image.open(io.BytesIO(data), formats=_TEXTURES) as image:
+                width, height = image.size
+                if width * height > _MAX_TEXELS:
+                    raise InputError(f"{name} has {width}x{height} pixels: more than 8192x8192")
+                deep = image.mode.startswith("I")  # 16 bits, which Pillow would cut off at 255
+                grey = (
+                    Image.fromarray((np.asarray(image) // 256).astype(np.uint8)) if deep else image
+                )
+                pixels = np.asarray(grey.convert("RGB"))
+    except InputError:
+        raise
+    except _BROKEN as error:
+        said = " ".join(str(error).split()) or type(error).__name__
+        said = "no image" if "cannot identify" in said else said
+        raise InputError(f"cannot read {name}: {said} ({', '.join(_TEXTURES)} are read)") from None
+    shrink = _MAX_TEXTURE / max(pixels.shape[:2])
+    if shrink < 1.0:
+        if min(pixels.shape[:2]) * shrink < 1.0:
+            raise InputError(f"{name} has {width}x{height} pixels: too narrow")
+        pixels = cv2.resize(pixels, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    return pixels

@@ -22,7 +22,7 @@ class Arguments:
     """Compare an estimated trajectory, a map, or both with the truth.
 
     Trajectories are TUM files: timestamp tx ty tz qx qy qz qw, camera to world. Maps are PLY files
-    (or what else trimesh reads): clouds as they are, meshes sampled. With --out, writes
+    (or OBJ, glTF, STL, OFF): clouds as they are, meshes sampled. With --out, writes
     evaluation.json, table.md and figures, and the poses that correspond, aligned,
     as evaluation.estimate.txt and evaluation.truth.txt.
     """

@@ -23,9 +23,8 @@ from ms_slam_env.evaluation.map_quality import ComparedMap, share_keys
 from ms_slam_env.evaluation.seen_surface import seen_surface
 from ms_slam_env.geometry import MAX_COORDINATE_M, transform_points
 from ms_slam_env.geometry.cloud_registration import CUTOFF_M, REGISTRATIONS
-from ms_slam_env.input_files import MAX_MESH_BYTES, check_file
 from ms_slam_env.metrics.reconstruction import SAMPLES
-from ms_slam_env.scenes.mesh_queries import check_geometry
+from ms_slam_env.scenes.mesh_formats import MESH_SUFFIXES, MeshFile
 from ms_slam_env.sequences.recording import Recording, open_recording, recorded_sequence
 
 Float64 = NDArray[np.float64]
@@ -137,10 +136,11 @@ class SurfaceFile:
 
 
 def read_surface(path: Path, samples: int, seed: int = 0) -> SurfaceFile:
-    """Read a cloud or a mesh (PLY, or what else trimesh reads).
+    """Read a cloud or a mesh.
 
     Args:
-        path: of the file; or of a sequence's folder, for the surface that its depth images show
+        path: of the file, in a format of scenes and with their options (see ``MeshOptions``); or of
+            a sequence's folder, for the surface that its depth images show
             from its true poses, up to 5 m away. Those of ``depth_true`` are taken if
             ``ms-slam generate --truth`` wrote them, else the recorded ones with their noise.
         samples: points taken evenly from the surface of a mesh.
@@ -154,17 +154,15 @@ def read_surface(path: Path, samples: int, seed: int = 0) -> SurfaceFile:
 
     if os.path.isdir(path):
         return _sequence_surface(open_recording(path), path / "depth_true")
-    check_file(path, "map file", MAX_MESH_BYTES)
-    try:
-        with np.errstate(all="ignore"):  # what cannot be is refused below
-            loaded = trimesh.load(path, process=False)
-            if isinstance(loaded, trimesh.Scene):
-                loaded = loaded.to_geometry()
-            if getattr(loaded, "vertices", None) is not None:
-                check_geometry(loaded)
-    except Exception as error:  # trimesh raises whatever its many readers raise
-        raise InputError(f"map file {str(path)!r} cannot be read: {error}") from None
-    vertices = np.asarray(getattr(loaded, "vertices", np.empty((0, 3))), dtype=np.float64)
+    file = MeshFile.named(path)
+    if file is None:
+        raise InputError(
+            f"map file {str(path)!r} is neither a folder nor of a format that is read: "
+            + ", ".join(MESH_SUFFIXES)
+        )
+    parts = file.read()
+    clouds = list({id(part.vertices): part.vertices for part in parts}.values())
+    vertices = np.concatenate([np.empty((0, 3)), *clouds])
     if len(vertices) == 0:
         raise InputError(f"map file {str(path)!r} holds no points")
     if not (np.abs(vertices) <= MAX_COORDINATE_M).all():
@@ -172,11 +170,14 @@ def read_surface(path: Path, samples: int, seed: int = 0) -> SurfaceFile:
             f"map file {str(path)!r} holds points that are not finite or beyond "
             f"{MAX_COORDINATE_M:g} m"
         )
-    if not isinstance(loaded, trimesh.Trimesh) or len(loaded.faces) == 0:
+    corners = np.concatenate([part.vertices[part.faces] for part in parts])  # (F, 3, 3)
+    if len(corners) == 0:
         return SurfaceFile(vertices, "cloud")
-    if not loaded.area > 0:
+    faces = np.arange(3 * len(corners)).reshape(-1, 3)
+    mesh = trimesh.Trimesh(corners.reshape(-1, 3), faces, process=False)
+    if not mesh.area > 0:
         raise InputError(f"map file {str(path)!r} holds a mesh without area")
-    points, _ = trimesh.sample.sample_surface(loaded, samples, seed=seed)
+    points, _ = trimesh.sample.sample_surface(mesh, samples, seed=seed)
     return SurfaceFile(np.asarray(points, dtype=np.float64), "mesh")
 
 

@@ -91,7 +91,7 @@ class Difficulty(Checked, Experiment):
 
     data: Path = Path("../shared/data")
     """Folder that holds icl_nuim/trajectories/lr_kt0.tum.txt and so on, and lr_kt3_depth."""
-    scenes: tuple[str, ...] = ("living_room", "../shared/data/small_house.glb")
+    scenes: tuple[str, ...] = ("living_room", "../shared/data/small_house.glb,up=z")
     """Names of scenes, or mesh files."""
     motions: tuple[str, ...] = ("lr_kt0", "lr_kt1", "lr_kt2", "lr_kt3")
     """Files of the trajectories, without .tum.txt."""

@@ -44,6 +44,12 @@ def trilinear(values: NDArray[np.floating], f: Float64) -> Float64:
     return along_y[:, 0] + (along_y[:, 1] - along_y[:, 0]) * f[:, 2]
 
 
+def voxel_for(low: Float64, high: Float64, voxel_m: float = VOXEL_M) -> float:
+    """Edge of the voxels between the corners (3,) of a box: ``voxel_m``, more where it is large."""
+    volume = float(np.prod(high - low + 4 * voxel_m))
+    return max(voxel_m, (volume / _MAX_CELLS) ** (1 / 3))
+
+
 class FreeSpace:
     """Distance to the nearest surface on a voxel grid, looked up trilinearly.
 
@@ -67,8 +73,7 @@ class FreeSpace:
                 not fit in memory.
         """
         low, high = points.min(0), points.max(0)
-        volume = float(np.prod(high - low + 4 * voxel_m))
-        self.voxel_m = max(voxel_m, (volume / _MAX_CELLS) ** (1 / 3))
+        self.voxel_m = voxel_for(low, high, voxel_m)
         self.origin = low - 1.5 * self.voxel_m
         shape = tuple(np.ceil((high - low) / self.voxel_m).astype(int) + 4)
         index = np.rint((points - self.origin) / self.voxel_m).astype(np.int64)

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-VERSION = 1
+VERSION = 2
 """Of what is kept and how it is worked out; goes up when either changes."""
 
 MOST_BYTES = 2 * 1024**3

@@ -8,25 +8,23 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 from tqdm import tqdm
 
 from ms_slam_env.errors import InputError
-from ms_slam_env.input_files import MAX_MESH_BYTES, check_file
 from ms_slam_env.scenes import mesh_cache
 from ms_slam_env.scenes.base import Float64, Rng, TexturedMesh
 from ms_slam_env.scenes.builder import Geometry
-from ms_slam_env.scenes.free_space import VOXEL_M, Enclosed, FreeSpace
-from ms_slam_env.scenes.lighting import Lamp, Lighting, auto_exposure, light_mesh, linear_to_srgb
-from ms_slam_env.scenes.mesh_queries import RayCaster, check_geometry, face_cross, sample_surface
+from ms_slam_env.scenes.free_space import Enclosed, FreeSpace, voxel_for
+from ms_slam_env.scenes.lighting import Lamp, Lighting, auto_exposure, light_mesh
+from ms_slam_env.scenes.mesh_formats import MESH_SUFFIXES, MeshFile
+from ms_slam_env.scenes.mesh_formats.part import MAX_TEXELS, Part
+from ms_slam_env.scenes.mesh_queries import RayCaster, face_cross, sample_surface
 from ms_slam_env.scenes.mesh_scene import MeshScene, unit_rows
 
 _GREY = np.array([190, 190, 190], np.uint8)
 _MAX_TRIANGLES = 900_000
-_MAX_TEXTURE = 1024  # larger images are shrunk to this side
 _BLOCK = 4  # texels a side for a triangle with a colour at each corner
 
 
@@ -51,45 +49,45 @@ class Soup:
     labels: tuple[str, ...]
 
 
-def load_soup(path: Path) -> Soup:
-    """Read a mesh file.
+def load_soup(name: str | Path) -> Soup:
+    """Read a mesh file: its path, or that with options (see ``MeshOptions``).
 
     Raises:
         InputError: no such file, not readable as a mesh, or without a triangle.
     """
-    if not os.path.exists(path):
-        raise InputError(f"mesh file {str(path)!r} does not exist")
-    check_file(path, "mesh file", MAX_MESH_BYTES)
-    try:
-        with np.errstate(all="ignore"):  # what cannot be is refused below
-            parts = trimesh.load_scene(path).dump()
-            for part in parts:
-                check_geometry(part)
-    except Exception as error:  # the loaders of the many formats raise anything
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"mesh file {str(path)!r} cannot be read: {reason}") from error
+    file = MeshFile.named(name)
+    if file is None:
+        raise InputError(f"{str(name)!r} is no mesh file ({', '.join(MESH_SUFFIXES)})")
     corners, uvs, texture, label = [], [], [], []
     images: list[NDArray[np.uint8]] = []
+    place: dict[object, int] = {}  # of an image, for parts share them
+    texels = 0
     labels: list[str] = []
-    for k, part in enumerate(parts):
-        if not isinstance(part, trimesh.Trimesh) or len(part.faces) == 0:
+    for part in file.read():
+        if not len(part.faces):
             continue
-        triangles = np.asarray(part.vertices, dtype=np.float64)[part.faces]
+        triangles = part.vertices[part.faces]
         if not (np.abs(triangles[np.isfinite(triangles)]) <= _MAX_COORDINATE_M).all():
             raise InputError(
-                f"mesh file {str(path)!r} reaches farther than {_MAX_COORDINATE_M:g} m"
+                f"mesh file {str(file.path)!r} reaches farther than {_MAX_COORDINATE_M:g} m; "
+                + _UNIT
             )
         area = np.linalg.norm(face_cross(triangles), axis=1)
         keep = np.isfinite(triangles).all((1, 2)) & (area > 1e-12)
-        uv, image = _appearance(part)
+        key, uv, image = _appearance(part)
+        if key not in place:
+            place[key] = len(images)
+            images.append(image)
+            texels += image.shape[0] * image.shape[1]
+        if texels > MAX_TEXELS:
+            raise InputError(f"mesh file {str(file.path)!r}: its textures are too large together")
         corners.append(triangles[keep])
         uvs.append(uv[keep])
-        texture.append(np.full(keep.sum(), len(images)))
+        texture.append(np.full(keep.sum(), place[key]))
         label.append(np.full(keep.sum(), len(labels)))
-        images.append(image)
-        labels.append(str(part.metadata.get("name") or f"part {k}"))
+        labels.append(part.name)
     if sum(len(c) for c in corners) == 0:
-        raise InputError(f"mesh file {str(path)!r} has no triangles")
+        raise InputError(f"mesh file {str(file.path)!r} has no triangles")
     joined = map(np.concatenate, (corners, uvs, texture, label))
     of_corners, of_uv, of_texture, of_label = joined
     return Soup(of_corners, of_uv, of_texture, of_label, tuple(images), tuple(labels))
@@ -115,58 +113,28 @@ def split_long_edges(soup: Soup, max_edge_m: float) -> Soup:
     return Soup(corners, uv, soup.texture[index], soup.label[index], soup.textures, soup.labels)
 
 
-def _appearance(part: trimesh.Trimesh) -> tuple[Float64, NDArray[np.uint8]]:
-    """Texture coordinates (F, 3, 2) and image of one part."""
-    visual = part.visual
-    count = len(part.faces)
-    if isinstance(visual, trimesh.visual.TextureVisuals):
-        image, factor = _material(visual.material)
-        if visual.uv is None or image is None:
-            return np.full((count, 3, 2), 0.5), _plain(factor)
-        uv = np.asarray(visual.uv, dtype=np.float64)[part.faces][..., :2]
-        uv = np.nan_to_num(uv)
-        uv[..., 1] = 1.0 - uv[..., 1]  # the loader has v pointing up
-        return uv, _tinted(image, factor)
-    if visual is None or not visual.defined:
-        return np.full((count, 3, 2), 0.5), _plain(_GREY)
-    if visual.kind == "face":
-        colours = np.repeat(np.asarray(visual.face_colors)[:, None, :3], 3, 1)
-    else:
-        colours = np.asarray(visual.vertex_colors)[part.faces][..., :3]
-    if (colours == colours[0, 0]).all():
-        return np.full((count, 3, 2), 0.5), _plain(colours[0, 0])
-    return _colour_atlas(colours.astype(np.float32))
+def _appearance(part: Part) -> tuple[object, Float64, NDArray[np.uint8]]:
+    """What names the image of a part, texture coordinates (F, 3, 2), and the image."""
+    tint = None if part.tint is None else tuple(part.tint)
+    if part.image is not None and part.uv is not None:
+        return (id(part.image), tint), np.nan_to_num(part.uv), _tinted(part.image, part.tint)
+    centre = np.full((len(part.faces), 3, 2), 0.5)
+    if part.colours is None:
+        return tint, centre, _plain(_GREY if part.tint is None else part.tint)
+    if (part.colours == part.colours[0, 0]).all():
+        return tuple(part.colours[0, 0]), centre, _plain(part.colours[0, 0])
+    return id(part), *_colour_atlas(part.colours.astype(np.float32))
 
 
-def _material(material: Any) -> tuple[NDArray[np.uint8] | None, Float64]:
-    """Image (h, w, 3) or None, and sRGB colour (3,) in [0, 255], of a file's material.
+def _tinted(image: NDArray[np.uint8], factor: Float64 | None) -> NDArray[np.uint8]:
+    """An image multiplied by a colour (3,) in [0, 255].
 
-    The image is multiplied by the colour. glTF gives it in linear light and multiplies there,
-    nearly the same as multiplying the sRGB values, for the curve is close to a power.
+    glTF multiplies linear light, nearly the same as multiplying the sRGB values, for the curve is
+    close to a power.
     """
-    if isinstance(material, trimesh.visual.material.PBRMaterial):
-        image, factor = material.baseColorTexture, material.baseColorFactor
-        if factor is not None:
-            linear = np.asarray(factor, dtype=np.float64)[:3] / 255.0
-            factor = 255.0 * linear_to_srgb(linear)
-    else:
-        image = getattr(material, "image", None)
-        factor = None if image is not None else getattr(material, "main_color", None)
-    if factor is None:
-        factor = _GREY if image is None else np.full(3, 255)
-    pixels = None if image is None else np.asarray(image.convert("RGB"))
-    return pixels, np.asarray(factor, dtype=np.float64)[:3]
-
-
-def _tinted(image: NDArray[np.uint8], factor: Float64) -> NDArray[np.uint8]:
-    """Image of bounded size, multiplied by a colour (3,) in [0, 255]."""
-    shrink = _MAX_TEXTURE / max(image.shape[:2])
-    result: Any = image
-    if shrink < 1.0:
-        result = cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-    if (factor < 255.0).any():
-        result = np.rint(result * (factor / 255.0)).astype(np.uint8)
-    return result
+    if factor is None or not (factor < 255.0).any():
+        return image
+    return np.rint(image * (factor / 255.0)).astype(np.uint8)
 
 
 def _colour_atlas(colours: NDArray[np.float32]) -> tuple[Float64, NDArray[np.uint8]]:
@@ -198,28 +166,32 @@ def _plain(rgb: Any) -> NDArray[np.uint8]:
 _OF_MESH = ("vertices", "faces", "uv", "face_texture", "face_label", "irradiance")
 _MAX_EDGE_M = 0.3
 _MAX_COORDINATE_M = 1e4  # of a place that a camera moves in
+_UNIT = "where its unit is not the metre, say so, as in 'room.ply,scale=0.01' for centimetres"
+_MAX_VOXEL_M = 0.15  # of the free space: some 20,000 cubic metres
+_FINENESS = 0.4  # distance between samples of the surface, in voxels
+_MAX_SAMPLES = 20_000_000
 _LAMPS = 10
 _KEY = 0.2
 _FACING_M = 0.06
 
 
-def from_file(path: Path, seed: int = 0) -> MeshScene:
+def from_file(name: str | Path, seed: int = 0) -> MeshScene:
     """Load a mesh and light it with lamps in its free space.
 
     What takes long is shown, and kept on disk for the next time (``mesh_cache``).
     The free space is the largest enclosed part (see ``Enclosed``); faces are turned towards it.
 
     Args:
-        path: of the file.
+        name: of the file, as ``load_soup`` takes it.
         seed: varies the strength of the lamps.
 
     Raises:
-        InputError: no such file, not readable as a mesh, or without a triangle.
+        InputError: no such file, not readable as a mesh, without a triangle, or too large.
     """
-    soup = load_soup(path)
+    soup = load_soup(name)
     given: list[NDArray[Any]] = [soup.corners, soup.uv, soup.texture, soup.label, *soup.textures]
-    name = mesh_cache.key(given, (seed, soup.labels))
-    arrays = mesh_cache.remembered(name, partial(_light, soup, seed, path))
+    entry = mesh_cache.key(given, (seed, soup.labels))
+    arrays = mesh_cache.remembered(entry, partial(_light, soup, seed, str(name)))
     free = FreeSpace.of_grid(arrays["distance"], arrays["origin"], float(arrays["voxel_m"]))
     of_mesh = {field: arrays[field] for field in _OF_MESH}
     mesh = TexturedMesh(**of_mesh, textures=soup.textures, labels=soup.labels)
@@ -230,25 +202,44 @@ def from_file(path: Path, seed: int = 0) -> MeshScene:
         angle, drop = draw.uniform(-np.pi, np.pi), draw.uniform(0.0, 0.4)
         return eye, eye + np.array([np.cos(angle), np.sin(angle), -drop])
 
-    maker = partial(from_file, path)
-    return MeshScene(maker, seed, mesh, free, start, float(arrays["exposure"]), name=str(path))
+    maker = partial(from_file, name)
+    return MeshScene(maker, seed, mesh, free, start, float(arrays["exposure"]), name=str(name))
 
 
-def _light(soup: Soup, seed: int, path: Path) -> mesh_cache.Arrays:
+def _check_extent(soup: Soup, name: str) -> float:
+    """The edge of the voxels of a mesh's free space; a mesh too large for a camera is refused.
+
+    Raises:
+        InputError: with its extent, and what to do if its unit is not the metre.
+    """
+    low, high = soup.corners.min((0, 1)), soup.corners.max((0, 1))
+    voxel_m = voxel_for(low, high)
+    area = 0.5 * float(np.linalg.norm(face_cross(soup.corners), axis=1).sum())
+    if voxel_m > _MAX_VOXEL_M or area > _MAX_SAMPLES * (_FINENESS * voxel_m) ** 2:
+        extent = " x ".join(f"{side:.4g}" for side in high - low)
+        raise InputError(
+            f"mesh {name!r} is too large for a scene: {extent} m, {area:.3g} m2 of surface; {_UNIT}"
+        )
+    return voxel_m
+
+
+def _light(soup: Soup, seed: int, name: str) -> mesh_cache.Arrays:
     """What is kept of a mesh: lit, with its free space and its exposure.
 
     Raises:
-        InputError: no free space.
+        InputError: no free space, or too large.
     """
-    with tqdm(total=4, desc=f"preparing {path.name}", unit="stage", disable=None) as bar:
+    voxel_m = _check_extent(soup, name)
+    title = f"preparing {os.path.basename(name)}"
+    with tqdm(total=4, desc=title, unit="stage", disable=None) as bar:
         soup = split_long_edges(soup, _MAX_EDGE_M)
         faces = np.arange(3 * len(soup.corners)).reshape(-1, 3)
         rays = RayCaster(soup.corners.reshape(-1, 3), faces)
-        samples, _ = sample_surface(soup.corners.reshape(-1, 3), faces, 0.4 * VOXEL_M)
+        samples, _ = sample_surface(soup.corners.reshape(-1, 3), faces, _FINENESS * voxel_m)
         free = FreeSpace(samples, Enclosed(rays))
         bar.update()
         if not free.distance.any():
-            raise InputError(f"mesh {str(path)!r} leaves no free space for a camera")
+            raise InputError(f"mesh {name!r} leaves no free space for a camera")
         geometry = _geometry(_turn_to_free_space(soup, free))
         bar.update()
         cells = _free_cells(free)

@@ -12,19 +12,6 @@ from numpy.typing import NDArray
 from ms_slam_env.scenes.base import Float64, TexturedMesh
 
 
-def check_geometry(part: Any) -> None:
-    """Refuse what a file can make trimesh hold, and what no mesh or cloud is.
-
-    Raises:
-        ValueError: vertices that are no (V, 3), or faces of others than these.
-    """
-    vertices, faces = np.asarray(part.vertices), np.asarray(getattr(part, "faces", ()))
-    if vertices.shape[1:] != (3,):
-        raise ValueError(f"its vertices have shape {vertices.shape}")
-    if faces.size and not 0 <= faces.min() <= faces.max() < len(vertices):
-        raise ValueError(f"a face has a vertex beyond the {len(vertices)} that there are")
-
-
 class RayCaster:
     """An Embree scene of one mesh; not picklable, cheap to rebuild."""
 

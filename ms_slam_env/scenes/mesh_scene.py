@@ -23,6 +23,7 @@ MIN_START_SHARE = 0.8
 _TRIES = 2000
 _FACING_M = 0.06
 _ASIDE_M = 0.04
+_MOST_OPEN_POINTS = 20_000_000
 
 
 class MeshScene(Scene):
@@ -107,9 +108,10 @@ class MeshScene(Scene):
         """See the base class.
 
         Points whose front does not open into free space (backs of furniture against a wall,
-        insides of boxes) are left out, since no camera can see them.
+        insides of boxes) are left out, since no camera can see them. There are 20 million before
+        that, farther apart if they must be.
         """
-        return self._open_points(None, spacing_m)
+        return self._open_points(None, spacing_m, _MOST_OPEN_POINTS)
 
     def _open_points(
         self, faces: Int32 | None, spacing_m: float, most: float = np.inf

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from ms_slam_env.scenes.factory_hall import factory_hall
 from ms_slam_env.scenes.homes.home import home
 from ms_slam_env.scenes.living_room import living_room
 from ms_slam_env.scenes.mesh_file import from_file
+from ms_slam_env.scenes.mesh_formats import MESH_SUFFIXES, MeshFile
 from ms_slam_env.scenes.residential_street import residential_street
 from ms_slam_env.scenes.tabletops import carpet, table, wall, window
 
@@ -55,9 +55,6 @@ LARGE_SCENES: tuple[str, ...] = tuple(_LARGE)
 SCENES: tuple[str, ...] = tuple(POINT.own)
 """Names of the procedural scenes; the first is the default."""
 
-MESH_SUFFIXES: tuple[str, ...] = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
-"""File formats of meshes."""
-
 SEED_SPLITS: dict[str, range] = {
     "train": range(0, 1000),
     "validation": range(1000, 1100),
@@ -76,8 +73,12 @@ SceneName = str | Callable[[int], Scene]
 
 
 def is_mesh_file(name: object) -> bool:
-    """Whether ``name`` is meant as a mesh file."""
-    return isinstance(name, (str, Path)) and Path(name).suffix.lower() in MESH_SUFFIXES
+    """Whether ``name`` is meant as a mesh file.
+
+    Raises:
+        InputError: it is, with options that there are not.
+    """
+    return MeshFile.named(name) is not None
 
 
 def check_name(name: object) -> None:
@@ -86,9 +87,8 @@ def check_name(name: object) -> None:
     Raises:
         InputError: listing the valid choices.
     """
-    if is_mesh_file(name):
-        if not os.path.isfile(str(name)):
-            raise InputError(f"mesh file {str(name)!r} does not exist")
+    if (file := MeshFile.named(name)) is not None:
+        file.check_exists()
     elif isinstance(name, str) and ":" not in name and name not in POINT.names():
         raise POINT.unknown(name, (f"the path of a mesh file ({', '.join(MESH_SUFFIXES)})",))
     else:
@@ -105,7 +105,8 @@ def make(name: SceneName | Path = "living_room", seed: int = 0) -> Scene:
 
     Args:
         name: one of ``SCENES``, an entry point (group ``ms_slam_env.scenes``) or
-            ``module:function``, a function of the seed, or the path of a mesh file (z up, metres).
+            ``module:function``, a function of the seed, or a mesh file, such as ``room.obj`` or
+            ``room.glb,up=z``.
         seed: varies layout, sizes, colours, textures and lights of a procedural scene, and the
             lamps of a mesh file; not negative.
 
@@ -118,7 +119,7 @@ def make(name: SceneName | Path = "living_room", seed: int = 0) -> Scene:
     key = str(name) if isinstance(name, Path) else name
     check_name(key)
     if is_mesh_file(key):
-        return from_file(Path(str(key)), int(seed))
+        return from_file(str(key), int(seed))
     scene = POINT.find(key)(int(seed))
     if not isinstance(scene, Scene):
         raise InputError(f"scene {name!r} made {type(scene).__name__}, no ms_slam_env.scenes.Scene")

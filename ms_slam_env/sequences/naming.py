@@ -10,7 +10,7 @@ perturbs the frames, each with options if it has any::
     living_room:2000
     living_room:2000:none
     living_room:2000:kinect+misregistration+motion-blur,exposure_s=0.02
-    small_house.glb:7:uneven,frames=120+depth-dropout
+    small_house.glb,up=z:7:uneven,frames=120+depth-dropout
 
 What is left out is Kinect noise, the path that the command has for its sequences, and nothing.
 """

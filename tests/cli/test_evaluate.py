@@ -515,7 +515,7 @@ def test_bad_maps_are_one_line_and_code_2(
     assert "valid choices: none, icp, plane-icp, gicp" in refused([*maps, "--register", "sift"])
     assert "thresholds_m = 0.0 is outside" in refused([*maps, "--thresholds-m", "0"])
     assert "voxel_m = -1.0 is outside" in refused([*maps, "--voxel-m", "-1"])
-    assert "No such file" in refused(["--map", "none.ply", *maps[2:]])
+    assert "'none.ply' does not exist" in refused(["--map", "none.ply", *maps[2:]])
     assert "cannot be read" in refused(["--map", str(junk), *maps[2:]])
     assert "holds no points" in refused([*maps[:2], "--true-map", str(empty)])
     assert "not finite" in refused(["--map", str(endless), *maps[2:]])

@@ -99,6 +99,8 @@ def test_files_that_a_spec_names(tmp_path, monkeypatch) -> None:
     Path("house.glb").write_text("mesh")
     Path("tracker").write_text("program")
     assert file_hashes(EpisodeSpec("greedy", "house.glb")) == {"house.glb": hash_of("mesh")}
+    options = file_hashes(EpisodeSpec("greedy", "house.glb,up=z"))
+    assert options == {"house.glb": hash_of("mesh")}
     command = Backend("command:./tracker --in {sequence} --out {trajectory}")
     assert file_hashes(command) == {"./tracker": hash_of("program")}
     for text in (

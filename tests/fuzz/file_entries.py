@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import tempfile
 from functools import cache
 from pathlib import Path
@@ -13,6 +14,16 @@ import trimesh
 import yaml
 from bag_files import Messages, write_bag
 from fuzzing import Entry
+from mesh_writers import (
+    QUADS,
+    embedded,
+    glb,
+    ply,
+    textured_gltf,
+    write_gltf,
+    write_obj,
+    write_png,
+)
 from mutations import Files, mutated_bytes, mutated_folder, mutated_text, write_files
 from PIL import Image
 
@@ -255,19 +266,49 @@ def call_evaluate(files: Files, folder: Path) -> None:
 
 @cache
 def meshes() -> Files:
-    """A box in the formats that are documented."""
+    """A box or a room in the formats that are documented; a folder holds what one file names."""
     box = trimesh.creation.box((2.0, 3.0, 1.0))
     cloud = trimesh.PointCloud(np.random.default_rng(0).normal(size=(40, 3)))
-    made = {f"box.{kind}": box.export(file_type=kind) for kind in ("ply", "obj", "glb", "stl")}
+    kinds = ("ply", "obj", "glb", "stl", "off")
+    made = {f"box.{kind}": box.export(file_type=kind) for kind in kinds}
     made["cloud.ply"] = cloud.export(file_type="ply")
     made["text.ply"] = box.export(file_type="ply", encoding="ascii")
+    made["text.stl"] = box.export(file_type="stl_ascii")
+    made["mixed.ply"] = ply([*QUADS, (0, 1, 2)], "binary_big_endian", ("double", "uchar", "int"))
+    with tempfile.TemporaryDirectory() as folder:
+        write_obj(Path(folder, "obj"), "map_Kd -s 2 2 2 wood.png")
+        tree, buffer = textured_gltf()
+        write_gltf(Path(folder, "gltf"), tree, buffer)
+        textured = ply(QUADS, "ascii", ("float", "uchar", "int")).replace(b"red", b"u")
+        Path(folder, "ply").mkdir()
+        Path(folder, "ply", "room.ply").write_bytes(
+            textured.replace(b"green", b"v").replace(b"made by hand", b"TextureFile wood.png")
+        )
+        for path in sorted(Path(folder).rglob("*.*")):
+            write_png(path.parent / "wood.png")
+        paths = sorted(path for path in Path(folder).rglob("*") if path.is_file())
+        made |= {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+    made["room.glb"] = glb(tree | {"images": [{"uri": "wood.png"}]}, buffer)
+    made["embedded.gltf"] = json.dumps(tree | {"buffers": [embedded(buffer)]})
     return {n: data.encode() if isinstance(data, str) else data for n, data in made.items()}
+
+
+def one_mesh(files: Files, rng: np.random.Generator) -> Files:
+    """A mutation of one of them, with what it names."""
+    groups = sorted({name.partition("/")[0] for name in files})
+    group = groups[rng.integers(len(groups))]
+    return mutated_folder({n: d for n, d in files.items() if n.partition("/")[0] == group}, rng)
+
+
+def mesh_names(files: Files) -> list[str]:
+    """Those that are meshes themselves."""
+    return [name for name in files if not name.endswith((".mtl", ".png", ".bin"))]
 
 
 def call_surface(files: Files, folder: Path) -> None:
     """Read a map file."""
     write_files(files, folder)
-    for name in files:
+    for name in mesh_names(files):
         points = read_surface(folder / name, 50).points
         assert points.ndim == 2
         assert points.shape[1] == 3
@@ -278,13 +319,14 @@ def call_surface(files: Files, folder: Path) -> None:
 def call_mesh(files: Files, folder: Path) -> None:
     """Read a scene's mesh file."""
     write_files(files, folder)
-    for name in files:
+    for name in mesh_names(files):
         if name.startswith("cloud"):
             continue
         soup = load_soup(folder / name)
         assert soup.corners.shape[1:] == (3, 3)
         assert np.isfinite(soup.corners).all()
         assert len(soup.uv) == len(soup.texture) == len(soup.corners)
+        assert soup.texture.max() < len(soup.textures)
 
 
 def call_calibration(data: bytes, folder: Path) -> None:
@@ -309,8 +351,8 @@ ENTRIES = [
     _of_folder("image", images, call_image, one_image),
     _of_folder("trajectory", lambda: {"a.txt": trajectory()}, call_trajectory),
     _of_folder("evaluate", two_trajectories, call_evaluate),
-    _of_folder("surface", meshes, call_surface, one_image),
-    _of_folder("mesh", meshes, call_mesh, one_image),
+    _of_folder("surface", meshes, call_surface, one_mesh),
+    _of_folder("mesh", meshes, call_mesh, one_mesh),
     Entry("calibration", CALIBRATION.encode, mutated_text, call_calibration),
     Entry("lens", LENS.encode, mutated_text, call_calibration),
 ]

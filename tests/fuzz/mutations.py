@@ -183,9 +183,16 @@ SPECIAL = (
 def mutated_file(name: str, data: bytes, rng: Rng) -> bytes:
     """By the ending of the name."""
     suffix = name.rpartition(".")[2]
-    if suffix == "json":
+    if suffix in ("json", "gltf"):
         return mutated_json(data, rng)
-    is_text = suffix in ("txt", "csv", "yaml", "obj", "xml", "gltf")
+    head, end, body = data.partition(b"end_header")
+    if suffix == "ply" and end and rng.random() < 0.5:
+        return mutated_text(head, rng) + end + body
+    if data.startswith(b"glTF") and rng.random() < 0.7:
+        size = int.from_bytes(data[12:16], "little")
+        text = mutated_json(data[20 : 20 + size], rng)
+        return data[:12] + len(text).to_bytes(4, "little") + b"JSON" + text + data[20 + size :]
+    is_text = suffix in ("txt", "csv", "yaml", "obj", "mtl", "off", "xml")
     return mutated_text(data, rng) if is_text else mutated_bytes(data, rng)
 
 

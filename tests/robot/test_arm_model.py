@@ -1,5 +1,6 @@
 """What is read from any arm's MJCF, and the geometry of its chain, against slow or other truth."""
 
+import os
 from pathlib import Path
 
 import mujoco
@@ -242,6 +243,40 @@ def test_bad_file_is_one_clear_error(tmp_path, content, reason):
     assert reason in message
     assert str(path) in message
     assert "\n" not in message
+
+
+_ASSETS = {
+    "include": "<include file='part'/>",
+    "mesh": "<asset><mesh file='part'/></asset>",
+    "in a folder": "<compiler meshdir='inner'/><asset><mesh file='../part'/></asset>",
+    "behind a comment": '<!-- file=" --><asset><mesh file="part"/></asset>',
+    "of one side, escaped": "<asset><texture type='cube' fileright = \"&#112;art\"/></asset>",
+    "within an include": "<include file='more.xml'/>",
+}
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "large"])
+@pytest.mark.parametrize("asset", _ASSETS)
+def test_what_a_model_names_is_a_regular_file_of_bounded_size(tmp_path, kind, asset):
+    """MuJoCo would read a pipe for ever."""
+    (tmp_path / "inner").mkdir()
+    (tmp_path / "more.xml").write_text("<mujoco><asset><hfield file='part'/></asset></mujoco>")
+    (tmp_path / "arm.xml").write_text(f"<mujoco>{_ASSETS[asset]}</mujoco>")
+    if kind == "pipe":
+        os.mkfifo(tmp_path / "part")
+    elif kind == "device":
+        (tmp_path / "part").symlink_to("/dev/zero")
+    else:
+        with (tmp_path / "part").open("wb") as file:
+            file.truncate(2**31 + 1)
+    with pytest.raises(InputError, match=r"file of arm .*arm\.xml, .*part: (not a reg|larger)"):
+        load_arm(str(tmp_path / "arm.xml"))
+
+
+def test_a_model_may_include_itself_and_be_refused(tmp_path):
+    (tmp_path / "arm.xml").write_text("<mujoco><include file='arm.xml'/></mujoco>")
+    with pytest.raises(InputError, match="MuJoCo cannot read it"):
+        load_arm(str(tmp_path / "arm.xml"))
 
 
 def test_missing_file_lists_the_arms():

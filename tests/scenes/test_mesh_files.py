@@ -8,6 +8,7 @@ from PIL import Image
 from ms_slam_env import scenes
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.map_files import read_surface
+from ms_slam_env.scenes import mesh_scene
 from ms_slam_env.scenes.free_space import FreeSpace, Holding
 from ms_slam_env.scenes.mesh_file import load_soup, split_long_edges
 from ms_slam_env.scenes.mesh_queries import sample_surface
@@ -26,14 +27,17 @@ def _room(size=(3.0, 2.4, 2.0)) -> trimesh.Trimesh:
 
 
 @pytest.mark.parametrize("suffix", [".glb", ".obj", ".ply"])
-def test_a_vertex_coloured_room_becomes_a_scene(tmp_path, suffix):
+def test_a_vertex_coloured_room_becomes_a_scene(tmp_path, suffix, monkeypatch):
     mesh = _room()
     colours = np.full((len(mesh.vertices), 4), 255, np.uint8)
     colours[:, :3] = np.random.default_rng(0).integers(40, 255, (len(mesh.vertices), 3))
     mesh.visual.vertex_colors = colours
     path = tmp_path / f"room{suffix}"
     mesh.export(path)
-    scene = scenes.make(path)
+    scene = scenes.make(f"{path},up=z")
+    with monkeypatch.context() as patch:
+        patch.setattr(mesh_scene, "_MOST_OPEN_POINTS", 5000)
+        assert 2000 < len(scene.surface_points(1e-6)[0]) <= 5000  # not 10^13
     clearance = scene.clearance(np.array([[0.6, 0.6, 1.2], [1.5, 1.2, 0.3], [4.0, 1, 1]]))
     assert clearance[0] == pytest.approx(0.6, abs=0.05)
     np.testing.assert_array_equal(clearance[1:], 0.0)
@@ -69,8 +73,8 @@ def test_a_textured_material_keeps_image_and_orientation(tmp_path):
     visual = trimesh.visual.TextureVisuals(uv=[[0, 0], [1, 0], [1, 1], [0, 1]], material=material)
     mesh = trimesh.Trimesh(vertices, [[0, 1, 2], [0, 2, 3]], visual=visual, process=False)
     mesh.export(tmp_path / "quad.glb")
-    soup = load_soup(tmp_path / "quad.glb")
-    # The loader's v = 1 is the image's top row; it lies at y = 1 of the quad.
+    soup = load_soup(f"{tmp_path}/quad.glb,up=z")
+    # The writer's v = 1 is the image's top row; it lies at y = 1 of the quad.
     top = soup.corners[..., 1] > 0.5
     assert (soup.uv[top][:, 1] < 0.5).all()
     assert (soup.uv[~top][:, 1] > 0.5).all()
@@ -126,7 +130,7 @@ def test_samples_are_spread_by_area():
 
 @pytest.mark.skipif(not _HOUSE.exists(), reason="../shared/data/small_house.glb is not there")
 def test_small_house_is_read():
-    soup = load_soup(_HOUSE)
+    soup = load_soup(f"{_HOUSE},up=z")
     assert len(soup.corners) > 140_000
     extent = np.ptp(soup.corners.reshape(-1, 3), axis=0)
     np.testing.assert_allclose(extent[:2], [19, 11.4], atol=0.6)

@@ -7,7 +7,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, cast
 
 import gymnasium as gym
@@ -262,7 +261,7 @@ def check_names(planners: Sequence[str], scenes: Sequence[str]) -> None:
     for scene in scenes:
         check_name(scene)
         if is_mesh_file(scene):
-            load_soup(Path(scene))
+            load_soup(scene)
 
 
 def seed_list(split: str, count: int) -> list[int]:

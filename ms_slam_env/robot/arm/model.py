@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import html
 import math
+import os
 import re
 from dataclasses import dataclass
 from functools import lru_cache
@@ -14,7 +16,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import Float64, make_pose
-from ms_slam_env.input_files import MAX_TEXT_BYTES, read_bytes
+from ms_slam_env.input_files import MAX_MESH_BYTES, MAX_TEXT_BYTES, check_file, read_bytes
 from ms_slam_env.robot.arm.chain import Chain, separate_pairs
 
 Int32 = NDArray[np.int32]
@@ -25,6 +27,7 @@ ARM_MODELS = {"mico": Path(__file__).with_name("mico.xml")}
 _PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 _BALL = int(mujoco.mjtGeom.mjGEOM_SPHERE)
 _ROUND = (int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER))
+_NAMED = re.compile(r"""(?=\b(file\w*|(?:mesh|texture|asset)dir)\s*=\s*(?:"([^"]*)"|'([^']*)'))""")
 _ROBOT = re.compile(r"<robot[\s>]")  # root of a URDF
 
 
@@ -95,7 +98,7 @@ def _compile(model: str, path: Path) -> mujoco.MjModel:
             f"arm.model {model!r}: no such file; valid choices: {', '.join(ARM_MODELS)}, "
             "or the path of an MJCF file"
         )
-    text = read_bytes(path, "arm model", MAX_TEXT_BYTES).decode(errors="replace")
+    text = _checked_text(path)
     if path.suffix == ".urdf" or _ROBOT.search(text):
         raise InputError(
             f"arm {path} is a URDF; an MJCF is needed: load the file in MuJoCo, save it with "
@@ -106,6 +109,38 @@ def _compile(model: str, path: Path) -> mujoco.MjModel:
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise InputError(f"arm {path}: MuJoCo cannot read it: {reason}") from None
+
+
+def _checked_text(path: Path) -> str:
+    """The text of a model, after a look at the files that it and what it includes may name.
+
+    MuJoCo opens these itself, and would read a pipe for ever. Comments and folders of other assets
+    are looked at, too.
+
+    Raises:
+        InputError: one that is no regular file, or too large.
+    """
+    texts: list[str] = []
+    names: set[str] = set()
+    folders, seen, waiting = {path.parent}, {path}, [path]
+    while waiting:
+        file = waiting.pop()
+        texts.append(read_bytes(file, "arm model", MAX_TEXT_BYTES).decode(errors="replace"))
+        folders.add(file.parent)
+        for found in _NAMED.finditer(texts[-1]):
+            value = html.unescape(found[2] or found[3] or "")
+            if found[1].endswith("dir"):
+                folders |= {base / value for base in (path.parent, file.parent)}
+            else:
+                names |= {value, Path(value).name}  # the latter with strippath
+        for place in sorted({base / name for base in folders for name in names} - seen):
+            if os.path.exists(place) and not os.path.isdir(place):
+                seen.add(place)
+                check_file(place, f"file of arm {path},", MAX_MESH_BYTES)
+                with place.open("rb") as opened:
+                    is_xml = opened.read(64).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
+                waiting += [place] if is_xml else []
+    return texts[0]
 
 
 def _no_site(mj: mujoco.MjModel, wanted: str, path: Path) -> InputError:

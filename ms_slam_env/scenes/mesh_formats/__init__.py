@@ -1,0 +1,126 @@
+"""Mesh files by name: ``room.obj``, or with options ``room.glb,up=z,scale=0.01``."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ms_slam_env.config import Checked, bounded, chosen, from_dict, parse_named
+from ms_slam_env.errors import InputError
+from ms_slam_env.input_files import MAX_MESH_BYTES, read_bytes
+from ms_slam_env.scenes.base import Float64
+from ms_slam_env.scenes.mesh_formats.gltf import read_gltf
+from ms_slam_env.scenes.mesh_formats.obj import read_obj
+from ms_slam_env.scenes.mesh_formats.part import MeshFolder, Part
+from ms_slam_env.scenes.mesh_formats.ply import read_ply
+
+Reader = Callable[[bytes, MeshFolder], list[Part]]
+
+
+def _by_trimesh(kind: str) -> Reader:
+    """Read a format that names no other files and no sizes that are not checked."""
+
+    def read(data: bytes, folder: MeshFolder) -> list[Part]:
+        import trimesh
+
+        if data.lstrip().startswith(b"COFF"):
+            folder.warn("its colours are not read: the surface stays plain")
+        loaded = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False)
+        return [
+            Part(folder.mesh.stem, np.asarray(one.vertices, np.float64), np.asarray(one.faces))
+            for one in loaded.geometry.values()
+            if isinstance(one, trimesh.Trimesh)
+        ]
+
+    return read
+
+
+_READERS: dict[str, Reader] = {
+    ".glb": read_gltf,
+    ".gltf": read_gltf,
+    ".obj": read_obj,
+    ".ply": read_ply,
+    ".stl": _by_trimesh("stl"),
+    ".off": _by_trimesh("off"),
+}
+
+MESH_SUFFIXES: tuple[str, ...] = tuple(_READERS)
+"""File formats of meshes."""
+
+_Y_UP = (".glb", ".gltf")
+_NAME = re.compile(rf"(.+({'|'.join(map(re.escape, MESH_SUFFIXES))}))((?:,[^,]*)*)", re.I | re.S)
+
+
+@dataclass(frozen=True)
+class MeshOptions(Checked):
+    """How the numbers in a mesh file are meant.
+
+    Attributes:
+        up: the axis that points up: ``y``, ``z``, or that of the format: y of glTF, z of all else.
+        scale: metres that a unit of the file has.
+    """
+
+    up: str = chosen("format", "format", "y", "z")
+    scale: float = bounded(1.0, 1e-9, 1e9)
+
+
+@dataclass(frozen=True)
+class MeshFile:
+    """A mesh file and its options, as they are named."""
+
+    path: Path
+    options: MeshOptions
+
+    @classmethod
+    def named(cls, name: object) -> MeshFile | None:
+        """What ``FILE[,option=value ...]`` names; None if that is no mesh file.
+
+        Raises:
+            InputError: an unknown option, or a bad value.
+        """
+        match = _NAME.fullmatch(str(name)) if isinstance(name, (str, Path)) else None
+        if match is None:
+            return None
+        path, _, options = match.groups()
+        _, given = parse_named(options, f"mesh file {path!r}")
+        return cls(Path(path), from_dict(MeshOptions, given, f"mesh file {path!r}"))
+
+    def check_exists(self) -> None:
+        """Refuse a file that is not there.
+
+        Raises:
+            InputError: naming it.
+        """
+        if not os.path.exists(self.path):
+            raise InputError(f"mesh file {str(self.path)!r} does not exist")
+
+    def read(self) -> list[Part]:
+        """Its parts, world z up, in metres.
+
+        Raises:
+            InputError: no such file, or one that cannot be read.
+        """
+        kind = f"mesh file {str(self.path)!r}"
+        self.check_exists()
+        data = read_bytes(self.path, "mesh file", MAX_MESH_BYTES)
+        try:
+            with np.errstate(all="ignore"):  # what cannot be is refused below
+                parts = _READERS[self.path.suffix.lower()](data, MeshFolder(self.path))
+                shared = {id(part.vertices): part.vertices for part in parts}
+                placed = {key: self._placed(vertices) for key, vertices in shared.items()}
+                return [replace(part, vertices=placed[id(part.vertices)]) for part in parts]
+        except Exception as error:  # broken files raise anything
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise InputError(f"{kind} cannot be read: {reason}") from error
+
+    def _placed(self, vertices: Float64) -> Float64:
+        up = self.options.up
+        if up == "y" or (up == "format" and self.path.suffix.lower() in _Y_UP):
+            vertices = np.stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]], -1)
+        return vertices if self.options.scale == 1.0 else vertices * self.options.scale

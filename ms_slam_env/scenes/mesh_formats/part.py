@@ -1,0 +1,214 @@
+"""What the readers of mesh files give, and the files that a mesh file names."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.camera.image_files import decode_texture
+from ms_slam_env.errors import InputError, InputWarning
+from ms_slam_env.input_files import MAX_IMAGE_BYTES, MAX_MESH_BYTES, read_bytes
+from ms_slam_env.scenes.base import Float64
+
+Int64 = NDArray[np.int64]
+Image = NDArray[np.uint8]
+
+MAX_TRIANGLES = 10_000_000
+"""Of a mesh file: some 4 GB of memory."""
+
+MAX_TEXELS = 2**28
+"""Of all textures of a mesh file, shrunk."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """Triangles of one material.
+
+    Attributes:
+        name: in the file.
+        vertices: (V, 3) in the file's unit and axes.
+        faces: (F, 3) indices of vertices; none in a cloud.
+        uv: (F, 3, 2) of ``image``, u along columns, v along rows from the top.
+        image: (h, w, 3) sRGB.
+        tint: (3,) sRGB in [0, 255] that the image is multiplied by; without an image, the colour.
+        colours: (F, 3, 3) sRGB in [0, 255] of the corners, where there is no image.
+    """
+
+    name: str
+    vertices: Float64
+    faces: Int64
+    uv: Float64 | None = None
+    image: Image | None = None
+    tint: Float64 | None = None
+    colours: Float64 | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse too many faces, and those of vertices that are not there."""
+        check_size(len(self.faces))
+        if self.faces.size and not 0 <= self.faces.min() <= self.faces.max() < len(self.vertices):
+            raise InputError(f"a face has a vertex beyond the {len(self.vertices)} that there are")
+
+
+@dataclass(frozen=True)
+class Polygons:
+    """Polygons one after the other, cut into fans of triangles.
+
+    Attributes:
+        corners: (T, 3) places of the triangles' corners in the list of all polygons' corners.
+        polygon: (T,) the polygon of each triangle.
+    """
+
+    corners: Int64
+    polygon: Int64
+
+    @classmethod
+    def of_lengths(cls, lengths: Int64) -> Polygons:
+        """Cut polygons of ``lengths`` (P,) corners; those of fewer than three give nothing.
+
+        Raises:
+            InputError: more triangles than a mesh may have.
+        """
+        count = np.maximum(lengths - 2, 0)
+        check_size(int(count.sum()))
+        first, before = np.cumsum(lengths) - lengths, np.cumsum(count) - count
+        polygon = np.repeat(np.arange(len(lengths)), count)
+        start = first[polygon]
+        second = start + 1 + np.arange(len(polygon)) - before[polygon]
+        return cls(np.stack([start, second, second + 1], -1), polygon)
+
+
+def check_size(triangles: int, most: int | None = None) -> None:
+    """Refuse more triangles than a mesh may have: ``MAX_TRIANGLES``, or ``most`` if that is less.
+
+    Raises:
+        InputError: with both numbers.
+    """
+    most = MAX_TRIANGLES if most is None else min(most, MAX_TRIANGLES)
+    if triangles > most:
+        raise InputError(f"it has {triangles} triangles, more than {most}")
+
+
+class MissingFileError(InputError):
+    """A file that a mesh file names is not in its folder."""
+
+
+@dataclass
+class MeshFolder:
+    """The files that a mesh file may name: regular ones, in its folder or below.
+
+    Together they are at most as large as a mesh file may be. Each is read once.
+
+    Attributes:
+        mesh: the mesh file.
+    """
+
+    mesh: Path
+    _bytes: dict[Path, bytes] = field(default_factory=dict)
+    _images: dict[object, Image] = field(default_factory=dict)
+
+    def find(self, name: str) -> Path:
+        """The file that ``name`` means: ``\\`` parts folders, too, and upper is lower case.
+
+        An absolute path, as of another machine, means the file of that name beside the mesh.
+
+        Raises:
+            MissingFileError: there is none, or it lies outside of the folder.
+        """
+        folder = Path(os.path.abspath(self.mesh)).parent
+        given = PurePosixPath(name.strip().strip('"').replace("\\", "/"))
+        why = "is not in its folder"
+        for parts in (given.parts, given.parts[-1:]):
+            found = None if "\0" in name else _matching(folder, parts)
+            if found is not None and found.resolve().is_relative_to(folder.resolve()):
+                return found
+            why = why if found is None else "lies outside of its folder"
+        raise MissingFileError(f"{self.mesh.name} names {name!r}, which {why}")
+
+    def read(self, name: str, kind: str, most_bytes: int = MAX_MESH_BYTES) -> bytes:
+        """What a file holds.
+
+        Raises:
+            MissingFileError: see `find`.
+            InputError: no regular file, or too large.
+        """
+        path = self.find(name)
+        if path not in self._bytes:
+            left = MAX_MESH_BYTES - sum(map(len, self._bytes.values()))
+            self._bytes[path] = read_bytes(
+                path, f"{kind} of {self.mesh.name},", min(most_bytes, left)
+            )
+        return self._bytes[path]
+
+    def texture(self, name: str) -> Image | None:
+        """The image in a file; None, and a warning that names it, where it is missing.
+
+        Raises:
+            InputError: no regular file, too large, or no image.
+        """
+        try:
+            path = self.find(name)
+            return self.image(path, self.read(name, "texture", MAX_IMAGE_BYTES), str(path))
+        except MissingFileError as error:
+            self.warn(f"{error}: the surface stays plain")
+            return None
+
+    def image(self, key: object, data: bytes, name: str) -> Image:
+        """Decode an image once for each ``key``; ``name`` is for errors."""
+        if key not in self._images:
+            self._images[key] = decode_texture(data, f"texture {name}")
+            if sum(image.shape[0] * image.shape[1] for image in self._images.values()) > MAX_TEXELS:
+                raise InputError(f"its textures have more than {MAX_TEXELS} pixels")
+        return self._images[key]
+
+    def warn(self, text: str) -> None:
+        """Say what of the file is not taken."""
+        warnings.warn(f"mesh file {str(self.mesh)!r}: {text}", InputWarning, 4)
+
+
+def _matching(folder: Path, parts: tuple[str, ...]) -> Path | None:
+    """The file at ``parts`` below ``folder``, whatever the case of letters."""
+    here = folder
+    for part in parts:
+        if not os.path.lexists(here / part):
+            try:
+                names = sorted(n for n in os.listdir(here) if n.casefold() == part.casefold())
+            except OSError:
+                return None
+            if not names:
+                return None
+            part = names[0]
+        here = here / part
+    return here if parts else None
+
+
+def text_of(data: bytes) -> str:
+    """The text of a file: UTF-8, with or without a byte order mark, else Latin-1."""
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
+
+
+def bytes_of_colours(values: NDArray[Any]) -> Float64:
+    """Colours in [0, 255] of integers of 8 or 16 bits, or of floats in [0, 1]."""
+    colours = np.nan_to_num(np.asarray(values, dtype=np.float64))
+    if values.dtype.kind == "u" and values.dtype.itemsize == 2:
+        colours = colours / 257.0
+    if values.dtype.kind == "f" and colours.size and colours.max() <= 1.0:
+        colours = 255.0 * colours
+    return np.clip(colours, 0.0, 255.0)
+
+
+def columns_of(table: Mapping[str, NDArray[Any]], *choices: tuple[str, ...]) -> NDArray[Any] | None:
+    """The columns of the first of ``choices`` whose names are all there, beside each other."""
+    for names in choices:
+        if all(name in table for name in names):
+            return np.stack([table[name] for name in names], -1)
+    return None
