@@ -292,7 +292,7 @@ class Run(TrainingRun):
             venv.obs_rms = PooledMoments(self.inputs, self.actions, args.candidates)
         self.network = self._network()
         self.optimizer = torch.optim.Adam(self.network.parameters(), args.learning_rate, eps=1e-5)
-        init = read_init(args) if args.init else None
+        init = read_init(args) if args.init and (file is None or args.pull) else None
         if init:
             init.metadata.check_sizes(args.init, self.inputs, self.actions)
         begun = file or init

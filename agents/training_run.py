@@ -25,17 +25,17 @@ from ms_slam_agents.environments import (
 )
 from ms_slam_agents.evaluation import references
 from ms_slam_agents.learning_curve import LATEST, Curve, read_curve
-from ms_slam_agents.options import (
+from ms_slam_agents.options import Problem, Training
+from ms_slam_agents.policy_file import Metadata, PolicyFile, Tensors, read_policy, write_policy
+from ms_slam_agents.resume import (
     JUDGED_WITH,
     KEPT,
-    Problem,
-    Training,
     check_kept,
     check_new,
     check_steps_left,
-    parse_for_task,
+    parse_options,
+    say_changes,
 )
-from ms_slam_agents.policy_file import Metadata, PolicyFile, Tensors, read_policy, write_policy
 from stable_baselines3.common.vec_env import VecEnv
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
@@ -129,6 +129,8 @@ class TrainingRun(ABC):
         signals: list[signal.Signals] = []
         with board, bar:
             if not curve.points:
+                write_policy(args.out / LATEST, self.file())
+            if curve.is_due(self.steps, args.eval_every):
                 self._judge(curve, validation, board)
             while self.steps < args.total_timesteps:
                 if args.minutes is not None and self.minutes - before >= args.minutes:
@@ -148,9 +150,9 @@ class TrainingRun(ABC):
                 write_policy(args.out / LATEST, self.file())
                 if signals:
                     break
-                if args.eval_every and self.steps // args.eval_every > steps // args.eval_every:
+                if curve.is_due(self.steps, args.eval_every):
                     self._judge(curve, validation, board)
-            if not signals and curve.points[-1]["timesteps"] < self.steps:
+            if not signals and curve.steps < self.steps:
                 self._judge(curve, validation, board)
         return signals[0] if signals else None
 
@@ -178,9 +180,9 @@ def train(
         RuntimeError: the process of an environment has ended.
     """
     torch.set_num_threads(1)
-    file = load_run(args, algorithm)
     curve = saved_curve(args)
-    if args.init:
+    file = load_run(args, algorithm, curve)
+    if args.init and file is None:
         read_init(args)  # refused before anything is written
     check_problem(args)
     with ExitStack() as stack:
@@ -204,7 +206,9 @@ def run_command_line(
     """Run ``ms-slam train NAME``; return the exit status: 0, 1, 2, 130 or 143."""
     words = list(sys.argv[1:] if argv is None else argv)
     prog = f"ms-slam train {name}"
-    return exit_code(lambda: train(parse_for_task(args, words, prog, name), algorithm, make), prog)
+    return exit_code(
+        lambda: train(parse_options(args, words, prog, name, [algorithm]), algorithm, make), prog
+    )
 
 
 @contextmanager
@@ -244,30 +248,24 @@ def metadata_of(args: Any, algorithm: str, **counts: Any) -> Metadata:
     )
 
 
-def load_run(args: Training, algorithm: str) -> PolicyFile | None:
+def load_run(args: Training, algorithm: str, curve: Curve | None) -> PolicyFile | None:
     """What there is to resume; None for a new run.
 
     Raises:
-        InputError: nothing to resume from, nothing left to do, another network or problem, or a
-            new run where there is one already.
+        InputError: nothing to resume from, nothing left to train or to judge, another network or
+            problem, or a new run where there is one already.
     """
     if not args.resume:
         check_new(args.out, LATEST)
         return None
-    file = read_run(args, algorithm, {*KEPT, *args.kept} - {"algorithm"})
-    check_can_resume(args.out / LATEST, file, args.total_timesteps)
-    return file
-
-
-def check_can_resume(path: Path, file: PolicyFile, total: int) -> None:
-    """Refuse to go on from a file without the state of training, or with all its steps.
-
-    Raises:
-        InputError: naming the ``path``.
-    """
-    check_steps_left(path, file.metadata.timesteps, total)
+    file = read_run(args, algorithm, {*KEPT, *args.kept})
+    path, done = args.out / LATEST, file.metadata.timesteps
+    if curve is None or curve.steps >= done:
+        check_steps_left(path, done, args.total_timesteps)
     if file.metadata.epochs and not file.can_resume:
         raise InputError(f"{path} has no state of the optimiser to resume from")
+    say_changes(file.metadata.options, args)
+    return file
 
 
 def read_run(args: Problem, algorithm: str, names: set[str]) -> PolicyFile:

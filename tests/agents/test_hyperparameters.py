@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
-from ms_slam_agents import environments, imitation, options, ppo, qrdqn, train_sb3
+from ms_slam_agents import environments, imitation, options, ppo, qrdqn, resume, train_sb3
 
 from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.errors import InputError
@@ -160,10 +160,10 @@ def test_terms_of_the_reward_are_left_out_by_name():
 
 def test_a_run_keeps_the_terms_that_it_leaves_out(tmp_path):
     args = parsed(["--without", "lost"])
-    options.check_kept(tmp_path, {"without": ["lost"]}, args, ["without"])
+    resume.check_kept(tmp_path, {"without": ["lost"]}, args, ["without"])
     assert parsed(["--without", "lost", "blocked", "lost"]).without == ("blocked", "lost")
     with pytest.raises(InputError, match="trained with without"):
-        options.check_kept(tmp_path, {}, args, ["without"])
+        resume.check_kept(tmp_path, {}, args, ["without"])
 
 
 @pytest.mark.parametrize("trainer", TRAINERS)

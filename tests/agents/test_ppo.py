@@ -158,8 +158,10 @@ def test_a_memory_is_trained_saved_and_resumed(tmp_path, capsys):
     assert ppo.main(words(tmp_path / "a", *more, "--resume", steps=128)) == 0
     assert read_policy(tmp_path / "a" / "latest.safetensors").metadata.timesteps == 128
     assert [p["timesteps"] for p in read_curve(tmp_path / "a").points] == [0, 64, 128]
-    assert ppo.main(words(tmp_path / "a", "--resume", steps=256)) == 2
-    assert "trained with memory 8, not 0" in capsys.readouterr().err
+    assert ppo.main(["--out", str(tmp_path / "a"), "--resume", "--total-timesteps", "160"]) == 0
+    assert read_policy(tmp_path / "a" / "latest.safetensors").metadata.timesteps == 160
+    assert ppo.main(words(tmp_path / "a", "--resume", "--memory", "4", steps=256)) == 2
+    assert "trained with memory 8, not 4" in capsys.readouterr().err
 
 
 def test_progress_says_what_the_episodes_returned(tmp_path):
