@@ -9,9 +9,6 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
-
-pytest.importorskip("safetensors")
-
 from ms_slam_agents.policy import Policy
 from ms_slam_agents.policy_file import STEP, PolicyFile, read_policy, write_policy
 from ms_slam_agents.policy_planner import TrainedPolicy
