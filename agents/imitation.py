@@ -26,6 +26,7 @@ from ms_slam_agents.environments import (
     make_venv,
     opened,
     problem_options,
+    say_problem,
 )
 from ms_slam_agents.learning_curve import LATEST, Curve, read_curve
 from ms_slam_agents.options import Problem
@@ -181,6 +182,7 @@ def train(args: Args) -> int:
     if args.init and not done:
         begun = read_similar(args.init, args, args.hidden)
     check_problem(args)
+    say_problem(args)
     if done >= args.rounds:
         raise InputError(f"{args.out} has {done} rounds already: give more than --rounds {done}")
     seeds = range(VALIDATION_SEED, VALIDATION_SEED + args.eval_episodes)

@@ -22,6 +22,7 @@ from ms_slam_agents.environments import (
     first_seed,
     make_venv,
     opened,
+    say_problem,
 )
 from ms_slam_agents.options import Args
 from ms_slam_agents.policy import action_parts
@@ -95,6 +96,7 @@ def train(args: Args) -> int:
     if args.init and file is None:
         read_init(args)  # refused before anything is written
     check_problem(args)  # here, not in a worker process
+    say_problem(args)
     args.out.mkdir(parents=True, exist_ok=True)
     seeds = range(VALIDATION_SEED, VALIDATION_SEED + args.eval_episodes)
     with (

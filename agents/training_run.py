@@ -22,6 +22,7 @@ from ms_slam_agents.environments import (
     env_options,
     make_venv,
     opened,
+    say_problem,
 )
 from ms_slam_agents.evaluation import references
 from ms_slam_agents.learning_curve import LATEST, Curve, read_curve
@@ -48,6 +49,9 @@ from ms_slam_env.report.records import to_plain
 from ms_slam_env.report.results import RESULTS
 
 T = TypeVar("T", bound=Training)
+
+_MEASURES = ("approx_kl", "clip_fraction", "explained_variance", "episode_length")
+"""What TensorBoard shows and the progress bar has no room for."""
 
 
 class TrainingRun(ABC):
@@ -142,9 +146,11 @@ class TrainingRun(ABC):
                     said = self.advance(lambda: bool(signals))
                 if said is None:
                     break
-                self.minutes += (time.monotonic() - begun) / 60
+                seconds = time.monotonic() - begun
+                self.minutes += seconds / 60
                 bar.update(self.steps - steps)
-                bar.set_postfix({name: f"{value:.3g}" for name, value in said.items()})
+                bar.set_postfix({k: f"{v:.3g}" for k, v in said.items() if k not in _MEASURES})
+                said["steps_per_s"] = (self.steps - steps) / max(seconds, 1e-9)
                 for name, value in said.items():
                     board.add_scalar(f"train/{name}", value, self.steps)
                 write_policy(args.out / LATEST, self.file())
@@ -185,6 +191,7 @@ def train(
     if args.init and file is None:
         read_init(args)  # refused before anything is written
     check_problem(args)
+    say_problem(args)
     with ExitStack() as stack:
         seeds = range(VALIDATION_SEED, VALIDATION_SEED + args.eval_episodes)
         validation = stack.enter_context(opened(make_venv(args, "validation", seeds)))

@@ -194,13 +194,30 @@ def test_the_parallel_environments_are_of_several_tasks_in_turn(tmp_path):
     environments.check_problem(args)
 
 
+def test_where_it_trains_is_said_and_the_further_tasks_can_be_left_out(capsys):
+    environments.say_problem(parsed(["--task", "room"]))
+    said = capsys.readouterr().out
+    assert said == (
+        "trains in MSActiveSLAM-Room-v0 (living_room, corridor, table, wall); and in "
+        "MSActiveSLAM-Arm-v0 (window, table, wall, carpet), as --also arm-kinematic says\n"
+    )
+    alone = parsed(["--task", "room", "--num-envs", "1", "--also"])
+    assert (alone.also, alone.num_envs) == ((), 1)
+    environments.check_problem(alone)
+    environments.say_problem(alone)
+    assert capsys.readouterr().out.endswith("wall)\n")
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         (["rooms"], "unknown task 'rooms'; valid choices: .*arm-kinematic"),
         (["other.yaml"], "task 'other.yaml' has other observations or actions"),
         (["unknown.yaml"], "unknown environment 'MSActiveSLAM-Nowhere-v0'"),
-        (["room", "arm", "arm-kinematic"], "4 tasks to train in, and num_envs = 3"),
+        (
+            ["room", "arm", "arm-kinematic"],
+            "4 tasks to train in, .*--num-envs 3 is too few",
+        ),
     ],
 )
 def test_tasks_that_cannot_be_trained_in_together_are_refused(
