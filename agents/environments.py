@@ -117,14 +117,26 @@ def check_problem(args: Problem) -> None:
     also = getattr(args, "also", ())
     if len(also) >= args.num_envs:
         raise InputError(
-            f"{1 + len(also)} tasks to train in, and num_envs = {args.num_envs}: it must be at "
-            "least as many"
+            f"{1 + len(also)} tasks to train in, the problem itself and --also {' '.join(also)}, "
+            f"need as many environments: --num-envs {args.num_envs} is too few; --also without a "
+            "name leaves the problem itself"
         )
     own = _spaces_in(args, "train")
     _spaces_in(args, "validation")
     for k, name in enumerate(also, 1):
         if _spaces_in(world_of(args, k), "train") != own:
             raise InputError(f"task {name!r} has other observations or actions than {args.env_id}")
+
+
+def say_problem(args: Problem) -> None:
+    """Print where a policy is trained, before anything is done."""
+    also = getattr(args, "also", ())
+    worlds = [world_of(args, k) for k in range(1 + len(also))]
+    places = [f"{world.env_id} ({', '.join(world.scenes)})" for world in worlds]
+    shares = [
+        f"{place}, as --also {name} says" for name, place in zip(also, places[1:], strict=True)
+    ]
+    print("; and in ".join([f"trains in {places[0]}", *shares]), flush=True)
 
 
 def _spaces_in(args: Problem, split: str) -> tuple[Any, Any]:

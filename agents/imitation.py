@@ -26,10 +26,12 @@ from ms_slam_agents.environments import (
     make_venv,
     opened,
     problem_options,
+    say_problem,
 )
 from ms_slam_agents.learning_curve import LATEST, Curve, read_curve
-from ms_slam_agents.options import KEPT, Problem, check_kept, check_new, parse_for_task
+from ms_slam_agents.options import Problem
 from ms_slam_agents.policy_file import PolicyFile, write_policy
+from ms_slam_agents.resume import KEPT, check_kept, check_new, parse_options, say_changes
 from ms_slam_agents.student import Student
 from ms_slam_agents.training_run import read_run, read_similar, saved_curve
 from tqdm import tqdm
@@ -43,7 +45,7 @@ from ms_slam_env.report.records import to_plain
 from ms_slam_env.report.results import RESULTS
 
 _TRAINING_SEED = 500_000  # of the first episode
-_OWN_PROBLEM = {*KEPT, "teacher", "episodes", "epochs", "seed", "memory"} - {"algorithm"}
+_OWN_PROBLEM = {*KEPT, "teacher", "episodes", "epochs", "seed", "memory"}
 """Options that all rounds of a run have in common."""
 
 
@@ -156,6 +158,7 @@ def load_run(args: Args) -> tuple[PolicyFile | None, int]:
             check_kept(args.out / RESULTS, begun.config, args, sorted(_OWN_PROBLEM))
         return None, 0
     file = read_run(args, "imitation", _OWN_PROBLEM)
+    say_changes(file.metadata.options, args)
     return file, file.metadata.epochs // args.epochs
 
 
@@ -179,10 +182,11 @@ def train(args: Args) -> int:
     if args.init and not done:
         begun = read_similar(args.init, args, args.hidden)
     check_problem(args)
+    say_problem(args)
     if done >= args.rounds:
         raise InputError(f"{args.out} has {done} rounds already: give more than --rounds {done}")
     seeds = range(VALIDATION_SEED, VALIDATION_SEED + args.eval_episodes)
-    minutes = curve.minutes
+    minutes = file.metadata.minutes if file else 0.0
     curve.write(args.out)  # before the first episode: what the run is of
     for number in range(done, args.rounds):
         started = time.monotonic()
@@ -215,10 +219,9 @@ def train(args: Args) -> int:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status: 0, 1 if an episode failed, 2, 130."""
     words = list(sys.argv[1:] if argv is None else argv)
-    return exit_code(
-        lambda: train(parse_for_task(Args, words, "ms-slam train imitation", "imitation")),
-        "ms-slam train imitation",
-    )
+    name = "imitation"
+    prog = f"ms-slam train {name}"
+    return exit_code(lambda: train(parse_options(Args, words, prog, name, [name])), prog)
 
 
 if __name__ == "__main__":

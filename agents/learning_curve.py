@@ -44,22 +44,32 @@ class Curve:
     config: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def minutes(self) -> float:
-        """Time trained up to the last point."""
-        return float(self.points[-1]["training_min"]) if self.points else 0.0
-
-    @property
     def best(self) -> float:
         """Highest return of a point after training began; -inf without any."""
         found = [point["return"] for point in self.points if point["timesteps"]]
         return max(found, default=-float("inf"))
 
+    @property
+    def steps(self) -> int:
+        """Steps trained at the last point; -1 without any."""
+        return self.points[-1]["timesteps"] if self.points else -1
+
+    def is_due(self, steps: int, every: int) -> bool:
+        """Whether the policy after ``steps`` has a point to come: the first, and one in ``every``.
+
+        A run that ended between saving and evaluating makes up for its point when it goes on.
+        """
+        return not self.points or bool(every and steps // every > self.steps // every)
+
     def add(self, timesteps: int, minutes: float, scores: Mapping[str, Any]) -> dict[str, Any]:
-        """Add a point; with random walk among the references, with its gain over that."""
+        """Add a point; with random walk among the references, with its gain over that.
+
+        It takes the place of one of the same steps, of a round that is done again.
+        """
         point = {"timesteps": timesteps, "training_min": round(minutes, 3), **scores}
         if BASELINE in self.references:
             point |= paired_gain(point["returns"], self.references[BASELINE]["returns"])
-        self.points.append(point)
+        self.points = [one for one in self.points if one["timesteps"] < timesteps] + [point]
         return point
 
     def judge(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
@@ -23,7 +23,8 @@ class Problem(Checked):
 
     Attributes:
         out: folder for everything the run writes.
-        resume: go on with the run in ``out``.
+        resume: go on with the run in ``out``; options that are not given are those of the run so
+            far. Files, modules and addresses among them must be given again.
         task: whose options to begin with: a name, of a file in ``hyperparameters/``, or a YAML file
             of your own; what is given beside it counts more.
         env_id: id of the environment.
@@ -32,7 +33,8 @@ class Problem(Checked):
             they were held for some steps, and taught most of those that were compared; `features`
             takes the least time.
         scenes: trained and validated on, with training and validation seeds.
-        scene_seeds: seeds of each scene, from the split's first.
+        scene_seeds: seeds of each scene, from the split's first; as many as the agents that are
+            shipped had. Few are learnt by heart.
         episode_steps: time limit of an episode.
         step_m: translation of a motion; None: the environment's default.
         step_deg: rotation of a motion; None: the environment's default.
@@ -59,10 +61,10 @@ class Problem(Checked):
     embodiment: str | None = None
     observation: str = "features"
     scenes: tuple[str, ...] = ("living_room", "corridor", "table")
-    scene_seeds: int = bounded(4, 1, 100_000)
+    scene_seeds: int = bounded(100, 1, 100_000)
     episode_steps: int = bounded(150, 1, 100_000)
-    step_m: float | None = None
-    step_deg: float | None = None
+    step_m: float | None = bounded(None, 0, 1)
+    step_deg: float | None = bounded(None, 0, 90)
     frames_per_action: int | None = bounded(None, 1, 1000)
     reward: str = chosen("default", *RewardConfig.named())
     without: tuple[str, ...] = ()
@@ -141,11 +143,11 @@ class Training(Problem):
     gamma: float = bounded(0.98, 0, 1)
     hidden: int = bounded(256, 1, 4096)
     curriculum: Path | None = None
-    episodes_per_scene: int = bounded(1, 1, 1_000_000)
+    episodes_per_scene: int = bounded(5, 1, 1_000_000)
     also: tuple[str, ...] = ()
 
     kept: ClassVar[tuple[str, ...]] = ()
-    """Options beside ``KEPT`` that a run keeps when it is resumed."""
+    """Options beside `resume.KEPT` that a run keeps when it is resumed."""
 
 
 @dataclass(frozen=True)
@@ -175,8 +177,6 @@ class Args(PpoTraining):
     """Train a camera-motion policy with PPO; these options are the command line.
 
     Attributes:
-        resume: go on from ``out/latest.safetensors``; options that are not given are those of the
-            run so far.
         algorithm: PPO over the actions that are not blocked, or over all of them.
     """
 
@@ -205,10 +205,21 @@ def parse_for_task(cls: type[P], arguments: Sequence[str], prog: str, trainer: s
     Raises:
         InputError: bad options, an unknown task, or a file with an option that there is not.
     """
-    words = [part for word in arguments for part in word.split("=", 1 if "--task" in word else 0)]
-    named = [after for word, after in pairwise(words) if word == "--task"]
-    default = of_task(cls, named[-1], trainer) if named else None
+    task = named_in(arguments).get("task")
+    default = of_task(cls, task, trainer) if task else None
     return parse(cls, arguments, prog, default=default)
+
+
+def named_in(arguments: Sequence[str]) -> dict[str, str]:
+    """The options that a command line names, each with the word after it."""
+    words = [part for word in arguments for part in word.split("=", int(word.startswith("--")))]
+    pairs = pairwise([*words, ""])
+    return {one[2:].replace("-", "_"): after for one, after in pairs if one.startswith("--")}
+
+
+def shipped_tasks() -> list[str]:
+    """Names of the files in ``hyperparameters/``."""
+    return sorted(one.stem for one in TASKS.glob("*.yaml"))
 
 
 def of_task(cls: type[P], task: str, trainer: str) -> P:
@@ -218,8 +229,8 @@ def of_task(cls: type[P], task: str, trainer: str) -> P:
         InputError: an unknown task, or a file that does not hold such options.
     """
     path = Path(task) if is_file_name(task) else TASKS / f"{task}.yaml"
-    if not is_file_name(task) and not path.is_file():
-        raise unknown("task", task, sorted(one.stem for one in TASKS.glob("*.yaml")))
+    if not is_file_name(task) and task not in shipped_tasks():
+        raise unknown("task", task, shipped_tasks())
     text = read_text(path, "hyperparameters")
     try:
         content = load_yaml(text)
@@ -232,7 +243,7 @@ def of_task(cls: type[P], task: str, trainer: str) -> P:
         if name in ("problem", trainer):
             values |= {key: tuple(v) if isinstance(v, list) else v for key, v in part.items()}
     try:
-        return _of_types(from_dict(cls, values), "option")
+        return of_types(from_dict(cls, values), "option")
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
@@ -266,104 +277,8 @@ def world_of(args: P, environment: int) -> P:
 SECTIONS = ("problem", "sb3", "imitation", "ppo", "qrdqn", "rllib")
 """Of a file of hyperparameters: the problem, and the options of each trainer."""
 
-KEPT = (
-    "algorithm",
-    "env_id",
-    "embodiment",
-    "observation",
-    "step_m",
-    "step_deg",
-    "reward",
-    "without",
-    "through",
-    "hidden",
-)
-"""Options that a run keeps when it is resumed: another network, or another problem."""
 
-JUDGED_WITH = (
-    "eval_episodes",
-    "deterministic_eval",
-    "scenes",
-    "scene_seeds",
-    "episode_steps",
-    "frames_per_action",
-    "image_size",
-)
-"""Options that the points of a learning curve have in common."""
-
-
-def resumed(given: Args, saved: Mapping[str, Any]) -> Args:
-    """The options of the run to resume, for what the command line does not say.
-
-    Args:
-        given: as the command line says, with the defaults for the rest.
-        saved: options in the policy file.
-
-    Raises:
-        InputError: options that no run has, or that name code which only the file wants loaded.
-    """
-    kept = {name: tuple(v) if isinstance(v, list) else v for name, v in saved.items()}
-    kept |= {"out": given.out, "resume": given.resume}
-    made = from_dict(Args, kept)
-    for name, value in kept.items():
-        texts = value if isinstance(value, tuple) else (value,)
-        named = [text for text in texts if isinstance(text, str) and ":" in text]
-        if named and value != getattr(given, name):
-            raise InputError(f"saved option {name} names code, {named[0]!r}: give --{name} again")
-    return _of_types(made, "saved option")
-
-
-def check_new(out: Path, *names: str) -> None:
-    """Refuse a new run where files of these names show that there is one already.
-
-    Raises:
-        InputError: there is one.
-    """
-    if any((out / name).exists() for name in names):
-        raise InputError(f"{out} holds a training run already: add --resume, or change --out")
-
-
-def check_kept(
-    path: Path,
-    saved: Mapping[str, Any],
-    args: Problem,
-    names: Iterable[str],
-    was: str = "was trained with",
-) -> None:
-    """Refuse to go on with a run under options that would make it another one.
-
-    What a run of earlier does not say, it had as an option is by default.
-
-    Args:
-        path: of the run.
-        saved: its options.
-        args: those given.
-        names: of the options that must be the same.
-        was: what the run or a part of it has to do with them.
-
-    Raises:
-        InputError: naming the first option that differs, and both values.
-    """
-    for name in names:
-        had, given = saved.get(name, getattr(type(args), name)), getattr(args, name)
-        had = tuple(had) if isinstance(had, list) else had  # as JSON has it
-        if had != given:
-            raise InputError(f"{path} {was} {name} {had!r}, not {given!r}")
-
-
-def check_steps_left(path: Path, done: int, total: int) -> None:
-    """Refuse to go on with a run that has all its steps.
-
-    Raises:
-        InputError: there is nothing left to do.
-    """
-    if done >= total:
-        raise InputError(
-            f"{path} is trained for {done} steps already: give more than --total-timesteps {total}"
-        )
-
-
-def _of_types(made: P, what: str) -> P:
+def of_types(made: P, what: str) -> P:
     """The same options, all of the types that they are declared with."""
     for name, hint in get_type_hints(type(made)).items():
         if not _is_of(getattr(made, name), hint):

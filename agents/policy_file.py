@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from ms_slam_env.env.config import EnvConfig
+from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.output_files import write_bytes
 from ms_slam_env.report.records import build, to_plain
@@ -40,7 +42,10 @@ _LARGEST_FILE = 2**30  # bytes
 _LARGEST_LAYER = 100_000
 _MOST_LAYERS = 16
 _NAME = re.compile(r"[\w-]+")  # what stands before a colon would be imported
-_ENV_OPTIONS = {"embodiment": str, "step_m": (int, float), "step_rad": (int, float)}
+_ENV_OPTIONS = ("embodiment", "step_m", "step_rad")
+_MOST = {"timesteps": 1e12, "epochs": 1e9, "minutes": 1e9}
+_LARGEST_WEIGHT = 1e6  # that of a trained network is below 100
+_LARGEST_NUMBER = 1e12  # of moments and counts
 
 
 @dataclass(frozen=True)
@@ -109,8 +114,10 @@ class Metadata:
         for name, value in self.env_options.items():
             if name not in _ENV_OPTIONS:
                 raise unknown("option of env_options", name, _ENV_OPTIONS)
-            if not isinstance(value, _ENV_OPTIONS[name]):  # type: ignore[arg-type]
-                raise InputError(f"env_options.{name} = {value!r} is of the wrong type")
+            if name != "embodiment":
+                EnvConfig(**{name: value})  # refuses what is no length of a motion
+            elif value not in EMBODIMENTS:
+                raise unknown("embodiment", value, EMBODIMENTS)
         for name, sizes in (
             ("inputs", (self.inputs,)), ("hidden", self.hidden), ("actions", self.actions)
         ):  # fmt: skip
@@ -134,9 +141,9 @@ class Metadata:
             raise InputError(f"image = {str(self.image)[:80]} is none in {self.inputs} numbers")
         if self.quantiles and (self.memory or len(self.actions) > 1):
             raise InputError("quantiles go with one number an action, and with no memory")
-        counts = (self.timesteps, self.epochs, self.minutes)
-        if not all(0 <= count < math.inf for count in counts):
-            raise InputError(f"timesteps, epochs, minutes = {counts} are no counts")
+        for name, most in _MOST.items():
+            if not 0 <= getattr(self, name) <= most:
+                raise InputError(f"{name} = {getattr(self, name)} is outside [0, {most:g}]")
 
     def check_sizes(self, path: Path, inputs: int, *actions: int) -> None:
         """Refuse another number of inputs or of actions than a training has.
@@ -366,5 +373,8 @@ def _check_values(path: Path, tensors: Tensors) -> None:
     for name, value in tensors.items():
         if not np.isfinite(value).all():
             raise InputError(f"{str(path)!r}: tensor {name} holds NaN or infinity")
+        most = _LARGEST_WEIGHT if name.startswith(("policy.", "target.")) else _LARGEST_NUMBER
+        if (np.abs(value) > most).any():
+            raise InputError(f"{str(path)!r}: tensor {name} holds numbers beyond {most:g}")
         if name.endswith((".var", ".count", ".step", ".exp_avg_sq")) and (value < 0).any():
             raise InputError(f"{str(path)!r}: tensor {name} holds negative numbers")

@@ -34,6 +34,7 @@ from ms_slam_agents.options import PpoTraining
 from ms_slam_agents.policy_file import Metadata, PolicyFile, Tensors
 from ms_slam_agents.sb3_state import optimizer_tensors, restore_adam
 from ms_slam_agents.training_run import TrainingRun, read_init, run_command_line
+from stable_baselines3.common.utils import explained_variance
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 from torch import Tensor, nn
 from torch.nn.functional import kl_div, mse_loss
@@ -169,12 +170,14 @@ class Player:
         self.memory = torch.zeros(venv.num_envs, network.width)
         self.returns: list[float] = []
         """Of the episodes that ended in the last rollout, as the environments reward them."""
+        self.lengths: list[int] = []
+        """Of these, in steps."""
 
     @torch.no_grad()
     def play(self, steps: int, stop: Any) -> Rollout | None:
         """A rollout; None where ``stop()`` says so before its end."""
         rows: list[tuple[Tensor, ...]] = []
-        self.returns = []
+        self.returns, self.lengths = [], []
         if not self.has_begun:  # not before: the environments are told of their stage first
             self.seen, self.has_begun = _tensor(self.venv.reset()), True
         for _ in range(steps):
@@ -194,7 +197,9 @@ class Player:
             gained = _tensor(rewards) + self._cut_off(dones, infos)
             rows.append((seen, masks, begins, before, actions, chosen, values, gained, pulled_to))
             self.seen, self.begins = _tensor(observations), _tensor(dones)
-            self.returns += [info["episode"]["r"] for info in infos if "episode" in info]
+            ended = [info["episode"] for info in infos if "episode" in info]
+            self.returns += [episode["r"] for episode in ended]
+            self.lengths += [episode["l"] for episode in ended]
         rollout = Rollout(*(torch.stack(column) for column in zip(*rows, strict=True)))
         memory = self.network.remember(self.seen, self.memory, self.begins)
         _, last = self.network(self.seen, memory, torch.ones_like(masks))
@@ -228,7 +233,11 @@ def update(
     pull: float,
     rng: np.random.Generator,
 ) -> dict[str, float]:
-    """Learn from a rollout; means of the parts of the loss."""
+    """Learn from a rollout; means of the parts of the loss, and how far the policy went.
+
+    ``approx_kl`` (of the last epoch), ``clip_fraction`` and ``explained_variance`` are defined as
+    in Stable-Baselines3.
+    """
     length = min(args.chunk, len(rollout.rewards)) if network.width else 1
     data = rollout.chunks(length)
     count = data["rewards"].shape[1]
@@ -240,18 +249,25 @@ def update(
             batch = {name: values[:, torch.as_tensor(chosen)] for name, values in data.items()}
             losses = _losses(network, batch, args)
             weights = (1.0, args.value_weight, -args.ent_coef, pull)
-            loss = sum(w * part for w, part in zip(weights, losses, strict=True))
+            loss = sum(w * part for w, part in zip(weights, losses[:4], strict=True))
             optimizer.zero_grad()
             loss.backward()
             nn.utils.clip_grad_norm_(network.parameters(), 0.5)
             optimizer.step()
             parts.append([part.item() for part in losses])
-    names = ("policy_loss", "value_loss", "entropy", "pull")
-    return dict(zip(names, np.mean(parts, axis=0).tolist(), strict=True))
+    names = ("policy_loss", "value_loss", "entropy", "pull", "approx_kl", "clip_fraction")
+    said = dict(zip(names, np.mean(parts, axis=0).tolist(), strict=True))
+    said["approx_kl"] = float(np.mean([part[4] for part in parts[-len(parts) // args.n_epochs :]]))
+    values, advantages = rollout.values.flatten().numpy(), rollout.advantages.flatten().numpy()
+    return said | {"explained_variance": explained_variance(values, values + advantages)}
 
 
 def _losses(network: Network, batch: dict[str, Tensor], args: Args) -> tuple[Tensor, ...]:
-    """Policy, value, entropy and divergence from the first policy, of chunks (L, C, ...)."""
+    """Policy, value, entropy and divergence from the first policy, of chunks (L, C, ...).
+
+    After these, of which the loss consists, the divergence from the policy that played (Schulman's
+    estimate) and the share of the steps whose ratio is clipped.
+    """
     log_probs, values = network.along(
         batch["seen"], batch["memory"][0], batch["begins"], batch["masks"]
     )
@@ -260,14 +276,17 @@ def _losses(network: Network, batch: dict[str, Tensor], args: Args) -> tuple[Ten
     targets = advantages + flat["values"]
     if len(advantages) > 1:
         advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-    ratio = (log_probs.gather(1, flat["actions"][:, None])[:, 0] - flat["log_probs"]).exp()
+    log_ratio = log_probs.gather(1, flat["actions"][:, None])[:, 0] - flat["log_probs"]
+    ratio = log_ratio.exp()
     clipped = ratio.clamp(1 - args.clip_range, 1 + args.clip_range)
     policy = -torch.min(ratio * advantages, clipped * advantages).mean()
     probabilities = log_probs.exp()
     entropy = -(probabilities * log_probs.masked_fill(~flat["masks"], 0)).sum(dim=1).mean()
     pulled_to = flat["pulled_to"]
     pull = kl_div(log_probs, pulled_to, reduction="batchmean") if pulled_to.numel() else 0 * policy
-    return policy, mse_loss(values, targets), entropy, pull
+    went, is_clipped = ratio - 1 - log_ratio, (ratio - 1).abs() > args.clip_range
+    measures = went.detach().mean(), is_clipped.float().mean()
+    return policy, mse_loss(values, targets), entropy, pull, *measures
 
 
 # -- Run ---------------------------------------------------------------------------------------
@@ -292,7 +311,7 @@ class Run(TrainingRun):
             venv.obs_rms = PooledMoments(self.inputs, self.actions, args.candidates)
         self.network = self._network()
         self.optimizer = torch.optim.Adam(self.network.parameters(), args.learning_rate, eps=1e-5)
-        init = read_init(args) if args.init else None
+        init = read_init(args) if args.init and (file is None or args.pull) else None
         if init:
             init.metadata.check_sizes(args.init, self.inputs, self.actions)
         begun = file or init
@@ -345,6 +364,7 @@ class Run(TrainingRun):
         self.epochs += args.n_epochs
         if self.player.returns:
             said["return"] = float(np.mean(self.player.returns))
+            said["episode_length"] = float(np.mean(self.player.lengths))
         return said
 
 

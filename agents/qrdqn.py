@@ -32,7 +32,7 @@ from ms_slam_agents.policy_file import Metadata, PolicyFile, Tensors
 from ms_slam_agents.sb3_state import optimizer_tensors, restore_adam
 from ms_slam_agents.training_run import TrainingRun, read_init, run_command_line
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from torch import Tensor
 from torch.nn.functional import huber_loss
 
@@ -278,6 +278,8 @@ class Run(TrainingRun):
         self.sums = np.zeros(venv.num_envs)
         self.played = 0
         """Steps since this run began."""
+        self.ended: list[dict[str, float]] = []
+        """Return and length of the episodes that ended since the network was last saved."""
 
     def tensors(self) -> Tensors:
         """See the base class."""
@@ -312,8 +314,11 @@ class Run(TrainingRun):
                 losses.append(self.learner.learn(self.replay.draw(self.rng, args.batch_size)))
         # As the other trainers count: how often the network has seen what it was shown.
         self.epochs = math.ceil(self.learner.updates * args.batch_size / self.steps)
-        loss = {"loss": float(np.mean(losses))} if losses else {}
-        return loss | {"epsilon": self.epsilon, "replay": float(len(self.replay))}
+        said = {"loss": float(np.mean(losses))} if losses else {}
+        for name, key in (("return", "r"), ("episode_length", "l")) if self.ended else ():
+            said[name] = float(np.mean([episode[key] for episode in self.ended]))
+        self.ended = []
+        return said | {"epsilon": self.epsilon, "replay": float(len(self.replay))}
 
     def _step(self) -> None:
         """A step of each environment, into the replay."""
@@ -330,6 +335,7 @@ class Run(TrainingRun):
             step = (self.seen[i], int(actions[i]), float(rewards[i]))
             for transition in self.returns[i].step(step, then, bool(ends[i]), is_terminated):
                 self.replay.add(transition)
+        self.ended += [info["episode"] for info in infos if "episode" in info]
         self.seen = after
         self.steps += venv.num_envs
         self.played += venv.num_envs
@@ -345,7 +351,8 @@ class Run(TrainingRun):
 
 def make_run(args: Args, file: PolicyFile | None, stack: ExitStack) -> Run:
     """A run in environments of its own."""
-    return Run(args, stack.enter_context(opened(make_venv(args, "train"))), file)
+    venv = stack.enter_context(opened(make_venv(args, "train")))
+    return Run(args, VecMonitor(venv), file)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

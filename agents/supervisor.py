@@ -46,6 +46,8 @@ class Supervisor(BaseCallback):
         self.stop_reason = ""
         self.signal: signal.Signals | None = None
         self.unlearnt_steps = 0
+        self.was_done = False
+        """Whether nothing but the last evaluation was left to do."""
         self._minutes_before = minutes_before
         self._evaluation_s = 0.0
         self._provenance = provenance()
@@ -74,6 +76,7 @@ class Supervisor(BaseCallback):
     def _on_training_start(self) -> None:
         self._start = time.monotonic()
         self._epochs_before = self.model._n_updates
+        self.was_done = self.num_timesteps >= self.args.total_timesteps
         if self.args.minutes is None:
             self._bar = tqdm(
                 total=self.args.total_timesteps,
@@ -127,13 +130,13 @@ class Supervisor(BaseCallback):
             buffer = self.model.rollout_buffer
             self.unlearnt_steps = 0 if buffer.full else buffer.pos * buffer.n_envs
         self._save_latest()
-        if self.has_learnt and not self.signal and not self._is_evaluated():
+        is_new = self.has_learnt or self.was_done
+        if is_new and not self.signal and not self._is_evaluated():
             self._evaluate()
         self._bar.close()
 
     def _is_evaluated(self) -> bool:
-        points = self.curve.points
-        return bool(points) and points[-1]["timesteps"] == self.num_timesteps
+        return self.curve.steps == self.num_timesteps
 
     def _save_latest(self) -> None:
         write_policy(self.args.out / LATEST, self.policy_file())

@@ -307,7 +307,11 @@ class Run(TrainingRun):
         self.steps += int(played)
         self.epochs += self.ppo.config.num_epochs if learnt else 0
         names = {"policy_loss": "policy_loss", "value_loss": "vf_loss", "entropy": "entropy"}
+        names |= {"explained_variance": "vf_explained_var"}
         said = {name: float(learnt[key]) for name, key in names.items() if key in learnt}
+        of_episodes = {"return": "episode_return_mean", "episode_length": "episode_len_mean"}
+        met = result.get("env_runners", {})
+        said |= {name: float(met[key]) for name, key in of_episodes.items() if key in met}
         healthy = self.ppo.env_runner_group.num_healthy_remote_workers()
         return said | {"runners": float(healthy)}
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict
 
 import torch
 from ms_slam_agents.environments import (
@@ -23,23 +22,17 @@ from ms_slam_agents.environments import (
     first_seed,
     make_venv,
     opened,
+    say_problem,
 )
-from ms_slam_agents.learning_curve import LATEST
-from ms_slam_agents.options import (
-    KEPT,
-    Args,
-    check_kept,
-    check_new,
-    parse_for_task,
-    resumed,
-)
+from ms_slam_agents.options import Args
 from ms_slam_agents.policy import action_parts
-from ms_slam_agents.policy_file import PolicyFile, read_policy
+from ms_slam_agents.policy_file import PolicyFile
+from ms_slam_agents.resume import parse_options
 from ms_slam_agents.sb3_state import ALGORITHMS, Model, restore, whole_batches
 from ms_slam_agents.supervisor import Supervisor
 from ms_slam_agents.training_run import (
     caught_signals,
-    check_can_resume,
+    load_run,
     new_curve,
     read_init,
     saved_curve,
@@ -47,7 +40,7 @@ from ms_slam_agents.training_run import (
 )
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
-from ms_slam_env.command_line import exit_code, parse
+from ms_slam_env.command_line import exit_code
 from ms_slam_env.interrupts import kept
 
 
@@ -90,27 +83,6 @@ def rollout_steps(args: Args, num_envs: int, done: int) -> int:
     return max(2, min(args.n_steps, left))
 
 
-def load_run(args: Args) -> PolicyFile | None:
-    """What there is to resume; None for a new run.
-
-    Raises:
-        InputError: nothing to resume from, nothing left to do, another network or problem, or a
-            new run where there is one already.
-    """
-    path = args.out / LATEST
-    if not args.resume:
-        check_new(args.out, LATEST)
-        return None
-    file = read_policy(path)
-    saved = resumed(args, file.metadata.options)
-    check_kept(path, asdict(saved), args, KEPT)
-    check_can_resume(path, file, args.total_timesteps)
-    for name, value in asdict(args).items():
-        if value != getattr(saved, name):
-            print(f"{name} is {value!r} from now on, {getattr(saved, name)!r} so far")
-    return file
-
-
 def train(args: Args) -> int:
     """Train as ``args`` say; return the exit status, 130 after Ctrl-C, 143 after SIGTERM.
 
@@ -120,10 +92,11 @@ def train(args: Args) -> int:
     """
     torch.set_num_threads(1)
     curve = saved_curve(args)
-    file = load_run(args)
+    file = load_run(args, args.algorithm, curve)
     if args.init and file is None:
         read_init(args)  # refused before anything is written
     check_problem(args)  # here, not in a worker process
+    say_problem(args)
     args.out.mkdir(parents=True, exist_ok=True)
     seeds = range(VALIDATION_SEED, VALIDATION_SEED + args.eval_episodes)
     with (
@@ -155,7 +128,7 @@ def report(supervisor: Supervisor) -> int:
     """
     args, steps = supervisor.args, supervisor.num_timesteps
     ended = supervisor.stop_reason or "done"
-    if not supervisor.has_learnt and not supervisor.signal:
+    if not supervisor.has_learnt and not supervisor.signal and not supervisor.was_done:
         raise RuntimeError(
             f"{ended}, but nothing was learnt: {supervisor.unlearnt_steps} steps are less than a "
             f"batch of {args.batch_size}; give more --minutes or a smaller --batch-size"
@@ -167,25 +140,11 @@ def report(supervisor: Supervisor) -> int:
     return 128 + supervisor.signal if supervisor.signal else 0
 
 
-def parse_options(argv: Sequence[str] | None) -> Args:
-    """The options; of a run to resume, those that it had for what the command line does not say.
-
-    Raises:
-        InputError: bad options, or nothing to resume from.
-    """
-    prog = "ms-slam train"
-    words = list(sys.argv[1:] if argv is None else argv)
-    given = parse_for_task(Args, words, prog, "sb3")
-    if not given.resume:
-        return given
-    saved = resumed(given, read_policy(given.out / LATEST).metadata.options)
-    return parse(Args, words, prog, default=saved)
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status: 0, 1 if nothing was learnt, 2, 130, 143."""
     words = list(sys.argv[1:] if argv is None else argv)
-    return exit_code(lambda: train(parse_options(words)), "ms-slam train")
+    prog = "ms-slam train"
+    return exit_code(lambda: train(parse_options(Args, words, prog, "sb3", list(ALGORITHMS))), prog)
 
 
 if __name__ == "__main__":

@@ -22,20 +22,21 @@ from ms_slam_agents.environments import (
     env_options,
     make_venv,
     opened,
+    say_problem,
 )
 from ms_slam_agents.evaluation import references
 from ms_slam_agents.learning_curve import LATEST, Curve, read_curve
-from ms_slam_agents.options import (
+from ms_slam_agents.options import Problem, Training
+from ms_slam_agents.policy_file import Metadata, PolicyFile, Tensors, read_policy, write_policy
+from ms_slam_agents.resume import (
     JUDGED_WITH,
     KEPT,
-    Problem,
-    Training,
     check_kept,
     check_new,
     check_steps_left,
-    parse_for_task,
+    parse_options,
+    say_changes,
 )
-from ms_slam_agents.policy_file import Metadata, PolicyFile, Tensors, read_policy, write_policy
 from stable_baselines3.common.vec_env import VecEnv
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
@@ -48,6 +49,9 @@ from ms_slam_env.report.records import to_plain
 from ms_slam_env.report.results import RESULTS
 
 T = TypeVar("T", bound=Training)
+
+_MEASURES = ("approx_kl", "clip_fraction", "explained_variance", "episode_length")
+"""What TensorBoard shows and the progress bar has no room for."""
 
 
 class TrainingRun(ABC):
@@ -129,6 +133,8 @@ class TrainingRun(ABC):
         signals: list[signal.Signals] = []
         with board, bar:
             if not curve.points:
+                write_policy(args.out / LATEST, self.file())
+            if curve.is_due(self.steps, args.eval_every):
                 self._judge(curve, validation, board)
             while self.steps < args.total_timesteps:
                 if args.minutes is not None and self.minutes - before >= args.minutes:
@@ -140,17 +146,19 @@ class TrainingRun(ABC):
                     said = self.advance(lambda: bool(signals))
                 if said is None:
                     break
-                self.minutes += (time.monotonic() - begun) / 60
+                seconds = time.monotonic() - begun
+                self.minutes += seconds / 60
                 bar.update(self.steps - steps)
-                bar.set_postfix({name: f"{value:.3g}" for name, value in said.items()})
+                bar.set_postfix({k: f"{v:.3g}" for k, v in said.items() if k not in _MEASURES})
+                said["steps_per_s"] = (self.steps - steps) / max(seconds, 1e-9)
                 for name, value in said.items():
                     board.add_scalar(f"train/{name}", value, self.steps)
                 write_policy(args.out / LATEST, self.file())
                 if signals:
                     break
-                if args.eval_every and self.steps // args.eval_every > steps // args.eval_every:
+                if curve.is_due(self.steps, args.eval_every):
                     self._judge(curve, validation, board)
-            if not signals and curve.points[-1]["timesteps"] < self.steps:
+            if not signals and curve.steps < self.steps:
                 self._judge(curve, validation, board)
         return signals[0] if signals else None
 
@@ -178,11 +186,12 @@ def train(
         RuntimeError: the process of an environment has ended.
     """
     torch.set_num_threads(1)
-    file = load_run(args, algorithm)
     curve = saved_curve(args)
-    if args.init:
+    file = load_run(args, algorithm, curve)
+    if args.init and file is None:
         read_init(args)  # refused before anything is written
     check_problem(args)
+    say_problem(args)
     with ExitStack() as stack:
         seeds = range(VALIDATION_SEED, VALIDATION_SEED + args.eval_episodes)
         validation = stack.enter_context(opened(make_venv(args, "validation", seeds)))
@@ -204,7 +213,9 @@ def run_command_line(
     """Run ``ms-slam train NAME``; return the exit status: 0, 1, 2, 130 or 143."""
     words = list(sys.argv[1:] if argv is None else argv)
     prog = f"ms-slam train {name}"
-    return exit_code(lambda: train(parse_for_task(args, words, prog, name), algorithm, make), prog)
+    return exit_code(
+        lambda: train(parse_options(args, words, prog, name, [algorithm]), algorithm, make), prog
+    )
 
 
 @contextmanager
@@ -244,30 +255,24 @@ def metadata_of(args: Any, algorithm: str, **counts: Any) -> Metadata:
     )
 
 
-def load_run(args: Training, algorithm: str) -> PolicyFile | None:
+def load_run(args: Training, algorithm: str, curve: Curve | None) -> PolicyFile | None:
     """What there is to resume; None for a new run.
 
     Raises:
-        InputError: nothing to resume from, nothing left to do, another network or problem, or a
-            new run where there is one already.
+        InputError: nothing to resume from, nothing left to train or to judge, another network or
+            problem, or a new run where there is one already.
     """
     if not args.resume:
         check_new(args.out, LATEST)
         return None
-    file = read_run(args, algorithm, {*KEPT, *args.kept} - {"algorithm"})
-    check_can_resume(args.out / LATEST, file, args.total_timesteps)
-    return file
-
-
-def check_can_resume(path: Path, file: PolicyFile, total: int) -> None:
-    """Refuse to go on from a file without the state of training, or with all its steps.
-
-    Raises:
-        InputError: naming the ``path``.
-    """
-    check_steps_left(path, file.metadata.timesteps, total)
+    file = read_run(args, algorithm, {*KEPT, *args.kept})
+    path, done = args.out / LATEST, file.metadata.timesteps
+    if curve is None or curve.steps >= done:
+        check_steps_left(path, done, args.total_timesteps)
     if file.metadata.epochs and not file.can_resume:
         raise InputError(f"{path} has no state of the optimiser to resume from")
+    say_changes(file.metadata.options, args)
+    return file
 
 
 def read_run(args: Problem, algorithm: str, names: set[str]) -> PolicyFile:

@@ -19,7 +19,6 @@ from typing import Any
 from ms_slam_env.errors import InputError, unknown
 
 _EXTRAS = {
-    "safetensors": "train",
     "torch": "train",
     "stable_baselines3": "train",
     "sb3_contrib": "train",

@@ -7,7 +7,12 @@ import re
 import subprocess
 import sys
 import zipfile
-from importlib.metadata import distribution, entry_points
+from importlib.metadata import (
+    PackageNotFoundError,
+    distribution,
+    entry_points,
+    packages_distributions,
+)
 from pathlib import Path
 
 import pytest
@@ -71,11 +76,75 @@ def test_entry_points_name_files_that_exist(group: str) -> None:
         assert re.search(rf"^(class|def) {attribute}\b", path.read_text(), re.MULTILINE)
 
 
+def normal(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
 def test_base_install_needs_neither_torch_nor_open3d() -> None:
     requirements = [Requirement(text) for text in distribution("ms-slam-env").requires or ()]
     base = {r.name.lower() for r in requirements if not (r.marker and "extra" in str(r.marker))}
     assert base.isdisjoint({"torch", "open3d", "stable-baselines3", "sb3-contrib", "evo"})
-    assert {"numpy", "gymnasium", "warp-lang", "embreex", "trimesh"} <= base
+    assert {"numpy", "gymnasium", "warp-lang", "embreex", "trimesh", "safetensors"} <= base
+
+
+def of_base_install() -> set[str]:
+    """Distributions that ``pip install ms-slam-env`` brings, by their normal names."""
+    found: set[str] = set()
+    wanted = ["ms-slam-env"]
+    while wanted:
+        name = wanted.pop()
+        if normal(name) in found:
+            continue
+        found.add(normal(name))
+        try:
+            texts = distribution(name).requires or ()
+        except PackageNotFoundError:
+            continue
+        needed = [Requirement(text) for text in texts]
+        wanted += [r.name for r in needed if not r.marker or r.marker.evaluate({"extra": ""})]
+    return found
+
+
+PLAY_AGENTS = """
+import sys
+from importlib.abc import MetaPathFinder
+from importlib.metadata import packages_distributions
+
+class NotInstalled(MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in missing:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, NotInstalled())
+import gymnasium as gym
+import ms_slam_env
+from ms_slam_env.env.planners import PLANNERS, make_planner, planner_observation
+
+for name in sorted(one for one in PLANNERS.names() if one.startswith("agent-")):
+    options = {"scene": "table", "scene_seed": 0, "image_size": "64x48"}
+    env = gym.make("MSActiveSLAM-FreeCamera-v0", observation=planner_observation(name), **options)
+    observation, info = env.reset(seed=0)
+    planner = make_planner(name, env.unwrapped)
+    planner.reset()
+    for _ in range(2):
+        observation, *_, info = env.step(planner.act(observation, info))
+    print(name)
+"""
+
+
+@pytest.mark.slow
+def test_after_a_base_install_the_shipped_agents_run() -> None:
+    base = of_base_install()
+    missing = {
+        module
+        for module, owners in packages_distributions().items()
+        if not any(normal(owner) in base for owner in owners)
+    }
+    assert {"torch", "stable_baselines3", "optuna"} - missing == set()
+    code = f"missing = {sorted(missing)}{PLAY_AGENTS}"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert done.stdout.split() == ["agent-home", "agent-paper", "agent-ppo", "agent-room"]
 
 
 def test_constraints_are_versions_only() -> None:
@@ -86,9 +155,6 @@ def test_constraints_are_versions_only() -> None:
 
 
 def test_constraints_cover_every_declared_dependency() -> None:
-    def normal(name: str) -> str:
-        return re.sub(r"[-_.]+", "-", name).lower()
-
     pinned = {
         normal(line.split("==")[0]): line.split("==")[1]
         for line in (ROOT / "constraints.txt").read_text().splitlines()

@@ -179,18 +179,22 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
 
         Args:
             seed: seeds the environment's generator.
-            options: ``T_world_camera`` (4, 4) to start from instead of a drawn pose.
+            options: ``T_world_camera`` (4, 4) to start from instead of a drawn pose; ``scene`` and
+                ``scene_seed`` in place of drawn ones, for this episode: the name of one of our
+                scenes or of this environment's. All else is as the seed has it.
 
         Raises:
             InputError: a bad option, or a start from where there is nothing to map; the
                 environment must then be reset again before it is used.
         """
-        check_reset(seed, options)
+        check_reset(seed, options, self.config.scenes)
         super().reset(seed=seed)
         place = self.simulation.place
-        if seed is not None or not self._episodes_left or place is None:
-            place = self.config.draw_scene(self.np_random)
-            self._episodes_left = self.config.episodes_per_scene
+        chosen = {key: (options or {}).get(key) for key in ("scene", "scene_seed")}
+        is_chosen = any(value is not None for value in chosen.values())
+        if seed is not None or not self._episodes_left or place is None or is_chosen:
+            place = self.config.draw_scene(self.np_random, chosen)
+            self._episodes_left = 1 if is_chosen else self.config.episodes_per_scene
         self._episodes_left -= 1
         self.simulation.enter(*place)
         start = (options or {}).get("T_world_camera")

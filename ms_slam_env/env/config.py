@@ -28,8 +28,8 @@ from ms_slam_env.env.pose_sources import POSE_SOURCES
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.extension import ExtensionPoint
 from ms_slam_env.robot.arm import ArmConfig
-from ms_slam_env.scenes import SEED_SPLITS
-from ms_slam_env.scenes.registry import SceneName, check_name
+from ms_slam_env.scenes import SCENES, SEED_SPLITS, seeds_of
+from ms_slam_env.scenes.registry import SceneName, check_name, name_of
 from ms_slam_env.sensor.noise import NoiseConfig, noise_config
 from ms_slam_env.slam import SlamBackend
 from ms_slam_env.slam.adaptation import AdaptationConfig, NoAdaptationConfig
@@ -147,9 +147,11 @@ class EnvConfig(Checked):
     Attributes:
         scene: a scene's name, a mesh file, or several to draw from at each reset.
         scene_seed: one seed, or None to draw from ``split`` at each reset.
-        split: which seeds to draw from: train, validation or test.
-        num_scene_seeds: how many seeds of the split are used. To build a room takes a second, a
-            home longer; the last 20 rooms or five homes are kept.
+        split: which seeds to draw from: train, validation or test; or your own, as 7000-7003 or
+            7000,7005.
+        num_scene_seeds: how many seeds of the split are used, as many as the agents that are
+            shipped were trained with: four rooms alone are learnt by heart. To build a room takes
+            a second, a home longer; the last 20 rooms or five homes are kept.
         episodes_per_scene: episodes in a row in a scene that was drawn; one that is reset with a
             seed draws in any case.
         image_size: of the camera, WIDTHxHEIGHT pixels.
@@ -195,8 +197,8 @@ class EnvConfig(Checked):
 
     scene: SceneName | tuple[SceneName, ...] = "living_room"
     scene_seed: int | None = None
-    split: str = chosen("train", *SEED_SPLITS)
-    num_scene_seeds: int = 4
+    split: str = "train"
+    num_scene_seeds: int = 100
     episodes_per_scene: int = bounded(1, 1, 1_000_000)
     image_size: str = "160x120"
     field_of_view_deg: float | None = bounded(None, 10, 150)
@@ -227,7 +229,8 @@ class EnvConfig(Checked):
         if not isinstance(self.noise, str):
             object.__setattr__(self, "noise", noise_config(self.noise))
         noise_config(self.noise)
-        check_range(self, "num_scene_seeds", 1, len(SEED_SPLITS[self.split]))
+        most = len(seeds_of(self.split))
+        check_range(self, "num_scene_seeds", 1, most if self.split in SEED_SPLITS else 100_000)
         if self.frame_management.uses_clock:
             raise InputError(
                 "frame_management.measured cannot be had in an environment, whose infos must be "
@@ -263,12 +266,23 @@ class EnvConfig(Checked):
         """The scenes to draw from."""
         return tuple(self.scene) if isinstance(self.scene, (tuple, list)) else (self.scene,)
 
-    def draw_scene(self, rng: np.random.Generator) -> tuple[SceneName, int]:
-        """Name and seed of an episode's scene."""
+    def draw_scene(
+        self, rng: np.random.Generator, given: Mapping[str, Any] | None = None
+    ) -> tuple[SceneName, int]:
+        """Name and seed of an episode's scene, where ``given`` options of a reset do not say them.
+
+        They are drawn in any case: what is drawn after them does not depend on what is given.
+        """
         name = self.scenes[int(rng.integers(len(self.scenes)))]
-        if self.scene_seed is not None:
-            return name, self.scene_seed
-        return name, SEED_SPLITS[self.split][int(rng.integers(self.num_scene_seeds))]
+        seed = self.scene_seed
+        if seed is None:
+            seeds = seeds_of(self.split)
+            seed = seeds[int(rng.integers(min(self.num_scene_seeds, len(seeds))))]
+        given = given or {}
+        if given.get("scene") is not None:
+            own = {name_of(one): one for one in self.scenes}
+            name = own.get(given["scene"], given["scene"])
+        return name, seed if given.get("scene_seed") is None else int(given["scene_seed"])
 
     def of_state(self, embodiment: str) -> dict[str, Any]:
         """What two environments must have in common to go on from one state."""
@@ -335,18 +349,33 @@ def _read_slam_config(options: Mapping[str, Any]) -> Mapping[str, Any]:
     return {**size, **options, "slam": file.slam, "slam_config": file.slam_config}
 
 
-def check_reset(seed: Any, options: Any) -> None:
-    """Refuse arguments of ``reset``.
+RESET_OPTIONS = ("T_world_camera", "scene", "scene_seed")
+
+
+def check_reset(seed: Any, options: Any, own: Sequence[SceneName]) -> None:
+    """Refuse arguments of ``reset`` of an environment whose scenes are ``own``.
 
     Raises:
-        InputError: one of the wrong type, or an unknown option.
+        InputError: one of the wrong type, an unknown option, or a scene that is none of ours and
+            none of the environment's.
     """
-    is_seed = isinstance(seed, (int, np.integer)) and not isinstance(seed, bool) and seed >= 0
-    if seed is not None and not is_seed:
+    if seed is not None and not _is_seed(seed):
         raise InputError(f"reset(seed={seed!r}): must be an integer >= 0 or None")
     if options is not None and not isinstance(options, Mapping):
         raise InputError(f"reset(options={options!r}): must be a mapping or None")
-    unknown_options = set(options or {}) - {"T_world_camera"}
+    given = options or {}
+    unknown_options = set(given) - {*RESET_OPTIONS}
     if unknown_options:
         names = sorted(map(str, unknown_options))
-        raise InputError(f"unknown reset option {names}; valid choices: T_world_camera")
+        valid = ", ".join(RESET_OPTIONS)
+        raise InputError(f"unknown reset option {names}; valid choices: {valid}")
+    scene, scene_seed = given.get("scene"), given.get("scene_seed")
+    names = dict.fromkeys([*map(name_of, own), *SCENES])
+    if scene is not None and (not isinstance(scene, str) or scene not in names):
+        raise unknown("reset option scene", scene, names)
+    if scene_seed is not None and not _is_seed(scene_seed):
+        raise InputError(f"reset option scene_seed = {scene_seed!r} must be an integer >= 0")
+
+
+def _is_seed(value: Any) -> bool:
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= 0

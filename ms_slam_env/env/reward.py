@@ -56,7 +56,7 @@ def reward_terms(
     if not isinstance(weights, RewardConfig):
         value = weights(outcome)
         terms = value if isinstance(value, Mapping) else {"reward": value}
-        return {name: float(term) for name, term in terms.items()}
+        return _without_minus_zero({name: float(term) for name, term in terms.items()})
     intensity, depth = np.minimum(targets.distances(outcome.divergence), _DISTANCE_CAP)
     growth = float(np.clip(outcome.pose_error_growth_m, -_ERROR_CAP_M, _ERROR_CAP_M))
     terms = {
@@ -70,4 +70,9 @@ def reward_terms(
     }
     if outcome.configuration_cost is not None:
         terms["compute"] = -weights.compute * outcome.configuration_cost
-    return terms
+    return _without_minus_zero(terms)
+
+
+def _without_minus_zero(terms: dict[str, float]) -> dict[str, float]:
+    """The same terms; what counts nothing is 0.0, which -0.0 is written differently from."""
+    return {name: term + 0.0 for name, term in terms.items()}

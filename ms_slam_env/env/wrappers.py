@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import importlib.util
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -87,21 +88,36 @@ class Perturbed(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordCon
         return self.get_wrapper_attr("unwrapped").action_masks()
 
 
+def _is_filmed(episode: int) -> bool:
+    """Whether an episode is a cube, or a multiple of 1000."""
+    return round(episode ** (1 / 3)) ** 3 == episode if episode < 1000 else episode % 1000 == 0
+
+
 class RecordVideo(gymnasium.wrappers.RecordVideo):
     """Gymnasium's wrapper of this name, with films written by FFmpeg through imageio.
 
     Gymnasium writes them with MoviePy, which wants an older Pillow than others can live with.
+    Without a trigger it films the episodes that Gymnasium's does: 0, 1, 8, 27, ..., 1000, 2000, ...
 
     Raises:
         InputError: imageio-ffmpeg, the extra ``video``, is not installed.
     """
 
-    def __init__(self, env: gymnasium.Env[Any, Any], *args: Any, **options: Any) -> None:
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        video_folder: str | Path,
+        episode_trigger: Callable[[int], bool] | None = None,
+        step_trigger: Callable[[int], bool] | None = None,
+        **options: Any,
+    ) -> None:
         if importlib.util.find_spec("imageio_ffmpeg") is None:
             needed = "imageio-ffmpeg: pip install 'ms-slam-env[video]'"
             raise InputError(f"recording videos needs {needed}")
+        if episode_trigger is None and step_trigger is None:
+            episode_trigger = _is_filmed  # Gymnasium's own is behind an import of MoviePy
         with suppress(gymnasium.error.DependencyNotInstalled):  # its last act is to ask for MoviePy
-            super().__init__(env, *args, **options)
+            super().__init__(env, str(video_folder), episode_trigger, step_trigger, **options)
 
     def stop_recording(self) -> None:
         """Write the film, and be ready for the next."""

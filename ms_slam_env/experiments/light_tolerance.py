@@ -57,7 +57,7 @@ class LightTolerance(Experiment, Checked):
     every: int = bounded(1, 1, 1000)
     """Take every n-th frame of it."""
     seeds: str = "validation"
-    """Split that the seeds come from: train, validation or test."""
+    """Split that the seeds come from: train, validation or test; or your own, as 7000-7003."""
 
     unit = "sequences"
 
@@ -72,7 +72,7 @@ class LightTolerance(Experiment, Checked):
             raise InputError(f"gains {self.gains} must be > 0, and there must be gains or offsets")
         for scene in self.scenes:
             check_name(scene)
-        (seed,) = seed_list(self.seeds, 1)
+        seed = seed_list(self.seeds, 1)[0]
         return [self.spec(LightSpec, sequence=f"{scene}:{seed}") for scene in self.scenes]
 
     @staticmethod

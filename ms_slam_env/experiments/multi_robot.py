@@ -71,7 +71,7 @@ class MultiRobot(Experiment, Checked):
     settings: tuple[str, ...] = (SHARED,)
     """shared: all robots in one scene; foreign: the last one in another of the same kind."""
     seeds: str = "validation"
-    """Split that the seeds come from: train, validation or test."""
+    """Split that the seeds come from: train, validation or test; or your own, as 7000-7003."""
     teams: int = 1
     """Seeds for each scene."""
     frames: int = bounded(200, 2, 1_000_000)

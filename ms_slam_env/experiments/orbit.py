@@ -63,7 +63,7 @@ class Orbit(Experiment, Checked):
     image_size: str = "160x120"
     """Of the camera."""
     seeds: str = "validation"
-    """Split that the seeds come from: train, validation or test."""
+    """Split that the seeds come from: train, validation or test; or your own, as 7000-7003."""
     recordings: int = bounded(2, 1, 1000)
     """Seeds for each scene."""
 

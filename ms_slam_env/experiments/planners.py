@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
+from ms_slam_env.errors import InputError
 from ms_slam_env.experiments.harness.episode_experiment import DOTS, episode_specs
 from ms_slam_env.experiments.harness.episodes import (
     DEFAULT_STEP_DEG,
@@ -68,7 +69,8 @@ class PlannerBenchmark(Experiment):
     steps: int | None = None
     """Length of an episode; by default the task's."""
     seeds: str = "test"
-    """Split that the seeds come from: train, validation or test."""
+    """Split that the seeds come from: train, validation or test; or your own, as 7000-7003 or
+    7000,7005, all of which are played."""
     env_id: str | None = None
     """Environment; by default the task's."""
     step_m: float | None = None
@@ -111,7 +113,13 @@ class PlannerBenchmark(Experiment):
     @property
     def _seeds(self) -> list[int]:
         usual = LEADERBOARD_EPISODES if self.task == ALL else EPISODES
-        return seed_list(self.seeds, usual if self.episodes is None else self.episodes)
+        seeds = seed_list(self.seeds, usual if self.episodes is None else self.episodes)
+        if self.episodes not in (None, len(seeds)):
+            raise InputError(
+                f"episodes = {self.episodes}, and seeds = {self.seeds} are {len(seeds)}: "
+                "leave --episodes out"
+            )
+        return seeds
 
     def prepare(self) -> None:
         """Start one episode of each planner."""

@@ -71,7 +71,7 @@ class TeamMapping(Experiment, Checked):
     robots: tuple[int, ...] = (1, 2, 3)
     """Sizes of the teams."""
     seeds: str = "validation"
-    """Split that the seeds come from: train, validation or test."""
+    """Split that the seeds come from: train, validation or test; or your own, as 7000-7003."""
     teams: int = bounded(2, 1, 1000)
     """Seeds for each scene."""
     steps: int = bounded(200, 1, 100_000)

@@ -9,6 +9,7 @@ from ms_slam_env.scenes.registry import (
     SCENES,
     SEED_SPLITS,
     make,
+    seeds_of,
     split_of,
 )
 
@@ -22,5 +23,6 @@ __all__ = [
     "Scene",
     "TexturedMesh",
     "make",
+    "seeds_of",
     "split_of",
 ]

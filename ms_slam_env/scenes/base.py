@@ -59,6 +59,8 @@ class Scene(ABC):
     """How far away the things are, at most, that a hand-held camera looks at."""
     gaze_gap_m: float = 0.05
     """How much of the line of sight to them need not be free, before their surface."""
+    clearance_grid_m: float = 0.05
+    """Distance within which ``clearance`` may be short of a surface's true one: a grid's edge."""
     passage_m: float = np.inf
     """Width of the narrowest passages that ways lead through."""
     lanes: tuple[tuple[Float64, Float64], ...] = ()

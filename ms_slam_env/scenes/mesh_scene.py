@@ -62,6 +62,7 @@ class MeshScene(Scene):
         self.exposure = exposure
         self._start_rule = start_rule
         self.free_space = free_space
+        self.clearance_grid_m = free_space.voxel_m
         self._start_objects = start_objects
         self._rays = RayCaster(mesh.vertices, mesh.faces)
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from ms_slam_env.errors import InputError
+from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.extension import ExtensionPoint
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.city_street import city_street
@@ -61,6 +62,33 @@ SEED_SPLITS: dict[str, range] = {
     "test": range(2000, 2100),
 }
 """Seeds of each split; planners and agents never train on validation or test seeds."""
+
+
+_OWN_SEEDS = re.compile(r"[0-9]{1,10}(-[0-9]{1,10})?(,[0-9]{1,10}(-[0-9]{1,10})?)*")
+_MOST_OWN_SEEDS = 100_000
+
+
+def seeds_of(text: str) -> Sequence[int]:
+    """The seeds of a split, or one's own: numbers and ranges, as 7000-7003 or 7000,7005,8000-8009.
+
+    Raises:
+        InputError: no split, and no such numbers; more than 100,000, or one that is named twice.
+    """
+    if isinstance(text, str) and text in SEED_SPLITS:
+        return SEED_SPLITS[text]
+    if not isinstance(text, str) or not _OWN_SEEDS.fullmatch(text):
+        own = "seeds of your own, as 7000-7003 or 7000,7005"
+        raise unknown("split of seeds", text, (*SEED_SPLITS, own))
+    found: list[int] = []
+    for part in text.split(","):
+        first, _, last = part.partition("-")
+        more = range(int(first), int(last or first) + 1)
+        if not more or len(found) + len(more) > _MOST_OWN_SEEDS:
+            raise InputError(f"seeds {text[:80]!r}: {part} is no range of 1 to 100,000 seeds")
+        found += more
+    if len(set(found)) < len(found):
+        raise InputError(f"seeds {text[:80]!r} names one twice")
+    return found
 
 
 def split_of(seed: int) -> str | None:

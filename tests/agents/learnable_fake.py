@@ -28,6 +28,7 @@ class LearnableFake(gym.Env):
         num_scene_seeds=1,
         observation="features",
         frame_divergences=True,
+        episodes_per_scene=1,
     ):
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (self.inputs,), np.float32)
         self.action_space = gym.spaces.Discrete(NUM_ACTIONS)

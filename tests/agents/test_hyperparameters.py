@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
-from ms_slam_agents import environments, imitation, options, ppo, qrdqn, train_sb3
+from ms_slam_agents import environments, imitation, options, ppo, qrdqn, resume, train_sb3
 
 from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.errors import InputError
@@ -160,10 +160,10 @@ def test_terms_of_the_reward_are_left_out_by_name():
 
 def test_a_run_keeps_the_terms_that_it_leaves_out(tmp_path):
     args = parsed(["--without", "lost"])
-    options.check_kept(tmp_path, {"without": ["lost"]}, args, ["without"])
+    resume.check_kept(tmp_path, {"without": ["lost"]}, args, ["without"])
     assert parsed(["--without", "lost", "blocked", "lost"]).without == ("blocked", "lost")
     with pytest.raises(InputError, match="trained with without"):
-        options.check_kept(tmp_path, {}, args, ["without"])
+        resume.check_kept(tmp_path, {}, args, ["without"])
 
 
 @pytest.mark.parametrize("trainer", TRAINERS)
@@ -194,13 +194,30 @@ def test_the_parallel_environments_are_of_several_tasks_in_turn(tmp_path):
     environments.check_problem(args)
 
 
+def test_where_it_trains_is_said_and_the_further_tasks_can_be_left_out(capsys):
+    environments.say_problem(parsed(["--task", "room"]))
+    said = capsys.readouterr().out
+    assert said == (
+        "trains in MSActiveSLAM-Room-v0 (living_room, corridor, table, wall); and in "
+        "MSActiveSLAM-Arm-v0 (window, table, wall, carpet), as --also arm-kinematic says\n"
+    )
+    alone = parsed(["--task", "room", "--num-envs", "1", "--also"])
+    assert (alone.also, alone.num_envs) == ((), 1)
+    environments.check_problem(alone)
+    environments.say_problem(alone)
+    assert capsys.readouterr().out.endswith("wall)\n")
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         (["rooms"], "unknown task 'rooms'; valid choices: .*arm-kinematic"),
         (["other.yaml"], "task 'other.yaml' has other observations or actions"),
         (["unknown.yaml"], "unknown environment 'MSActiveSLAM-Nowhere-v0'"),
-        (["room", "arm", "arm-kinematic"], "4 tasks to train in, and num_envs = 3"),
+        (
+            ["room", "arm", "arm-kinematic"],
+            "4 tasks to train in, .*--num-envs 3 is too few",
+        ),
     ],
 )
 def test_tasks_that_cannot_be_trained_in_together_are_refused(

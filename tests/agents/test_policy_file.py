@@ -9,9 +9,6 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
-
-pytest.importorskip("safetensors")
-
 from ms_slam_agents.policy import Policy
 from ms_slam_agents.policy_file import STEP, PolicyFile, read_policy, write_policy
 from ms_slam_agents.policy_planner import TrainedPolicy
@@ -101,12 +98,17 @@ BROKEN = {
     "number for a text": (as_bytes(words(env_id=5)), "env_id is int"),
     "null": (as_bytes(words(hidden=None)), "hidden is no list"),
     "list for a mapping": (as_bytes(words(env_options=[])), "env_options is list"),
-    "endless time": (as_bytes(words(minutes=1e400).replace("Infinity", "1e400")), "are no counts"),
+    "endless time": (as_bytes(words(minutes=1e400).replace("Infinity", "1e400")), "minutes = inf"),
+    "more steps than there are": (as_bytes(words(timesteps=10**400)), "metadata: "),
+    "an age of training": (as_bytes(words(minutes=1e300)), r"minutes = 1e\+300 is outside"),
     "unknown algorithm": (as_bytes(words(algorithm="dqn")), "unknown algorithm 'dqn'"),
     "module as environment": (as_bytes(words(env_id="evil:Env-v0")), "env_id 'evil:Env-v0' is no"),
     "module as observation": (as_bytes(words(observation="evil:Seen")), "observation 'evil:Seen'"),
     "other option": (as_bytes(words(env_options={"slam": "evil:Slam"})), "'slam'; valid"),
-    "option of other type": (as_bytes(words(env_options={"step_m": [1]})), "wrong type"),
+    "option of other type": (as_bytes(words(env_options={"step_m": [1]})), r"step_m = \[1\] is"),
+    "steps backwards": (as_bytes(words(env_options={"step_m": -1})), "step_m = -1 is outside"),
+    "turns for ever": (as_bytes(words(env_options={"step_rad": 9})), "step_rad = 9 is outside"),
+    "module as robot": (as_bytes(words(env_options={"embodiment": "x:Y"})), "embodiment 'x:Y'"),
     "negative layer": (as_bytes(words(hidden=[4, -3])), "no sizes of layers"),
     "huge layer": (as_bytes(words(hidden=[4, 10**9])), "no sizes of layers"),
     "many layers": (as_bytes(words(hidden=[4] * 100_000)), "no sizes of layers"),
@@ -118,6 +120,12 @@ BROKEN = {
     "extra tensor": (as_bytes(extra=np.zeros(3)), "unknown tensor extra"),
     "half an optimiser": (as_bytes(**{STEP: None}), "unknown tensor optimizer"),
     "NaN weights": (as_bytes(**{BIAS: np.full(7, np.nan, np.float32)}), "NaN or infinity"),
+    "huge weights": (
+        as_bytes(**{BIAS: np.full(7, 3e38, np.float32)}),
+        f"tensor {BIAS} holds numbers beyond",
+    ),
+    "huge count": (as_bytes(**{"return.count": np.array(1e300)}), "return.count holds numbers"),
+    "huge moments": (as_bytes(**{"observation.mean": -np.full(5, 1e300)}), "mean holds numbers"),
     "negative variance": (as_bytes(**{"observation.var": -np.ones(5)}), "negative"),
 }
 

@@ -1,6 +1,8 @@
 """PPO of our own: parts against slow versions and PyTorch, learning against Stable-Baselines3."""
 
+import copy
 from contextlib import ExitStack
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -158,8 +160,10 @@ def test_a_memory_is_trained_saved_and_resumed(tmp_path, capsys):
     assert ppo.main(words(tmp_path / "a", *more, "--resume", steps=128)) == 0
     assert read_policy(tmp_path / "a" / "latest.safetensors").metadata.timesteps == 128
     assert [p["timesteps"] for p in read_curve(tmp_path / "a").points] == [0, 64, 128]
-    assert ppo.main(words(tmp_path / "a", "--resume", steps=256)) == 2
-    assert "trained with memory 8, not 0" in capsys.readouterr().err
+    assert ppo.main(["--out", str(tmp_path / "a"), "--resume", "--total-timesteps", "160"]) == 0
+    assert read_policy(tmp_path / "a" / "latest.safetensors").metadata.timesteps == 160
+    assert ppo.main(words(tmp_path / "a", "--resume", "--memory", "4", steps=256)) == 2
+    assert "trained with memory 8, not 4" in capsys.readouterr().err
 
 
 def test_progress_says_what_the_episodes_returned(tmp_path):
@@ -169,7 +173,60 @@ def test_progress_says_what_the_episodes_returned(tmp_path):
         said = run.advance(lambda: False)
     assert len(run.player.returns) == 8
     assert said["return"] == np.mean(run.player.returns)
+    assert said["episode_length"] == 10
     assert 0 < said["return"] < 10
+
+
+def scalars(out):
+    events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    found = events.EventAccumulator(str(out / "tensorboard")).Reload()
+    return {name: [e.value for e in found.Scalars(name)] for name in found.Tags()["scalars"]}
+
+
+@pytest.mark.parametrize("trainer", [ppo, qrdqn])
+def test_tensorboard_shows_what_others_look_at(trainer, tmp_path):
+    own = {ppo: {"n_steps": 32}, qrdqn: {"save_every": 32, "learning_starts": 16}}[trainer]
+    assert trainer.main(words_of(tmp_path, [], total_timesteps=64, eval_every=0, **own)) == 0
+    found = scalars(tmp_path)
+    names = {"return", "episode_length", "steps_per_s"}
+    if trainer is ppo:
+        names |= {"approx_kl", "clip_fraction", "explained_variance"}
+    assert {f"train/{name}" for name in names} <= found.keys()
+    assert found["train/episode_length"] == [10, 10]
+    assert min(found["train/steps_per_s"]) > 0
+
+
+def test_measures_of_an_update_are_those_of_stable_baselines(tmp_path):
+    """The second of two epochs of one batch meets the policy that the first one made."""
+    args = ppo.Args(out=tmp_path, env_id=ENV_ID, n_steps=64, num_envs=1, episode_steps=10)
+    args = replace(args, batch_size=64, hidden=16, learning_rate=0.01, n_epochs=2, clip_range=0.05)
+    with ExitStack() as stack:
+        run = ppo.make_run(args, None, stack)
+        rollout = run.player.play(64, lambda: False)
+    start, rng = copy.deepcopy(run.network.state_dict()), np.random.default_rng(0)
+
+    def updated(epochs):
+        run.network.load_state_dict(start)
+        adam = torch.optim.Adam(run.network.parameters(), args.learning_rate, eps=1e-5)
+        return ppo.update(run.network, adam, rollout, replace(args, n_epochs=epochs), 0, rng)
+
+    first = updated(1)
+    assert first["approx_kl"] == pytest.approx(0, abs=1e-6)
+    assert first["clip_fraction"] == 0
+    with torch.no_grad():
+        seen, masks = (part.flatten(0, 1) for part in (rollout.seen, rollout.masks))
+        log_probs, _ = run.network(seen, torch.zeros(64, 0), masks)
+    actions = rollout.actions.flatten()
+    log_ratio = (log_probs[range(64), actions] - rollout.log_probs.flatten()).double().numpy()
+    second = updated(2)
+    expected = np.mean(np.exp(log_ratio) - 1 - log_ratio)
+    assert second["approx_kl"] == pytest.approx(expected, rel=1e-3)
+    clipped = np.mean(np.abs(np.exp(log_ratio) - 1) > args.clip_range)
+    assert 0 < clipped == pytest.approx(2 * second["clip_fraction"])
+    values = rollout.values.flatten().numpy()
+    returns = values + rollout.advantages.flatten().numpy()
+    share = 1 - np.var(returns - values) / np.var(returns)
+    assert second["explained_variance"] == pytest.approx(share, rel=1e-5)
 
 
 def test_two_runs_of_one_seed_are_one(tmp_path):

@@ -313,7 +313,9 @@ def test_a_run_that_began_with_a_policy_is_resumed(run, tmp_path, capsys):
     init = ("--init", str(run.out / "latest.safetensors"))
     assert train_sb3.main(arguments(tmp_path, *init, algorithm=run.algorithm)) == 0
     more = arguments(tmp_path, "--resume", steps=96, algorithm=run.algorithm)
-    assert train_sb3.main(more) == 0
+    assert train_sb3.main(more) == 2  # no file is opened because a run's file names it
+    assert "give --init again" in capsys.readouterr().err
+    assert train_sb3.main([*more, *init]) == 0
     assert read_policy(tmp_path / "latest.safetensors").metadata.timesteps == 96
 
 

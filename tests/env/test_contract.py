@@ -124,6 +124,70 @@ def test_episodes_in_a_row_are_in_one_scene_until_a_seed_draws_another():
     assert after[::2] == after[1::2]  # the first of them draws
 
 
+def test_a_reset_may_say_where_it_is_and_all_else_is_as_its_seed_has_it():
+    options = {"scene": ("table", "wall"), "num_scene_seeds": 3, "episodes_per_scene": 3}
+    env, other = (gym.make("MSActiveSLAM-FreeCamera-v0", **options) for _ in range(2))
+    drawn = env.reset(seed=4)
+    where = {name: drawn[1][name] for name in ("scene", "scene_seed")}
+    assert_same(other.reset(seed=4, options=where), drawn)
+    assert_same(other.step(5), env.step(5))
+    # Elsewhere, in a scene that is none of its own; the generator is where it would be.
+    _, info = other.reset(seed=4, options={"scene": "corridor", "scene_seed": 7000})
+    assert (info["scene"], info["scene_seed"]) == ("corridor", 7000)
+    state = pickle.loads(pickle.dumps(other.unwrapped.save_state()))
+    outcome = other.step(5)
+    env.unwrapped.load_state(state)
+    assert_same(env.step(5), outcome)
+    assert_same(pickle.loads(pickle.dumps(other)).step(5), other.step(5))
+    # The next episode is drawn again, and is in one of its own scenes.
+    assert other.reset()[1]["scene"] in options["scene"]
+    _, info = other.reset(seed=4, options={"scene_seed": 5})
+    assert (info["scene"], info["scene_seed"]) == (where["scene"], 5)
+    _, info = other.reset(seed=4, options={"scene": "wall"})
+    assert (info["scene"], info["scene_seed"]) == ("wall", where["scene_seed"])
+
+
+def test_a_vector_of_environments_is_told_where_it_is():
+    small = {"image_size": "64x48", "scene": "table"}
+    envs = gym.make_vec("MSActiveSLAM-FreeCamera-v0", num_envs=2, **small)
+    _, infos = envs.reset(seed=0, options={"scene": "wall", "scene_seed": 3})
+    assert [*infos["scene"]] == ["wall", "wall"]
+    assert [*infos["scene_seed"]] == [3, 3]
+    envs.close()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"scene": "attic"}, r"reset option scene 'attic'; valid choices: living_room, corridor"),
+        ({"scene": "os:system"}, "reset option scene 'os:system'"),
+        ({"scene": "scan.glb"}, "reset option scene 'scan.glb'"),
+        ({"scene": np.zeros(3)}, "reset option scene"),
+        ({"scene": ["table"]}, "reset option scene"),
+        ({"scene_seed": -1}, "reset option scene_seed = -1 must be an integer >= 0"),
+        ({"scene_seed": True}, "scene_seed = True"),
+        ({"scene_seed": 1.5}, "scene_seed = 1.5"),
+        ({"where": 1}, r"\['where'\]; valid choices: T_world_camera, scene, scene_seed"),
+    ],
+)
+def test_a_reset_that_says_something_else_is_refused(env, options, said):
+    with pytest.raises(InputError, match=said):
+        env.reset(seed=0, options=options)
+
+
+def test_seeds_of_ones_own_are_drawn_from():
+    config = EnvConfig(split="7000-7002,8000")
+    rng = np.random.default_rng(0)
+    assert {config.draw_scene(rng)[1] for _ in range(60)} == {7000, 7001, 7002, 8000}
+    assert {replace(config, num_scene_seeds=2).draw_scene(rng)[1] for _ in range(30)} == {
+        *(7000, 7001)
+    }
+    assert len({EnvConfig().draw_scene(rng)[1] for _ in range(1000)}) == 100
+    for split in ("tests", "7000-", 7000, ["train"]):
+        with pytest.raises(InputError, match=r"split of seeds .*; valid choices: train, valid"):
+            EnvConfig(split=split)
+
+
 def test_another_seed_gives_another_episode(env):
     first, _ = env.reset(seed=1)
     second, _ = env.reset(seed=2)

@@ -54,6 +54,19 @@ def test_a_film_shows_every_step(tmp_path: Path) -> None:
         np.testing.assert_allclose(seen, 40 + 20 * np.arange(steps + 1), atol=4)
 
 
+def test_without_a_trigger_the_episodes_are_filmed_that_gymnasium_films(tmp_path: Path) -> None:
+    pytest.importorskip("imageio_ffmpeg", reason="the extra video is not installed")
+    env = RecordVideo(Colours(), tmp_path / "films")
+    for _ in range(10):
+        env.reset()
+        env.step(0)
+    env.close()
+    names = [path.stem.rpartition("-")[2] for path in (tmp_path / "films").iterdir()]
+    assert sorted(names) == ["0", "1", "8"]
+    filmed = [k for k in range(3001) if env.episode_trigger(k)]
+    assert filmed == [*(k**3 for k in range(10)), 1000, 2000, 3000]
+
+
 def test_what_is_missing_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(

@@ -11,6 +11,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import ms_slam_env
+import ms_slam_env.scenes
 from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.env.wrappers import Perturbed
 from ms_slam_env.errors import InputError
@@ -214,6 +215,29 @@ def test_other_environments_are_refused() -> None:
 
 
 # ---------------------------------------------------------------- ids
+
+
+@pytest.mark.parametrize("scene", ["window", "table", "wall", "carpet"])
+def test_things_move_where_nothing_fits_between_camera_and_table(scene: str) -> None:
+    env = gymnasium.make(
+        "MSActiveSLAM-FreeCamera-MovingObjects-v0", scene=scene, scene_seed=1, image_size="64x48"
+    )
+    env.reset(seed=0)
+    movers = env.unwrapped.camera_feed.movers  # type: ignore[attr-defined]
+    assert len(movers) == 2
+    start = env.unwrapped.episode.trajectory_truth[:1, :3, 3]  # type: ignore[attr-defined]
+    assert all(mover.distance(start, np.zeros(1))[0] >= 0.35 for mover in movers)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", ms_slam_env.scenes.SCENES)
+def test_every_id_begins_in_every_scene(scene: str) -> None:
+    for env_id in (*ms_slam_env.ENV_IDS, *ms_slam_env.PERTURBED_ENV_IDS, *ms_slam_env.TASK_IDS):
+        env = gymnasium.make(env_id, scene=scene, scene_seed=1, image_size="40x32")
+        for seed in range(2 if scene in ms_slam_env.scenes.ROOMS else 1):
+            _, info = env.reset(seed=seed)
+            assert (info["scene"], info["tracking_ok"]) == (scene, True), (env_id, seed)
+        env.close()
 
 
 def test_it_takes_effect_at_the_next_reset() -> None:

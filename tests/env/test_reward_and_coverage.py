@@ -28,7 +28,11 @@ ON_TARGET = Outcome(
 
 
 def test_all_terms_are_zero_on_target():
-    assert set(reward_terms(ON_TARGET, WEIGHTS, TARGETS).values()) == {0.0}
+    on_target = dataclasses.replace(ON_TARGET, configuration_cost=0.0)
+    own = lambda outcome: {"mine": -0.0}  # noqa: E731
+    for weights in (WEIGHTS, own):
+        terms = reward_terms(on_target, weights, TARGETS)
+        assert {str(value) for value in terms.values()} == {"0.0"}  # and none is -0.0
 
 
 @given(st.floats(0, 0.05), st.floats(0, 0.09))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from ms_slam_env.errors import InputError
 from ms_slam_env.experiments.harness.episodes import seed_list, short_planner_names
 from ms_slam_env.experiments.harness.planner_tables import (
     DETAILS,
@@ -373,3 +375,14 @@ def test_one_long_line_does_not_squeeze_the_others() -> None:
 def test_the_table_says_how_long_an_episode_is(more: dict[str, Any], length: str) -> None:
     config = PlannerBenchmark(planners=("random", "greedy"), episodes=3, **more)
     assert length in config.tables(rows_of(config))[0].note
+
+
+def test_seeds_of_ones_own_are_all_played() -> None:
+    own = replace(CONFIG, seeds="7000-7002,8000", episodes=None)
+    assert {spec.seed for spec in own.specs()} == {7000, 7001, 7002, 8000}
+    assert own.content([])["seeds"] == [7000, 7001, 7002, 8000]
+    assert replace(own, episodes=4).specs() == own.specs()
+    with pytest.raises(InputError, match=r"episodes = 3, .*are 4: leave --episodes out"):
+        replace(own, episodes=3).specs()
+    with pytest.raises(InputError, match="split of seeds 'tests'; valid choices: train"):
+        replace(own, seeds="tests").specs()

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 pytest.importorskip("optuna")
-pytest.importorskip("safetensors")
 pytest.importorskip("plotly")
 
 from entries import ENTRIES

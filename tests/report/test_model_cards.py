@@ -154,6 +154,13 @@ def test_a_score_on_other_seeds_than_those_of_tests_says_so(clone: Path, seeds: 
     assert ("On validation seeds:\n" in card(clone)) == (seeds == "validation")
 
 
+@pytest.mark.parametrize(("seeds", "is_new"), [("7000-7003", True), ("7000,12", False)])
+def test_a_score_on_ones_own_seeds_says_which(clone: Path, seeds: str, is_new: bool) -> None:
+    scores(clone / "docs/results/judged", Interval(0.8, 0.6, 0.9), seeds=seeds)
+    assert f"On the seeds {seeds}:\n" in card(clone)
+    assert ("No score is on a seed that it was trained with" in card(clone)) == is_new
+
+
 def test_one_rival_is_not_called_the_best(clone: Path) -> None:
     scores(clone / "docs/results/judged", Interval(0.8, 0.6, 0.9), names=("nbv",))
     text = card(clone)

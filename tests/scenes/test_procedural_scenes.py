@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from ms_slam_env import scenes
+from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose
 from ms_slam_env.scenes import base
 from ms_slam_env.scenes.mesh_queries import RayCaster
@@ -173,3 +174,27 @@ def test_splits_do_not_overlap():
         seen |= set(seeds)
         assert scenes.split_of(seeds[0]) == name
     assert scenes.split_of(1500) is None
+
+
+def test_seeds_may_be_ones_own():
+    assert scenes.seeds_of("test") == range(2000, 2100)
+    assert scenes.seeds_of("7000-7003") == [7000, 7001, 7002, 7003]
+    assert scenes.seeds_of("7000,7005,7010-7011") == [7000, 7005, 7010, 7011]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("tests", "split of seeds 'tests'; valid choices: train, validation, test, seeds of your"),
+        ("", "split of seeds ''"),
+        ("-3", "split of seeds '-3'"),
+        ("7000-", "split of seeds '7000-'"),
+        ("1 2", "split of seeds '1 2'"),
+        ("7003-7000", "7003-7000 is no range"),
+        ("0-9999999999", "0-9999999999 is no range of 1 to 100,000 seeds"),
+        ("1,2,1", "names one twice"),
+    ],
+)
+def test_what_are_no_seeds_is_refused(text, said):
+    with pytest.raises(InputError, match=said):
+        scenes.seeds_of(text)

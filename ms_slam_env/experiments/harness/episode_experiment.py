@@ -60,7 +60,7 @@ class EpisodeExperiment(Experiment):
     steps: int
     """Length of an episode."""
     seeds: str
-    """Split that the seeds come from: train, validation or test."""
+    """Split that the seeds come from: train, validation or test; or your own, as 7000-7003."""
     options: tuple[str, ...] = ()
     """Options of the environment, as in lookahead.reference=live targets.M_I=0.05."""
 

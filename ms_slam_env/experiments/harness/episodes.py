@@ -27,7 +27,7 @@ from ms_slam_env.experiments.harness.episode_scores import (
     measure_trajectory,
 )
 from ms_slam_env.registration import ADAPTIVE_ID
-from ms_slam_env.scenes import SEED_SPLITS
+from ms_slam_env.scenes import SEED_SPLITS, seeds_of
 from ms_slam_env.scenes.mesh_file import load_soup
 from ms_slam_env.scenes.registry import check_name, is_mesh_file
 from ms_slam_env.tasks import find_task
@@ -265,14 +265,14 @@ def check_names(planners: Sequence[str], scenes: Sequence[str]) -> None:
 
 
 def seed_list(split: str, count: int) -> list[int]:
-    """The first ``count`` seeds of a split.
+    """The first ``count`` seeds of a split; seeds of one's own are all meant.
 
     Raises:
-        InputError: an unknown split, or more seeds than it has.
+        InputError: neither a split nor seeds, or more seeds than it has.
     """
+    seeds = seeds_of(split)
     if split not in SEED_SPLITS:
-        raise unknown("split of seeds", split, SEED_SPLITS)
-    seeds = SEED_SPLITS[split]
+        return list(seeds)
     if not 1 <= count <= len(seeds):
         raise InputError(f"episodes = {count} is outside [1, {len(seeds)}] of split {split}")
     return list(seeds[:count])

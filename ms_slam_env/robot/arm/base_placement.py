@@ -226,7 +226,7 @@ def _check_base(model: ArmModel, scene: Scene, T_world_base: Float64) -> None:
         a, b = transform_points(T_world_base, chain.capsule_ends[index])
         points = a + np.linspace(0, 1, 5)[:, None] * (b - a)
         # the surface that it stands on may be as near as the base's own plane
-        height = points[:, 2] - T_world_base[2, 3] - _GRID_M
+        height = points[:, 2] - T_world_base[2, 3] - scene.clearance_grid_m
         need = np.clip(height, 0.0, chain.capsule_radius[index])
         free = scene.clearance(points)
         worst = int(np.argmax(need - free))
@@ -247,7 +247,7 @@ def _column_is_free(scene: Scene, bases: Float64, camera: Float64) -> Bool:
     z = floor + share * np.maximum(height, 0.0)[:, None]  # (s, steps)
     points = np.stack([*(np.broadcast_to(bases[:, k, None], z.shape) for k in (0, 1)), z], axis=-1)
     free = scene.clearance(points.reshape(-1, 3)).reshape(z.shape)
-    need = np.clip(z - floor - _GRID_M, 0.0, COLUMN_RADIUS_M)
+    need = np.clip(z - floor - scene.clearance_grid_m, 0.0, COLUMN_RADIUS_M)
     return np.asarray((height >= 0) & (free >= need).all(axis=1))
 
 

@@ -100,18 +100,22 @@ class MovingObjects(Checked, WorldPerturbation):
         spin = rng.uniform(-_SPIN_RAD_S, _SPIN_RAD_S) if self.kind == "box" else 0.0
         places = Places(scene, poses, intrinsics, rng)
         best, best_score, found = None, -1.0, 0
-        for track in places.tracks(shape, self.speed_m_s, _TRIES):
-            for _ in range(_PHASES):
-                phase = rng.uniform(0.0, track.period_s)
-                mover = Mover(f"{self.kind} {number}", shape, track, phase, spin)
-                if not _keeps_clear(mover, times, poses, others):
-                    continue
-                score = _seen(mover, scene, times, poses, intrinsics)
-                found += 1
-                if score > best_score:
-                    best, best_score = mover, score
-            if found >= _CANDIDATES * _PHASES:
+        # Near to a table or a wall nothing fits in between: then it begins out of sight.
+        for anywhere in (False, True):
+            if best is not None:
                 break
+            for track in places.tracks(shape, self.speed_m_s, _TRIES, anywhere):
+                for _ in range(_PHASES):
+                    phase = rng.uniform(0.0, track.period_s)
+                    mover = Mover(f"{self.kind} {number}", shape, track, phase, spin)
+                    if not _keeps_clear(mover, times, poses, others):
+                        continue
+                    score = _seen(mover, scene, times, poses, intrinsics)
+                    found += 1
+                    if score > best_score:
+                        best, best_score = mover, score
+                if found >= _CANDIDATES * _PHASES:
+                    break
         if best is None:
             raise InputError(
                 f"moving-objects: found no free way for {self.kind} {number} in scene "
