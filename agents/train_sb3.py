@@ -38,6 +38,7 @@ from ms_slam_agents.policy_file import PolicyFile, read_policy
 from ms_slam_agents.sb3_state import ALGORITHMS, Model, restore, whole_batches
 from ms_slam_agents.supervisor import Supervisor
 from ms_slam_agents.training_run import (
+    alone,
     caught_signals,
     check_can_resume,
     new_curve,
@@ -49,6 +50,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
 from ms_slam_env.command_line import exit_code, parse
 from ms_slam_env.interrupts import kept
+from ms_slam_env.result_folders import own_folder
 
 
 def make_model(args: Args, venv: VecEnv, file: PolicyFile | None) -> Model:
@@ -111,6 +113,7 @@ def load_run(args: Args) -> PolicyFile | None:
     return file
 
 
+@alone
 def train(args: Args) -> int:
     """Train as ``args`` say; return the exit status, 130 after Ctrl-C, 143 after SIGTERM.
 
@@ -124,7 +127,7 @@ def train(args: Args) -> int:
     if args.init and file is None:
         read_init(args)  # refused before anything is written
     check_problem(args)  # here, not in a worker process
-    args.out.mkdir(parents=True, exist_ok=True)
+    own_folder(args.out / "tensorboard")
     seeds = range(VALIDATION_SEED, VALIDATION_SEED + args.eval_episodes)
     with (
         opened(make_venv(args, "validation", seeds)) as validation,
