@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env.errors import InputError
 from ms_slam_env.output_files import new_file
 
 VERSION = 1
@@ -62,7 +63,7 @@ def remembered(name: str, work_out: Callable[[], Arrays]) -> Arrays:
         os.utime(path)
         return found
     arrays = work_out()
-    with suppress(OSError):
+    with suppress(OSError, InputError):  # a disk, a place that takes no file
         _keep(path, arrays)
     return arrays
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from ms_slam_env.errors import InputError
+from ms_slam_env.errors import InputError, one_line
 from ms_slam_env.evaluation.run_sequence import lost_throughout
 from ms_slam_env.experiments.harness.experiment import Experiment
 from ms_slam_env.experiments.harness.named_files import file_hashes
@@ -106,7 +106,7 @@ def run_all(
                 bar.update()
                 if row["error"] is not None:
                     name = name_of[row["key"]]
-                    bar.write(f"failed: {name}: {row['error']}", file=sys.stderr)
+                    bar.write(one_line(f"failed: {name}: {row['error']}"), file=sys.stderr)
 
             variables = one_thread_unless_set() if environment is None else environment
             pool = open_pool(run, workers, ray, environment=variables, fresh=fresh)
