@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.errors import InputError, UnreachableError, unknown
+from ms_slam_env.sequences import read_trajectory
 
 
 @given(st.text())
@@ -66,3 +67,10 @@ def test_of_a_quotation_some_80_characters_are_shown(text: str) -> None:
 )
 def test_paths_and_lists_of_choices_are_shown_whole(told: str) -> None:
     assert str(InputError(told)) == told
+
+
+def test_a_line_of_megabytes_in_a_file_is_not_shown_whole(tmp_path):
+    (tmp_path / "t.txt").write_text("x y " * 1_000_000)
+    with pytest.raises(InputError, match=r"line 1: expected the 8 numbers .* got 'x y ") as caught:
+        read_trajectory(tmp_path / "t.txt")
+    assert len(str(caught.value)) < 200 + len(str(tmp_path))

@@ -133,7 +133,7 @@ def _complaints(
             yield "its values are not a number for each objective"
         if not _is_numbers(trial.constraints, trial.constraints):
             yield "its constraints are not numbers"
-        if not _is_measured(own.get(MEASURED)):
+        if not is_measured(own.get(MEASURED)):
             yield "what was measured is missing or not numbers"
 
 
@@ -145,7 +145,7 @@ def _is_in(space: SearchSpace, params: Any) -> bool:
     )
 
 
-def _is_measured(measured: Any) -> bool:
+def is_measured(measured: Any) -> bool:
     """Whether an evaluation may have returned this."""
     if not isinstance(measured, Mapping) or not isinstance(measured.get(FAILURE, ""), str):
         return False

@@ -46,7 +46,7 @@ ARRAYS: tuple[Callable[[Any], Any], ...] = (
 
 @dataclasses.dataclass(frozen=True)
 class Special:
-    """No regular file of its own: ``fifo``, ``folder``, or ``link``, ``hardlink`` with its target."""
+    """No regular file of its own: ``fifo``, ``folder``; ``link``, ``hardlink`` with its target."""
 
     kind: str
     target: str = ""
