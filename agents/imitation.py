@@ -33,7 +33,7 @@ from ms_slam_agents.options import Problem
 from ms_slam_agents.policy_file import PolicyFile, write_policy
 from ms_slam_agents.resume import KEPT, check_kept, check_new, parse_options, say_changes
 from ms_slam_agents.student import Student
-from ms_slam_agents.training_run import read_run, read_similar, saved_curve
+from ms_slam_agents.training_run import alone, read_run, read_similar, saved_curve
 from tqdm import tqdm
 
 from ms_slam_env.command_line import exit_code
@@ -43,6 +43,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.parallel import one_thread_unless_set, open_pool, run_each
 from ms_slam_env.report.records import to_plain
 from ms_slam_env.report.results import RESULTS
+from ms_slam_env.result_folders import own_folder
 
 _TRAINING_SEED = 500_000  # of the first episode
 _OWN_PROBLEM = {*KEPT, "teacher", "episodes", "epochs", "seed", "memory"}
@@ -129,7 +130,7 @@ def play_round(args: Args, number: int) -> None:
     missing = {task.path: task for task in tasks(args, number) if not task.path.exists()}
     if not missing:
         return
-    (args.out / "episodes").mkdir(parents=True, exist_ok=True)
+    own_folder(args.out / "episodes")
     environment = one_thread_unless_set()
     with open_pool(play, args.num_envs, environment=environment) as pool:
         for outcome in tqdm(
@@ -162,6 +163,7 @@ def load_run(args: Args) -> tuple[PolicyFile | None, int]:
     return file, file.metadata.epochs // args.epochs
 
 
+@alone
 def train(args: Args) -> int:
     """Train as ``args`` say; return the exit status.
 

@@ -15,6 +15,7 @@ from typing import Any
 
 from ms_slam_agents.environments import check_problem
 from ms_slam_agents.train_rllib import Args, make_run
+from ms_slam_agents.training_run import alone
 from tqdm import tqdm
 
 from ms_slam_env.command_line import parse
@@ -48,12 +49,17 @@ class Scaling(Args):
 
 
 def main(words: Sequence[str]) -> int:
-    """Measure as the command line says; return the exit code.
+    """Measure as the command line says; return the exit code."""
+    return scale(parse(Scaling, words, "ms-slam train rllib scaling"))
+
+
+@alone
+def scale(args: Scaling) -> int:
+    """Measure and write; return the exit code.
 
     Raises:
         InputError: bad options, or fewer than one runner.
     """
-    args = parse(Scaling, words, "ms-slam train rllib scaling")
     if not args.runners or min(args.runners) < 1:
         raise InputError(f"runners = {args.runners} must be numbers from 1 on")
     check_problem(args)

@@ -31,6 +31,7 @@ from ms_slam_agents.resume import parse_options
 from ms_slam_agents.sb3_state import ALGORITHMS, Model, restore, whole_batches
 from ms_slam_agents.supervisor import Supervisor
 from ms_slam_agents.training_run import (
+    alone,
     caught_signals,
     load_run,
     new_curve,
@@ -42,6 +43,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
 from ms_slam_env.command_line import exit_code
 from ms_slam_env.interrupts import kept
+from ms_slam_env.result_folders import own_folder
 
 
 def make_model(args: Args, venv: VecEnv, file: PolicyFile | None) -> Model:
@@ -83,6 +85,7 @@ def rollout_steps(args: Args, num_envs: int, done: int) -> int:
     return max(2, min(args.n_steps, left))
 
 
+@alone
 def train(args: Args) -> int:
     """Train as ``args`` say; return the exit status, 130 after Ctrl-C, 143 after SIGTERM.
 
@@ -97,7 +100,7 @@ def train(args: Args) -> int:
         read_init(args)  # refused before anything is written
     check_problem(args)  # here, not in a worker process
     say_problem(args)
-    args.out.mkdir(parents=True, exist_ok=True)
+    own_folder(args.out / "tensorboard")
     seeds = range(VALIDATION_SEED, VALIDATION_SEED + args.eval_episodes)
     with (
         opened(make_venv(args, "validation", seeds)) as validation,

@@ -10,8 +10,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
+from functools import wraps
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar, cast
 
 import torch
 from gymnasium import spaces
@@ -47,8 +48,10 @@ from ms_slam_env.interrupts import kept
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import to_plain
 from ms_slam_env.report.results import RESULTS
+from ms_slam_env.result_folders import alone_in, own_folder
 
 T = TypeVar("T", bound=Training)
+Train = TypeVar("Train", bound=Callable[..., int])
 
 _MEASURES = ("approx_kl", "clip_fraction", "explained_variance", "episode_length")
 """What TensorBoard shows and the progress bar has no room for."""
@@ -128,7 +131,7 @@ class TrainingRun(ABC):
             that by KeyboardInterrupt: it may take minutes.
         """
         args, before = self.options, self.minutes
-        board = SummaryWriter(str(args.out / "tensorboard"))
+        board = SummaryWriter(str(own_folder(args.out / "tensorboard")))
         bar = tqdm(total=args.total_timesteps, initial=self.steps, unit="step", smoothing=0.1)
         signals: list[signal.Signals] = []
         with board, bar:
@@ -171,6 +174,18 @@ class TrainingRun(ABC):
         tqdm.write(f"{self.steps} steps, {self.minutes:.1f} min: {curve.in_words(point)}")
 
 
+def alone(train: Train) -> Train:
+    """Let one process at a time train in the folder ``out`` of the options, the first argument."""
+
+    @wraps(train)
+    def alone(args: Any, *more: Any) -> int:
+        with alone_in(args.out):
+            return train(args, *more)
+
+    return cast(Train, alone)
+
+
+@alone
 def train(
     args: T, algorithm: str, make: Callable[[T, PolicyFile | None, ExitStack], TrainingRun]
 ) -> int:

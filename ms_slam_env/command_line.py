@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 
 import tyro
 
-from ms_slam_env.errors import InputError, InputWarning
+from ms_slam_env.errors import InputError, InputWarning, one_line
 from ms_slam_env.interrupts import Interrupts
 from ms_slam_env.output_files import DISK_ERRORS, check_out_folder
 
@@ -86,7 +86,7 @@ def exit_code(run: Callable[[], int], name: str = "ms-slam") -> int:
             raise
         code, text = ending
         _close_bars()
-        print(f"{name}: {text}", file=sys.stderr)
+        print(f"{name}: {one_line(text)}", file=sys.stderr)
         return code
 
 
@@ -142,13 +142,14 @@ def _show_warning(
     """Print a warning in one line; others than ours say where they come from."""
     ours = issubclass(category, InputWarning)
     place = "" if ours else f" ({category.__name__} in {where[0]}, line {where[1]})"
-    print(f"{name}: warning: {message}{place}", file=sys.stderr)
+    print(f"{name}: warning: {one_line(message)}{place}", file=sys.stderr)
 
 
 def report_failures(errors: Sequence[str], name: str = "ms-slam") -> int:
     """Print how much work failed; return the exit code."""
     if errors:
-        print(f"{name}: error: {len(errors)} failed, the first: {errors[0]}", file=sys.stderr)
+        first = one_line(errors[0])
+        print(f"{name}: error: {len(errors)} failed, the first: {first}", file=sys.stderr)
     return 1 if errors else 0
 
 

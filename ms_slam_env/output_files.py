@@ -1,13 +1,16 @@
 """Files that are whole or not there, and results that count once their last file is in place.
 
 Whatever the package writes goes through here, so that a full disk costs what was being written and
-nothing else, and is one error that names the file.
+nothing else, and is one error that names the file. A folder of results may come from a stranger:
+no link in it leads what is written to another place.
 """
 
 from __future__ import annotations
 
 import errno
 import os
+import re
+import secrets
 import shutil
 import socket
 import stat
@@ -31,6 +34,7 @@ _KINDS: dict[str, Callable[[int], bool]] = {
     "socket": stat.S_ISSOCK,
 }
 _WORKING = ".partial-"
+_OWN = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 DISK_ERRORS = {
     getattr(errno, name)
     for name in ("ENOSPC", "EDQUOT", "EFBIG", "EIO", "EROFS")
@@ -56,40 +60,40 @@ def write_bytes(path: Path, data: bytes, durable: bool = True) -> None:
         InputError: ``path`` is a device or the like, which a file would replace.
         OSError: with the name of the file: no space, no right, a broken disk.
     """
-    _check_kind(path, "file")
-    partial = path.with_name(path.name + ".partial")
-    try:
-        with naming(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+    with new_file(path, durable) as descriptor:
+        _write(descriptor, data)
+
+
+@contextmanager
+def new_file(path: Path, durable: bool = True) -> Iterator[int]:
+    """A descriptor to write to; the file takes its place ``path`` at the end, or never.
+
+    It grows under a name that was not there before, so that two writers do not meet and no link is
+    followed: one at ``path`` is replaced. See `write_bytes`.
+    """
+    check_kind(path, "file")
+    with naming(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if durable:  # images by the thousand do not look through their folder for each
+            remove_left_behind(path.parent)
+        partial = working_name(path.parent)
+        descriptor = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _OWN, 0o666)
+        try:
             try:
-                _write(descriptor, data)
+                yield descriptor
                 if durable:
                     os.fsync(descriptor)
             finally:
                 os.close(descriptor)
             os.replace(partial, path)
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
+        except BaseException:
+            partial.unlink(missing_ok=True)
+            raise
 
 
 def write_text(path: Path, text: str) -> None:
     """`write_bytes` of ``text`` in UTF-8."""
     write_bytes(path, text.encode("utf-8", errors="replace"))
-
-
-def make_file(path: Path) -> None:
-    """Make an empty file where there is none, for libraries that write it themselves.
-
-    Raises:
-        InputError: ``path`` is a device or the like.
-        OSError: with the name of the file: no space, no right, a read-only disk.
-    """
-    _check_kind(path, "file")
-    with naming(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        os.close(os.open(path, os.O_RDWR | os.O_CREAT, 0o666))
 
 
 @contextmanager
@@ -100,10 +104,8 @@ def growing_file(path: Path) -> Iterator[Callable[[str], None]]:
         InputError: ``path`` is a device or the like.
         OSError: with the name of the file.
     """
-    _check_kind(path, "file")
-    with naming(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+    write_bytes(path, b"", durable=False)
+    descriptor = open_own(path)
 
     def add(line: str) -> None:
         with naming(path):
@@ -122,13 +124,11 @@ def append_line(path: Path, line: bytes) -> None:
     short, is removed first. Several processes may append to one file.
 
     Raises:
-        InputError: ``path`` is a device or the like.
+        InputError: ``path`` is a device or the like, or has other names.
         OSError: with the name of the file.
     """
-    _check_kind(path, "file")
+    descriptor = open_own(path, os.O_APPEND)
     with naming(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o666)
         try:
             if fcntl is not None:
                 with suppress(OSError):  # a disk without locks
@@ -165,6 +165,32 @@ def _write(descriptor: int, data: bytes) -> None:
         rest = rest[os.write(descriptor, rest) :]
 
 
+def open_own(path: Path, flags: int = 0) -> int:
+    """A descriptor of a file to read and change, new or there already; see `check_own`.
+
+    Raises:
+        InputError: see there.
+        OSError: with the name of the file.
+    """
+    check_own(path)
+    with naming(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return os.open(path, os.O_RDWR | os.O_CREAT | _OWN | flags, 0o666)
+
+
+def check_own(path: Path) -> None:
+    """Refuse a file to be changed in its place that is reached by other names, too.
+
+    Raises:
+        InputError: a link, of either sort, which would lead what is written to another place; a
+            device or the like.
+    """
+    check_kind(path, "file", is_own=True)
+    with suppress(FileNotFoundError):
+        if os.lstat(path).st_nlink > 1:
+            raise InputError(f"{path} has other names (hard links); a file of its own is needed")
+
+
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
     """Let errors of the system in here name ``path``, whatever file they happened at."""
@@ -174,61 +200,68 @@ def naming(path: Path) -> Iterator[None]:
         raise OSError(error.errno, error.strerror or str(error), str(path)) from error
 
 
-# -- Folders of results ------------------------------------------------------------------------
+def working_name(folder: Path) -> Path:
+    """A new name in ``folder`` that says which process works there."""
+    process = process_name().replace("/", "-")
+    return folder / f"{_WORKING}{process}-{secrets.token_hex(8)}"
 
 
-@contextmanager
-def result_folder(out: Path, marker: str) -> Iterator[Path]:
-    """A folder to write a result into, whose files then move into ``out``, ``marker`` the last.
+def remove_left_behind(folder: Path) -> None:
+    """Remove what processes of this machine that were killed were writing in ``folder``."""
+    host = socket.gethostname()
+    form = re.compile(rf"{re.escape(_WORKING + host)}-(\d+)-(\w*)-\w+")
+    found = []
+    with suppress(OSError), os.scandir(folder) as entries:  # a folder that cannot be listed
+        found = [(entry, form.fullmatch(entry.name)) for entry in entries]
+    for entry, name in found:
+        if name is None or is_alive(f"{host}/{name[1]}/{name[2]}"):
+            continue
+        if entry.is_dir(follow_symlinks=False):
+            shutil.rmtree(entry.path, ignore_errors=True)
+        else:
+            with suppress(OSError):
+                os.unlink(entry.path)
 
-    Who finds the marker finds the whole result. What fails or is interrupted before leaves ``out``
-    as it was. The working folder lies in ``out``: on the same disk, under the same rights.
 
-    Args:
-        out: of the result; made if it is not there.
-        marker: name of the file that makes the others count.
+# -- Which process works on something, and whether it still lives -------------------------------
 
-    Raises:
-        OSError: with the name of the file.
+
+def process_name(pid: int | None = None) -> str:
+    """Name of process ``pid`` (this one if None): host, number, and when it began."""
+    pid = os.getpid() if pid is None else pid
+    return f"{socket.gethostname()}/{pid}/{_start_of(pid)}"
+
+
+def is_alive(name: str) -> bool:
+    """Whether the process called ``name`` lives on this host.
+
+    Studies lie on one machine: the process of another host is one from before a container was
+    started anew, under a new name.
     """
-    missing = [folder for folder in (out, *out.parents) if not folder.exists()]
-    prefix = f"{_WORKING}{socket.gethostname()}-"
-    working = out / f"{prefix}{os.getpid()}"
-    with naming(out):
-        out.mkdir(parents=True, exist_ok=True)
-        _remove_left_behind(out, prefix)
-        working.mkdir()
+    host, pid, start = name.rsplit("/", 2)
+    if host != socket.gethostname():
+        return False
     try:
-        yield working
-        (out / marker).unlink(missing_ok=True)
-        files = [path for path in working.rglob("*") if path.is_file()]
-        for path in sorted(files, key=lambda path: path == working / marker):
-            target = out / path.relative_to(working)
-            _check_kind(target, "file")
-            with naming(target):
-                target.parent.mkdir(parents=True, exist_ok=True)
-                os.replace(path, target)
-        missing = []
-    except OSError as error:
-        if error.filename is not None:  # where the file was to be
-            error.filename = str(error.filename).replace(str(working), str(out))
-        raise
-    finally:
-        shutil.rmtree(working, ignore_errors=True)
-        for folder in missing:
-            if not any(folder.iterdir()):
-                folder.rmdir()
+        if int(pid) < 1:  # a group of processes
+            return False
+        os.kill(int(pid), 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        pass  # it lives, and is another user's
+    return _start_of(int(pid)) == start
 
 
-def _remove_left_behind(out: Path, prefix: str) -> None:
-    """Remove the working folders of processes of this machine that were killed."""
-    processes = Path("/proc")
-    for folder in out.glob(f"{prefix}*"):
-        number = folder.name.removeprefix(prefix)
-        is_own = number == str(os.getpid())  # of one before, under the same number
-        is_dead = (processes / "self").exists() and not (processes / number).exists()
-        if is_own or is_dead:
-            shutil.rmtree(folder, ignore_errors=True)
+def _start_of(pid: int) -> str:
+    """Start of a process in clock ticks since boot, from proc(5); empty where there is no proc.
+
+    Numbers of processes are used again. A process that ended and was not waited for counts as none.
+    """
+    try:
+        after_name = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return ""
+    return "ended" if after_name[0] in "ZX" else after_name[19]
 
 
 # -- Where results may go ----------------------------------------------------------------------
@@ -241,7 +274,7 @@ def check_out_folder(path: Path) -> None:
         InputError: it or what it lies in is a file, a device or the like, or takes no files.
     """
     there = next((p for p in (path, *path.parents) if os.path.lexists(p)), Path())
-    _check_kind(there, "folder")
+    check_kind(there, "folder")
     if not os.access(there, os.W_OK | os.X_OK):
         raise InputError(f"{there}: nothing can be written there")
 
@@ -252,12 +285,12 @@ def check_out_file(path: Path) -> None:
     Raises:
         InputError: it is a folder, a device or the like, or its folder takes no files.
     """
-    _check_kind(path, "file")
+    check_kind(path, "file")
     check_out_folder(path.parent)
 
 
-def _check_kind(path: Path, wanted: str) -> None:
-    """Refuse what is there already and is something else."""
+def check_kind(path: Path, wanted: str, is_own: bool = False) -> None:
+    """Refuse what is there already and is something else; if it must be one's own, a link, too."""
     if not os.path.lexists(path):
         return
     try:
@@ -267,3 +300,5 @@ def _check_kind(path: Path, wanted: str) -> None:
     kind = next((name for name, fits in _KINDS.items() if fits(mode)), "special file")
     if kind != wanted:
         raise InputError(f"{path} is a {kind}; a {wanted} is needed")
+    if is_own and path.is_symlink():
+        raise InputError(f"{path} is a link to another {wanted}; one of its own is needed")

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import errno
+import multiprocessing
 import os
 import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -20,10 +22,11 @@ from ms_slam_env.output_files import (
     check_out_file,
     check_out_folder,
     growing_file,
-    result_folder,
+    new_file,
     write_bytes,
     write_text,
 )
+from ms_slam_env.result_folders import alone_in, own_folder, result_folder
 
 WRITE = os.write
 
@@ -166,6 +169,93 @@ def test_a_disk_that_is_really_full(small_disk: Path) -> None:
     assert sorted(path.name for path in small_disk.iterdir()) == ["a.jsonl", "old.json"]
 
 
+PRECIOUS = b"of the user, without an end of line"
+
+
+def grow(path: Path, text: bytes) -> None:
+    with growing_file(path) as add:
+        add(text.decode().rstrip("\n"))
+
+
+@pytest.mark.parametrize("link", [os.symlink, os.link])
+@pytest.mark.parametrize("write", [write_bytes, grow, append_line])
+def test_no_link_leads_what_is_written_to_another_file(
+    tmp_path: Path, write: Callable[[Path, bytes], None], link: Callable[[Path, Path], None]
+) -> None:
+    victim, path = tmp_path / "victim", tmp_path / "out" / "report.html"
+    victim.write_bytes(PRECIOUS)
+    path.parent.mkdir()
+    for name in ("report.html", "report.html.partial"):
+        link(victim, path.with_name(name))
+    if write is append_line:
+        with pytest.raises(InputError, match=r"html (is a link to another|has other names)"):
+            write(path, b"new\n")
+    else:
+        write(path, b"new\n")
+        assert path.read_bytes() == b"new\n"
+        assert not path.is_symlink()
+    assert victim.read_bytes() == PRECIOUS
+
+
+def test_no_linked_folder_takes_a_part_of_a_result(tmp_path: Path) -> None:
+    out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+    write_result(out, "1")
+    (out / "below" / "a.txt").unlink()
+    (out / "below").rmdir()
+    elsewhere.mkdir()
+    (out / "below").symlink_to(elsewhere)
+    with pytest.raises(InputError, match="below is a link to another folder"):
+        write_result(out, "2")
+    with pytest.raises(InputError, match="below is a link to another folder"):
+        own_folder(out / "below")
+    assert content(elsewhere) == {}
+    assert (out / "result.json").read_text() == (out / "z.txt").read_text() == "1"
+
+
+def test_a_name_may_be_as_long_as_the_system_takes(tmp_path: Path) -> None:
+    write_bytes(tmp_path / ("n" * 250), b"x")
+    append_line(tmp_path / ("n" * 250), b"y\n")
+    with pytest.raises(OSError, match="File name too long"):
+        write_bytes(tmp_path / ("n" * 300), b"x")
+    assert [len(path.name) for path in tmp_path.iterdir()] == [250]
+
+
+def write_often(path: str, byte: int) -> None:
+    for _ in range(50):
+        write_bytes(Path(path), bytes([byte]) * 1_000_000, durable=False)
+
+
+def test_two_writers_do_not_tear_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    write_bytes(path, b"a" * 1_000_000)
+    context = multiprocessing.get_context("fork")
+    writers = [context.Process(target=write_often, args=(str(path), k)) for k in b"ab"]
+    for writer in writers:
+        writer.start()
+    while any(writer.is_alive() for writer in writers):
+        data = path.read_bytes()
+        assert len(data) == 1_000_000
+        assert data in (data[:1] * len(data),)
+    assert [writer.exitcode for writer in writers] == [0, 0]
+    assert [found.name for found in tmp_path.iterdir()] == ["a.bin"]
+
+
+def test_what_a_killed_process_left_of_a_file_is_removed(tmp_path: Path) -> None:
+    code = """
+import os, signal, sys
+from pathlib import Path
+from ms_slam_env.output_files import new_file
+with new_file(Path(sys.argv[1]) / "a") as descriptor:
+    os.write(descriptor, b"half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+    subprocess.run([sys.executable, "-c", code, str(tmp_path)])
+    assert [data for name, data in content(tmp_path).items() if name.startswith(".")] == [b"half"]
+    with new_file(tmp_path / "b"):  # what is being written stays
+        write_bytes(tmp_path / "c", b"c")
+    assert content(tmp_path) == {"b": b"", "c": b"c"}
+
+
 # -- Folders of results ------------------------------------------------------------------------
 
 
@@ -228,7 +318,8 @@ def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
     code = """
 import os, signal, sys
 from pathlib import Path
-from ms_slam_env.output_files import result_folder, write_text
+from ms_slam_env.output_files import write_text
+from ms_slam_env.result_folders import result_folder
 with result_folder(Path(sys.argv[1]), "result.json") as folder:
     write_text(folder / "result.json", "killed")
     os.kill(os.getpid(), signal.SIGKILL)
@@ -240,6 +331,70 @@ with result_folder(Path(sys.argv[1]), "result.json") as folder:
     assert all(name.startswith(".") for name in left)  # which readers pass over
     write_result(tmp_path, "1")
     assert not any(name.startswith(".") for name in content(tmp_path))
+
+
+# -- One process at a time ---------------------------------------------------------------------
+
+
+HOLD = """
+import sys
+from pathlib import Path
+from ms_slam_env.result_folders import alone_in
+with alone_in(Path(sys.argv[1])):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def holder(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    """A process that has the folder ``out`` to itself."""
+    words = [sys.executable, "-c", HOLD, str(tmp_path / "out")]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(words, **pipes) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "held\n"
+        yield process
+        process.kill()
+
+
+def test_the_second_process_says_which_is_the_first(
+    tmp_path: Path, holder: subprocess.Popen[str]
+) -> None:
+    out = tmp_path / "out"
+    with pytest.raises(InputError, match=f"out is in use by process {holder.pid}: "):
+        alone_in(out).__enter__()
+    holder.kill()  # the lock dies with it
+    holder.wait()
+    with alone_in(out), alone_in(out):
+        assert content(out).keys() == {".ms-slam.lock"}
+        write_result(out, "1")
+    assert content(out).keys() == {"result.json", "z.txt", "below", "below/a.txt"}
+
+
+def test_a_lock_goes_when_its_holder_is_done(tmp_path: Path, holder: subprocess.Popen[str]) -> None:
+    with pytest.raises(InputError, match="in use"):
+        alone_in(tmp_path / "out", wait_s=0.1).__enter__()
+    threading.Timer(0.2, holder.stdin.close).start()  # type: ignore[union-attr]
+    with alone_in(tmp_path / "out", wait_s=60):
+        pass
+    assert not any((tmp_path / "out").glob("*"))
+
+
+def test_a_folder_that_was_made_for_nothing_goes_again(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError), alone_in(tmp_path / "new" / "out"):
+        raise RuntimeError
+    assert content(tmp_path) == {}
+
+
+def test_what_a_lock_file_says_is_not_trusted(tmp_path: Path) -> None:
+    fcntl = pytest.importorskip("fcntl")
+    with (tmp_path / ".ms-slam.lock").open("w+") as file:
+        file.write("x/1/2\n\033[2J" * 9)
+        file.flush()
+        fcntl.flock(file, fcntl.LOCK_EX)
+        with pytest.raises(InputError, match="in use by another process: wait"):
+            alone_in(tmp_path).__enter__()
 
 
 # -- Where results may go ----------------------------------------------------------------------

@@ -43,18 +43,20 @@ def main(arguments: Sequence[str]) -> int:
     from ms_slam_env.divergence import DivergenceConfig
     from ms_slam_env.errors import InputError
     from ms_slam_env.evaluation.sequence_divergence import sequence_divergence, write_divergences
+    from ms_slam_env.result_folders import alone_in
     from ms_slam_env.sequences import open_sequence
 
     if not args.sequences:
         raise InputError("no sequence given")
     config = DivergenceConfig.paper() if args.paper else DivergenceConfig()
     opened = [open_sequence(name, args.image_size, layout=args.layout) for name in args.sequences]
-    measured = [sequence_divergence(one, config, args.every, args.measure) for one in opened]
     settings = {
         "divergence": {**asdict(config), "measure": args.measure},
         "image_size": args.image_size,
         "every": args.every,
     }
-    print(write_divergences(measured, settings, args.out).as_markdown())
+    with alone_in(args.out):
+        measured = [sequence_divergence(one, config, args.every, args.measure) for one in opened]
+        print(write_divergences(measured, settings, args.out).as_markdown())
     print(f"written: {args.out}/divergence.json, table.md, divergence.png", file=sys.stderr)
     return 0

@@ -23,10 +23,12 @@ from ms_slam_env.config import Checked, bounded, chosen, free_options
 from ms_slam_env.env.lerobot_dataset import DatasetWriter, Steps
 from ms_slam_env.env.planners import check_planner, make_planner, planner_observation
 from ms_slam_env.errors import InputError
+from ms_slam_env.input_files import is_named
 from ms_slam_env.interrupts import kept
-from ms_slam_env.output_files import check_out_folder, naming, result_folder
+from ms_slam_env.output_files import check_out_folder, naming
 from ms_slam_env.parallel import open_pool, run_each
 from ms_slam_env.report.provenance import provenance
+from ms_slam_env.result_folders import alone_in, lock_beside, result_folder
 
 _STREAM = 2  # of an episode's seed, for the planner; the environment draws from the seed itself
 _VARIABLE = "MINARI_DATASETS_PATH"
@@ -106,10 +108,18 @@ def record(args: Args) -> Path:
     check_out_folder(args.out)
     name = args.name or f"{args.planner.partition(',')[0].replace(':', '-')}-v0"
     folder = args.out / name
-    if folder.exists():
-        raise InputError(f"{folder} is there already: give another --name, or remove it")
+    with alone_in(folder, lock_beside(folder)):
+        if is_named(folder):
+            raise InputError(f"{folder} is there already: give another --name, or remove it")
+        _make(args, name)
+    print(f"{args.episodes} episodes in {folder}; in Python{_read_by(args, name)}")
+    return folder
+
+
+def _make(args: Args, name: str) -> None:
+    """Play the episodes in a process of its own; the dataset takes its place at the end."""
     with (
-        kept(f"nothing is left in {folder}"),
+        kept(f"nothing is left in {args.out / name}"),
         result_folder(args.out, f"{name}/{_MARKERS[args.format]}") as made,
         naming(made / name),
         open_pool(_attempt, 1) as pool,
@@ -123,8 +133,6 @@ def record(args: Args) -> Path:
             raise OSError(errno.EIO, "the process that wrote it died", str(made / name))
         if outcome.error:
             raise RuntimeError(outcome.traceback)
-    print(f"{args.episodes} episodes in {folder}; in Python{_read_by(args, name)}")
-    return folder
 
 
 def _read_by(args: Args, name: str) -> str:

@@ -38,10 +38,11 @@ from ms_slam_env.evaluation.tracking_diagnosis import (
 )
 from ms_slam_env.evaluation.trajectory_charts import error_panel, marked_panel, path_panel
 from ms_slam_env.geometry import invert
-from ms_slam_env.output_files import growing_file, result_folder, write_bytes
+from ms_slam_env.output_files import growing_file, write_bytes
 from ms_slam_env.report.charts import Chart, Panel
 from ms_slam_env.report.results import write_results
 from ms_slam_env.report.tables import Table, make_table
+from ms_slam_env.result_folders import alone_in, result_folder
 from ms_slam_env.sequences import Sequence, associate
 from ms_slam_env.sequences.recording import Recording
 from ms_slam_env.sequences.trajectory import (
@@ -117,7 +118,7 @@ def run_to_folder(
 
     Raises:
         InputError: a bad option, a map that cannot be gone on with, or an image that cannot be
-            read.
+            read; or another process works in ``out``.
         OSError: a file that cannot be written.
     """
     if mesh:
@@ -131,6 +132,20 @@ def run_to_folder(
     content = _about(sequence, backend, params, fed or {}, selection)
     content["map_in"] = None if map_in is None else str(map_in)
     refused = RefusedFrame(has_map=map_in is not None)
+    with alone_in(out):
+        return _run(run, sequence, out, content, refused, map_out, mesh)
+
+
+def _run(
+    run: SequenceRun,
+    sequence: Sequence,
+    out: Path,
+    content: dict[str, Any],
+    refused: RefusedFrame,
+    map_out: Path | None,
+    mesh: bool,
+) -> dict[str, Any]:
+    """Track and write, with ``out`` to itself."""
     for old in (METRICS, TRAJECTORY, CORRECTED, TRUTH, MAP, MESH, FRAMES, SUBMAPS, REFUSED):
         (out / old).unlink(missing_ok=True)
     try:
@@ -140,7 +155,7 @@ def run_to_folder(
                 add(trajectory_line(step.frame.timestamp, step.result.T_world_camera))
                 refused.look(run, step)
         if map_out is not None:
-            system.save(map_out)
+            run.backend.save(map_out)
         result = _write(run, sequence, out, {"complete": True, **content}, refused, mesh)
     except BaseException as error:
         stopped = isinstance(error, KeyboardInterrupt)

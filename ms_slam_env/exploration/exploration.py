@@ -17,10 +17,11 @@ from ms_slam_env.exploration.front import Point, hypervolume_history, importance
 from ms_slam_env.exploration.held_out import DEFAULT, compare_configurations
 from ms_slam_env.exploration.results import ABOUT, TITLE, Explored
 from ms_slam_env.exploration.settings import ExplorationSettings
-from ms_slam_env.exploration.space import absences, make_space
+from ms_slam_env.exploration.space import SearchSpace, absences, make_space
 from ms_slam_env.exploration.study_storage import StudyStorage
 from ms_slam_env.metrics.cost import energy_counters
 from ms_slam_env.report.results import Results, write_result_folder
+from ms_slam_env.result_folders import alone_in
 from ms_slam_env.sequences import check_sequence
 from ms_slam_env.slam.configuration import SlamConfiguration, write_configuration, write_levels
 
@@ -90,13 +91,28 @@ def run_exploration(
     adaptation and frame management take from the study (``choices.as_options``).
 
     Raises:
-        InputError: bad input, ``out`` holds another exploration, or, when all is written, no trial
-            was measured at the divergence to name a configuration for.
+        InputError: bad input, ``out`` holds another exploration, another process works in it, or,
+            when all is written, no trial was measured at the divergence to name a configuration
+            for.
         RuntimeError: worker processes die again and again.
     """
     space = make_space(exploration.parameters, exploration.base)
+    with alone_in(out):
+        storage = _explored(exploration, space, out, trials, workers, ray_address)
+        return write_exploration(exploration, storage, out)
+
+
+def _explored(
+    exploration: Exploration,
+    space: SearchSpace,
+    out: Path,
+    trials: int,
+    workers: int,
+    ray_address: str | None,
+) -> StudyStorage:
+    """The study with so many finished trials; show progress."""
     with tqdm(total=trials, desc=exploration.settings.sampler, unit="trial") as bar:
-        storage = explore(
+        return explore(
             out,
             space,
             exploration.settings,
@@ -106,7 +122,6 @@ def run_exploration(
             ray_address,
             lambda finished: _show(bar, finished),
         )
-    return write_exploration(exploration, storage, out)
 
 
 def _show(bar: tqdm, finished: int) -> None:

@@ -35,7 +35,8 @@ def explore(
     """Go on with the study in ``folder``, or begin it, until ``budget`` trials have finished.
 
     It may be killed at any moment and called again: what had finished is kept, what was running
-    is marked as failed and done again. Calls in several processes share the work.
+    is marked as failed and done again. Calls in several processes share the work
+    (``ms-slam explore`` has its folder to itself, and processes by ``--workers``).
 
     Args:
         folder: of the study.

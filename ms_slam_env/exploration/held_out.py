@@ -13,8 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from ms_slam_env.errors import InputError
 from ms_slam_env.exploration.evaluator import Row, SlamEvaluator, worst_ratio
 from ms_slam_env.exploration.objectives import FAILURE, METRICS, key_of
+from ms_slam_env.exploration.study_check import is_measured
 from ms_slam_env.report.records import RecordFile, spec_key
 from ms_slam_env.report.statistics import bootstrap_interval
 from ms_slam_env.slam.configuration import SlamConfiguration
@@ -43,6 +45,9 @@ def compare_configurations(
 
     Runs that are in the file ``path`` already are not repeated.
 
+    Raises:
+        InputError: the file holds something else.
+
     Returns:
         a line for each configuration: the keys of ``COMPARED`` (means over the sequences), with
         ``_ratio`` the interval of these to the default's, by a bootstrap over the sequences;
@@ -51,6 +56,9 @@ def compare_configurations(
     """
     records = RecordFile(path)
     done = records.load()
+    for key, row in done.items():  # the file may be a stranger's
+        if not is_measured(row):
+            raise InputError(f"{path}: row {key} holds no measures of a run")
     rows: dict[str, list[Row]] = {name: [] for name in configurations}
     for sequence in sequences:
         for name, configuration in configurations.items():

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
+import sqlite3
+import tempfile
 from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ms_slam_env.exploration.objectives import FAILURE, METRICS, OTHERS
@@ -24,6 +29,61 @@ REFERENCE = "reference"
 
 _NUMBERS = {*METRICS, *OTHERS} - {FAILURE}
 _PROCESS = re.compile(r"[^/]*/[0-9]{1,10}/([0-9]{0,20}|ended)")
+
+
+Schema = frozenset[tuple[str, str, str, str]]
+"""Type, name and table of everything in a database, and the SQL that makes it."""
+
+
+def check_schema(path: Path) -> None:
+    """Refuse a database that has not just Optuna's tables and indices, before it is used.
+
+    A trigger, a view or a constraint would run whenever Optuna reads or writes.
+
+    Raises:
+        ValueError: what it has that is not Optuna's, what it lacks, or how it is broken.
+        sqlite3.Error: it is no database.
+    """
+    file = f"{path.absolute().as_uri()}?mode=ro"
+    with contextlib.closing(sqlite3.connect(file, uri=True)) as connection:
+        connection.execute("PRAGMA trusted_schema=OFF")
+        found, expected = _schema(connection), _made_by_optuna()[1]
+        names = {name for _, name, *_ in expected}
+        for kind, name, *_ in sorted(found - expected):
+            wrong = "is not as Optuna makes it" if name in names else "is not Optuna's"
+            raise ValueError(f"{kind} {name} {wrong}")
+        for kind, name, *_ in sorted(expected - found):
+            raise ValueError(f"{kind} {name} is missing")
+        (complaint,) = connection.execute("PRAGMA quick_check(1)").fetchone()
+        if complaint != "ok":
+            raise ValueError(" ".join(complaint.split()))
+
+
+def empty_study() -> bytes:
+    """A database with Optuna's tables and no study, with a write-ahead log."""
+    return _made_by_optuna()[0]
+
+
+@cache
+def _made_by_optuna() -> tuple[bytes, Schema]:
+    from optuna.storages import RDBStorage
+
+    with tempfile.TemporaryDirectory(prefix="ms-slam-study-") as folder:
+        path = Path(folder) / "study.db"
+        with contextlib.closing(sqlite3.connect(path, check_same_thread=False)) as connection:
+            connection.execute("PRAGMA synchronous=OFF")
+            RDBStorage("sqlite://", engine_kwargs={"creator": lambda: connection})
+            connection.commit()
+            schema = _schema(connection)
+        data = path.read_bytes()
+    return data[:18] + b"\2\2" + data[20:], schema
+
+
+def _schema(connection: sqlite3.Connection) -> Schema:
+    rows = connection.execute("SELECT type, name, tbl_name, sql FROM sqlite_master")
+    return frozenset(
+        (kind, name, table, " ".join((sql or "").split())) for kind, name, table, sql in rows
+    )
 
 
 def check_study(study: Study, space: SearchSpace, objectives: Iterable[str]) -> None:
@@ -73,7 +133,7 @@ def _complaints(
             yield "its values are not a number for each objective"
         if not _is_numbers(trial.constraints, trial.constraints):
             yield "its constraints are not numbers"
-        if not _is_measured(own.get(MEASURED)):
+        if not is_measured(own.get(MEASURED)):
             yield "what was measured is missing or not numbers"
 
 
@@ -85,7 +145,7 @@ def _is_in(space: SearchSpace, params: Any) -> bool:
     )
 
 
-def _is_measured(measured: Any) -> bool:
+def is_measured(measured: Any) -> bool:
     """Whether an evaluation may have returned this."""
     if not isinstance(measured, Mapping) or not isinstance(measured.get(FAILURE, ""), str):
         return False

@@ -10,7 +10,6 @@ import contextlib
 import errno
 import math
 import os
-import socket
 import sqlite3
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -31,9 +30,19 @@ from ms_slam_env.exploration.study_check import (
     REFERENCE,
     RETRIES,
     RETRY_OF,
+    check_schema,
     check_study,
+    empty_study,
 )
-from ms_slam_env.output_files import check_out_folder, make_file
+from ms_slam_env.input_files import check_file, is_named
+from ms_slam_env.output_files import (
+    check_out_folder,
+    check_own,
+    is_alive,
+    process_name,
+    write_bytes,
+)
+from ms_slam_env.result_folders import alone_in
 from ms_slam_env.slam.configuration import SlamConfiguration
 
 if TYPE_CHECKING:
@@ -44,6 +53,7 @@ STUDY_FILE, LOCK_FILE = "study.db", "study.lock"
 _NAME = "exploration"
 _MOST_RETRIES = 2  # of a trial whose process died; then its values may be what kills processes
 _LOCK_TIMEOUT_S = 600.0
+_MAX_BYTES = 2**30
 _DISK_ERRORS = {
     "database or disk is full": errno.ENOSPC,
     "disk I/O error": errno.EIO,
@@ -158,11 +168,13 @@ class StudyStorage:
                 "exploration needs Optuna: pip install 'ms-slam-env[explore]'"
             ) from None
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        make_file(self.folder / STUDY_FILE)
+        path = self.folder / STUDY_FILE
+        self._check_files(path)
         with self._checked():
-            storage = RDBStorage(
-                f"sqlite:///{self.folder / STUDY_FILE}", engine_kwargs={"creator": self._connect}
-            )
+            if not path.exists() or not path.stat().st_size:
+                write_bytes(path, empty_study())
+            check_schema(path)
+            storage = RDBStorage(f"sqlite:///{path}", engine_kwargs={"creator": self._connect})
             study = optuna.create_study(
                 storage=storage,
                 study_name=_NAME,
@@ -176,6 +188,16 @@ class StudyStorage:
         if not any(trial.user_attrs.get(DEFAULT) for trial in study.get_trials(deepcopy=False)):
             study.enqueue_trial(self.space.defaults(), user_attrs={DEFAULT: True})
         return study
+
+    def _check_files(self, path: Path) -> None:
+        """Refuse files that SQLite would follow to others; a stranger may have made them."""
+        for ending in ("", "-wal", "-shm"):
+            check_own(Path(f"{path}{ending}"))
+        journal = Path(f"{path}-journal")
+        if is_named(journal):  # it may name a file that SQLite deletes
+            raise InputError(f"{journal} is of no exploration: those write {path.name}-wal")
+        if is_named(path):
+            check_file(path, "study", _MAX_BYTES)
 
     @contextmanager
     def _checked(self) -> Iterator[None]:
@@ -256,34 +278,26 @@ class StudyStorage:
         connection = sqlite3.connect(
             self.folder / STUDY_FILE, timeout=_LOCK_TIMEOUT_S, check_same_thread=False
         )
+        connection.execute("PRAGMA trusted_schema=OFF")
         connection.execute("PRAGMA journal_mode=WAL")
         connection.execute("PRAGMA synchronous=NORMAL")
         return connection
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
-        """Hold the folder's lock; the system drops it when the process dies, however it dies."""
-        path = self.folder / LOCK_FILE
-        make_file(path)  # here the system says what is wrong; SQLite does not
-        with self._disk_errors(path):
-            lock = sqlite3.connect(path, timeout=_LOCK_TIMEOUT_S, isolation_level=None)
-        try:
-            with self._disk_errors(path):
-                lock.execute("BEGIN EXCLUSIVE")
-            with self._disk_errors():
-                yield
-        finally:
-            lock.close()
+        """Hold the study's lock, for a moment."""
+        with alone_in(self.folder, self.folder / LOCK_FILE, _LOCK_TIMEOUT_S), self._disk_errors():
+            yield
 
     @contextmanager
-    def _disk_errors(self, path: Path | None = None) -> Iterator[None]:
+    def _disk_errors(self) -> Iterator[None]:
         """Let what SQLite says of its file, through two libraries, be one line that names it.
 
         Raises:
             OSError: of the disk.
             InputError: all else that it says: no right to write, another kind of file.
         """
-        path = path or self.folder / STUDY_FILE
+        path = self.folder / STUDY_FILE
         try:
             yield
         except Exception as error:
@@ -307,42 +321,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_plain(inner) for inner in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-# -- Which process works on a trial, and whether it still lives ---------------------------------
-
-
-def process_name(pid: int | None = None) -> str:
-    """Name of process ``pid`` (this one if None): host, number, and when it began."""
-    pid = os.getpid() if pid is None else pid
-    return f"{socket.gethostname()}/{pid}/{_start_of(pid)}"
-
-
-def is_alive(name: str) -> bool:
-    """Whether the process called ``name`` lives on this host.
-
-    A study's file lies on one machine: the process of another host is one from before a container
-    was started anew, under a new name.
-    """
-    host, pid, start = name.rsplit("/", 2)
-    if host != socket.gethostname():
-        return False
-    try:
-        os.kill(int(pid), 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        pass  # it lives, and is another user's
-    return _start_of(int(pid)) == start
-
-
-def _start_of(pid: int) -> str:
-    """Start of a process in clock ticks since boot, from proc(5); empty where there is no proc.
-
-    Numbers of processes are used again. A process that ended and was not waited for counts as none.
-    """
-    try:
-        after_name = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    except OSError:
-        return ""
-    return "ended" if after_name[0] in "ZX" else after_name[19]

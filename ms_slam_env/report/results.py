@@ -25,11 +25,12 @@ from ms_slam_env.metrics.registry import (
     check_keys,
     versions_since,
 )
-from ms_slam_env.output_files import result_folder, write_text
+from ms_slam_env.output_files import write_text
 from ms_slam_env.report.charts import Chart, chart_from_json
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import check_plain, from_plain, write_json
 from ms_slam_env.report.tables import Table, table_from_json
+from ms_slam_env.result_folders import result_folder
 
 RESULTS = "results.json"
 TABLE = "table.md"

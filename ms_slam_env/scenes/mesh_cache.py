@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import tempfile
 import zipfile
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -20,6 +19,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ms_slam_env.errors import InputError
+from ms_slam_env.output_files import new_file
 
 VERSION = 2
 """Of what is kept and how it is worked out; goes up when either changes."""
@@ -61,22 +63,16 @@ def remembered(name: str, work_out: Callable[[], Arrays]) -> Arrays:
         os.utime(path)
         return found
     arrays = work_out()
-    with suppress(OSError):
+    with suppress(OSError, InputError):  # a disk, a place that takes no file
         _keep(path, arrays)
     return arrays
 
 
 def _keep(path: Path, arrays: Arrays) -> None:
-    """Write an entry beside its place and move it there, so that none is ever half written."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, draft = tempfile.mkstemp(dir=path.parent, prefix="draft-", suffix=".npz")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            named: dict[str, Any] = {"names": np.array(list(arrays)), **arrays}
-            np.savez(file, **named)
-        Path(draft).replace(path)
-    finally:
-        Path(draft).unlink(missing_ok=True)
+    """Write an entry, whole or not at all, and make room for it."""
+    named: dict[str, Any] = {"names": np.array(list(arrays)), **arrays}
+    with new_file(path) as descriptor, os.fdopen(descriptor, "wb", closefd=False) as file:
+        np.savez(file, **named)
     _make_room(path.parent)
 
 

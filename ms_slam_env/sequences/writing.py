@@ -18,6 +18,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.input_files import read_json
 from ms_slam_env.interrupts import kept
 from ms_slam_env.output_files import write_bytes, write_text
+from ms_slam_env.result_folders import alone_in, lock_beside, own_folder
 from ms_slam_env.sequences.rendering import RenderedSequence
 from ms_slam_env.sequences.sequence import Sequence
 from ms_slam_env.sequences.trajectory import write_trajectory
@@ -63,20 +64,30 @@ def write_sequence(
         whether anything was left to write.
 
     Raises:
-        InputError: the folder, or the unfinished one, holds something else.
+        InputError: the folder, or the unfinished one, holds something else or is being written.
     """
     target = Path(folder)
     content = json.loads(json.dumps(dict(description)))
-    if _is_there(target, content):
+    with alone_in(target, lock_beside(target)):
+        return _write_whole(sequence, target, content, with_truth)
+
+
+def _write_whole(
+    sequence: RenderedSequence, target: Path, content: dict[str, Any], with_truth: bool
+) -> bool:
+    """Write a sequence, or what is left of it; return whether anything was."""
+    if _is_there(target, content):  # by now
         return False
     partial = working_folder(target)
     _begin(partial, content)
     names = [f"{time:.6f}" for time in sequence.frames.timestamps]
+    kinds = ("rgb", "depth", *(("depth_true", "labels") if with_truth else ()))
+    for kind in (*kinds, "objects") if sequence.frames.object_trajectories else kinds:
+        own_folder(partial / kind)
     with kept(f"finished frames are kept in {partial}; the same command goes on"):
         for index, name in enumerate(tqdm(names, desc=sequence.name, unit="frame")):
             _write_frame(partial, name, sequence, index, with_truth)
-    truths = ("depth_true", "labels") if with_truth else ()
-    _write_lists(partial, names, ("rgb", "depth", *truths))
+    _write_lists(partial, names, kinds)
     if with_truth:
         objects = enumerate(sequence.frames.labels, start=1)
         lines = "".join(f"{value} {label}\n" for value, label in objects)
@@ -125,16 +136,16 @@ def _is_there(target: Path, content: dict[str, Any]) -> bool:
 
 def _begin(partial: Path, content: dict[str, Any]) -> None:
     """Make the working folder, or check that it is the beginning of the same sequence."""
-    if partial.exists():
+    own_folder(partial)
+    if any(partial.iterdir()):
         if (partial / DESCRIPTION).is_file():  # interrupted between the last two steps
             os.replace(partial / DESCRIPTION, partial / UNFINISHED)
         is_same = (partial / UNFINISHED).is_file() and _read(partial / UNFINISHED) == content
-        if not is_same and any(partial.iterdir()):
+        if not is_same:
             raise InputError(
                 f"{partial} holds the beginning of another sequence; delete it or choose another "
                 "folder"
             )
-    partial.mkdir(parents=True, exist_ok=True)
     write_text(partial / UNFINISHED, json.dumps(content, indent=1) + "\n")
 
 

@@ -244,6 +244,9 @@ def test_held_out_ratios(tmp_path, monkeypatch):
     assert ratio.low == ratio.high == pytest.approx(0.25)
     assert (knee["failed_runs"], knee["ate_m"]) == (2, None)
     assert compare_configurations(evaluator, configurations, (), file) == []
+    file.write_text(file.read_text().replace("0.04", '"x"', 1))
+    with pytest.raises(InputError, match=r"runs\.jsonl: row \w+ holds no measures"):
+        compare_configurations(evaluator, configurations, ("table:1",), file)
 
 
 def test_results_have_the_keys_of_the_registry():

@@ -11,7 +11,8 @@ from optuna.trial import TrialState
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.exploration import ExplorationSettings, explore, make_space
-from ms_slam_env.exploration.study_storage import StudyStorage, is_alive, process_name
+from ms_slam_env.exploration.study_storage import StudyStorage
+from ms_slam_env.output_files import is_alive, process_name
 from ms_slam_env.slam.configuration import SlamConfiguration
 
 BUDGET = 12

@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import socket
 import sqlite3
 
 import pytest
@@ -13,6 +14,7 @@ from ms_slam_env.command_line import exit_code
 from ms_slam_env.errors import InputError
 from ms_slam_env.exploration import ExplorationSettings
 from ms_slam_env.exploration.study_storage import StudyStorage
+from ms_slam_env.output_files import is_alive
 
 
 def open_study(folder):
@@ -85,6 +87,97 @@ def test_what_no_exploration_wrote_is_refused(study, statement, complaint):
     assert (study / "study.db").read_bytes() == before
 
 
+FOR_EVER = "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c) SELECT x FROM c"
+
+
+@pytest.mark.parametrize(
+    ("statements", "complaint"),
+    [
+        (["CREATE TRIGGER t AFTER INSERT ON trial_values BEGIN UPDATE trial_values SET value = -1; "
+          "END"], "trigger t is not Optuna's"),
+        (["CREATE TRIGGER t AFTER INSERT ON trials BEGIN INSERT INTO trial_user_attributes"
+          f"(trial_id) SELECT * FROM ({FOR_EVER}); END"], "trigger t is not Optuna's"),
+        (["ALTER TABLE trial_params RENAME TO other", f"CREATE VIEW trial_params AS {FOR_EVER}"],
+         "is not Optuna's|trial_params is not as"),
+        (["DROP TABLE trial_heartbeats",
+          "CREATE VIRTUAL TABLE trial_heartbeats USING fts5(trial_id)"],
+         "trial_heartbeats"),
+        (["CREATE TABLE passwords(a)"], "table passwords is not Optuna's"),
+        (["CREATE INDEX mine ON trials(abs(number))"], "index mine is not Optuna's"),
+        (["ALTER TABLE trials ADD COLUMN x DEFAULT 3"], "table trials is not as Optuna makes it"),
+        (["DROP TABLE trial_heartbeats"], "trial_heartbeats_1 is missing"),
+        (["PRAGMA writable_schema=ON", "UPDATE sqlite_master SET sql = replace(sql, 'NOT NULL', "
+          "'NOT NULL CHECK (length(randomblob(100000000)))') WHERE name = 'trials'"],
+         "table trials is not as Optuna makes it"),
+        (["PRAGMA writable_schema=ON", "UPDATE sqlite_master SET rootpage = (SELECT rootpage FROM "
+          "sqlite_master WHERE name = 'trials') WHERE name = 'trial_values'"], "2nd reference"),
+    ],
+)  # fmt: skip
+def test_a_study_has_optunas_tables_and_nothing_else(study, statements, complaint):
+    connection = sqlite3.connect(study / "study.db")
+    for statement in statements:
+        connection.execute(statement)
+    connection.commit()
+    connection.close()
+    before = (study / "study.db").read_bytes()
+    with pytest.raises(InputError, match=rf"study\.db: .*({complaint})") as caught:
+        open_study(study)
+    assert "\n" not in str(caught.value)
+    assert (study / "study.db").read_bytes() == before
+
+
+def test_what_a_log_adds_to_the_tables_is_seen(study):
+    """A write-ahead log is part of the database, as the one of an exploration that was killed."""
+    connection = sqlite3.connect(study / "study.db")
+    connection.execute("CREATE VIEW v AS SELECT 1")
+    connection.commit()
+    kept = {name: (study / name).read_bytes() for name in ("study.db", "study.db-wal")}
+    connection.close()
+    for name, data in kept.items():
+        (study / name).write_bytes(data)
+    with pytest.raises(InputError, match="view v is not Optuna's"):
+        open_study(study)
+
+
+def foreign(path):
+    connection = sqlite3.connect(path)
+    connection.execute("CREATE TABLE passwords(a)")
+    connection.commit()
+    connection.close()
+
+
+@pytest.mark.parametrize("name", ["study.db", "study.db-wal", "study.db-shm", "study.lock"])
+@pytest.mark.parametrize("link", [os.symlink, os.link])
+def test_no_link_leads_to_another_file(tmp_path, name, link):
+    victim, folder = tmp_path / "other.sqlite", tmp_path / "study"
+    foreign(victim)
+    before = victim.read_bytes()
+    folder.mkdir()
+    link(victim, folder / name)
+    with pytest.raises(InputError, match=rf"{name} (is a link to another file|has other names)"):
+        open_study(folder)
+    assert victim.read_bytes() == before
+
+
+def test_a_database_of_another_is_left_as_it_is(tmp_path):
+    foreign(tmp_path / "study.db")
+    before = (tmp_path / "study.db").read_bytes()
+    with pytest.raises(InputError, match="table passwords is not Optuna's"):
+        open_study(tmp_path)
+    assert (tmp_path / "study.db").read_bytes() == before
+
+
+def test_a_journal_which_may_name_a_file_to_delete_is_refused(study):
+    (study / "study.db-journal").write_bytes(b"x" * 1024)
+    with pytest.raises(InputError, match=r"study\.db-journal is of no exploration"):
+        open_study(study)
+
+
+def test_an_owner_that_is_no_process_does_not_live_for_ever():
+    for number in (0, 2**31, 10**9 * 9):
+        assert not is_alive(f"{socket.gethostname()}/{number}/")
+
+
 def test_a_table_that_goes_missing_meanwhile_is_one_line(study):
     storage = open_study(study)
     write_into(study, "DROP TABLE trial_user_attributes")
@@ -95,14 +188,20 @@ def test_a_table_that_goes_missing_meanwhile_is_one_line(study):
 @pytest.mark.parametrize("name", ["ENOSPC", "EDQUOT", "EIO", "EROFS"])
 @pytest.mark.parametrize("file", ["study.lock", "study.db"])
 def test_a_disk_that_takes_no_file_is_one_line(tmp_path, monkeypatch, capsys, file, name):
-    number, opened = getattr(errno, name), os.open
+    number, opened, replace = getattr(errno, name), os.open, os.replace
 
     def broken(path, *arguments):
         if str(path).endswith(file):
             raise OSError(number, os.strerror(number))
         return opened(path, *arguments)
 
+    def not_moved(source, target):
+        if str(target).endswith(file):
+            raise OSError(number, os.strerror(number))
+        replace(source, target)
+
     monkeypatch.setattr(output_files.os, "open", broken)
+    monkeypatch.setattr(output_files.os, "replace", not_moved)
     assert exit_code(lambda: open_study(tmp_path) and 0) == 1
     said = capsys.readouterr().err
     assert said == f"ms-slam: error: {tmp_path / file}: {os.strerror(number)}\n"

@@ -8,6 +8,7 @@ import re
 import sqlite3
 import struct
 import tempfile
+from collections.abc import Callable
 from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
@@ -31,16 +32,20 @@ from mutations import (
 from optuna.storages._rdb.storage import _VersionManager
 from policy_files import as_bytes
 
+from ms_slam_env.errors import InputError
 from ms_slam_env.exploration import ExplorationSettings, explore, make_space
 from ms_slam_env.exploration.choices import choose
 from ms_slam_env.exploration.front import hypervolume_history, importances, points_of
 from ms_slam_env.exploration.space import SearchSpace
+from ms_slam_env.exploration.study_storage import StudyStorage
+from ms_slam_env.output_files import append_line, growing_file, write_bytes
 from ms_slam_env.report import page
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import RecordFile
 from ms_slam_env.report.results import write_results
 from ms_slam_env.report.statistics import Interval
 from ms_slam_env.report.tables import make_table
+from ms_slam_env.result_folders import alone_in, own_folder, result_folder
 from ms_slam_env.slam.configuration import SlamConfiguration
 
 # --- policies ----------------------------------------------------------------------------------
@@ -103,18 +108,41 @@ def study() -> bytes:
             return data[:18] + b"\1\1" + data[20:]  # no write-ahead log, which memory has not
 
 
+_WITHOUT_END = "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c) SELECT x FROM c"
+_RUNNING = (
+    "CREATE TRIGGER x{k} AFTER {event} ON {table} BEGIN DELETE FROM trials; END",
+    f"CREATE TRIGGER x{{k}} BEFORE {{event}} ON {{table}} BEGIN {_WITHOUT_END}; END",
+    "CREATE VIEW x{k} AS SELECT * FROM {table}",
+    f"ALTER TABLE {{table}} RENAME TO y{{k}}; CREATE VIEW {{table}} AS {_WITHOUT_END}",
+    "CREATE VIRTUAL TABLE x{k} USING fts5(a)",
+    "CREATE TABLE x{k}(a)",
+    "CREATE INDEX x{k} ON {table}(length(randomblob(100000000)))",
+    "ALTER TABLE {table} ADD COLUMN x{k} DEFAULT (random())",
+    "ALTER TABLE {table} ADD COLUMN x{k} AS (length(randomblob(100000000)))",
+    "PRAGMA writable_schema=ON; UPDATE sqlite_master SET sql = replace(sql, 'NOT NULL', "
+    "'CHECK (length(randomblob(100000000)))') WHERE name = '{table}'",
+    "PRAGMA writable_schema=ON; UPDATE sqlite_master SET rootpage = {k} WHERE name = '{table}'",
+)
+"""SQL that makes a database do more than hold rows, or hold them elsewhere."""
+
+
 def mutated_study(data: bytes, rng: Rng) -> bytes:
-    """The bytes of the file, or some cells of its tables."""
+    """The bytes of the file, some cells of its tables, or what its tables are."""
     if rng.random() < 0.2:
         return mutated_bytes(data, rng)
     with contextlib.closing(sqlite3.connect(":memory:")) as connection:
         connection.deserialize(data)
         names = "SELECT name FROM sqlite_master WHERE type='table'"
         tables = [name for (name,) in connection.execute(names)]
-        for _ in range(rng.integers(1, 4)):
+        for k in range(rng.integers(1, 4)):
             table = tables[rng.integers(len(tables))]
             with contextlib.suppress(sqlite3.Error, UnicodeEncodeError, OverflowError):
-                _mutate_table(connection, table, rng)
+                if rng.random() < 0.15:
+                    event = ("INSERT", "UPDATE", "DELETE")[rng.integers(3)]
+                    statement = _RUNNING[rng.integers(len(_RUNNING))]
+                    connection.executescript(statement.format(k=k, event=event, table=table))
+                else:
+                    _mutate_table(connection, table, rng)
         connection.commit()
         return connection.serialize()
 
@@ -257,7 +285,104 @@ def rows() -> Files:
     return {"rows.jsonl": ("\n".join(lines) + "\n").encode()}
 
 
+# --- places of files ----------------------------------------------------------------------------
+
+FIGURE = "figs/a.png"
+OUTPUTS = (
+    *("report.html", "trajectory.txt", "rows.jsonl", "results.json", FIGURE, "episodes/1.npz"),
+    *("figs", "episodes", ".ms-slam.lock"),
+    *("study.db", "study.db-wal", "study.db-shm", "study.db-journal", "study.lock"),
+)
+OUTSIDE: Files = {"secret.txt": SECRET.encode(), "figs/a.png": b"a", "episodes/1.npz": b"1"}
+
+
+@cache
+def outputs() -> Files:
+    """A folder of results, and files outside of it."""
+    inside = {name: b"old\n" for name in OUTPUTS if "." in name.strip(".") and "study" not in name}
+    inside = {f"in/{name}": data for name, data in inside.items()} | {"in/study.db": study()}
+    return {f"outside/{name}": data for name, data in OUTSIDE.items()} | inside
+
+
+def mutated_outputs(files: Files, rng: Rng) -> Files:
+    """With what a stranger may have put in the place of what is to be written."""
+    made = dict(files)
+    for _ in range(rng.integers(1, 4)):
+        name = OUTPUTS[rng.integers(len(OUTPUTS))]
+        if rng.random() < 0.2:
+            name += ".partial"
+        up = "../" * (1 + name.count("/"))
+        inner = [other for other in made if other.startswith((f"in/{name}/", f"in/{name}"))]
+        outer = [k for k in made if f"in/{name}".startswith(f"{k}/")]
+        for other in (*inner, *outer):
+            del made[other]
+        made[f"in/{name}"] = (
+            Special("link", f"{up}outside/secret.txt"),
+            Special("hardlink", f"{up}outside/secret.txt"),
+            Special("link", f"{up}outside"),
+            Special("link", f"{up}outside/{name}"),
+            Special("link", f"{up}nowhere"),
+            Special("fifo"),
+            Special("folder"),
+            b"x" * int(rng.integers(2000)),
+        )[rng.integers(8)]
+    return made
+
+
+def call_outputs(files: Files, folder: Path) -> None:
+    """Write all sorts of results; what lies outside stays as it is, whatever is refused."""
+    write_files(files, folder)
+    out, outside = folder / "in", folder / "outside"
+    refused: list[InputError] = []
+
+    def attempted(write: Callable[[], object]) -> None:
+        try:
+            write()
+        except InputError as error:
+            refused.append(error)
+
+    def write_growing() -> None:
+        with growing_file(out / "trajectory.txt") as add:
+            add("new")
+        assert (out / "trajectory.txt").read_bytes() == b"new\n"
+
+    def write_result() -> None:
+        with result_folder(out, "results.json") as made:
+            write_bytes(made / "results.json", b"new")
+            write_bytes(made / FIGURE, b"new")
+        assert (out / FIGURE).read_bytes() == (out / "results.json").read_bytes() == b"new"
+
+    def write_page() -> None:
+        write_bytes(out / "report.html", b"new", durable=False)
+        assert (out / "report.html").read_bytes() == b"new"
+
+    def append() -> None:
+        append_line(out / "rows.jsonl", b"new\n")
+        assert (out / "rows.jsonl").read_bytes().endswith(b"new\n")
+
+    def hold() -> None:
+        with alone_in(out):
+            write_bytes(own_folder(out / "episodes") / "1.npz", b"new", durable=False)
+
+    def go_on() -> None:
+        known = migrations()
+        with patch.object(_VersionManager, "_create_alembic_script", lambda manager: known):
+            StudyStorage(out, space(), SETTINGS)
+
+    for write in (write_growing, write_result, write_page, append, hold, go_on):
+        attempted(write)
+    found = {
+        path.relative_to(outside).as_posix(): path.read_bytes()
+        for path in outside.rglob("*")
+        if path.is_file()
+    }
+    assert found == OUTSIDE
+    if refused:
+        raise refused[0]
+
+
 ENTRIES = [
+    Entry("outputs", outputs, mutated_outputs, call_outputs, in_tests=20),
     Entry("policy", as_bytes, mutated_policy, call_policy),
     Entry("study", study, mutated_study, call_study, in_tests=20),
     Entry("report", results, mutated_results, call_report),

@@ -46,7 +46,7 @@ ARRAYS: tuple[Callable[[Any], Any], ...] = (
 
 @dataclasses.dataclass(frozen=True)
 class Special:
-    """What is no regular file: ``fifo``, ``folder``, or ``link`` with its target."""
+    """No regular file of its own: ``fifo``, ``folder``; ``link``, ``hardlink`` with its target."""
 
     kind: str
     target: str = ""
@@ -208,6 +208,8 @@ def write_files(files: Files, folder: Path) -> None:
             os.mkfifo(path)
         elif content.kind == "folder":
             path.mkdir()
+        elif content.kind == "hardlink":
+            os.link(path.parent / content.target, path)
         else:
             path.symlink_to(content.target)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 from pathlib import Path
 
 import numpy as np
@@ -113,9 +114,22 @@ def test_a_half_written_image_is_written_again(sequence, tmp_path) -> None:
     partial = working_folder(target)
     (partial / "rgb").mkdir(parents=True)
     (partial / "incomplete.json").write_text(json.dumps(ABOUT))
-    (partial / "rgb/0.000000.png.partial").write_bytes(b"half")
+    of_the_dead = f".partial-{socket.gethostname()}-999999999-1-ab"
+    (partial / "rgb" / of_the_dead).write_bytes(b"half")
     write_sequence(sequence, target, ABOUT)
     assert contents(target) == contents(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("place", ["stopped.partial", "stopped.partial/rgb"])
+def test_no_link_takes_images_elsewhere(sequence, tmp_path, place) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / place).parent.mkdir(exist_ok=True)
+    (tmp_path / place).symlink_to(tmp_path / "elsewhere")
+    if place.endswith("rgb"):
+        (tmp_path / "stopped.partial" / "incomplete.json").write_text(json.dumps(ABOUT))
+    with pytest.raises(InputError, match="is a link to another folder"):
+        write_sequence(sequence, tmp_path / "stopped", ABOUT)
+    assert contents(tmp_path / "elsewhere") == {}
 
 
 def test_another_sequence_is_not_overwritten(sequence, tmp_path) -> None:

@@ -20,8 +20,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ms_slam_env.errors import InputError
-from ms_slam_env.input_files import is_named
+from ms_slam_env.input_files import MAX_TEXT_BYTES, is_named, read_bytes
 from ms_slam_env.interrupts import sigterm_exits
+from ms_slam_env.output_files import write_bytes
 from ms_slam_env.sequences import Sequence, associate, read_trajectory
 from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S
 from ms_slam_env.sequences.writing import write_frames
@@ -103,7 +104,7 @@ def run_command(
         if not is_named(made):
             raise InputError(f"{about} wrote no trajectory to {TRAJECTORY}")
         _check_trajectory(made, sequence, about)
-        shutil.copyfile(made, trajectory)
+        write_bytes(trajectory, read_bytes(made, "trajectory", MAX_TEXT_BYTES))
     return cost
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from ms_slam_env.errors import InputError
+from ms_slam_env.errors import InputError, one_line
 from ms_slam_env.evaluation.run_sequence import lost_throughout
 from ms_slam_env.experiments.harness.experiment import Experiment
 from ms_slam_env.experiments.harness.named_files import file_hashes
@@ -24,6 +24,7 @@ from ms_slam_env.report.provenance import git_commit
 from ms_slam_env.report.records import RecordFile, Row, from_plain, spec_key, to_plain
 from ms_slam_env.report.results import RESULTS, Results, write_result_folder
 from ms_slam_env.report.tables import finished
+from ms_slam_env.result_folders import alone_in
 
 RECORDS = "rows.jsonl"
 _NAMING = ("planner", "scene", "sequence", "backend", "seed")  # what a person calls the work by
@@ -105,7 +106,7 @@ def run_all(
                 bar.update()
                 if row["error"] is not None:
                     name = name_of[row["key"]]
-                    bar.write(f"failed: {name}: {row['error']}", file=sys.stderr)
+                    bar.write(one_line(f"failed: {name}: {row['error']}"), file=sys.stderr)
 
             variables = one_thread_unless_set() if environment is None else environment
             pool = open_pool(run, workers, ray, environment=variables, fresh=fresh)
@@ -203,12 +204,20 @@ def run_experiment(
         ray: address of a Ray cluster whose workers run the rows; None: processes of this machine.
 
     Raises:
-        InputError: options that no row could be run with, or no cluster at the address.
+        InputError: options that no row could be run with, no cluster at the address, or another
+            process that works in ``out``.
         RuntimeError: every row failed; the files of an earlier run are left as they are.
     """
     specs = experiment.specs()
     if not specs:
         raise InputError(f"no {experiment.unit} to run: an option is an empty list")
+    with alone_in(out):
+        return _run_specs(experiment, specs, out, workers, ray)
+
+
+def _run_specs(
+    experiment: Experiment, specs: Sequence[Any], out: Path, workers: int | None, ray: str | None
+) -> Outcome:
     experiment.prepare()
     rows = run_all(
         specs,
