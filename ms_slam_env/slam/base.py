@@ -254,7 +254,7 @@ class SlamBackend(Stateful):
         own = self.get_state()
         try:
             self.reset()
-            check_like(state, self.get_state(), "map")
+            check_like(state, self.state_like(), "map")
             self.set_state(state)
         except Exception as error:  # whatever a part makes of what only looks like its state
             self.set_state(own)

@@ -23,6 +23,7 @@ from ms_slam_env.slam.alignment_measures import DepthImage, check_alignment
 from ms_slam_env.slam.base import BorrowedMap, Float64
 from ms_slam_env.slam.pose_hypotheses import motion_hypotheses
 from ms_slam_env.slam.semi_dense import SemiDenseAligner
+from ms_slam_env.slam.state_check import ArrayOf, OrNone
 from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
 from ms_slam_env.slam.tracking_template import Attempt, FrameByFrameSlam
 
@@ -240,6 +241,12 @@ class OdometrySlam(BorrowedMap, FrameByFrameSlam[DepthImage, _Placed]):
             "key": _save(self._key),
             "last": None if self._last is self._key else _save(self._last),
         }
+
+    def state_like(self) -> Any:
+        """See ``Stateful``."""
+        image = ArrayOf(np.float32, self.intrinsics.shape, least=0)
+        placed = OrNone({"pose": np.eye(4), "depth": image, "intensity": image})
+        return super().state_like() | {"key": placed, "last": placed}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state of a backend of the same intrinsics and configuration."""

@@ -164,6 +164,11 @@ class SurfelSlam(SlamBackend):
         own = self._color_camera.get_state() | {"submaps": self._submaps.get_state()}
         return self._slam.get_state() | own
 
+    def state_like(self) -> Any:
+        """See ``Stateful``."""
+        own = self._color_camera.state_like() | {"submaps": self._submaps.state_like()}
+        return self._slam.state_like() | own
+
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state that ``get_state`` returned."""
         check_has(state, ("submaps",), type(self).__name__)

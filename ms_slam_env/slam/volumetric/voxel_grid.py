@@ -19,6 +19,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert
 from ms_slam_env.slam.base import Float32, Float64
 from ms_slam_env.slam.state import Stateful
+from ms_slam_env.slam.state_check import ArrayOf
 
 STOCK: dict[str, Any] = {
     "voxel_m": 0.01,
@@ -284,6 +285,11 @@ class VoxelGrid(Stateful):
         for name in ("tsdf", "weight", "color"):
             state[name] = self._blocks(name)[used[order]]
         return state
+
+    def state_like(self) -> Any:
+        """See ``Stateful``."""
+        own = self.get_state().items()
+        return {name: ArrayOf(one.dtype, ("blocks", *one.shape[1:])) for name, one in own}
 
     def set_state(self, state: dict[str, NDArray[Any]]) -> None:
         """Go on from a state of a grid of the same configuration."""
