@@ -22,6 +22,10 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
 
+LARGEST_CUTOFF_M = 12.0
+"""Of depth, by any backend: as far as a sensor model reads (``RangeNoise``)."""
+
+
 @dataclass(frozen=True)
 class Loop:
     """What a closed loop says: where the camera is beside a place that it had left.

@@ -20,7 +20,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, relative_angle
 from ms_slam_env.slam.alignment_check import NO_ALIGNMENT, AcceptanceThresholds
 from ms_slam_env.slam.alignment_measures import DepthImage, check_alignment
-from ms_slam_env.slam.base import BorrowedMap, Float64
+from ms_slam_env.slam.base import LARGEST_CUTOFF_M, BorrowedMap, Float64
 from ms_slam_env.slam.pose_hypotheses import motion_hypotheses
 from ms_slam_env.slam.semi_dense import SemiDenseAligner
 from ms_slam_env.slam.state_check import ArrayOf, OrNone
@@ -49,7 +49,7 @@ class OdometryConfig(Checked):
             becomes the keyframe where the camera was last.
     """
 
-    depth_cutoff_m: float = bounded(4.0, 0.1, 10.0)
+    depth_cutoff_m: float = bounded(4.0, 0.1, LARGEST_CUTOFF_M)
     keyframe_m: float = bounded(0.04, 0.0, 1.0)
     keyframe_deg: float = bounded(3.0, 0.0, 90.0)
     least_overlap: float = bounded(0.3, 0.0, 1.0)

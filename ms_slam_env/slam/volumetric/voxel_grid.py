@@ -17,7 +17,7 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert
-from ms_slam_env.slam.base import Float32, Float64
+from ms_slam_env.slam.base import LARGEST_CUTOFF_M, Float32, Float64
 from ms_slam_env.slam.state import Stateful
 from ms_slam_env.slam.state_check import ArrayOf
 
@@ -62,7 +62,7 @@ class VolumetricConfig(Checked):
     block_voxels: int = bounded(8, 4, 32)
     blocks: int = bounded(4_000, 100, 10_000_000)
     truncation_voxels: float = bounded(4.0, 1.0, 50.0)
-    depth_cutoff_m: float = bounded(4.0, 0.1, 10.0)
+    depth_cutoff_m: float = bounded(4.0, 0.1, LARGEST_CUTOFF_M)
     aligner: str = chosen("opencv", "opencv", "open3d")
     association_m: float = bounded(0.07, 0.001, 1.0)
     least_weight: int = bounded(1, 1, 1000)
