@@ -226,7 +226,7 @@ def check_choice(owner: object, name: str, choices: tuple[str, ...]) -> None:
         InputError: listing the valid choices.
     """
     value = getattr(owner, name)
-    if value not in choices:
+    if not any(isinstance(value, type(choice)) and value == choice for choice in choices):
         raise unknown(f"{type(owner).__name__}.{name}", value, choices)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
+from ms_slam_env.camera import Intrinsics, RGBDFrame, check_frame, intensity_image
 from ms_slam_env.config import Checked, Family, bounded, chosen
 from ms_slam_env.divergence import DivergenceConfig, Histograms, make_divergence
 from ms_slam_env.errors import InputError
@@ -170,7 +170,7 @@ class Change(Stateful):
 
     def measure(self, frame: RGBDFrame) -> float:
         """Change of ``frame`` from the reference, nats; infinite without one."""
-        self._intrinsics.check_image(frame.depth, "frame")
+        check_frame(frame, self._intrinsics)
         s = self._stride
         grey = intensity_image(np.ascontiguousarray(frame.color[::s, ::s])).astype(np.float32)
         depth = frame.depth[::s, ::s].astype(np.float32)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ms_slam_env.camera import RGBDFrame
+from ms_slam_env.camera import RGBDFrame, check_frame
 from ms_slam_env.geometry import check_pose, invert, se3_exp, se3_log
 from ms_slam_env.slam.base import BorrowedMap, Float64, SlamBackend, TrackResult
 from ms_slam_env.slam.state import Saved, Stateful, check_has
@@ -169,7 +169,7 @@ class SelectiveSlam(Saved, BorrowedMap):
     def _process_or_drop(
         self, frame: RGBDFrame, known_pose: ArrayLike | None, process: Callable[[], TrackResult]
     ) -> TrackResult:
-        self.intrinsics.check_image(frame.depth, "frame")
+        check_frame(frame, self.intrinsics)
         begin = time.process_time()
         result = self._note(process()) if self._is_worth(frame) else self._drop(known_pose)
         self._filter.charge(time.process_time() - begin)
