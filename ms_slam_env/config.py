@@ -9,7 +9,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeGuard, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, TypeGuard, TypeVar, get_args, get_origin, get_type_hints
 
 import yaml
 
@@ -95,7 +95,8 @@ def from_dict(cls: type[T], values: Mapping[str, Any], path: str = "") -> T:
         cls: a dataclass; fields that are themselves dataclasses take nested mappings. Of a
             :class:`Family` the variant that ``name`` names.
         values: field name to value; missing fields keep their default, a :class:`Named` or
-            :class:`Family` field may be given by name, a path as text.
+            :class:`Family` field may be given by name, a path as text. ``{"a.b": 1}`` is
+            ``{"a": {"b": 1}}``.
         path: dotted prefix used in error messages.
 
     Raises:
@@ -104,6 +105,7 @@ def from_dict(cls: type[T], values: Mapping[str, Any], path: str = "") -> T:
     """
     if issubclass(cls, Family) and inspect.isabstract(cls):
         cls, values = _variant(cls, values, path)
+    values = _nested(values, path)
     fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
     fixed = {name: field.default for name, field in fields.items() if not field.init}
     fields = {name: field for name, field in fields.items() if field.init}
@@ -132,6 +134,22 @@ def from_dict(cls: type[T], values: Mapping[str, Any], path: str = "") -> T:
             raise _no_mapping(where, value, hint, names)
         arguments[key] = value
     return cls(**arguments)
+
+
+def _nested(values: Mapping[str, Any], path: str) -> Mapping[str, Any]:
+    """``values`` with a mapping in the place of dotted names."""
+    if not any(isinstance(key, str) and "." in key for key in values):
+        return values
+    nested: dict[str, Any] = {}
+    for key, value in values.items():
+        first, dot, rest = key.partition(".") if isinstance(key, str) else (key, "", "")
+        more = {rest: value} if dot else value
+        known = nested.get(first, {})
+        is_joined = isinstance(known, Mapping) and isinstance(more, Mapping)
+        if first in nested and not (is_joined and known.keys().isdisjoint(more)):
+            raise InputError(f"{path}.{key}: {first} already has a value".lstrip("."))
+        nested[first] = {**known, **more} if is_joined else more
+    return nested
 
 
 def is_options(value: object) -> TypeGuard[Mapping[str, Any]]:
@@ -208,25 +226,61 @@ def check_choice(owner: object, name: str, choices: tuple[str, ...]) -> None:
         InputError: listing the valid choices.
     """
     value = getattr(owner, name)
-    if value not in choices:
+    if not any(isinstance(value, type(choice)) and value == choice for choice in choices):
         raise unknown(f"{type(owner).__name__}.{name}", value, choices)
 
 
+def check_counts(owner: object, name: str, most: int, highest: int) -> None:
+    """Refuse ``owner.name`` unless it is 1 to ``most`` integers in [0, highest]; make it a tuple.
+
+    Raises:
+        InputError: naming the class, the field, its value, and the form that it should have.
+    """
+    value = getattr(owner, name)
+    are_counts = isinstance(value, (tuple, list)) and all(
+        type(count) is int and 0 <= count <= highest for count in value
+    )
+    if not are_counts or not 1 <= len(value) <= most:
+        form = f"1 to {most} integers in [0, {highest}], such as [4, 5, 10]"
+        raise InputError(f"{type(owner).__name__}.{name} = {value!r} must be {form}")
+    object.__setattr__(owner, name, tuple(value))  # lists come from YAML
+
+
 def parse_value(text: str, name: str) -> Any:
-    """The YAML value of option ``name``.
+    """The YAML value of option ``name``; a tuple, (4, 5, 10), is a list.
 
     Raises:
         InputError: text that is not YAML.
     """
+    tuple_form = _TUPLE.fullmatch(text)
     try:
-        return load_yaml(text)
+        return load_yaml(f"[{tuple_form[1]}]" if tuple_form else text)
     except ValueError:
         shown = text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
         raise InputError(f"option {name!r}: {shown!r} is not a YAML value") from None
 
 
+_TUPLE = re.compile(r"\s*\(([^()]*,[^()]*)\)\s*")
+_BETWEEN_OPTIONS = re.compile(r",(?![^\[(]*[\])])")  # not within [4, 5] or (4, 5)
+_NUMBERS = {
+    "int": r"[-+]?[0-9][0-9_]*|0o[0-7]+|0x[0-9a-fA-F]+",
+    "float": r"[-+]?(\.[0-9]+|[0-9][0-9_]*(\.[0-9]*)?)([eE][-+]?[0-9]+)?"
+    r"|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+    "bool": "true|True|TRUE|false|False|FALSE",
+}
+"""What YAML 1.2 takes for a number or a truth value (and 1_000, as Python does).
+
+PyYAML reads YAML 1.1, in which ``off`` is false, ``1:30`` is 90, ``010`` is 8 and ``1e-3`` a text.
+"""
+
+
 class _Loader(yaml.SafeLoader):
-    """YAML's own, but nothing may be said twice."""
+    """YAML's own, but nothing may be said twice, and plain values are those of YAML 1.2."""
+
+    yaml_implicit_resolvers: ClassVar[dict[str, Any]] = {
+        first: [one for one in known if one[0].rpartition(":")[2] not in _NUMBERS]
+        for first, known in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         """Refuse aliases, with which ten lines stand for a thousand million."""
@@ -238,21 +292,31 @@ class _Loader(yaml.SafeLoader):
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """Refuse a key that is given twice, of which YAML silently keeps the last."""
-        seen = set()
+        seen: set[Any] = set()
         for key_node, _ in node.value:
-            key = key_node.value if isinstance(key_node, yaml.ScalarNode) else None
-            if key is not None and key in seen:
+            if not isinstance(key_node, yaml.ScalarNode):
+                continue
+            key = self.construct_object(key_node)
+            if key in seen:  # 1, 1.0 and true are one key of a dict
                 raise yaml.constructor.ConstructorError(
-                    None, None, f"key {key!r} is given twice", key_node.start_mark
+                    None, None, f"key {key_node.value!r} is given twice", key_node.start_mark
                 )
             seen.add(key)
         return super().construct_mapping(node, deep)
 
 
-# 1e-3 is a number in YAML 1.2, and a text in the 1.1 that PyYAML reads.
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+$"), [*"-+0123456789"]
-)
+def _whole_number(loader: _Loader, node: yaml.ScalarNode) -> int:
+    """A whole number in base 10, whatever it begins with, or behind 0x or 0o."""
+    text = node.value.replace("_", "")
+    return int(text, 0 if text[:2] in ("0x", "0o") else 10)
+
+
+for _kind, _pattern in _NUMBERS.items():
+    _firsts = "tTfF" if _kind == "bool" else "-+.0123456789"
+    _Loader.add_implicit_resolver(
+        f"tag:yaml.org,2002:{_kind}", re.compile(f"^(?:{_pattern})$"), list(_firsts)
+    )
+_Loader.add_constructor("tag:yaml.org,2002:int", _whole_number)
 
 
 def load_yaml(text: str) -> Any:
@@ -278,11 +342,11 @@ def parse_named(text: str, kind: str) -> tuple[str, dict[str, Any]]:
     Raises:
         InputError: an option without ``=``, or a value that is not YAML.
     """
-    name, *parts = text.split(",")
+    name, *parts = _BETWEEN_OPTIONS.split(text)
     options = {}
     for part in parts:
         option, equals, value = part.partition("=")
-        if not equals or not option.isidentifier():
+        if not equals or not all(part.isidentifier() for part in option.split(".")):
             raise InputError(f"{kind} {text!r}: {part!r} is not option=value")
         options[option] = parse_value(value, option)
     return name, options

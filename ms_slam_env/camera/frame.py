@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import numbers
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ms_slam_env.camera.intrinsics import Intrinsics
 from ms_slam_env.errors import InputError
 
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
@@ -32,6 +34,12 @@ class RGBDFrame:
 
     def __post_init__(self) -> None:
         """Refuse frames that would poison what follows."""
+        for name in ("color", "depth"):
+            if not isinstance(getattr(self, name), np.ndarray):
+                kind = type(getattr(self, name)).__name__
+                raise InputError(f"{name} must be an array, got a {kind}")
+        if not isinstance(self.timestamp, numbers.Real):
+            raise InputError(f"timestamp = {self.timestamp!r} must be a number of seconds")
         if self.color.ndim != 3 or self.color.shape[2] != 3 or self.color.dtype != np.uint8:
             raise InputError(
                 f"color must be (H, W, 3) uint8, got {self.color.shape} {self.color.dtype}"
@@ -43,6 +51,27 @@ class RGBDFrame:
         if not np.issubdtype(self.depth.dtype, np.floating):
             raise InputError(f"depth must be float metres, got {self.depth.dtype}")
         check_readings(self.depth)
+
+
+def check_camera(intrinsics: object) -> None:
+    """Refuse what is no camera.
+
+    Raises:
+        InputError: naming what it is.
+    """
+    if not isinstance(intrinsics, Intrinsics):
+        raise InputError(f"a camera must be an Intrinsics, got a {type(intrinsics).__name__}")
+
+
+def check_frame(frame: object, intrinsics: Intrinsics) -> None:
+    """Refuse what is no frame of a camera.
+
+    Raises:
+        InputError: naming what it is, or both sizes.
+    """
+    if not isinstance(frame, RGBDFrame):
+        raise InputError(f"a frame must be an RGBDFrame, got a {type(frame).__name__}")
+    intrinsics.check_image(frame.depth, "frame")
 
 
 def check_readings(depth: NDArray[np.floating]) -> None:
@@ -63,7 +92,10 @@ def intensity_image(image: ArrayLike) -> NDArray[np.uint8]:
     Raises:
         InputError: another shape or type.
     """
-    array = np.asarray(image)
+    try:
+        array = np.asarray(image)
+    except ValueError:  # rows of several lengths
+        raise InputError("an image must be an array") from None
     if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3):
         raise InputError(f"an image must be (H, W) or (H, W, 3), got {array.shape}")
     if array.dtype != np.uint8:

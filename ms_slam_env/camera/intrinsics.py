@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from numbers import Integral, Real
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -54,13 +55,18 @@ class Intrinsics:
 
     def __post_init__(self) -> None:
         """Refuse values that no camera has."""
+        numbers = (self.fx, self.fy, self.cx, self.cy)
+        for value in (*numbers, self.width, self.height):
+            if not isinstance(value, Real) or isinstance(value, bool):
+                raise InputError(f"intrinsics must be numbers, got {value!r}")
+        if not isinstance(self.width, Integral) or not isinstance(self.height, Integral):
+            raise InputError(f"image size {self.width}x{self.height} must be whole pixels")
         if not 1 <= min(self.width, self.height) <= max(self.width, self.height) <= LARGEST_SIDE:
             raise InputError(
                 f"image size {self.width}x{self.height} must be at least 1x1 and at most "
                 f"{LARGEST_SIDE}x{LARGEST_SIDE}"
             )
-        numbers = (self.fx, self.fy, self.cx, self.cy)
-        if not all(math.isfinite(number) for number in numbers) or min(self.fx, self.fy) <= 0:
+        if not all(abs(number) < math.inf for number in numbers) or min(self.fx, self.fy) <= 0:
             raise InputError(f"focal lengths and centre must be finite, fx, fy > 0: {numbers}")
         if min(self.fx, self.fy) < 1 / LARGEST_NUMBER or max(map(abs, numbers)) > LARGEST_NUMBER:
             raise InputError(

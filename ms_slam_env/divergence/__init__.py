@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ms_slam_env.camera import Intrinsics
+from ms_slam_env.camera import Intrinsics, check_camera
 from ms_slam_env.divergence.config import MEASURES, DivergenceConfig
 from ms_slam_env.divergence.counting import Histograms
 from ms_slam_env.divergence.measures import (
@@ -12,6 +12,7 @@ from ms_slam_env.divergence.measures import (
     WindowedKLDivergence,
 )
 from ms_slam_env.divergence.pairwise import depth_divergence, intensity_divergence, ms_parameters
+from ms_slam_env.errors import InputError
 
 _VARIANTS: dict[str, type[Divergence]] = {
     "kl": KLDivergence,
@@ -24,6 +25,9 @@ def make_divergence(
     config: DivergenceConfig, intrinsics: Intrinsics, device: str = "cpu"
 ) -> Divergence:
     """Return the divergence that ``config.measure`` names, for images of ``intrinsics``."""
+    check_camera(intrinsics)
+    if not isinstance(config, DivergenceConfig):
+        raise InputError(f"config must be a DivergenceConfig, got a {type(config).__name__}")
     return _VARIANTS[config.measure](config, intrinsics, device)
 
 

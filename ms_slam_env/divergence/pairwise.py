@@ -7,12 +7,13 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
+from ms_slam_env.camera import Intrinsics, RGBDFrame, check_camera, intensity_image
 from ms_slam_env.camera.frame import check_readings
 from ms_slam_env.divergence.config import DivergenceConfig
 from ms_slam_env.divergence.counting import HistogramCounter, grouping_matrix, normalise
 from ms_slam_env.divergence.measures import kl_divergence
 from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import as_numbers
 
 _PAPER = DivergenceConfig.paper()
 
@@ -94,7 +95,7 @@ def ms_parameters(divergences: ArrayLike) -> tuple[float, float]:
     Raises:
         InputError: another shape, no rows, or values that are not finite and >= 0.
     """
-    values = np.asarray(divergences, dtype=np.float64)
+    values = as_numbers(divergences, "divergences")
     if values.ndim != 2 or values.shape[1] != 2 or len(values) == 0:
         raise InputError(f"divergences must be (T, 2) with T >= 1, got {values.shape}")
     if not np.isfinite(values).all() or (values < 0).any():
@@ -123,7 +124,11 @@ def _intensity_distribution(
 
 def _depth_image(image: ArrayLike | RGBDFrame, intrinsics: Intrinsics) -> NDArray[np.float32]:
     """Depth (H, W) float32 of one image, checked."""
-    depth = np.asarray(image.depth if isinstance(image, RGBDFrame) else image)
+    check_camera(intrinsics)
+    try:
+        depth = np.asarray(image.depth if isinstance(image, RGBDFrame) else image)
+    except ValueError:  # rows of several lengths
+        raise InputError("depth must be an array") from None
     if depth.ndim != 2 or not np.issubdtype(depth.dtype, np.floating):
         raise InputError(f"depth must be (H, W) float metres, got {depth.shape} {depth.dtype}")
     intrinsics.check_image(depth, "depth")

@@ -409,6 +409,8 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         Raises:
             InputError: no action of the action space, or no reset before.
         """
+        if not isinstance(actions, Iterable):
+            raise InputError(f"actions = {actions!r} must be several")
         state = self.save_state()
         foreseen = []
         for action in actions:

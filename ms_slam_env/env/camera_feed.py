@@ -18,6 +18,7 @@ from ms_slam_env.sequences.perturbations.base import Perturbation
 from ms_slam_env.sequences.perturbations.movers import Mover
 from ms_slam_env.sequences.perturbed_camera import Imperfections, PerturbedCamera
 from ms_slam_env.sequences.trajectory import PoseInterpolation
+from ms_slam_env.slam.state_check import MOST, SEED, ListOf, Real
 
 Float64 = NDArray[np.float64]
 
@@ -33,8 +34,8 @@ class CameraFeed(ABC):
     """
 
     perturbations: tuple[Perturbation, ...] = ()
-    example: ClassVar[Mapping[str, Any]] = {"noise_seed": 0}
-    """A state, as small as there is."""
+    state_like: ClassVar[Mapping[str, Any]] = {"noise_seed": SEED}
+    """What ``state_check`` compares states with."""
 
     @property
     def lens(self) -> Distortion:
@@ -118,7 +119,11 @@ class PerturbedFeed(CameraFeed):
     begins where the camera of the start can see it, and waits rather than bump into the camera.
     """
 
-    example: ClassVar[Mapping[str, Any]] = {"noise_seed": 0, "brightness": [], "waits": []}
+    state_like: ClassVar[Mapping[str, Any]] = {
+        "noise_seed": SEED,
+        "brightness": ListOf(Real(0, 255), "metered"),
+        "waits": ListOf(ListOf((0.0, Real(0, MOST)))),
+    }
 
     def __init__(self, perturbations: tuple[Perturbation, ...]) -> None:
         """Take the perturbations.

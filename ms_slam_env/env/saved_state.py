@@ -67,11 +67,11 @@ def _check_parts_of(
     """Refuse parts of a state that do not belong into a world."""
     like = {
         "slam": simulation.fresh_slam,
-        "embodiment": world.embodiment.get_state(),
+        "embodiment": world.embodiment.state_like(),
         "coverage": world.coverage.get_state(),
         "T_world_kinematic": np.eye(4),
         "random": rng.bit_generator.state,
-        "camera_feed": simulation.camera_feed.example,
+        "camera_feed": simulation.camera_feed.state_like,
     }
     for name, own in like.items():
         check_like(state[name], own, name)

@@ -17,12 +17,12 @@ from ms_slam_env.env.coverage import CoverageGrid
 from ms_slam_env.env.embodiments import EmbodimentType
 from ms_slam_env.env.episode import Episode
 from ms_slam_env.env.pose_sources import POSE_SOURCES
-from ms_slam_env.errors import InputError, UnreachableError
+from ms_slam_env.errors import InputError, UnreachableError, unknown
 from ms_slam_env.geometry import invert
 from ms_slam_env.mapping import OccupancyGrid
 from ms_slam_env.robot import Embodiment, MotionResult
 from ms_slam_env.scenes.base import Scene
-from ms_slam_env.scenes.registry import SceneName, name_of
+from ms_slam_env.scenes.registry import SCENES, SceneName, name_of
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sensor.scene_cache import get_scene, get_sensor
 from ms_slam_env.slam.base import SlamBackend, TrackResult
@@ -85,7 +85,7 @@ class Simulation:
         self.place: tuple[SceneName, int] | None = None
         self.episode: Episode | None = None
         self.carves = False
-        self.fresh_slam = slam.get_state()
+        self.fresh_slam = slam.state_like()
 
     # -- The start of an episode -------------------------------------------------------------
 
@@ -96,13 +96,20 @@ class Simulation:
         self.world = self.world_of(name, scene_seed)
 
     def place_of(self, episode: Episode) -> tuple[SceneName, int]:
-        """Where an episode is: a scene of the options, even if a function, or one by its name."""
+        """Where an episode is: a scene of the options, even if a function, or one of ours.
+
+        Raises:
+            InputError: another name: it may be that of code, or of a file.
+        """
         if self.place is not None:
             name, seed = self.place
             if (name_of(name), seed) == (episode.scene, episode.scene_seed):
                 return self.place
         own = {name_of(name): name for name in self.config.scenes}
-        return own.get(episode.scene, episode.scene), episode.scene_seed
+        own |= {name: name for name in SCENES if name not in own}
+        if episode.scene not in own:
+            raise unknown("scene of a state", episode.scene, own)
+        return own[episode.scene], episode.scene_seed
 
     def world_of(self, name: SceneName, scene_seed: int) -> World:
         """A scene and what stands in it."""

@@ -11,7 +11,6 @@ from itertools import takewhile
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.divergence import Histograms
@@ -19,11 +18,19 @@ from ms_slam_env.env.episode import Episode, FrameRecord
 from ms_slam_env.errors import InputError
 from ms_slam_env.mapping import OccupancyGrid
 from ms_slam_env.slam.state_check import (
+    MOST,
+    SEED,
+    ArrayOf,
+    OrNone,
+    Real,
+    WholeNumber,
     check_array,
     check_keys,
+    check_like,
     check_list,
     check_mapping,
     check_plain,
+    stacked,
     wrong,
 )
 
@@ -33,14 +40,31 @@ PARTS = (
 )
 """Keys of a saved state of an environment."""
 
-_COUNTED = dict.fromkeys(("scene_seed", "noise_seed", "action", "steps_lost", "steps_away"), 0)
-_MEASURED = dict.fromkeys(("energy_j", "inlier_fraction", "squared_error_sum"), 0.0)
-_OF_EPISODE = {"scene": "", "tracking_ok": True, **_COUNTED, **_MEASURED}
-_OF_RECORD = {"tracking_ok": True, "processed": True, "submap": 0, "time_s": 0.0, "pose_error": 0.0}
+_STEPS = WholeNumber(most="steps")
+_OF_EPISODE = {
+    "scene": "",
+    "scene_seed": SEED,
+    "noise_seed": SEED,
+    "energy_j": Real(0, MOST),
+    "action": WholeNumber(index_of="motions"),
+    "steps_lost": _STEPS,
+    "steps_away": _STEPS,
+    "tracking_ok": True,
+    "inlier_fraction": Real(0, 1),
+    "squared_error_sum": Real(0),
+    "pose_covariance": OrNone(np.zeros((6, 6))),
+    "predicted_divergences": OrNone(ArrayOf(np.float64, ("motions", 2))),
+}
+_OF_RECORD = {
+    "tracking_ok": True,
+    "processed": True,
+    "submap": WholeNumber(index_of="frames"),
+    "time_s": Real(0, MOST),
+    "pose_error": Real(0),
+}
 _POSES = ("T_world_camera", "T_world_camera_kinematic", "T_world_camera_estimate")
-_COVARIANCE = np.zeros((6, 6))
 _ARRAYS_OF_RECORD = {**dict.fromkeys(_POSES, np.zeros((0, 4, 4))), "divergence": np.zeros((0, 2))}
-_SUM_ERROR = 1e-6  # of a distribution
+_ROUNDING = 1e-6  # of distances and their squares, metres
 _FARTHEST_CELL = 1_000_000  # of an occupancy grid; far from what would overflow
 
 
@@ -103,21 +127,16 @@ def check_episode(
     if type(episode) is not Episode:
         raise wrong("episode", f"is a {type(episode).__name__}, not an Episode")
     _check_all_fields(episode, "episode")
-    for name, like in _OF_EPISODE.items():
-        check_plain(getattr(episode, name), like, f"episode.{name}")
-    if episode.action >= motions:
-        raise wrong("episode.action", f"is {episode.action}; there are {motions} motions")
+    _check_steps(episode.divergences_of_steps)
+    _check_records(episode.frames, own.frames if own else [])
+    lengths = {"motions": motions, "steps": len(episode.divergences_of_steps)}
+    given = {name: getattr(episode, name) for name in _OF_EPISODE}
+    check_like(given, _OF_EPISODE, "episode", lengths)
+    _check_errors(episode)
     _check_terms(episode.reward_terms)
     _check_frame(episode.frame, shape)
     for one in (episode.histograms, episode.step_histograms):
         _check_histograms(one, histograms)
-    _check_steps(episode.divergences_of_steps)
-    _check_records(episode.frames, own.frames if own else [])
-    if episode.pose_covariance is not None:
-        check_array(episode.pose_covariance, _COVARIANCE, "episode.pose_covariance")
-    if episode.predicted_divergences is not None:
-        like = np.zeros((motions, 2))
-        check_array(episode.predicted_divergences, like, "episode.predicted_divergences")
     if carves != (episode.occupancy is not None):
         raise wrong("episode.occupancy", "is missing" if carves else "is one too many")
     if carves:
@@ -152,10 +171,9 @@ def _check_histograms(one: Any, like: Histograms) -> None:
         raise wrong(where, f"is a {type(one).__name__}, not Histograms")
     _check_all_fields(one, where)
     for name in ("intensity", "normals"):
-        rows = getattr(one, name)
-        check_array(rows, getattr(like, name), f"{where}.{name}")
-        if (rows < 0).any() or (np.abs(rows.sum(axis=-1) - 1) > _SUM_ERROR).any():
-            raise wrong(f"{where}.{name}", "are no distributions")
+        rows = getattr(like, name)
+        distribution = ArrayOf(rows.dtype, rows.shape, least=0, is_distribution=True)
+        check_like(getattr(one, name), distribution, f"{where}.{name}")
 
 
 def _check_occupancy(grid: Any) -> None:
@@ -180,7 +198,23 @@ def _check_steps(divergences: Any) -> None:
     check_list(divergences, where)
     if not divergences:
         raise wrong(where, "has no step")
-    check_array(_stacked(divergences, where), np.zeros((0, 2)), where)
+    check_array(stacked(divergences, where), np.zeros((0, 2)), where)
+
+
+def _check_errors(episode: Episode) -> None:
+    """The distances between truth and estimate are what the poses say, time goes on."""
+    errors = np.array([record.pose_error for record in episode.frames])
+    truth, estimate = (
+        np.array([getattr(record, name)[:3, 3] for record in episode.frames])
+        for name in ("T_world_camera", "T_world_camera_estimate")
+    )
+    off = np.linalg.norm(estimate - truth, axis=1)
+    if not np.allclose(errors, off, rtol=_ROUNDING, atol=_ROUNDING):
+        raise wrong("episode.frames", "has a pose_error that its poses do not have")
+    if not np.isclose(episode.squared_error_sum, errors @ errors, rtol=_ROUNDING, atol=_ROUNDING):
+        raise wrong("episode.squared_error_sum", "is not that of its frames")
+    if (np.diff([record.time_s for record in episode.frames]) < 0).any():
+        raise wrong("episode.frames", "goes back in time")
 
 
 def _check_records(records: Any, own: Sequence[FrameRecord]) -> None:
@@ -194,17 +228,8 @@ def _check_records(records: Any, own: Sequence[FrameRecord]) -> None:
         if not isinstance(record, FrameRecord):
             raise wrong(where, f"holds a {type(record).__name__}, not a FrameRecord")
         _check_all_fields(record, where)
-        for name, like in _OF_RECORD.items():
-            check_plain(getattr(record, name), like, f"{where}.{name}")
+        given = {name: getattr(record, name) for name in _OF_RECORD}
+        check_like(given, _OF_RECORD, where, {"frames": len(records)})
     for name, empty in _ARRAYS_OF_RECORD.items():
         if new:
-            check_array(_stacked([getattr(one, name) for one in new], where), empty, where)
-
-
-def _stacked(arrays: list[Any], where: str) -> NDArray[Any]:
-    """Arrays of one shape as one array; what is no array makes none of numbers."""
-    if not all(isinstance(array, np.ndarray) for array in arrays):
-        raise wrong(where, "holds something else than arrays")
-    if len({array.shape for array in arrays}) > 1:
-        raise wrong(where, "holds arrays of several shapes")
-    return np.array(arrays)
+            check_array(stacked([getattr(one, name) for one in new], where), empty, where)

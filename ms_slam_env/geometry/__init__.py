@@ -2,6 +2,7 @@
 
 from ms_slam_env.geometry.pose import (
     MAX_COORDINATE_M,
+    as_numbers,
     check_pose,
     invert,
     look_at,
@@ -18,6 +19,7 @@ __all__ = [
     "MAX_COORDINATE_M",
     "Float64",
     "adjoint",
+    "as_numbers",
     "check_pose",
     "hat",
     "invert",

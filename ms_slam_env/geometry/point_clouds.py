@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from scipy.spatial import cKDTree
 
 from ms_slam_env.errors import InputError
+from ms_slam_env.geometry.pose import as_numbers
 
 Float64 = NDArray[np.float64]
 
@@ -21,10 +22,7 @@ def check_points(points: ArrayLike, name: str) -> Float64:
     Raises:
         InputError: wrong shape, no points, values that are not finite or not numbers.
     """
-    try:
-        values = np.asarray(points, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{name} is not an array of numbers") from None
+    values = as_numbers(points, name)
     if values.ndim != 2 or values.shape[1] != 3:
         raise InputError(f"{name} must be (N, 3), got {values.shape}")
     if len(values) == 0:

@@ -15,6 +15,20 @@ MAX_COORDINATE_M = 1e9
 _IDENTITY = np.eye(4)
 
 
+def as_numbers(values: ArrayLike, name: str) -> Float64:
+    """``values`` as a float64 array.
+
+    Raises:
+        InputError: they are no array of numbers.
+    """
+    try:
+        if not np.iscomplexobj(values):
+            return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        pass
+    raise InputError(f"{name} is not an array of numbers") from None
+
+
 def check_pose(T: ArrayLike, name: str = "pose") -> Float64:
     """Return ``T`` as float64 (4, 4) after checking that it is a rigid motion.
 
@@ -25,7 +39,7 @@ def check_pose(T: ArrayLike, name: str = "pose") -> Float64:
     """
     try:
         matrix = np.asarray(T, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError(f"{name} must be a (4, 4) array of numbers, got {T!r}") from None
     if matrix.shape != (4, 4):
         raise InputError(f"{name} must have shape (4, 4), got {matrix.shape}")

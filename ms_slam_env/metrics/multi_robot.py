@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import Float64
+from ms_slam_env.geometry import Float64, as_numbers
 from ms_slam_env.metrics.relative import motion_errors, relative_errors
 from ms_slam_env.metrics.trajectory import (
     ErrorStatistics,
@@ -159,7 +159,7 @@ def task_time(times: Sequence[ArrayLike]) -> float:
     """
     if len(times) == 0:
         raise InputError("no robot given")
-    arrays = [np.asarray(t, dtype=np.float64) for t in times]
+    arrays = [as_numbers(t, f"times of robot {k}") for k, t in enumerate(times)]
     for k, array in enumerate(arrays):
         increases = array.ndim == 1 and len(array) > 0 and (np.diff(array) > 0).all()
         if not (increases and np.isfinite(array).all()):

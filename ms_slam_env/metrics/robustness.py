@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import logm
 
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.geometry import Float64
+from ms_slam_env.geometry import Float64, as_numbers
 from ms_slam_env.geometry.point_clouds import umeyama
 from ms_slam_env.metrics.trajectory import check_pair, check_positions, check_positive
 
@@ -157,8 +157,8 @@ def relocalisation_times(timestamps: ArrayLike, black: ArrayLike, tracked: Array
         InputError: arrays of other or unequal shapes, times that are not finite and ascending, or
             no frame at all.
     """
-    times = np.asarray(timestamps, dtype=np.float64)
-    hidden, found = np.asarray(black, dtype=bool), np.asarray(tracked, dtype=bool)
+    times = as_numbers(timestamps, "timestamps")
+    hidden, found = (as_numbers(one, "black, tracked") != 0 for one in (black, tracked))
     if times.ndim != 1 or len(times) == 0 or not times.shape == hidden.shape == found.shape:
         raise InputError(
             f"timestamps {times.shape}, black {hidden.shape} and tracked {found.shape} must be of "
@@ -247,7 +247,7 @@ def local_scales(
             not positive.
     """
     positions, true_positions = check_pair(estimate, truth, need_poses=False)
-    seconds = np.asarray(times, dtype=np.float64)
+    seconds = as_numbers(times, "times")
     if seconds.shape != (len(positions),) or not (np.diff(seconds) > 0).all():
         raise InputError(f"times must be ({len(positions)},) and increase")
     check_positive(window_s, "window_s")
@@ -294,7 +294,7 @@ def initialisation(
         if value is not None:
             check_positive(value, name)
     scales = local_scales(times, estimate, truth, window_s)
-    seconds = np.asarray(times, dtype=np.float64)
+    seconds = as_numbers(times, "times")
     if global_scale is None:
         positions = check_positions(estimate, "estimate")
         global_scale = umeyama(positions, check_positions(truth, "truth"), with_scale=True)[2]

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.geometry import Float64, invert, so3_exp
+from ms_slam_env.geometry import Float64, as_numbers, invert, so3_exp
 from ms_slam_env.geometry.point_clouds import umeyama
 
 P = ParamSpec("P")
@@ -81,7 +81,7 @@ def rotation_angles(R: Float64) -> Float64:
 
 def check_positions(trajectory: ArrayLike, name: str) -> Float64:
     """Positions (N, 3) of poses (N, 4, 4) or positions (N, 3), checked."""
-    values = _numbers(trajectory, name)
+    values = as_numbers(trajectory, name)
     if values.ndim == 3 and values.shape[1:] == (4, 4):
         values = values[:, :3, 3]
     if values.ndim != 2 or values.shape[1] != 3:
@@ -91,7 +91,7 @@ def check_positions(trajectory: ArrayLike, name: str) -> Float64:
 
 def check_poses(trajectory: ArrayLike, name: str) -> Float64:
     """Poses (N, 4, 4), checked."""
-    values = _numbers(trajectory, name)
+    values = as_numbers(trajectory, name)
     if values.ndim != 3 or values.shape[1:] != (4, 4):
         raise InputError(f"{name} must be (N, 4, 4) poses, got {values.shape}")
     return _filled(values, name)
@@ -99,7 +99,7 @@ def check_poses(trajectory: ArrayLike, name: str) -> Float64:
 
 def check_times(times: ArrayLike, count: int, name: str = "times") -> Float64:
     """Times (N,) in seconds, finite and increasing, of ``count`` poses, checked."""
-    values = _numbers(times, name)
+    values = as_numbers(times, name)
     if values.shape != (count,) or not (np.isfinite(values).all() and (np.diff(values) > 0).all()):
         raise InputError(f"{name} must be ({count},), finite and increase")
     return values
@@ -153,13 +153,6 @@ def with_arguments_of(
         return of_arguments
 
     return wrap
-
-
-def _numbers(values: ArrayLike, name: str) -> Float64:
-    try:
-        return np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{name} is not an array of numbers") from None
 
 
 def _filled(values: Float64, name: str) -> Float64:

@@ -94,6 +94,10 @@ class Embodiment(ABC):
     def get_state(self) -> dict[str, Any]:
         """Everything needed to go on bit-exactly."""
 
+    def state_like(self) -> dict[str, Any]:
+        """A state with which others are compared; NaN stands where there may be none."""
+        return self.get_state()
+
     @abstractmethod
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state that ``get_state`` returned."""

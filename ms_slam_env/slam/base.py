@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import as_numbers
 from ms_slam_env.slam.state import Stateful
 from ms_slam_env.slam.state_check import check_like
 from ms_slam_env.slam.state_file import read_state, write_state
@@ -20,6 +22,10 @@ from ms_slam_env.slam.submaps import Submaps, one_submap
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+
+
+LARGEST_CUTOFF_M = 12.0
+"""Of depth, by any backend: as far as a sensor model reads (``RangeNoise``)."""
 
 
 @dataclass(frozen=True)
@@ -254,7 +260,7 @@ class SlamBackend(Stateful):
         own = self.get_state()
         try:
             self.reset()
-            check_like(state, self.get_state(), "map")
+            check_like(state, self.state_like(), "map")
             self.set_state(state)
         except Exception as error:  # whatever a part makes of what only looks like its state
             self.set_state(own)
@@ -283,11 +289,13 @@ def _camera(backend: SlamBackend) -> dict[str, Any]:
 
 def check_views(poses: ArrayLike, scale: float) -> Float64:
     """``poses`` as an array (N, 4, 4); refuse another shape, and a scale outside (0, 1]."""
-    stack = np.asarray(poses, dtype=np.float64)
+    stack = as_numbers(poses, "poses")
     if stack.ndim != 3 or stack.shape[1:] != (4, 4):
         raise InputError(f"poses must have shape (N, 4, 4), got {stack.shape}")
-    if not 0 < scale <= 1:
-        raise InputError(f"scale = {scale} is outside (0, 1]")
+    if not np.isfinite(stack).all():
+        raise InputError("poses hold a value that is not finite")
+    if not isinstance(scale, Real) or not 0 < scale <= 1:
+        raise InputError(f"scale = {scale!r} is outside (0, 1]")
     return stack
 
 

@@ -122,7 +122,10 @@ def open_map(path: str | Path, lost: bool = True, **params: Any) -> SlamBackend:
     intrinsics = _part(read_about(Path(path)), "intrinsics", path)
     saved = configuration_of_map(path)
     camera = from_dict(Intrinsics, intrinsics, f"{path}: intrinsics")
-    made = make_backend(saved.slam, camera, merged(saved.slam_config, params))
+    try:
+        made = make_backend(saved.slam, camera, merged(saved.slam_config, params))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
     made.load(path, lost)
     return made
 

@@ -15,6 +15,7 @@ from ms_slam_env.slam.feature_matching import match_anywhere
 from ms_slam_env.slam.features import FeatureExtractor, Features, InverseDepth
 from ms_slam_env.slam.point_poses import Sightings, pose_from_matches, refine_pose
 from ms_slam_env.slam.state import Saved
+from ms_slam_env.slam.state_check import ListOf, WholeNumber
 
 _HAMMING = 60  # largest distance of matching descriptors, bits of 256
 _ERROR_PX = 2.5  # of a match that RANSAC counts
@@ -127,6 +128,15 @@ class KeyframeImages(FrameFeatures, Saved):
     def fitting(self, intrinsics: Intrinsics) -> KeyframeImages:
         """Itself for a camera with these intrinsics, or one without images."""
         return self if intrinsics == self.intrinsics else KeyframeImages(intrinsics)
+
+    def state_like(self) -> Any:
+        """See ``Stateful``."""
+        shape = self.intrinsics.shape
+        return {
+            "times": ListOf(WholeNumber(), "images"),
+            "grey": ListOf(np.zeros(shape, np.uint8), "images"),
+            "depth": ListOf(np.zeros(shape, np.float32), "images"),
+        }
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state; features are sought anew."""

@@ -19,6 +19,7 @@ from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose
 from ms_slam_env.slam.state import Stateful
+from ms_slam_env.slam.state_check import ArrayOf
 
 _THRESHOLDS = (32.0, 224.0)  # on colours, after that
 _AVERAGED = 8  # rows and columns of the image, at least, that a reduced pixel is the mean of
@@ -257,6 +258,13 @@ class FernDatabase(Stateful):
     def get_state(self) -> dict[str, Any]:
         """The keyframes."""
         return {name[1:]: getattr(self, name)[: self._count].copy() for name in _ROWS}
+
+    def state_like(self) -> Any:
+        """See ``Stateful``."""
+        return {
+            name: ArrayOf(rows.dtype, ("ferns", *rows.shape[1:]), 0 if name == "times" else None)
+            for name, rows in self.get_state().items()
+        }
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state of a database of the same camera, configuration and seed."""

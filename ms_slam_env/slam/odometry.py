@@ -20,9 +20,10 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, relative_angle
 from ms_slam_env.slam.alignment_check import NO_ALIGNMENT, AcceptanceThresholds
 from ms_slam_env.slam.alignment_measures import DepthImage, check_alignment
-from ms_slam_env.slam.base import BorrowedMap, Float64
+from ms_slam_env.slam.base import LARGEST_CUTOFF_M, BorrowedMap, Float64
 from ms_slam_env.slam.pose_hypotheses import motion_hypotheses
 from ms_slam_env.slam.semi_dense import SemiDenseAligner
+from ms_slam_env.slam.state_check import ArrayOf, OrNone
 from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
 from ms_slam_env.slam.tracking_template import Attempt, FrameByFrameSlam
 
@@ -48,7 +49,7 @@ class OdometryConfig(Checked):
             becomes the keyframe where the camera was last.
     """
 
-    depth_cutoff_m: float = bounded(4.0, 0.1, 10.0)
+    depth_cutoff_m: float = bounded(4.0, 0.1, LARGEST_CUTOFF_M)
     keyframe_m: float = bounded(0.04, 0.0, 1.0)
     keyframe_deg: float = bounded(3.0, 0.0, 90.0)
     least_overlap: float = bounded(0.3, 0.0, 1.0)
@@ -240,6 +241,12 @@ class OdometrySlam(BorrowedMap, FrameByFrameSlam[DepthImage, _Placed]):
             "key": _save(self._key),
             "last": None if self._last is self._key else _save(self._last),
         }
+
+    def state_like(self) -> Any:
+        """See ``Stateful``."""
+        image = ArrayOf(np.float32, self.intrinsics.shape, least=0)
+        placed = OrNone({"pose": np.eye(4), "depth": image, "intensity": image})
+        return super().state_like() | {"key": placed, "last": placed}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state of a backend of the same intrinsics and configuration."""

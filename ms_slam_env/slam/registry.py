@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
-from ms_slam_env.camera import Intrinsics
+from ms_slam_env.camera import Intrinsics, check_camera
 from ms_slam_env.config import from_dict, is_options
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.extension import ExtensionPoint, check_options
@@ -52,6 +52,7 @@ def make_backend(name: object, intrinsics: Intrinsics, params: Mapping[str, Any]
     Raises:
         InputError: unknown backend, unknown parameter or value out of range.
     """
+    check_camera(intrinsics)
     config = check_parameters(name, params)
     entry = POINT.find(name)
     if not isinstance(entry, BackendEntry):

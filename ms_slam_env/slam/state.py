@@ -21,6 +21,13 @@ class Stateful(ABC):
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state that ``get_state`` of an object made in the same way returned."""
 
+    def state_like(self) -> Any:
+        """What ``state_check`` compares states with; the object is as it was made, or reset.
+
+        A fresh state, but where that is no example of others.
+        """
+        return self.get_state()
+
 
 class Saved(Stateful):
     """An object whose state is the values of the attributes that ``saved`` names.
@@ -36,6 +43,10 @@ class Saved(Stateful):
     def get_state(self) -> dict[str, Any]:
         """Copies of the attributes, by their names without a leading underscore."""
         return {_key(name): _state_of(getattr(self, name)) for name in self.saved}
+
+    def state_like(self) -> Any:
+        """See ``Stateful``."""
+        return {_key(name): _like_of(getattr(self, name)) for name in self.saved}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Take the attributes from a state.
@@ -71,6 +82,14 @@ def _state_of(value: Any) -> Any:
     if isinstance(value, list):
         return [_state_of(each) for each in value]
     return deepcopy(value)
+
+
+def _like_of(value: Any) -> Any:
+    if isinstance(value, Stateful):
+        return value.state_like()
+    if isinstance(value, list):
+        return [_like_of(each) for each in value]
+    return _state_of(value)
 
 
 def _restored(value: Any, state: Any) -> Any:

@@ -1,13 +1,15 @@
 """Whether a state may be gone on from: what it holds, of which type, shape and size.
 
-There is no second description of what each part keeps: a part is compared with one that the same
-object made itself, whose arrays and tables are the smallest that there are.
+A state is compared with what ``Stateful.state_like`` says of it: with a fresh state, in which
+`ArrayOf`, `ListOf`, `WholeNumber`, `OrNone` and `Fields` stand where a fresh one is no example, and
+say how lengths and indices hang together.
 """
 
 from __future__ import annotations
 
 import numbers
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,46 +17,247 @@ from numpy.typing import NDArray
 
 from ms_slam_env.errors import InputError
 
-_TABLES = (  # arrays with a row for each of the same things
-    ("position", "normal", "color", "radius", "confidence", "created", "seen"),
-    ("bits", "known", "poses", "times"),
-    ("dropped", "offsets"),
-)
 _IDENTITY = np.eye(3)
 _RIGID = 1e-4  # as ``check_pose`` has it
 _KINDS: tuple[Any, ...] = ((bool, np.bool_), numbers.Integral, (float, np.floating), str, tuple)
-_MOST = 2**31  # counts and seeds of noise are below
+_SUM_ERROR = 1e-6  # of a distribution
+MOST = 2**30
+"""Largest number of anything that is counted: no count to come overflows 32 bits."""
+_MOST_SEED = 2**31 - 1
 
 
-def check_like(value: Any, like: Any, where: str) -> None:
+@dataclass(frozen=True)
+class WholeNumber:
+    """A whole number of a state.
+
+    Attributes:
+        least: smallest.
+        most: largest, or the name of a length that is.
+        index_of: name of a length that it must be below; of none, too, 0 says the first.
+    """
+
+    least: int = 0
+    most: int | str = MOST
+    index_of: str = ""
+
+
+SEED = WholeNumber(most=_MOST_SEED)
+"""Of noise, or of a scene."""
+
+
+@dataclass(frozen=True)
+class Real:
+    """A number of a state between ``least`` and ``most``, which may be infinite."""
+
+    least: float = -np.inf
+    most: float = np.inf
+
+
+@dataclass(frozen=True)
+class ArrayOf:
+    """An array of a state.
+
+    Attributes:
+        dtype: of its elements.
+        shape: a name stands for one length, wherever it occurs in a state, or in one mapping or
+            list of a list in it.
+        least: smallest element; None: whatever is finite.
+        index_of: name of a length that all elements must be below.
+        may_be_nan: whether NaN means none.
+        is_distribution: whether it adds up to 1 along the last axis.
+    """
+
+    dtype: Any
+    shape: tuple[int | str, ...]
+    least: float | None = None
+    index_of: str = ""
+    may_be_nan: bool = False
+    is_distribution: bool = False
+
+
+@dataclass(frozen=True)
+class ListOf:
+    """A list of a state, of things that look alike.
+
+    Attributes:
+        of: what they look like.
+        length: its name, or the largest.
+        rising: key of mappings, a whole number that is larger from one to the next.
+    """
+
+    of: Any
+    length: int | str = MOST
+    rising: str = ""
+
+
+@dataclass(frozen=True)
+class OrNone:
+    """None, or something that looks like ``of``."""
+
+    of: Any
+
+
+@dataclass(frozen=True)
+class Fields:
+    """A mapping of a state with a rule of its own, which says what is wrong, or nothing."""
+
+    of: Mapping[str, Any]
+    rule: Callable[[Any], str]
+
+
+@dataclass(frozen=True)
+class Depending:
+    """What ``of`` makes of the value that is to be compared."""
+
+    of: Callable[[Any], Any]
+
+
+@dataclass
+class _Lengths:
+    """Lengths by name, and what is to be checked once all are known."""
+
+    outer: _Lengths | None = None
+    own: dict[str, int] = field(default_factory=dict)
+    later: list[Callable[[], None]] = field(default_factory=list)
+
+    def inside(self) -> _Lengths:
+        """Those of one element of a list."""
+        return _Lengths(self, later=self.later)
+
+    def fix(self, length: int | str, found: int, where: str) -> None:
+        """Refuse another length than the one of that name, or than the number."""
+        wanted = self.own.setdefault(length, found) if isinstance(length, str) else length
+        if found != wanted:
+            raise wrong(where, f"has length {found} in place of {wanted}")
+
+    def get(self, name: str) -> int | None:
+        """The length of that name, if anything has it."""
+        if name in self.own:
+            return self.own[name]
+        return self.outer.get(name) if self.outer else None
+
+    def most(self, like: WholeNumber | ArrayOf) -> float:
+        """The largest number that there may be."""
+        if like.index_of:
+            count = self.get(like.index_of)
+            least = 0 if isinstance(like, WholeNumber) else -1
+            return MOST if count is None else max(count - 1, least)
+        if isinstance(like, ArrayOf):
+            return MOST if np.dtype(like.dtype).kind in "iu" else np.inf
+        most = self.get(like.most) if isinstance(like.most, str) else like.most
+        return MOST if most is None else most
+
+
+def check_like(value: Any, like: Any, where: str, lengths: Mapping[str, int] | None = None) -> None:
     """Refuse a part of a state that is not made like a part of the same environment.
 
     Where ``like`` is an empty table, list or None there may be more of it; where an array of it
     holds NaN, meaning none, ``value`` may as well. Counts are not negative, numbers are finite,
-    poses are rigid motions.
+    poses are rigid motions. ``lengths`` are known by name before anything is looked at.
 
     Raises:
         InputError: naming the place in the state and what is wrong with it.
     """
+    known = _Lengths(own=dict(lengths or {}))
+    _check(value, like, where, known)
+    for check in known.later:
+        check()
+
+
+def _check(value: Any, like: Any, where: str, lengths: _Lengths) -> None:
     if isinstance(like, np.ndarray):
         check_array(value, like, where)
-        is_count = like.dtype.kind == "i" and like.size and like.min() >= 0
-        if is_count and (value < 0).any():
-            raise wrong(where, f"counts to {value.min()}")
+        if like.dtype.kind == "i" and like.size and like.min() >= 0:
+            _check_between(value, 0, MOST, where)
+    elif isinstance(like, ArrayOf):
+        _check_array_of(value, like, where, lengths)
+    elif isinstance(like, WholeNumber):
+        check_plain(value, 0, where, low=like.least)
+        lengths.later.append(lambda: _check_between(value, like.least, lengths.most(like), where))
+    elif isinstance(like, numbers.Integral) and not isinstance(like, bool):
+        least = min(0, int(like))  # where there may be none, -1 says so
+        _check(value, WholeNumber(least), where, lengths)
+    elif isinstance(like, Real):
+        if not isinstance(value, (float, np.floating)) or not like.least <= value <= like.most:
+            raise wrong(where, f"is {value!r}, no number in [{like.least:g}, {like.most:g}]")
+    elif isinstance(like, Fields):
+        _check(value, like.of, where, lengths)
+        lengths.later.append(lambda: _check_rule(value, like.rule, where))
+    elif isinstance(like, Depending):
+        _check(value, like.of(value), where, lengths)
+    elif isinstance(like, OrNone):
+        if value is not None:
+            _check(value, like.of, where, lengths)
+    elif isinstance(like, ListOf):
+        _check_list_of(value, like, where, lengths)
     elif isinstance(like, Mapping):
-        _check_fields(value, like, where)
-    elif isinstance(like, list) and like:
-        check_list(value, where, len(like))
+        _check_fields(value, like, where, lengths)
+    elif isinstance(like, (list, tuple)) and like:
+        check_list(value, where, len(like), type(like))
         for k, pair in enumerate(zip(value, like, strict=True)):
-            check_like(*pair, f"{where}[{k}]")
+            _check(*pair, f"{where}[{k}]", lengths.inside())
     elif like is None or isinstance(like, list):
         _check_free(value, where)
     else:
         check_plain(value, like, where)
 
 
+def _check_between(value: Any, least: float, most: float, where: str) -> None:
+    if not np.size(value):
+        return
+    low, high = np.min(value), np.max(value)
+    if low < least or high > most:
+        raise wrong(where, f"counts to {low if low < least else high}, outside [{least}, {most}]")
+
+
+def _check_rule(value: Any, rule: Callable[[Any], str], where: str) -> None:
+    what = rule(value)
+    if what:
+        raise wrong(where, what)
+
+
+def _check_array_of(value: Any, like: ArrayOf, where: str, lengths: _Lengths) -> None:
+    _check_form(value, like.dtype, len(like.shape), where)
+    for length, found in zip(like.shape, value.shape, strict=True):
+        lengths.fix(length, found, where)
+    check_values(value, where, like.may_be_nan)
+    if like.is_distribution and (np.abs(value.sum(axis=-1) - 1) > _SUM_ERROR).any():
+        raise wrong(where, "are no distributions")
+    least = like.least
+    if least is not None:
+        lengths.later.append(lambda: _check_between(value, least, lengths.most(like), where))
+
+
+def _check_list_of(value: Any, like: ListOf, where: str, lengths: _Lengths) -> None:
+    check_list(value, where)
+    if isinstance(like.length, str):
+        lengths.fix(like.length, len(value), where)
+    elif len(value) > like.length:
+        raise wrong(where, f"has {len(value)} elements, more than {like.length}")
+    if like.rising:  # before anything that takes time
+        _check_rising(value, like.rising, where)
+    if isinstance(like.of, np.ndarray):
+        if value:
+            check_array(stacked(value, where), np.zeros((0, *like.of.shape), like.of.dtype), where)
+        return
+    is_flat = isinstance(like.of, ArrayOf)  # arrays of one shape
+    for k, one in enumerate(value):
+        _check(one, like.of, f"{where}[{k}]", lengths if is_flat else lengths.inside())
+
+
+def _check_rising(value: list[Any], key: str, where: str) -> None:
+    last = -1
+    for one in value:
+        now = one.get(key) if isinstance(one, Mapping) else None
+        if not isinstance(now, numbers.Integral) or not last < now:
+            raise wrong(where, f"is not in the order of {key}")
+        last = int(now)
+
+
 def is_open(like: Any) -> bool:
     """Whether something in ``like`` may be replaced by what ``check_like`` knows nothing of."""
+    if isinstance(like, (Fields, OrNone, ListOf)):
+        return is_open(like.of)
     if isinstance(like, Mapping):
         return any(map(is_open, like.values()))
     if isinstance(like, list):
@@ -81,36 +284,22 @@ def check_keys(value: Mapping[Any, Any], names: Sequence[str], where: str) -> No
         raise wrong(where, f"lacks {missing}" if missing else f"has {more} too")
 
 
-def check_list(value: Any, where: str, length: int | None = None) -> None:
+def check_list(value: Any, where: str, length: int | None = None, kind: type = list) -> None:
     """Refuse what is no list, or not of that length."""
-    if not isinstance(value, list):
-        raise wrong(where, f"is a {type(value).__name__}, not a list")
+    if not isinstance(value, kind):
+        raise wrong(where, f"is a {type(value).__name__}, not a {kind.__name__}")
     if length is not None and len(value) != length:
         raise wrong(where, f"has {len(value)} elements in place of {length}")
 
 
-def _check_fields(value: Any, like: Mapping[str, Any], where: str) -> None:
+def _check_fields(value: Any, like: Mapping[str, Any], where: str, lengths: _Lengths) -> None:
     check_mapping(value, where)
     check_keys(value, list(like), where)
     if "bit_generator" in like:
         _check_random(value, like, where)
         return
     for name, own in like.items():
-        check_like(value[name], own, f"{where}.{name}")
-    for table in _TABLES:
-        rows = {len(value[name]) for name in table if name in value}
-        if len(rows) > 1 and all(name in value for name in table):
-            raise wrong(where, f"has tables of {sorted(rows)} rows")
-    if {"counters", "surfels"} <= set(like):
-        _check_counts(value, where)
-
-
-def _check_counts(value: Mapping[str, Any], where: str) -> None:
-    """The counters of surfel maps say how many surfels there are."""
-    used = np.array([len(arrays["radius"]) for arrays in value["surfels"]])
-    counters = value["counters"]
-    if (counters["count"] != used).any() or (counters["dead"] > used).any():
-        raise wrong(f"{where}.counters", f"do not count the {used.tolist()} surfels")
+        _check(value[name], own, f"{where}.{name}", lengths)
 
 
 def _check_random(value: Mapping[str, Any], like: Mapping[str, Any], where: str) -> None:
@@ -133,15 +322,34 @@ def _is_same(a: Any, b: Any) -> bool:
 
 def check_array(value: Any, like: NDArray[Any], where: str) -> None:
     """Refuse what is no array of the same type and shape; the first axis may grow from nothing."""
-    if not isinstance(value, np.ndarray) or value.dtype != like.dtype:
-        found = value.dtype if isinstance(value, np.ndarray) else type(value).__name__
-        raise wrong(where, f"is of {found}, not an array of {like.dtype}")
+    _check_form(value, like.dtype, like.ndim, where)
     grows = like.ndim > 0 and len(like) == 0
     rest = slice(int(grows), None)
-    if value.ndim != like.ndim or value.shape[rest] != like.shape[rest]:
+    if value.shape[rest] != like.shape[rest]:
         raise wrong(where, f"has shape {value.shape} in place of {like.shape}")
     may_be_nan = like.dtype.kind == "f" and not grows and bool(np.isnan(like).any())
     check_values(value, where, may_be_nan)
+
+
+def _check_form(value: Any, dtype: Any, ndim: int, where: str) -> None:
+    if not isinstance(value, np.ndarray) or value.dtype != dtype:
+        found = value.dtype if isinstance(value, np.ndarray) else type(value).__name__
+        raise wrong(where, f"is of {found}, not an array of {np.dtype(dtype)}")
+    if value.ndim != ndim:
+        raise wrong(where, f"has shape {value.shape}, not {ndim} axes")
+
+
+def stacked(arrays: list[Any], where: str) -> NDArray[Any]:
+    """Arrays of one shape and type as one array.
+
+    Raises:
+        InputError: they are none; naming the place in the state.
+    """
+    if not all(isinstance(array, np.ndarray) for array in arrays):
+        raise wrong(where, "holds something else than arrays")
+    if len({(array.shape, array.dtype) for array in arrays}) > 1:
+        raise wrong(where, "holds arrays of several shapes or types")
+    return np.array(arrays)
 
 
 def check_values(value: NDArray[Any], where: str, may_be_nan: bool = False) -> None:
@@ -183,14 +391,15 @@ def _check_rigid(stack: NDArray[Any], where: str) -> None:
         raise wrong(where, "holds a pose that is no rigid motion")
 
 
-def check_plain(value: Any, like: Any, where: str) -> None:
+def check_plain(value: Any, like: Any, where: str, low: int | None = None) -> None:
     """Refuse a value of another kind than ``like``, a negative count, a number not finite."""
     kind = next(kind for kind in _KINDS if isinstance(like, kind))
     if not isinstance(value, kind) or (kind is not _KINDS[0] and isinstance(value, _KINDS[0])):
         raise wrong(where, f"is a {type(value).__name__}, not a {type(like).__name__}")
-    low = min(0, like) if kind is numbers.Integral else 0  # where there may be none, -1 says so
-    if kind is numbers.Integral and not low <= value < _MOST:
-        raise wrong(where, f"is {value}, outside [{low}, {_MOST})")
+    if kind is numbers.Integral:
+        low = min(0, like) if low is None else low  # where there may be none, -1 says so
+        if not low <= value <= _MOST_SEED:
+            raise wrong(where, f"is {value}, outside [{low}, {_MOST_SEED}]")
     if kind is _KINDS[2] and not np.isfinite(value):
         raise wrong(where, f"is {value}, not finite")
 

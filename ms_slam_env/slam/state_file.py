@@ -24,7 +24,12 @@ from ms_slam_env.input_files import MAX_MESH_BYTES, check_file
 from ms_slam_env.output_files import write_bytes
 
 FORMAT, VERSION = "ms_slam_env map", 1
-MAX_UNPACKED_BYTES = 4 * MAX_MESH_BYTES
+MAX_TREE_BYTES = 16 * 1024 * 1024
+"""Of the JSON text: a hundred thousand frames with four arrays each need half of it."""
+MAX_EXPANSION, ALWAYS_TAKEN_BYTES = 20, 32 * 1024 * 1024
+"""Times that a larger file may grow once unpacked: maps as they are written do not, zeros that
+somebody packed grow to 1000 times."""
+_PIECE_BYTES = 1024 * 1024
 _TREE = "tree.json"
 _CONTAINERS = {"list": list, "tuple": tuple}
 _BROKEN = (
@@ -65,7 +70,8 @@ def read_state(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         InputError: no such file, none of these, of another version, or damaged; one line.
     """
     with _opened(path) as (archive, header):
-        state = _unpacked(header["state"], lambda index: _read_array(archive, index))
+        read: set[str] = set()
+        state = _unpacked(header["state"], lambda index: _read_array(archive, index, read))
         return dict(header["about"]), dict(state)
 
 
@@ -81,8 +87,11 @@ def _opened(path: Path) -> Iterator[tuple[zipfile.ZipFile, Mapping[str, Any]]]:
     check_file(path, "map", MAX_MESH_BYTES)
     try:
         with zipfile.ZipFile(path) as archive:
-            if sum(info.file_size for info in archive.infolist()) > MAX_UNPACKED_BYTES:
-                raise InputError(f"larger than {MAX_UNPACKED_BYTES / 1e9:.0f} GB once unpacked")
+            most = max(MAX_EXPANSION * path.stat().st_size, ALWAYS_TAKEN_BYTES)
+            if sum(info.file_size for info in archive.infolist()) > most:
+                raise InputError(f"larger than {most / 1e6:.0f} MB once unpacked")
+            if archive.getinfo(_TREE).file_size > MAX_TREE_BYTES:
+                raise InputError(f"{_TREE} is larger than {MAX_TREE_BYTES / 1e6:.0f} MB")
             header = json.loads(archive.read(_TREE))
             _check_version(header)
             yield archive, header
@@ -131,17 +140,26 @@ def _unpacked(tree: Any, array: Callable[[int], NDArray[Any]]) -> Any:
     return _CONTAINERS[kind](_unpacked(one, array) for one in content)
 
 
-def _read_array(archive: zipfile.ZipFile, index: int) -> NDArray[Any]:
-    """One array, whose header must say how long it really is."""
-    with archive.open(_name(index)) as file:
+def _read_array(archive: zipfile.ZipFile, index: int, read: set[str]) -> NDArray[Any]:
+    """One array, whose header must say how long it really is; none that was ``read`` before."""
+    name = _name(index)
+    if name in read:
+        raise ValueError(f"{name} stands for several arrays")
+    read.add(name)
+    with archive.open(name) as file:
         version = np.lib.format.read_magic(file)
         readers = {
             (1, 0): np.lib.format.read_array_header_1_0,
             (2, 0): np.lib.format.read_array_header_2_0,
         }
         shape, is_fortran, dtype = readers[version](file)
-        data = file.read()
-    if dtype.hasobject or len(data) != math.prod(shape) * dtype.itemsize:
-        raise ValueError(f"{_name(index)} is not the array that it says")
-    flat = np.frombuffer(bytearray(data), dtype=dtype)
+        size = archive.getinfo(name).file_size - file.tell()
+        if dtype.hasobject or size != math.prod(shape) * dtype.itemsize:
+            raise ValueError(f"{name} is not the array that it says")
+        data = bytearray()  # in pieces: one copy, not two
+        while piece := file.read(_PIECE_BYTES):
+            data += piece
+    if len(data) != size:
+        raise ValueError(f"{name} is not the array that it says")
+    flat = np.frombuffer(data, dtype=dtype)
     return flat.reshape(shape, order="F" if is_fortran else "C")

@@ -9,7 +9,7 @@ number of the older.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.geometry import adjoint, invert, se3_exp, se3_log
 from ms_slam_env.slam.state import Saved
+from ms_slam_env.slam.state_check import ListOf, WholeNumber
 
 Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
@@ -143,6 +144,20 @@ class SubmapLedger(Saved):
         """Everything but the first submap, of which all is known."""
         state = super().get_state()
         return state | {name: state[name][1:] for name in _OF_SUBMAPS}
+
+    def state_like(self) -> Any:
+        """See ``Stateful``; "submaps" are those after the first."""
+        frame, submap = WholeNumber(index_of="frames"), WholeNumber(most="submaps")
+        return {
+            "first_frames": ListOf(frame, "submaps"),
+            "joined_to": ListOf(submap, "submaps"),
+            "joined_at": ListOf(replace(frame, least=-1), "submaps"),
+            "links": ListOf(np.zeros((6, 6)), "submaps"),
+            "starts": ListOf(np.eye(4), "submaps"),
+            "frames": ListOf(frame, "followed"),
+            "labels": ListOf(submap, "followed"),
+            "poses": ListOf(np.eye(4), "followed"),
+        }
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state."""

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ms_slam_env.camera import Intrinsics, RGBDFrame
+from ms_slam_env.camera import Intrinsics, RGBDFrame, check_frame
 from ms_slam_env.geometry import check_pose, invert
 from ms_slam_env.slam.alignment_check import (
     FEWEST_READINGS,
@@ -89,7 +89,7 @@ class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
 
     def track(self, frame: RGBDFrame, T_world_camera_guess: ArrayLike | None = None) -> TrackResult:
         """Estimate the pose of ``frame`` and extend the map; see ``SlamBackend``."""
-        self.intrinsics.check_image(frame.depth, "frame")
+        check_frame(frame, self.intrinsics)
         guess = None
         if T_world_camera_guess is not None:
             guess = np.array(check_pose(T_world_camera_guess, "T_world_camera_guess"))
@@ -115,7 +115,7 @@ class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
 
     def fuse(self, frame: RGBDFrame, T_world_camera: ArrayLike) -> TrackResult:
         """Fuse ``frame`` into the map at a known pose (4, 4), without tracking."""
-        self.intrinsics.check_image(frame.depth, "frame")
+        check_frame(frame, self.intrinsics)
         self._pose = np.array(check_pose(T_world_camera, "T_world_camera"))
         return self._take(frame, self._prepare(frame))
 

@@ -453,7 +453,7 @@ def test_options_of_slam_stand_behind_its_name_and_in_slam_config():
         ({"reward": 3}, "reward = 3 must be a function of an Outcome, module:function, default"),
         ({"lookahead": {"view": 1}}, "'lookahead.view'; valid choices: reference, scale"),
         ({"scene_seed": -1}, "scene seed -1 must be an integer >= 0"),
-        ({"slam_config": {"depth_cutoff_m": 11}}, r"outside \[0, 10\]"),
+        ({"slam_config": {"depth_cutoff_m": 13}}, r"outside \[0, 12\]"),
         ({"image_size": "1x1"}, "valid choices: 80x60"),
         ({"image_size": 160}, "unknown image size '160'"),
         ({"image_size": "native"}, "no size of their own"),

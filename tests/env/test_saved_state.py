@@ -1,7 +1,9 @@
 """Saved states: what is no state is refused and changes nothing, whatever is wrong with it."""
 
 import copy
+import dataclasses
 import pickle
+import sys
 
 import gymnasium as gym
 import numpy as np
@@ -201,6 +203,112 @@ def parts(value):
 def test_what_is_no_state_is_refused(played, state):
     with pytest.raises(InputError, match="state"):
         played["env"].load_state(state)
+
+
+def test_the_scene_of_a_state_is_one_of_ours_and_no_code(tmp_path, monkeypatch):
+    """A name of code or of a file is taken from the options alone."""
+    (tmp_path / "strange_scene.py").write_text("raise SystemExit('executed')")
+    monkeypatch.chdir(tmp_path)
+    env = after_steps(ActiveSlamEnv(**OPTIONS), 1)
+    before = env.save_state()
+    for name in ("strange_scene:scene", "os:system", str(tmp_path / "room.ply"), ""):
+        state = copy.deepcopy(before)
+        state["episode"].scene = name
+        with pytest.raises(InputError, match="unknown scene of a state"):
+            env.load_state(state)
+    assert "strange_scene" not in sys.modules
+    assert same(env.save_state(), before)
+    other = copy.deepcopy(before)
+    other["episode"].scene = "wall"
+    other["coverage"] = after_steps(ActiveSlamEnv(**{**OPTIONS, "scene": "wall"}), 0).save_state()[
+        "coverage"
+    ]
+    env.load_state(other)
+    assert env.scene.name == "wall"
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("squared_error_sum", -1e30, "squared_error_sum"),
+        ("squared_error_sum", 1e-3, "squared_error_sum is not that of its frames"),
+        ("inlier_fraction", 1.5, "inlier_fraction"),
+        ("energy_j", -1.0, "energy_j"),
+        ("steps_lost", 3, "steps_lost counts to 3"),
+        ("steps_away", 10**6, "steps_away"),
+        ("action", 49, "action counts to 49"),
+        ("scene_seed", 2**31, "scene_seed"),
+    ],
+)
+def test_an_episode_that_cannot_be_is_refused(field, value, message):
+    env = after_steps(ActiveSlamEnv(**OPTIONS), 1)
+    state = env.save_state()
+    setattr(state["episode"], field, value)
+    with pytest.raises(InputError, match=message):
+        env.load_state(state)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("pose_error", 0.5, "pose_error that its poses do not have"),
+        ("time_s", 0.0, "goes back in time"),
+        ("submap", 7, "submap counts to 7"),
+    ],
+)
+def test_a_record_of_a_frame_that_cannot_be_is_refused(field, value, message):
+    env = after_steps(ActiveSlamEnv(**OPTIONS), 2)
+    state = env.save_state()
+    frames = state["episode"].frames
+    frames[-1] = dataclasses.replace(frames[-1], **{field: value})
+    with pytest.raises(InputError, match=message):
+        env.load_state(state)
+
+
+def test_counts_that_overflow_in_a_later_step_are_refused():
+    env = after_steps(ActiveSlamEnv(slam="surfel", **OPTIONS), 1)
+    before = env.save_state()
+    for part, name in (("", "time"), ("", "lost"), ("surfels", "seen"), ("surfels", "created")):
+        state = copy.deepcopy(before)
+        values = state["slam"]["map"][part][0] if part else state["slam"]
+        values[name][:] = 2**31 - 1
+        with pytest.raises(InputError, match=f"{name} counts to 2147483647"):
+            env.load_state(state)
+    assert same(env.save_state(), before)
+
+
+def test_dead_surfels_are_as_many_as_the_counters_say():
+    env = after_steps(ActiveSlamEnv(slam="surfel", **OPTIONS), 1)
+    state = env.save_state()
+    state["slam"]["map"]["surfels"][0]["confidence"][:] = 0
+    with pytest.raises(InputError, match="counters of others than its"):
+        env.load_state(state)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "options"),
+    [
+        ("MSActiveSLAM-Adaptive-v0", {"image_size": "320x240"}),
+        ("MSActiveSLAM-FreeCamera-v0", {"slam_config": {"color_registration": "estimated"}}),
+        ("MSActiveSLAM-FreeCamera-v0", {"slam_config": {"relocalisation": "features"}}),
+        ("MSActiveSLAM-FreeCamera-v0", {"frame_management": "budget"}),
+    ],
+    ids=["levels-of-smaller-images", "unregistered-colour", "features", "budget"],
+)
+def test_every_variant_goes_on_from_its_own_state(env_id, options):
+    env = gym.make(env_id, **{**OPTIONS, **options}).unwrapped
+    states = []
+    for steps in (0, 3):
+        states.append(after_steps(env, steps).save_state())
+    for state in (*states, *reversed(states)):
+        env.load_state(state)
+        assert same(env.save_state(), state)
+    action = an_action(env, np.random.default_rng(0))
+    first = env.step(action)[0]
+    env.load_state(states[0])
+    env.load_state(states[1])
+    env.load_state(states[0])
+    np.testing.assert_equal(env.step(action)[0], first)
 
 
 def test_a_pose_of_another_shape_and_an_empty_episode_are_refused(played):

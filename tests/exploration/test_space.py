@@ -143,7 +143,7 @@ def test_a_range_holds_what_lies_in_it(low, size, value):
         (["depth_cutoff_m=0:5:log"], "holds no values"),
         (["depth_cutoff_m=1:5:exp"], "'1:5:exp' is not low:high or low:high:log"),
         (["depth_cutoff_m=near:far"], "'near:far' is not low:high"),
-        (["depth_cutoff_m=1:50"], "SurfelConfig.depth_cutoff_m = 50.0 is outside [0, 10]"),
+        (["depth_cutoff_m=1:50"], "SurfelConfig.depth_cutoff_m = 50.0 is outside [0, 12]"),
         (["loop_closure=none,some"], "unknown SurfelConfig.loop_closure 'some'"),
         (["image_size=160x120,3x2"], "unknown image size '3x2'"),
         (["loop_closure=none"], "values none must be two or more"),

@@ -90,7 +90,7 @@ def test_an_environment_takes_a_file(tmp_path):
         ("slam: 3", "unknown SLAM backend '3'"),
         ("slam_config: 3", "slam_config = 3 must be a mapping"),
         ("slam_config: {depth: 3}", "'slam_config.depth'; valid choices: depth_cutoff_m"),
-        ("slam_config: {depth_cutoff_m: 11}", "SurfelConfig.depth_cutoff_m = 11 is outside"),
+        ("slam_config: {depth_cutoff_m: 13}", "SurfelConfig.depth_cutoff_m = 13 is outside"),
         ("slam_config: {1: 2}", "must be a mapping of options"),
         ("image_size: 3x2", "unknown image size '3x2'; valid choices: 80x60"),
         ("image_size: [3]", "unknown image size"),

@@ -1,8 +1,11 @@
 """Maps on disk: gone on from bit-exactly, found again in, and refused in one line."""
 
+import io
 import json
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -219,3 +222,54 @@ def test_the_state_of_another_backend_names_what_it_lacks():
     managed = make_config(name="regular", every=2).manage(_new("surfel"))
     with pytest.raises(InputError, match="no state of SelectiveSlam: it lacks"):
         managed.set_state(states["surfel"])
+
+
+def _forged(saved: Path, change: Callable[[dict[str, Any]], None], **members: bytes) -> Path:
+    """A copy of a map with another header, and more in its archive."""
+    path = saved.with_name("forged.npz")
+    with zipfile.ZipFile(saved) as old, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as new:
+        header = json.loads(old.read("tree.json"))
+        change(header)
+        new.writestr("tree.json", json.dumps(header))
+        for name in old.namelist():
+            if name != "tree.json":
+                new.writestr(name, old.read(name))
+        for name, data in members.items():
+            new.writestr(f"{name}.npy", data)
+    return path
+
+
+def _with_poses(tree: Any) -> Callable[[dict[str, Any]], None]:
+    return lambda header: header["state"]["mapping"].update(poses=tree)
+
+
+def _array(shape: tuple[int, ...]) -> bytes:
+    data = io.BytesIO()
+    np.lib.format.write_array(data, np.zeros(shape, np.float32), allow_pickle=False)
+    return data.getvalue()
+
+
+def test_a_file_that_grows_once_unpacked_is_refused_before_anything_is_read(saved):
+    zeros = _array((50_000_000,))
+    path = _forged(saved, _with_poses({"array": 900}), **{"900": zeros})
+    assert path.stat().st_size < 2e6
+    assert "MB once unpacked" in _refusal(path)
+    path = _forged(saved, lambda header: header.update(more="x" * 17_000_000))
+    assert "tree.json is larger than 17 MB" in _refusal(path)
+
+
+def test_an_array_that_stands_in_several_places_is_refused(saved):
+    """Two hundred names of 4 MB would grow to 800 MB."""
+    tree = {"list": [{"array": 900}] * 200}
+    path = _forged(saved, _with_poses(tree), **{"900": _array((1_000_000,))})
+    assert "900.npy stands for several arrays" in _refusal(path)
+
+
+def test_a_map_with_room_for_more_than_there_is_memory_is_refused(saved, monkeypatch):
+    def no_memory(*_: Any) -> None:
+        raise OSError(12, "Cannot allocate memory")
+
+    path = _forged(saved, lambda header: header["about"]["config"].update(max_surfels=50_000_000))
+    monkeypatch.setattr("ms_slam_env.slam.surfel.surfels.roomy_zeros", no_memory)
+    with pytest.raises(InputError, match=f"{path}: no memory for a map of max_surfels = 50000000"):
+        slam.open_map(path)

@@ -15,6 +15,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, look_at, make_pose, relative_angle, se3_exp, so3_exp
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.sparse import SparseConfig, SparseSlam
+from ms_slam_env.slam.state_check import check_like
 
 CAMERA = xtion("160x120")
 OPEN = 34  # frames of the turn before it meets its beginning
@@ -133,6 +134,60 @@ def test_loops_go_with_the_state(circle, before_the_loop):
     frame = circle[1][5]
     first, second = closed.track(frame, circle[0][5]), other.track(frame, circle[0][5])
     np.testing.assert_array_equal(first.T_world_camera, second.T_world_camera)
+
+
+def test_a_map_with_closed_loops_is_gone_on_from_bit_exactly(circle, before_the_loop, tmp_path):
+    closed, _ = _close(circle, before_the_loop, loops=True)
+    closed.save(tmp_path / "map.npz")
+    other = slam.open_map(tmp_path / "map.npz", lost=False)
+    assert isinstance(other, SparseSlam)
+    assert other.loops_closed == closed.loops_closed > 0
+    for frame in circle[1][5:8]:
+        one, two = closed.track(frame), other.track(frame)
+        np.testing.assert_array_equal(one.T_world_camera, two.T_world_camera)
+    np.testing.assert_array_equal(closed.surface_points(), other.surface_points())
+
+
+def _refused(state: dict[str, Any], part: str, **changes: Any) -> str:
+    """What is said of a state with other values in its part ``map``, or in a keyframe of it."""
+    backend = SparseSlam(CAMERA)
+    of_map = dict(state["map"])
+    if part == "map":
+        of_map |= changes
+    else:
+        of_map["keyframes"] = [*of_map["keyframes"][:-1], of_map["keyframes"][-1] | changes]
+    with pytest.raises(InputError) as caught:
+        check_like({**state, "map": of_map}, backend.state_like(), "slam")
+    return str(caught.value)
+
+
+def test_links_between_points_and_keyframes_are_checked(before_the_loop):
+    state = before_the_loop
+    check_like(state, SparseSlam(CAMERA).state_like(), "slam")
+    of_map, last = state["map"], state["map"]["keyframes"][-1]
+    points, keyframes = len(of_map["positions"]), len(of_map["keyframes"])
+    for name in ("positions", "descriptors", "hosts", "host_features", "alive", "tried", "found"):
+        for values in (of_map[name][:0], of_map[name][1:], np.repeat(of_map[name], 2, axis=0)):
+            assert "in place of" in _refused(state, "map", **{name: values})
+    for name, most in (("hosts", keyframes), ("host_features", 2**40), ("tried", 2**40)):
+        for value in (-1, most):
+            assert "counts to" in _refused(state, "map", **{name: np.full(points, value)})
+    fewest = min(len(one["pixels"]) for one in of_map["keyframes"])
+    strange = np.full(points, fewest)
+    assert "do not have" in _refused(state, "map", host_features=strange)
+    doubled = of_map["keyframes"] * 1000
+    assert "not in the order of frame" in _refused(state, "map", keyframes=doubled)
+    features = len(last["pixels"])
+    for value in (-2, points):
+        ids = np.full(features, value)
+        assert "counts to" in _refused(state, "keyframe", point_ids=ids)
+    assert "in place of" in _refused(state, "keyframe", pixels=last["pixels"][1:])
+    assert "in place of" in _refused(state, "keyframe", depth=last["depth"][1:])
+    assert "counts to" in _refused(state, "keyframe", depth=-last["depth"])
+    assert "than it has counted" in _refused(state, "keyframe", frame=1000)
+    assert "not a list" in _refused({**state, "dense": {**state["dense"], "poses": ()}}, "map")
+    for reference in (-1, keyframes):
+        assert "outside" in _refused({**state, "reference": reference}, "map")
 
 
 def test_a_kidnapped_camera_is_found_in_the_map(box_scene, circle, before_the_loop):

@@ -112,6 +112,12 @@ class DynamicArm(ArmEmbodiment):
         """Where the arm stands, its physics, its errors and the state of its random numbers."""
         return {"T_world_base": self.T_world_base.copy(), **self._moving_state()}
 
+    def state_like(self) -> dict[str, Any]:
+        """A state in which the links have not been moved yet."""
+        like = self.get_state()
+        like["imperfections"]["link"][:] = np.nan
+        return like
+
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state that ``get_state`` returned."""
         if not np.array_equal(self.T_world_base, state["T_world_base"]):

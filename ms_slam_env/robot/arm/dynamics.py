@@ -202,7 +202,7 @@ class Imperfections:
             "offset": self._offset.copy(),
             "T_camera_assumed": self.T_camera_assumed.copy(),
             "slack": self._slack.copy(),
-            "link": None if self._link is None else self._link.copy(),
+            "link": np.full_like(self._slack, np.nan) if self._link is None else self._link.copy(),
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
@@ -211,7 +211,7 @@ class Imperfections:
         self._offset = state["offset"].copy()
         self.T_camera_assumed = state["T_camera_assumed"].copy()
         self._slack = state["slack"].copy()
-        self._link = None if state["link"] is None else state["link"].copy()
+        self._link = None if np.isnan(state["link"]).any() else state["link"].copy()
 
 
 def play(x: Float64, start: Float64, half_width: float) -> Float64:

@@ -15,6 +15,7 @@ from ms_slam_env.slam.base import SlamBackend
 from ms_slam_env.slam.configuration import SlamConfiguration, merged, read_configuration
 from ms_slam_env.slam.frame_selection import FrameFilter, SelectiveSlam
 from ms_slam_env.slam.state import Stateful
+from ms_slam_env.slam.state_check import Depending, WholeNumber
 from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
 
 _NEVER = 1_000_000_000  # frames in a row that are dropped at most
@@ -180,6 +181,23 @@ class AdaptiveSlam(SelectiveSlam):
         self._switch = _Switch(backend, levels, controller, drops_frames)
         super().__init__(backend, self._switch, max_skip=_NEVER)
 
+    # The level is put in force before the backend takes arrays of its image size.
+    saved = tuple(sorted(SelectiveSlam.saved, key=lambda name: name != "_filter"))
+
+    def state_like(self) -> Any:
+        """See ``Stateful``: arrays have the image size of the level in force."""
+        likes = []
+        for index in reversed(range(len(self.levels))):
+            self._switch.put_in_force(index)
+            likes.insert(0, super().state_like())
+        self._switch.reset()
+
+        def like(state: Any) -> Any:
+            index = state["filter"]["index"] if _has_index(state) else 0
+            return likes[index if index in range(len(likes)) else 0]
+
+        return Depending(like)
+
     @property
     def level(self) -> int:
         """Index of the configuration of the last processed frame; of the first before any."""
@@ -197,6 +215,12 @@ class AdaptiveSlam(SelectiveSlam):
             InputError: no such index, or a variant that chooses by itself.
         """
         self.controller.use(index)
+
+
+def _has_index(state: Any) -> bool:
+    """Whether a state says which level was in force; if not, other checks say what is wrong."""
+    chosen = state.get("filter") if isinstance(state, Mapping) else None
+    return isinstance(chosen, Mapping) and isinstance(chosen.get("index"), int)
 
 
 class _Switch(FrameFilter):
@@ -218,14 +242,15 @@ class _Switch(FrameFilter):
     def reset(self) -> None:
         """Forget every frame."""
         self._controller.reset()
-        self.index = self._controller.index
+        self.put_in_force(self._controller.index)
 
     def admits(self, frame: RGBDFrame, dropped: int, forced: bool = False) -> bool:
         """Whether the level in force keeps this frame; ``forced`` means lost or not started."""
-        self._put_in_force(self._controller.choose(frame, forced))
+        self.put_in_force(self._controller.choose(frame, forced))
         return not self._drops_frames or dropped + 1 >= self.levels[self.index].keep_every
 
-    def _put_in_force(self, index: int) -> None:
+    def put_in_force(self, index: int) -> None:
+        """Track with the configuration of a level from now on."""
         self.index = index
         level = self.levels[index]
         self._backend.reconfigure(level.config, level.image_size)
@@ -234,7 +259,12 @@ class _Switch(FrameFilter):
         """The level in force and the controller's."""
         return {"index": self.index, "controller": self._controller.get_state()}
 
+    def state_like(self) -> Any:
+        """See ``Stateful``."""
+        index = WholeNumber(most=len(self.levels) - 1)
+        return {"index": index, "controller": self._controller.state_like()}
+
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state."""
-        self._put_in_force(state["index"])
+        self.put_in_force(state["index"])
         self._controller.set_state(state["controller"])

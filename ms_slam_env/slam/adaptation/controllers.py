@@ -29,6 +29,7 @@ from ms_slam_env.slam.configuration import SlamConfiguration, read_levels
 from ms_slam_env.slam.frame_selection import ChangeConfig
 from ms_slam_env.slam.frame_selection.filters import Change
 from ms_slam_env.slam.state import Saved
+from ms_slam_env.slam.state_check import ListOf, OrNone, Real, WholeNumber
 
 
 def rising(values: Any, name: str, count: int) -> tuple[float, ...]:
@@ -218,6 +219,14 @@ class DivergenceController(Saved, Controller):
         self.index = self._config.first
         self._recent: list[float] = []  # changes of the last frames, as many as the dwell
 
+    def state_like(self) -> Any:
+        """See ``Stateful``."""
+        return super().state_like() | {
+            "time_s": OrNone(0.0),
+            "index": WholeNumber(most=len(self._config.thresholds)),
+            "recent": ListOf(Real(least=0), self._config.dwell_frames),
+        }
+
     def choose(self, frame: RGBDFrame, is_lost: bool) -> int:
         """Index by the change from the frame before."""
         is_first = self._time_s is None
@@ -272,6 +281,10 @@ class AgentController(Saved, Controller):
     def reset(self) -> None:
         """Back to the first."""
         self.index = self._first
+
+    def state_like(self) -> Any:
+        """See ``Stateful``."""
+        return {"index": WholeNumber(most=self._count - 1)}
 
     def choose(self, frame: RGBDFrame, is_lost: bool) -> int:
         """The index told."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.config import bounded, check_range
@@ -11,6 +12,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.slam.frame_selection.filters import Change, ChangeConfig, DroppingConfig
 from ms_slam_env.slam.frame_selection.selective_slam import FrameFilter
 from ms_slam_env.slam.state import Saved
+from ms_slam_env.slam.state_check import OrNone
 
 
 class ThresholdController(Saved):
@@ -130,6 +132,10 @@ class BudgetFilter(Saved, FrameFilter):
             config.threshold, config.gain, config.lowest_threshold, config.highest_threshold
         )
         self.reset()
+
+    def state_like(self) -> Any:
+        """See ``Stateful``."""
+        return super().state_like() | {"time": OrNone(0.0)}
 
     @property
     def threshold(self) -> float:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
+from ms_slam_env.camera import Intrinsics, RGBDFrame, check_frame, intensity_image
 from ms_slam_env.config import Checked, Family, bounded, chosen
 from ms_slam_env.divergence import DivergenceConfig, Histograms, make_divergence
 from ms_slam_env.errors import InputError
@@ -21,6 +21,7 @@ from ms_slam_env.slam.base import SlamBackend
 from ms_slam_env.slam.configuration import read_levels
 from ms_slam_env.slam.frame_selection.selective_slam import PREDICTIONS, FrameFilter, SelectiveSlam
 from ms_slam_env.slam.state import Saved, Stateful
+from ms_slam_env.slam.state_check import ArrayOf, Fields, OrNone
 
 _ROUNDING = 1e-9  # 13 / 1.3 is less than 10
 
@@ -156,7 +157,9 @@ class Change(Stateful):
     def __init__(self, config: ChangeConfig, intrinsics: Intrinsics) -> None:
         self._intrinsics = intrinsics
         self._stride = max(1, intrinsics.width // config.width)
-        self._measure = make_divergence(config.divergence, intrinsics.every_nth(self._stride))
+        reduced = intrinsics.every_nth(self._stride)
+        self._size = reduced.shape
+        self._measure = make_divergence(config.divergence, reduced)
         self._weights = np.array([1.0, config.depth_weight])
         self._reference: Histograms | None = None
         self._current: Histograms | None = None
@@ -167,7 +170,7 @@ class Change(Stateful):
 
     def measure(self, frame: RGBDFrame) -> float:
         """Change of ``frame`` from the reference, nats; infinite without one."""
-        self._intrinsics.check_image(frame.depth, "frame")
+        check_frame(frame, self._intrinsics)
         s = self._stride
         grey = intensity_image(np.ascontiguousarray(frame.color[::s, ::s])).astype(np.float32)
         depth = frame.depth[::s, ::s].astype(np.float32)
@@ -187,6 +190,15 @@ class Change(Stateful):
             return {"intensity": None, "normals": None}
         return {"intensity": kept.intensity.copy(), "normals": kept.normals.copy()}
 
+    def state_like(self) -> Any:
+        """See ``Stateful``."""
+        blank = self._measure.histograms(*(np.zeros((1, *self._size), np.float32),) * 2)
+        like = {
+            name: OrNone(ArrayOf(rows.dtype, rows.shape, least=0, is_distribution=True))
+            for name, rows in (("intensity", blank.intensity), ("normals", blank.normals))
+        }
+        return Fields(like, _why_no_reference)
+
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on with the reference of a state."""
         self._current = None
@@ -194,6 +206,12 @@ class Change(Stateful):
             self._reference = None
         else:
             self._reference = Histograms(state["intensity"].copy(), state["normals"].copy())
+
+
+def _why_no_reference(state: dict[str, Any]) -> str:
+    """What is wrong between the two histograms of a state."""
+    is_whole = (state["intensity"] is None) == (state["normals"] is None)
+    return "" if is_whole else "has one of the two histograms"
 
 
 @dataclass(frozen=True)

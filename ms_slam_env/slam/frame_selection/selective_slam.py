@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ms_slam_env.camera import RGBDFrame
+from ms_slam_env.camera import RGBDFrame, check_frame
 from ms_slam_env.geometry import check_pose, invert, se3_exp, se3_log
 from ms_slam_env.slam.base import BorrowedMap, Float64, SlamBackend, TrackResult
 from ms_slam_env.slam.state import Saved, Stateful, check_has
-from ms_slam_env.slam.state_check import check_like, check_mapping
+from ms_slam_env.slam.state_check import ArrayOf, Fields, OrNone, WholeNumber
 from ms_slam_env.slam.submaps import Submaps
 
 
@@ -70,6 +70,10 @@ class PosePrediction(Saved):
         self._pose: Float64 = np.eye(4)
         self._twist: Float64 = np.zeros(6)  # of the last motion, which took so many frames:
         self._frames = 1
+
+    def state_like(self) -> Any:
+        """See ``Stateful``."""
+        return super().state_like() | {"frames": WholeNumber(least=1)}
 
     def observe(self, T_world_camera: Float64, frames: int, continues: bool) -> None:
         """Note the pose of a processed frame, ``frames`` after the one before.
@@ -165,7 +169,7 @@ class SelectiveSlam(Saved, BorrowedMap):
     def _process_or_drop(
         self, frame: RGBDFrame, known_pose: ArrayLike | None, process: Callable[[], TrackResult]
     ) -> TrackResult:
-        self.intrinsics.check_image(frame.depth, "frame")
+        check_frame(frame, self.intrinsics)
         begin = time.process_time()
         result = self._note(process()) if self._is_worth(frame) else self._drop(known_pose)
         self._filter.charge(time.process_time() - begin)
@@ -292,24 +296,43 @@ class SelectiveSlam(Saved, BorrowedMap):
             "offsets": np.array(list(self._offsets.values())).reshape(-1, 4, 4),
         }
 
+    def state_like(self) -> Any:
+        """See ``Stateful``; "frames" are those that the backend has counted."""
+        result = _copied(vars(TrackResult(np.eye(4), True)))
+        result |= {"covariance": OrNone(np.zeros((6, 6)))}
+        result |= {"moving": OrNone(ArrayOf(np.bool_, ("rows", "columns")))}
+        like = {
+            "last": OrNone(result),
+            "processed": ArrayOf(np.int64, ("frames",), least=0),
+            "dropped": ArrayOf(np.int64, ("dropped",), least=0),
+            "offsets": ArrayOf(np.float64, ("dropped", 4, 4)),
+        }
+        return Fields(super().state_like() | like, _why_no_selection)
+
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state of the same backend behind the same filter."""
         check_has(state, self.also_saved, type(self).__name__)
-        if state["last"] is not None:
-            _check_result(state["last"])
         super().set_state(state)
         self._last = None if state["last"] is None else TrackResult(**_copied(state["last"]))
         self._processed = state["processed"].tolist()
         self._offsets = dict(zip(state["dropped"].tolist(), state["offsets"].copy(), strict=True))
 
 
-def _check_result(last: Any) -> None:
-    """Refuse what has not the fields of a ``TrackResult``."""
-    check_mapping(last, "last")
-    like = vars(TrackResult(np.eye(4), True, covariance=np.zeros((6, 6))))
-    without = last.get("covariance") is None
-    check_like(last, {**like, "covariance": None} if without else like, "last")
+def _why_no_selection(state: dict[str, Any]) -> str:
+    """What is wrong between the frames of a state that were processed and all."""
+    processed, frames = state["processed"], state["frames"]
+    if (np.diff(processed) <= 0).any() or (processed >= frames).any():
+        return f"has processed frames that are not among its {frames}, in order"
+    if bool(frames) != bool(len(processed)) or (state["last"] is not None and not frames):
+        return "has frames of which none was processed, or a last one of none"
+    dropped = state["dropped"]
+    is_after = len(processed) and (dropped > processed[0]).all()
+    if len(dropped) and not (is_after and (dropped < frames).all()):
+        return "has dropped frames that are not among its frames"
+    return ""
 
 
 def _copied(values: dict[str, Any]) -> dict[str, Any]:
-    return {k: v.copy() if isinstance(v, np.ndarray) else v for k, v in values.items()}
+    """Fields of a ``TrackResult`` but for its loop, which is said once."""
+    copies = {k: v.copy() if isinstance(v, np.ndarray) else v for k, v in values.items()}
+    return {k: v for k, v in copies.items() if k != "loop"}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ms_slam_env.config import Checked, bounded
+from ms_slam_env.slam.base import LARGEST_CUTOFF_M
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class SparseConfig(Checked):
         max_surfels: capacity of the dense map; None as in ``SurfelConfig``.
     """
 
-    depth_cutoff_m: float = bounded(4.0, 0.1, 10.0)
+    depth_cutoff_m: float = bounded(4.0, 0.1, LARGEST_CUTOFF_M)
     features: int = bounded(600, 50, 10_000)
     levels: int = bounded(4, 1, 12)
     fast_threshold: int = bounded(7, 1, 100)

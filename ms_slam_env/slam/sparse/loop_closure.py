@@ -17,6 +17,7 @@ from ms_slam_env.slam.sparse.local_mapping import load_gtsam
 from ms_slam_env.slam.sparse.localization import Fix, LiveFrame, Localizer
 from ms_slam_env.slam.sparse.sparse_map import SparseMap
 from ms_slam_env.slam.state import Stateful
+from ms_slam_env.slam.state_check import ArrayOf
 
 _FIXED_SIGMA = 1e-6
 _ITERATIONS = 20
@@ -144,13 +145,20 @@ class LoopCloser(Stateful):
     def get_state(self) -> dict[str, Any]:
         """The loops closed so far."""
         return {
-            "ends": np.array([(edge.a, edge.b) for edge in self.edges], dtype=np.int64),
+            "ends": np.array([(edge.a, edge.b) for edge in self.edges], np.int64).reshape(-1, 2),
             "motions": np.array([edge.T_a_b for edge in self.edges]).reshape(-1, 4, 4),
+        }
+
+    def state_like(self) -> Any:
+        """See ``Stateful``."""
+        return {
+            "ends": ArrayOf(np.int64, ("loops", 2), least=0, index_of="keyframes"),
+            "motions": ArrayOf(np.float64, ("loops", 4, 4)),
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state."""
-        ends = state["ends"].reshape(-1, 2).tolist()
+        ends = state["ends"].tolist()
         self.edges = [
             Edge(a, b, T.copy(), _LOOP_RAD, _LOOP_M)
             for (a, b), T in zip(ends, state["motions"], strict=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from ms_slam_env.slam.feature_matching import Int64, thumbnail
 from ms_slam_env.slam.features import Features, InverseDepth
 from ms_slam_env.slam.sparse.features import Templates, cut
 from ms_slam_env.slam.state import Saved
+from ms_slam_env.slam.state_check import ArrayOf, Fields, ListOf, WholeNumber
 
 _TRIED_FRAMES = 8  # frames after which a point that is hardly ever found again is dropped
 _FOUND_SHARE = 0.25  # as in ORB-SLAM
@@ -167,6 +168,21 @@ class SparseMap(Saved):
         """Everything, as arrays."""
         return super().get_state() | {"keyframes": [_save(one) for one in self.keyframes]}
 
+    def state_like(self) -> Any:
+        """See ``Stateful``."""
+        counts = ArrayOf(np.int64, ("points",), least=0)
+        like = {
+            "positions": ArrayOf(np.float64, ("points", 3)),
+            "descriptors": ArrayOf(np.uint64, ("points", 4)),
+            "hosts": replace(counts, index_of="keyframes"),
+            "host_features": counts,
+            "alive": ArrayOf(np.bool_, ("points",)),
+            "tried": counts,
+            "found": counts,
+            "keyframes": ListOf(_keyframe_like(self.intrinsics.shape), "keyframes", "frame"),
+        }
+        return Fields(like, _why_no_map)
+
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state."""
         super().set_state(state)
@@ -190,6 +206,31 @@ def _save(keyframe: Keyframe) -> dict[str, Any]:
     for name in _OF_FEATURES:
         saved[name] = getattr(keyframe.features, name).copy()
     return saved
+
+
+def _keyframe_like(shape: tuple[int, int]) -> dict[str, Any]:
+    """What a keyframe is in a state, of an image of ``shape`` (H, W)."""
+    return {
+        "T_world_camera": np.eye(4),
+        "point_ids": ArrayOf(np.int64, ("features",), least=-1, index_of="points"),
+        "color": ArrayOf(np.uint8, (*shape, 3)),
+        "intensity": ArrayOf(np.float32, shape),
+        "depth": ArrayOf(np.float32, shape, least=0),
+        "known": False,
+        "frame": WholeNumber(index_of="frames"),
+        "pixels": ArrayOf(np.float64, ("features", 2)),
+        "inverse_depth": ArrayOf(np.float64, ("features",), least=0),
+        "descriptors": ArrayOf(np.uint64, ("features", 4)),
+        "scale": ArrayOf(np.float64, ("features",), least=0),
+    }
+
+
+def _why_no_map(state: dict[str, Any]) -> str:
+    """What is wrong between the keyframes of a state and its points."""
+    features = np.array([len(keyframe["pixels"]) for keyframe in state["keyframes"]], np.int64)
+    if (state["host_features"] >= features[state["hosts"]]).any():
+        return "has points of features that their keyframes do not have"
+    return ""
 
 
 def _restore(saved: dict[str, Any]) -> Keyframe:

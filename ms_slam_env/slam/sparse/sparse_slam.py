@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,6 +27,7 @@ from ms_slam_env.slam.sparse.localization import Fix, LiveFrame, Localizer, keyf
 from ms_slam_env.slam.sparse.loop_closure import LoopCloser
 from ms_slam_env.slam.sparse.sparse_map import Keyframe, SparseMap
 from ms_slam_env.slam.state import Saved
+from ms_slam_env.slam.state_check import Fields, ListOf, WholeNumber
 from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
 from ms_slam_env.slam.tracking_template import Attempt, FrameByFrameSlam
 
@@ -47,6 +49,11 @@ class DenseMap(Saved):
         )
         self._poses: list[Float64] = []  # where each keyframe is in the map
         self._fused = 0  # how many of them are fused
+
+    def state_like(self) -> Any:
+        """See ``Stateful``."""
+        placed = {"poses": ListOf(np.eye(4), "keyframes"), "fused": WholeNumber(most="keyframes")}
+        return super().state_like() | placed
 
     def clear(self) -> None:
         """Forget everything."""
@@ -256,6 +263,18 @@ class SparseSlam(BorrowedMap, FrameByFrameSlam[LiveFrame, Fix]):
         self._pose = keyframe.T_world_camera.copy()
         self._dense.place(self._map.keyframes)
 
+    def state_like(self) -> Any:
+        """See ``Stateful``."""
+        like = super().state_like() | {"reference": WholeNumber(index_of="keyframes")}
+        return Fields(like, _why_no_frame)
+
     @property
     def _mapper(self) -> SurfelSlam:
         return self._dense.updated(self._map.keyframes)
+
+
+def _why_no_frame(state: dict[str, Any]) -> str:
+    """What is wrong between the frames of a state that were counted and its keyframes."""
+    keyframes = state["map"]["keyframes"]
+    is_later = keyframes and keyframes[-1]["frame"] >= state["frame"]
+    return "has keyframes of later frames than it has counted" if is_later else ""

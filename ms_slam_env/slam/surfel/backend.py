@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ms_slam_env.camera import Intrinsics, RGBDFrame
+from ms_slam_env.camera import Intrinsics, RGBDFrame, check_frame
 from ms_slam_env.camera.frame import reduce_color, reduce_depth
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose
@@ -96,7 +96,7 @@ class SurfelSlam(SlamBackend):
 
     def _images(self, frame: RGBDFrame) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Colour (1, h, w, 3) and depth (1, h, w) at the size in force."""
-        self.intrinsics.check_image(frame.depth, "frame")
+        check_frame(frame, self.intrinsics)
         color, depth = frame.color, frame.depth
         if self._slam.intrinsics != self.intrinsics:
             size = self.image_size
@@ -163,6 +163,11 @@ class SurfelSlam(SlamBackend):
         """Everything needed to go on bit-exactly, as NumPy arrays."""
         own = self._color_camera.get_state() | {"submaps": self._submaps.get_state()}
         return self._slam.get_state() | own
+
+    def state_like(self) -> Any:
+        """See ``Stateful``."""
+        own = self._color_camera.state_like() | {"submaps": self._submaps.state_like()}
+        return self._slam.state_like() | own
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state that ``get_state`` returned."""

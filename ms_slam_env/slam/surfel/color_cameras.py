@@ -11,6 +11,7 @@ from ms_slam_env.camera.registration import Registration
 from ms_slam_env.slam.base import Float32, Float64, TrackResult
 from ms_slam_env.slam.color_registration import depth_edges, estimate_registration
 from ms_slam_env.slam.state import Saved
+from ms_slam_env.slam.state_check import ArrayOf, ListOf
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
 
 UInt8 = NDArray[np.uint8]
@@ -62,6 +63,16 @@ class EstimatedColorCamera(ColorCamera):
         self._offset: Float64 = np.full(2, np.nan)  # focal ratio and baseline; NaN: not known yet
         self._is_whole = True  # nothing but the frames kept is in the map
         self._forget()
+
+    def state_like(self) -> Any:
+        """See ``Stateful``."""
+        like = {
+            "colors": ListOf(ArrayOf(np.uint8, ("height", "width", 3)), "first frames"),
+            "depths": ListOf(ArrayOf(np.float32, ("height", "width"), least=0), "first frames"),
+            "guesses": ListOf(ArrayOf(np.float64, (4, 4), may_be_nan=True), "first frames"),
+            "times": ListOf(0.0, "first frames"),
+        }
+        return super().state_like() | like
 
     def _forget(self) -> None:
         self._edges = 0

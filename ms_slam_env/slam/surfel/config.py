@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from ms_slam_env.config import Checked, bounded, chosen
-from ms_slam_env.errors import InputError
+from ms_slam_env.config import Checked, bounded, check_counts, chosen
+from ms_slam_env.slam.base import LARGEST_CUTOFF_M
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ class SurfelConfig(Checked):
     """Parameters of tracking, fusion and prediction.
 
     Attributes:
-        depth_cutoff_m: readings beyond are ignored, [0, 10]; those with more than 48 mm of noise,
+        depth_cutoff_m: readings beyond are ignored; those with more than 48 mm of noise,
             by default beyond 4 m, count the less the more noise they have.
         icp_rgb_weight: weight w of the photometric term against the geometric one, [0, 1]: 0 is
             geometry alone, 1 photometry alone; ``normal_equations`` has the exact cost.
@@ -231,7 +231,7 @@ class SurfelConfig(Checked):
             cameras in lockstep it is.
     """
 
-    depth_cutoff_m: float = bounded(8.0, 0.0, 10.0)
+    depth_cutoff_m: float = bounded(8.0, 0.0, LARGEST_CUTOFF_M)
     icp_rgb_weight: float = bounded(0.1, 0.0, 1.0)
     confidence_threshold: float = bounded(10.0, 0.0, 12.0)
     iterations: tuple[int, ...] = (4, 5, 10)
@@ -270,14 +270,7 @@ class SurfelConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        are_counts = isinstance(self.iterations, (tuple, list)) and all(
-            isinstance(count, int) and 0 <= count <= 100 for count in self.iterations
-        )
-        if not are_counts or not 1 <= len(self.iterations) <= 5:
-            raise InputError(
-                f"SurfelConfig.iterations = {self.iterations!r} must be 1 to 5 integers in [0, 100]"
-            )
-        object.__setattr__(self, "iterations", tuple(self.iterations))  # lists come from YAML
+        check_counts(self, "iterations", 5, 100)
 
     @classmethod
     def paper(cls) -> SurfelConfig:

@@ -220,6 +220,10 @@ class FernRelocalization(Relocalization):
         """State of the database of one env."""
         return self.databases[env].get_state()
 
+    def keyframes_like(self) -> dict[str, Any]:
+        """See the base class."""
+        return dict(self.databases[0].state_like())
+
     def set_keyframes(self, env: int, keyframes: dict[str, Any]) -> None:
         """Know these keyframes of one env, and nothing else."""
         self.clear(env)

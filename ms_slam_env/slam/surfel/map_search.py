@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from ms_slam_env.slam.alignment_check import AlignmentStatistics
 from ms_slam_env.slam.base import Float64, Views
 from ms_slam_env.slam.map_fit import FitConfig, measure_fit, why_not_believed
 from ms_slam_env.slam.state import Saved
+from ms_slam_env.slam.state_check import Fields, ListOf, OrNone, WholeNumber
 from ms_slam_env.slam.surfel.acceptance import Alignment
 from ms_slam_env.slam.surfel.config import SubmapConfig
 from ms_slam_env.slam.surfel.detached_map import DetachedMap
@@ -126,6 +128,15 @@ class JointSearch(Saved):
         self._pose = np.eye(4)  # (4, 4) in the present map at the last look
         self._looks = 0  # in vain, since the map was lost
 
+    def state_like(self) -> Any:
+        """See ``Stateful``."""
+        like = {
+            "label": OrNone(WholeNumber(most="submaps")),
+            "votes": ListOf(np.eye(4)),
+            "frame": OrNone(WholeNumber()),
+        }
+        return Fields(super().state_like() | like, _why_no_search)
+
     def is_due(self, frame: int, pose: Float64, rules: SubmapConfig) -> bool:
         """Whether it is time for a look; the next one that may agree is from another place."""
         if self._frame is None or frame - self._frame >= rules.interval:
@@ -186,6 +197,12 @@ class JointSearch(Saved):
         if found is None and dissimilar[which] <= rules.dissimilarity:
             found = finder.anywhere(frames, other, self._looks)
         return other, found
+
+
+def _why_no_search(state: dict[str, Any]) -> str:
+    """What is wrong between the label of a state and its votes."""
+    is_known = state["label"] is not None
+    return "" if is_known == bool(state["votes"]) else "has votes without a label, or a label alone"
 
 
 @dataclass(frozen=True)

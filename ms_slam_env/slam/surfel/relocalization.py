@@ -122,5 +122,9 @@ class Relocalization(Saved):
         """The keyframes of one env, as arrays."""
         return {}
 
+    def keyframes_like(self) -> dict[str, Any]:
+        """What ``get_keyframes`` gives, as ``Stateful.state_like`` says it."""
+        return {}
+
     def set_keyframes(self, env: int, keyframes: dict[str, Any]) -> None:
         """Know these keyframes of one env, and nothing else."""

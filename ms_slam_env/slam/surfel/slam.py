@@ -335,6 +335,11 @@ class BatchedSurfelSlam(Saved):
         """Everything needed to go on bit-exactly, as NumPy arrays."""
         return self._states.get_state() | super().get_state() | self._shutter.get_state()
 
+    def state_like(self) -> Any:
+        """See ``Stateful``."""
+        own = self._states.state_like(), super().state_like(), self._shutter.state_like()
+        return own[0] | own[1] | own[2]
+
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state of a SLAM of the same batch, intrinsics and configuration."""
         check_has(state, ("map",), "SurfelSlam")

@@ -20,12 +20,14 @@ from numpy.typing import ArrayLike, NDArray
 from ms_slam_env.geometry import invert, se3_exp, se3_log
 from ms_slam_env.slam.base import Float64, TrackResult
 from ms_slam_env.slam.state import Saved
+from ms_slam_env.slam.state_check import ListOf, WholeNumber
 from ms_slam_env.slam.submaps import SubmapLedger, Submaps, one_submap
 from ms_slam_env.slam.surfel.config import SubmapConfig
 from ms_slam_env.slam.surfel.detached_map import DetachedMap
 from ms_slam_env.slam.surfel.map_search import JointSearch, MapFinder
 from ms_slam_env.slam.surfel.relocalization import Images
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
+from ms_slam_env.slam.surfel.trajectory_history import TrajectoryHistory
 
 CARRIED_ON = 0.95
 """From frame to frame, of the last motion, which is all that is known of a lost camera.
@@ -226,6 +228,19 @@ class AtlasSubmaps(NoSubmaps):
     def get_state(self) -> dict[str, Any]:
         """Everything, as NumPy arrays and plain values."""
         return super().get_state() | {"detached": [each.get_state() for each in self._detached]}
+
+    def state_like(self) -> Any:
+        """See ``Stateful``."""
+        submap = WholeNumber(most="submaps")
+        detached = {
+            "surfels": self._slam.map.surfels_like(),
+            "keyframes": self._slam.relocalization.keyframes_like(),
+            "history": TrajectoryHistory().state_like(),
+            "label": submap,
+            "since": WholeNumber(),
+        }
+        like = {"present": submap, "detached": ListOf(detached)}
+        return super().state_like() | like
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state."""

@@ -14,6 +14,7 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.base import Float64, Views
 from ms_slam_env.slam.state import Stateful
+from ms_slam_env.slam.state_check import ArrayOf, Fields
 from ms_slam_env.slam.surfel import fusion, surfel_culling, surfel_update
 from ms_slam_env.slam.surfel.block_bounds import bound_blocks, set_bounded
 from ms_slam_env.slam.surfel.config import SurfelConfig
@@ -301,6 +302,18 @@ class SurfelMap(Stateful):
             "surfels": [self.get_surfels(env) for env in range(self.batch)],
         }
 
+    def state_like(self) -> Any:
+        """See ``Stateful``."""
+        like = self.get_state() | {"surfels": [self.surfels_like() for _ in range(self.batch)]}
+        return Fields(like, self._why_wrong)
+
+    def surfels_like(self) -> dict[str, ArrayOf]:
+        """What ``get_surfels`` gives."""
+        return {
+            name: ArrayOf(values.dtype, ("surfels", *values.shape[1:]), _LEAST.get(name))
+            for name, values in self.get_surfels(0).items()
+        }
+
     def get_surfels(self, env: int) -> dict[str, NDArray[Any]]:
         """The used part of every array of one env, dead surfels included."""
         used = int(self.surfels.count.numpy()[env])
@@ -328,9 +341,22 @@ class SurfelMap(Stateful):
         Raises:
             InputError: naming both numbers.
         """
-        most = max(len(arrays["radius"]) for arrays in state["surfels"])
-        if most > self._buffers.capacity:
-            raise InputError(f"a map of {most} surfels; there is room for {self._buffers.capacity}")
+        why = self._why_too_large(state)
+        if why:
+            raise InputError(f"the map {why}")
+
+    def _why_too_large(self, state: dict[str, Any]) -> str:
+        most, room = max(len(one["radius"]) for one in state["surfels"]), self._buffers.capacity
+        return f"has {most} surfels; there is room for {room}" if most > room else ""
+
+    def _why_wrong(self, state: dict[str, Any]) -> str:
+        """What is wrong between the counters of a state, its surfels and the room for them."""
+        used = [len(one["confidence"]) for one in state["surfels"]]
+        dead = [np.count_nonzero(one["confidence"] == 0) for one in state["surfels"]]
+        counters = state["counters"]
+        if (counters["count"] != used).any() or (counters["dead"] != dead).any():
+            return self._why_too_large(state) or f"has counters of others than its {used} surfels"
+        return self._why_too_large(state)
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state that ``get_state`` of a map of this size returned."""
@@ -339,6 +365,9 @@ class SurfelMap(Stateful):
         for env, arrays in enumerate(state["surfels"]):
             self._assign(env, arrays)
         self.surfels_moved()
+
+
+_LEAST = dict.fromkeys(("radius", "confidence", "created", "seen"), 0)
 
 
 def _write(array: wp.array, env: int, values: NDArray[Any]) -> None:

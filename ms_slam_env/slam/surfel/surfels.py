@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from ms_slam_env._warp import roomy_zeros, wp
+from ms_slam_env.errors import InputError
 
 BLOCK_SIZE = wp.constant(128)
 """Surfels of a culling block."""
@@ -131,6 +132,17 @@ class MapBuffers:
     """Device arrays of B maps, empty at first, which all that works on these maps shares."""
 
     def __init__(self, batch: int, capacity: int, device: str, workers: int | None = None) -> None:
+        """Make room for maps.
+
+        Raises:
+            InputError: there is none for so many surfels.
+        """
+        try:
+            self._make_room(batch, capacity, device, workers)
+        except (OSError, MemoryError, RuntimeError) as error:  # RuntimeError: on a GPU
+            raise InputError(f"no memory for a map of max_surfels = {capacity}: {error}") from error
+
+    def _make_room(self, batch: int, capacity: int, device: str, workers: int | None) -> None:
         self.batch, self.capacity, self.device = batch, capacity, device
         self.workers = default_workers(batch, device) if workers is None else workers
         of_surfels = batch, capacity, device

@@ -12,6 +12,7 @@ from ms_slam_env.geometry import invert, relative_angle, transform_points
 from ms_slam_env.slam.base import Float64, Loop
 from ms_slam_env.slam.rows import join
 from ms_slam_env.slam.state import Saved
+from ms_slam_env.slam.state_check import ArrayOf, ListOf, OrNone, WholeNumber
 from ms_slam_env.slam.surfel.deformation_graph import Constraints, Deformation, no_constraints
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 
@@ -124,6 +125,21 @@ class TrajectoryHistory(Saved):
         """Everything, as NumPy arrays."""
         joined = {name: getattr(self.joined, name).copy() for name in _CONSTRAINT_ARRAYS}
         return super().get_state() | {"joined": joined}
+
+    def state_like(self) -> Any:
+        """See ``Stateful``."""
+        points, times = ArrayOf(np.float64, ("joined", 3)), ArrayOf(np.float64, ("joined",))
+        return {
+            "frames": ListOf(WholeNumber(index_of="frames"), "fused"),
+            "poses": ListOf(np.eye(4), "fused"),
+            "anchors": ListOf(np.zeros((ANCHORS, 3)), "fused"),
+            "anchor_times": ListOf(np.zeros(ANCHORS), "fused"),
+            "found": OrNone(WholeNumber(least=-1)),
+            "correction": np.eye(4),
+            "joined": {
+                name: times if name.endswith("times") else points for name in _CONSTRAINT_ARRAYS
+            },
+        }
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state."""

@@ -18,11 +18,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame
-from ms_slam_env.config import Checked, bounded
-from ms_slam_env.errors import InputError
+from ms_slam_env.config import Checked, bounded, check_counts
 from ms_slam_env.geometry import invert, transform_points
 from ms_slam_env.slam.alignment_measures import DepthImage
-from ms_slam_env.slam.base import Float64
+from ms_slam_env.slam.base import LARGEST_CUTOFF_M, Float64
 from ms_slam_env.slam.tracking_template import Attempt
 from ms_slam_env.slam.volumetric.projective_icp import (
     ProjectiveICP,
@@ -78,7 +77,7 @@ class KinectFusionConfig(Checked):
     start_x: float = bounded(0.5, 0.0, 1.0)
     start_y: float = bounded(0.5, 0.0, 1.0)
     start_z: float = bounded(0.5, 0.0, 1.0)
-    depth_cutoff_m: float = bounded(4.0, 0.1, 10.0)
+    depth_cutoff_m: float = bounded(4.0, 0.1, LARGEST_CUTOFF_M)
     least_weight: int = bounded(1, 1, 1000)
     least_overlap: float = bounded(0.3, 0.0, 1.0)
     least_inliers: float = bounded(0.75, 0.0, 1.0)
@@ -88,15 +87,7 @@ class KinectFusionConfig(Checked):
     def __post_init__(self) -> None:
         """Refuse counts that are none."""
         super().__post_init__()
-        given = self.iterations
-        are_counts = isinstance(given, (tuple, list)) and all(
-            type(count) is int and 0 <= count <= 100 for count in given
-        )
-        if not are_counts or not 1 <= len(given) <= 5:
-            raise InputError(
-                f"KinectFusionConfig.iterations = {given!r} must be 1 to 5 integers in [0, 100]"
-            )
-        object.__setattr__(self, "iterations", tuple(given))  # lists come from YAML
+        check_counts(self, "iterations", 5, 100)
 
     @property
     def grid(self) -> VolumetricConfig:

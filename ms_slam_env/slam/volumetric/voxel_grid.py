@@ -17,8 +17,9 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert
-from ms_slam_env.slam.base import Float32, Float64
+from ms_slam_env.slam.base import LARGEST_CUTOFF_M, Float32, Float64
 from ms_slam_env.slam.state import Stateful
+from ms_slam_env.slam.state_check import ArrayOf
 
 STOCK: dict[str, Any] = {
     "voxel_m": 0.01,
@@ -61,7 +62,7 @@ class VolumetricConfig(Checked):
     block_voxels: int = bounded(8, 4, 32)
     blocks: int = bounded(4_000, 100, 10_000_000)
     truncation_voxels: float = bounded(4.0, 1.0, 50.0)
-    depth_cutoff_m: float = bounded(4.0, 0.1, 10.0)
+    depth_cutoff_m: float = bounded(4.0, 0.1, LARGEST_CUTOFF_M)
     aligner: str = chosen("opencv", "opencv", "open3d")
     association_m: float = bounded(0.07, 0.001, 1.0)
     least_weight: int = bounded(1, 1, 1000)
@@ -284,6 +285,11 @@ class VoxelGrid(Stateful):
         for name in ("tsdf", "weight", "color"):
             state[name] = self._blocks(name)[used[order]]
         return state
+
+    def state_like(self) -> Any:
+        """See ``Stateful``."""
+        own = self.get_state().items()
+        return {name: ArrayOf(one.dtype, ("blocks", *one.shape[1:])) for name, one in own}
 
     def set_state(self, state: dict[str, NDArray[Any]]) -> None:
         """Go on from a state of a grid of the same configuration."""
