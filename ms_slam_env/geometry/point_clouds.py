@@ -157,5 +157,6 @@ def umeyama_scales(sources: Float64, targets: Float64) -> Float64:
     U, singular, Vt = np.linalg.svd(np.swapaxes(targets, 1, 2) @ centred / sources.shape[1])
     signs = np.ones_like(singular)
     signs[:, 2] = np.where(np.linalg.det(U) * np.linalg.det(Vt) < 0, -1.0, 1.0)
-    variance = (centred**2).reshape(len(sources), 3 * sources.shape[1]).sum(axis=1) / sources.shape[1]
+    squares = (centred**2).reshape(len(sources), 3 * sources.shape[1])
+    variance = squares.sum(axis=1) / sources.shape[1]
     return np.asarray((singular * signs).sum(axis=1) / variance)

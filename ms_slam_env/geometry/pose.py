@@ -103,7 +103,7 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) 
 
 
 def pose_from_quaternion(t: ArrayLike, q_xyzw: ArrayLike) -> Float64:
-    """Poses (..., 4, 4) from translations (..., 3) in m and quaternions (..., 4): qx, qy, qz, qw."""
+    """Poses (..., 4, 4) of translations (..., 3) in m and quaternions (..., 4), qx qy qz qw."""
     R = Rotation.from_quat(np.asarray(q_xyzw, dtype=np.float64)).as_matrix()
     T = np.zeros((*R.shape[:-2], 4, 4))
     T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1.0

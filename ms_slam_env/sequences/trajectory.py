@@ -79,15 +79,19 @@ def in_seconds(times: Float64, where: str | Path, said: str | None = None) -> Fl
         return times
     unit, is_guess = (said, False) if said else unit_of(times)
     if is_guess:
-        say_unit(unit, times, where)
+        say_unit(unit, times, where, "a comment such as [s]")
     return times if unit == "s" else times * UNITS[unit]
 
 
-def say_unit(unit: str, times: Float64, where: str | Path) -> None:
-    """Warn that the unit of times (N,) is a guess."""
+def say_unit(unit: str, times: Float64, where: str | Path, otherwise: str) -> None:
+    """Warn that the unit of times (N,) is a guess, and what says ``otherwise``."""
     step = float(np.median(np.diff(times)))
-    text = f"{where}: times are taken as {unit}, since they are {step:.6g} apart; a comment [s] says"
-    warnings.warn(f"{text} otherwise", InputWarning, stacklevel=2)
+    warnings.warn(
+        f"{where}: times are taken as {unit}, since they are {step:.6g} apart; {otherwise} says "
+        "otherwise",
+        InputWarning,
+        stacklevel=2,
+    )
 
 
 def trajectory_line(timestamp: float, T_world_camera: Float64) -> str:

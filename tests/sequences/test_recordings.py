@@ -67,6 +67,34 @@ def test_tum_layout(tum):
     np.testing.assert_allclose(recording.truth, poses(3), atol=1e-8)
 
 
+FORMS = {
+    "mark and CRLF": lambda text: "\ufeff" + text.replace("\n", "\r\n"),
+    "decimal commas": lambda text: re.sub(r"^(\d+)\.", r"\1,", text, flags=re.MULTILINE),
+    "commas between": lambda text: re.sub(r"^(\S+) ", r"\1,", text, flags=re.MULTILINE),
+    "backslashes": lambda text: text.replace("/", "\\"),
+    "quoted": lambda text: re.sub(r"(depth|rgb)/(\d)", r'"\1/\2', text).replace("png", 'png"'),
+    "nanoseconds": lambda text: re.sub(r"\b(\d)\.(\d{6})\b", r"\1\g<2>000", text),
+    "blanks": lambda text: text.replace("depth/", "depth/a b# ").replace("filename", "a#"),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_one_listing_in_many_forms(tum, form):
+    if form == "blanks":
+        for path in (tum / "depth").iterdir():
+            path.rename(path.with_name(f"a b# {path.name}"))
+    for name in ("rgb.txt", "depth.txt"):
+        text = FORMS[form]((tum / name).read_text())
+        text = re.sub(r"depth/a b# (\d.png)", r'"depth/a b# \1"', text)
+        if form == "nanoseconds":
+            text = "# [ns]\n" + text
+        (tum / name).write_bytes(text.encode())
+    recording = open_recording(tum)
+    np.testing.assert_allclose(recording.timestamps, np.arange(3) / 30 + 0.004, atol=1e-6)
+    np.testing.assert_allclose(recording.frame(2).depth, depth_values(2) / 1000, rtol=1e-6)
+    np.testing.assert_array_equal(recording.frame(2).color, colors(2))
+
+
 def test_associations_in_either_order(tum):
     for line in ("{0} depth/{0}.png {0} rgb/{0}.png\n", "{0} rgb/{0}.png {0} depth/{0}.png\n"):
         (tum / "associations.txt").write_text("".join(line.format(k) for k in range(3)))

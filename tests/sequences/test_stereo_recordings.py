@@ -138,7 +138,7 @@ def test_faults_of_kitti_are_named(kitti, tmp_path):
     texts = {name: (kitti / name).read_text() for name in ("calib.txt", "times.txt", "poses.txt")}
     cases = {
         "calib.txt": [("P3:", "X:", "has no line P3:"), ("P2: ", "P2: 1 ", "expected 12 numbers")],
-        "times.txt": [("0.000000e+00\n", "", "3 images in image_2 and 3 in image_3 for 2 times")],
+        "times.txt": [("0.000000e+00\n", "", "times\.txt: 2 times for 3 images")],
         "poses.txt": [("\n", " 1\n", "poses.txt:1: expected 12 numbers, got 13")],
     }
     for name, faults in cases.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +14,8 @@ from ms_slam_env.camera import Distortion, Intrinsics
 from ms_slam_env.camera.distortion import ALIASES, NAMES
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import Float64, check_pose
-from ms_slam_env.input_files import read_text
+from ms_slam_env.input_files import read_text, words_of
+from ms_slam_env.sequences.trajectory import in_seconds, said_unit, say_unit, unit_of
 
 _ROUNDED = 1e-2  # as for the length of a quaternion
 
@@ -39,11 +41,18 @@ def rows(path: Path) -> Iterator[tuple[str, list[str]]]:
     Raises:
         InputError: the file cannot be read.
     """
-    text = read_text(path, "listing")
-    for number, line in enumerate(text.splitlines(), start=1):
-        words = line.split("#")[0].replace(",", " ").split()
-        if words:
-            yield f"{path}:{number}", words
+    for where, line in _lines(path):
+        yield where, words_of(line)
+
+
+def _lines(path: Path, comments: list[str] | None = None) -> Iterator[tuple[str, str]]:
+    """Yield (``file:line``, text) of every line, without its comment, that says something."""
+    for number, line in enumerate(read_text(path, "listing").splitlines(), start=1):
+        text, mark, comment = re.match(r"(.*?)((?:^|(?<=\s))#|$)(.*)", line).groups()  # type: ignore[union-attr]
+        if mark and comments is not None:
+            comments.append(comment)
+        if text.strip():
+            yield f"{path}:{number}", text
 
 
 def number(word: str, where: str) -> float:
@@ -64,22 +73,71 @@ def number(word: str, where: str) -> float:
 def listed_images(path: Path) -> list[Listed]:
     """Lines ``timestamp filename``, times increasing, files relative to the listing's folder.
 
+    A name with blanks stands in quotation marks.
+
     Raises:
         InputError: naming file and line.
     """
     found: list[Listed] = []
-    for where, words in rows(path):
-        if len(words) != 2:
-            raise InputError(f"{where}: expected 'timestamp filename', got {' '.join(words)!r}")
-        time = number(words[0], where)
+    comments: list[str] = []
+    for where, line in _lines(path, comments):
+        words = _NAME_AND_TIME.fullmatch(line.strip())
+        if words is None:
+            raise InputError(f"{where}: expected 'timestamp filename', got {line.strip()!r}")
+        first, quoted, plain = words.groups()
+        time = number(first.replace(",", "."), where)
         if found and time <= found[-1].timestamp:
-            raise InputError(
-                f"{where}: timestamp {words[0]} does not come after {found[-1].timestamp}"
-            )
-        found.append(Listed(time, path.parent / words[1], where))
+            before = found[-1].timestamp
+            raise InputError(f"{where}: timestamp {first} does not come after {before}")
+        name = (quoted or plain).replace("\\", "/")
+        found.append(Listed(time, path.parent / name, where))
     if not found:
         raise InputError(f"{path} lists no image")
-    return found
+    said = next(filter(None, map(said_unit, comments)), None)
+    times = in_seconds(np.array([image.timestamp for image in found]), path, said)
+    return [replace(one, timestamp=time) for one, time in zip(found, times.tolist(), strict=True)]
+
+
+_NAME_AND_TIME = re.compile(r"""([^\s;,]+(?:,\d+(?=\s))?)[\s;,]+(?:"([^"]+)"|([^\s"]+))""")
+
+
+def listed_times(path: Path, names: Sequence[str]) -> Float64:
+    """Seconds (N,) of images from lines ``time``, or ``id time [exposure]`` as TUM-VI has them.
+
+    Args:
+        path: of the file; a comment may name the unit of time, as ``[ns]``.
+        names: N names of images without ending; an id is one of them.
+
+    Raises:
+        InputError: naming file and line; not as many lines as images.
+    """
+    comments: list[str] = []
+    lines = [(where, words_of(line)) for where, line in _lines(path, comments)]
+    if len(lines) != len(names):
+        raise InputError(f"{path}: {len(lines)} times for {len(names)} images")
+    times = []
+    for name, (where, words) in zip(names, lines, strict=True):
+        has_id = len(words) > 1
+        if len(words) > 3 or (has_id and not _is_id(words[0], name)):
+            raise InputError(
+                f"{where}: expected a time, with a point for decimals, or 'id time [exposure]' "
+                f"with id {name}, got {' '.join(words)!r}"
+            )
+        times.append(number(words[has_id], where))
+    found = np.array(times)
+    said = next(filter(None, map(said_unit, comments)), None)
+    step = float(np.median(np.diff(found))) if len(found) > 1 else 0.0
+    if not said and unit_of(found)[0] == "s" and step >= 2:  # no camera's seconds
+        said = "ms"
+        say_unit(said, found, path, "a comment such as [s]")
+    return in_seconds(found, path, said)
+
+
+def _is_id(word: str, name: str) -> bool:
+    """Whether a word is a name, or the number in it."""
+    numbers = re.findall(r"\d+", name)
+    is_number = word.isdecimal() and len(numbers) == 1 and int(word) == int(numbers[0])
+    return word.rpartition(".")[0] == name or word == name or is_number
 
 
 def read_matrix(path: Path) -> Float64:

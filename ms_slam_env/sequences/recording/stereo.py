@@ -23,7 +23,13 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import Float64, check_pose, make_pose
 from ms_slam_env.input_files import is_named
 from ms_slam_env.sequences.recording.image_folders import images
-from ms_slam_env.sequences.recording.listings import Calibration, number, rigid, rows
+from ms_slam_env.sequences.recording.listings import (
+    Calibration,
+    listed_times,
+    number,
+    rigid,
+    rows,
+)
 from ms_slam_env.sequences.recording.recording import Entry, Recording
 
 _BLOCK_PX = 5
@@ -165,12 +171,11 @@ def open_kitti(folder: Path, intrinsics: Calibration | None) -> Recording:
     if pair is None:
         raise InputError(f"{folder} needs both images of a pair: image_0 and image_1, or 2 and 3")
     lefts, rights = (images(folder / f"image_{k}") for k in pair)
-    times = [number(words[0], where) for where, words in rows(folder / "times.txt")]
-    if not len(lefts) == len(rights) == len(times):
+    if len(lefts) != len(rights):
         raise InputError(
-            f"{folder}: {len(lefts)} images in image_{pair[0]} and {len(rights)} in "
-            f"image_{pair[1]} for {len(times)} times in times.txt"
+            f"{folder}: {len(lefts)} images in image_{pair[0]} and {len(rights)} in image_{pair[1]}"
         )
+    times = listed_times(folder / "times.txt", [path.stem for path in lefts]).tolist()
     matrices = [_projection(folder / "calib.txt", f"P{k}") for k in pair]
     places = [_place(matrix) for matrix in matrices]
     left, right = (_intrinsics(matrix, lefts[0]) for matrix in matrices)
