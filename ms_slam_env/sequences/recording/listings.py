@@ -12,6 +12,7 @@ import numpy as np
 
 from ms_slam_env.camera import Distortion, Intrinsics
 from ms_slam_env.camera.distortion import ALIASES, NAMES
+from ms_slam_env.camera.image_files import image_size
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import Float64, check_pose
 from ms_slam_env.input_files import read_text, words_of
@@ -140,18 +141,62 @@ def _is_id(word: str, name: str) -> bool:
     return word.rpartition(".")[0] == name or word == name or is_number
 
 
-def read_matrix(path: Path) -> Float64:
+def read_pose(path: Path) -> Float64 | None:
     """Read a pose (4, 4) T_world_camera written as four rows of four numbers.
 
-    A rotation that is orthonormal but for rounding is made so exactly.
+    A rotation that is orthonormal but for rounding is made so exactly. None where all is ``-inf``,
+    as ScanNet has it where the pose is not known.
 
     Raises:
         InputError: another shape, NaN, or no rigid motion.
     """
+    if [words for _, words in rows(path)] == 4 * [4 * ["-inf"]]:
+        return None
+    return check_pose(rigid(_read_matrix(path, (4,))), str(path))
+
+
+def _read_matrix(path: Path, sides: Sequence[int]) -> Float64:
+    """Read a square matrix of one of some sizes.
+
+    Raises:
+        InputError: another shape, or what is no finite number.
+    """
     values = [[number(word, where) for word in words] for where, words in rows(path)]
-    if [len(row) for row in values] != [4, 4, 4, 4]:
-        raise InputError(f"{path}: expected 4 rows of 4 numbers")
-    return check_pose(rigid(np.array(values)), str(path))
+    if len(values) not in sides or any(len(row) != len(values) for row in values):
+        many = " or ".join(f"{side} rows of {side} numbers" for side in sides)
+        raise InputError(f"{path}: expected {many}")
+    return np.array(values)
+
+
+def read_poses(path: Path, count: int) -> Float64:
+    """Read poses (N, 4, 4), one a line and frame, of 16 numbers or of 12 without the last row.
+
+    Raises:
+        InputError: naming file and line; not as many as ``count`` frames.
+    """
+    poses = []
+    for where, words in rows(path):
+        if len(words) not in (12, 16):
+            raise InputError(f"{where}: expected 12 or 16 numbers, got {len(words)}")
+        matrix = np.eye(4)
+        matrix.ravel()[: len(words)] = [number(word, where) for word in words]
+        poses.append(check_pose(rigid(matrix), where))
+    if len(poses) != count:
+        raise InputError(f"{path}: {len(poses)} poses for {count} frames")
+    return np.stack(poses)
+
+
+def read_camera_matrix(path: Path, image: Path) -> Intrinsics:
+    """Intrinsics of a file of a matrix (3, 3) or (4, 4), for images as large as ``image``.
+
+    Raises:
+        InputError: naming the file.
+    """
+    K = _read_matrix(path, (3, 4))
+    try:
+        return Intrinsics(K[0, 0], K[1, 1], K[0, 2], K[1, 2], *image_size(image))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
 def rigid(matrix: Float64) -> Float64:

@@ -27,7 +27,7 @@ from ms_slam_env.sequences.recording.listings import (
     Calibration,
     listed_times,
     number,
-    rigid,
+    read_poses,
     rows,
 )
 from ms_slam_env.sequences.recording.recording import Entry, Recording
@@ -139,7 +139,9 @@ class StereoEntry(Entry):
     right: Path
     rig: StereoRig
 
-    def read(self, camera: Intrinsics) -> tuple[NDArray[np.uint8] | None, NDArray[Any]]:
+    def read(
+        self, camera: Intrinsics, color_camera: Intrinsics | None = None
+    ) -> tuple[NDArray[np.uint8] | None, NDArray[Any]]:
         """The rectified left image, and depth in metres; see the base class."""
         paths = zip((self.depth, self.right), self.rig.cameras, strict=True)
         left, right = self.rig.rectify(*(read_color(path, K) for path, K in paths))
@@ -228,11 +230,5 @@ def _truth(folder: Path, count: int) -> Float64 | None:
     """T_world_camera0 (N, 4, 4), if there is one a frame."""
     for path in (folder / "poses.txt", folder.parent.parent / "poses" / f"{folder.name}.txt"):
         if is_named(path):
-            poses = []
-            for where, words in rows(path):
-                matrix = np.vstack([_matrix(words, where), [0, 0, 0, 1]])
-                poses.append(check_pose(rigid(matrix), where))
-            if len(poses) != count:
-                raise InputError(f"{path}: {len(poses)} poses for {count} frames")
-            return np.stack(poses)
+            return read_poses(path, count)
     return None
