@@ -89,11 +89,15 @@ class ColorCamera:
 
     def __eq__(self, other: object) -> bool:
         """Whether both say the same."""
-        return isinstance(other, ColorCamera) and str(self) == str(other)
+        return isinstance(other, ColorCamera) and self._key == other._key
 
     def __hash__(self) -> int:
         """Of what it says."""
-        return hash(str(self))
+        return hash(self._key)
+
+    @property
+    def _key(self) -> tuple[Intrinsics, bytes]:
+        return self.intrinsics, self.T_color_depth.tobytes()
 
     def register(
         self, color: NDArray[np.uint8], depth: NDArray[np.float32], camera: Intrinsics
@@ -115,12 +119,12 @@ class ColorCamera:
 
     def __str__(self) -> str:
         """Return what is assumed, for a report."""
-        place = ", ".join(f"{v:.6g}" for v in self.T_color_depth[:3, 3])
-        turn = np.linalg.norm(cv2.Rodrigues(self.T_color_depth[:3, :3])[0])
+        place = ", ".join(f"{100 * v:.4g}" for v in self.T_color_depth[:3, 3])
+        turn = np.degrees(np.linalg.norm(cv2.Rodrigues(self.T_color_depth[:3, :3])[0]))
+        K = self.intrinsics
         return (
-            "colour brought into the depth camera, which stands at "
-            f"{place} m, {np.degrees(turn):.4g} deg, as seen from the colour camera "
-            f"({self.intrinsics})"
+            f"colour of {K.width}x{K.height}, focal length {K.fx:.5g} px, brought into the depth "
+            f"camera, which stands at {place} cm of the colour camera, turned by {turn:.3g} deg"
         )
 
 

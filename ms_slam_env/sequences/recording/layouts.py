@@ -415,9 +415,10 @@ def open_recording(
     name = _recognise(folder) if layout == "auto" else layout
     if topics not in (None, Topics()) and name != "bag":
         raise InputError(f"{path} is no bag: it has no topics")
-    found = (
-        open_bag(folder, intrinsics, topics) if name == "bag" else LAYOUTS[name](folder, intrinsics)
-    )
+    if name == "bag":
+        found = open_bag(folder, intrinsics, topics, register is not None)
+    else:
+        found = LAYOUTS[name](folder, intrinsics)
     _say_what_is_not_read(folder, name)
     if register is None or (register is True and found.registration is not None):
         return found

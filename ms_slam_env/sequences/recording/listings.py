@@ -22,7 +22,8 @@ _ROUNDED = 1e-2  # as for the length of a quaternion
 
 CALIBRATION = (
     "fx fy cx cy width height [depth_scale] "
-    "[radial-tangential k1 k2 p1 p2 k3 | equidistant k1 k2 k3 k4]"
+    "[radial-tangential k1 k2 p1 p2 k3 | equidistant k1 k2 k3 k4 | "
+    "rational k1 k2 p1 p2 k3 k4 k5 k6]"
 )
 """What a calibration says; a lens is that of both images."""
 
