@@ -202,6 +202,13 @@ def associate(times: Float64, others: Float64, max_difference_s: float) -> tuple
     return first, nearest[first]
 
 
+def say_few_pairs(where: str | Path, pairs: int, count: int) -> None:
+    """Warn where fewer than half of the depth images have colour of their time."""
+    if 2 * pairs < count:
+        text = f"{where}: only {pairs} of {count} depth images have colour of their time"
+        warnings.warn(f"{text}; the others are left out", InputWarning, stacklevel=2)
+
+
 def _nearest(times: Float64, others: Float64) -> Int64:
     """Index (N,) of the one of ``others`` (M,) nearest to each of ``times`` (N,)."""
     right = np.clip(np.searchsorted(others, times), 1, max(1, len(others) - 1))

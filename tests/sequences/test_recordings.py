@@ -316,6 +316,13 @@ def test_given_intrinsics_come_first(tum):
     assert (recording.source.fx, recording.depth_scale) == (31, 5000)
 
 
+def test_depth_without_colour_of_its_time_is_said_to_be_left_out(tum):
+    open_recording(tum)
+    (tum / "rgb.txt").write_text("0.0 rgb/0.png\n")
+    with pytest.warns(InputWarning, match="only 1 of 3 depth images have colour of their time"):
+        assert len(open_recording(tum)) == 1
+
+
 def test_depth_alone_has_black_colour(tum):
     (tum / "rgb.txt").unlink()
     with pytest.raises(InputError, match=r"rgb\.txt is missing, which lists the images of rgb"):

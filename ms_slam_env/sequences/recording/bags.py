@@ -33,7 +33,7 @@ from ms_slam_env.sequences.recording.bag_frames import (
 from ms_slam_env.sequences.recording.bag_images import read_color_message, read_depth_message
 from ms_slam_env.sequences.recording.listings import Calibration
 from ms_slam_env.sequences.recording.recording import Entry, Recording
-from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S, associate
+from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S, associate, say_few_pairs
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 """Endings of the names of bags; a ROS 2 bag is also a folder with a ``metadata.yaml``."""
@@ -286,6 +286,7 @@ def open_bag(
         own, other = associate(times, color_times, MAX_DIFFERENCE_S)
         if len(own) == 0:
             raise InputError(f"{path}: no image of {color_topic} is as old as one of {depth_topic}")
+        say_few_pairs(path, len(own), len(times))
         times, depths = times[own], [depths[k] for k in own]
         colors = [addresses[k] for k in other]
     entries = []

@@ -42,7 +42,12 @@ from ms_slam_env.sequences.recording.listings import (
 from ms_slam_env.sequences.recording.parts import join_parts, part_folders
 from ms_slam_env.sequences.recording.recording import Entry, Recording, Registration
 from ms_slam_env.sequences.recording.stereo import is_kitti, open_kitti
-from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S, associate, read_trajectory
+from ms_slam_env.sequences.trajectory import (
+    MAX_DIFFERENCE_S,
+    associate,
+    read_trajectory,
+    say_few_pairs,
+)
 from ms_slam_env.sequences.writing import DESCRIPTION, UNFINISHED
 
 # Published calibrations of the colour cameras, to which depth is registered, 640x480: TUM RGB-D
@@ -124,6 +129,7 @@ def _pairs(folder: Path) -> list[Entry]:
     pairs = list(zip(*associate(_times(depth), _times(color), MAX_DIFFERENCE_S), strict=True))
     if not pairs:
         raise InputError(f"{folder}: no image of rgb.txt is as old as one of depth.txt")
+    say_few_pairs(folder, len(pairs), len(depth))
     return [
         Entry(depth[d].timestamp, depth[d].path, color[c].path, depth[d].where) for d, c in pairs
     ]

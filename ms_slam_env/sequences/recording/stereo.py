@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics, intensity_image
-from ms_slam_env.camera.image_files import image_size, read_color
+from ms_slam_env.camera.image_files import image_size, read_grey
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import Float64, check_pose, make_pose
 from ms_slam_env.input_files import is_named
@@ -144,7 +144,7 @@ class StereoEntry(Entry):
     ) -> tuple[NDArray[np.uint8] | None, NDArray[Any]]:
         """The rectified left image, and depth in metres; see the base class."""
         paths = zip((self.depth, self.right), self.rig.cameras, strict=True)
-        left, right = self.rig.rectify(*(read_color(path, K) for path, K in paths))
+        left, right = self.rig.rectify(*(read_grey(path, K) for path, K in paths))
         return left, self.rig.depth(left, right)
 
 
