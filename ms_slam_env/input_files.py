@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import stat
 from pathlib import Path
 from typing import Any
@@ -61,13 +62,13 @@ def read_bytes(path: str | Path, kind: str, most_bytes: int) -> bytes:
 
 
 def read_text(path: str | Path, kind: str, most_bytes: int = MAX_TEXT_BYTES) -> str:
-    """The text of a file in UTF-8; see `check_file`.
+    """The text of a file in UTF-8, without the mark that may begin it; see `check_file`.
 
     Raises:
         InputError: also what is no UTF-8.
     """
     try:
-        return read_bytes(path, kind, most_bytes).decode("utf-8")
+        return read_bytes(path, kind, most_bytes).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(f"cannot read {kind} {path}: not a text file in UTF-8") from None
 
@@ -84,6 +85,22 @@ def read_json(path: str | Path, kind: str, most_bytes: int = MAX_TEXT_BYTES) -> 
         return json.loads(text)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is not a JSON file: {str(error).splitlines()[0]}") from None
+
+
+_DECIMAL_COMMA = re.compile(r"[-+]?\d+(,\d+)?([eE][-+]?\d+)?")
+
+
+def words_of(line: str) -> list[str]:
+    """Words of a line between blanks, commas or semicolons.
+
+    Between numbers that blanks or semicolons separate already, a comma is a decimal mark.
+    """
+    words = (line.replace(";", " ") if ";" in line else line).split()
+    if "," not in line:
+        return words
+    if len(words) > 1 and all(map(_DECIMAL_COMMA.fullmatch, words)):
+        return [word.replace(",", ".") for word in words]
+    return " ".join(words).replace(",", " ").split()
 
 
 def is_named(path: Path) -> bool:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -39,14 +40,14 @@ class Messages:
         cls = self.store.types[f"{package}/msg/{name}"]
         return cls(**fields)
 
-    def header(self, time: float) -> Any:
+    def header(self, time: float, frame: str = "camera") -> Any:
         """Of a message."""
         nanoseconds = round(time * 1e9)
         stamp = self.make(
             "builtin_interfaces/Time", sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9
         )
         number = {"seq": 0} if self.version == 1 else {}
-        return self.make("std_msgs/Header", stamp=stamp, frame_id="camera", **number)
+        return self.make("std_msgs/Header", stamp=stamp, frame_id=frame, **number)
 
     def image(self, time: float, pixels: np.ndarray, encoding: str, **changes: Any) -> Any:
         """Raw."""
@@ -71,6 +72,21 @@ class Messages:
         inverse = np.where(depth > 0, a / np.where(depth > 0, depth, 1) + b, 0)
         data = struct.pack("<iff", 0, a, b) + png(np.rint(inverse).astype(np.uint16))
         return self.compressed(time, data, "32FC1; compressedDepth png")
+
+    def transforms(self, time: float, of: Mapping[tuple[str, str], np.ndarray]) -> Any:
+        """What /tf_static says: T_parent_child (4, 4) by frames."""
+        sent = []
+        for (parent, child), T in of.items():
+            moved = self.pose(time, T, "TransformStamped")
+            header = self.header(time, parent)
+            sent.append(dataclasses.replace(moved, header=header, child_frame_id=child))
+        name = "tf2_msgs/msg/TFMessage"
+        if name not in self.store.types:
+            from rosbags.typesys import get_types_from_msg
+
+            text = "geometry_msgs/TransformStamped[] transforms"
+            self.store.register(get_types_from_msg(text, name))
+        return self.store.types[name](transforms=sent)
 
     def info(self, time: float, K: Any) -> Any:
         """CameraInfo."""

@@ -4,6 +4,7 @@ Models, of a ray (x, y, 1) with r = |(x, y)| and theta = atan r:
 
     radial-tangential  (x, y) (1 + k1 r^2 + k2 r^4 + k3 r^6)
                        + (2 p1 x y + p2 (r^2 + 2 x^2), p1 (r^2 + 2 y^2) + 2 p2 x y)
+    rational           the same, the first part over 1 + k4 r^2 + k5 r^4 + k6 r^6
     equidistant        (x, y) / r theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)
 
 Sources: Brown, "Close-range camera calibration" (1971); Kannala and Brandt (PAMI 2006); OpenCV's
@@ -24,18 +25,21 @@ from ms_slam_env.errors import InputError, unknown
 Array = NDArray[np.float64]
 
 _LARGEST = 20.0  # of any coefficient, more than calibrations have
+_LARGEST_RATIONAL = 1000.0  # those above and below the line cancel out
 _STEPS = 30  # of Newton's method; from the bent point, most lenses need five
 _CONVERGED = 1e-9
 
 NAMES = {
     "radial-tangential": ("k1", "k2", "p1", "p2", "k3"),
     "equidistant": ("k1", "k2", "k3", "k4"),
+    "rational": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
 """Model to its coefficients in the order in which calibration files list them."""
 
 ALIASES = {
     "radtan": "radial-tangential",
     "plumb_bob": "radial-tangential",
+    "rational_polynomial": "rational",
     "fisheye": "equidistant",
     "kannala_brandt": "equidistant",
 }
@@ -47,33 +51,41 @@ class Distortion(Checked):
     """A lens; by default none.
 
     Attributes:
-        model: none, radial-tangential or equidistant (a fisheye).
+        model: none, radial-tangential, rational (eight numbers) or equidistant (a fisheye).
         k1: of r^2 or theta^2,
         k2: of the fourth power,
         p1: tangential, as is
-        p2: both radial-tangential only,
+        p2: both not of equidistant,
         k3: of the sixth power,
-        k4: of the eighth, equidistant only.
+        k4: of the eighth, equidistant; of r^2 below the line, rational; as are
+        k5: of the fourth,
+        k6: and of the sixth power.
 
     Raises:
         InputError: an unknown model, a coefficient out of range, or one that the model has not.
     """
 
     model: str = chosen("none", "none", *NAMES)
-    k1: float = bounded(0.0, -_LARGEST, _LARGEST)
-    k2: float = bounded(0.0, -_LARGEST, _LARGEST)
+    k1: float = bounded(0.0, -_LARGEST_RATIONAL, _LARGEST_RATIONAL)
+    k2: float = bounded(0.0, -_LARGEST_RATIONAL, _LARGEST_RATIONAL)
     p1: float = bounded(0.0, -_LARGEST, _LARGEST)
     p2: float = bounded(0.0, -_LARGEST, _LARGEST)
-    k3: float = bounded(0.0, -_LARGEST, _LARGEST)
-    k4: float = bounded(0.0, -_LARGEST, _LARGEST)
+    k3: float = bounded(0.0, -_LARGEST_RATIONAL, _LARGEST_RATIONAL)
+    k4: float = bounded(0.0, -_LARGEST_RATIONAL, _LARGEST_RATIONAL)
+    k5: float = bounded(0.0, -_LARGEST_RATIONAL, _LARGEST_RATIONAL)
+    k6: float = bounded(0.0, -_LARGEST_RATIONAL, _LARGEST_RATIONAL)
 
     def __post_init__(self) -> None:
         """Refuse what the model has not."""
         super().__post_init__()
         own = NAMES.get(self.model, ())
-        for name in ("k1", "k2", "p1", "p2", "k3", "k4"):
-            if name not in own and getattr(self, name) != 0:
+        for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"):
+            value = getattr(self, name)
+            if name not in own and value != 0:
                 raise InputError(f"distortion {self.model} has no {name}; it has: {list(own)}")
+            if self.model != "rational" and abs(value) > _LARGEST:
+                limits = f"[{-_LARGEST:g}, {_LARGEST:g}]"
+                raise InputError(f"distortion {self.model}: {name} = {value} is outside {limits}")
 
     @staticmethod
     def of(model: str, coefficients: Sequence[float]) -> Distortion:
@@ -87,6 +99,8 @@ class Distortion(Checked):
         name = ALIASES.get(model, model)
         if name not in NAMES:
             raise unknown("distortion model", model, (*NAMES, *ALIASES))
+        if name == "rational" and not any(coefficients[5:]):
+            name = "radial-tangential"
         names = NAMES[name]
         if any(coefficients[len(names) :]):
             raise InputError(f"distortion {name} has {len(names)} numbers, got {coefficients}")
@@ -108,7 +122,7 @@ class Distortion(Checked):
         squared = x**2 + y**2
         if self.model == "equidistant":
             return p * self._bent_angle(np.sqrt(squared))[0][..., None]
-        radial = 1 + squared * (self.k1 + squared * (self.k2 + squared * self.k3))
+        radial, _ = self._radial(squared)
         across = 2 * self.p1 * x * y + self.p2 * (squared + 2 * x**2)
         down = self.p1 * (squared + 2 * y**2) + 2 * self.p2 * x * y
         return p * radial[..., None] + np.stack([across, down], axis=-1)
@@ -153,6 +167,18 @@ class Distortion(Checked):
         ratio = np.where(r > 1e-9, theta * grown / np.maximum(r, 1e-9), 1.0)
         return ratio, slope / (1 + r**2)
 
+    def _radial(self, s: Array) -> tuple[Array, Array]:
+        """The radial factor (...,) at s = r^2 (...,), and its derivative d / d s."""
+        above = 1 + s * (self.k1 + s * (self.k2 + s * self.k3))
+        slope = self.k1 + s * (2 * self.k2 + s * 3 * self.k3)
+        if self.model != "rational":
+            return above, slope
+        below = 1 + s * (self.k4 + s * (self.k5 + s * self.k6))
+        falling = self.k4 + s * (2 * self.k5 + s * 3 * self.k6)
+        with np.errstate(all="ignore"):  # where nothing is below the line, no ray leads
+            ratio = above / below
+            return ratio, (slope - ratio * falling) / below
+
     def _jacobian(self, p: Array) -> tuple[Array, Array, Array]:
         """d distort / d(x, y), a symmetric matrix: its entries xx, xy and yy (...,)."""
         x, y = p[..., 0], p[..., 1]
@@ -161,8 +187,8 @@ class Distortion(Checked):
             ratio, slope = self._bent_angle(np.sqrt(squared))
             growth = np.where(squared > 1e-18, (slope - ratio) / np.maximum(squared, 1e-18), 0.0)
             return ratio + growth * x**2, growth * x * y, ratio + growth * y**2
-        radial = 1 + squared * (self.k1 + squared * (self.k2 + squared * self.k3))
-        growth = 2 * (self.k1 + squared * (2 * self.k2 + squared * 3 * self.k3))
+        radial, slope = self._radial(squared)
+        growth = 2 * slope
         return (
             radial + growth * x**2 + 2 * self.p1 * y + 6 * self.p2 * x,
             growth * x * y + 2 * self.p1 * x + 2 * self.p2 * y,

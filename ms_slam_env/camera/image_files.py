@@ -24,7 +24,8 @@ SUFFIXES = (".png", ".pgm", ".jpg", ".jpeg", ".ppm", ".tif", ".tiff")
 _FORMATS = ("PNG", "JPEG", "PPM", "TIFF")
 
 _DEPTH = ("I;16", "I;16B", "I;16L", "I")
-_COLOR = ("RGB", "RGBA", "L", "P")
+_COLOR = ("RGB", "RGBA", "L", "LA", "P", "CMYK")
+_GREY = (*_COLOR, *_DEPTH)
 
 # What Pillow raises for files that are truncated or damaged, format by format.
 _BROKEN = (
@@ -51,6 +52,19 @@ def read_color(path: Path, intrinsics: Intrinsics) -> NDArray[np.uint8]:
             has another size than ``intrinsics`` say.
     """
     return decode_color(_bytes(path, "colour image"), str(path), intrinsics)
+
+
+def read_grey(path: Path, intrinsics: Intrinsics) -> NDArray[np.uint8]:
+    """As `read_color`, of a camera without depth: grey of 16 bits, as in TUM-VI, is rounded to 8.
+
+    Raises:
+        InputError: as `read_color`.
+    """
+    found = _decode(_bytes(path, "image"), str(path), "image", _GREY, intrinsics)
+    if found.ndim == 2:
+        grey = np.rint(found.clip(0, 65535) / 257.0)
+        found = np.repeat(grey[..., None], 3, axis=2)
+    return found.astype(np.uint8, copy=False)
 
 
 def read_depth(path: Path, intrinsics: Intrinsics) -> NDArray[Any]:
@@ -101,7 +115,7 @@ def _decode(
                 if image.mode not in modes:
                     raise InputError(f"{path} is not a {kind}: its pixels are {image.mode}")
                 image.load()
-                return np.array(image.convert("RGB") if modes is _COLOR else image)
+                return np.array(image.convert("RGB") if image.mode in _COLOR else image)
     except InputError:
         raise
     except _BROKEN as error:

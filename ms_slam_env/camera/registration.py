@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -72,6 +73,64 @@ class Registration(Checked):
             f"colour brought into the depth camera: focal ratio {self.focal_ratio:.4g}, baseline "
             f"{100 * self.baseline_m:g} cm, shift {self.shift_x_px:g}, {self.shift_y_px:g} px"
         )
+
+
+@dataclass(frozen=True, eq=False)
+class ColorCamera:
+    """A colour camera that is calibrated and whose place beside the depth camera is known.
+
+    Attributes:
+        intrinsics: of its images on disk.
+        T_color_depth: (4, 4) maps points of the depth camera into its frame.
+    """
+
+    intrinsics: Intrinsics
+    T_color_depth: NDArray[np.float64]
+
+    def __eq__(self, other: object) -> bool:
+        """Whether both say the same."""
+        return isinstance(other, ColorCamera) and self._key == other._key
+
+    def __hash__(self) -> int:
+        """Of what it says."""
+        return hash(self._key)
+
+    @property
+    def _key(self) -> tuple[Intrinsics, bytes]:
+        return self.intrinsics, self.T_color_depth.tobytes()
+
+    def register(
+        self, color: NDArray[np.uint8], depth: NDArray[np.float32], camera: Intrinsics
+    ) -> NDArray[np.uint8]:
+        """Colour image (H, W, 3) as the depth camera would see it, as `Registration.register` does.
+
+        Args:
+            color: as recorded, of the size that ``intrinsics`` say.
+            depth: (H, W) metres, 0 = no reading.
+            camera: intrinsics of the depth camera.
+        """
+        R, t = self.T_color_depth[:3, :3], self.T_color_depth[:3, 3]
+        points = _rays(camera) @ R.T + _inverse_depth(depth)[..., None] * t
+        is_ahead = points[..., 2] > 1e-6
+        places = self.intrinsics.project(np.where(is_ahead[..., None], points, (0, 0, 1)))
+        x, y = np.where(is_ahead, np.moveaxis(places, -1, 0), -1).astype(np.float32)
+        registered = cv2.remap(color, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return registered.astype(np.uint8, copy=False)
+
+    def __str__(self) -> str:
+        """Return what is assumed, for a report."""
+        place = ", ".join(f"{100 * v:.4g}" for v in self.T_color_depth[:3, 3])
+        turn = np.degrees(np.linalg.norm(cv2.Rodrigues(self.T_color_depth[:3, :3])[0]))
+        K = self.intrinsics
+        return (
+            f"colour of {K.width}x{K.height}, focal length {K.fx:.5g} px, brought into the depth "
+            f"camera, which stands at {place} cm of the colour camera, turned by {turn:.3g} deg"
+        )
+
+
+@lru_cache(maxsize=4)
+def _rays(camera: Intrinsics) -> NDArray[np.float64]:
+    return camera.rays()
 
 
 def _inverse_depth(depth: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -28,10 +28,11 @@ _PRINTED = (
 class Arguments:
     """Run a SLAM backend over an RGB-D sequence.
 
-    Layouts: TUM RGB-D, ICL-NUIM, 7-Scenes, EuRoC and KITTI odometry (depth by stereo matching), ROS
-    bags and MCAP files, or folders depth and rgb with an intrinsics.txt of "fx fy cx cy width
-    height [depth_scale] [radial-tangential k1 k2 p1 p2 k3 | equidistant k1 k2 k3 k4]". Writes
-    trajectory.txt (TUM), map.ply, metrics.json and frames.csv (what each frame cost).
+    Layouts: TUM RGB-D, ICL-NUIM, 7-Scenes, 3DMatch, ScanNet, Replica, EuRoC and KITTI odometry
+    (depth by stereo matching), ROS bags and MCAP files, or folders depth and rgb with an
+    intrinsics.txt of "fx fy cx cy width height [depth_scale] [MODEL k...]", MODEL
+    radial-tangential, rational or equidistant. Writes trajectory.txt (TUM), map.ply, metrics.json
+    and frames.csv (what each frame cost).
     """
 
     sequence: tyro.conf.Positional[str]
@@ -46,13 +47,13 @@ class Arguments:
     part of that aspect, 160x120+crop=480x360 that part. By default that of the configuration file,
     else "native"."""
     layout: str = "auto"
-    """auto, tum, icl-nuim, 7-scenes, folder, euroc, kitti or bag."""
+    """auto, tum, icl-nuim, 7-scenes, folder, replica, euroc, kitti or bag."""
     intrinsics: str | None = None
     """Of the images on disk, as intrinsics.txt has them; by default those of
     intrinsics.txt in the folder, else the published ones of the dataset."""
     register: bool | None = None
-    """Bring colour into the depth camera, as an uncalibrated Kinect needs it; by default only for
-    7-scenes."""
+    """Bring colour into the depth camera: True as an uncalibrated Kinect needs it, False not; by
+    default only for 7-scenes and, with their own calibration, for bags and ScanNet."""
     topics: tuple[str, ...] = ()
     """Topics of a bag, as in depth=/camera/depth/image_rect color=/camera/rgb/image_rect
     info=/camera/depth/camera_info pose=/vicon/camera; those left out are found by type and name."""
@@ -138,6 +139,8 @@ def main(arguments: Sequence[str]) -> int:
             mesh=args.mesh,
             core_watts=args.core_watts,
         )
+    if "poses" in result:
+        print(f"{'true poses':16} {result['poses']} of {result['frames']} frames")
     for name in _PRINTED:
         if result.get(name) is not None:
             print(f"{name:16} {result[name]:.4g}")
@@ -158,3 +161,6 @@ def _say_what_is_missing(sequence: RGBDSequence) -> None:
         print("no colour: SLAM has depth alone", file=sys.stderr)
     if sequence.true_trajectory() is None:
         print("no true trajectory: errors are not measured", file=sys.stderr)
+    elif not sequence.known.all():
+        are = "are" if sequence.known.sum() > 1 else "need two and are not"
+        print(f"{sequence.said_known()}; errors {are} measured over these", file=sys.stderr)

@@ -136,7 +136,7 @@ def trajectory_summary(found: Found, options: TrajectoryOptions) -> str:
     """Lines for a terminal."""
     unit = "" if options.delta_unit == "frames" else f" {options.delta_unit}"
     lines = [
-        f"{found['poses']} poses, alignment {_alignment(options)}, delta {options.delta}{unit}"
+        f"{_matched(found)}, alignment {_alignment(options)}, delta {options.delta}{unit}"
         + (f", scale {found['scale']:.6f}" if options.align == "sim3" else "")
     ]
     for key in _errors(options):
@@ -156,11 +156,10 @@ def trajectory_tables(found: Found, options: TrajectoryOptions) -> list[Table]:
     """Everything that was measured."""
     errors = _errors(options)
     note = (
-        f"{found['poses']} poses over {found['duration_s']:.3f} s and "
-        f"{found['path_m']:.3f} m, timestamps at most {options.max_difference_s:g} s apart "
-        f"({found['unmatched_poses']} poses of the estimate have no true one); alignment "
-        f"{_alignment(options)} (scale {found['scale']:.6f}); relative errors over {options.delta} "
-        f"{options.delta_unit} ({options.pairs} pairs)."
+        f"{_matched(found)}, over {found['duration_s']:.3f} s and "
+        f"{found['path_m']:.3f} m, timestamps at most {options.max_difference_s:g} s apart; "
+        f"alignment {_alignment(options)} (scale {found['scale']:.6f}); relative errors over "
+        f"{options.delta} {options.delta_unit} ({options.pairs} pairs)."
     )
     if found["tracked_share"] is not None:
         note += f" {_of_tracked(found, options).capitalize()}."
@@ -211,6 +210,11 @@ def trajectory_charts(matched: Matched, options: TrajectoryOptions) -> list[Char
         f"After alignment ({_alignment(options)}); lines are broken where the estimate was lost."
     )
     return [Chart("trajectory", "Path and error", caption, panels)]
+
+
+def _matched(found: Found) -> str:
+    """Of how many poses the errors are."""
+    return f"{found['poses']} of {found['poses'] + found['unmatched_poses']} poses have a true one"
 
 
 def _errors(options: TrajectoryOptions) -> tuple[str, ...]:

@@ -128,7 +128,11 @@ def systems_table(runs: Sequence[Run], options: TrajectoryOptions) -> Table:
             "runs_count": len(own),
             **{key: median_interval(values) if values else None for key, values in known.items()},
         })  # fmt: skip
-    note = "Medians over the runs with 95 % bootstrap intervals."
+    poses, unmatched = (sum(r.found[key] for r in runs) for key in ("poses", "unmatched_poses"))
+    note = (
+        "Medians over the runs with 95 % bootstrap intervals; "
+        f"{poses} of {poses + unmatched} poses have a true one."
+    )
     return make_table(("system", "runs_count", *keys), lines, "Systems", note)
 
 

@@ -68,6 +68,8 @@ _TABLES = {
             "processed_frames",
             "lost_frames",
             "uncertain_frames",
+            "poses",
+            "unmatched_poses",
             "path_m",
             "ate_m",
             "ate_tracked_m",
@@ -276,18 +278,21 @@ def _tracked_errors(run: SequenceRun, sequence: Sequence) -> dict[str, Any]:
 
 
 def trajectory_errors(run: SequenceRun, poses: Float64, sequence: Sequence) -> dict[str, Any]:
-    """Errors of poses (N, 4, 4) against the true ones; empty with fewer than two of these.
+    """Errors of poses (N, 4, 4) against the true ones; empty without any of these.
 
-    ``poses``; ``ate_m`` (RMSE after SE(3) alignment), ``ate_max_m``, ``ate_rad`` (RMSE of
-    the orientation after it, None where the path is a line), ``ate_unaligned_m``, ``rpe_m``,
-    ``rpe_rad``.
+    ``poses`` that have a true one, ``unmatched_poses`` that have none; with two of them ``ate_m``
+    (RMSE after SE(3) alignment), ``ate_max_m``, ``ate_rad`` (RMSE of the orientation after it, None
+    where the path is a line), ``ate_unaligned_m``, ``rpe_m``, ``rpe_rad``.
     """
-    _, P, Q = _pairs(run, poses, sequence)
-    if len(P) < 2:
+    if sequence.true_trajectory() is None:
         return {}
+    _, P, Q = _pairs(run, poses, sequence)
+    counts = {"poses": len(P), "unmatched_poses": len(poses) - len(P)}
+    if len(P) < 2:
+        return counts
     ate = metrics.ate_statistics(P, Q)
     return {
-        "poses": len(P),
+        **counts,
         "ate_m": ate.rmse,
         "ate_max_m": ate.max,
         "ate_rad": _orientation_error(P, Q),

@@ -31,6 +31,7 @@ _LEAST_SHARE = 0.5  # of the poses of the shorter trajectory
 _MOST_EXTENT = 3.0  # times as far as the other
 _LEAST_SPREAD_M = 0.02  # of a truth that stands still nothing more can be said
 _MOST_SPREAD = 0.7  # an alignment explains less than half of the variance of the positions
+_MOST_TURN_DEG = 30.0  # of the median pose
 _FRAME_COLUMNS = ("timestamp", "tracking_ok")
 _BESIDE = "frames.csv"  # of ms-slam run, in the folder of the estimate
 
@@ -147,8 +148,11 @@ def match_files(estimate: Path, truth: Path, options: TrajectoryOptions) -> Matc
     alignment = metrics.find_alignment(raw, true, options.align, options.align_first)
     share = len(first) / min(len(times), len(true_times))
     best = metrics.find_alignment(raw, true, "sim3" if options.align == "sim3" else "se3")
-    for complaint in complaints(best.poses(raw), true, share):
+    for complaint in complaints(best.poses(raw), true, share, best.unique):
         warnings.warn(f"{truth} may be of another recording: {complaint}", InputWarning, 2)
+    if len(first) < _LEAST_SHARE * len(times):
+        text = f"{estimate}: only {len(first)} of {len(times)} poses have a true one in {truth}"
+        warnings.warn(text, InputWarning, 2)
     gap_s = options.gap_s
     if gap_s is None:
         gap_s = _GAP_INTERVALS * float(np.median(np.diff(times)))
@@ -168,13 +172,14 @@ def match_files(estimate: Path, truth: Path, options: TrajectoryOptions) -> Matc
     )
 
 
-def complaints(aligned: Float64, truth: Float64, share: float) -> list[str]:
+def complaints(aligned: Float64, truth: Float64, share: float, is_turned: bool = True) -> list[str]:
     """What speaks against two trajectories being of one recording.
 
     Args:
         aligned: (N, 4, 4) estimate after the best alignment.
         truth: (N, 4, 4) at the same times.
         share: of the poses of the shorter trajectory, those that correspond.
+        is_turned: whether the positions say how the estimate is turned.
     """
     found = []
     if share < _LEAST_SHARE:
@@ -195,6 +200,14 @@ def complaints(aligned: Float64, truth: Float64, share: float) -> list[str]:
             f"the aligned estimate is {error_m:.3g} m off where the true positions themselves lie "
             f"{spread_m:.3g} m around their mean"
         )
+    elif is_turned:
+        angles = metrics.absolute_errors(aligned, truth, "none", "rotation")
+        off_deg = float(np.degrees(np.median(angles)))
+        if off_deg > _MOST_TURN_DEG:
+            found.append(
+                f"where positions fit, orientations are {off_deg:.3g} deg off (median), as of "
+                "another body or of quaternions that begin with qw"
+            )
     return found
 
 

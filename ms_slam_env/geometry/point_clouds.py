@@ -145,3 +145,16 @@ def umeyama(
             raise InputError("an alignment with scale needs an estimate that moves")
         scale = float((singular * np.diag(S)).sum() / variance)  # (42)
     return R, target_mean - scale * R @ source_mean, scale  # (41)
+
+
+def umeyama_scales(sources: Float64, targets: Float64) -> Float64:
+    """Scales (B,) of `umeyama` for B pairs of sets (B, N, 3), to the bit; each source moves."""
+    centred, targets = (
+        points - points.mean(axis=1, keepdims=True) for points in (sources, targets)
+    )
+    U, singular, Vt = np.linalg.svd(np.swapaxes(targets, 1, 2) @ centred / sources.shape[1])
+    signs = np.ones_like(singular)
+    signs[:, 2] = np.where(np.linalg.det(U) * np.linalg.det(Vt) < 0, -1.0, 1.0)
+    squares = (centred**2).reshape(len(sources), 3 * sources.shape[1])
+    variance = squares.sum(axis=1) / sources.shape[1]
+    return np.asarray((singular * signs).sum(axis=1) / variance)

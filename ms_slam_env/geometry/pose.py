@@ -117,11 +117,14 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) 
 
 
 def pose_from_quaternion(t: ArrayLike, q_xyzw: ArrayLike) -> Float64:
-    """Pose (4, 4) from a translation (3,) in m and a quaternion (qx, qy, qz, qw)."""
-    return make_pose(Rotation.from_quat(np.asarray(q_xyzw, dtype=np.float64)).as_matrix(), t)
+    """Poses (..., 4, 4) of translations (..., 3) in m and quaternions (..., 4), qx qy qz qw."""
+    R = Rotation.from_quat(np.asarray(q_xyzw, dtype=np.float64)).as_matrix()
+    T = np.zeros((*R.shape[:-2], 4, 4))
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1.0
+    return T
 
 
 def quaternion_from_pose(T: ArrayLike) -> Float64:
-    """Quaternion (qx, qy, qz, qw), of unit length with qw >= 0, of a pose (4, 4)."""
-    R = np.asarray(T, dtype=np.float64)[:3, :3]
+    """Quaternions (..., 4), qx qy qz qw, of unit length with qw >= 0, of poses (..., 4, 4)."""
+    R = np.asarray(T, dtype=np.float64)[..., :3, :3]
     return Rotation.from_matrix(R).as_quat(canonical=True)

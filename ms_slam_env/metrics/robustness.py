@@ -17,10 +17,11 @@ from scipy.linalg import logm
 
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.geometry import Float64, as_numbers
-from ms_slam_env.geometry.point_clouds import umeyama
+from ms_slam_env.geometry.point_clouds import umeyama, umeyama_scales
 from ms_slam_env.metrics.trajectory import check_pair, check_positions, check_positive
 
 SEGMENT_ALIGNMENTS = ("se3", "sim3")
+_POINTS_AT_ONCE = 200_000  # of windows that scales are found of together
 
 
 @dataclass(frozen=True)
@@ -252,11 +253,15 @@ def local_scales(
         raise InputError(f"times must be ({len(positions)},) and increase")
     check_positive(window_s, "window_s")
     first = np.searchsorted(seconds, seconds - window_s / 2, "left")
-    end = np.searchsorted(seconds, seconds + window_s / 2, "right")
+    count = np.searchsorted(seconds, seconds + window_s / 2, "right") - first
     scales = np.full(len(positions), np.nan)
-    for k, (a, b) in enumerate(zip(first, end, strict=True)):
-        if b - a >= 3 and np.ptp(positions[a:b], axis=0).max() > 1e-9:
-            scales[k] = umeyama(positions[a:b], true_positions[a:b], with_scale=True)[2]
+    for size in np.unique(count[count >= 3]):
+        own = np.flatnonzero(count == size)
+        for part in np.array_split(own, len(own) * int(size) // _POINTS_AT_ONCE + 1):
+            rows = first[part, None] + np.arange(size)
+            moves = np.ptp(positions[rows], axis=1).max(axis=1) > 1e-9
+            part, rows = part[moves], rows[moves]
+            scales[part] = umeyama_scales(positions[rows], true_positions[rows])
     return np.where(scales > 0, scales, np.nan)
 
 
@@ -299,12 +304,16 @@ def initialisation(
         positions = check_positions(estimate, "estimate")
         global_scale = umeyama(positions, check_positions(truth, "truth"), with_scale=True)[2]
     end = np.searchsorted(seconds, seconds + settled_s, "right")
-    for k, last in enumerate(end):
-        if seconds[-1] - seconds[k] < settled_s:
-            break
-        within = scales[k:last]
-        if np.isfinite(within).all() and within.max() / within.min() - 1 < threshold:  # (12)
-            ratio = scales[k] / global_scale
-            error = (abs(1 / ratio - 1) + abs(ratio - 1)) / 2  # (13)
-            return Initialisation(float(seconds[k] - seconds[0]), float(scales[k]), float(error))
-    return Initialisation(None, None, None)
+    first = np.flatnonzero(seconds[-1] - seconds >= settled_s)
+    if len(first) == 0:
+        return Initialisation(None, None, None)
+    spans = np.stack([first, end[first]], axis=1).ravel()
+    padded = np.append(scales, np.nan)
+    largest, least = (of.reduceat(padded, spans)[::2] for of in (np.maximum, np.minimum))
+    settled = first[largest / least - 1 < threshold]  # (12); NaN is never below
+    if len(settled) == 0:
+        return Initialisation(None, None, None)
+    k = settled[0]
+    ratio = scales[k] / global_scale
+    error = (abs(1 / ratio - 1) + abs(ratio - 1)) / 2  # (13)
+    return Initialisation(float(seconds[k] - seconds[0]), float(scales[k]), float(error))

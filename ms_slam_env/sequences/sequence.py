@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections.abc
+import warnings
 from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame
-from ms_slam_env.errors import InputError
+from ms_slam_env.errors import InputError, InputWarning
 from ms_slam_env.geometry import Float64
 
 
@@ -118,7 +119,7 @@ class Sequence:
         return replace(self, frames=frames, poses=self.poses[indices])
 
     def where_known(self) -> Sequence:
-        """The same sequence without the frames whose true pose is not known.
+        """The same sequence without the frames whose true pose is not known, which is warned of.
 
         Raises:
             InputError: fewer than two are left.
@@ -128,4 +129,12 @@ class Sequence:
             raise InputError(f"sequence {self.name} has no true trajectory to compare with")
         if known.sum() < 2:
             raise InputError(f"sequence {self.name}: fewer than 2 frames have a true pose")
-        return self if known.all() else self.picked(np.flatnonzero(known))
+        if known.all():
+            return self
+        text = f"sequence {self.name}: {self.said_known()}; the others are left out"
+        warnings.warn(text, InputWarning, stacklevel=2)
+        return self.picked(np.flatnonzero(known))
+
+    def said_known(self) -> str:
+        """How many frames have a true pose, in words."""
+        return f"{int(self.known.sum())} of {len(self)} frames have a true pose"

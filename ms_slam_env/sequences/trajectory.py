@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+import warnings
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from ms_slam_env.errors import InputError
+from ms_slam_env.errors import InputError, InputWarning
 from ms_slam_env.geometry import (
     MAX_COORDINATE_M,
     Float64,
@@ -17,7 +18,7 @@ from ms_slam_env.geometry import (
     pose_from_quaternion,
     quaternion_from_pose,
 )
-from ms_slam_env.input_files import read_text
+from ms_slam_env.input_files import read_text, words_of
 from ms_slam_env.output_files import write_text
 
 Int64 = NDArray[np.int64]
@@ -25,7 +26,7 @@ Int64 = NDArray[np.int64]
 MAX_DIFFERENCE_S = 0.02
 """Timestamps further apart do not belong together (the tolerance of the TUM tools)."""
 
-_MAX_TIME_S = 1e20  # nanoseconds since 1970 are taken too, as they stand
+_MAX_TIME_S = 1e20  # nanoseconds since 1970 among them
 
 _FIELDS = "timestamp tx ty tz qx qy qz qw"
 
@@ -33,11 +34,75 @@ _FIELDS = "timestamp tx ty tz qx qy qz qw"
 TRAJECTORY_HEADER = f"# {_FIELDS}"
 """First line of a file of poses."""
 
+UNITS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
+"""Unit of time to its seconds."""
+
+_SAID_UNITS = {
+    r"\[ns\]|\bnano_?s": "ns",
+    r"\[[uµμ]s\]|\bmicro_?s": "us",
+    r"\[ms\]|\bmilli_?s": "ms",
+    r"\[s\]|\bsec(ond)?s?\b": "s",
+}
+_CLOCK_S = 9e8, 4.2e9  # since 1970, of a clock that is right
+
+
+def said_unit(comment: str) -> str | None:
+    """The unit of time that a comment names, as in ``#timestamp [ns]``; None if it names none."""
+    said = (u for form, u in _SAID_UNITS.items() if re.search(form, comment.lower()))
+    return next(said, None)
+
+
+def unit_of(times: Float64) -> tuple[str, bool]:
+    """The unit of increasing times (N,) as found in a file, and whether it is guessed.
+
+    Times since 1970 tell their unit. Of others, poses or frames would be minutes apart in a unit
+    that is too long: steps of 2000 are of microseconds, of two million of nanoseconds.
+    """
+    step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    for unit in ("ns", "us", "ms"):
+        is_clock = _CLOCK_S[0] <= times[0] * UNITS[unit] < _CLOCK_S[1]
+        if is_clock and step * UNITS[unit] < 10:
+            return unit, False
+    unit = "ns" if step >= 2e6 else "us" if step >= 2e3 else "s"
+    return unit, unit != "s"
+
+
+def in_seconds(times: Float64, where: str | Path, said: str | None = None) -> Float64:
+    """Increasing times (N,) of a file in seconds; a unit that is guessed is warned of.
+
+    Args:
+        times: as they stand there.
+        where: for the warning.
+        said: the unit that the file names, if it does.
+    """
+    if len(times) == 0:
+        return times
+    unit, is_guess = (said, False) if said else unit_of(times)
+    if is_guess:
+        say_unit(unit, times, where, "a comment such as [s]")
+    return times if unit == "s" else times * UNITS[unit]
+
+
+def say_unit(unit: str, times: Float64, where: str | Path, otherwise: str) -> None:
+    """Warn that the unit of times (N,) is a guess, and what says ``otherwise``."""
+    step = float(np.median(np.diff(times)))
+    warnings.warn(
+        f"{where}: times are taken as {unit}, since they are {step:.6g} apart; {otherwise} says "
+        "otherwise",
+        InputWarning,
+        stacklevel=2,
+    )
+
 
 def trajectory_line(timestamp: float, T_world_camera: Float64) -> str:
     """One pose (4, 4) at ``timestamp`` in seconds, without line end."""
-    values = (*T_world_camera[:3, 3], *quaternion_from_pose(T_world_camera))
-    return f"{timestamp:.6f} " + " ".join(f"{value:.9f}" for value in values)
+    return _lines(np.array([timestamp]), T_world_camera[None])[0]
+
+
+def _lines(times: Float64, poses: Float64) -> list[str]:
+    rows = np.column_stack([times, poses[:, :3, 3], quaternion_from_pose(poses)])
+    form = "%.6f" + 7 * " %.9f"
+    return [form % tuple(row) for row in rows.tolist()]
 
 
 def write_trajectory(path: str | Path, timestamps: ArrayLike, poses: ArrayLike) -> None:
@@ -50,52 +115,74 @@ def write_trajectory(path: str | Path, timestamps: ArrayLike, poses: ArrayLike) 
     matrices = np.asarray(poses, dtype=np.float64)
     if times.ndim != 1 or matrices.shape != (len(times), 4, 4):
         raise InputError(f"{len(times)} timestamps do not fit poses of shape {matrices.shape}")
-    lines = [TRAJECTORY_HEADER, *map(trajectory_line, times, matrices)]
+    lines = [TRAJECTORY_HEADER, *(_lines(times, matrices) if len(times) else ())]
     write_text(Path(path), "\n".join(lines) + "\n")
 
 
-def _parse(line: str, where: str) -> Sequence[float]:
-    """Read the eight numbers of a line, or raise one error naming file and line."""
-    words = line.replace(",", " ").split()
-    try:
-        numbers = [float(word) for word in words]
-    except ValueError:
-        numbers = []
-    if len(numbers) != 8:
-        raise InputError(f"{where}: expected the 8 numbers '{_FIELDS}', got {line.strip()!r}")
-    if not np.isfinite(numbers).all():
+def _check(row: Float64, where: str) -> None:
+    """Raise the error of a line of eight numbers, if there is one."""
+    if not np.isfinite(row).all():
         raise InputError(f"{where}: a number is not finite")
-    if max(map(abs, numbers[1:4])) > MAX_COORDINATE_M or abs(numbers[0]) > _MAX_TIME_S:
+    if np.abs(row[1:4]).max() > MAX_COORDINATE_M or abs(row[0]) > _MAX_TIME_S:
         raise InputError(
             f"{where}: a position beyond {MAX_COORDINATE_M:g} m or a time beyond {_MAX_TIME_S:g} s"
         )
-    if max(map(abs, numbers[4:])) > 2 or abs(np.linalg.norm(numbers[4:]) - 1.0) > 1e-2:
-        raise InputError(f"{where}: the quaternion {numbers[4:]} is not of unit length")
-    return numbers
+    if np.abs(row[4:]).max() > 2 or abs(np.linalg.norm(row[4:]) - 1.0) > 1e-2:
+        raise InputError(f"{where}: the quaternion {row[4:].tolist()} is not of unit length")
 
 
 def read_trajectory(path: str | Path) -> tuple[Float64, Float64]:
     """Read a trajectory: timestamps (N,) in seconds and poses T_world_camera (N, 4, 4).
 
+    A comment may name the unit of time, as ``[ns]``, and the order of the columns.
+
     Raises:
         InputError: no such file, no pose in it, a line that does not parse, or timestamps that
             do not increase; the message names file and line.
     """
-    text = read_text(path, "trajectory")
-    times: list[float] = []
-    poses: list[Float64] = []
-    for number, line in enumerate(text.splitlines(), start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
+    numbers: list[int] = []
+    found: list[list[float]] = []
+    said, columns = None, list(range(8))
+    for number, line in enumerate(read_text(path, "trajectory").splitlines(), start=1):
+        if not line.strip():
             continue
-        where = f"{path}, line {number}"
-        time, *rest = _parse(line, where)
-        if times and time <= times[-1]:
-            raise InputError(f"{where}: timestamp {time} does not come after {times[-1]}")
-        times.append(time)
-        poses.append(pose_from_quaternion(rest[:3], rest[3:]))
-    if not times:
+        if line.lstrip().startswith("#"):
+            named = re.split(r"[\s,;]+", line.strip("# \t"))
+            if sorted(named) == sorted(_FIELDS.split()):
+                columns = [named.index(field) for field in _FIELDS.split()]
+            said = said or said_unit(line)
+            continue
+        try:
+            row = list(map(float, words_of(line)))
+        except ValueError:
+            row = []
+        if len(row) != 8:
+            shown = line.strip()
+            raise InputError(
+                f"{path}, line {number}: expected the 8 numbers '{_FIELDS}', got {shown!r}"
+            )
+        numbers.append(number)
+        found.append(row)
+    if not found:
         raise InputError(f"{path} holds no pose; each line must be '{_FIELDS}'")
-    return np.array(times), np.stack(poses)
+    rows = np.array(found)[:, columns]
+    with np.errstate(invalid="ignore", over="ignore"):
+        length = np.linalg.norm(rows[:, 4:], axis=1)
+        is_good = (
+            np.isfinite(rows).all(axis=1)
+            & (np.abs(rows[:, 1:4]).max(axis=1) <= MAX_COORDINATE_M)
+            & (np.abs(rows[:, 0]) <= _MAX_TIME_S)
+            & (np.abs(rows[:, 4:]).max(axis=1) <= 2)
+            & (np.abs(length - 1.0) <= 1e-2)
+        )
+        goes_on = np.diff(rows[:, 0], prepend=-np.inf) > 0
+    if not (is_good & goes_on).all():
+        k = int(np.argmin(is_good & goes_on))
+        where = f"{path}, line {numbers[k]}"
+        _check(rows[k], where)
+        raise InputError(f"{where}: timestamp {rows[k, 0]} does not come after {rows[k - 1, 0]}")
+    times = in_seconds(rows[:, 0], path, said)
+    return times, pose_from_quaternion(rows[:, 1:4], rows[:, 4:])
 
 
 def associate(times: Float64, others: Float64, max_difference_s: float) -> tuple[Int64, Int64]:
@@ -113,6 +200,13 @@ def associate(times: Float64, others: Float64, max_difference_s: float) -> tuple
     close = np.abs(times - others[nearest]) <= max_difference_s
     first = np.flatnonzero(mutual & close)
     return first, nearest[first]
+
+
+def say_few_pairs(where: str | Path, pairs: int, count: int) -> None:
+    """Warn where fewer than half of the depth images have colour of their time."""
+    if 2 * pairs < count:
+        text = f"{where}: only {pairs} of {count} depth images have colour of their time"
+        warnings.warn(f"{text}; the others are left out", InputWarning, stacklevel=2)
 
 
 def _nearest(times: Float64, others: Float64) -> Int64:

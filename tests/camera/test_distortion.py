@@ -16,7 +16,12 @@ KINECT = Distortion("radial-tangential", 0.2624, -0.9531, -0.0054, 0.0026, 1.163
 FISHEYE = Distortion.of("equidistant", [0.00348, 0.000715, -0.00205, 0.000202])
 CAMERA = Intrinsics(517.3, 516.5, 318.6, 255.3, 640, 480, KINECT)
 WIDE = Intrinsics(190.9, 190.9, 254.9, 256.8, 512, 512, FISHEYE)
-LENSES = {"radial-tangential": CAMERA, "equidistant": WIDE}
+# The colour camera of an Azure Kinect.
+AZURE = Distortion.of(
+    "rational_polynomial", [0.517, -2.627, 0.00054, -0.00021, 1.522, 0.394, -2.449, 1.448]
+)
+RATIONAL = Intrinsics(605.9, 605.7, 638.2, 363.5, 1280, 720, AZURE)
+LENSES = {"radial-tangential": CAMERA, "equidistant": WIDE, "rational": RATIONAL}
 
 
 def opencv_projection(K, points):
@@ -25,7 +30,8 @@ def opencv_projection(K, points):
     if d.model == "equidistant":
         numbers = np.array([d.k1, d.k2, d.k3, d.k4])
         return cv2.fisheye.projectPoints(*args, numbers)[0].reshape(-1, 2)
-    return cv2.projectPoints(*args, np.array([d.k1, d.k2, d.p1, d.p2, d.k3]))[0].reshape(-1, 2)
+    numbers = np.array([d.k1, d.k2, d.p1, d.p2, d.k3, d.k4, d.k5, d.k6])
+    return cv2.projectPoints(*args, numbers)[0].reshape(-1, 2)
 
 
 @pytest.mark.parametrize("model", LENSES)
@@ -40,6 +46,13 @@ def test_rays_are_the_inverse_of_projection(u, v):
     for K in (CAMERA, CAMERA.scaled(0.5), CAMERA.cropped(10, 20, 600, 400).resized(300, 200)):
         pixel = np.array([u, v]) * (K.width - 1, K.height - 1) / (639, 479)
         np.testing.assert_allclose(K.project(K.rays_at(pixel) * 1.7), pixel, atol=1e-5)
+
+
+def test_rays_of_a_rational_lens_are_the_inverse_of_projection():
+    pixels = np.stack(np.meshgrid(np.arange(0, 1280, 97), np.arange(0, 720, 83)), axis=-1)
+    np.testing.assert_allclose(RATIONAL.project(RATIONAL.rays_at(pixels)), pixels, atol=1e-6)
+    plain = Distortion.of("rational_polynomial", [0.1, -0.2, 0, 0, 0.05, 0, 0, 0])
+    assert plain == Distortion.of("plumb_bob", [0.1, -0.2, 0, 0, 0.05])
 
 
 def test_rays_of_a_fisheye_are_the_inverse_of_projection():
@@ -79,7 +92,10 @@ def test_a_lens_survives_a_change_of_size_and_not_straightening():
     [
         ("radial-tangential", [-0.9], "folds an image of 640x480"),
         ("radial-tangential", [30.0], r"k1 = 30.0 is outside \[-20, 20\]"),
-        ("rational", [1.0], "unknown distortion model 'rational'; valid choices: radial-tang"),
+        ("tilted", [1.0], "unknown distortion model 'tilted'; valid choices: radial-tang"),
+        ("rational", [0, 0, 0, 0, 0, -2.0], "folds an image of 640x480"),
+        ("rational", [0, 0, 0, 0, 0, 2e3], r"k4 = 2000.0 is outside \[-1000, 1000\]"),
+        ("rational", [0.1] * 12, "has 8 numbers"),
         ("radtan", [0.1] * 6, "has 5 numbers"),
         ("equidistant", [float("nan")], "k1 = nan is outside"),
     ],

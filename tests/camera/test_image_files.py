@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.camera.image_files import read_color, read_depth
+from ms_slam_env.camera.image_files import read_color, read_depth, read_grey
 from ms_slam_env.errors import InputError
 
 CAMERA = Intrinsics(20, 20, 7.5, 5.5, 16, 12)
@@ -33,6 +33,26 @@ def test_colour_of_every_format(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"c.{suffix}"
     Image.fromarray(COLOR).save(path)
     assert np.array_equal(read_color(path, CAMERA), np.asarray(Image.open(path)))
+
+
+@pytest.mark.parametrize("mode", ["RGBA", "LA", "L", "P", "CMYK"])
+def test_colour_of_every_kind(tmp_path: Path, mode: str) -> None:
+    grey = Image.fromarray(np.full((4, 6), 100, dtype=np.uint8))
+    path = tmp_path / f"a.{'tif' if mode == 'CMYK' else 'png'}"
+    grey.convert("RGB").convert(mode).save(path)
+    found = read_color(path, Intrinsics(5, 5, 2.5, 1.5, 6, 4))
+    assert found.shape == (4, 6, 3)
+    assert np.abs(found.astype(int) - 100).max() <= 2
+
+
+def test_grey_of_sixteen_bits_is_no_colour_but_what_a_camera_sees(tmp_path: Path) -> None:
+    values = np.arange(24, dtype=np.uint16).reshape(4, 6) * 2730
+    Image.fromarray(values).save(tmp_path / "a.png")
+    K = Intrinsics(5, 5, 2.5, 1.5, 6, 4)
+    found = read_grey(tmp_path / "a.png", K)
+    np.testing.assert_array_equal(found, np.rint(values / 257).astype(int)[..., None].repeat(3, 2))
+    with pytest.raises(InputError, match="not a colour image: its pixels are I;16"):
+        read_color(tmp_path / "a.png", K)
 
 
 def test_depth_of_eight_bits_is_refused(tmp_path: Path) -> None:

@@ -202,6 +202,22 @@ def test_lengths_of_segments_are_free(tmp_path: Path) -> None:
     assert [drift["length_m"] for drift in result["drift_by_length"]] == [0.5, 2.0]
 
 
+def test_of_how_many_poses_the_errors_are_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    estimate, truth = write_pair(tmp_path)
+    times, poses = read_trajectory(Path(truth))
+    write_trajectory(truth, times[[3, 40, 41]], poses[[3, 40, 41]])
+    found = evaluate([estimate, truth], tmp_path / "out")
+    said = capsys.readouterr()
+    assert said.out.startswith(f"3 of {COUNT} poses have a true one, alignment se3")
+    assert f"estimate.txt: only 3 of {COUNT} poses have a true one in {truth}" in said.err
+    assert (found["poses"], found["unmatched_poses"]) == (3, COUNT - 3)
+    assert f"3 of {COUNT} poses have a true one" in (tmp_path / "out/table.md").read_text()
+    assert main(["evaluate", "--runs", estimate, "--truth", truth]) == 0
+    assert f"3 of {COUNT} poses have a true one" in capsys.readouterr().out
+
+
 def test_a_truth_of_another_recording_is_complained_about(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -217,6 +233,8 @@ def test_a_truth_of_another_recording_is_complained_about(
             _moved(poses, np.random.default_rng(1).uniform(-1, 1, (COUNT, 3))),
         ),
     }
+    turned = poses @ se3_exp([0, 0, 0, 0, 0, 1.0])  # positions stay
+    others["orientations are 57.3 deg off"] = (times, turned)
     for complaint, other in others.items():
         write_trajectory(tmp_path / "other.txt", *other)
         assert main(["evaluate", estimate, str(tmp_path / "other.txt")]) == 0

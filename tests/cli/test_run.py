@@ -11,11 +11,12 @@ from PIL import Image
 
 from ms_slam_env.camera import xtion
 from ms_slam_env.cli import main
+from ms_slam_env.errors import InputError, InputWarning
 from ms_slam_env.evaluation.run_to_folder import run_to_folder
 from ms_slam_env.geometry import look_at
 from ms_slam_env.metrics import ate_rmse
 from ms_slam_env.metrics.registry import RESULTS_VERSION
-from ms_slam_env.sequences import read_trajectory, render_sequence, write_trajectory
+from ms_slam_env.sequences import open_sequence, read_trajectory, render_sequence, write_trajectory
 from ms_slam_env.sequences.recording import Recording
 
 FRAMES = 8
@@ -120,6 +121,31 @@ def test_writes_trajectory_map_and_metrics(sequence, tmp_path, capsys):
     raw = cloud.metadata["_ply_raw"]["vertex"]["properties"]
     assert {"red", "nx", "ny", "nz", "radius", "confidence"} <= set(raw)
     assert "ate_m" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("rows", "said"), [(2, "are measured"), (1, "need two and are not meas")])
+def test_of_how_many_frames_the_errors_are_is_said(rows, said, sequence, tmp_path, capsys):
+    folder = shutil.copytree(sequence, tmp_path / "box")
+    lines = (folder / "groundtruth.txt").read_text().splitlines()
+    (folder / "groundtruth.txt").write_text("\n".join(lines[: rows + 1]))
+    assert main(["run", str(folder), "--backend", "odometry", "--out", str(tmp_path / "o")]) == 0
+    out, err = capsys.readouterr()
+    assert f"true poses       {rows} of {FRAMES} frames" in out
+    assert re.search(f"{rows} of {FRAMES} frames have a true pose; errors {said}", err)
+    written = json.loads((tmp_path / "o/metrics.json").read_text())
+    assert (written["poses"], written["unmatched_poses"]) == (rows, FRAMES - rows)
+    assert ("ate_m" in written) == (rows > 1)
+    table = written["tables"][0]
+    assert {"poses", "unmatched_poses"} <= {column["name"] for column in table["columns"]}
+    opened = open_sequence(folder)
+    with (
+        pytest.raises(InputError)
+        if rows < 2
+        else pytest.warns(
+            InputWarning, match=f"2 of {FRAMES} frames have a true pose; the others are left out"
+        )
+    ):
+        assert len(opened.where_known()) == 2
 
 
 def test_a_backend_that_closes_loops_writes_the_final_poses_too(sequence, tmp_path):

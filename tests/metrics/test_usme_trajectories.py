@@ -10,6 +10,7 @@ from scipy.linalg import expm
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import hat, make_pose, se3_exp, se3_log, so3_exp
+from ms_slam_env.geometry.point_clouds import umeyama
 from ms_slam_env.metrics import (
     ate_rmse,
     initialisation,
@@ -222,3 +223,19 @@ def test_time_and_way_of_a_team() -> None:
 def test_bad_input(call, message: str) -> None:
     with pytest.raises(InputError, match=message):
         call()
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.02, 0.3])
+def test_scales_of_all_windows_are_those_of_each_to_the_bit(jitter: float) -> None:
+    rng = np.random.default_rng(3)
+    times = np.cumsum(1 / 30 + jitter * rng.random(300))
+    truth = np.cumsum(rng.normal(0, 0.01, (300, 3)), axis=0)
+    estimate = truth / 3 + rng.normal(0, 1e-3, (300, 3))
+    estimate[100:160] = estimate[100]
+    found = local_scales(times, estimate, truth, 1.0)
+    for k, t in enumerate(times):
+        near = (times >= t - 0.5) & (times <= t + 0.5)
+        moves = near.sum() >= 3 and np.ptp(estimate[near], axis=0).max() > 1e-9
+        want = umeyama(estimate[near], truth[near], with_scale=True)[2] if moves else np.nan
+        assert found[k] == want or (np.isnan(found[k]) and not want > 0)
+    assert np.isnan(found).any()

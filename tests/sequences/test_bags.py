@@ -9,9 +9,11 @@ import pytest
 from bag_files import COLOR, DEPTH, INFO, TRUTH, Messages, png, topics_of, write_bag
 
 from ms_slam_env.camera import Distortion, Intrinsics, xtion
+from ms_slam_env.camera.registration import ColorCamera, Registration
 from ms_slam_env.camera.undistortion import undistort_color
 from ms_slam_env.cli import main
-from ms_slam_env.errors import InputError
+from ms_slam_env.errors import InputError, InputWarning
+from ms_slam_env.geometry import make_pose, so3_exp
 from ms_slam_env.sequences import handheld_trajectory, open_sequence, render_sequence
 from ms_slam_env.sequences.recording import Topics, open_recording
 
@@ -38,6 +40,7 @@ def bag(tmp_path, sequence, messages):
     """Writes a ROS 1 bag with other topics in the place of some."""
 
     def write(**changes):
+        (tmp_path / "one.bag").unlink(missing_ok=True)
         topics = {**topics_of(sequence, messages[1]), **changes}
         return write_bag(tmp_path / "one.bag", messages[1], {t: m for t, m in topics.items() if m})
 
@@ -164,6 +167,139 @@ def test_messages_out_of_order_and_sent_twice(bag, sequence, messages):
     recording = open_recording(bag(**{DEPTH: [*late, (late[0][0], sent[0][1])]}))
     np.testing.assert_allclose(recording.timestamps, sequence.timestamps, atol=1e-6)
     np.testing.assert_array_equal(recording.frame(1).depth, sequence.frames[1].depth)
+
+
+COLOR_INFO, OF_DEPTH, OF_COLOR = "/camera/rgb/camera_info", "depth_optical", "rgb_optical"
+T_DEPTH_COLOR = make_pose(so3_exp([0.01, 0.02, -0.01]), [0.025, 0.002, 0.001])
+
+
+def of_frame(sent, frame):
+    """The same messages of another frame."""
+    return [
+        (t, dataclasses.replace(m, header=dataclasses.replace(m.header, frame_id=frame)))
+        for t, m in sent
+    ]
+
+
+@pytest.fixture
+def unregistered(sequence, messages):
+    """Topics of a colour camera of its own, beside the depth camera and of another focal length."""
+    own, time = messages[1], sequence.timestamps[0]
+    topics = topics_of(sequence, own)
+    K_color = Intrinsics(100, 101, 41, 29, 80, 60)
+    v, u = np.mgrid[:60, :80]
+    ramp = np.stack([3 * u, 4 * v, 0 * u], axis=-1).astype(np.uint8)
+    images = [(t, own.image(t, ramp, "rgb8", step=240)) for t in sequence.timestamps]
+    links = {("base", OF_DEPTH): make_pose(np.eye(3), [0, 0, 1])}
+    links[("base", OF_COLOR)] = links[("base", OF_DEPTH)] @ T_DEPTH_COLOR
+    return {
+        DEPTH: of_frame(topics[DEPTH], f"/{OF_DEPTH}"),
+        COLOR: of_frame(images, OF_COLOR),
+        COLOR_INFO: [(time, own.info(time, K_color))],
+        "/tf_static": [(time, own.transforms(time, links))],
+    }, K_color
+
+
+def test_colour_of_another_camera_is_registered_by_its_transform(bag, sequence, unregistered):
+    topics, K_color = unregistered
+    path = bag(**topics)
+    with pytest.warns(InputWarning, match="depth is not registered: colour of 80x60, focal length"):
+        recording = open_recording(path)
+    depth = sequence.frames[2].depth
+    points = K.rays()[depth > 0] * depth[depth > 0][:, None]
+    T = np.linalg.inv(T_DEPTH_COLOR)
+    want = K_color.project(points @ T[:3, :3].T + T[:3, 3])
+    inside = ((want >= 0) & (want <= [79, 59])).all(axis=1)
+    found = recording.frame(2).color[depth > 0][inside, :2]
+    assert inside.sum() > 1000
+    np.testing.assert_allclose(found, want[inside] * [3, 4], atol=1)
+    plain = open_recording(path, register=False)
+    assert plain.registration is None
+    np.testing.assert_array_equal(plain.frame(2).color[5, 7], [21, 20, 0])
+    assert open_recording(path, register=True).registration == Registration()
+
+
+def test_cameras_whose_place_nobody_says_are_refused(bag, unregistered):
+    topics, _ = unregistered
+    no_place = "depth is of frame depth_optical and colour of rgb_optical, and no /tf_static"
+    with pytest.raises(InputError, match=no_place):
+        open_recording(bag(**{**topics, "/tf_static": []}))
+    with pytest.raises(InputError, match="colour is of another camera, rgb_optical, whose Cam"):
+        open_recording(bag(**{**topics, COLOR_INFO: []}))
+
+
+def test_colour_of_one_frame_and_another_calibration_is_registered(bag, sequence, messages):
+    time = sequence.timestamps[0]
+    K_color = dataclasses.replace(K, fx=1.5 * K.fx, fy=1.5 * K.fy)
+    with pytest.warns(InputWarning, match="depth is not registered"):
+        found = open_recording(bag(**{COLOR_INFO: [(time, messages[1].info(time, K_color))]}))
+    assert found.registration == ColorCamera(K_color, np.eye(4))
+    same = open_recording(bag(**{COLOR_INFO: [(time, messages[1].info(time, K))]}))
+    assert same.registration is None
+
+
+def test_poses_of_another_body_are_moved_to_the_camera_or_warned_of(bag, sequence, messages):
+    own, time = messages[1], sequence.timestamps[0]
+    T_body_camera = make_pose(so3_exp([0.5, -1.0, 0.3]), [0.3, -0.1, 0.2])
+    bodies = sequence.poses @ np.linalg.inv(T_body_camera)
+    sent = [
+        (t, dataclasses.replace(own.pose(t, T, "Odometry"), child_frame_id="/base_link"))
+        for t, T in zip(sequence.timestamps, bodies, strict=True)
+    ]
+    link = own.transforms(time, {("base_link", "camera"): T_body_camera})
+    found = open_recording(bag(**{TRUTH: sent, "/tf_static": [(time, link)]}))
+    np.testing.assert_allclose(found.truth, sequence.poses, atol=1e-9)
+    with pytest.warns(InputWarning, match="are of frame base_link, images of camera, and no /tf"):
+        found = open_recording(bag(**{TRUTH: sent}))
+    np.testing.assert_allclose(found.truth, bodies, atol=1e-9)
+
+
+def test_topics_of_poses_that_are_not_taken_are_named(bag, sequence, messages):
+    topics = topics_of(sequence, messages[1])
+    with pytest.warns(InputWarning, match=r"no poses are taken as true; .*'/odom'"):
+        assert open_recording(bag(**{TRUTH: [], "/odom": topics[TRUTH]})).truth is None
+
+
+def test_a_clock_that_begins_at_zero(tmp_path, sequence, messages):
+    own = messages[1]
+    frames = zip(np.arange(3) / 10, sequence.frames, strict=False)
+    sent = [(1.7e9 + t, own.image(t, f.depth, "32FC1")) for t, f in frames]
+    topics = {DEPTH: sent, INFO: [(1.7e9, own.info(0.0, K))]}
+    recording = open_recording(write_bag(tmp_path / "a.bag", own, topics))
+    np.testing.assert_allclose(recording.timestamps, [0, 0.1, 0.2], atol=1e-9)
+
+
+@pytest.mark.parametrize("form", ["16UC1; compressedDepth", "16UC1; compressedDepth "])
+@pytest.mark.parametrize("header", [b"", bytes(12)])
+def test_compressed_depth_of_before_its_codec_was_named(form, header, bag, sequence, messages):
+    time = sequence.timestamps[0]
+    whole = np.rint(sequence.frames[0].depth * 1000).astype(np.uint16)
+    whole[3, 4] = 65535
+    sent = messages[1].compressed(time, header + png(whole), form)
+    topic = "/camera/depth/image/compressedDepth"
+    depth = open_recording(bag(**{DEPTH: [], topic: [(time, sent)]})).frame(0).depth
+    whole[3, 4] = 0
+    np.testing.assert_array_equal(depth, whole / np.float32(1000))
+
+
+@pytest.mark.parametrize("profile", ["ros1", ""])
+def test_mcap_of_another_profile_is_named(profile, tmp_path, sequence, messages):
+    path = write_bag(tmp_path / "a.mcap", messages[2], topics_of(sequence, messages[2]))
+    data = path.read_bytes()
+    assert data[17:25] == b"\4\0\0\0ros2"
+    path.write_bytes(data[:17] + bytes([len(profile), 0, 0, 0]) + profile.encode() + data[25:])
+    with pytest.raises(InputError, match=f"MCAP file of profile '{profile}'; only ros2 is read"):
+        open_recording(path)
+
+
+def test_a_rational_lens(bag, sequence, messages):
+    time, numbers = sequence.timestamps[0], [0.5, -2.6, 1e-4, -2e-4, 1.5, 0.4, -2.4, 1.4]
+    info = messages[1].info(time, K)
+    info = dataclasses.replace(info, D=np.array(numbers), distortion_model="rational_polynomial")
+    recording = open_recording(bag(**{INFO: [(time, info)]}))
+    assert recording.source.distortion == Distortion.of("rational", numbers)
+    straight = undistort_color(sequence.frames[1].color, recording.source)
+    np.testing.assert_array_equal(recording.frame(1).color, straight)
 
 
 def broken(what, sequence, own):

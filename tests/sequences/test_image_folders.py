@@ -54,7 +54,7 @@ def test_a_folder_that_is_not_read_is_named(tmp_path: Path) -> None:
 
 
 @settings(max_examples=50, deadline=None)
-@given(st.sets(st.integers(0, 99999), min_size=1, max_size=8), st.sampled_from(["", "cam0_", "f"]))
+@given(st.sets(st.integers(0, 1999), min_size=1, max_size=8), st.sampled_from(["", "cam0_", "f"]))
 def test_numbers_of_frames_are_their_times(tmp_path_factory, numbers, prefix) -> None:  # type: ignore[no-untyped-def]
     folder = make(
         tmp_path_factory.getbasetemp() / "numbers", [f"{prefix}{n:05d}_depth" for n in numbers]
@@ -73,11 +73,70 @@ def test_numbers_of_frames_are_their_times(tmp_path_factory, numbers, prefix) ->
         (["1305031102160407000", "1305031102193740000"], [1305031102.160407, 1305031102.193740]),
         (["1305031102160407", "1305031102193740"], [1305031102.160407, 1305031102.193740]),
         (["1305031102160", "1305031102193"], [1305031102.160, 1305031102.193]),
+        (["512000000000", "512033333333", "512066666667"], [512, 512.033333333, 512.066666667]),
+        (["512000000", "512033333", "512066667"], [512, 512.033333, 512.066667]),
+        (["0", "33333", "66667"], [0, 0.033333, 0.066667]),
     ],
 )
 def test_times_in_names(tmp_path: Path, names: list[str], times: list[float]) -> None:
     found = open_recording(make(tmp_path / "s", names, "rgb")).timestamps
     np.testing.assert_allclose(found, times, rtol=0, atol=1e-6)
+
+
+def test_a_unit_that_steps_tell_is_said_and_held_against_no_truth(tmp_path: Path) -> None:
+    names = [f"{round(1e9 * (512 + k / 30))}" for k in range(4)]
+    colors = [f"{round(1e9 * (512.004 + k / 30))}" for k in range(4)]
+    folder = make(tmp_path / "s", names, "rgb", colors)
+    truth = 512 + np.arange(4) / 30 + 0.01
+    write_trajectory(folder / "groundtruth.txt", truth, np.tile(np.eye(4), (4, 1, 1)))
+    with pytest.warns(InputWarning, match=r"as ns, .* 3\.33333e\+07 apart; a file times\.txt"):
+        recording = open_recording(folder)
+    np.testing.assert_allclose(recording.timestamps, 512 + np.arange(4) / 30, atol=1e-9)
+    (folder / "times.txt").write_text("0\n1\n2\n3")
+    assert open_recording(folder).timestamps.tolist() == [0, 1, 2, 3]
+
+
+STAMPS = [1_466_000_000.5, 1_466_000_000.75, 1_466_000_001.5]
+TIMES = {
+    "{name} {:.2f} 12.5": STAMPS,
+    "{name} {:.2f}": STAMPS,
+    "{name}.png,{:.2f},12.5": STAMPS,
+    "{:.2f}": STAMPS,
+    "{ns}": STAMPS,
+    "{name} {ns} 12.5": STAMPS,
+    "# time [ms]\n{k}500": [0.5, 1.5, 2.5],
+    "# [s]\n{k}00": [0, 100, 200],
+    "{k}00": [0, 0.1, 0.2],
+    "0,{k}0": None,
+    "7 {:.2f} 12.5": None,
+    "{:.2f} 12.5": None,
+    "{name} {:.2f} 1 2": None,
+}
+
+
+@pytest.mark.filterwarnings("ignore::ms_slam_env.errors.InputWarning")
+@pytest.mark.parametrize("form", TIMES)
+def test_forms_of_a_file_of_times(tmp_path: Path, form: str) -> None:
+    names = ["0000", "0001", "0005"]
+    folder = make(tmp_path / "s", names, "rgb")
+    lines = [
+        form.format(stamp, name=name, ns=round(1e9 * stamp), k=k)
+        for k, (name, stamp) in enumerate(zip(names, STAMPS, strict=True))
+    ]
+    (folder / "times.txt").write_text("\ufeff" + "\n".join(lines) + "\n")
+    want = TIMES[form]
+    if want is None:
+        with pytest.raises(InputError, match=r"times\.txt:\d: expected a time, .* id 000"):
+            open_recording(folder)
+    else:
+        np.testing.assert_allclose(open_recording(folder).timestamps, want, rtol=1e-15, atol=1e-6)
+
+
+def test_milliseconds_in_a_file_of_times_are_said(tmp_path: Path) -> None:
+    folder = make(tmp_path / "s", ["0", "1", "2"])
+    (folder / "times.txt").write_text("512000\n512033\n512067\n")
+    with pytest.warns(InputWarning, match=r"times\.txt: times are taken as ms, .* 33\.5 apart"):
+        assert np.allclose(open_recording(folder).timestamps, [512, 512.033, 512.067])
 
 
 def test_gaps_are_warned_of_and_keep_their_time(tmp_path: Path) -> None:
@@ -97,7 +156,7 @@ def test_a_file_of_times_comes_first(tmp_path: Path) -> None:
     (folder / "times.txt").write_text("# seconds\n0.5\n0.75\n1.5\n")
     assert open_recording(folder).timestamps.tolist() == [0.5, 0.75, 1.5]
     (folder / "times.txt").write_text("0.5\n0.75\n")
-    with pytest.raises(InputError, match=r"times\.txt: 2 times for 3 depth images"):
+    with pytest.raises(InputError, match=r"times\.txt: 2 times for 3 images"):
         open_recording(folder)
     (folder / "times.txt").write_text("0.5\n0.75\n0.75\n")
     with pytest.raises(InputError, match="does not come after"):

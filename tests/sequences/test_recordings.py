@@ -1,5 +1,6 @@
 """Recorded sequences: four folder layouts, and one clear error for each way they can be broken."""
 
+import json
 import re
 import shutil
 from pathlib import Path
@@ -11,7 +12,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.errors import InputError
+from ms_slam_env.camera.registration import ColorCamera
+from ms_slam_env.errors import InputError, InputWarning
 from ms_slam_env.geometry import make_pose, so3_exp
 from ms_slam_env.sequences import associate, open_sequence, write_trajectory
 from ms_slam_env.sequences.recording import open_recording, parse_calibration
@@ -65,6 +67,34 @@ def test_tum_layout(tum):
         np.testing.assert_array_equal(frame.color, colors(index))
         assert frame.timestamp == pytest.approx(index / 30 + 0.004, abs=1e-6)
     np.testing.assert_allclose(recording.truth, poses(3), atol=1e-8)
+
+
+FORMS = {
+    "mark and CRLF": lambda text: "\ufeff" + text.replace("\n", "\r\n"),
+    "decimal commas": lambda text: re.sub(r"^(\d+)\.", r"\1,", text, flags=re.MULTILINE),
+    "commas between": lambda text: re.sub(r"^(\S+) ", r"\1,", text, flags=re.MULTILINE),
+    "backslashes": lambda text: text.replace("/", "\\"),
+    "quoted": lambda text: re.sub(r"(depth|rgb)/(\d)", r'"\1/\2', text).replace("png", 'png"'),
+    "nanoseconds": lambda text: re.sub(r"\b(\d)\.(\d{6})\b", r"\1\g<2>000", text),
+    "blanks": lambda text: text.replace("depth/", "depth/a b# ").replace("filename", "a#"),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_one_listing_in_many_forms(tum, form):
+    if form == "blanks":
+        for path in (tum / "depth").iterdir():
+            path.rename(path.with_name(f"a b# {path.name}"))
+    for name in ("rgb.txt", "depth.txt"):
+        text = FORMS[form]((tum / name).read_text())
+        text = re.sub(r"depth/a b# (\d.png)", r'"depth/a b# \1"', text)
+        if form == "nanoseconds":
+            text = "# [ns]\n" + text
+        (tum / name).write_bytes(text.encode())
+    recording = open_recording(tum)
+    np.testing.assert_allclose(recording.timestamps, np.arange(3) / 30 + 0.004, atol=1e-6)
+    np.testing.assert_allclose(recording.frame(2).depth, depth_values(2) / 1000, rtol=1e-6)
+    np.testing.assert_array_equal(recording.frame(2).color, colors(2))
 
 
 def test_associations_in_either_order(tum):
@@ -127,11 +157,154 @@ def test_plain_folder_pairs_by_number(tmp_path):
     np.testing.assert_allclose(recording.frame(11).depth, depth_values(11) / 2000, rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["rgbd_dataset_freiburg2_desk", "fr2_desk", "tum-fr2-xyz"])
-def test_published_calibrations_of_tum(tum, name):
+@pytest.mark.parametrize("name", ["rgbd_dataset_freiburg2_desk", "fr2_desk", "tum-fr2-xyz", "fr2"])
+def test_published_calibrations_of_tum_are_said(tum, name):
     (tum / "intrinsics.txt").unlink()
-    recording = open_recording(tum.rename(tum.with_name(name)))
+    with pytest.warns(
+        InputWarning, match="published ones of TUM freiburg2, by its name, 520.9 521"
+    ):
+        recording = open_recording(tum.rename(tum.with_name(name)))
     assert recording.source == Intrinsics(520.9, 521.0, 325.1, 249.7, 640, 480)
+
+
+@pytest.mark.parametrize(
+    "name", ["kitchen_fr30", "sofr2024", "fr30", "my_fr3_desk", "fr2x", "fr4_a"]
+)
+def test_other_names_have_no_calibration(tum, name):
+    (tum / "intrinsics.txt").unlink()
+    with pytest.raises(InputError, match=f"intrinsics of .*{name} are missing"):
+        open_recording(tum.rename(tum.with_name(name)))
+
+
+def test_a_plain_folder_must_say_its_depth_scale(tmp_path):
+    write_images(tmp_path)
+    (tmp_path / "intrinsics.txt").write_text(INTRINSICS)
+    with pytest.raises(InputError, match=r"depth scale of .* is missing: .* 1000 for millimetres"):
+        open_recording(tmp_path)
+    with pytest.raises(InputError, match="depth scale"):
+        open_recording(tmp_path, intrinsics=Intrinsics(30, 30, 15.5, 11.5, 32, 24))
+    given = parse_calibration(f"{INTRINSICS} 1000".split(), "here")
+    frame = open_recording(tmp_path, intrinsics=given).frame(0)
+    np.testing.assert_allclose(frame.depth, depth_values(0) / 1000, rtol=1e-6)
+
+
+@pytest.mark.parametrize("layout", ["tum", "folder"])
+def test_saturated_depth_is_no_reading(tum, layout):
+    values = depth_values(0)
+    values[3, 4] = 65535
+    Image.fromarray(values).save(tum / "depth/0.png")
+    depth = open_recording(tum, layout).frame(0).depth
+    assert depth[3, 4] == 0
+    assert depth[3, 5] == pytest.approx(values[3, 5] / 1000)
+
+
+def test_3dmatch_says_its_camera_and_is_registered(tmp_path):
+    write_images(tmp_path, 3, "frame-00000{}.depth.png", "frame-00000{}.color.png")
+    K = Intrinsics(31, 32, 15, 11, WIDTH, HEIGHT)
+    np.savetxt(tmp_path / "camera-intrinsics.txt", K.matrix)
+    for index, T in enumerate(poses(3)):
+        lost = np.full((4, 4), -np.inf)
+        np.savetxt(tmp_path / f"frame-00000{index}.pose.txt", lost if index == 1 else T)
+    with pytest.warns(InputWarning, match="as registered with depth, for there is a camera-intr"):
+        sequence = open_sequence(tmp_path)
+    assert sequence.intrinsics == K
+    assert sequence.frames.registration is None
+    np.testing.assert_array_equal(sequence.frames[2].color, colors(2))
+    assert sequence.known.tolist() == [True, False, True]
+    np.testing.assert_allclose(sequence.poses[2], poses(3)[2])
+    (tmp_path / "camera-intrinsics.txt").write_text("31 0 15\n0 32 11\n")
+    with pytest.raises(
+        InputError, match=r"camera-intrinsics\.txt: expected 3 rows of 3 numbers or"
+    ):
+        open_sequence(tmp_path)
+
+
+def test_replica(tmp_path):
+    folder = tmp_path / "office0"
+    write_images(folder, 3, "results/depth00000{}.png", "results/frame00000{}.jpg")
+    camera = {
+        "w": WIDTH,
+        "h": HEIGHT,
+        "fx": 30.0,
+        "fy": 31,
+        "cx": 15.5,
+        "cy": 11.5,
+        "scale": 6553.5,
+    }
+    (tmp_path / "cam_params.json").write_text(json.dumps({"camera": camera}))
+    lines = "".join(" ".join(f"{v:.9e}" for v in T.ravel()) + "\n" for T in poses(3))
+    (folder / "traj.txt").write_text(lines)
+    recording = open_recording(folder)
+    assert (recording.layout, recording.has_color) == ("replica", True)
+    assert recording.source == Intrinsics(30, 31, 15.5, 11.5, WIDTH, HEIGHT)
+    np.testing.assert_allclose(recording.frame(2).depth, depth_values(2) / 6553.5, rtol=1e-6)
+    assert np.abs(recording.frame(2).color.astype(int) - colors(2)).max() < 8
+    np.testing.assert_allclose(recording.truth, poses(3), atol=1e-8)
+    np.testing.assert_allclose(recording.truth_times, np.arange(3) / 30)
+    (folder / "traj.txt").write_text(lines.partition("\n")[0])
+    with pytest.raises(InputError, match=r"traj\.txt: 1 poses for 3 frames"):
+        open_recording(folder)
+    (tmp_path / "cam_params.json").write_text('{"camera": {"w": "x"}}')
+    with pytest.raises(
+        InputError, match=r"cam_params\.json: expected a camera with the numbers fx"
+    ):
+        open_recording(folder)
+
+
+@pytest.fixture
+def scannet(tmp_path):
+    """Colour twice as large as depth and by another camera; the pose of frame 1 is lost."""
+    folder = tmp_path / "scene0000_00"
+    write_images(folder, 3, "depth/{}.png", "color/{}.jpg")
+    v, u = np.mgrid[: 2 * HEIGHT, : 2 * WIDTH]
+    ramp = np.stack([4 * u, 4 * v, 0 * u], axis=-1).astype(np.uint8)
+    for index, T in enumerate(poses(3)):
+        Image.fromarray(ramp).save(folder / f"color/{index}.jpg", quality=100, subsampling=0)
+        path = folder / f"pose/{index}.txt"
+        path.parent.mkdir(exist_ok=True)
+        np.savetxt(path, np.full((4, 4), -np.inf) if index == 1 else T)
+    for name, K in (("depth", (30, 30, 15.5, 11.5)), ("color", (66, 66, 31.0, 23.0))):
+        path = folder / f"intrinsic/intrinsic_{name}.txt"
+        path.parent.mkdir(exist_ok=True)
+        matrix = np.eye(4)
+        matrix[[0, 1, 0, 1], [0, 1, 2, 2]] = K
+        np.savetxt(path, matrix)
+    return folder
+
+
+def test_scannet(scannet):
+    sequence = open_sequence(scannet)
+    assert (sequence.frames.layout, sequence.frames.depth_scale) == ("folder", 1000)
+    assert sequence.intrinsics == Intrinsics(30, 30, 15.5, 11.5, WIDTH, HEIGHT)
+    assert sequence.known.tolist() == [True, False, True]
+    np.testing.assert_allclose(sequence.poses[2], poses(3)[2])
+    u, v = 20, 9  # seen by the colour camera at 66 / 30 (u - 15.5) + 31
+    want = 4 * (66 / 30 * (u - 15.5) + 31), 4 * (66 / 30 * (v - 11.5) + 23)
+    np.testing.assert_allclose(sequence.frames[0].color[v, u, :2], want, atol=4)
+    for path in (scannet / "pose").iterdir():
+        path.write_text("-inf -inf -inf -inf\n" * 4)
+    with pytest.raises(InputError, match="pose holds no pose of a frame"):
+        open_sequence(scannet)
+
+
+def test_what_lies_there_and_is_not_read_is_named(tum):
+    for name in ("calibration.yaml", "traj.txt", "poses.csv", "accelerometer.txt", "notes.md"):
+        (tum / name).write_text("")
+    with pytest.warns(InputWarning, match="not read: calibration.yaml, poses.csv, traj.txt$"):
+        open_recording(tum)
+
+
+def test_a_depth_camera_sees_colour_where_the_colour_camera_has_it():
+    K = Intrinsics(30, 30, 15.5, 11.5, WIDTH, HEIGHT)
+    of_color = Intrinsics(50, 50, 30, 22, 64, 48)
+    T = make_pose(so3_exp([0.02, -0.05, 0.1]), [0.05, 0.01, -0.02])
+    v, u = np.mgrid[:48, :64]
+    color = np.stack([4 * u, 4 * v, 0 * u], axis=-1).astype(np.uint8)
+    depth = np.linspace(1, 3, WIDTH * HEIGHT, dtype=np.float32).reshape(HEIGHT, WIDTH)
+    found = ColorCamera(of_color, T).register(color, depth, K)
+    points = K.rays() * depth[..., None]
+    want = 4 * of_color.project(points @ T[:3, :3].T + T[:3, 3])
+    np.testing.assert_allclose(found[..., :2], want.clip(0), atol=0.6)  # replicated beyond
 
 
 def test_given_intrinsics_come_first(tum):
@@ -141,6 +314,13 @@ def test_given_intrinsics_come_first(tum):
     np.testing.assert_allclose(recording.frame(0).depth, depth_values(0) / 2000, rtol=1e-6)
     recording = open_recording(tum, intrinsics=Intrinsics(31, 32, 15, 11, 32, 24))
     assert (recording.source.fx, recording.depth_scale) == (31, 5000)
+
+
+def test_depth_without_colour_of_its_time_is_said_to_be_left_out(tum):
+    open_recording(tum)
+    (tum / "rgb.txt").write_text("0.0 rgb/0.png\n")
+    with pytest.warns(InputWarning, match="only 1 of 3 depth images have colour of their time"):
+        assert len(open_recording(tum)) == 1
 
 
 def test_depth_alone_has_black_colour(tum):
@@ -285,7 +465,7 @@ def test_a_damaged_file_gives_an_image_or_one_clear_error(tmp_path_factory, seed
     folder = tmp_path_factory.getbasetemp() / "damaged"
     if not folder.exists():
         write_images(folder, 1)
-        (folder / "intrinsics.txt").write_text(INTRINSICS)
+        (folder / "intrinsics.txt").write_text(f"{INTRINSICS} 1000")
         (folder / "whole.bin").write_bytes((folder / "depth/0.png").read_bytes())
     data = bytearray((folder / "whole.bin").read_bytes())
     where = int(rng.integers(0, len(data)))
@@ -370,7 +550,7 @@ def test_seven_scenes_without_colour(tmp_path):
 def test_empty_and_unequal_folders(tmp_path):
     folder = tmp_path / "mine"
     (folder / "depth").mkdir(parents=True)
-    (folder / "intrinsics.txt").write_text(INTRINSICS)
+    (folder / "intrinsics.txt").write_text(f"{INTRINSICS} 1000")
     with pytest.raises(InputError, match=r"mine/depth holds no image"):
         open_recording(folder)
     write_images(folder, 2)

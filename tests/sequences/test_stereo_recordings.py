@@ -1,15 +1,17 @@
 """EuRoC and KITTI odometry: rectification, depth of stereo and poses against what was rendered."""
 
 import re
+import shutil
 
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 from stereo_files import LENSES, T_LEFT_RIGHT, write_euroc, write_kitti
 
 from ms_slam_env.camera import Intrinsics, xtion
 from ms_slam_env.cli import main
-from ms_slam_env.errors import InputError
+from ms_slam_env.errors import InputError, InputWarning
 from ms_slam_env.geometry import invert, look_at
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sequences import open_sequence
@@ -56,6 +58,41 @@ def test_euroc(euroc, box_scene):
     np.testing.assert_allclose(recording.truth[:, :3, 3], POSES[:, :3, 3], atol=1e-8)
     check_frames(recording, box_scene)
     assert len(open_sequence(euroc / "mav0", with_truth=True)) == 3
+
+
+def in_sixteen_bits(path):
+    Image.fromarray(np.array(Image.open(path)).astype(np.uint16) * 257).save(path)
+
+
+FORMS = {
+    "16 bits": ("cam*/data/*.png", in_sixteen_bits),
+    "marked lists": ("*/data.csv", lambda p: p.write_bytes(b"\xef\xbb\xbf" + p.read_bytes())),
+    "marked YAML": ("cam*/sensor.yaml", lambda p: p.write_bytes(b"\xef\xbb\xbf" + p.read_bytes())),
+    "OpenCV's YAML": (
+        "cam*/sensor.yaml",
+        lambda p: p.write_text("%YAML:1.0\n---\n" + p.read_text()),
+    ),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_one_recording_in_many_forms(form, euroc, tmp_path):
+    folder = shutil.copytree(euroc, tmp_path / "s")
+    pattern, change = FORMS[form]
+    for path in (folder / "mav0").glob(pattern):
+        change(path)
+    found, plain = open_recording(folder), open_recording(euroc)
+    assert found.source == plain.source
+    np.testing.assert_array_equal(found.truth, plain.truth)
+    np.testing.assert_array_equal(found.frame(1).color, plain.frame(1).color)
+    np.testing.assert_array_equal(found.frame(1).depth, plain.frame(1).depth)
+
+
+def test_times_of_kitti_in_nanoseconds(kitti, tmp_path):
+    folder = shutil.copytree(kitti, tmp_path / "00")
+    (folder / "times.txt").write_text("".join(f"{512_000_000_000 + k * 10**8}\n" for k in range(3)))
+    with pytest.warns(InputWarning, match=r"times\.txt: times are taken as ns"):
+        assert np.allclose(open_recording(folder).timestamps, [512, 512.1, 512.2])
 
 
 def test_kitti(kitti, box_scene):
@@ -138,8 +175,8 @@ def test_faults_of_kitti_are_named(kitti, tmp_path):
     texts = {name: (kitti / name).read_text() for name in ("calib.txt", "times.txt", "poses.txt")}
     cases = {
         "calib.txt": [("P3:", "X:", "has no line P3:"), ("P2: ", "P2: 1 ", "expected 12 numbers")],
-        "times.txt": [("0.000000e+00\n", "", "3 images in image_2 and 3 in image_3 for 2 times")],
-        "poses.txt": [("\n", " 1\n", "poses.txt:1: expected 12 numbers, got 13")],
+        "times.txt": [("0.000000e+00\n", "", r"times\.txt: 2 times for 3 images")],
+        "poses.txt": [("\n", " 1\n", "poses.txt:1: expected 12 or 16 numbers, got 13")],
     }
     for name, faults in cases.items():
         for old, new, complaint in faults:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from typing import Any
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.camera.image_files import check_size, decode_color, decode_depth
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.sequences.recording.recording import SATURATED
 
 Float32 = NDArray[np.float32]
 
@@ -63,6 +65,8 @@ def read_depth_message(
         values = _decompressed(message, topic, camera, dtype == "f4")
     else:
         values = _raw(message, topic, camera, dtype, 1)[..., 0].astype(np.float32)
+    if dtype == "u2":
+        values[values == SATURATED] = 0
     depth = values / np.float32(scale or own_scale)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
@@ -85,7 +89,8 @@ def _raw(message: Any, topic: str, camera: Intrinsics, dtype: str, channels: int
 def _decompressed(message: Any, topic: str, camera: Intrinsics, is_inverse: bool) -> Float32:
     """Values (H, W) of image_transport's compressedDepth: PNG, of 32FC1 quantised 1 / depth."""
     data = bytes(message.data)
-    if "png" not in message.format.lower() and "compressedDepth" in message.format:
+    codec = re.search(r"compressedDepth\s*(\w*)", message.format)
+    if codec is not None and codec[1] not in ("", "png"):  # before 2021 it was not named
         wanted = ["16UC1; compressedDepth png", "32FC1; compressedDepth png"]
         raise unknown(f"format of depth in {topic}", message.format, wanted)
     is_plain = data[:4] == b"\x89PNG"  # by tools that leave the header out

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import struct
+import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,13 +21,19 @@ from numpy.typing import NDArray
 
 from ms_slam_env.camera import Distortion, Intrinsics
 from ms_slam_env.camera.distortion import NO_DISTORTION
-from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.errors import InputError, InputWarning, unknown
 from ms_slam_env.geometry import Float64, check_pose, pose_from_quaternion
 from ms_slam_env.input_files import check_file, is_named
+from ms_slam_env.sequences.recording.bag_frames import (
+    Transforms,
+    poses_of_camera,
+    registration_of,
+    transforms_of,
+)
 from ms_slam_env.sequences.recording.bag_images import read_color_message, read_depth_message
 from ms_slam_env.sequences.recording.listings import Calibration
 from ms_slam_env.sequences.recording.recording import Entry, Recording
-from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S, associate
+from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S, associate, say_few_pairs
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 """Endings of the names of bags; a ROS 2 bag is also a folder with a ``metadata.yaml``."""
@@ -40,6 +47,9 @@ POSES = (
     "nav_msgs/msg/Odometry",
 )
 
+TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+
+_TF_STATIC = "/tf_static"
 _MAX_BYTES = 1 << 40
 _TRANSPORTS = ("compressed", "compressedDepth")
 _NO_COLOR = r"depth|infra|(^|[/_])ir([/_\d]|$)|disparity|mask|normal"
@@ -54,7 +64,8 @@ class Topics:
     """Depth images: by default the one topic of images named depth, registered or aligned if there
     are several."""
     color: str | None = None
-    """Colour images, registered with depth: by default the one that is named so."""
+    """Colour images: by default the one that is named so. Where its frame or its CameraInfo is not
+    that of depth, colour is brought into the depth camera by /tf_static."""
     info: str | None = None
     """CameraInfo of the depth images: by default camera_info beside them, or the only one."""
     pose: str | None = None
@@ -93,18 +104,22 @@ class Bag:
         """The library's reader, and what decodes a message of a type."""
         try:
             from rosbags import rosbag1, rosbag2
-            from rosbags.typesys import Stores, get_typestore
+            from rosbags.typesys import Stores, get_types_from_msg, get_typestore
         except ImportError as error:
             raise InputError(
                 f"{self.path} needs rosbags (pip install 'ms-slam-env[ros]'): {error}"
             ) from None
         if self.path.suffix in SUFFIXES:
             check_file(self.path, "bag", _MAX_BYTES)
+        if self.path.suffix == ".mcap":
+            _check_profile(self.path)
         is_first = self.path.suffix == ".bag"
         with self.refusing():
             reader = (rosbag1 if is_first else rosbag2).Reader(self.path)
             reader.open()
         store = get_typestore(Stores.ROS1_NOETIC if is_first else Stores.LATEST)
+        for name in TRANSFORMS if is_first else ():
+            store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", name))
         return reader, store.deserialize_ros1 if is_first else store.deserialize_cdr
 
     @contextmanager
@@ -138,16 +153,16 @@ class Bag:
     def index(self, topic: str) -> tuple[Float64, list[Address]]:
         """Times (N,) in seconds, increasing, and addresses of the messages of a topic.
 
-        A time is that of the header, or where that is 0 that of recording; of several messages of
-        one time the first is taken.
+        A time is that of the header, or where these are all 0 that of recording; of several
+        messages of one time the first is taken.
         """
-        is_first = self.path.suffix == ".bag"
+        is_first, is_stamped = self.path.suffix == ".bag", self._is_stamped(topic)
         found: dict[float, Address] = {}
         last, number = -1, 0
         for recorded, data in self._messages(topic):
             number = number + 1 if recorded == last else 0
             last = recorded
-            time = _stamp(data, is_first) or 1e-9 * recorded
+            time = _stamp(data, is_first) if is_stamped else 1e-9 * recorded
             found.setdefault(time, Address(topic, recorded, number))
         if not found:
             raise InputError(f"{self.path}: topic {topic} has no message")
@@ -155,11 +170,24 @@ class Bag:
 
     def messages(self, topic: str) -> Iterator[tuple[float, Any]]:
         """Times in seconds and messages of a topic, decoded, in the order of recording."""
-        is_first = self.path.suffix == ".bag"
+        is_first, is_stamped = self.path.suffix == ".bag", self._is_stamped(topic)
         for recorded, data in self._messages(topic):
             with self.refusing(f", topic {topic}"):
                 message = self._opened[1](data, self.types[topic])
-            yield _stamp(data, is_first) or 1e-9 * recorded, message
+            yield _stamp(data, is_first) if is_stamped else 1e-9 * recorded, message
+
+    def _is_stamped(self, topic: str) -> bool:
+        """Whether headers say the time; a simulated clock may begin at 0."""
+        is_first = self.path.suffix == ".bag"
+        return any(_stamp(data, is_first) for _, data in self._messages(topic))
+
+    @cached_property
+    def transforms(self) -> Transforms:
+        """What ``/tf_static`` says."""
+        if _TF_STATIC not in self.of_types(TRANSFORMS):
+            return {}
+        with self.refusing(f", topic {_TF_STATIC}"):
+            return transforms_of(self.messages(_TF_STATIC), _TF_STATIC)
 
     def read(self, address: Address) -> Any:
         """The message at an address, decoded."""
@@ -169,6 +197,18 @@ class Bag:
                 with self.refusing(f", topic {address.topic}"):
                     return self._opened[1](data, self.types[address.topic])
         raise InputError(f"{self.path}: topic {address.topic} has lost a message")
+
+
+def _check_profile(path: Path) -> None:
+    """Refuse an MCAP file of others' messages in a line that says what to do."""
+    with open(path, "rb") as file:
+        start = file.read(64)
+    profile = start[21 : 21 + int.from_bytes(start[17:21], "little")].decode(errors="replace")
+    if start.startswith(b"\x89MCAP0\r\n\x01") and profile != "ros2":
+        raise InputError(
+            f"{path} is an MCAP file of profile {profile!r}; only ros2 is read. Of ROS 1 give the "
+            ".bag that it was made from"
+        )
 
 
 def _stamp(data: bytes, is_first: bool) -> float:
@@ -198,7 +238,9 @@ class BagEntry(Entry):
     color_at: Address | None
     depth_scale: float | None
 
-    def read(self, camera: Intrinsics) -> tuple[NDArray[np.uint8] | None, NDArray[Any]]:
+    def read(
+        self, camera: Intrinsics, color_camera: Intrinsics | None = None
+    ) -> tuple[NDArray[np.uint8] | None, NDArray[Any]]:
         """Colour, and depth in metres; see the base class."""
         message = self.bag.read(self.depth_at)
         with self.bag.refusing(f", topic {self.depth_at.topic}"):
@@ -207,11 +249,20 @@ class BagEntry(Entry):
             return None, depth
         message = self.bag.read(self.color_at)
         with self.bag.refusing(f", topic {self.color_at.topic}"):
-            return read_color_message(message, self.color_at.topic, camera), depth
+            found = read_color_message(message, self.color_at.topic, color_camera or camera)
+        return found, depth
 
 
-def open_bag(path: Path, intrinsics: Calibration | None, topics: Topics | None = None) -> Recording:
+def open_bag(
+    path: Path,
+    intrinsics: Calibration | None,
+    topics: Topics | None = None,
+    is_registration_given: bool = False,
+) -> Recording:
     """Frames of the depth topic, each with the colour image of its time.
+
+    Where images of depth and colour say that they are of two cameras, colour is brought into the
+    depth camera, unless ``is_registration_given``.
 
     Raises:
         InputError: no such topic, none or several that may be meant, no calibration, or a file
@@ -235,13 +286,22 @@ def open_bag(path: Path, intrinsics: Calibration | None, topics: Topics | None =
         own, other = associate(times, color_times, MAX_DIFFERENCE_S)
         if len(own) == 0:
             raise InputError(f"{path}: no image of {color_topic} is as old as one of {depth_topic}")
+        say_few_pairs(path, len(own), len(times))
         times, depths = times[own], [depths[k] for k in own]
         colors = [addresses[k] for k in other]
     entries = []
     for time, d, c in zip(times.tolist(), depths, colors, strict=True):
         names = path, None if c is None else path, f"{path}, time {time:.9f}"
         entries.append(BagEntry(time, *names, bag, d, c, scale))
-    truth_times, truth = _truth(bag, given.pose)
+    frame = _frame(bag, depths[0])
+    registration = None
+    if color_topic is not None and colors[0] is not None and not is_registration_given:
+        beside = _info_beside(color_topic)
+        is_there = beside in bag.of_types(INFO)
+        cameras = camera, _read_camera(bag, beside, color_topic) if is_there else None
+        frames = frame, _frame(bag, colors[0])
+        registration = registration_of(path, frames, cameras, bag.transforms)
+    truth_times, truth = _truth(bag, given.pose, frame)
     return Recording(
         name=path.stem,
         layout="bag",
@@ -251,7 +311,20 @@ def open_bag(path: Path, intrinsics: Calibration | None, topics: Topics | None =
         depth_scale=1.0,
         truth_times=truth_times,
         truth=truth,
+        registration=registration,
     )
+
+
+def _frame(bag: Bag, address: Address) -> str:
+    """The frame that a message says it is of."""
+    message = bag.read(address)
+    return str(message.header.frame_id)
+
+
+def _info_beside(topic: str) -> str:
+    """The topic where the calibration of a topic of images belongs."""
+    parts = [part for part in topic.split("/") if part not in _TRANSPORTS]
+    return "/".join([*parts[:-1], "camera_info"])
 
 
 def _check_topic(bag: Bag, name: str, topic: str, types: Iterable[str]) -> None:
@@ -293,8 +366,7 @@ def _best(bag: Bag, name: str, topics: list[str], preferred: str) -> str:
 
 def _camera(bag: Bag, depth: str, given: str | None) -> Intrinsics:
     """What the CameraInfo of the depth images says."""
-    parts = [part for part in depth.split("/") if part not in _TRANSPORTS]
-    beside, all_of_them = "/".join([*parts[:-1], "camera_info"]), bag.of_types(INFO)
+    beside, all_of_them = _info_beside(depth), bag.of_types(INFO)
     if given is not None:
         _check_topic(bag, "info", given, INFO)
     elif beside in all_of_them:
@@ -306,6 +378,12 @@ def _camera(bag: Bag, depth: str, given: str | None) -> Intrinsics:
             f"{bag.path}: the calibration of {depth} is missing: there is no {beside}; say "
             f"--topics info=TOPIC, one of {all_of_them}, or --intrinsics"
         )
+    return _read_camera(bag, given, depth)
+
+
+def _read_camera(bag: Bag, given: str, images: str) -> Intrinsics:
+    """What the first message of a topic of CameraInfo says of a topic of images."""
+    parts = [part for part in images.split("/") if part not in _TRANSPORTS]
     message = next((message for _, message in bag.messages(given)), None)
     if message is None:
         raise InputError(f"{bag.path}: topic {given} has no message")
@@ -321,28 +399,35 @@ def _intrinsics(message: Any, is_rectified: bool) -> Intrinsics:
     if is_rectified and P[0] > 0:
         return Intrinsics(P[0], P[5], P[2], P[6], *size)
     name = message.distortion_model
-    if name == "rational_polynomial" and not any(D[5:]):
-        name = "plumb_bob"
     distortion = Distortion.of(name, D) if any(D) or name == "equidistant" else NO_DISTORTION
     return Intrinsics(K[0], K[4], K[2], K[5], *size, distortion)
 
 
-def _truth(bag: Bag, given: str | None) -> tuple[Float64, Float64] | tuple[None, None]:
-    """Times (M,) and true T_world_camera (M, 4, 4)."""
+def _truth(bag: Bag, given: str | None, camera: str) -> tuple[Float64, Float64] | tuple[None, None]:
+    """Times (M,) and true T_world_camera (M, 4, 4) of the frame ``camera``."""
     if given is None:
-        named = [t for t in bag.of_types(POSES) if re.search(_TRUTH, t.lower())]
+        every = bag.of_types(POSES)
+        named = [t for t in every if re.search(_TRUTH, t.lower())]
+        if len(named) != 1 and every:
+            text = (
+                f"{bag.path}: no poses are taken as true; say --topics pose=TOPIC, one of {every}"
+            )
+            warnings.warn(text, InputWarning, stacklevel=2)
         if len(named) != 1:
             return None, None
         given = named[0]
     _check_topic(bag, "pose", given, POSES)
     poses: dict[float, Float64] = {}
+    body = ""
     for time, message in bag.messages(given):
+        body = body or str(getattr(message, "child_frame_id", ""))
         with bag.refusing(f", topic {given}, time {time:.9f}"):
             poses.setdefault(time, _pose(message, given))
     times = np.array(sorted(poses))
     if len(times) == 0:
         raise InputError(f"{bag.path}: topic {given} has no message")
-    return times, np.stack([poses[time] for time in times.tolist()])
+    found = np.stack([poses[time] for time in times.tolist()])
+    return times, poses_of_camera(bag.path, given, found, body, camera, bag.transforms)
 
 
 def _pose(message: Any, topic: str) -> Float64:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -80,9 +81,9 @@ def _listed(camera: Path) -> list[tuple[float, Path, str]]:
 
 
 def _sensor(path: Path) -> dict[str, Any]:
-    """What a ``sensor.yaml`` says."""
+    """What a ``sensor.yaml`` says; its first line may be OpenCV's ``%YAML:1.0``."""
     try:
-        read = load_yaml(read_text(path, "calibration"))
+        read = load_yaml(re.sub(r"\A%YAML.*\n", "", read_text(path, "calibration")))
     except ValueError as error:
         raise InputError(f"{path} is not a YAML file: {error}") from None
     if not isinstance(read, dict):

@@ -13,9 +13,9 @@ from ms_slam_env.camera.image_files import SUFFIXES
 from ms_slam_env.errors import InputError, InputWarning
 from ms_slam_env.geometry import Float64
 from ms_slam_env.input_files import is_named
-from ms_slam_env.sequences.recording.listings import number, rows
+from ms_slam_env.sequences.recording.listings import listed_times
 from ms_slam_env.sequences.recording.recording import Entry
-from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S
+from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S, UNITS, say_unit, unit_of
 
 FRAME_RATE_HZ = 30.0
 """Where a layout has no times."""
@@ -24,16 +24,13 @@ COLOR_FOLDERS = ("rgb", "color", "colour", "image", "images", "img")
 TIMES_FILES = ("times.txt", "timestamps.txt")
 _NO_COLOR = {"depth", "depth_true", "labels", "mask", "masks", "normals", "objects"}
 
-# Whole numbers this large are times since 1970, in fractions of a second.
-_UNITS = ((1e18, 1e-9), (1e15, 1e-6), (1e12, 1e-3))
-
 
 def folder_entries(folder: Path, truth_times: Float64 | None) -> list[Entry]:
     """Frames of ``depth`` and of one of `COLOR_FOLDERS`, in the order of the numbers in the names.
 
-    Their times are those of ``times.txt`` (a time a line, seconds), else those of the truth if it
-    has one pose a frame, else what the names say: seconds with a fraction, time since 1970 in
-    milli-, micro- or nanoseconds, or the number of the frame at 30 Hz.
+    Their times are those of ``times.txt`` (`listed_times`), else what the names say: seconds with a
+    fraction, time since 1970 or another start in milli-, micro- or nanoseconds. Where names are
+    numbers of frames, they are those of the truth if it has one pose a frame, else at 30 Hz.
 
     Args:
         folder: of the recording.
@@ -119,12 +116,26 @@ def _paired(folder: Path, depth: list[Path], color: list[Path]) -> list[Path]:
 
 def _numbers(paths: list[Path]) -> Float64 | None:
     """Frame numbers (N,) at 30 Hz that names say, increasing; None where they say none."""
+    found, unit, _ = _said(paths)
+    if found is None:
+        return None
+    return found if unit is None else FRAME_RATE_HZ * UNITS[unit] * found
+
+
+def _said(paths: list[Path]) -> tuple[Float64 | None, str | None, bool]:
+    """Numbers (N,) that names say, increasing, the unit of time that they have, if it is a guess.
+
+    Without a unit they are numbers of frames; None where names say none.
+    """
     stems = [path.stem for path in paths]
     are_seconds = all(re.fullmatch(r"\d{1,12}\.\d{1,12}", stem) for stem in stems)
-    seconds = np.array([float(stem) for stem in stems]) if are_seconds else None
-    found = _whole_numbers(stems) if seconds is None else FRAME_RATE_HZ * seconds
-    is_order = found is not None and bool((np.diff(found) > 0).all())
-    return found if is_order else None
+    found = np.array([float(stem) for stem in stems]) if are_seconds else _whole_numbers(stems)
+    if found is None or not (np.diff(found) > 0).all():
+        return None, None, False
+    if are_seconds:
+        return found, "s", False
+    unit, is_guess = unit_of(found)
+    return found, None if unit == "s" else unit, is_guess
 
 
 def _whole_numbers(stems: list[str]) -> Float64 | None:
@@ -136,17 +147,20 @@ def _whole_numbers(stems: list[str]) -> Float64 | None:
     columns = [column for column in columns if len(set(column)) > 1] or columns[-1:]
     if len(columns) != 1:
         return None
-    values = np.array([int(word) for word in columns[0]], dtype=np.float64)
-    unit = next((unit for least, unit in _UNITS if values[0] >= least), None)
-    return values if unit is None else FRAME_RATE_HZ * unit * values
+    return np.array([int(word) for word in columns[0]], dtype=np.float64)
 
 
 def _times(folder: Path, depth: list[Path], truth_times: Float64 | None) -> Float64:
     """Seconds (N,) of the frames."""
     for name in TIMES_FILES:
         if is_named(folder / name):
-            return _listed_times(folder / name, len(depth))
-    said = _numbers(depth)
+            return listed_times(folder / name, [path.stem for path in depth])
+    said, unit, is_guess = _said(depth)
+    if said is not None and unit is not None:
+        if is_guess:
+            say_unit(unit, said, folder, "a file times.txt")
+        _warn_of_gaps(folder, depth, said, "")
+        return said * UNITS[unit]
     numbers = np.arange(len(depth), dtype=np.float64) if said is None else said
     if said is None:
         _warn(f"{folder}: the names of depth images say no times; 30 frames a second are assumed")
@@ -155,13 +169,6 @@ def _times(folder: Path, depth: list[Path], truth_times: Float64 | None) -> Floa
         taken = "; the true trajectory has one pose a frame, whose times are taken"
     _warn_of_gaps(folder, depth, numbers, taken)
     return truth_times if truth_times is not None and taken else numbers / FRAME_RATE_HZ
-
-
-def _listed_times(path: Path, count: int) -> Float64:
-    lines = list(rows(path))
-    if len(lines) != count:
-        raise InputError(f"{path}: {len(lines)} times for {count} depth images")
-    return np.array([number(words[0], where) for where, words in lines])
 
 
 def _warn_of_gaps(folder: Path, depth: list[Path], numbers: Float64, taken: str) -> None:

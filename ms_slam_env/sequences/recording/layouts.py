@@ -4,18 +4,27 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.camera.image_files import image_size
+from ms_slam_env.camera.registration import ColorCamera
+from ms_slam_env.errors import InputError, InputWarning, unknown
 from ms_slam_env.geometry import Float64
-from ms_slam_env.input_files import is_named
+from ms_slam_env.input_files import is_named, read_json
 from ms_slam_env.sequences.recording.bags import SUFFIXES, Topics, is_bag, open_bag
 from ms_slam_env.sequences.recording.euroc import is_euroc, open_euroc
-from ms_slam_env.sequences.recording.image_folders import FRAME_RATE_HZ, find_color, folder_entries
+from ms_slam_env.sequences.recording.image_folders import (
+    FRAME_RATE_HZ,
+    TIMES_FILES,
+    find_color,
+    folder_entries,
+    images,
+)
 from ms_slam_env.sequences.recording.listings import (
     Calibration,
     Listed,
@@ -23,43 +32,88 @@ from ms_slam_env.sequences.recording.listings import (
     flip_y,
     listed_images,
     number,
+    parse_calibration,
+    read_camera_matrix,
     read_intrinsics,
-    read_matrix,
+    read_pose,
+    read_poses,
     rows,
 )
 from ms_slam_env.sequences.recording.parts import join_parts, part_folders
 from ms_slam_env.sequences.recording.recording import Entry, Recording, Registration
 from ms_slam_env.sequences.recording.stereo import is_kitti, open_kitti
-from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S, associate, read_trajectory
+from ms_slam_env.sequences.trajectory import (
+    MAX_DIFFERENCE_S,
+    associate,
+    read_trajectory,
+    say_few_pairs,
+)
 from ms_slam_env.sequences.writing import DESCRIPTION, UNFINISHED
 
 # Published calibrations of the colour cameras, to which depth is registered, 640x480: TUM RGB-D
 # benchmark, "Intrinsic camera calibration of the Kinect"; ICL-NUIM page; 7-Scenes page (default).
+TUM_NAME = r"(rgbd_dataset_|tum[-_])?(freiburg|fr)([123])([-_].*)?"
 TUM_CAMERAS = {
-    r"(freiburg|fr)1": (517.3, 516.5, 318.6, 255.3),
-    r"(freiburg|fr)2": (520.9, 521.0, 325.1, 249.7),
-    r"(freiburg|fr)3": (535.4, 539.2, 320.1, 247.6),
+    "1": (517.3, 516.5, 318.6, 255.3),
+    "2": (520.9, 521.0, 325.1, 249.7),
+    "3": (535.4, 539.2, 320.1, 247.6),
 }
 ICL_NUIM_CAMERA = (481.2, -480.0, 319.5, 239.5)
 SEVEN_SCENES_CAMERA = (585.0, 585.0, 320.0, 240.0)
 DEPTH_SCALE = 5000.0
-SEVEN_SCENES_NO_READING = 65535
+MILLIMETRES = 1000.0
+CAMERA_MATRIX = "camera-intrinsics.txt"
 
 
 def _calibration_of(
-    folder: Path, given: Calibration | None, known: tuple[float, float, float, float] | None
+    folder: Path,
+    given: Calibration | None,
+    known: tuple[float, float, float, float] | None = None,
+    whose: str = "",
+    depth: Path | None = None,
 ) -> Calibration:
-    """The user's, the folder's, or the published calibration of the dataset, in that order."""
+    """The user's, the folder's, or the published calibration of the dataset, in that order.
+
+    Args:
+        folder: of the recording.
+        given: by the user.
+        known: published.
+        whose: dataset that it is the published one of.
+        depth: a depth image, which a file without its size is of.
+    """
     if given is not None:
         return given
     if is_named(folder / "intrinsics.txt"):
         return read_intrinsics(folder / "intrinsics.txt")
+    for name in (CAMERA_MATRIX, "intrinsic/intrinsic_depth.txt"):  # 3DMatch, ScanNet
+        if depth is not None and is_named(folder / name):
+            return Calibration(read_camera_matrix(folder / name, depth), False, MILLIMETRES)
+    for path in (folder / "cam_params.json", folder.parent / "cam_params.json"):  # Replica
+        if depth is not None and is_named(path):
+            return _camera_parameters(path)
     if known is not None:
+        words = " ".join(f"{number:g}" for number in known)
+        _say(f"{folder} has no intrinsics.txt: taken are the published ones of {whose}, {words}")
         return calibration(*known, 640, 480)
     raise InputError(
         f"intrinsics of {folder} are missing: write 'fx fy cx cy width height [depth_scale]' into "
         f"{folder / 'intrinsics.txt'}, or give them with the command"
     )
+
+
+def _camera_parameters(path: Path) -> Calibration:
+    """Calibration of a ``cam_params.json`` of Replica."""
+    read = read_json(path, "calibration")
+    camera = read.get("camera") if isinstance(read, dict) else None
+    keys = ("fx", "fy", "cx", "cy", "w", "h", "scale")
+    values = [camera.get(key) for key in keys] if isinstance(camera, dict) else [None]
+    if not all(type(value) in (int, float) for value in values):
+        raise InputError(f"{path}: expected a camera with the numbers {', '.join(keys)}")
+    return parse_calibration([str(value) for value in values], str(path))
+
+
+def _say(text: str) -> None:
+    warnings.warn(text, InputWarning, stacklevel=2)
 
 
 def _pairs(folder: Path) -> list[Entry]:
@@ -75,6 +129,7 @@ def _pairs(folder: Path) -> list[Entry]:
     pairs = list(zip(*associate(_times(depth), _times(color), MAX_DIFFERENCE_S), strict=True))
     if not pairs:
         raise InputError(f"{folder}: no image of rgb.txt is as old as one of depth.txt")
+    say_few_pairs(folder, len(pairs), len(depth))
     return [
         Entry(depth[d].timestamp, depth[d].path, color[c].path, depth[d].where) for d, c in pairs
     ]
@@ -125,14 +180,16 @@ def _trajectory(folder: Path, flipped: bool) -> tuple[Float64, Float64] | tuple[
 
 def open_tum(folder: Path, intrinsics: Calibration | None) -> Recording:
     """TUM RGB-D benchmark: ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``; scale 5000."""
-    known = (camera for name, camera in TUM_CAMERAS.items() if re.search(name, folder.name))
-    camera = next(known, None)
-    return _listed(folder, "tum", _calibration_of(folder, intrinsics, camera))
+    name = re.fullmatch(TUM_NAME, folder.name)
+    known = (TUM_CAMERAS[name[3]], f"TUM freiburg{name[3]}, by its name") if name else (None, "")
+    return _listed(folder, "tum", _calibration_of(folder, intrinsics, *known))
 
 
 def open_icl_nuim(folder: Path, intrinsics: Calibration | None) -> Recording:
     """ICL-NUIM, TUM-compatible: ``associations.txt``, ``*.gt.freiburg``; y up in its poses."""
-    return _listed(folder, "icl-nuim", _calibration_of(folder, intrinsics, ICL_NUIM_CAMERA))
+    return _listed(
+        folder, "icl-nuim", _calibration_of(folder, intrinsics, ICL_NUIM_CAMERA, "ICL-NUIM")
+    )
 
 
 def _listed(folder: Path, layout: str, camera: Calibration) -> Recording:
@@ -143,16 +200,22 @@ def _recording(folder: Path, layout: str, entries: list[Entry], camera: Calibrat
     scale, (times, truth) = camera.depth_scale or DEPTH_SCALE, _trajectory(folder, camera.flipped)
     K = camera.intrinsics
     frames = tuple(entries), K, K.undistorted
-    return Recording(folder.name, layout, *frames, scale, None, times, truth)
+    return Recording(folder.name, layout, *frames, scale, times, truth)
 
 
 def open_seven_scenes(folder: Path, intrinsics: Calibration | None) -> Recording:
     """7-Scenes: ``frame-NNNNNN.color.png`` (or JPEG), ``.depth.png`` in millimetres, ``.pose.txt``.
 
     Colour and depth are the raw images of two cameras, so colour is registered by default, with
-    the numbers of ``Registration``.
+    the numbers of ``Registration``. With a ``camera-intrinsics.txt`` they are those of 3DMatch,
+    which are registered.
     """
-    camera = _calibration_of(folder, intrinsics, SEVEN_SCENES_CAMERA)
+    first = min(folder.glob("frame-*.depth.png"), default=None)
+    known = SEVEN_SCENES_CAMERA, "7-Scenes", first
+    camera = _calibration_of(folder, intrinsics, *known)
+    is_registered = is_named(folder / CAMERA_MATRIX)
+    if is_registered:
+        _say(f"{folder}: colour is taken as registered with depth, for there is a {CAMERA_MATRIX}")
     entries, poses = [], []
     colors = {path.name.partition(".")[0]: path for path in sorted(folder.glob("frame-*.color.*"))}
     for depth in sorted(folder.glob("frame-*.depth.png")):
@@ -161,27 +224,90 @@ def open_seven_scenes(folder: Path, intrinsics: Calibration | None) -> Recording
         color = colors.get(stem, folder / f"{stem}.color.png") if colors else None
         time = number(stem.removeprefix("frame-"), str(depth)) / FRAME_RATE_HZ
         entries.append(Entry(time, depth, color, str(depth)))
-        if is_named(pose):
-            poses.append((time, read_matrix(pose)))
+        if is_named(pose) and (T := read_pose(pose)) is not None:
+            poses.append((time, T))
     return Recording(
         name=folder.name,
         layout="7-scenes",
         entries=tuple(entries),
         source=camera.intrinsics,
         intrinsics=camera.intrinsics.undistorted,
-        depth_scale=camera.depth_scale or 1000.0,
-        no_reading=SEVEN_SCENES_NO_READING,
+        depth_scale=camera.depth_scale or MILLIMETRES,
         truth_times=np.array([time for time, _ in poses]) if poses else None,
         truth=np.stack([T for _, T in poses]) if poses else None,
-        registration=Registration(),
+        registration=None if is_registered else Registration(),
     )
 
 
 def open_folder(folder: Path, intrinsics: Calibration | None) -> Recording:
-    """Folders ``depth`` and, if there is colour, ``rgb``, ``color`` or the like."""
-    camera = _calibration_of(folder, intrinsics, None)
+    """Folders ``depth`` and, if there is colour, ``rgb``, ``color`` or the like.
+
+    True poses are those of ``groundtruth.txt``, or one a frame: of ``pose/NUMBER.txt`` (ScanNet) or
+    the lines of ``traj.txt`` (Replica). ScanNet's colour, of another camera, is brought into the
+    depth camera.
+    """
+    depth = images(folder / "depth")
+    camera = _calibration_of(folder, intrinsics, depth=depth[0])
+    _check_scale(folder, camera)
     times, _ = _trajectory(folder, camera.flipped)
-    return _recording(folder, "folder", folder_entries(folder, times), camera)
+    found = _recording(folder, "folder", folder_entries(folder, times), camera)
+    of_color, color = folder / "intrinsic/intrinsic_color.txt", found.entries[0].color
+    if is_named(of_color) and color is not None and image_size(color) != image_size(depth[0]):
+        seen = ColorCamera(read_camera_matrix(of_color, color), np.eye(4))
+        found = dataclasses.replace(found, registration=seen)
+    return found if times is not None else _with_poses(folder, found)
+
+
+def open_replica(folder: Path, intrinsics: Calibration | None) -> Recording:
+    """Replica as NICE-SLAM has it: ``results/depthNNNNNN.png`` and ``frameNNNNNN.jpg``.
+
+    True poses are the lines of ``traj.txt``, the calibration is ``cam_params.json`` beside them or
+    in the folder above.
+    """
+    depth = sorted((folder / "results").glob("depth*.png"))
+    if not depth:
+        raise InputError(f"{folder / 'results'} holds no depth*.png")
+    camera = _calibration_of(folder, intrinsics, depth=depth[0])
+    _check_scale(folder, camera)
+    entries = []
+    for path in depth:
+        stem = path.stem.removeprefix("depth")
+        color = path.with_name(f"frame{stem}.jpg")
+        time = number(stem, str(path)) / FRAME_RATE_HZ
+        entries.append(Entry(time, path, color, str(path)))
+    return _with_poses(folder, _recording(folder, "replica", entries, camera))
+
+
+def _check_scale(folder: Path, camera: Calibration) -> None:
+    """Refuse to guess the unit of depth."""
+    if camera.depth_scale is None:
+        raise InputError(
+            f"the depth scale of {folder} is missing: add the value of a depth image for one metre "
+            "as the seventh number of the intrinsics, 1000 for millimetres, 5000 as TUM has it"
+        )
+
+
+def _with_poses(folder: Path, recording: Recording) -> Recording:
+    """A recording with the true poses that a folder has one a frame, if it has any."""
+    times = recording.timestamps
+    if is_named(folder / "pose"):
+        by_number = {_number(path): path for path in (folder / "pose").glob("*.txt")}
+        paths = [by_number.get(_number(entry.depth)) for entry in recording.entries]
+        poses = [None if path is None else read_pose(path) for path in paths]
+    elif is_named(folder / "traj.txt"):
+        poses = list(read_poses(folder / "traj.txt", len(times)))
+    else:
+        return recording
+    known = [k for k, pose in enumerate(poses) if pose is not None]
+    if not known:
+        raise InputError(f"{folder / 'pose'} holds no pose of a frame")
+    truth = np.stack([pose for pose in poses if pose is not None])
+    return dataclasses.replace(recording, truth_times=times[known], truth=truth)
+
+
+def _number(path: Path) -> int:
+    """The last number in a name; -1 without one."""
+    return int((re.findall(r"\d{1,18}", path.stem) or [-1])[-1])
 
 
 LAYOUTS: dict[str, Callable[[Path, Calibration | None], Recording]] = {
@@ -189,11 +315,46 @@ LAYOUTS: dict[str, Callable[[Path, Calibration | None], Recording]] = {
     "icl-nuim": open_icl_nuim,
     "7-scenes": open_seven_scenes,
     "folder": open_folder,
+    "replica": open_replica,
     "euroc": open_euroc,
     "kitti": open_kitti,
     "bag": open_bag,
 }
 """Name of a layout to its reader."""
+
+
+_TELLING = re.compile(
+    r".*(intrinsic|extrinsic|calib|cam_|camera|pose|traj|truth|(^|[_.-])gt([_.-]|$)|times).*"
+)
+_CALIBRATIONS = ("intrinsics.txt", CAMERA_MATRIX)
+_READ = {
+    "tum": ("intrinsics.txt", "groundtruth.txt"),
+    "icl-nuim": ("intrinsics.txt", "groundtruth.txt"),
+    "7-scenes": _CALIBRATIONS,
+    "folder": (
+        *(*_CALIBRATIONS, "intrinsic", "cam_params.json"),
+        *("groundtruth.txt", "pose", "traj.txt", *TIMES_FILES),
+    ),
+    "replica": ("intrinsics.txt", "cam_params.json", "traj.txt"),
+    "kitti": ("calib.txt", "times.txt", "poses.txt"),
+}
+"""Layout to the names in its folder, of those that are `_TELLING`, that are read."""
+
+
+def _say_what_is_not_read(folder: Path, layout: str) -> None:
+    """Name the files that may say something of calibration, time or truth, and are not read."""
+    if layout not in _READ:
+        return
+    found = (path.name for path in folder.iterdir() if path.suffix != ".freiburg")
+    left = [
+        name
+        for name in sorted(found)
+        if _TELLING.fullmatch(name.lower()) and name not in _READ[layout]
+        and not name.startswith("frame-")
+    ]  # fmt: skip
+    if left:
+        more = f" and {len(left) - 5} more" if len(left) > 5 else ""
+        _say(f"{folder}: not read: {', '.join(left[:5])}{more}")
 
 
 def _recognise(folder: Path) -> str:
@@ -211,10 +372,12 @@ def _recognise(folder: Path) -> str:
         return "7-scenes"
     if (folder / "depth").is_dir():
         return "folder"
+    if any(folder.glob("results/depth*.png")):
+        return "replica"
     raise InputError(
         f"{folder} is no RGB-D sequence: found neither depth.txt or associations.txt (TUM, "
-        "ICL-NUIM) nor frame-*.depth.png (7-Scenes) nor a folder depth nor mav0 (EuRoC) nor "
-        "calib.txt and image_0 (KITTI) nor metadata.yaml (ROS 2)"
+        "ICL-NUIM) nor frame-*.depth.png (7-Scenes) nor a folder depth nor results/depth*.png "
+        "(Replica) nor mav0 (EuRoC) nor calib.txt and image_0 (KITTI) nor metadata.yaml (ROS 2)"
     )
 
 
@@ -258,10 +421,12 @@ def open_recording(
     name = _recognise(folder) if layout == "auto" else layout
     if topics not in (None, Topics()) and name != "bag":
         raise InputError(f"{path} is no bag: it has no topics")
-    found = (
-        open_bag(folder, intrinsics, topics) if name == "bag" else LAYOUTS[name](folder, intrinsics)
-    )
-    if register is None:
+    if name == "bag":
+        found = open_bag(folder, intrinsics, topics, register is not None)
+    else:
+        found = LAYOUTS[name](folder, intrinsics)
+    _say_what_is_not_read(folder, name)
+    if register is None or (register is True and found.registration is not None):
         return found
     given = register if isinstance(register, Registration) else Registration()
     return dataclasses.replace(found, registration=given if register else None)

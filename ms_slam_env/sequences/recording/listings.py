@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,15 +12,18 @@ import numpy as np
 
 from ms_slam_env.camera import Distortion, Intrinsics
 from ms_slam_env.camera.distortion import ALIASES, NAMES
+from ms_slam_env.camera.image_files import image_size
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import Float64, check_pose
-from ms_slam_env.input_files import read_text
+from ms_slam_env.input_files import read_text, words_of
+from ms_slam_env.sequences.trajectory import in_seconds, said_unit, say_unit, unit_of
 
 _ROUNDED = 1e-2  # as for the length of a quaternion
 
 CALIBRATION = (
     "fx fy cx cy width height [depth_scale] "
-    "[radial-tangential k1 k2 p1 p2 k3 | equidistant k1 k2 k3 k4]"
+    "[radial-tangential k1 k2 p1 p2 k3 | equidistant k1 k2 k3 k4 | "
+    "rational k1 k2 p1 p2 k3 k4 k5 k6]"
 )
 """What a calibration says; a lens is that of both images."""
 
@@ -39,11 +43,18 @@ def rows(path: Path) -> Iterator[tuple[str, list[str]]]:
     Raises:
         InputError: the file cannot be read.
     """
-    text = read_text(path, "listing")
-    for number, line in enumerate(text.splitlines(), start=1):
-        words = line.split("#")[0].replace(",", " ").split()
-        if words:
-            yield f"{path}:{number}", words
+    for where, line in _lines(path):
+        yield where, words_of(line)
+
+
+def _lines(path: Path, comments: list[str] | None = None) -> Iterator[tuple[str, str]]:
+    """Yield (``file:line``, text) of every line, without its comment, that says something."""
+    for number, line in enumerate(read_text(path, "listing").splitlines(), start=1):
+        text, mark, comment = re.match(r"(.*?)((?:^|(?<=\s))#|$)(.*)", line).groups()  # type: ignore[union-attr]
+        if mark and comments is not None:
+            comments.append(comment)
+        if text.strip():
+            yield f"{path}:{number}", text
 
 
 def number(word: str, where: str) -> float:
@@ -64,36 +75,129 @@ def number(word: str, where: str) -> float:
 def listed_images(path: Path) -> list[Listed]:
     """Lines ``timestamp filename``, times increasing, files relative to the listing's folder.
 
+    A name with blanks stands in quotation marks.
+
     Raises:
         InputError: naming file and line.
     """
     found: list[Listed] = []
-    for where, words in rows(path):
-        if len(words) != 2:
-            raise InputError(f"{where}: expected 'timestamp filename', got {' '.join(words)!r}")
-        time = number(words[0], where)
+    comments: list[str] = []
+    for where, line in _lines(path, comments):
+        words = _NAME_AND_TIME.fullmatch(line.strip())
+        if words is None:
+            raise InputError(f"{where}: expected 'timestamp filename', got {line.strip()!r}")
+        first, quoted, plain = words.groups()
+        time = number(first.replace(",", "."), where)
         if found and time <= found[-1].timestamp:
-            raise InputError(
-                f"{where}: timestamp {words[0]} does not come after {found[-1].timestamp}"
-            )
-        found.append(Listed(time, path.parent / words[1], where))
+            before = found[-1].timestamp
+            raise InputError(f"{where}: timestamp {first} does not come after {before}")
+        name = (quoted or plain).replace("\\", "/")
+        found.append(Listed(time, path.parent / name, where))
     if not found:
         raise InputError(f"{path} lists no image")
-    return found
+    said = next(filter(None, map(said_unit, comments)), None)
+    times = in_seconds(np.array([image.timestamp for image in found]), path, said)
+    return [replace(one, timestamp=time) for one, time in zip(found, times.tolist(), strict=True)]
 
 
-def read_matrix(path: Path) -> Float64:
+_NAME_AND_TIME = re.compile(r"""([^\s;,]+(?:,\d+(?=\s))?)[\s;,]+(?:"([^"]+)"|([^\s"]+))""")
+
+
+def listed_times(path: Path, names: Sequence[str]) -> Float64:
+    """Seconds (N,) of images from lines ``time``, or ``id time [exposure]`` as TUM-VI has them.
+
+    Args:
+        path: of the file; a comment may name the unit of time, as ``[ns]``.
+        names: N names of images without ending; an id is one of them.
+
+    Raises:
+        InputError: naming file and line; not as many lines as images.
+    """
+    comments: list[str] = []
+    lines = [(where, words_of(line)) for where, line in _lines(path, comments)]
+    if len(lines) != len(names):
+        raise InputError(f"{path}: {len(lines)} times for {len(names)} images")
+    times = []
+    for name, (where, words) in zip(names, lines, strict=True):
+        has_id = len(words) > 1
+        if len(words) > 3 or (has_id and not _is_id(words[0], name)):
+            raise InputError(
+                f"{where}: expected a time, with a point for decimals, or 'id time [exposure]' "
+                f"with id {name}, got {' '.join(words)!r}"
+            )
+        times.append(number(words[has_id], where))
+    found = np.array(times)
+    said = next(filter(None, map(said_unit, comments)), None)
+    step = float(np.median(np.diff(found))) if len(found) > 1 else 0.0
+    if not said and unit_of(found)[0] == "s" and step >= 2:  # no camera's seconds
+        said = "ms"
+        say_unit(said, found, path, "a comment such as [s]")
+    return in_seconds(found, path, said)
+
+
+def _is_id(word: str, name: str) -> bool:
+    """Whether a word is a name, or the number in it."""
+    numbers = re.findall(r"\d+", name)
+    is_number = word.isdecimal() and len(numbers) == 1 and int(word) == int(numbers[0])
+    return word.rpartition(".")[0] == name or word == name or is_number
+
+
+def read_pose(path: Path) -> Float64 | None:
     """Read a pose (4, 4) T_world_camera written as four rows of four numbers.
 
-    A rotation that is orthonormal but for rounding is made so exactly.
+    A rotation that is orthonormal but for rounding is made so exactly. None where all is ``-inf``,
+    as ScanNet has it where the pose is not known.
 
     Raises:
         InputError: another shape, NaN, or no rigid motion.
     """
+    if [words for _, words in rows(path)] == 4 * [4 * ["-inf"]]:
+        return None
+    return check_pose(rigid(_read_matrix(path, (4,))), str(path))
+
+
+def _read_matrix(path: Path, sides: Sequence[int]) -> Float64:
+    """Read a square matrix of one of some sizes.
+
+    Raises:
+        InputError: another shape, or what is no finite number.
+    """
     values = [[number(word, where) for word in words] for where, words in rows(path)]
-    if [len(row) for row in values] != [4, 4, 4, 4]:
-        raise InputError(f"{path}: expected 4 rows of 4 numbers")
-    return check_pose(rigid(np.array(values)), str(path))
+    if len(values) not in sides or any(len(row) != len(values) for row in values):
+        many = " or ".join(f"{side} rows of {side} numbers" for side in sides)
+        raise InputError(f"{path}: expected {many}")
+    return np.array(values)
+
+
+def read_poses(path: Path, count: int) -> Float64:
+    """Read poses (N, 4, 4), one a line and frame, of 16 numbers or of 12 without the last row.
+
+    Raises:
+        InputError: naming file and line; not as many as ``count`` frames.
+    """
+    poses = []
+    for where, words in rows(path):
+        if len(words) not in (12, 16):
+            raise InputError(f"{where}: expected 12 or 16 numbers, got {len(words)}")
+        matrix = np.eye(4)
+        matrix.ravel()[: len(words)] = [number(word, where) for word in words]
+        poses.append(check_pose(rigid(matrix), where))
+    if len(poses) != count:
+        raise InputError(f"{path}: {len(poses)} poses for {count} frames")
+    return np.stack(poses)
+
+
+def read_camera_matrix(path: Path, image: Path) -> Intrinsics:
+    """Intrinsics of a file of a matrix (3, 3) or (4, 4), for images as large as ``image``.
+
+    Raises:
+        InputError: naming the file.
+    """
+    K = _read_matrix(path, (3, 4))
+    try:
+        return Intrinsics(K[0, 0], K[1, 1], K[0, 2], K[1, 2], *image_size(image))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
 def rigid(matrix: Float64) -> Float64:

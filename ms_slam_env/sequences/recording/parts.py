@@ -40,7 +40,7 @@ def join_parts(parts: Sequence[Recording]) -> Recording:
     """
     first = parts[0]
     for part in parts[1:]:
-        for attribute in ("source", "depth_scale", "no_reading", "registration", "has_color"):
+        for attribute in ("source", "depth_scale", "registration", "has_color"):
             one, other = getattr(first, attribute), getattr(part, attribute)
             if one != other:
                 raise InputError(

@@ -14,12 +14,15 @@ from ms_slam_env.camera import Intrinsics, RGBDFrame, parse_image_size
 from ms_slam_env.camera.frame import reduce_color, reduce_depth
 from ms_slam_env.camera.image_files import read_color, read_depth
 from ms_slam_env.camera.image_size import Crop
-from ms_slam_env.camera.registration import Registration
+from ms_slam_env.camera.registration import ColorCamera, Registration
 from ms_slam_env.camera.undistortion import undistort_color, undistort_depth
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import Float64
 from ms_slam_env.sequences.sequence import Frames, Sequence
 from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S, associate
+
+SATURATED = 65535
+"""Largest value of a depth image with 16 bits, which many sensors write where they see nothing."""
 
 
 @dataclass(frozen=True)
@@ -38,15 +41,20 @@ class Entry:
     color: Path | None
     where: str
 
-    def read(self, camera: Intrinsics) -> tuple[NDArray[np.uint8] | None, NDArray[Any]]:
+    def read(
+        self, camera: Intrinsics, color_camera: Intrinsics | None = None
+    ) -> tuple[NDArray[np.uint8] | None, NDArray[Any]]:
         """Colour (H, W, 3), if there is any, and values of depth (H, W), as they are on disk.
+
+        Both are of the size that ``camera`` says, unless ``color_camera`` says that of colour.
 
         Raises:
             InputError: a file that is missing, truncated, of another kind or size; the message
                 names it.
         """
         depth = read_depth(self.depth, camera)
-        return None if self.color is None else read_color(self.color, camera), depth
+        color = None if self.color is None else read_color(self.color, color_camera or camera)
+        return color, depth
 
 
 @dataclass(frozen=True)
@@ -61,11 +69,10 @@ class Recording(Frames):
             no more.
         intrinsics: intrinsics of the frames that are returned.
         depth_scale: value of a depth image for one metre.
-        no_reading: value of a depth image, besides 0, that means no reading.
         truth_times: (M,) seconds, or None.
         truth: (M, 4, 4) true T_world_camera, or None.
         registration: where the colour camera is, if colour has to be brought into the depth
-            camera; None where the recording has that done.
+            camera: known, or assumed to be a Kinect's; None where the recording has that done.
         crop: the part of the images on disk that is taken; None for all of them.
 
     Raises:
@@ -78,10 +85,9 @@ class Recording(Frames):
     source: Intrinsics
     intrinsics: Intrinsics
     depth_scale: float
-    no_reading: int | None = None
     truth_times: Float64 | None = None
     truth: Float64 | None = None
-    registration: Registration | None = None
+    registration: Registration | ColorCamera | None = None
     crop: Crop | None = None
 
     def __post_init__(self) -> None:
@@ -141,14 +147,17 @@ class Recording(Frames):
                 names it and the line that lists it.
         """
         entry = self.entries[index]
+        known = self.registration if isinstance(self.registration, ColorCamera) else None
         try:
-            read, raw = entry.read(self.source)
+            read, raw = entry.read(self.source, known and known.intrinsics)
         except InputError as error:
             raise InputError(f"{entry.where}: {error}") from None
         depth: NDArray[Any] = raw.astype(np.float32) / np.float32(self.depth_scale)
-        if self.no_reading is not None:
-            depth[raw == self.no_reading] = 0
+        if raw.dtype.kind in "iu":
+            depth[raw == SATURATED] = 0
         color: NDArray[Any] = np.zeros((*raw.shape, 3), np.uint8) if read is None else read
+        if known is not None and read is not None:
+            color = known.register(read, depth, self.source)
         if self.source.distortion:
             color = undistort_color(color, self.source)
             depth = undistort_depth(depth, self.source)
@@ -160,7 +169,7 @@ class Recording(Frames):
         if size != (crop.width, crop.height):
             color = reduce_color(color, size)
             depth = reduce_depth(depth, size)
-        if self.registration is not None and entry.color is not None:
+        if isinstance(self.registration, Registration) and entry.color is not None:
             factor = self.intrinsics.width / crop.width
             color = self.registration.register(color, depth, self.intrinsics, factor)
         return RGBDFrame(np.ascontiguousarray(color), np.ascontiguousarray(depth), entry.timestamp)

@@ -18,12 +18,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics, intensity_image
-from ms_slam_env.camera.image_files import image_size, read_color
+from ms_slam_env.camera.image_files import image_size, read_grey
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import Float64, check_pose, make_pose
 from ms_slam_env.input_files import is_named
 from ms_slam_env.sequences.recording.image_folders import images
-from ms_slam_env.sequences.recording.listings import Calibration, number, rigid, rows
+from ms_slam_env.sequences.recording.listings import (
+    Calibration,
+    listed_times,
+    number,
+    read_poses,
+    rows,
+)
 from ms_slam_env.sequences.recording.recording import Entry, Recording
 
 _BLOCK_PX = 5
@@ -133,10 +139,12 @@ class StereoEntry(Entry):
     right: Path
     rig: StereoRig
 
-    def read(self, camera: Intrinsics) -> tuple[NDArray[np.uint8] | None, NDArray[Any]]:
+    def read(
+        self, camera: Intrinsics, color_camera: Intrinsics | None = None
+    ) -> tuple[NDArray[np.uint8] | None, NDArray[Any]]:
         """The rectified left image, and depth in metres; see the base class."""
         paths = zip((self.depth, self.right), self.rig.cameras, strict=True)
-        left, right = self.rig.rectify(*(read_color(path, K) for path, K in paths))
+        left, right = self.rig.rectify(*(read_grey(path, K) for path, K in paths))
         return left, self.rig.depth(left, right)
 
 
@@ -165,12 +173,11 @@ def open_kitti(folder: Path, intrinsics: Calibration | None) -> Recording:
     if pair is None:
         raise InputError(f"{folder} needs both images of a pair: image_0 and image_1, or 2 and 3")
     lefts, rights = (images(folder / f"image_{k}") for k in pair)
-    times = [number(words[0], where) for where, words in rows(folder / "times.txt")]
-    if not len(lefts) == len(rights) == len(times):
+    if len(lefts) != len(rights):
         raise InputError(
-            f"{folder}: {len(lefts)} images in image_{pair[0]} and {len(rights)} in "
-            f"image_{pair[1]} for {len(times)} times in times.txt"
+            f"{folder}: {len(lefts)} images in image_{pair[0]} and {len(rights)} in image_{pair[1]}"
         )
+    times = listed_times(folder / "times.txt", [path.stem for path in lefts]).tolist()
     matrices = [_projection(folder / "calib.txt", f"P{k}") for k in pair]
     places = [_place(matrix) for matrix in matrices]
     left, right = (_intrinsics(matrix, lefts[0]) for matrix in matrices)
@@ -223,11 +230,5 @@ def _truth(folder: Path, count: int) -> Float64 | None:
     """T_world_camera0 (N, 4, 4), if there is one a frame."""
     for path in (folder / "poses.txt", folder.parent.parent / "poses" / f"{folder.name}.txt"):
         if is_named(path):
-            poses = []
-            for where, words in rows(path):
-                matrix = np.vstack([_matrix(words, where), [0, 0, 0, 1]])
-                poses.append(check_pose(rigid(matrix), where))
-            if len(poses) != count:
-                raise InputError(f"{path}: {len(poses)} poses for {count} frames")
-            return np.stack(poses)
+            return read_poses(path, count)
     return None
