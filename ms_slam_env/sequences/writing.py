@@ -95,7 +95,8 @@ def write_frames(sequence: Sequence, folder: Path) -> None:
     """Write what a camera gives of a sequence into a folder, in the TUM layout, and no true pose.
 
     ``rgb/TIME.png``, ``depth/TIME.png``, ``rgb.txt``, ``depth.txt`` and ``intrinsics.txt``, as
-    `write_sequence`; TIME in seconds with six decimals.
+    `write_sequence`; TIME in seconds with six decimals. ``intrinsics.txt`` is one line of numbers,
+    ``fx fy cx cy width height depth_scale``.
     """
     names = []
     for frame in sequence.frames:
@@ -168,9 +169,7 @@ def depth_values(depth: NDArray[np.float32]) -> NDArray[np.uint16]:
 
 def _intrinsics(K: Intrinsics) -> str:
     numbers = (K.fx, K.fy, K.cx, K.cy, K.width, K.height, DEPTH_SCALE)
-    return (
-        "# fx fy cx cy width height depth_scale\n" + " ".join(f"{n:.10g}" for n in numbers) + "\n"
-    )
+    return " ".join(f"{n:.10g}" for n in numbers) + "\n"
 
 
 def _write_image(path: Path, pixels: NDArray[Any]) -> None:
