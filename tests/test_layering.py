@@ -20,7 +20,7 @@ FLOW = (
 LEVEL = {name: level for level, name in enumerate(re.split(r" -> |, ", FLOW))}
 BELOW_ALL = {
     *("errors", "input_files", "output_files", "interrupts", "config", "command_line", "parallel"),
-    *("extension", "tasks", "timings", "_warp"),
+    *("extension", "progress", "tasks", "timings", "_warp"),
 }
 ABOVE_ALL = {"registration", ""}  # "" is ms_slam_env/__init__.py
 NEVER = {"baselines", "agents", "ms_slam_baselines", "ms_slam_agents", "evo"}

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import gymnasium as gym
-from tqdm import tqdm
 
 import ms_slam_env
 from ms_slam_env.command_line import parse
@@ -18,6 +17,7 @@ from ms_slam_env.env.planners import check_planner, make_planner, planner_observ
 from ms_slam_env.env.rerun_view import EpisodeView
 from ms_slam_env.interrupts import kept
 from ms_slam_env.output_files import check_out_file
+from ms_slam_env.progress import Bar
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def _play(env: gym.Env[Any, Any], args: Args) -> None:
     try:
         with kept("the steps so far are shown"):
             view.log(planner)
-            for _ in tqdm(range(args.steps), "steps", unit="step"):
+            for _ in Bar(range(args.steps), "steps", unit="step"):
                 action = planner.act(observation, info)
                 observation, _, terminated, truncated, info = env.step(action)
                 view.log(planner)

@@ -38,6 +38,7 @@ from ms_slam_env.evaluation.tracking_diagnosis import (
 )
 from ms_slam_env.evaluation.trajectory_charts import error_panel, marked_panel, path_panel
 from ms_slam_env.geometry import invert
+from ms_slam_env.interrupts import recorded
 from ms_slam_env.output_files import growing_file, result_folder, write_bytes
 from ms_slam_env.report.charts import Chart, Panel
 from ms_slam_env.report.results import write_results
@@ -144,7 +145,7 @@ def run_to_folder(
         result = _write(run, sequence, out, {"complete": True, **content}, refused, mesh)
     except BaseException as error:
         stopped = isinstance(error, KeyboardInterrupt)
-        content["error"] = str(error) or type(error).__name__
+        content["error"] = recorded(error)
         with suppress(OSError):  # a disk that is full: the poses so far are all there is
             unfinished = {"complete": False, "interrupted": stopped, **content}
             _write(run, sequence, out, unfinished, refused, mesh=False)

@@ -11,13 +11,13 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.input_files import read_json
 from ms_slam_env.interrupts import kept
 from ms_slam_env.output_files import write_bytes, write_text
+from ms_slam_env.progress import Bar
 from ms_slam_env.sequences.rendering import RenderedSequence
 from ms_slam_env.sequences.sequence import Sequence
 from ms_slam_env.sequences.trajectory import write_trajectory
@@ -73,7 +73,7 @@ def write_sequence(
     _begin(partial, content)
     names = [f"{time:.6f}" for time in sequence.frames.timestamps]
     with kept(f"finished frames are kept in {partial}; the same command goes on"):
-        for index, name in enumerate(tqdm(names, desc=sequence.name, unit="frame")):
+        for index, name in enumerate(Bar(names, desc=sequence.name, unit="frame")):
             _write_frame(partial, name, sequence, index, with_truth)
     truths = ("depth_true", "labels") if with_truth else ()
     _write_lists(partial, names, ("rgb", "depth", *truths))

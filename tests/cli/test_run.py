@@ -201,7 +201,7 @@ def test_an_interrupted_run_keeps_the_trajectory_so_far(sequence, tmp_path, caps
     assert (out / "trajectory.incomplete.txt").read_text().splitlines() == whole[:5]
     written = json.loads((out / "metrics.json").read_text())
     assert (written["complete"], written["frames"]) == (False, 4)
-    assert written["error"] == "KeyboardInterrupt"
+    assert written["error"] == "interrupted by SIGINT"
 
 
 def test_says_what_registration_it_assumes(sequence, tmp_path, capsys):
