@@ -33,7 +33,6 @@ from ms_slam_env.report.charts import Chart, scatter
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished
 from ms_slam_env.scenes import PUBLISHED_ROOMS
-from ms_slam_env.sequences import check_sequence
 
 DEFAULT_SEQUENCES = (
     "living_room:2000:none",
@@ -98,6 +97,8 @@ class Compare(Experiment, Checked):
 
     def __post_init__(self) -> None:
         """Refuse what no run could use."""
+        from ms_slam_env.sequences import check_sequence
+
         super().__post_init__()
         for name in ("sequences", "backends", "image_sizes"):
             if not getattr(self, name):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry.so3 import Float64
@@ -78,6 +77,8 @@ def transform_points(T_a_b: ArrayLike, points_b: ArrayLike) -> Float64:
 
 def relative_angle(R_a: ArrayLike, R_b: ArrayLike) -> float:
     """Angle in radians of the rotation between two rotation matrices (3, 3)."""
+    from scipy.spatial.transform import Rotation
+
     difference = np.asarray(R_a, dtype=np.float64).T @ np.asarray(R_b, dtype=np.float64)
     return float(Rotation.from_matrix(difference).magnitude())
 
@@ -104,10 +105,14 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) 
 
 def pose_from_quaternion(t: ArrayLike, q_xyzw: ArrayLike) -> Float64:
     """Pose (4, 4) from a translation (3,) in m and a quaternion (qx, qy, qz, qw)."""
+    from scipy.spatial.transform import Rotation
+
     return make_pose(Rotation.from_quat(np.asarray(q_xyzw, dtype=np.float64)).as_matrix(), t)
 
 
 def quaternion_from_pose(T: ArrayLike) -> Float64:
     """Quaternion (qx, qy, qz, qw), of unit length with qw >= 0, of a pose (4, 4)."""
+    from scipy.spatial.transform import Rotation
+
     R = np.asarray(T, dtype=np.float64)[:3, :3]
     return Rotation.from_matrix(R).as_quat(canonical=True)

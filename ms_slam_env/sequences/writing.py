@@ -6,9 +6,8 @@ import json
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,9 +17,11 @@ from ms_slam_env.input_files import read_json
 from ms_slam_env.interrupts import kept
 from ms_slam_env.output_files import write_bytes, write_text
 from ms_slam_env.progress import Bar
-from ms_slam_env.sequences.rendering import RenderedSequence
 from ms_slam_env.sequences.sequence import Sequence
 from ms_slam_env.sequences.trajectory import write_trajectory
+
+if TYPE_CHECKING:
+    from ms_slam_env.sequences.rendering import RenderedSequence
 
 DEPTH_SCALE = 5000.0
 """Value of a depth image for one metre, as in the TUM RGB-D benchmark."""
@@ -173,5 +174,7 @@ def _intrinsics(K: Intrinsics) -> str:
 
 
 def _write_image(path: Path, pixels: NDArray[Any]) -> None:
+    import cv2
+
     _, data = cv2.imencode(".png", np.ascontiguousarray(pixels))
     write_bytes(path, data.tobytes(), durable=False)

@@ -19,7 +19,7 @@ from ms_slam_env.evaluation.seen_surface import open_with_surface
 from ms_slam_env.evaluation.trajectory_files import tracked_beside
 from ms_slam_env.experiments.harness.command_runs import run_command
 from ms_slam_env.geometry import invert
-from ms_slam_env.sequences import HandheldPath, Sequence, associate, open_sequence, read_trajectory
+from ms_slam_env.sequences import HandheldPath, Sequence, associate, read_trajectory
 from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S
 
 Float64 = NDArray[np.float64]
@@ -153,6 +153,8 @@ def judge_trajectory(spec: CompareSpec) -> dict[str, Any]:
 
 
 def _opened(spec: CompareSpec) -> Sequence:
+    from ms_slam_env.sequences import open_sequence
+
     return open_sequence(spec.sequence, spec.image_size, path=spec.path, with_truth=True)
 
 

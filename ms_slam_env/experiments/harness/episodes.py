@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -17,21 +17,16 @@ from numpy.typing import NDArray
 import ms_slam_env
 from ms_slam_env import slam
 from ms_slam_env.config import Checked, bounded, chosen, nested_options
-from ms_slam_env.env import ActiveSlamEnv, Planner
-from ms_slam_env.env.config import make_config
-from ms_slam_env.env.embodiments import EMBODIMENTS
+from ms_slam_env.env import Planner
 from ms_slam_env.env.planners import check_planner, make_planner, planner_observation
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.experiments.harness.episode_scores import (
-    MapScores,
-    measure_losses,
-    measure_trajectory,
-)
 from ms_slam_env.registration import ADAPTIVE_ID
 from ms_slam_env.scenes import SEED_SPLITS
-from ms_slam_env.scenes.mesh_file import load_soup
 from ms_slam_env.scenes.registry import check_name, is_mesh_file
 from ms_slam_env.tasks import find_task
+
+if TYPE_CHECKING:
+    from ms_slam_env.env import ActiveSlamEnv
 
 Float64 = NDArray[np.float64]
 
@@ -100,9 +95,15 @@ def run_episode(spec: EpisodeSpec) -> dict[str, Any]:
         (running RMSE, unaligned, metres, when the map was looked at), ``time_s`` (simulated) and
         ``energy_j`` (mechanical work of the motion).
     """
+    from ms_slam_env.experiments.harness.episode_scores import (
+        MapScores,
+        measure_losses,
+        measure_trajectory,
+    )
+
     env = make_env(spec)
     try:
-        world = cast(ActiveSlamEnv, env.unwrapped)
+        world = cast("ActiveSlamEnv", env.unwrapped)
         planner = make_planner(spec.planner, world, spec.seed)
         maps = MapScores(world, spec.scene, spec.seed, find_task(spec.task).reference)
         progress = play(env, planner, spec.seed, after_step=maps.after_step)
@@ -130,7 +131,7 @@ def planned_motion(spec: EpisodeSpec) -> tuple[Float64, Float64, dict[str, Any]]
     check_planner(spec.planner)
     env = make_env(spec)
     try:
-        world = cast(ActiveSlamEnv, env.unwrapped)
+        world = cast("ActiveSlamEnv", env.unwrapped)
         progress = play(env, make_planner(spec.planner, world, spec.seed), spec.seed)
         lost = int((~world.episode.tracked).sum())
         about = {"episode_steps": progress["steps"], "episode_lost_frames": lost}
@@ -234,6 +235,9 @@ def parse_options(texts: Sequence[str]) -> dict[str, Any]:
         InputError: no ``=``, an unknown name (the message lists the valid ones), a value out of
             range, or a name that the benchmark sets itself.
     """
+    from ms_slam_env.env.config import make_config
+    from ms_slam_env.env.embodiments import EMBODIMENTS
+
     result = nested_options(texts)
     for name in result:
         if name in OWN_OPTIONS:
@@ -252,6 +256,8 @@ def check_names(planners: Sequence[str], scenes: Sequence[str]) -> None:
     Raises:
         InputError: naming the valid choices, or what is wrong with the file.
     """
+    from ms_slam_env.scenes.mesh_file import load_soup
+
     for kind, names in (("planner", planners), ("scene", scenes)):
         if not names:
             raise InputError(f"no {kind} given")
