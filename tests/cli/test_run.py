@@ -96,6 +96,13 @@ def test_writes_trajectory_map_and_metrics(sequence, tmp_path, capsys):
     assert written["complete"]
     assert (written["kind"], written["results_version"]) == ("run", RESULTS_VERSION)
     assert [chart["name"] for chart in written["charts"]] == ["path", "error", "alignment", "cost"]
+    path = written["charts"][0]
+    drawn = {line["name"]: line for line in path["panels"][0]["series"]}
+    for axis in "xy":  # aligned as a whole, the two have one centre
+        assert np.mean(drawn["estimate"][axis]) == pytest.approx(
+            np.mean(drawn["truth"][axis]), abs=1e-9
+        )
+    assert path["caption"].endswith("After SE(3) alignment with the truth.")
     assert [table["title"] for table in written["tables"]] == ["Frames and trajectory", "Cost"]
     assert (written["frames"], written["lost_frames"], len(times)) == (FRAMES, 0, FRAMES)
     assert written["ate_m"] == pytest.approx(ate_rmse(poses, truth), abs=1e-6)
