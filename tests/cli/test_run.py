@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -96,6 +97,10 @@ def test_writes_trajectory_map_and_metrics(sequence, tmp_path, capsys):
     assert written["complete"]
     assert (written["kind"], written["results_version"]) == ("run", RESULTS_VERSION)
     assert [chart["name"] for chart in written["charts"]] == ["path", "error", "alignment", "cost"]
+    page = (Path(__file__).parents[2] / "docs" / "evaluation.md").read_text(encoding="utf-8")
+    named = re.findall(r"`(\w+)`", re.findall(r"`metrics.json` \(([^)]*)\)", page)[0])
+    assert named
+    assert set(named) <= written.keys()
     path = written["charts"][0]
     drawn = {line["name"]: line for line in path["panels"][0]["series"]}
     for axis in "xy":  # aligned as a whole, the two have one centre
