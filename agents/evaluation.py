@@ -19,7 +19,8 @@ from ms_slam_agents.policy import (
 from ms_slam_baselines.greedy import distance_to_targets
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
-from tqdm import tqdm
+
+from ms_slam_env.progress import Bar
 
 Choose = Callable[
     [NDArray[Any], NDArray[np.bool_], Sequence[np.random.Generator], NDArray[np.bool_]], Actions
@@ -166,7 +167,7 @@ def references(venv: VecEnv, num_episodes: int) -> dict[str, dict[str, Any]]:
 
     planners = {"random walk": random_walk, "stationary": stationary, "greedy": greedy}
     results = {}
-    with tqdm(total=len(planners) * num_episodes, unit="episode") as bar:
+    with Bar(total=len(planners) * num_episodes, desc="references", unit="episode") as bar:
         for name, choose in planners.items():
             bar.set_description(f"reference: {name}")
             results[name] = evaluate(venv, num_episodes, choose, bar.update)

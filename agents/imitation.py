@@ -34,13 +34,13 @@ from ms_slam_agents.policy_file import PolicyFile, write_policy
 from ms_slam_agents.resume import KEPT, check_kept, check_new, parse_options, say_changes
 from ms_slam_agents.student import Student
 from ms_slam_agents.training_run import alone, read_run, read_similar, saved_curve
-from tqdm import tqdm
 
 from ms_slam_env.command_line import exit_code
 from ms_slam_env.config import bounded, parse_named
 from ms_slam_env.env.planners import PLANNERS, check_planner
 from ms_slam_env.errors import InputError
 from ms_slam_env.parallel import one_thread_unless_set, open_pool, run_each
+from ms_slam_env.progress import Bar
 from ms_slam_env.report.records import to_plain
 from ms_slam_env.report.results import RESULTS
 from ms_slam_env.result_folders import own_folder
@@ -133,7 +133,7 @@ def play_round(args: Args, number: int) -> None:
     own_folder(args.out / "episodes")
     environment = one_thread_unless_set()
     with open_pool(play, args.num_envs, environment=environment) as pool:
-        for outcome in tqdm(
+        for outcome in Bar(
             run_each(pool, missing), f"round {number}", len(missing), unit="episode"
         ):
             if outcome.error:

@@ -16,11 +16,11 @@ from typing import Any
 from ms_slam_agents.environments import check_problem
 from ms_slam_agents.train_rllib import Args, make_run
 from ms_slam_agents.training_run import alone
-from tqdm import tqdm
 
 from ms_slam_env.command_line import parse
 from ms_slam_env.config import bounded
 from ms_slam_env.errors import InputError
+from ms_slam_env.progress import Bar
 from ms_slam_env.report.records import to_plain
 from ms_slam_env.report.results import RESULTS, write_result_folder
 from ms_slam_env.report.tables import make_table
@@ -63,7 +63,9 @@ def scale(args: Scaling) -> int:
     if not args.runners or min(args.runners) < 1:
         raise InputError(f"runners = {args.runners} must be numbers from 1 on")
     check_problem(args)
-    rows = [measure(args, count) for count in tqdm(args.runners, unit="number of runners")]
+    rows = [
+        measure(args, count) for count in Bar(args.runners, "scaling", unit="number of runners")
+    ]
     alone = rows[0]["steps_per_s"] / rows[0]["runners"]
     for row in rows:
         row["scaling_efficiency"] = row["steps_per_s"] / (row["runners"] * alone)

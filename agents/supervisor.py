@@ -15,8 +15,8 @@ from ms_slam_agents.sb3_state import Model, tensors_of, update_on_partial_rollou
 from ms_slam_agents.training_run import metadata_of, stage_of
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
-from tqdm import tqdm
 
+from ms_slam_env.progress import Bar
 from ms_slam_env.report.provenance import provenance
 
 
@@ -51,7 +51,7 @@ class Supervisor(BaseCallback):
         self._minutes_before = minutes_before
         self._evaluation_s = 0.0
         self._provenance = provenance()
-        self._bar = tqdm(disable=True)
+        self._bar = Bar(disable=True)
 
     def __enter__(self) -> Supervisor:
         return self
@@ -78,14 +78,15 @@ class Supervisor(BaseCallback):
         self._epochs_before = self.model._n_updates
         self.was_done = self.num_timesteps >= self.args.total_timesteps
         if self.args.minutes is None:
-            self._bar = tqdm(
+            self._bar = Bar(
                 total=self.args.total_timesteps,
+                desc="training",
                 initial=self.num_timesteps,
                 unit="step",
                 smoothing=0.1,
             )
         else:
-            self._bar = tqdm(total=round(60 * self.args.minutes), unit="s")
+            self._bar = Bar(total=round(60 * self.args.minutes), desc="training", unit="s")
         self._next_evaluation = self.num_timesteps
         if self._is_evaluated():
             self._plan_evaluation()  # resumed where it was evaluated

@@ -40,11 +40,11 @@ from ms_slam_agents.resume import (
 )
 from stable_baselines3.common.vec_env import VecEnv
 from torch.utils.tensorboard import SummaryWriter
-from tqdm import tqdm
 
 from ms_slam_env.command_line import exit_code
 from ms_slam_env.errors import InputError
 from ms_slam_env.interrupts import kept
+from ms_slam_env.progress import Bar
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import to_plain
 from ms_slam_env.report.results import RESULTS
@@ -132,7 +132,13 @@ class TrainingRun(ABC):
         """
         args, before = self.options, self.minutes
         board = SummaryWriter(str(own_folder(args.out / "tensorboard")))
-        bar = tqdm(total=args.total_timesteps, initial=self.steps, unit="step", smoothing=0.1)
+        bar = Bar(
+            total=args.total_timesteps,
+            desc="training",
+            initial=self.steps,
+            unit="step",
+            smoothing=0.1,
+        )
         signals: list[signal.Signals] = []
         with board, bar:
             if not curve.points:
@@ -171,7 +177,7 @@ class TrainingRun(ABC):
         point = curve.judge(file, validation, self.options.out, self.options.deterministic_eval)
         for name in point.keys() - {"returns", "timesteps", "training_min"}:
             board.add_scalar(f"validation/{name}", point[name], self.steps)
-        tqdm.write(f"{self.steps} steps, {self.minutes:.1f} min: {curve.in_words(point)}")
+        Bar.write(f"{self.steps} steps, {self.minutes:.1f} min: {curve.in_words(point)}")
 
 
 def alone(train: Train) -> Train:
@@ -214,7 +220,8 @@ def train(
         args.out.mkdir(parents=True, exist_ok=True)
         with kept(f"what was trained before the last update is kept in {args.out}"):
             ended_by = run.learn(curve or new_curve(args, validation), validation)
-    print(f"{'interrupted' if ended_by else 'done'}: {run.steps} steps, policy in {args.out}")
+    ended = f"interrupted by {ended_by.name}" if ended_by else "done"
+    print(f"{ended}: {run.steps} steps, policy in {args.out}")
     return 128 + ended_by if ended_by else 0
 
 

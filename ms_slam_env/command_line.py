@@ -7,18 +7,17 @@ import errno
 import io
 import os
 import re
+import select
 import signal
 import sys
 import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
-
-import tyro
+from typing import IO, Any, TypeVar
 
 from ms_slam_env.errors import InputError, InputWarning, one_line
-from ms_slam_env.interrupts import Interrupts
+from ms_slam_env.interrupts import Interrupts, Terminated
 from ms_slam_env.output_files import DISK_ERRORS, check_out_folder
 
 T = TypeVar("T")
@@ -45,6 +44,8 @@ def parse(
             that nothing can be written to.
         SystemExit: with code 0 after ``--help``.
     """
+    import tyro  # here, so that a list of the commands does not wait for it
+
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
@@ -66,8 +67,10 @@ def exit_code(run: Callable[[], int], name: str = "ms-slam") -> int:
     So are warnings about what was given; those of libraries tell a user nothing.
 
     Returns:
-        0 success, 1 failure (also of the disk), 2 bad input, 130 after Ctrl-C, 143 after SIGTERM.
+        0 success, 1 failure (also of the disk), 2 bad input, 130 after Ctrl-C, 143 after SIGTERM,
+        141 where nobody reads the output any more, which is what a pipe makes of other programs.
     """
+    _open_missing_streams()
     interrupts = Interrupts()
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # names of files need not be text
@@ -77,17 +80,58 @@ def exit_code(run: Callable[[], int], name: str = "ms-slam") -> int:
                 warnings.simplefilter("ignore", RuntimeWarning)
             warnings.simplefilter("default", InputWarning)
             warnings.showwarning = partial(_show_warning, name)
-            code = run()
+            try:
+                code = run()
+            except SystemExit:  # after --help
+                _flush()
+                raise
             _flush()
             return code
     except BaseException as error:
+        if isinstance(error, BrokenPipeError) and _no_one_reads():
+            return 128 + signal.SIGPIPE
         ending = _ending(error, interrupts.signal)
         if ending is None:
             raise
         code, text = ending
-        _close_bars()
-        print(f"{name}: {one_line(text)}", file=sys.stderr)
+        with contextlib.suppress(OSError):  # a message that no one reads changes no exit code
+            _close_bars()
+            print(f"{name}: {one_line(text)}", file=sys.stderr)
+        _no_one_reads()
         return code
+
+
+def _open_missing_streams() -> None:
+    """Give a process that was started with closed standard streams ones that lead nowhere.
+
+    Python has None for them, which not all code expects; and the next file to be opened would get
+    the number of one, and everything that a library writes there.
+    """
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(descriptor)
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115, as long as the process
+
+
+def _no_one_reads() -> bool:
+    """Whether an output is a pipe whose reader has gone; what is left for it goes nowhere."""
+    gone = []
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):  # a stream without a file
+            outputs = select.poll()
+            outputs.register(stream.fileno(), 0)  # asks for errors alone
+            gone += [stream] if outputs.poll(0) else []
+    for stream in gone:
+        _lead_nowhere(stream)
+    return bool(gone)
+
+
+def _lead_nowhere(stream: IO[str]) -> None:
+    """Let what is left in a stream that takes nothing more cause no error at the exit."""
+    with open(os.devnull, "wb") as nowhere:
+        os.dup2(nowhere.fileno(), stream.fileno())
 
 
 def _close_bars() -> None:
@@ -102,8 +146,9 @@ def _ending(error: BaseException, stopped: int | None) -> tuple[int, str] | None
     if stopped is not None or isinstance(error, KeyboardInterrupt):
         # After a signal anything may come out of a library that was in the middle of something.
         kept = str(error) if isinstance(error, KeyboardInterrupt) else ""
-        text = f"interrupted; {kept}" if kept else "interrupted"
-        return 128 + (stopped or signal.SIGINT), text
+        number = stopped or (signal.SIGTERM if isinstance(error, Terminated) else signal.SIGINT)
+        by = " by SIGTERM" if number == signal.SIGTERM else ""
+        return 128 + number, f"interrupted{by}; {kept}" if kept else f"interrupted{by}"
     if isinstance(error, InputError):
         return 2, f"error: {error}"
     if isinstance(error, OSError):
@@ -120,9 +165,10 @@ def _flush() -> None:
     """Let a standard output that takes nothing more be an error now, not after the exit code."""
     try:
         sys.stdout.flush()
+    except BrokenPipeError:
+        raise
     except OSError as error:
-        with open(os.devnull, "wb") as nowhere:
-            os.dup2(nowhere.fileno(), sys.stdout.fileno())
+        _lead_nowhere(sys.stdout)
         raise OSError(errno.EIO, error.strerror, "standard output") from None
 
 

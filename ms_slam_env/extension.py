@@ -37,7 +37,8 @@ class ExtensionPoint:
         group: of entry points, such as ``ms_slam_env.slam``.
         base: class of which what is found is a subclass, or instance of a function's result; None
             for anything that can be called.
-        own: our names and what they stand for.
+        own: our names and what they stand for; a text ``module:name`` is imported when it is asked
+            for.
         form: of the names that a user makes up.
     """
 
@@ -64,7 +65,8 @@ class ExtensionPoint:
                 raise self.unknown(name)
             return self._checked(name, name)
         if name in self.own:
-            return self.own[name]
+            own = self.own[name]
+            return self._load(name, own, "") if isinstance(own, str) and ":" in own else own
         if ":" in name:
             # A console script, unlike ``python -m``, leaves the current folder out.
             if os.getcwd() not in sys.path:

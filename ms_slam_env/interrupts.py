@@ -13,8 +13,21 @@ from typing import Any
 _AGAIN_S = 0.2
 
 
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, which ends a command as Ctrl-C does: what is kept then, is kept now."""
+
+
+def recorded(error: BaseException) -> str:
+    """What is recorded of an error that ended some work: its text, of an interrupt the signal."""
+    if isinstance(error, KeyboardInterrupt):
+        return f"interrupted by {'SIGTERM' if isinstance(error, Terminated) else 'SIGINT'}"
+    return str(error) or type(error).__name__
+
+
 class Interrupts:
     """While this context lasts, SIGINT and SIGTERM raise KeyboardInterrupt until it is handled.
+
+    That of SIGTERM is `Terminated`.
 
     Libraries have ``except BaseException`` around their imports (trimesh has dozens), in callbacks
     and the like, which lose an interrupt. So a timer looks every 0.2 s whether the exception is
@@ -50,7 +63,7 @@ class Interrupts:
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
         self.signal = signal.Signals(number)
-        self._raised = KeyboardInterrupt()
+        self._raised = Terminated() if number == signal.SIGTERM else KeyboardInterrupt()
         self._set_timer(_AGAIN_S)
         raise self._raised
 

@@ -11,7 +11,7 @@ import time
 import pytest
 
 from ms_slam_env.command_line import exit_code
-from ms_slam_env.interrupts import Interrupts, kept
+from ms_slam_env.interrupts import Interrupts, kept, recorded
 
 pytestmark = pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="needs POSIX signals")
 
@@ -54,7 +54,25 @@ def test_a_swallowed_signal_comes_again(number, code, times, capsys):
     start = time.monotonic()
     assert exit_code(run) == code
     assert time.monotonic() - start < 5
-    assert capsys.readouterr().err == "ms-slam: interrupted\n"
+    by = " by SIGTERM" if number == signal.SIGTERM else ""
+    assert capsys.readouterr().err == f"ms-slam: interrupted{by}\n"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_is_recorded_by_the_name_of_its_signal(number):
+    said = []
+
+    def run():
+        try:
+            os.kill(os.getpid(), number)
+            time.sleep(5)
+        except BaseException as error:
+            said.append(recorded(error))
+            raise
+
+    assert exit_code(run) == 128 + number
+    assert said == [f"interrupted by {number.name}"]
+    assert [recorded(ValueError("no")), recorded(MemoryError())] == ["no", "MemoryError"]
 
 
 def test_what_is_done_about_an_interrupt_is_not_interrupted_by_the_same(capsys):
@@ -76,7 +94,7 @@ def test_what_is_done_about_an_interrupt_is_not_interrupted_by_the_same(capsys):
 
     assert exit_code(run) == 143
     assert done == list(range(10))
-    assert capsys.readouterr().err == "ms-slam: interrupted; half of it is kept\n"
+    assert capsys.readouterr().err == "ms-slam: interrupted by SIGTERM; half of it is kept\n"
 
 
 def test_a_second_signal_interrupts_what_the_first_set_off():

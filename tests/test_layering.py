@@ -7,9 +7,12 @@ import re
 import subprocess
 import sys
 from collections.abc import Collection, Iterator, Mapping
+from importlib import import_module
 from pathlib import Path
 
 import pytest
+
+from ms_slam_env.cli import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "ms_slam_env"
@@ -20,7 +23,7 @@ FLOW = (
 LEVEL = {name: level for level, name in enumerate(re.split(r" -> |, ", FLOW))}
 BELOW_ALL = {
     *("errors", "input_files", "output_files", "interrupts", "config", "command_line", "parallel"),
-    *("extension", "result_folders", "tasks", "timings", "_warp", "native"),
+    *("extension", "lazy", "native", "progress", "result_folders", "tasks", "timings", "_warp"),
 }
 ABOVE_ALL = {"registration", ""}  # "" is ms_slam_env/__init__.py
 NEVER = {"baselines", "agents", "ms_slam_baselines", "ms_slam_agents", "evo"}
@@ -201,9 +204,46 @@ def test_a_circle_is_found_and_what_only_looks_like_one_is_not() -> None:
     assert in_circles(edges) == {"p.a", "p.b", "p.c"}
 
 
+HEAVY = ONLY_INSIDE_FUNCTIONS | {
+    *("cv2", "embreex", "imageio", "matplotlib", "mink", "mujoco", "pandas", "PIL", "scipy"),
+    *("tensorboard", "trimesh", "warp"),
+}
+LOADED = f"print([m for m in {sorted(HEAVY)!r} if m in sys.modules])"
+
+
 @pytest.mark.parametrize("module", ["ms_slam_env", "ms_slam_env.cli"])
 def test_importing_loads_nothing_heavy(module: str) -> None:
-    heavy = sorted(ONLY_INSIDE_FUNCTIONS | {"matplotlib", "scipy", "trimesh", "warp", "cv2"})
-    code = f"import sys, {module}; print([m for m in {heavy!r} if m in sys.modules])"
+    code = f"import sys, {module}; {LOADED}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout.strip() == "[]", done.stderr
+
+
+TRAINERS = {"train"}  # their options are declared beside what trains, which needs torch
+
+
+@pytest.mark.parametrize(
+    "words",
+    [*sorted(COMMANDS.keys() - TRAINERS), "usme make", "usme run", "experiment soak"],
+)
+def test_a_typo_is_answered_before_anything_heavy_is_loaded(words: str) -> None:
+    """That takes half a second; with everything loaded it took 7 to 10 s on a busy machine."""
+    code = f"""import sys; from ms_slam_env.cli import main
+assert main({[*words.split(), "--no-such-option"]!r}) == 2
+{LOADED}"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.strip() == "[]", done.stderr
+    assert "ms-slam: error: " in done.stderr
+
+
+def test_what_a_package_offers_is_imported_when_it_is_asked_for() -> None:
+    packages = [name for name in (module_name(path) for path in FILES if path.name == "__init__.py")
+                if "lazy_names" in vars(import_module(name))]  # fmt: skip
+    assert len(packages) > 5
+    for name in packages:
+        package = import_module(name)
+        for offered in package.__all__:
+            # A submodule of that name would be found in its place, once it is imported.
+            assert not (Path(str(package.__file__)).parent / f"{offered}.py").exists()
+            assert getattr(package, offered) is not None
+        with pytest.raises(AttributeError, match=f"module '{name}' has no attribute 'nothing'"):
+            _ = package.nothing

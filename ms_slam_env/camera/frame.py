@@ -5,7 +5,6 @@ from __future__ import annotations
 import numbers
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -110,6 +109,8 @@ _SAME_SURFACE = 0.03  # of the depth; readings further apart are taken for diffe
 
 def reduce_color(color: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
     """Colour image at ``size`` (width, height): the mean of what each pixel covers."""
+    import cv2
+
     return cv2.resize(color, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
 
 
@@ -121,6 +122,8 @@ def reduce_depth(depth: NDArray[np.float32], size: tuple[int, int]) -> NDArray[n
     a reading there the pixel has none. A size that does not divide the image's takes the reading
     alone, because the pixels covered are then not the same number everywhere.
     """
+    import cv2
+
     width, height = size
     centre = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT)
     rows, columns = depth.shape[0] // height, depth.shape[1] // width

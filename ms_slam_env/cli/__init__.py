@@ -6,6 +6,9 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
+from ms_slam_env.command_line import exit_code
+from ms_slam_env.errors import unknown
+
 COMMANDS = {
     "benchmark": "run planners on scenes with SLAM in the loop and compare them",
     "compare": "run SLAM backends over the same sequences and compare them",
@@ -26,7 +29,10 @@ COMMANDS = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; return the exit code: 0 success, 1 failure, 2 bad input."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
+    return exit_code(lambda: _run(list(sys.argv[1:] if argv is None else argv)))
+
+
+def _run(arguments: Sequence[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_usage(), file=sys.stdout if arguments else sys.stderr)
         return 0 if arguments else 2
@@ -37,14 +43,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     command, *rest = arguments
     if command not in COMMANDS:
-        valid = ", ".join(COMMANDS)
-        print(
-            f"ms-slam: error: unknown command {command!r}; valid choices: {valid}", file=sys.stderr
-        )
-        return 2
-    from ms_slam_env.command_line import exit_code
-
-    return exit_code(lambda: import_module(f"ms_slam_env.cli.{command}").main(rest))
+        raise unknown("command", command, COMMANDS)
+    return int(import_module(f"ms_slam_env.cli.{command}").main(rest))
 
 
 def _usage() -> str:

@@ -15,7 +15,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from tqdm import tqdm
 
 import ms_slam_env
 from ms_slam_env.command_line import parse
@@ -27,6 +26,7 @@ from ms_slam_env.input_files import is_named
 from ms_slam_env.interrupts import kept
 from ms_slam_env.output_files import check_out_folder, naming
 from ms_slam_env.parallel import open_pool, run_each
+from ms_slam_env.progress import Bar
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.result_folders import alone_in, lock_beside, result_folder
 
@@ -223,7 +223,7 @@ def _told(args: Args) -> str:
 
 def _episodes(env: gym.Env[Any, Any], args: Args) -> Iterator[tuple[int, Steps]]:
     """The episodes with their seeds."""
-    bar = tqdm(range(args.seed, args.seed + args.episodes), "episodes", unit="episode")
+    bar = Bar(range(args.seed, args.seed + args.episodes), "episodes", unit="episode")
     for seed in bar:
         yield seed, _play(env, args, seed)
 

@@ -11,7 +11,6 @@ from ms_slam_env.cli.experiment import run
 from ms_slam_env.command_line import parse
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import unknown
-from ms_slam_env.experiments.pictures.usme import save_usme_picture
 from ms_slam_env.experiments.usme import Usme, check_suite
 from ms_slam_env.output_files import check_out_file, check_out_folder
 from ms_slam_env.sequences.usme_suite import NAMES, make_suite
@@ -80,6 +79,8 @@ def main(arguments: Sequence[str]) -> int:
         )
         print(f"{len(folders)} sequences in {command.out}")
     if isinstance(command, Picture):
+        from ms_slam_env.experiments.pictures.usme import save_usme_picture
+
         print(f"written: {save_usme_picture(command.out, command.seed)}")
     return 0
 

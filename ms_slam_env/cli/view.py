@@ -5,19 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium as gym
-from tqdm import tqdm
 
 import ms_slam_env
 from ms_slam_env.command_line import parse
 from ms_slam_env.config import Checked, bounded, chosen, free_options
-from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.env.planners import check_planner, make_planner, planner_observation
-from ms_slam_env.env.rerun_view import EpisodeView
 from ms_slam_env.interrupts import kept
 from ms_slam_env.output_files import check_out_file
+from ms_slam_env.progress import Bar
+
+if TYPE_CHECKING:
+    from ms_slam_env.env import ActiveSlamEnv
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,9 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _play(env: gym.Env[Any, Any], args: Args) -> None:
-    world = cast(ActiveSlamEnv, env.unwrapped)
+    from ms_slam_env.env.rerun_view import EpisodeView
+
+    world = cast("ActiveSlamEnv", env.unwrapped)
     planner = make_planner(args.planner, world, args.seed)
     observation, info = env.reset(seed=args.seed)
     planner.reset()
@@ -79,7 +82,7 @@ def _play(env: gym.Env[Any, Any], args: Args) -> None:
     try:
         with kept("the steps so far are shown"):
             view.log(planner)
-            for _ in tqdm(range(args.steps), "steps", unit="step"):
+            for _ in Bar(range(args.steps), "steps", unit="step"):
                 action = planner.act(observation, info)
                 observation, _, terminated, truncated, info = env.step(action)
                 view.log(planner)

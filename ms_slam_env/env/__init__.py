@@ -1,10 +1,17 @@
 """The Gymnasium environments."""
 
-from ms_slam_env.env.active_slam import ActiveSlamEnv
-from ms_slam_env.env.config import EnvConfig, LookaheadConfig, RewardConfig, TargetConfig
-from ms_slam_env.env.episode import Episode
-from ms_slam_env.env.planners import Planner
-from ms_slam_env.env.robot_knowledge import STATE_NAMES
+from typing import TYPE_CHECKING
+
+from ms_slam_env.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from ms_slam_env.env.active_slam import ActiveSlamEnv
+    from ms_slam_env.env.config import EnvConfig, LookaheadConfig, RewardConfig, TargetConfig
+    from ms_slam_env.env.episode import Episode
+    from ms_slam_env.env.planners import Planner
+    from ms_slam_env.env.robot_knowledge import STATE_NAMES
+else:
+    __getattr__ = lazy_names(__name__)
 
 __all__ = [
     "STATE_NAMES",

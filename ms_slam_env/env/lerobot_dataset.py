@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -197,6 +196,8 @@ def _array(values: NDArray[Any]) -> Any:
 
 
 def _png(image: NDArray[np.uint8]) -> bytes:
+    import cv2
+
     return bytes(cv2.imencode(".png", image[..., ::-1])[1])
 
 

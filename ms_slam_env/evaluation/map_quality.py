@@ -17,7 +17,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.integrate import trapezoid
 
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.geometry.point_clouds import IndexedCloud, indexed, voxel_downsample
@@ -219,6 +218,8 @@ class ScoreCurve:
 
     def area(self, steps: int) -> float:
         """Mean F-score over ``steps``, linear between looks; after the last one the map stays."""
+        from scipy.integrate import trapezoid
+
         scores, at = [*self.scores, self.scores[-1]], [*self.steps, max(steps, self.steps[-1])]
         return float(trapezoid(scores, at)) / max(1, at[-1])
 

@@ -28,12 +28,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from tqdm import tqdm
 
 from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.errors import InputError
 from ms_slam_env.metrics.cost import CostMeter
 from ms_slam_env.metrics.cost.meter import FrameCost
+from ms_slam_env.progress import Bar
 from ms_slam_env.sequences.sequence import Sequence
 from ms_slam_env.slam.base import SlamBackend, TrackResult
 
@@ -117,7 +117,7 @@ class SequenceRun:
     def __iter__(self) -> Iterator[Step]:
         """Track frame after frame."""
         clock = self.meter or self._stopwatch
-        with tqdm(
+        with Bar(
             desc=self._progress,
             total=self._total,
             initial=len(self.results),

@@ -38,6 +38,7 @@ from ms_slam_env.evaluation.tracking_diagnosis import (
 )
 from ms_slam_env.evaluation.trajectory_charts import error_panel, marked_panel, path_panel
 from ms_slam_env.geometry import invert
+from ms_slam_env.interrupts import recorded
 from ms_slam_env.output_files import growing_file, write_bytes
 from ms_slam_env.report.charts import Chart, Panel
 from ms_slam_env.report.results import write_results
@@ -161,7 +162,7 @@ def _run(
         result = _write(run, sequence, out, {"complete": True, **content}, refused, mesh)
     except BaseException as error:
         stopped = isinstance(error, KeyboardInterrupt)
-        content["error"] = str(error) or type(error).__name__
+        content["error"] = recorded(error)
         with suppress(OSError):  # a disk that is full: the poses so far are all there is
             unfinished = {"complete": False, "interrupted": stopped, **content}
             _write(run, sequence, out, unfinished, refused, mesh=False)
@@ -346,16 +347,17 @@ def _charts(run: SequenceRun, sequence: Sequence) -> list[Chart]:
     times, P, Q = _pairs(run, run.estimates, sequence)
     corrected = run.corrected()
     paths = {"truth": Q[:, :3, 3]} if len(Q) else {}
-    paths["estimate"] = run.estimates[:, :3, 3]
+    paths["estimate"] = _aligned(run, run.estimates, sequence)[:, :3, 3]
     if corrected is not None:
-        paths["estimate, loops closed"] = corrected[:, :3, 3]
-    found = [Chart("path", "Path", "The two directions in which it extends most.",
-                   [path_panel(paths)])]  # fmt: skip
+        paths["estimate, loops closed"] = _aligned(run, corrected, sequence)[:, :3, 3]
+    how = "After SE(3) alignment with the truth." if len(P) > 1 else "As SLAM has it."
+    caption = f"The two directions in which it extends most. {how}"
+    found = [Chart("path", "Path", caption, [path_panel(paths)])]
     if len(run.backend.submaps()) > 1:
         final = run.estimates if corrected is None else corrected
         pieces = {name: path for name, path in paths.items() if name == "truth"}
-        pieces |= paths_by_submap(final, submap_numbers(run))
-        caption = "As the finished map has the frames; submaps that were joined are one."
+        pieces |= paths_by_submap(_aligned(run, final, sequence), submap_numbers(run))
+        caption = "As the finished map has the frames; submaps that were joined are one. " + how
         found.append(Chart("submaps", "Path by submap", caption, [path_panel(pieces)]))
     if len(P) > 1:
         aligned = metrics.find_alignment(P, Q).poses(P)
@@ -366,6 +368,12 @@ def _charts(run: SequenceRun, sequence: Sequence) -> list[Chart]:
     found.append(alignment_chart(run))
     caption = "The frames for which SLAM had no pose are marked."
     return [*found, Chart("cost", "Cost of every frame", caption, _cost_panels(run))]
+
+
+def _aligned(run: SequenceRun, poses: Float64, sequence: Sequence) -> Float64:
+    """Poses (N, 4, 4) of all frames, moved onto the truth as a whole, as their errors are."""
+    _, P, Q = _pairs(run, poses, sequence)
+    return metrics.find_alignment(P, Q).poses(poses) if len(P) > 1 else poses
 
 
 def _cost_panels(run: SequenceRun) -> list[Panel]:

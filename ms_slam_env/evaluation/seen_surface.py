@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry.point_clouds import voxel_downsample
-from ms_slam_env.sequences import CameraPath, Sequence, open_sequence
+from ms_slam_env.sequences import CameraPath, Sequence
 
 Float64 = NDArray[np.float64]
 
@@ -72,6 +72,8 @@ def open_with_surface(text: str, image_size: str, path: CameraPath) -> SequenceW
         InputError: a sequence that cannot be made or read, or a recording without truth or without
             a depth reading.
     """
+    from ms_slam_env.sequences import open_sequence
+
     sequence = open_sequence(text, image_size, path=path, with_truth=True)
     surface = seen_surface(sequence)
     frames = tuple(sequence.frames)

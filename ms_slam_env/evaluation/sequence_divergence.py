@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.divergence import MEASURES, DivergenceConfig, make_divergence
@@ -21,6 +20,7 @@ from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.evaluation.observation_distance import observation_distance
 from ms_slam_env.evaluation.trajectory_charts import thinned
 from ms_slam_env.geometry import invert
+from ms_slam_env.progress import Bar
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.results import Results, write_result_folder
 from ms_slam_env.report.tables import Table, Value, make_table
@@ -184,7 +184,7 @@ def sequence_divergence(
             f"sequence {sequence.name}: {len(sequence)} frames, every {every}th: "
             "a divergence needs two"
         )
-    frames = (sequence.frames[k] for k in tqdm(picked, desc=sequence.name, unit="frame"))
+    frames = (sequence.frames[k] for k in Bar(picked, desc=sequence.name, unit="frame"))
     config, K = config or DivergenceConfig(), sequence.intrinsics
     sequence.check_depth()
     if measure == WASSERSTEIN:

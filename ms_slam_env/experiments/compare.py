@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -10,7 +11,12 @@ from ms_slam_env import slam
 from ms_slam_env.camera import parse_image_size
 from ms_slam_env.config import Checked, bounded, parse_named
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.experiments.harness.command_runs import check_command, is_command
+from ms_slam_env.experiments.harness.command_runs import (
+    check_command,
+    command_of,
+    is_command,
+    name_of,
+)
 from ms_slam_env.experiments.harness.compare_runs import (
     CompareSpec,
     TrajectoryPattern,
@@ -27,7 +33,6 @@ from ms_slam_env.report.charts import Chart, scatter
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished
 from ms_slam_env.scenes import PUBLISHED_ROOMS
-from ms_slam_env.sequences import check_sequence
 
 DEFAULT_SEQUENCES = (
     "living_room:2000:none",
@@ -44,6 +49,8 @@ DEFAULT_SEQUENCES = (
     ),
 )
 """A clean and a noisy room, every scene, and what recordings suffer from, alone and together."""
+
+_TIME = "cpu_ms_mean"  # the only one that is known of a command, too
 
 PEERS = ("odometry,stock=true", "volumetric,stock=true")
 """OpenCV's odometry and Open3D's dense SLAM as they are."""
@@ -62,8 +69,8 @@ class Compare(Experiment, Checked):
     backends: tuple[str, ...] = (*slam.BACKENDS, *PEERS)
     """NAME, parameters appended as in surfel,loop_closure=deformation; odometry,stock=true is
     OpenCV's odometry as it is, volumetric,stock=true Open3D's dense SLAM. Any other system is
-    "command:PROGRAM --in {sequence} --out {trajectory}": it reads a folder in the TUM layout and
-    writes a TUM trajectory."""
+    "NAME=command:PROGRAM --in {sequence} --out {trajectory}", NAME= for the tables: it reads a
+    folder in the TUM layout and writes a TUM trajectory."""
     image_sizes: tuple[str, ...] = ("160x120", "320x240")
     """Such as 160x120."""
     frames: int = bounded(200, 10, 100_000)
@@ -90,6 +97,8 @@ class Compare(Experiment, Checked):
 
     def __post_init__(self) -> None:
         """Refuse what no run could use."""
+        from ms_slam_env.sequences import check_sequence
+
         super().__post_init__()
         for name in ("sequences", "backends", "image_sizes"):
             if not getattr(self, name):
@@ -103,7 +112,7 @@ class Compare(Experiment, Checked):
                 slam.check_parameters(*parse_named(text, "backend"))
         for size in self.image_sizes:
             parse_image_size(size)
-        names = [*self.backends, *(pattern.name for pattern in self._patterns())]
+        names = [*map(name_of, self.backends), *(pattern.name for pattern in self._patterns())]
         if len(set(names)) < len(names):
             raise InputError(f"backends and trajectories {', '.join(names)} must differ")
         for pattern in self._patterns():
@@ -128,7 +137,9 @@ class Compare(Experiment, Checked):
                 for size in self.image_sizes:
                     made = [
                         CompareSpec(
-                            *(sequence, b, size, *shared, repeat), timeout_s=self.command_timeout_s
+                            *(sequence, name_of(b), size, *shared, repeat),
+                            timeout_s=self.command_timeout_s,
+                            command=command_of(b) if is_command(b) else "",
                         )
                         for b in self.backends
                     ]
@@ -161,7 +172,7 @@ class Compare(Experiment, Checked):
         limit_threads(spec.threads)
         if spec.trajectory:
             return judge_trajectory(spec)
-        return judge_command(spec) if is_command(spec.backend) else run_backend(spec)
+        return judge_command(spec) if spec.command else run_backend(spec)
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
         """For each image size every sequence with medians, then differences in pairs."""
@@ -171,10 +182,22 @@ class Compare(Experiment, Checked):
     def charts(self, rows: Sequence[Row]) -> list[Chart]:
         """Error against processor time, a panel for each image size, a mark for each sequence."""
         panels = []
-        timed = [row for row in finished(rows) if row["result"].get("cpu_ms_median") is not None]
+        timed = [row for row in finished(rows) if row["result"].get(_TIME) is not None]
         for size in dict.fromkeys(row["spec"]["image_size"] for row in timed):
             own = [row for row in timed if row["spec"]["image_size"] == size]
-            panel = scatter(own, "cpu_ms_median", "ate_m", "backend", log="xy")
-            panels.append(replace(panel, title=size))
-        about = "Error against time", "One mark a sequence."
-        return [Chart("compare", *about, panels)] if panels else []
+            panels.append(replace(scatter(own, _TIME, "ate_m", "backend", log="xy"), title=size))
+        caption = f"One mark a run. {_left_out(rows)}".rstrip()
+        return [Chart("compare", "Error against time", caption, panels)] if panels else []
+
+
+def _left_out(rows: Sequence[Row]) -> str:
+    """Of which runs the figure has no mark: those that failed, and those of unknown time."""
+    total = Counter(row["spec"]["backend"] for row in rows)
+    failed = [row for row in rows if row["error"] is not None]
+    untimed = [row for row in finished(rows) if row["result"].get(_TIME) is None]
+    parts = [
+        f"{name} ({why}: {count} of {total[name]})"
+        for why, missing in (("failed", failed), ("time not known", untimed))
+        for name, count in Counter(row["spec"]["backend"] for row in missing).items()
+    ]
+    return f"Not shown: {', '.join(parts)}." if parts else ""

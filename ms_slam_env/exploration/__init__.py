@@ -4,13 +4,20 @@ Saeedi et al., ICRA 2017, section IV. :func:`explore` takes what is evaluated as
 :func:`run_exploration` explores SLAM configurations over sequences and writes what came of it.
 """
 
-from ms_slam_env.exploration.evaluator import SlamEvaluator
-from ms_slam_env.exploration.exploration import Exploration, run_exploration
-from ms_slam_env.exploration.explorer import explore
-from ms_slam_env.exploration.objectives import METRICS, Constraint, parse_constraint
-from ms_slam_env.exploration.parameters import Choice, Float, Integer, Parameter
-from ms_slam_env.exploration.settings import Evaluate, ExplorationSettings
-from ms_slam_env.exploration.space import SearchSpace, make_space
+from typing import TYPE_CHECKING
+
+from ms_slam_env.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from ms_slam_env.exploration.evaluator import SlamEvaluator
+    from ms_slam_env.exploration.exploration import Exploration, run_exploration
+    from ms_slam_env.exploration.explorer import explore
+    from ms_slam_env.exploration.objectives import METRICS, Constraint, parse_constraint
+    from ms_slam_env.exploration.parameters import Choice, Float, Integer, Parameter
+    from ms_slam_env.exploration.settings import Evaluate, ExplorationSettings
+    from ms_slam_env.exploration.space import SearchSpace, make_space
+else:
+    __getattr__ = lazy_names(__name__)
 
 __all__ = [
     "METRICS",

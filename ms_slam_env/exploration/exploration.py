@@ -6,8 +6,6 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
 from ms_slam_env.exploration.choices import Limit, as_options, choose, for_divergence, levels_of
@@ -20,6 +18,7 @@ from ms_slam_env.exploration.settings import ExplorationSettings
 from ms_slam_env.exploration.space import SearchSpace, absences, make_space
 from ms_slam_env.exploration.study_storage import StudyStorage
 from ms_slam_env.metrics.cost import energy_counters
+from ms_slam_env.progress import Bar
 from ms_slam_env.report.results import Results, write_result_folder
 from ms_slam_env.result_folders import alone_in
 from ms_slam_env.sequences import check_sequence
@@ -111,7 +110,7 @@ def _explored(
     ray_address: str | None,
 ) -> StudyStorage:
     """The study with so many finished trials; show progress."""
-    with tqdm(total=trials, desc=exploration.settings.sampler, unit="trial") as bar:
+    with Bar(total=trials, desc=exploration.settings.sampler, unit="trial") as bar:
         return explore(
             out,
             space,
@@ -124,7 +123,7 @@ def _explored(
         )
 
 
-def _show(bar: tqdm, finished: int) -> None:
+def _show(bar: Bar, finished: int) -> None:
     bar.update(finished - bar.n)
 
 

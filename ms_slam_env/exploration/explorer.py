@@ -11,7 +11,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.exploration.settings import Evaluate, ExplorationSettings
 from ms_slam_env.exploration.space import SearchSpace
 from ms_slam_env.exploration.study_storage import StudyStorage
-from ms_slam_env.interrupts import kept
+from ms_slam_env.interrupts import kept, recorded
 from ms_slam_env.parallel import Outcome, Pool, open_pool
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ def _explore_here(storage: StudyStorage, evaluate: Evaluate, budget: int, report
         try:
             storage.tell(trial, evaluate(storage.configuration(trial)))
         except BaseException as error:  # also an interrupt between evaluating and telling
-            storage.give_up(trial, str(error) or type(error).__name__)
+            storage.give_up(trial, recorded(error))
             raise
 
 
@@ -107,7 +107,7 @@ def _explore_with(pool: Pool, storage: StudyStorage, budget: int, report: Progre
                     raise _complaint(outcome)
     except BaseException as error:
         for trial in running.values():
-            storage.give_up(trial, str(error) or type(error).__name__)
+            storage.give_up(trial, recorded(error))
         raise
 
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.geometry import se3_exp, transform_points
@@ -124,6 +123,7 @@ def _plane_icp(
     (n_b . (T a - b))^2, where this and Open3D's end.
     """
     import small_gicp
+    from scipy.spatial import cKDTree
 
     cloud = small_gicp.PointCloud(target)
     small_gicp.estimate_normals(cloud, small_gicp.KdTree(cloud), neighbours, 1)

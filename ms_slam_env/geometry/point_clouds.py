@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
-from scipy.spatial import cKDTree
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry.pose import as_numbers
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 Float64 = NDArray[np.float64]
 
@@ -60,6 +62,8 @@ class IndexedCloud:
     @cached_property
     def tree(self) -> cKDTree:
         """For the nearest of the points, SciPy's."""
+        from scipy.spatial import cKDTree
+
         return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
 
     @cached_property

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry.so3 import Float64
@@ -92,6 +91,8 @@ def transform_points(T_a_b: ArrayLike, points_b: ArrayLike) -> Float64:
 
 def relative_angle(R_a: ArrayLike, R_b: ArrayLike) -> float:
     """Angle in radians of the rotation between two rotation matrices (3, 3)."""
+    from scipy.spatial.transform import Rotation
+
     difference = np.asarray(R_a, dtype=np.float64).T @ np.asarray(R_b, dtype=np.float64)
     return float(Rotation.from_matrix(difference).magnitude())
 
@@ -118,6 +119,8 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) 
 
 def pose_from_quaternion(t: ArrayLike, q_xyzw: ArrayLike) -> Float64:
     """Poses (..., 4, 4) of translations (..., 3) in m and quaternions (..., 4), qx qy qz qw."""
+    from scipy.spatial.transform import Rotation
+
     R = Rotation.from_quat(np.asarray(q_xyzw, dtype=np.float64)).as_matrix()
     T = np.zeros((*R.shape[:-2], 4, 4))
     T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1.0
@@ -126,5 +129,7 @@ def pose_from_quaternion(t: ArrayLike, q_xyzw: ArrayLike) -> Float64:
 
 def quaternion_from_pose(T: ArrayLike) -> Float64:
     """Quaternions (..., 4), qx qy qz qw, of unit length with qw >= 0, of poses (..., 4, 4)."""
+    from scipy.spatial.transform import Rotation
+
     R = np.asarray(T, dtype=np.float64)[..., :3, :3]
     return Rotation.from_matrix(R).as_quat(canonical=True)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 Float64 = NDArray[np.float64]
 
@@ -23,11 +22,15 @@ def hat(phi: ArrayLike) -> Float64:
 
 def so3_exp(phi: ArrayLike) -> Float64:
     """Rotation matrix (3, 3) of the rotation vector ``phi`` (3,) in radians."""
+    from scipy.spatial.transform import Rotation
+
     return Rotation.from_rotvec(np.asarray(phi, dtype=np.float64)).as_matrix()
 
 
 def so3_log(R: ArrayLike) -> Float64:
     """Rotation vectors (..., 3) in radians, of angle at most pi, of matrices ``R`` (..., 3, 3)."""
+    from scipy.spatial.transform import Rotation
+
     return Rotation.from_matrix(np.asarray(R, dtype=np.float64)).as_rotvec()
 
 

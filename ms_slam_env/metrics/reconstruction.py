@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import Float64, transform_points
@@ -153,6 +152,8 @@ def statistical_inliers(
         InputError: bad points, fewer than 2 neighbours or fewer points than neighbours, a ratio
             that is not positive.
     """
+    from scipy.spatial import cKDTree
+
     values = check_points(points, "points")
     check_count(neighbours, "neighbours", least=2)
     if len(values) < neighbours:
@@ -182,6 +183,8 @@ def point_spacing(points: ArrayLike) -> float:
     Raises:
         InputError: bad points, or fewer than 2.
     """
+    from scipy.spatial import cKDTree
+
     values = check_points(points, "points")
     if len(values) < 2:
         raise InputError("the spacing of points needs at least 2")

@@ -81,7 +81,9 @@
     const found = {
       paper_bgcolor: "rgba(0,0,0,0)",
       plot_bgcolor: "rgba(0,0,0,0)",
-      margin: { l: small ? 44 : 60, r: small ? 10 : 20, t: 10, b: 46 },
+      // The mode bar stands in the right margin, where it covers neither plot nor legend.
+      margin: { l: small ? 44 : 60, r: touch.matches ? 10 : 40, t: 10, b: 46 },
+      modebar: { orientation: "v", bgcolor: "rgba(0,0,0,0)", color: line, activecolor: text },
       hovermode: "closest",
       dragmode: touch.matches ? false : "zoom",
       ...layout,

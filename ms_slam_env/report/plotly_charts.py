@@ -116,12 +116,14 @@ def _plot(panel: Panel, names: Sequence[str], label: str) -> Plot:
     in_axis = {*categories["x"], *categories["y"]}
     is_named_by_axis = bool(in_axis) and {s.name for s in panel.series} <= in_axis
     layout: dict[str, Any] = {
-        "xaxis": _axis(panel.x, list(categories["x"].values()), "x" in panel.log),
-        "yaxis": _axis(panel.y, list(categories["y"].values()), "y" in panel.log),
+        "xaxis": _axis(panel.x, list(categories["x"].values())),
+        "yaxis": _axis(panel.y, list(categories["y"].values())),
         "showlegend": entries > 1 and not is_named_by_axis,
         "barmode": "group",
         "shapes": _guides(panel),
     }
+    for axis in (axis for axis in panel.log if not categories[axis]):
+        layout[f"{axis}axis"] |= _logarithmic(panel, axis)
     if categories["y"]:
         layout["yaxis"]["autorange"] = "reversed"  # the first one on top
     if panel.equal:
@@ -138,7 +140,7 @@ def _categories(panel: Panel, axis: str) -> dict[str, str]:
     return _shorts(str(value) for value in values if value is not None)
 
 
-def _axis(key: str, categories: list[str], log: bool) -> dict[str, Any]:
+def _axis(key: str, categories: list[str]) -> dict[str, Any]:
     axis: dict[str, Any] = {"automargin": True}
     if key:
         axis["title"] = {"text": html.escape(metric(key).label, quote=False)}
@@ -148,7 +150,19 @@ def _axis(key: str, categories: list[str], log: bool) -> dict[str, Any]:
             "categoryorder": "array",
             "categoryarray": categories,
         }
-    return axis | ({"type": "log", "dtick": "D2", "exponentformat": "none"} if log else {})
+    return axis
+
+
+def _logarithmic(panel: Panel, axis: str) -> dict[str, Any]:
+    """A logarithmic axis with few plain numbers: of decades, 1, 2 and 5 in each, or all along.
+
+    Without a format Plotly writes 0.05, 0.1, 0.2, 0.5 as 5, 0.1, 2, 5.
+    """
+    values = [value for series in panel.series for value in getattr(series, axis)]
+    drawn = [value for value in values if value is not None and 0 < value < math.inf]
+    decades = math.log10(max(drawn) / min(drawn)) if drawn else 0.0
+    step = {} if decades < 0.8 else {"dtick": "D2" if decades < 3 else 1}
+    return {"type": "log", "tickformat": "~g", **step}
 
 
 def _guides(panel: Panel) -> list[dict[str, Any]]:

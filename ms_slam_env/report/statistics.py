@@ -12,7 +12,6 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
 
 Float64 = NDArray[np.float64]
 Key = TypeVar("Key")
@@ -60,6 +59,8 @@ def bootstrap_interval(
     samples: tuple[ArrayLike, ...], statistic: Callable[..., Float64]
 ) -> Interval:
     """Percentile bootstrap of ``statistic(*samples, axis=...)``, the samples paired."""
+    from scipy import stats
+
     arrays = [np.asarray(sample, dtype=np.float64) for sample in samples]
     if arrays[0].size == 0:
         return Interval(np.nan, np.nan, np.nan)
@@ -83,6 +84,8 @@ def bootstrap_interval(
 
 def share_interval(flags: ArrayLike) -> Interval:
     """Share of true flags (n,) with its Wilson interval; NaN without flags."""
+    from scipy import stats
+
     array = np.asarray(flags, dtype=bool)
     if array.size == 0:
         return Interval(np.nan, np.nan, np.nan)
@@ -93,6 +96,8 @@ def share_interval(flags: ArrayLike) -> Interval:
 
 def rank_correlation(a: ArrayLike, b: ArrayLike) -> float:
     """Spearman's correlation of (n,) and (n,) values; NaN where one of them does not vary."""
+    from scipy import stats
+
     if np.ptp(a) == 0 or np.ptp(b) == 0:
         return float("nan")
     return float(stats.spearmanr(a, b).statistic)

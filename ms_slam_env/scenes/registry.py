@@ -11,31 +11,22 @@ import numpy as np
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.extension import ExtensionPoint
 from ms_slam_env.scenes.base import Scene
-from ms_slam_env.scenes.city_street import city_street
-from ms_slam_env.scenes.corridor import corridor
-from ms_slam_env.scenes.factory_hall import factory_hall
-from ms_slam_env.scenes.homes.home import home
-from ms_slam_env.scenes.living_room import living_room
-from ms_slam_env.scenes.mesh_file import from_file
 from ms_slam_env.scenes.mesh_formats import MESH_SUFFIXES, MeshFile
-from ms_slam_env.scenes.residential_street import residential_street
-from ms_slam_env.scenes.tabletops import carpet, table, wall, window
 
 _ROOMS = {
-    "living_room": living_room,
-    "corridor": corridor,
-    "window": window,
-    "table": table,
-    "wall": wall,
-    "carpet": carpet,
+    "living_room": "ms_slam_env.scenes.living_room:living_room",
+    "corridor": "ms_slam_env.scenes.corridor:corridor",
+    **{
+        name: f"ms_slam_env.scenes.tabletops:{name}"
+        for name in ("window", "table", "wall", "carpet")
+    },
 }
 
-_HOMES = {"home": home}
+_HOMES = {"home": "ms_slam_env.scenes.homes.home:home"}
 
 _LARGE = {
-    "residential_street": residential_street,
-    "city_street": city_street,
-    "factory_hall": factory_hall,
+    name: f"ms_slam_env.scenes.{name}:{name}"
+    for name in ("residential_street", "city_street", "factory_hall")
 }
 POINT = ExtensionPoint(
     "scene", "ms_slam_env.scenes", own={**_ROOMS, **_HOMES, **_LARGE}, form="module:function"
@@ -147,6 +138,8 @@ def make(name: SceneName | Path = "living_room", seed: int = 0) -> Scene:
     key = str(name) if isinstance(name, Path) else name
     check_name(key)
     if is_mesh_file(key):
+        from ms_slam_env.scenes.mesh_file import from_file
+
         return from_file(str(key), int(seed))
     scene = POINT.find(key)(int(seed))
     if not isinstance(scene, Scene):

@@ -21,46 +21,53 @@ FrameSkipping, MovingObjects, FastMotion, Illumination``, or
 ``make_perturbation("rolling-shutter", {"readout_s": 0.02})``.
 """
 
-from ms_slam_env.sequences.naming import check_sequence, open_sequence, parse_sequence
-from ms_slam_env.sequences.paths import (
-    CameraPath,
-    HandheldPath,
-    MotionSegments,
-    Placement,
-    RoutePath,
-    UnevenPath,
-    WanderingPath,
-    handheld_trajectory,
-    place_trajectory,
-    repeated_trajectory,
-)
-from ms_slam_env.sequences.perturbations import (
-    PERTURBATIONS,
-    AutoExposure,
-    BlackFrames,
-    DepthDropout,
-    DepthQuantisation,
-    ExposureJumps,
-    ExposureRamp,
-    FastMotion,
-    FrameSkipping,
-    Illumination,
-    LensDistortion,
-    Misregistration,
-    MotionBlur,
-    MovingObjects,
-    Perturbation,
-    RollingShutter,
-    make_perturbation,
-)
-from ms_slam_env.sequences.rendering import RenderedSequence, render_sequence
-from ms_slam_env.sequences.sequence import Sequence
-from ms_slam_env.sequences.trajectory import (
-    PoseInterpolation,
-    associate,
-    read_trajectory,
-    write_trajectory,
-)
+from typing import TYPE_CHECKING
+
+from ms_slam_env.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from ms_slam_env.sequences.naming import check_sequence, open_sequence, parse_sequence
+    from ms_slam_env.sequences.paths import (
+        CameraPath,
+        HandheldPath,
+        MotionSegments,
+        Placement,
+        RoutePath,
+        UnevenPath,
+        WanderingPath,
+        handheld_trajectory,
+        place_trajectory,
+        repeated_trajectory,
+    )
+    from ms_slam_env.sequences.perturbations import (
+        PERTURBATIONS,
+        AutoExposure,
+        BlackFrames,
+        DepthDropout,
+        DepthQuantisation,
+        ExposureJumps,
+        ExposureRamp,
+        FastMotion,
+        FrameSkipping,
+        Illumination,
+        LensDistortion,
+        Misregistration,
+        MotionBlur,
+        MovingObjects,
+        Perturbation,
+        RollingShutter,
+        make_perturbation,
+    )
+    from ms_slam_env.sequences.rendering import RenderedSequence, render_sequence
+    from ms_slam_env.sequences.sequence import Sequence
+    from ms_slam_env.sequences.trajectory import (
+        PoseInterpolation,
+        associate,
+        read_trajectory,
+        write_trajectory,
+    )
+else:
+    __getattr__ = lazy_names(__name__)
 
 __all__ = [
     "PERTURBATIONS",

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from ms_slam_env.errors import InputError, InputWarning
 from ms_slam_env.geometry import (
@@ -231,6 +230,8 @@ class PoseInterpolation:
             InputError: no pose, shapes that do not fit, times that are not finite or do not
                 increase, or a pose that is no rigid motion.
         """
+        from scipy.spatial.transform import Rotation
+
         self.times_s: Float64 = np.asarray(times_s, dtype=np.float64)
         self.poses: Float64 = np.asarray(poses, dtype=np.float64)
         count = len(self.times_s)
@@ -253,6 +254,8 @@ class PoseInterpolation:
 
     def __call__(self, times_s: ArrayLike) -> Float64:
         """T_world_camera (..., 4, 4) at times (...) in seconds."""
+        from scipy.spatial.transform import Rotation
+
         t = np.asarray(times_s, dtype=np.float64)
         before = np.clip(np.searchsorted(self.times_s, t, side="right") - 1, 0, None)
         since = (t - self.times_s[before])[..., None]

@@ -17,7 +17,7 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,15 +28,11 @@ from ms_slam_env.config import parse_named
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.input_files import read_json
 from ms_slam_env.scenes import Scene
-from ms_slam_env.sequences import (
-    HandheldPath,
-    Perturbation,
-    RenderedSequence,
-    RoutePath,
-    make_perturbation,
-    render_sequence,
-)
+from ms_slam_env.sequences import HandheldPath, RoutePath
 from ms_slam_env.sequences.writing import DESCRIPTION, write_sequence
+
+if TYPE_CHECKING:
+    from ms_slam_env.sequences import Perturbation, RenderedSequence
 
 Float64 = NDArray[np.float64]
 
@@ -90,6 +86,8 @@ class UsmeSequence:
 
     def made_perturbations(self, frames_scale: float = 1.0) -> list[Perturbation]:
         """The perturbations; those that name frames name them at this scale."""
+        from ms_slam_env.sequences import make_perturbation
+
         made = []
         for text in self.perturbations:
             name, options = parse_named(text, "perturbation")
@@ -209,6 +207,8 @@ def render(
     Raises:
         InputError: an unknown size, or no free way.
     """
+    from ms_slam_env.sequences import render_sequence
+
     intrinsics, seed = xtion(image_size), scene.seed
     times, poses = entry.motion(scene, seed, frames_scale)
     return render_sequence(

@@ -6,22 +6,23 @@ import json
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.input_files import read_json
 from ms_slam_env.interrupts import kept
 from ms_slam_env.output_files import write_bytes, write_text
+from ms_slam_env.progress import Bar
 from ms_slam_env.result_folders import alone_in, lock_beside, own_folder
-from ms_slam_env.sequences.rendering import RenderedSequence
 from ms_slam_env.sequences.sequence import Sequence
 from ms_slam_env.sequences.trajectory import write_trajectory
+
+if TYPE_CHECKING:
+    from ms_slam_env.sequences.rendering import RenderedSequence
 
 DEPTH_SCALE = 5000.0
 """Value of a depth image for one metre, as in the TUM RGB-D benchmark."""
@@ -85,7 +86,7 @@ def _write_whole(
     for kind in (*kinds, "objects") if sequence.frames.object_trajectories else kinds:
         own_folder(partial / kind)
     with kept(f"finished frames are kept in {partial}; the same command goes on"):
-        for index, name in enumerate(tqdm(names, desc=sequence.name, unit="frame")):
+        for index, name in enumerate(Bar(names, desc=sequence.name, unit="frame")):
             _write_frame(partial, name, sequence, index, with_truth)
     _write_lists(partial, names, kinds)
     if with_truth:
@@ -106,7 +107,8 @@ def write_frames(sequence: Sequence, folder: Path) -> None:
     """Write what a camera gives of a sequence into a folder, in the TUM layout, and no true pose.
 
     ``rgb/TIME.png``, ``depth/TIME.png``, ``rgb.txt``, ``depth.txt`` and ``intrinsics.txt``, as
-    `write_sequence`; TIME in seconds with six decimals.
+    `write_sequence`; TIME in seconds with six decimals. ``intrinsics.txt`` is one line of numbers,
+    ``fx fy cx cy width height depth_scale``.
     """
     names = []
     for frame in sequence.frames:
@@ -179,11 +181,11 @@ def depth_values(depth: NDArray[np.float32]) -> NDArray[np.uint16]:
 
 def _intrinsics(K: Intrinsics) -> str:
     numbers = (K.fx, K.fy, K.cx, K.cy, K.width, K.height, DEPTH_SCALE)
-    return (
-        "# fx fy cx cy width height depth_scale\n" + " ".join(f"{n:.10g}" for n in numbers) + "\n"
-    )
+    return " ".join(f"{n:.10g}" for n in numbers) + "\n"
 
 
 def _write_image(path: Path, pixels: NDArray[Any]) -> None:
+    import cv2
+
     _, data = cv2.imencode(".png", np.ascontiguousarray(pixels))
     write_bytes(path, data.tobytes(), durable=False)

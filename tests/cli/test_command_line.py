@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -11,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tqdm import tqdm
 
 from ms_slam_env.cli import COMMANDS, main
 from ms_slam_env.command_line import exit_code
@@ -19,6 +19,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.experiments.harness import rows as harness_rows
 from ms_slam_env.experiments.planners import DETAILS, HEADLINE
 from ms_slam_env.geometry import make_pose, so3_exp
+from ms_slam_env.progress import Bar
 from ms_slam_env.report.records import Row
 from ms_slam_env.sequences import associate, write_trajectory
 
@@ -248,9 +249,66 @@ def test_the_message_stands_below_the_bars_that_an_error_left_open(capsys):
     bars = []
 
     def run():
-        bars.append(tqdm(total=9, desc="frames"))
+        bars.append(Bar(total=9, desc="frames"))
         raise InputError("no")
 
     assert exit_code(run) == 2
     bars[0].close()
     assert capsys.readouterr().err.splitlines()[-1] == "ms-slam: error: no"
+
+
+SLOW_WRITER = """
+import sys
+from ms_slam_env.command_line import exit_code
+def run():
+    for _ in range(100_000):
+        print("a line", file=getattr(sys, sys.argv[1]), flush=True)
+    return 0
+sys.exit(exit_code(run))
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs a shell")
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize(
+    ("line", "codes", "said"),
+    [
+        ("ms-slam --help | head -1", "", "usage: ms-slam COMMAND"),
+        ("ms-slam run --help | true", "141 0", ""),
+        ("ms-slam run --help 2>&1 | true", "141 0", ""),
+        ('python -c "$WRITER" stdout | head -1', "141 0", "a line"),
+        ('python -c "$WRITER" stderr 2>&1 >/dev/null | head -1', "141 0", "a line"),
+        ("ms-slam run x --nope 2>&1 | true", "2 0", ""),
+        ("ms-slam --help >&-", "0", ""),
+        ("ms-slam run --help >&-", "0", ""),
+        ("ms-slam run --help 2>&- <&- | cat", "0 0", "usage: ms-slam run"),
+        ("ms-slam run x --nope >&- 2>&- <&-", "2", ""),
+    ],
+)
+def test_an_output_that_is_closed_ends_a_command_quietly(
+    line, codes, said, unbuffered, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    line = line.replace("ms-slam ", 'python -c "$MAIN" ', 1)
+    places = {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    code = "import sys; from ms_slam_env.cli import main; sys.exit(main())"
+    done = subprocess.run(
+        ["bash", "-c", f"{{ {line}; echo \"${{PIPESTATUS[@]}}\" >&3; }} 3>codes 2>errors"],
+        capture_output=True,
+        text=True,
+        env={**os.environ, **places, "PYTHONUNBUFFERED": unbuffered, "MAIN": code,
+             "WRITER": SLOW_WRITER},
+    )  # fmt: skip
+    # All of a short text may be in the pipe before its reader goes.
+    assert Path("codes").read_text().strip() in ([codes] if codes else ["0 0", "141 0"])
+    assert Path("errors").read_text() == ""
+    assert said in done.stdout
+
+
+def test_files_do_not_take_the_place_of_closed_streams(tmp_path) -> None:
+    code = (
+        "import os, sys; from ms_slam_env.command_line import exit_code;"
+        "sys.exit(exit_code(lambda: 0 if open(sys.argv[1], 'w').fileno() > 2 else 1))"
+    )
+    line = f'exec {sys.executable} -c "$0" {tmp_path}/file >&- 2>&- <&-'
+    assert subprocess.run(["bash", "-c", line, code]).returncode == 0

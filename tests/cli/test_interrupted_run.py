@@ -57,11 +57,12 @@ def test_a_signal_ends_a_run_and_what_is_complete_is_kept(number, when, tmp_path
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 128 + number, done.stderr
     last = done.stderr.strip().splitlines()[-1]
+    said = {signal.SIGINT: "interrupted", signal.SIGTERM: "interrupted by SIGTERM"}[number]
     if when is AT_IMPORT:
-        assert last == "ms-slam: interrupted"
+        assert last == f"ms-slam: {said}"
         assert not out.exists()
         return
-    assert last == f"ms-slam: interrupted; 3 of 300 frames are kept in {out}"
+    assert last == f"ms-slam: {said}; 3 of 300 frames are kept in {out}"
     assert sorted(path.name for path in out.iterdir()) == [
         "frames.csv",
         "metrics.json",
@@ -69,5 +70,6 @@ def test_a_signal_ends_a_run_and_what_is_complete_is_kept(number, when, tmp_path
     ]
     written = json.loads((out / "metrics.json").read_text())
     assert (written["complete"], written["interrupted"], written["frames"]) == (False, True, 3)
+    assert written["error"] == f"interrupted by {number.name}"
     assert len(read_trajectory(out / "trajectory.incomplete.txt")[0]) == 3
     assert len((out / "frames.csv").read_text().splitlines()) == 1 + 3

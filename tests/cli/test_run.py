@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -97,6 +98,17 @@ def test_writes_trajectory_map_and_metrics(sequence, tmp_path, capsys):
     assert written["complete"]
     assert (written["kind"], written["results_version"]) == ("run", RESULTS_VERSION)
     assert [chart["name"] for chart in written["charts"]] == ["path", "error", "alignment", "cost"]
+    page = (Path(__file__).parents[2] / "docs" / "evaluation.md").read_text(encoding="utf-8")
+    named = re.findall(r"`(\w+)`", re.findall(r"`metrics.json` \(([^)]*)\)", page)[0])
+    assert named
+    assert set(named) <= written.keys()
+    path = written["charts"][0]
+    drawn = {line["name"]: line for line in path["panels"][0]["series"]}
+    for axis in "xy":  # aligned as a whole, the two have one centre
+        assert np.mean(drawn["estimate"][axis]) == pytest.approx(
+            np.mean(drawn["truth"][axis]), abs=1e-9
+        )
+    assert path["caption"].endswith("After SE(3) alignment with the truth.")
     assert [table["title"] for table in written["tables"]] == ["Frames and trajectory", "Cost"]
     assert (written["frames"], written["lost_frames"], len(times)) == (FRAMES, 0, FRAMES)
     assert written["ate_m"] == pytest.approx(ate_rmse(poses, truth), abs=1e-6)
@@ -227,7 +239,7 @@ def test_an_interrupted_run_keeps_the_trajectory_so_far(sequence, tmp_path, caps
     assert (out / "trajectory.incomplete.txt").read_text().splitlines() == whole[:5]
     written = json.loads((out / "metrics.json").read_text())
     assert (written["complete"], written["frames"]) == (False, 4)
-    assert written["error"] == "KeyboardInterrupt"
+    assert written["error"] == "interrupted by SIGINT"
 
 
 def test_says_what_registration_it_assumes(sequence, tmp_path, capsys):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import json
 import re
 import subprocess
 import sys
@@ -12,12 +13,20 @@ from pathlib import Path
 import pytest
 
 from ms_slam_env.cli import COMMANDS
-from ms_slam_env.experiments.harness import experiment_names
+from ms_slam_env.errors import InputError
+from ms_slam_env.experiments.harness import experiment_class, experiment_names
+from ms_slam_env.metrics.registry import metric
 
 ROOT = Path(__file__).resolve().parents[2]
 AT_ROOT = [ROOT / f"{name}.md" for name in ("README", "BENCHMARK", "CONTRIBUTING")]
 PAGES = [*AT_ROOT, *sorted((ROOT / "docs").glob("*.md"))]
 FILE = re.compile(r"`((?:ms_slam_env|baselines|agents|tests|docs|notebooks)/[\w./-]*)`")
+WORDS = {
+    word
+    for folder in ("ms_slam_env", "agents", "baselines")
+    for path in sorted((ROOT / folder).rglob("*.py"))
+    for word in re.findall(r"\w+", path.read_text(encoding="utf-8"))
+}
 LINK = re.compile(r"\]\((?!https?:)([^)#\s]*)(?:#([^)\s]*))?\)")
 
 
@@ -56,6 +65,39 @@ def test_commands_of_a_page_exist(page: Path) -> None:
 def test_python_of_a_page_is_python(page: Path) -> None:
     for source in re.findall(r"^```python\n(.*?)^```", text_of(page), re.MULTILINE | re.DOTALL):
         ast.parse(source)
+
+
+def test_the_form_of_results_is_as_the_page_says() -> None:
+    page = text_of(ROOT / "docs" / "experiments.md")
+    (said,) = re.findall(r"`results.json` of every experiment has one form.*?\n\n", page, re.DOTALL)
+    form, _, where = said.partition("They stand under")
+    named = set(re.findall(r"`(\w+)`", form))
+    assert named >= {"kind", "config", "tables", "spec", "result"}
+    for folder in ("room_task", "compare160"):
+        content = json.loads((ROOT / "docs" / "results" / folder / "results.json").read_text())
+        key = content["rows_key"]
+        assert named <= {*content, *content[key][0]}
+        assert f"`{key}`" in where
+    for name in experiment_names():
+        key = experiment_class(name).rows_key
+        assert f"`{key}`" in where
+        of_own = re.findall(rf"`{key}` of ([^:]*?)(?:, `\w+` of|\. )", where, re.DOTALL)
+        assert key == "rows" or name == "planners" or f"`{name}`" in of_own[0]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_measures_that_a_page_names_are_measured(page: Path) -> None:
+    """A name with a unit is a metric, or at least stands somewhere in the code."""
+    names = set(re.findall(r"`([a-z]\w*_(?:m|mm|ms|s|rad|deg|j|mb|share|\d+cm))`", text_of(page)))
+    assert [name for name in sorted(names) if not is_metric(name) and name not in WORDS] == []
+
+
+def is_metric(name: str) -> bool:
+    try:
+        metric(name)
+    except InputError:
+        return False
+    return True
 
 
 def test_readme_is_short() -> None:

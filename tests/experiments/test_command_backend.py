@@ -30,7 +30,8 @@ mode, folder, out = sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3])
 assert not (folder / "groundtruth.txt").exists()
 times = [l.split()[0] for l in (folder / "rgb.txt").read_text().splitlines() if l[0] != "#"]
 assert all((folder / "depth" / (t + ".png")).exists() for t in times)
-assert len((folder / "intrinsics.txt").read_text().split()) > 7
+values = [float(word) for word in (folder / "intrinsics.txt").read_text().split()]
+assert values[4:] == [80, 60, 5000]
 lines = [f"{t} {0.001 * k} 0 0 0 0 0 1" for k, t in enumerate(times)]
 if mode == "fails":
     print("no camera\\nfound")
@@ -62,10 +63,11 @@ def opened():
 
 
 def test_a_stand_in_program_stands_in_the_table(program, tmp_path) -> None:
-    backends = [program.format("tracks"), program.format("loses")]
+    backends = ["mine=" + program.format("tracks"), program.format("loses")]
     options = ["--sequences", SEQUENCE, "--image-sizes", "80x60", "--frames", "10"]
     assert main(["compare", *options, "--backends", *backends, "--out", str(tmp_path / "o")]) == 0
     rows = json.loads((tmp_path / "o" / "results.json").read_text())["rows"]
+    assert [row["spec"]["backend"] for row in rows] == ["mine", backends[1]]
     tracks, loses = (row["result"] for row in rows)
     assert (tracks["frames"], tracks["lost_share"], loses["lost_share"]) == (10, 0.0, 0.5)
     assert tracks["ate_unaligned_m"] > 0  # it does not know where the camera goes
@@ -143,11 +145,19 @@ def _ends(pid: int) -> None:
         ("command:prog --out {trajectory}", r"lacks \{sequence\}"),
         ("command:no-such-program {sequence} {trajectory}", "there is no program"),
         ("command:prog '{sequence} {trajectory}", "No closing quotation"),
+        ("mine=command:no-such-program {sequence} {trajectory}", "there is no program"),
+        ("command:sh -c x=command: {sequence}", r"lacks \{trajectory\}"),
     ],
 )
 def test_a_bad_command_is_refused_before_anything_runs(command, message) -> None:
     with pytest.raises(InputError, match=message):
         Compare(backends=(command,))
+
+
+def test_two_commands_of_one_name_are_refused() -> None:
+    command = "mine=command:sh {sequence} {trajectory}"
+    with pytest.raises(InputError, match="must differ"):
+        Compare(backends=(command, command + " x"))
 
 
 def test_no_shell_reads_the_command(tmp_path) -> None:

@@ -132,7 +132,8 @@ def test_folders_of_one_name_are_two_sequences() -> None:
         rows.append({**row, "spec": {**row["spec"], "sequence": name}})
     table, _ = Compare().tables(rows)
     assert {line["sequence"] for line in table.rows} == {"x/s", "y/s", "c:1", "median"}
-    assert "over 2 of 3 sequences" in table.note
+    counts = {line["backend"]: line.get("sequences_count") for line in table.rows}
+    assert counts == {"one": 3, "two": 2}
 
 
 @pytest.mark.parametrize(
@@ -156,19 +157,42 @@ def test_a_system_without_any_trajectory_is_refused(
     assert f"no trajectory of orb: {tmp_path}/table:1.txt" in capsys.readouterr().err
 
 
-def test_medians_leave_out_what_a_backend_failed_on() -> None:
+def test_a_median_is_over_what_its_own_system_finished() -> None:
     table, _ = Compare().tables(ROWS)
     lines = [line for line in table.rows if line["sequence"] != "median"]
     assert [line["cpu_ms_median"] for line in lines if line["backend"] == "one"] == [1, 4, 100]
     medians = {line["backend"]: line for line in table.rows if line["sequence"] == "median"}
-    for name, values in (("one", [1, 4]), ("two", [4, 6])):
+    for name, values in (("one", [1, 4, 100]), ("two", [4, 6])):
         assert medians[name]["cpu_ms_median"] == median_interval(values)
+        assert medians[name]["sequences_count"] == len(values)
     failed = next(line for line in lines if "error" in line)
     assert (failed["sequence"], failed["error"]) == ("c:1", "RuntimeError: no")
-    assert "over 2 of 3 sequences" in table.note
-    assert "not c:1 (two: RuntimeError: no)" in table.note
+    assert "of 3; two over 2, not c:1: RuntimeError: no" in table.note
     (chart,) = Compare().charts(ROWS)
     assert [series.name for series in chart.panels[0].series] == ["one", "two"]
+    assert "Not shown: two (failed: 1 of 3)." in chart.caption
+
+
+def test_a_system_that_always_fails_takes_nothing_from_the_others() -> None:
+    broken = [row(f"{k}:1", "broken", None, "InputError: exit code 3") for k in "abc"]
+    (alone, own), (table, differences) = (Compare().tables(rows) for rows in (ROWS, ROWS + broken))
+    lines = [line for line in table.rows if line["backend"] != "broken"]
+    assert lines == list(alone.rows)
+    assert differences == own
+    (last,) = (
+        line for line in table.rows if line["backend"] == "broken" and line["sequence"] == "median"
+    )
+    assert last["sequences_count"] == 0
+    assert "broken over 0, not a:1: InputError: exit code 3" in table.note
+    (chart,) = Compare().charts(ROWS + broken)
+    assert "broken (failed: 3 of 3)" in chart.caption
+
+
+def test_the_figure_has_every_system_whose_time_is_known_and_names_the_others() -> None:
+    command, trajectory = row("a:1", "mine", None), row("a:1", "orb", None, cpu_ms_mean=None)
+    (chart,) = Compare().charts([*ROWS[:2], command, trajectory])
+    assert [series.name for series in chart.panels[0].series] == ["one", "two", "mine"]
+    assert "Not shown: orb (time not known: 1 of 1)." in chart.caption
 
 
 def test_a_median_over_fewer_sequences_says_so() -> None:

@@ -283,3 +283,32 @@ def test_columns_out_of_sight_are_counted(browser: Any, tmp_path: Path, width: i
     assert out > 3
     assert second == f"{out} more columns to the right →"
     assert at_the_end == ""
+
+
+def test_a_logarithmic_axis_has_plain_numbers_and_the_mode_bar_covers_nothing(
+    browser: Any, tmp_path: Path
+) -> None:
+    def chart(name: str, low: float, high: float) -> Chart:
+        values = np.geomspace(low, high, 20).tolist()
+        panel = Panel("cpu_ms_mean", "lost_share", [Series("a", values, values)], log="x")
+        return Chart(name, name, "Caption.", [panel])
+
+    wide = chart("wide", 5, 500), chart("narrow", 12, 30), chart("huge", 0.01, 1e4)
+    table = make_table(["sequence", "ate_m"], [{"sequence": "s", "ate_m": 0.1}])
+    write_results(tmp_path / "results.json", "compare", "Title", "About.", [table], wide)
+    page = browser.new_page(viewport={"width": 900, "height": 1600})
+    page.goto(write_report(tmp_path, None).as_uri())
+    page.wait_for_selector("html[data-ready=yes]")
+    labels = page.eval_on_selector_all(
+        ".canvas",
+        "all => all.map(c => [...c.querySelectorAll('.xtick text')].map(t => t.textContent))",
+    )
+    assert labels[0] == ["5", "10", "20", "50", "100", "200", "500"]
+    assert len(labels[1]) > 3
+    assert all(12 <= float(label) <= 30 for label in labels[1])
+    assert labels[2] == ["0.01", "0.1", "1", "10", "100", "1000", "10000"]
+    page.hover(".canvas >> nth=0")
+    bar = page.locator(".modebar").first.bounding_box()
+    plot = page.locator(".canvas .nsewdrag").first.bounding_box()
+    assert bar["x"] >= plot["x"] + plot["width"]
+    page.close()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import resource
 import shlex
 import shutil
@@ -45,19 +46,34 @@ class CommandCost:
     cpu_s: float
 
 
+_NAMED = re.compile(rf"(?:([^=,:]+)=)?({PREFIX}.*)", re.DOTALL)
+"""``command:PROGRAM ...``, a name in front of it or not."""
+
+
 def is_command(backend: str) -> bool:
-    """Whether a backend is a command line."""
-    return backend.startswith(PREFIX)
+    """Whether a backend is a command line, ``[NAME=]command:PROGRAM ...``."""
+    return _NAMED.fullmatch(backend) is not None
+
+
+def name_of(backend: str) -> str:
+    """What tables call a backend: of ``NAME=command:...`` NAME, of others all that was given."""
+    found = _NAMED.fullmatch(backend)
+    return found[1] if found and found[1] else backend
+
+
+def command_of(backend: str) -> str:
+    """``command:PROGRAM ...`` without its name."""
+    return backend[backend.index(PREFIX) :]
 
 
 def check_command(backend: str) -> list[str]:
-    """The words of ``command:PROGRAM ... {sequence} ... {trajectory}``.
+    """The words of ``[NAME=]command:PROGRAM ... {sequence} ... {trajectory}``.
 
     Raises:
         InputError: no program, a blank that is missing, or quotes that are not closed; a program
             that is not there.
     """
-    text = backend.removeprefix(PREFIX)
+    text = command_of(backend).removeprefix(PREFIX)
     try:
         words = shlex.split(text)
     except ValueError as error:
@@ -65,8 +81,8 @@ def check_command(backend: str) -> list[str]:
     for blank in (SEQUENCE, TRAJECTORY):
         if blank not in text:
             raise InputError(
-                f"command {text!r} lacks {blank}: write it as command:PROGRAM --in {SEQUENCE} "
-                f"--out {TRAJECTORY}"
+                f"command {text!r} lacks {blank}: write it as NAME=command:PROGRAM --in "
+                f"{SEQUENCE} --out {TRAJECTORY}"
             )
     if shutil.which(words[0]) is None:
         raise InputError(f"command {text!r}: there is no program {words[0]!r}")
@@ -78,9 +94,8 @@ def run_command(
 ) -> CommandCost:
     """Let a program track a sequence; it must write a TUM trajectory, camera to world.
 
-    Its folder ``{sequence}`` has ``rgb.txt``, ``depth.txt``, the images that they list, and
-    ``intrinsics.txt``; ``{trajectory}`` is the file that it is to write. A frame without a pose is
-    one that it has lost.
+    Its folder ``{sequence}`` is as ``write_frames`` has it; ``{trajectory}`` is the file that it
+    is to write. A frame without a pose is one that it has lost.
 
     Args:
         backend: ``command:PROGRAM ...``.

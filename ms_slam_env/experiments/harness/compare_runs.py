@@ -19,7 +19,7 @@ from ms_slam_env.evaluation.seen_surface import open_with_surface
 from ms_slam_env.evaluation.trajectory_files import tracked_beside
 from ms_slam_env.experiments.harness.command_runs import run_command
 from ms_slam_env.geometry import invert
-from ms_slam_env.sequences import HandheldPath, Sequence, associate, open_sequence, read_trajectory
+from ms_slam_env.sequences import HandheldPath, Sequence, associate, read_trajectory
 from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S
 
 Float64 = NDArray[np.float64]
@@ -38,7 +38,7 @@ class CompareSpec:
 
     Attributes:
         sequence: a folder, or ``scene:seed[:word[+word ...]]``.
-        backend: ``NAME`` or ``NAME,parameter=value,...``; of a trajectory any name.
+        backend: ``NAME`` or ``NAME,parameter=value,...``; of a trajectory or a command any name.
         image_size: such as 160x120.
         frames: of a rendered sequence.
         speed_m_s: mean speed of the camera of a rendered sequence, where it does not turn.
@@ -48,6 +48,7 @@ class CompareSpec:
         trajectory: TUM file that is judged in place of a backend.
         digest: of what it holds.
         timeout_s: of a command.
+        command: ``command:PROGRAM ...`` that is run in place of a backend.
     """
 
     sequence: str
@@ -61,6 +62,7 @@ class CompareSpec:
     trajectory: str = ""
     digest: str = ""
     timeout_s: float = 3600.0
+    command: str = ""
 
     @property
     def path(self) -> HandheldPath:
@@ -129,7 +131,7 @@ def judge_command(spec: CompareSpec) -> dict[str, Any]:
     sequence = _opened(spec)
     with tempfile.TemporaryDirectory(prefix="ms-slam-compare-") as folder:
         path = Path(folder) / "trajectory.txt"
-        cost = run_command(spec.backend, sequence, path, spec.timeout_s)
+        cost = run_command(spec.command, sequence, path, spec.timeout_s)
         found = _judged(path, sequence)
     return {
         **found,
@@ -151,6 +153,8 @@ def judge_trajectory(spec: CompareSpec) -> dict[str, Any]:
 
 
 def _opened(spec: CompareSpec) -> Sequence:
+    from ms_slam_env.sequences import open_sequence
+
     return open_sequence(spec.sequence, spec.image_size, path=spec.path, with_truth=True)
 
 

@@ -84,51 +84,52 @@ def _cell_of(repeats: Sequence[Row], shown: Mapping[str, str]) -> dict[str, Any]
 
 
 def medians(cells: Sequence[Cell]) -> list[dict[str, Any]]:
-    """Medians with intervals over the sequences that every system finished, a line for each."""
+    """Medians with intervals over the sequences that a system finished, a line for each."""
     lines = []
-    for backend, own in _complete(cells).items():
+    for backend, own in _finished(cells).items():
         known = {key: summary(own, key) for key in METRICS if any(key in cell for cell in own)}
-        lines.append({"sequence": MEDIAN, "backend": backend, **known})
+        count = {"sequences_count": len(own)}
+        lines.append({"sequence": MEDIAN, "backend": backend, **count, **known})
     return lines
 
 
-def _complete(cells: Sequence[Cell]) -> dict[str, list[Cell]]:
-    """By system, the cells of the sequences that every system finished, in one order."""
-    failed = _failed(cells)
-    found: dict[str, list[Cell]] = {}
+def _finished(cells: Sequence[Cell]) -> dict[str, list[Cell]]:
+    """By system, the cells of the sequences that it finished; of one that failed on all, none."""
+    found: dict[str, list[Cell]] = {cell["backend"]: [] for cell in cells}
     for cell in cells:
-        if cell["sequence"] not in failed:
-            found.setdefault(cell["backend"], []).append(cell)
+        if "error" not in cell:
+            found[cell["backend"]].append(cell)
     return found
 
 
-def _failed(cells: Sequence[Cell]) -> dict[str, str]:
-    """Sequences that a system did not finish, and why."""
-    reasons: dict[str, list[str]] = {}
+def failures(cells: Sequence[Cell]) -> dict[str, list[str]]:
+    """By system that failed, the sequences that it did not finish, and why."""
+    found: dict[str, list[str]] = {}
     for cell in cells:
         if "error" in cell:
-            why = f"{cell['backend']}: {cell['error']}"
+            why = f"{cell['sequence']}: {cell['error']}"
             shown = why if len(why) <= _LONGEST else f"{why[: _LONGEST - 3]}..."
-            reasons.setdefault(cell["sequence"], []).append(shown)
-    return {sequence: "; ".join(texts) for sequence, texts in reasons.items()}
+            found.setdefault(cell["backend"], []).append(shown)
+    return found
 
 
 def _columns(cells: Sequence[Cell]) -> list[str]:
     """Of a table; energy only where a machine counts it, errors only where there are some."""
     shown = [key for key in (*METRICS, "error") if any(key in cell for cell in cells)]
-    return ["sequence", "backend", *shown]
+    return ["sequence", "backend", "sequences_count", *shown]
 
 
 def _note(cells: Sequence[Cell]) -> str:
-    """Over how many sequences the medians are, which are left out and why, and which have fewer."""
-    names, failed = {cell["sequence"] for cell in cells}, _failed(cells)
-    note = f"{MEDIAN.capitalize()}: over {len(names) - len(failed)} of {len(names)} sequences"
-    if failed:
-        reasons = ", ".join(f"{name} ({why})" for name, why in failed.items())
-        note += f", those that every backend finished; not {reasons}"
+    """Over what the medians are: which system failed where and why, which measures have fewer."""
+    total, finished_by = len({cell["sequence"] for cell in cells}), _finished(cells)
+    note = f"{MEDIAN.capitalize()}: over the sequences that a backend finished, of {total}"
+    note += "".join(
+        f"; {backend} over {len(finished_by[backend])}, not {', '.join(reasons)}"
+        for backend, reasons in failures(cells).items()
+    )
     fewer = [
         f"{backend}'s {metric(key).heading} over {known}"
-        for backend, own in _complete(cells).items()
+        for backend, own in finished_by.items()
         for key in METRICS
         if 0 < (known := sum(key in cell for cell in own)) < len(own)
     ]
@@ -137,32 +138,36 @@ def _note(cells: Sequence[Cell]) -> str:
 
 
 def _differences(cells: Sequence[Cell], reference: str) -> Table | None:
-    """What each system has more than the reference on the same sequences, and where it is better.
+    """What each system has more than the reference on what both finished, and where it is better.
 
     None where there is nothing to set against each other.
     """
-    complete = _complete(cells)
-    if reference not in complete or len(complete) < 2:
+    by_system = {
+        backend: {cell["sequence"]: cell for cell in own}
+        for backend, own in _finished(cells).items()
+    }
+    base = by_system.pop(reference, {})
+    shared = {backend: [(own[at], base[at]) for at in own if at in base]
+              for backend, own in by_system.items()}  # fmt: skip
+    lines = [_line(backend, pairs) for backend, pairs in shared.items() if pairs]
+    if not lines:
         return None
-    base = complete.pop(reference)
-    lines = [_line(backend, own, base) for backend, own in complete.items()]
     shown = [key for key in PAIRED if any(f"{key}_more" in line for line in lines)]
     columns = [Column(f"{key}_more", key, f"{metric(key).heading}, difference") for key in shown]
     title = f"{cells[0]['image_size']}: differences from {reference}"
     note = (
-        f"Medians of the differences on the same {len(base)} sequences, with 95 % bootstrap "
-        "intervals: where an interval contains 0, chance may have made the difference. Better on: "
-        "share of the sequences with a smaller ATE."
+        f"Medians of the differences on the sequences that {reference} finished, too, with 95 % "
+        "bootstrap intervals: where an interval contains 0, chance may have made the difference. "
+        "Better on: share of the sequences with a smaller ATE."
     )
     return make_table(["backend", "sequences_count", *columns, "better_share"], lines, title, note)
 
 
-def _line(backend: str, own: Sequence[Cell], base: Sequence[Cell]) -> dict[str, Any]:
-    line: dict[str, Any] = {"backend": backend, "sequences_count": len(own)}
+def _line(backend: str, pairs: Sequence[tuple[Cell, Cell]]) -> dict[str, Any]:
+    line: dict[str, Any] = {"backend": backend, "sequences_count": len(pairs)}
     for key in PAIRED:
-        pairs = zip(own, base, strict=True)
         more = [a[key] - b[key] for a, b in pairs if key in a and key in b]
         if more:
             line[f"{key}_more"] = median_interval(more)
-    wins = [a["ate_m"] < b["ate_m"] for a, b in zip(own, base, strict=True)]
+    wins = [a["ate_m"] < b["ate_m"] for a, b in pairs]
     return {**line, "better_share": share_interval(wins)}

@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -16,21 +16,16 @@ from numpy.typing import NDArray
 import ms_slam_env
 from ms_slam_env import slam
 from ms_slam_env.config import Checked, bounded, chosen, nested_options
-from ms_slam_env.env import ActiveSlamEnv, Planner
-from ms_slam_env.env.config import make_config
-from ms_slam_env.env.embodiments import EMBODIMENTS
+from ms_slam_env.env import Planner
 from ms_slam_env.env.planners import check_planner, make_planner, planner_observation
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.experiments.harness.episode_scores import (
-    MapScores,
-    measure_losses,
-    measure_trajectory,
-)
 from ms_slam_env.registration import ADAPTIVE_ID
 from ms_slam_env.scenes import SEED_SPLITS, seeds_of
-from ms_slam_env.scenes.mesh_file import load_soup
 from ms_slam_env.scenes.registry import check_name, is_mesh_file
 from ms_slam_env.tasks import find_task
+
+if TYPE_CHECKING:
+    from ms_slam_env.env import ActiveSlamEnv
 
 Float64 = NDArray[np.float64]
 
@@ -99,9 +94,15 @@ def run_episode(spec: EpisodeSpec) -> dict[str, Any]:
         (running RMSE, unaligned, metres, when the map was looked at), ``time_s`` (simulated) and
         ``energy_j`` (mechanical work of the motion).
     """
+    from ms_slam_env.experiments.harness.episode_scores import (
+        MapScores,
+        measure_losses,
+        measure_trajectory,
+    )
+
     env = make_env(spec)
     try:
-        world = cast(ActiveSlamEnv, env.unwrapped)
+        world = cast("ActiveSlamEnv", env.unwrapped)
         planner = make_planner(spec.planner, world, spec.seed)
         maps = MapScores(world, spec.scene, spec.seed, find_task(spec.task).reference)
         progress = play(env, planner, spec.seed, after_step=maps.after_step)
@@ -129,7 +130,7 @@ def planned_motion(spec: EpisodeSpec) -> tuple[Float64, Float64, dict[str, Any]]
     check_planner(spec.planner)
     env = make_env(spec)
     try:
-        world = cast(ActiveSlamEnv, env.unwrapped)
+        world = cast("ActiveSlamEnv", env.unwrapped)
         progress = play(env, make_planner(spec.planner, world, spec.seed), spec.seed)
         lost = int((~world.episode.tracked).sum())
         about = {"episode_steps": progress["steps"], "episode_lost_frames": lost}
@@ -233,6 +234,9 @@ def parse_options(texts: Sequence[str]) -> dict[str, Any]:
         InputError: no ``=``, an unknown name (the message lists the valid ones), a value out of
             range, or a name that the benchmark sets itself.
     """
+    from ms_slam_env.env.config import make_config
+    from ms_slam_env.env.embodiments import EMBODIMENTS
+
     result = nested_options(texts)
     for name in result:
         if name in OWN_OPTIONS:
@@ -261,6 +265,8 @@ def check_names(planners: Sequence[str], scenes: Sequence[str]) -> None:
     for scene in scenes:
         check_name(scene)
         if is_mesh_file(scene):
+            from ms_slam_env.scenes.mesh_file import load_soup
+
             load_soup(scene)
 
 

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from ms_slam_env.errors import InputError, one_line
 from ms_slam_env.evaluation.run_sequence import lost_throughout
 from ms_slam_env.experiments.harness.experiment import Experiment
@@ -20,6 +18,7 @@ from ms_slam_env.metrics.registry import RESULTS_VERSION, versions_since
 from ms_slam_env.output_files import check_out_folder
 from ms_slam_env.parallel import Outcome as Done
 from ms_slam_env.parallel import one_thread_unless_set, open_pool, run_each
+from ms_slam_env.progress import Bar
 from ms_slam_env.report.provenance import git_commit
 from ms_slam_env.report.records import RecordFile, Row, from_plain, spec_key, to_plain
 from ms_slam_env.report.results import RESULTS, Results, write_result_folder
@@ -93,7 +92,7 @@ def run_all(
         by = f", {older} of them made by other code" if older else ""
         print(f"{description}: {done} of {len(set(keys))} already in {out}{by}", file=sys.stderr)
     if todo:
-        with tqdm(total=len(set(keys)), initial=done, desc=description, unit="") as bar:
+        with Bar(total=len(set(keys)), initial=done, desc=description, unit="") as bar:
             name_of = names(
                 {key: dataclasses.asdict(spec) for key, spec in zip(keys, specs, strict=True)}
             )

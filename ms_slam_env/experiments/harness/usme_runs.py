@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,10 @@ from ms_slam_env.evaluation.run_sequence import SequenceRun, run_sequence
 from ms_slam_env.evaluation.trajectory_charts import thinned
 from ms_slam_env.geometry import transform_points
 from ms_slam_env.scenes import Scene
-from ms_slam_env.sensor import RGBDSensor
-from ms_slam_env.sequences import RenderedSequence
-from ms_slam_env.sequences.recording import open_recording, recorded_sequence
 from ms_slam_env.sequences.usme_suite import UsmeSequence, find, render
+
+if TYPE_CHECKING:
+    from ms_slam_env.sequences import RenderedSequence
 
 Float64 = NDArray[np.float64]
 
@@ -158,6 +158,8 @@ def _loop_measures(
     run: SequenceRun, scene: Scene, truth: Float64, options: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Precision and recall of the loops of a run, by true views without moving objects."""
+    from ms_slam_env.sensor import RGBDSensor
+
     sensor = RGBDSensor(scene, xtion(_LOOP_VIEW_SIZE), noise="none")
     depths = np.stack([sensor.ground_truth(pose).depth for pose in truth])
     seconds = np.array(run.timestamps)
@@ -177,6 +179,8 @@ def _frames(sequence: RenderedSequence, folder: str | None) -> Iterator[RGBDFram
         InputError: the folder holds another number of frames than the sequence has, or none with a
             depth reading.
     """
+    from ms_slam_env.sequences.recording import open_recording, recorded_sequence
+
     if folder is None:
         yield from sequence.frames
         return
@@ -202,6 +206,8 @@ def _robustness(poses: Float64, truth: Float64, tracked: NDArray[np.bool_]) -> f
 
 def _seen_surface(scene: Scene, poses: Float64, options: dict[str, Any]) -> Float64:
     """True surface (M, 3) that the camera saw within the reach of SLAM, moving objects left out."""
+    from ms_slam_env.sensor import RGBDSensor
+
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     walked = np.concatenate([[0.0], np.cumsum(steps)])
     count = int(min(_MOST_VIEWS, max(20, walked[-1] / _VIEW_EVERY_M)))

@@ -16,7 +16,6 @@ import cv2
 import gymnasium
 import numpy as np
 from PIL import Image as Pillow
-from tqdm import tqdm
 
 from ms_slam_env.config import Checked, bounded, chosen, free_options
 from ms_slam_env.env import ActiveSlamEnv
@@ -25,6 +24,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.experiments.pictures.drawing import Image, run_script
 from ms_slam_env.experiments.pictures.episode_views import VIEWS
 from ms_slam_env.output_files import write_bytes
+from ms_slam_env.progress import Bar
 
 _FORMATS = (".webp", ".gif")
 _QUALITIES = (80, 65, 50, 40, 30, 20)  # of WebP, tried until the file is small enough
@@ -100,7 +100,7 @@ def play(env: gymnasium.Env[Any, Any], options: Options) -> Iterator[Image]:
     planner.reset()
     view = VIEWS[options.view](world, planner)
     yield view.draw()
-    for step in tqdm(range(1, options.steps + 1), options.planner, unit="step"):
+    for step in Bar(range(1, options.steps + 1), options.planner, unit="step"):
         observation, _, terminated, truncated, info = env.step(planner.act(observation, info))
         view.see()
         is_over = terminated or truncated

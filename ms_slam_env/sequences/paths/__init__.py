@@ -3,16 +3,23 @@
 Seeded ones are frozen dataclasses, a `CameraPath` each, which names of sequences can say.
 """
 
-from ms_slam_env.sequences.paths.base import CameraPath
-from ms_slam_env.sequences.paths.handheld import HandheldPath
-from ms_slam_env.sequences.paths.paced import MotionSegments, UnevenPath
-from ms_slam_env.sequences.paths.placement import Placement, place_trajectory
-from ms_slam_env.sequences.paths.route import RoutePath
-from ms_slam_env.sequences.paths.wandering import (
-    WanderingPath,
-    handheld_trajectory,
-    repeated_trajectory,
-)
+from typing import TYPE_CHECKING
+
+from ms_slam_env.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from ms_slam_env.sequences.paths.base import CameraPath
+    from ms_slam_env.sequences.paths.handheld import HandheldPath
+    from ms_slam_env.sequences.paths.paced import MotionSegments, UnevenPath
+    from ms_slam_env.sequences.paths.placement import Placement, place_trajectory
+    from ms_slam_env.sequences.paths.route import RoutePath
+    from ms_slam_env.sequences.paths.wandering import (
+        WanderingPath,
+        handheld_trajectory,
+        repeated_trajectory,
+    )
+else:
+    __getattr__ = lazy_names(__name__)
 
 __all__ = [
     "CameraPath",

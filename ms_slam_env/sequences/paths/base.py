@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from ms_slam_env.geometry import Float64, look_at, relative_angle
 from ms_slam_env.scenes.base import Scene
@@ -32,6 +31,8 @@ def dense_path(
         targets: K points (3,) that the camera looks at from them.
         is_closed: the path runs on from the last waypoint to the first, without a kink.
     """
+    from scipy.interpolate import CubicSpline
+
     # The viewing direction, not the target, is interpolated: two targets may lie on both sides.
     directions = [unit(target - eye) for eye, target in zip(eyes, targets, strict=True)]
     if is_closed:

@@ -7,9 +7,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
-from scipy.spatial import cKDTree
 
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
@@ -48,6 +45,8 @@ def _roadmap(
 
     The places are random, around the height of ``start`` (3,), which is the first of them.
     """
+    from scipy.spatial import cKDTree
+
     low, high = scene.bounds()
     low[2], high[2] = start[2] - _HEIGHT_M, start[2] + _HEIGHT_M
     drawn = rng.uniform(low, high, (_SAMPLES, 3))
@@ -65,6 +64,9 @@ def _roadmap(
 
 def _shortest(lengths: Float64, start: int, end: int) -> list[int]:
     """Places from ``start`` to ``end``, both included; empty if there is no way."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import dijkstra
+
     _, before = dijkstra(csr_array(lengths), indices=start, return_predecessors=True)
     way = [end]
     while way[-1] != start:
@@ -76,6 +78,8 @@ def _shortest(lengths: Float64, start: int, end: int) -> list[int]:
 
 def _round_trip(places: Float64, lengths: Float64, destination: int) -> list[Float64]:
     """Waypoints to a place and back, by another way where the detour is bearable."""
+    from scipy.spatial import cKDTree
+
     out = _shortest(lengths, 0, destination)
     if not out:
         return []

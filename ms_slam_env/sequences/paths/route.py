@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
 
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError, unknown
@@ -136,6 +135,8 @@ def _corners(scene: Scene, via: tuple[str, ...]) -> Float64:
 
 def _rounded(corners: Float64, width_m: float) -> Float64:
     """Points (M, 3) every ``_SAMPLE_M`` or so along the corners (K, 3), which are rounded."""
+    from scipy.ndimage import gaussian_filter1d
+
     lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
     at = np.concatenate([[0.0], np.cumsum(lengths)])
     arc = np.arange(0.0, at[-1], _SAMPLE_M)

@@ -11,7 +11,6 @@ from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import Float64
 from ms_slam_env.scenes.base import Scene
-from ms_slam_env.sensor import FRAME_RATE_HZ
 from ms_slam_env.sequences.paths.base import (
     CameraPath,
     dense_path,
@@ -231,5 +230,7 @@ class WanderingPath(Checked, CameraPath):
 
     def motion(self, scene: Scene, seed: int) -> tuple[Float64, Float64]:
         """Times (N,) in seconds and poses T_world_camera (N, 4, 4)."""
+        from ms_slam_env.sensor import FRAME_RATE_HZ
+
         poses = handheld_trajectory(scene, self.frames, seed, self.step_m, self.step_deg)
         return np.arange(self.frames) / FRAME_RATE_HZ, poses
