@@ -289,7 +289,10 @@ def test_a_gltf_whose_data_is_only_compressed(tmp_path: Path) -> None:
     tree, buffer = gltf()
     for accessor in tree["accessors"]:
         del accessor["bufferView"]
-    with pytest.raises(InputError, match="has no data"):
+    with pytest.raises(InputError, match=r"has no data$"):
+        load_soup(write_gltf(tmp_path, tree, buffer))
+    tree["extensionsUsed"] = ["KHR_draco_mesh_compression"]
+    with pytest.raises(InputError, match=r"has no data: its meshes are compressed with Draco$"):
         load_soup(write_gltf(tmp_path, tree, buffer))
 
 
