@@ -136,7 +136,7 @@ def check_size(path: str, size: tuple[int, int], intrinsics: Intrinsics) -> None
         )
 
 
-_TEXTURES = ("PNG", "JPEG", "BMP", "TGA", "TIFF", "WEBP", "PPM")
+_TEXTURES = ("PNG", "JPEG", "BMP", "TGA", "TIFF", "WEBP", "PPM", "GIF")
 _MAX_TEXELS = 8192 * 8192
 _MAX_TEXTURE = 1024
 

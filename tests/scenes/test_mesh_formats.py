@@ -289,7 +289,10 @@ def test_a_gltf_whose_data_is_only_compressed(tmp_path: Path) -> None:
     tree, buffer = gltf()
     for accessor in tree["accessors"]:
         del accessor["bufferView"]
-    with pytest.raises(InputError, match="has no data"):
+    with pytest.raises(InputError, match=r"has no data$"):
+        load_soup(write_gltf(tmp_path, tree, buffer))
+    tree["extensionsUsed"] = ["KHR_draco_mesh_compression"]
+    with pytest.raises(InputError, match=r"has no data: its meshes are compressed with Draco$"):
         load_soup(write_gltf(tmp_path, tree, buffer))
 
 
@@ -335,6 +338,22 @@ def test_a_gltf_with_colours_of_corners_beside_a_material(tmp_path: Path) -> Non
     srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     for place, colour in zip(ROOM, 255 * srgb, strict=True):
         np.testing.assert_allclose(colour_at(soup, place), colour, atol=0.51)
+
+
+def test_texture_coordinates_of_a_gltf_are_scaled_turned_and_moved(tmp_path: Path) -> None:
+    tree, buffer = textured_gltf()
+    tree["bufferViews"].append({"buffer": 0, "byteOffset": len(buffer), "byteLength": 64})
+    tree["accessors"].append({"bufferView": 2, "componentType": 5126, "count": 8, "type": "VEC2"})
+    tree["buffers"][0]["byteLength"] = len(buffer) + 64
+    tree["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_1"] = 3
+    texture = tree["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
+    change = {"scale": [2, 1], "rotation": np.pi / 2, "offset": [0.1, 0.2], "texCoord": 1}
+    texture["extensions"] = {"KHR_texture_transform": change}
+    write_png(tmp_path / "wood.png")
+    uv = np.tile([0.25, 0.5], (8, 1)).astype("<f4").tobytes()
+    soup = load_soup(write_gltf(tmp_path, tree, buffer + uv))
+    # As the Khronos viewer has it: u' = cos 2u + sin v, v' = -sin 2u + cos v, then the offset.
+    np.testing.assert_allclose(soup.uv, np.broadcast_to([0.6, -0.3], soup.uv.shape), atol=1e-6)
 
 
 def test_a_sparse_accessor_of_a_gltf(tmp_path: Path) -> None:

@@ -40,6 +40,7 @@ from ms_slam_env.sequences.writing import write_sequence
             "table:7:motion-blur,samples=3+uneven,frames=40",
             SequenceName("table", 7, "kinect", (MotionBlur(samples=3),), "uneven", {"frames": 40}),
         ),
+        ("a/b.glb,up=z,scale=0.01:7:none", SequenceName("a/b.glb,up=z,scale=0.01", 7, "none")),
         ("table:7:steady", SequenceName("table", 7, path="steady")),
     ],
 )

@@ -221,7 +221,9 @@ class _Reader:
         elif "sparse" in entry and count <= self._size:
             values = np.zeros((count, width), dtype)
         else:
-            raise InputError(f"accessor {index} of {count} elements has no data")
+            used = self._tree.get("extensionsUsed", ())
+            why = "".join(f": {what}" for name, what in _COMPRESSED.items() if name in used)
+            raise InputError(f"accessor {index} of {count} elements has no data{why}")
         if "sparse" in entry:
             values = self._with_sparse(values, entry["sparse"], dtype)
         if entry.get("normalized") and values.dtype.kind in "iu":
