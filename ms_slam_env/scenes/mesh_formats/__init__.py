@@ -7,7 +7,9 @@ import os
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,20 +17,18 @@ from ms_slam_env.config import Checked, bounded, chosen, from_dict, parse_named
 from ms_slam_env.errors import InputError
 from ms_slam_env.input_files import MAX_MESH_BYTES, read_bytes
 from ms_slam_env.scenes.base import Float64
-from ms_slam_env.scenes.mesh_formats.gltf import read_gltf
-from ms_slam_env.scenes.mesh_formats.obj import read_obj
-from ms_slam_env.scenes.mesh_formats.part import MeshFolder, Part
-from ms_slam_env.scenes.mesh_formats.ply import read_ply
 
-Reader = Callable[[bytes, MeshFolder], list[Part]]
+if TYPE_CHECKING:
+    from ms_slam_env.scenes.mesh_formats.part import MeshFolder, Part
 
 
-def _by_trimesh(kind: str) -> Reader:
+def _by_trimesh(kind: str) -> Callable[[bytes, MeshFolder], list[Part]]:
     """Read a format that names no other files and no sizes that are not checked."""
+    import trimesh
+
+    from ms_slam_env.scenes.mesh_formats.part import Part
 
     def read(data: bytes, folder: MeshFolder) -> list[Part]:
-        import trimesh
-
         if data.lstrip().startswith(b"COFF"):
             folder.warn("its colours are not read: the surface stays plain")
         loaded = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False)
@@ -41,16 +41,18 @@ def _by_trimesh(kind: str) -> Reader:
     return read
 
 
-_READERS: dict[str, Reader] = {
-    ".glb": read_gltf,
-    ".gltf": read_gltf,
-    ".obj": read_obj,
-    ".ply": read_ply,
-    ".stl": _by_trimesh("stl"),
-    ".off": _by_trimesh("off"),
-}
+_READERS = {".glb": "gltf", ".gltf": "gltf", ".obj": "obj", ".ply": "ply"}  # modules beside
 
-MESH_SUFFIXES: tuple[str, ...] = tuple(_READERS)
+
+def _reader(suffix: str) -> Callable[[bytes, MeshFolder], list[Part]]:
+    """What reads a format; loaded only when there is a file to read."""
+    if suffix not in _READERS:
+        return _by_trimesh(suffix.removeprefix("."))
+    kind = _READERS[suffix]
+    return getattr(import_module(f"{__name__}.{kind}"), f"read_{kind}")
+
+
+MESH_SUFFIXES = (*_READERS, ".stl", ".off")
 """File formats of meshes."""
 
 _Y_UP = (".glb", ".gltf")
@@ -106,12 +108,14 @@ class MeshFile:
         Raises:
             InputError: no such file, or one that cannot be read.
         """
+        from ms_slam_env.scenes.mesh_formats.part import MeshFolder
+
         kind = f"mesh file {str(self.path)!r}"
         self.check_exists()
         data = read_bytes(self.path, "mesh file", MAX_MESH_BYTES)
         try:
             with np.errstate(all="ignore"):  # what cannot be is refused below
-                parts = _READERS[self.path.suffix.lower()](data, MeshFolder(self.path))
+                parts = _reader(self.path.suffix.lower())(data, MeshFolder(self.path))
                 shared = {id(part.vertices): part.vertices for part in parts}
                 placed = {key: self._placed(vertices) for key, vertices in shared.items()}
                 return [replace(part, vertices=placed[id(part.vertices)]) for part in parts]
