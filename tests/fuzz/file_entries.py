@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import tempfile
+from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -39,7 +42,9 @@ from ms_slam_env.sequences.recording import parse_calibration
 WIDTH, HEIGHT, FRAMES = 16, 12, 4
 K = Intrinsics(15.0, 15.0, 7.5, 5.5, WIDTH, HEIGHT)
 CALIBRATION = "15 15 7.5 5.5 16 12 5000\n"
+MATRIX = b"15 0 7.5 0\n0 15 5.5 0\n0 0 1 0\n0 0 0 1\n"
 LENS = "15 15 7.5 5.5 16 12 5000 radial-tangential -0.2 0.05 0.001 0.002 0\n"
+RATIONAL = "15 15 7.5 5.5 16 12 5000 rational 0.52 -2.63 0.0005 -0.0002 1.52 0.39 -2.45 1.45\n"
 
 
 def image(kind: str, number: int, suffix: str = "PNG", times: int = 1) -> bytes:
@@ -119,6 +124,76 @@ def plain() -> Files:
 
 
 @cache
+def match3d() -> Files:
+    """A recording in the layout of 3DMatch: that of 7-Scenes with its camera's matrix."""
+    files = {name: data for name, data in seven_scenes().items() if name != "intrinsics.txt"}
+    lost = b"-inf -inf -inf -inf\n" * 4
+    return {**files, "camera-intrinsics.txt": MATRIX, "frame-000001.pose.txt": lost}
+
+
+@cache
+def scannet() -> Files:
+    """A recording in the layout of ScanNet, with colour twice as large as depth."""
+    files: Files = {
+        "intrinsic/intrinsic_depth.txt": MATRIX,
+        "intrinsic/intrinsic_color.txt": MATRIX,
+    }
+    for k in range(FRAMES):
+        files |= {
+            f"depth/{k}.png": image("depth", k),
+            f"color/{k}.jpg": image("color", k, "JPEG", times=2),
+            f"pose/{k}.txt": match3d()[f"frame-{k:06d}.pose.txt"],
+        }
+    return files
+
+
+@cache
+def replica() -> Files:
+    """A recording in the layout of Replica."""
+    camera = {"w": WIDTH, "h": HEIGHT, "fx": 15, "fy": 15, "cx": 7.5, "cy": 5.5, "scale": 6553.5}
+    files: Files = {"cam_params.json": json.dumps({"camera": camera}).encode()}
+    for k in range(FRAMES):
+        files |= {
+            f"results/depth{k:06d}.png": image("depth", k),
+            f"results/frame{k:06d}.jpg": image("color", k, "JPEG"),
+        }
+    poses = [f"1 0 0 {0.1 * k} 0 1 0 0 0 0 1 0 0 0 0 1" for k in range(FRAMES)]
+    return {**files, "traj.txt": "\n".join(poses).encode()}
+
+
+@cache
+def vary_times() -> Files:
+    """Folders of images with ids in their times and nanoseconds since boot in the truth's."""
+    times = "\n".join(f"{k} {512 * 10**9 + k * 33_333_333} 12.5" for k in range(FRAMES))
+    truth = "\n".join(f"{512 * 10**9 + k * 16_666_667} 0 0 0 0 0 0 1" for k in range(2 * FRAMES))
+    return {**plain(), "times.txt": times.encode(), "groundtruth.txt": truth.encode()}
+
+
+FORMS: tuple[Callable[[bytes], bytes], ...] = (
+    lambda data: b"\xef\xbb\xbf" + data,
+    lambda data: data.replace(b"\n", b"\r\n"),
+    lambda data: re.sub(rb"(?<=\d)\.(?=\d)", b",", data),
+    lambda data: data.replace(b" ", b";"),
+    lambda data: b"# [ns]\n" + data,
+    lambda data: b"%YAML:1.0\n---\n" + data,
+    lambda data: b"-inf -inf -inf -inf\n" * 4,
+)
+"""Other forms of the same text, as others' tools write it."""
+
+
+def varied_folder(files: Files, rng: np.random.Generator) -> Files:
+    """Some texts in another form, and then, mostly, a mutation of the folder."""
+    made = dict(files)
+    texts = [name for name in sorted(made) if name.endswith((".txt", ".csv", ".yaml", ".json"))]
+    form = FORMS[rng.integers(len(FORMS))]
+    for name in texts:
+        content = made[name]
+        if rng.random() < 0.3 and isinstance(content, bytes):
+            made[name] = form(content)
+    return made if rng.random() < 0.2 else mutated_folder(made, rng)
+
+
+@cache
 def euroc() -> Files:
     """A stereo recording in the layout of EuRoC."""
     files: Files = {}
@@ -179,7 +254,9 @@ def bags() -> dict[str, bytes]:
             ],
             "/rgb/image": [(t, own.image(t, c, "rgb8")) for t, c in zip(times, color, strict=True)],
             "/depth/camera_info": [(1.0, own.info(1.0, K))],
-            "/ground_truth": [(t, own.pose(t, np.eye(4))) for t in times],
+            "/rgb/camera_info": [(1.0, own.info(1.0, replace(K, fx=20.0)))],
+            "/ground_truth": [(t, own.pose(t, np.eye(4), "Odometry")) for t in times],
+            "/tf_static": [(1.0, own.transforms(1.0, {("camera", "base_link"): np.eye(4)}))],
         }
         with tempfile.TemporaryDirectory() as folder:
             made[name] = write_bag(Path(folder) / name, own, topics).read_bytes()
@@ -347,6 +424,10 @@ ENTRIES = [
         _of_folder(seed.__name__.replace("_", "-"), seed, call_recording)
         for seed in (tum, icl_nuim, seven_scenes, plain, euroc, kitti)
     ),
+    *(
+        _of_folder(f"{seed.__name__}-forms".replace("_", "-"), seed, call_recording, varied_folder)
+        for seed in (match3d, scannet, replica, vary_times, tum, euroc)
+    ),
     Entry("bag", bags, one_bag, call_bag),
     _of_folder("image", images, call_image, one_image),
     _of_folder("trajectory", lambda: {"a.txt": trajectory()}, call_trajectory),
@@ -355,4 +436,6 @@ ENTRIES = [
     _of_folder("mesh", meshes, call_mesh, one_mesh),
     Entry("calibration", CALIBRATION.encode, mutated_text, call_calibration),
     Entry("lens", LENS.encode, mutated_text, call_calibration),
+    Entry("rational-lens", RATIONAL.encode, mutated_text, call_calibration),
+    _of_folder("trajectory-forms", lambda: {"a.txt": trajectory()}, call_trajectory, varied_folder),
 ]
