@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,9 @@ from numpy.typing import NDArray
 
 from ms_slam_env.env.planners import Planner, make_planner
 from ms_slam_env.errors import InputError
+from ms_slam_env.input_files import MAX_MESH_BYTES, check_file
 from ms_slam_env.output_files import write_bytes
+from ms_slam_env.slam.state_file import check_expansion
 
 _PLANNER, _POLICY = 1, 2  # streams of an episode's seed; the environment draws from the seed itself
 _ARRAYS = {"observations": 2, "masks": 2, "preferences": 2, "rewards": 1, "is_tracked": 1}
@@ -78,6 +81,9 @@ class Demonstration:
             InputError: no such file, or another one.
         """
         try:
+            check_file(path, "demonstration", MAX_MESH_BYTES)
+            with zipfile.ZipFile(path) as archive:
+                check_expansion(archive, path.stat().st_size)
             with np.load(path, allow_pickle=False) as found:
                 made = Demonstration(**{name: found[name] for name in _ARRAYS})
             lengths = {len(getattr(made, name)) for name in _ARRAYS}

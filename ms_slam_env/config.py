@@ -277,7 +277,7 @@ PyYAML reads YAML 1.1, in which ``off`` is false, ``1:30`` is 90, ``010`` is 8 a
 class _Loader(yaml.SafeLoader):
     """YAML's own, but nothing may be said twice, and plain values are those of YAML 1.2."""
 
-    yaml_implicit_resolvers: ClassVar[dict[str, Any]] = {
+    yaml_implicit_resolvers: ClassVar[dict[str, Any]] = {  # type: ignore[misc]
         first: [one for one in known if one[0].rpartition(":")[2] not in _NUMBERS]
         for first, known in yaml.SafeLoader.yaml_implicit_resolvers.items()
     }

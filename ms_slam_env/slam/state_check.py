@@ -23,6 +23,7 @@ _KINDS: tuple[Any, ...] = ((bool, np.bool_), numbers.Integral, (float, np.floati
 _SUM_ERROR = 1e-6  # of a distribution
 MOST = 2**30
 """Largest number of anything that is counted: no count to come overflows 32 bits."""
+_MOST_FLOAT32 = 1e15  # kernels square them and add them up
 _MOST_SEED = 2**31 - 1
 
 
@@ -62,6 +63,7 @@ class ArrayOf:
         shape: a name stands for one length, wherever it occurs in a state, or in one mapping or
             list of a list in it.
         least: smallest element; None: whatever is finite.
+        most: largest, where there is a smallest.
         index_of: name of a length that all elements must be below.
         may_be_nan: whether NaN means none.
         is_distribution: whether it adds up to 1 along the last axis.
@@ -70,6 +72,7 @@ class ArrayOf:
     dtype: Any
     shape: tuple[int | str, ...]
     least: float | None = None
+    most: float = np.inf
     index_of: str = ""
     may_be_nan: bool = False
     is_distribution: bool = False
@@ -143,7 +146,7 @@ class _Lengths:
             least = 0 if isinstance(like, WholeNumber) else -1
             return MOST if count is None else max(count - 1, least)
         if isinstance(like, ArrayOf):
-            return MOST if np.dtype(like.dtype).kind in "iu" else np.inf
+            return min(like.most, MOST) if np.dtype(like.dtype).kind in "iu" else like.most
         most = self.get(like.most) if isinstance(like.most, str) else like.most
         return MOST if most is None else most
 
@@ -249,7 +252,7 @@ def _check_rising(value: list[Any], key: str, where: str) -> None:
     last = -1
     for one in value:
         now = one.get(key) if isinstance(one, Mapping) else None
-        if not isinstance(now, numbers.Integral) or not last < now:
+        if not isinstance(now, numbers.Integral) or int(now) <= last:
             raise wrong(where, f"is not in the order of {key}")
         last = int(now)
 
@@ -376,7 +379,9 @@ def _is_finite(value: NDArray[Any]) -> bool:
     flat = value.reshape(-1)
     # The sum of squares, a fifth of the time, is finite unless a value is not, or very large.
     with np.errstate(over="ignore", invalid="ignore"):
-        return bool(np.isfinite(np.dot(flat, flat)) or np.isfinite(flat).all())
+        if np.isfinite(np.dot(flat, flat)):
+            return True
+    return bool((np.abs(flat) < (_MOST_FLOAT32 if flat.dtype == np.float32 else np.inf)).all())
 
 
 def _check_rigid(stack: NDArray[Any], where: str) -> None:

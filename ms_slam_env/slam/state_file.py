@@ -87,9 +87,7 @@ def _opened(path: Path) -> Iterator[tuple[zipfile.ZipFile, Mapping[str, Any]]]:
     check_file(path, "map", MAX_MESH_BYTES)
     try:
         with zipfile.ZipFile(path) as archive:
-            most = max(MAX_EXPANSION * path.stat().st_size, ALWAYS_TAKEN_BYTES)
-            if sum(info.file_size for info in archive.infolist()) > most:
-                raise InputError(f"larger than {most / 1e6:.0f} MB once unpacked")
+            check_expansion(archive, path.stat().st_size)
             if archive.getinfo(_TREE).file_size > MAX_TREE_BYTES:
                 raise InputError(f"{_TREE} is larger than {MAX_TREE_BYTES / 1e6:.0f} MB")
             header = json.loads(archive.read(_TREE))
@@ -100,6 +98,17 @@ def _opened(path: Path) -> Iterator[tuple[zipfile.ZipFile, Mapping[str, Any]]]:
     except _BROKEN as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"cannot read map {path}: damaged, or no map ({reason})") from None
+
+
+def check_expansion(archive: zipfile.ZipFile, packed_bytes: int) -> None:
+    """Refuse an archive of so many bytes that grows too much, before anything in it is read.
+
+    Raises:
+        InputError: saying how much is taken.
+    """
+    most = max(MAX_EXPANSION * packed_bytes, ALWAYS_TAKEN_BYTES)
+    if sum(info.file_size for info in archive.infolist()) > most:
+        raise InputError(f"larger than {most / 1e6:.0f} MB once unpacked")
 
 
 def _check_version(header: Mapping[str, Any]) -> None:

@@ -5,6 +5,9 @@ from __future__ import annotations
 import contextlib
 import copy
 import io
+import json
+import tempfile
+import zipfile
 from functools import cache, partial
 from itertools import islice
 from pathlib import Path
@@ -14,7 +17,16 @@ import file_entries
 import gymnasium as gym
 import numpy as np
 from fuzzing import Entry
-from mutations import ARRAYS, NUMBERS, PLAIN, Rng, mutated_text, mutated_tree, write_files
+from mutations import (
+    ARRAYS,
+    NUMBERS,
+    PLAIN,
+    Rng,
+    mutated_bytes,
+    mutated_text,
+    mutated_tree,
+    write_files,
+)
 
 import ms_slam_env
 from ms_slam_env import slam
@@ -126,9 +138,9 @@ def call_options(options: Any, folder: Path) -> None:
 
 
 @cache
-def environment() -> Any:
+def environment(**options: Any) -> Any:
     """An environment, and its state after a few steps."""
-    env = gym.make(ms_slam_env.ENV_IDS[1], **SMALL).unwrapped
+    env = gym.make(ms_slam_env.ENV_IDS[1], **SMALL, **options).unwrapped
     env.reset(seed=0)
     for action in (0, 8, 16):
         env.step(action)
@@ -140,9 +152,9 @@ def mutated_state(state: Any, rng: Rng) -> Any:
     return mutated_tree(state, rng, (*PLAIN, np.zeros(3), np.eye(3), np.full((4, 4), np.nan)))
 
 
-def call_state(state: Any, folder: Path) -> None:
+def call_state(options: dict[str, Any], state: Any, folder: Path) -> None:
     """Load a state; what is taken can be stepped from, what is refused changes nothing."""
-    env, own = environment()
+    env, own = environment(**options)
     env.load_state(own)
     try:
         env.load_state(state)
@@ -151,10 +163,56 @@ def call_state(state: Any, folder: Path) -> None:
         env.load_state(own)
         assert (mask == env.action_masks()).all()
         raise
-    observation, reward, *_, info = env.step(0)
-    assert is_finite(observation)
-    assert np.isfinite(reward)
-    assert np.isfinite(info["T_world_camera_estimate"]).all()
+    for action in (0, 35):
+        observation, reward, *_, info = env.step(action)
+        assert is_finite(observation)
+        assert np.isfinite(reward)
+        assert np.isfinite(info["T_world_camera_estimate"]).all()
+        assert np.isfinite(env.lookahead()).all()
+    env.load_state(env.save_state())
+
+
+# --- maps --------------------------------------------------------------------------------------
+
+
+@cache
+def saved_map(name: str) -> tuple[Any, dict[str, bytes]]:
+    """The header of a map, and the arrays that it names."""
+    system = backend(name)
+    system.reset(np.eye(4))
+    for frame in rendered()[:2]:
+        system.track(RGBDFrame(*frame))
+    with tempfile.TemporaryDirectory() as folder:
+        system.save(Path(folder) / "map.npz")
+        with zipfile.ZipFile(Path(folder) / "map.npz") as archive:
+            members = {member: archive.read(member) for member in archive.namelist()}
+    return json.loads(members.pop("tree.json")), members
+
+
+def mutated_map(parts: Any, rng: Rng) -> Any:
+    """Another header, or other bytes in an array."""
+    header, members = parts
+    if rng.random() < 0.7:
+        return mutated_tree(header, rng), members
+    member = list(members)[rng.integers(len(members))]
+    return header, {**members, member: mutated_bytes(members[member], rng)}
+
+
+def call_map(parts: Any, folder: Path) -> None:
+    """Open a map; what is taken shows finite points and can be gone on in."""
+    header, members = parts
+    try:
+        text = json.dumps(header)
+    except (TypeError, ValueError):  # a value that no file can hold
+        raise InputError("not JSON") from None
+    with zipfile.ZipFile(folder / "map.npz", "w") as archive:
+        for name, data in {"tree.json": text.encode(), **members}.items():
+            archive.writestr(name, data)
+    system = slam.open_map(folder / "map.npz")
+    assert np.isfinite(system.surface_points()).all()
+    frame = RGBDFrame(*rendered()[2])
+    if system.intrinsics.shape == frame.depth.shape:
+        assert np.isfinite(system.track(frame).T_world_camera).all()
 
 
 def call_action(action: Any, folder: Path) -> None:
@@ -172,6 +230,8 @@ def mutated_value(value: Any, rng: Rng) -> Any:
 
 # --- frames ------------------------------------------------------------------------------------
 
+STATES = ("odometry", "sparse")
+"""Backends, besides the usual one, whose states are tried."""
 MAKE: dict[str, dict[str, Any]] = {
     "surfel": {"max_surfels": 20_000},
     "odometry": {},
@@ -310,7 +370,22 @@ ENTRIES = [
     Entry("option-texts", lambda: list(OPTION_TEXTS), mutated_texts, call_option_texts),
     Entry("sequence-names", lambda: list(NAMES), mutated_texts, call_names),
     Entry("env-options", cache(seed_options), mutated_tree, call_options, in_tests=10),
-    Entry("env-state", lambda: copy.copy(environment()[1]), mutated_state, call_state, in_tests=20),
+    *(
+        Entry(
+            f"env-state{name and '-'}{name}",
+            lambda options=options: copy.copy(environment(**options)[1]),  # type: ignore[misc]
+            mutated_state,
+            partial(call_state, options),
+            in_tests=15,
+        )
+        for name, options in {
+            name: {"slam": name} if name else {} for name in ("", *STATES)
+        }.items()
+    ),
+    *(
+        Entry(f"map-{name}", partial(saved_map, name), mutated_map, call_map, in_tests=10)
+        for name in ("surfel", "sparse")
+    ),
     Entry("env-action", lambda: 0, mutated_value, call_action),
     *(
         Entry(f"frames-{name}", rendered, mutated_frames, partial(call_frames, name), in_tests=6)

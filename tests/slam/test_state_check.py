@@ -58,6 +58,8 @@ PAIRS = ListOf({"a": ArrayOf(np.int8, ("n",)), "b": ArrayOf(np.int8, ("n",))}, "
         (-0.5, Real(0, 1), r"no number in \[0, 1\]"),
         ({"a": 1}, Fields({"a": 0}, lambda value: "is odd" if value["a"] % 2 else ""), "is odd"),
         ({"k": 1}, Depending(lambda value: {"k": WholeNumber(most=value["k"] - 1)}), "counts to 1"),
+        (np.full(3, 3e38, "f4"), ArrayOf("f4", ("n",)), "not finite"),
+        (np.full(3, 300.0), ArrayOf(float, ("n",), 0, 255), r"outside \[0, 255\]"),
         (np.full((1, 4), 0.3), ArrayOf(float, (1, 4), 0, is_distribution=True), "distributions"),
     ],
 )

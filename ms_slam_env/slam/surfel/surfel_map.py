@@ -310,7 +310,7 @@ class SurfelMap(Stateful):
     def surfels_like(self) -> dict[str, ArrayOf]:
         """What ``get_surfels`` gives."""
         return {
-            name: ArrayOf(values.dtype, ("surfels", *values.shape[1:]), _LEAST.get(name))
+            name: ArrayOf(values.dtype, ("surfels", *values.shape[1:]), *_RANGES.get(name, ()))
             for name, values in self.get_surfels(0).items()
         }
 
@@ -367,7 +367,10 @@ class SurfelMap(Stateful):
         self.surfels_moved()
 
 
-_LEAST = dict.fromkeys(("radius", "confidence", "created", "seen"), 0)
+_RANGES = {  # grey levels are those of the first exposure, so that later ones may leave [0, 255]
+    "color": (-1e4, 1e4),
+    **dict.fromkeys(("radius", "confidence", "created", "seen"), (0,)),
+}
 
 
 def _write(array: wp.array, env: int, values: NDArray[Any]) -> None:
