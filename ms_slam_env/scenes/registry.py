@@ -82,7 +82,7 @@ def check_name(name: object) -> None:
             raise InputError(f"mesh file {str(name)!r} does not exist")
     elif isinstance(name, str) and ":" not in name and name not in POINT.names():
         raise POINT.unknown(name, (f"the path of a mesh file ({', '.join(MESH_SUFFIXES)})",))
-    else:
+    elif name not in SCENES:  # ours are there; to import one takes a while
         POINT.find(name)
 
 
