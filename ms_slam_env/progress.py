@@ -18,7 +18,7 @@ class Bar(tqdm):
     A bar that is drawn over itself would fill a log with carriage returns.
     """
 
-    monitor_interval = EVERY_S / 3  # of tqdm's thread, which sees to an iteration that takes long
+    monitor_interval = 10  # seconds, of tqdm's thread, which sees to an iteration that takes long
 
     def __init__(self, *args: Any, **options: Any) -> None:
         self._in_terminal = sys.stderr.isatty()
@@ -48,7 +48,7 @@ class Bar(tqdm):
         if not self.disable and not self._in_terminal:
             self._write_line()
             self.disable = True
-            self._decr_instances(self)
+            self._decr_instances(self)  # type: ignore[attr-defined]
         super().close()
 
     def _write_line(self) -> None:

@@ -79,6 +79,10 @@ class Arguments:
 def main(arguments: Sequence[str]) -> int:
     """Run, write, and print what was measured."""
     args = parse(Arguments, arguments, "ms-slam run")
+    if args.backend is not None:
+        from ms_slam_env.slam.registry import POINT
+
+        POINT.find(args.backend)  # a typo is answered before all that a run needs is imported
     from ms_slam_env.config import from_dict, nested_options
     from ms_slam_env.evaluation.run_sequence import lost_throughout
     from ms_slam_env.evaluation.run_to_folder import run_to_folder

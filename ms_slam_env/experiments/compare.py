@@ -97,19 +97,19 @@ class Compare(Experiment, Checked):
 
     def __post_init__(self) -> None:
         """Refuse what no run could use."""
-        from ms_slam_env.sequences import check_sequence
-
         super().__post_init__()
         for name in ("sequences", "backends", "image_sizes"):
             if not getattr(self, name):
                 raise InputError(f"{type(self).__name__}.{name} is empty")
-        for text in self.sequences:
-            check_sequence(text)
         for text in self.backends:
             if is_command(text):
                 check_command(text)
             else:
                 slam.check_parameters(*parse_named(text, "backend"))
+        from ms_slam_env.sequences import check_sequence
+
+        for text in self.sequences:
+            check_sequence(text)
         for size in self.image_sizes:
             parse_image_size(size)
         names = [*map(name_of, self.backends), *(pattern.name for pattern in self._patterns())]

@@ -110,7 +110,7 @@ def check_name(name: object) -> None:
         file.check_exists()
     elif isinstance(name, str) and ":" not in name and name not in POINT.names():
         raise POINT.unknown(name, (f"the path of a mesh file ({', '.join(MESH_SUFFIXES)})",))
-    else:
+    elif name not in SCENES:  # ours are there; to import one takes a while
         POINT.find(name)
 
 

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ms_slam_env import sequences
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
 from ms_slam_env.experiments import compare
@@ -144,7 +145,7 @@ def test_folders_of_one_name_are_two_sequences() -> None:
     ],
 )
 def test_what_no_run_could_use_is_refused(more, said, monkeypatch) -> None:
-    monkeypatch.setattr(compare, "check_sequence", lambda text: None)
+    monkeypatch.setattr(sequences, "check_sequence", lambda text: None)
     with pytest.raises(InputError, match=said):
         Compare(**more)
 

@@ -260,10 +260,11 @@ def check_names(planners: Sequence[str], scenes: Sequence[str]) -> None:
             raise InputError(f"no {kind} given")
         if len(set(names)) < len(names):
             raise InputError(f"a {kind} is given twice: {', '.join(names)}")
+    for scene in scenes:  # the cheapest first: a planner may take seconds to import
+        check_name(scene)
     for planner in planners:
         check_planner(planner)
     for scene in scenes:
-        check_name(scene)
         if is_mesh_file(scene):
             from ms_slam_env.scenes.mesh_file import load_soup
 
