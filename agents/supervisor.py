@@ -131,8 +131,7 @@ class Supervisor(BaseCallback):
             buffer = self.model.rollout_buffer
             self.unlearnt_steps = 0 if buffer.full else buffer.pos * buffer.n_envs
         self._save_latest()
-        is_new = self.has_learnt or self.was_done
-        if is_new and not self.signal and not self._is_evaluated():
+        if self.has_learnt and not self.signal and not self._is_evaluated():
             self._evaluate()
         self._bar.close()
 

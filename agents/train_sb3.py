@@ -109,6 +109,10 @@ def train(args: Args) -> int:
         model = make_model(args, training, file)
         minutes = file.metadata.minutes if file else 0.0
         curve = curve or new_curve(args, validation)
+        if file and curve.steps < file.metadata.timesteps:  # as saved: a reset moves the moments
+            judged = file.without_optimizer()
+            point = curve.judge(judged, validation, args.out, args.deterministic_eval)
+            print(f"{file.metadata.timesteps} steps, made up: {curve.in_words(point)}")
         supervisor = Supervisor(args, validation, curve, minutes)
         if args.curriculum:  # before the first reset
             training.env_method("enter_stage", stage_of(args, model.num_timesteps, curve))

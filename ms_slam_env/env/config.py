@@ -370,12 +370,13 @@ def check_reset(seed: Any, options: Any, own: Sequence[SceneName]) -> None:
         valid = ", ".join(RESET_OPTIONS)
         raise InputError(f"unknown reset option {names}; valid choices: {valid}")
     scene, scene_seed = given.get("scene"), given.get("scene_seed")
-    names = dict.fromkeys([*map(name_of, own), *SCENES])
-    if scene is not None and (not isinstance(scene, str) or scene not in names):
-        raise unknown("reset option scene", scene, names)
+    known = dict.fromkeys([*map(name_of, own), *SCENES])
+    if scene is not None and (not isinstance(scene, str) or scene not in known):
+        raise unknown("reset option scene", scene, known)
     if scene_seed is not None and not _is_seed(scene_seed):
         raise InputError(f"reset option scene_seed = {scene_seed!r} must be an integer >= 0")
 
 
 def _is_seed(value: Any) -> bool:
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= 0
+    is_whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    return is_whole and bool(value >= 0)

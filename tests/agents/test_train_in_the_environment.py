@@ -55,7 +55,7 @@ def test_two_processes_train_a_policy_that_plans(tmp_path):
             ("--env-id", "Mars-v0"),
             "unknown environment 'Mars-v0'; valid choices: MSA",
         ),
-        (("--step-m", "7"), "EnvConfig.step_m = 7.0 is outside"),
+        (("--step-m", "7"), "step_m = 7.0 is outside"),
         (("--scene-seeds", "1000"), "EnvConfig.num_scene_seeds = 1000 is outside"),  # validation's
     ],
 )
