@@ -149,7 +149,7 @@ class Recording(Frames):
         entry = self.entries[index]
         known = self.registration if isinstance(self.registration, ColorCamera) else None
         try:
-            read, raw = entry.read(self.source, known and known.intrinsics)
+            read, raw = entry.read(self.source, None if known is None else known.intrinsics)
         except InputError as error:
             raise InputError(f"{entry.where}: {error}") from None
         depth: NDArray[Any] = raw.astype(np.float32) / np.float32(self.depth_scale)
