@@ -206,9 +206,12 @@ def _check(value: Any, like: Any, where: str, lengths: _Lengths) -> None:
 
 
 def _check_between(value: Any, least: float, most: float, where: str) -> None:
-    if not np.size(value):
-        return
-    low, high = np.min(value), np.max(value)
+    if isinstance(value, np.ndarray):
+        if not value.size:
+            return
+        low, high = value.min(), value.max()
+    else:
+        low = high = value
     if low < least or high > most:
         raise wrong(where, f"counts to {low if low < least else high}, outside [{least}, {most}]")
 
@@ -287,7 +290,9 @@ def check_keys(value: Mapping[Any, Any], names: Sequence[str], where: str) -> No
         raise wrong(where, f"lacks {missing}" if missing else f"has {more} too")
 
 
-def check_list(value: Any, where: str, length: int | None = None, kind: type = list) -> None:
+def check_list(
+    value: Any, where: str, length: int | None = None, kind: type[Sequence[Any]] = list
+) -> None:
     """Refuse what is no list, or not of that length."""
     if not isinstance(value, kind):
         raise wrong(where, f"is a {type(value).__name__}, not a {kind.__name__}")
