@@ -6,7 +6,7 @@ from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from ms_slam_env.camera import XTION_SIZES, Intrinsics, RGBDFrame, rendered_size
 from ms_slam_env.config import from_dict
@@ -182,11 +182,13 @@ class AdaptiveSlam(SelectiveSlam):
         super().__init__(backend, self._switch, max_skip=_NEVER)
 
     # The level is put in force before the backend takes arrays of its image size.
-    saved = tuple(sorted(SelectiveSlam.saved, key=lambda name: name != "_filter"))
+    saved: ClassVar[tuple[str, ...]] = tuple(
+        sorted(SelectiveSlam.saved, key=lambda name: name != "_filter")
+    )
 
     def state_like(self) -> Any:
         """See ``Stateful``: arrays have the image size of the level in force."""
-        likes = []
+        likes: list[Any] = []
         for index in reversed(range(len(self.levels))):
             self._switch.put_in_force(index)
             likes.insert(0, super().state_like())

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -116,7 +116,7 @@ class SelectiveSlam(Saved, BorrowedMap):
         pose: of a dropped frame without a known or guessed pose, ``constant-velocity`` or ``last``.
     """
 
-    saved = ("backend", "_filter", "_prediction", "_frames")
+    saved: ClassVar[tuple[str, ...]] = ("backend", "_filter", "_prediction", "_frames")
     also_saved = ("last", "processed", "dropped", "offsets")
 
     def __init__(

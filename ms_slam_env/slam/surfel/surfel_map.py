@@ -310,7 +310,7 @@ class SurfelMap(Stateful):
     def surfels_like(self) -> dict[str, ArrayOf]:
         """What ``get_surfels`` gives."""
         return {
-            name: ArrayOf(values.dtype, ("surfels", *values.shape[1:]), *_RANGES.get(name, ()))
+            name: ArrayOf(values.dtype, ("surfels", *values.shape[1:]), *_RANGES.get(name, _FREE))
             for name, values in self.get_surfels(0).items()
         }
 
@@ -367,9 +367,11 @@ class SurfelMap(Stateful):
         self.surfels_moved()
 
 
-_RANGES = {  # grey levels are those of the first exposure, so that later ones may leave [0, 255]
-    "color": (-1e4, 1e4),
-    **dict.fromkeys(("radius", "confidence", "created", "seen"), (0,)),
+_FREE: tuple[float | None, float] = None, math.inf
+_RANGES: dict[str, tuple[float | None, float]] = {
+    "color": (-1e4, 1e4),  # in the first exposure: those of later ones may leave [0, 255]
+    **dict.fromkeys(("radius", "confidence"), (0.0, math.inf)),
+    **dict.fromkeys(("created", "seen"), (0, math.inf)),
 }
 
 

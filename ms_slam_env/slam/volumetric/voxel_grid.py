@@ -99,6 +99,7 @@ def load_open3d(what: str = "the volumetric backend") -> Any:
     return open3d
 
 
+_FARTHEST_M = 1e4  # of a block in a state; rays are cast from farther than all blocks
 DEPTH_SCALE = 5000.0  # 16-bit depth of 0.2 mm, well below the sensor's noise
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
 
@@ -289,7 +290,9 @@ class VoxelGrid(Stateful):
     def state_like(self) -> Any:
         """See ``Stateful``."""
         own = self.get_state().items()
-        return {name: ArrayOf(one.dtype, ("blocks", *one.shape[1:])) for name, one in own}
+        like = {name: ArrayOf(one.dtype, ("blocks", *one.shape[1:])) for name, one in own}
+        most = round(_FARTHEST_M / (self.config.voxel_m * self.config.block_voxels))
+        return like | {"keys": replace(like["keys"], least=-most, most=most)}
 
     def set_state(self, state: dict[str, NDArray[Any]]) -> None:
         """Go on from a state of a grid of the same configuration."""
