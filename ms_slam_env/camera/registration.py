@@ -101,8 +101,10 @@ class ColorCamera:
 
     def register(
         self, color: NDArray[np.uint8], depth: NDArray[np.float32], camera: Intrinsics
-    ) -> NDArray[np.uint8]:
+    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         """Colour image (H, W, 3) as the depth camera would see it, as `Registration.register` does.
+
+        And (H, W) whether the colour camera sees what a pixel shows.
 
         Args:
             color: as recorded, of the size that ``intrinsics`` say.
@@ -115,7 +117,11 @@ class ColorCamera:
         places = self.intrinsics.project(np.where(is_ahead[..., None], points, (0, 0, 1)))
         x, y = np.where(is_ahead, np.moveaxis(places, -1, 0), -1).astype(np.float32)
         registered = cv2.remap(color, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return registered.astype(np.uint8, copy=False)
+        K = self.intrinsics
+        is_seen = (np.abs(2 * x - K.width + 1) <= K.width) & (
+            np.abs(2 * y - K.height + 1) <= K.height
+        )
+        return registered.astype(np.uint8, copy=False), is_seen & is_ahead
 
     def __str__(self) -> str:
         """Return what is assumed, for a report."""

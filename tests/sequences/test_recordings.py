@@ -301,10 +301,13 @@ def test_a_depth_camera_sees_colour_where_the_colour_camera_has_it():
     v, u = np.mgrid[:48, :64]
     color = np.stack([4 * u, 4 * v, 0 * u], axis=-1).astype(np.uint8)
     depth = np.linspace(1, 3, WIDTH * HEIGHT, dtype=np.float32).reshape(HEIGHT, WIDTH)
-    found = ColorCamera(of_color, T).register(color, depth, K)
+    found, is_seen = ColorCamera(of_color, T).register(color, depth, K)
     points = K.rays() * depth[..., None]
     want = 4 * of_color.project(points @ T[:3, :3].T + T[:3, 3])
     np.testing.assert_allclose(found[..., :2], want.clip(0), atol=0.6)  # replicated beyond
+    inside = ((want / 4 >= -0.5) & (want / 4 <= [63.5, 47.5])).all(axis=-1)
+    np.testing.assert_array_equal(is_seen, inside)
+    assert 0 < (~is_seen).sum() < 50
 
 
 def test_given_intrinsics_come_first(tum):

@@ -157,7 +157,8 @@ class Recording(Frames):
             depth[raw == SATURATED] = 0
         color: NDArray[Any] = np.zeros((*raw.shape, 3), np.uint8) if read is None else read
         if known is not None and read is not None:
-            color = known.register(read, depth, self.source)
+            color, is_seen = known.register(read, depth, self.source)
+            depth = np.where(is_seen, depth, np.float32(0))  # as an aligned image has it
         if self.source.distortion:
             color = undistort_color(color, self.source)
             depth = undistort_depth(depth, self.source)
