@@ -76,7 +76,7 @@ def _check_parts_of(
     for name, own in like.items():
         check_like(state[name], own, name)
     if state["camera_feed"]["noise_seed"] != state["episode"].noise_seed:
-        raise InputError("this is no state to go on from: camera_feed is of another episode")
+        raise InputError("not a saved state: camera_feed is of another episode")
 
 
 def _take_up(state: Mapping[str, Any], simulation: Simulation, world: World) -> None:
@@ -97,4 +97,4 @@ def _take_up(state: Mapping[str, Any], simulation: Simulation, world: World) -> 
     except Exception as error:  # whatever a part makes of what only looks like its state
         for back in undo:
             back()
-        raise InputError(f"this is no state to go on from: {error!r}") from error
+        raise InputError(f"not a saved state: {error!r}") from error

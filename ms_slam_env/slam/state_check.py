@@ -273,7 +273,7 @@ def is_open(like: Any) -> bool:
 
 def wrong(where: str, what: str) -> InputError:
     """Return the error that says what is wrong at a place in a state."""
-    return InputError(f"this is no state to go on from: {where} {what}")
+    return InputError(f"not a saved state: {where} {what}")
 
 
 def check_mapping(value: Any, where: str) -> None:
