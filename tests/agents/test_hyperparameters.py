@@ -67,7 +67,7 @@ def test_a_file_of_ones_own(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("ppo: {gama: 0.7}", "unknown option of Args 'gama'; valid choices"),
+        ("ppo: {gama: 0.7}", "unknown option of PpoArgs 'gama'; valid choices"),
         ("ppo: {gamma: 7}", "gamma"),
         ("ppo: {gamma: high}", "gamma"),
         ("problem: {scenes: 3}", "scenes"),
