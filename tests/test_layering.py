@@ -219,11 +219,23 @@ def test_importing_loads_nothing_heavy(module: str) -> None:
     assert done.stdout.strip() == "[]", done.stderr
 
 
+LIGHT_EXPERIMENTS = [
+    "compare",
+    "paper_table2",
+    "planners",
+    "pose_sources",
+    "soak",
+    "step_size",
+    "usme",
+]
+
+
 @pytest.mark.parametrize(
     "line",
     [
         *(f"{name} --no-such-option" for name in sorted(COMMANDS)),
-        *(f"{name} --no-such-option" for name in ("usme make", "usme run", "experiment soak")),
+        *(f"{name} --no-such-option" for name in ("usme make", "usme run")),
+        *(f"experiment {name} --no-such-option" for name in LIGHT_EXPERIMENTS),
         "benchmark --planners gredy",
         "benchmark --scenes kitchn",
         "compare --backends surfl",
