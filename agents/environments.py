@@ -21,7 +21,7 @@ from ms_slam_agents.through_planner import ThroughPlanner
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 import ms_slam_env  # registers the ids, in a worker process too
-from ms_slam_env.env.config import RewardConfig
+from ms_slam_env.env.reward import RewardConfig
 from ms_slam_env.errors import InputError, unknown
 
 VALIDATION_SEED = 1_000_000  # of the first validation episode; training draws from small seeds

@@ -12,10 +12,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Any
+from dataclasses import asdict
 
 import numpy as np
 import torch
@@ -29,14 +26,14 @@ from ms_slam_agents.environments import (
     say_problem,
 )
 from ms_slam_agents.learning_curve import LATEST, Curve, read_curve
-from ms_slam_agents.options import Problem
 from ms_slam_agents.policy_file import PolicyFile, write_policy
-from ms_slam_agents.resume import KEPT, check_kept, check_new, parse_options, say_changes
+from ms_slam_agents.resume import KEPT, check_kept, check_new, say_changes
 from ms_slam_agents.student import Student
+from ms_slam_agents.trainers import ImitationArgs as Args
+from ms_slam_agents.trainers import imitation as main
 from ms_slam_agents.training_run import alone, read_run, read_similar, saved_curve
 
-from ms_slam_env.command_line import exit_code
-from ms_slam_env.config import bounded, parse_named
+from ms_slam_env.config import parse_named
 from ms_slam_env.env.planners import PLANNERS, check_planner
 from ms_slam_env.errors import InputError
 from ms_slam_env.parallel import one_thread_unless_set, open_pool, run_each
@@ -48,54 +45,6 @@ from ms_slam_env.result_folders import own_folder
 _TRAINING_SEED = 500_000  # of the first episode
 _OWN_PROBLEM = {*KEPT, "teacher", "episodes", "epochs", "seed", "memory"}
 """Options that all rounds of a run have in common."""
-
-
-@dataclass(frozen=True)
-class Args(Problem):
-    """Learn from a planner; these options are the command line.
-
-    Attributes:
-        teacher: a planner, NAME,option=value,...
-        init: policy file to begin with, its network and normalisation; it may be of another task.
-        through: planner that the policy acts through in the rounds after the first, as its option
-            ``path``: `agent-home` has goals for the way to what is not near by. Then only the
-            decisions count that the teacher weighs. None: the policy acts by itself.
-        rounds: of episodes and fitting; in the first the teacher acts.
-        episodes: of each round.
-        share: of the decisions that are the teacher's in the second round; half as many in each
-            round after it.
-        epochs: passes over all episodes so far, each round.
-        batch_size: of the gradient steps.
-        learning_rate: of Adam.
-        value_weight: of the error of the value in the loss.
-        gamma: discount factor of the returns.
-        hidden: width of the two hidden layers.
-        dropout: share of what the layers see that is zero, drawn anew for each gradient step.
-        memory: width of the recurrent unit; 0: the policy sees the present observation alone. With
-            one, a batch is of whole episodes, as many as have ``batch_size`` steps together, one
-            at least.
-    """
-
-    out: Path = Path("runs/imitation")
-    teacher: str = "nbv"
-    init: Path | None = None
-    through: str | None = None
-    rounds: int = bounded(5, 1, 1000)
-    episodes: int = bounded(40, 1, 100_000)
-    share: float = bounded(0.5, 0, 1)
-    epochs: int = bounded(10, 1, 1000)
-    batch_size: int = bounded(256, 2, 1_000_000)
-    learning_rate: float = bounded(5e-4, 0, 1)
-    value_weight: float = bounded(0.1, 0, 1000)
-    gamma: float = bounded(0.98, 0, 1)
-    hidden: int = bounded(256, 1, 4096)
-    dropout: float = bounded(0.0, 0, 0.99)
-    memory: int = bounded(0, 0, 4096)
-
-    @property
-    def layers(self) -> dict[str, Any]:
-        """See the base class; a policy to begin with has the same memory."""
-        return {**super().layers, "memory": self.memory}
 
 
 # -- Episodes ----------------------------------------------------------------------------------
@@ -216,14 +165,6 @@ def train(args: Args) -> int:
             flush=True,
         )
     return 0
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit status: 0, 1 if an episode failed, 2, 130."""
-    words = list(sys.argv[1:] if argv is None else argv)
-    name = "imitation"
-    prog = f"ms-slam train {name}"
-    return exit_code(lambda: train(parse_options(Args, words, prog, name, [name])), prog)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Options of the training scripts."""
+"""Options that the training scripts have in common, and the tasks that set them."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_ty
 
 from ms_slam_env.command_line import parse
 from ms_slam_env.config import Checked, bounded, chosen, from_dict, load_yaml
-from ms_slam_env.env.config import RewardConfig
-from ms_slam_env.env.observations import POINT as OBSERVATIONS
+from ms_slam_env.env.registry import POINT as OBSERVATIONS
+from ms_slam_env.env.reward import RewardConfig
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.input_files import read_text
 from ms_slam_env.slam.configuration import is_file_name
@@ -74,14 +74,18 @@ class Problem(Checked):
     eval_episodes: int = bounded(24, 1, 100_000)
     deterministic_eval: bool = False
 
+    algorithms: ClassVar[tuple[str, ...]] = ()
+    """What a policy file of such a training may say that it is of."""
+
     def __post_init__(self) -> None:
         """Refuse values out of range, and training nowhere."""
         super().__post_init__()
         if not self.scenes:
-            raise InputError("Args.scenes names no scene")
+            raise InputError(f"{type(self).__name__}.scenes names no scene")
         terms = [term.name for term in fields(RewardConfig)]
         if not isinstance(self.without, tuple):
-            raise InputError(f"Args.without = {self.without!r} must be a list of terms")
+            given = f"{type(self).__name__}.without = {self.without!r}"
+            raise InputError(f"{given} must be a list of terms")
         for name in self.without:
             if name not in terms:
                 raise unknown("term of the reward", name, terms)
@@ -170,29 +174,6 @@ class PpoTraining(Training):
     gae_lambda: float = bounded(0.95, 0, 1)
     ent_coef: float = bounded(0.003, 0, 1)
     clip_range: float = bounded(0.2, 0, 1)
-
-
-@dataclass(frozen=True)
-class Args(PpoTraining):
-    """Train a camera-motion policy with PPO; these options are the command line.
-
-    Attributes:
-        algorithm: PPO over the actions that are not blocked, or over all of them.
-    """
-
-    out: Path = Path("runs/sb3")
-    algorithm: Literal["maskable_ppo", "ppo"] = "maskable_ppo"
-    eval_every: int = bounded(10_000, 0, 1_000_000_000)
-    references: bool = True
-    batch_size: int = bounded(128, 2, 1_000_000)
-    n_epochs: int = bounded(8, 1, 1000)
-    learning_rate: float = bounded(3e-4, 0, 1)
-    hidden: int = bounded(128, 1, 4096)
-
-    @property
-    def layers(self) -> dict[str, Any]:
-        """See `Problem`; Stable-Baselines3 sees one long vector."""
-        return {**super().layers, "candidates": 0, "image": ()}
 
 
 TASKS = Path(__file__).parent / "hyperparameters"

@@ -14,11 +14,10 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,53 +29,15 @@ from ms_slam_agents.normalization import (
     moment_tensors,
     restore_moments,
 )
-from ms_slam_agents.options import PpoTraining
 from ms_slam_agents.policy_file import Metadata, PolicyFile, Tensors
 from ms_slam_agents.sb3_state import optimizer_tensors, restore_adam
-from ms_slam_agents.training_run import TrainingRun, read_init, run_command_line
+from ms_slam_agents.trainers import PpoArgs as Args
+from ms_slam_agents.trainers import ppo as main
+from ms_slam_agents.training_run import TrainingRun, read_init, train_run
 from stable_baselines3.common.utils import explained_variance
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 from torch import Tensor, nn
 from torch.nn.functional import kl_div, mse_loss
-
-from ms_slam_env.config import bounded
-from ms_slam_env.errors import InputError
-
-
-@dataclass(frozen=True)
-class Args(PpoTraining):
-    """Train with masked PPO, with memory or without; these options are the command line.
-
-    Attributes:
-        pull: weight of the divergence from the first policy, at the start; it falls to 0 linearly.
-        pull_steps: environment steps until then.
-        memory: width of the recurrent unit; 0: the policy sees the present observation alone.
-        chunk: steps over which gradients go back through the memory; ``n_steps`` is a multiple.
-        value_weight: of the error of the value in the loss.
-    """
-
-    out: Path = Path("runs/ppo")
-    pull: float = bounded(0.0, 0, 1000)
-    pull_steps: int = bounded(100_000, 1, 1_000_000_000)
-    memory: int = bounded(0, 0, 4096)
-    chunk: int = bounded(16, 1, 10_000)
-    value_weight: float = bounded(0.5, 0, 1000)
-
-    kept: ClassVar[tuple[str, ...]] = ("memory",)
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range, chunks that leave steps over, a pull to nothing."""
-        super().__post_init__()
-        if self.memory and self.n_steps % min(self.chunk, self.n_steps):
-            raise InputError(f"n_steps = {self.n_steps} is no multiple of chunk = {self.chunk}")
-        if self.pull and self.init is None:
-            raise InputError("pull needs init, the policy to be near")
-
-    @property
-    def layers(self) -> dict[str, Any]:
-        """See the base class; a policy to begin with has the same memory."""
-        return {**super().layers, "memory": self.memory}
-
 
 # -- Experience --------------------------------------------------------------------------------
 
@@ -301,7 +262,7 @@ class Run(TrainingRun):
         file: to go on from, if there is one.
     """
 
-    algorithm = "masked_ppo"
+    (algorithm,) = Args.algorithms
 
     def __init__(self, args: Args, venv: VecNormalize, file: PolicyFile | None) -> None:
         super().__init__(args, venv.observation_space, venv.action_space, file)
@@ -374,9 +335,9 @@ def make_run(args: Args, file: PolicyFile | None, stack: ExitStack) -> Run:
     return Run(args, VecNormalize(VecMonitor(venv), gamma=args.gamma), file)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit status: 0, 2 or 130."""
-    return run_command_line(Args, "ppo", Run.algorithm, make_run, argv)
+def train(args: Args) -> int:
+    """Train as ``args`` say; return the exit code; see `train_run`."""
+    return train_run(args, Run.algorithm, make_run)
 
 
 if __name__ == "__main__":

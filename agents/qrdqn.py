@@ -18,63 +18,23 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, ClassVar
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
 from ms_slam_agents.environments import first_seed, make_venv, opened
 from ms_slam_agents.network import BLOCKED, Network, load_parameters
 from ms_slam_agents.normalization import Normalization, moment_tensors, restore_moments
-from ms_slam_agents.options import Training
 from ms_slam_agents.policy_file import Metadata, PolicyFile, Tensors
 from ms_slam_agents.sb3_state import optimizer_tensors, restore_adam
-from ms_slam_agents.training_run import TrainingRun, read_init, run_command_line
+from ms_slam_agents.trainers import QrdqnArgs as Args
+from ms_slam_agents.trainers import qrdqn as main
+from ms_slam_agents.training_run import TrainingRun, read_init, train_run
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from torch import Tensor
 from torch.nn.functional import huber_loss
-
-from ms_slam_env.config import bounded
-
-
-@dataclass(frozen=True)
-class Args(Training):
-    """Train with masked QR-DQN; these options are the command line.
-
-    Attributes:
-        quantiles: of the return of each action.
-        n_step: rewards of a return before the target network's word is taken.
-        buffer_size: transitions kept; each holds two observations of 4-byte numbers.
-        batch_size: of the gradient steps, in transitions.
-        learning_starts: environment steps before the first gradient step, of each run.
-        train_every: environment steps between gradient steps.
-        target_every: gradient steps between copies of the network to the target's.
-        epsilon: share of random actions in the end, from 1 at the start.
-        exploration: share of ``total_timesteps`` until then.
-        save_every: environment steps between savings.
-    """
-
-    out: Path = Path("runs/qrdqn")
-    quantiles: int = bounded(32, 1, 1000)
-    n_step: int = bounded(3, 1, 1000)
-    buffer_size: int = bounded(100_000, 2, 100_000_000)
-    batch_size: int = bounded(128, 1, 1_000_000)
-    learning_starts: int = bounded(5_000, 1, 1_000_000_000)
-    train_every: int = bounded(4, 1, 1_000_000)
-    target_every: int = bounded(500, 1, 1_000_000_000)
-    epsilon: float = bounded(0.02, 0, 1)
-    exploration: float = bounded(0.2, 0, 1)
-    save_every: int = bounded(2_000, 1, 1_000_000_000)
-
-    kept: ClassVar[tuple[str, ...]] = ("quantiles",)
-
-    @property
-    def layers(self) -> dict[str, int]:
-        """See `Problem`."""
-        return {**super().layers, "quantiles": self.quantiles}
-
 
 # -- Replay ------------------------------------------------------------------------------------
 
@@ -261,7 +221,7 @@ class Run(TrainingRun):
         InputError: a policy to begin with that is no QR-DQN's.
     """
 
-    algorithm = "qr_dqn"
+    (algorithm,) = Args.algorithms
 
     def __init__(self, args: Args, venv: VecEnv, file: PolicyFile | None) -> None:
         super().__init__(args, venv.observation_space, venv.action_space, file)
@@ -355,9 +315,9 @@ def make_run(args: Args, file: PolicyFile | None, stack: ExitStack) -> Run:
     return Run(args, VecMonitor(venv), file)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit status: 0, 2 or 130."""
-    return run_command_line(Args, "qrdqn", Run.algorithm, make_run, argv)
+def train(args: Args) -> int:
+    """Train as ``args`` say; return the exit code; see `train_run`."""
+    return train_run(args, Run.algorithm, make_run)
 
 
 if __name__ == "__main__":

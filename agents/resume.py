@@ -13,16 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-from ms_slam_agents.learning_curve import LATEST, read_curve
 from ms_slam_agents.options import P, Problem, named_in, of_task, of_types, shipped_tasks
-from ms_slam_agents.policy_file import ALGORITHMS, read_policy
 
 from ms_slam_env.command_line import parse
 from ms_slam_env.config import from_dict, parse_named
-from ms_slam_env.env.config import RewardConfig
-from ms_slam_env.env.embodiments import EMBODIMENTS
-from ms_slam_env.env.observations import POINT as OBSERVATIONS
 from ms_slam_env.env.planners import PLANNERS
+from ms_slam_env.env.registry import POINT as OBSERVATIONS
+from ms_slam_env.env.reward import RewardConfig
 from ms_slam_env.errors import InputError
 from ms_slam_env.report.records import to_plain
 from ms_slam_env.report.results import RESULTS
@@ -68,10 +65,22 @@ def _is_planner(text: str) -> bool:
     )
 
 
+def _algorithms() -> Collection[str]:
+    from ms_slam_agents.policy_file import ALGORITHMS  # here: builds no arm for a new run
+
+    return ALGORITHMS
+
+
+def _embodiments() -> Collection[str]:
+    from ms_slam_env.env.embodiments import EMBODIMENTS
+
+    return EMBODIMENTS
+
+
 _NAMES: dict[str, Callable[[str], bool]] = {
-    "algorithm": _one_of(lambda: ALGORITHMS),
+    "algorithm": _one_of(_algorithms),
     "also": _one_of(shipped_tasks),
-    "embodiment": _one_of(lambda: EMBODIMENTS),
+    "embodiment": _one_of(_embodiments),
     "env_id": _one_of(lambda: gym.registry),
     "image_size": lambda text: re.fullmatch("[0-9]+x[0-9]+", text) is not None,
     "observation": _one_of(OBSERVATIONS.names),
@@ -129,6 +138,9 @@ def parse_options(
 
 def _saved_options(out: Path, algorithms: Sequence[str]) -> tuple[Path, dict[str, Any]]:
     """The options of the run in ``out``, and the file that has them."""
+    from ms_slam_agents.learning_curve import LATEST, read_curve  # here: only this needs torch
+    from ms_slam_agents.policy_file import read_policy
+
     path, curve = out / LATEST, out / RESULTS
     if curve.is_file() and not path.exists():  # interrupted before there was a policy
         return curve, dict(read_curve(curve).config)

@@ -7,50 +7,20 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from dataclasses import asdict, replace
 from typing import Any
 
 from ms_slam_agents.environments import check_problem
-from ms_slam_agents.train_rllib import Args, make_run
+from ms_slam_agents.train_rllib import make_run
+from ms_slam_agents.trainers import RllibScaling as Scaling
 from ms_slam_agents.training_run import alone
 
-from ms_slam_env.command_line import parse
-from ms_slam_env.config import bounded
 from ms_slam_env.errors import InputError
 from ms_slam_env.progress import Bar
 from ms_slam_env.report.records import to_plain
 from ms_slam_env.report.results import RESULTS, write_result_folder
 from ms_slam_env.report.tables import make_table
-
-
-@dataclass(frozen=True)
-class Scaling(Args):
-    """Measure steps a second with different numbers of runners; these options are the command line.
-
-    Attributes:
-        runners: numbers of environment runners, one after the other.
-        rounds: of ``n_steps`` steps of each runner and an update, that are measured; one more comes
-            before, in which scenes are built and kernels loaded.
-    """
-
-    out: Path = Path("runs/rllib-scaling")
-    runners: tuple[int, ...] = (1, 2, 4)
-    rounds: int = bounded(2, 1, 10_000)
-    n_steps: int = bounded(128, 2, 1_000_000)
-    batch_size: int = bounded(128, 2, 1_000_000)
-
-    @property
-    def fewest_runners(self) -> int:
-        """See `Args`."""
-        return min(self.runners, default=1)
-
-
-def main(words: Sequence[str]) -> int:
-    """Measure as the command line says; return the exit code."""
-    return scale(parse(Scaling, words, "ms-slam train rllib scaling"))
 
 
 @alone

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,12 +12,10 @@ from ms_slam_agents.demonstrations import Demonstration
 from ms_slam_agents.network import Network, load_parameters
 from ms_slam_agents.normalization import Normalization, moment_tensors, restore_moments
 from ms_slam_agents.policy_file import PolicyFile
+from ms_slam_agents.trainers import ImitationArgs as Args
 from ms_slam_agents.training_run import metadata_of
 
 from ms_slam_env.report.provenance import provenance
-
-if TYPE_CHECKING:
-    from ms_slam_agents.imitation import Args
 
 
 class Student:

@@ -8,10 +8,10 @@ import time
 
 import numpy as np
 from ms_slam_agents.learning_curve import LATEST, Curve
-from ms_slam_agents.options import Args
 from ms_slam_agents.policy import action_parts
 from ms_slam_agents.policy_file import PolicyFile, write_policy
 from ms_slam_agents.sb3_state import Model, tensors_of, update_on_partial_rollout
+from ms_slam_agents.trainers import Sb3Args as Args
 from ms_slam_agents.training_run import metadata_of, stage_of
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv

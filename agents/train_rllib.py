@@ -16,8 +16,6 @@ import logging
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -27,11 +25,13 @@ import torch
 from ms_slam_agents.environments import first_seed, make_env
 from ms_slam_agents.network import Network, load_parameters
 from ms_slam_agents.normalization import Normalization, moment_tensors, restore_moments
-from ms_slam_agents.options import PpoTraining, Problem
+from ms_slam_agents.options import Problem
 from ms_slam_agents.policy import CLIP, EPSILON
 from ms_slam_agents.policy_file import PolicyFile, Tensors
 from ms_slam_agents.sb3_state import optimizer_tensors, restore_adam
-from ms_slam_agents.training_run import TrainingRun, read_init, run_command_line
+from ms_slam_agents.trainers import RllibArgs as Args
+from ms_slam_agents.trainers import rllib as main
+from ms_slam_agents.training_run import TrainingRun, read_init, train_run
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.connectors.connector_v2 import ConnectorV2
 from ray.rllib.core.columns import Columns
@@ -42,49 +42,11 @@ from ray.tune.registry import register_env
 from scipy.signal import lfilter
 from torch import Tensor
 
-from ms_slam_env.command_line import exit_code
-from ms_slam_env.config import bounded
 from ms_slam_env.errors import InputError
 
 MODULE = "default_policy"  # RLlib's name for the only one
 _ENV = "ms_slam_env"
 _MOMENTS = ("mean", "var", "count")
-
-
-@dataclass(frozen=True)
-class Args(PpoTraining):
-    """Train with masked PPO on Ray; these options are the command line.
-
-    Attributes:
-        num_envs: environment runners, one process and one thread each, on all machines together.
-        envs_per_runner: environments that a runner steps one after the other.
-        address: of a Ray cluster, or ``auto``; None: one on this machine, for this run.
-        value_weight: of the error of the value in the loss.
-    """
-
-    out: Path = Path("runs/rllib")
-    envs_per_runner: int = bounded(1, 1, 10_000)
-    address: str | None = None
-    value_weight: float = bounded(0.5, 0, 1000)
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range, and a batch that is larger than a round."""
-        super().__post_init__()
-        if self.batch_size > self.round_steps:
-            raise InputError(
-                f"batch_size = {self.batch_size} is larger than a round of {self.round_steps} "
-                "steps (n_steps x num_envs x envs_per_runner)"
-            )
-
-    @property
-    def round_steps(self) -> int:
-        """Steps of all environments between updates."""
-        return self.n_steps * max(1, self.fewest_runners) * self.envs_per_runner
-
-    @property
-    def fewest_runners(self) -> int:
-        """Environment runners that a round has at least."""
-        return self.num_envs
 
 
 # -- Environment and network -------------------------------------------------------------------
@@ -264,7 +226,7 @@ class Run(TrainingRun):
         InputError: a policy to begin with that is of another network.
     """
 
-    algorithm = "rllib_ppo"
+    (algorithm,) = Args.algorithms
 
     def __init__(self, args: Args, file: PolicyFile | None) -> None:
         env = make_env(args, "train")
@@ -378,15 +340,9 @@ def make_run(args: Args, file: PolicyFile | None, stack: ExitStack) -> Run:
     return run
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit status: 0, 2 or 130."""
-    words = list(sys.argv[1:] if argv is None else argv)
-    prog = "ms-slam train rllib"
-    if words[:1] == ["scaling"]:
-        from ms_slam_agents import rllib_scaling
-
-        return exit_code(lambda: rllib_scaling.main(words[1:]), f"{prog} scaling")
-    return run_command_line(Args, "rllib", Run.algorithm, make_run, words)
+def train(args: Args) -> int:
+    """Train as ``args`` say; return the exit code; see `train_run`."""
+    return train_run(args, Run.algorithm, make_run)
 
 
 if __name__ == "__main__":

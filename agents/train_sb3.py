@@ -2,7 +2,7 @@
 
     ms-slam train sb3 --out runs/ppo --minutes 60
 
-The options are in ``options.py``, what happens between updates in ``supervisor.py``. Writes into
+The options are in ``trainers.py``, what happens between updates in ``supervisor.py``. Writes into
 ``out``: ``latest.safetensors`` (to resume from) and ``best.safetensors`` (highest validation
 return), both fit for ``ms_slam_agents.policy`` and the planners, the learning curve with random
 walk, standing still and the greedy planner on the same validation episodes as references
@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Sequence
 
 import torch
 from ms_slam_agents.environments import (
@@ -24,12 +23,12 @@ from ms_slam_agents.environments import (
     opened,
     say_problem,
 )
-from ms_slam_agents.options import Args
 from ms_slam_agents.policy import action_parts
 from ms_slam_agents.policy_file import PolicyFile
-from ms_slam_agents.resume import parse_options
 from ms_slam_agents.sb3_state import ALGORITHMS, Model, restore, whole_batches
 from ms_slam_agents.supervisor import Supervisor
+from ms_slam_agents.trainers import Sb3Args as Args
+from ms_slam_agents.trainers import sb3 as main
 from ms_slam_agents.training_run import (
     alone,
     caught_signals,
@@ -41,7 +40,6 @@ from ms_slam_agents.training_run import (
 )
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
-from ms_slam_env.command_line import exit_code
 from ms_slam_env.interrupts import kept
 from ms_slam_env.result_folders import own_folder
 
@@ -145,13 +143,6 @@ def report(supervisor: Supervisor) -> int:
         learnt += f"; the last {supervisor.unlearnt_steps} steps, less than a batch, are not in it"
     print(f"{ended}: {steps} steps, policy in {args.out}{learnt}")
     return 128 + supervisor.signal if supervisor.signal else 0
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit status: 0, 1 if nothing was learnt, 2, 130, 143."""
-    words = list(sys.argv[1:] if argv is None else argv)
-    prog = "ms-slam train"
-    return exit_code(lambda: train(parse_options(Args, words, prog, "sb3", list(ALGORITHMS))), prog)
 
 
 if __name__ == "__main__":

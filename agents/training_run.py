@@ -4,10 +4,9 @@ save after each update and judge every so often, to stop by the clock or a signa
 from __future__ import annotations
 
 import signal
-import sys
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from functools import wraps
@@ -35,13 +34,11 @@ from ms_slam_agents.resume import (
     check_kept,
     check_new,
     check_steps_left,
-    parse_options,
     say_changes,
 )
 from stable_baselines3.common.vec_env import VecEnv
 from torch.utils.tensorboard import SummaryWriter
 
-from ms_slam_env.command_line import exit_code
 from ms_slam_env.errors import InputError
 from ms_slam_env.interrupts import kept
 from ms_slam_env.progress import Bar
@@ -192,7 +189,7 @@ def alone(train: Train) -> Train:
 
 
 @alone
-def train(
+def train_run(
     args: T, algorithm: str, make: Callable[[T, PolicyFile | None, ExitStack], TrainingRun]
 ) -> int:
     """Train as ``args`` say; return the exit status, 130 after Ctrl-C, 143 after SIGTERM.
@@ -223,21 +220,6 @@ def train(
     ended = f"interrupted by {ended_by.name}" if ended_by else "done"
     print(f"{ended}: {run.steps} steps, policy in {args.out}")
     return 128 + ended_by if ended_by else 0
-
-
-def run_command_line(
-    args: type[T],
-    name: str,
-    algorithm: str,
-    make: Callable[[T, PolicyFile | None, ExitStack], TrainingRun],
-    argv: Sequence[str] | None,
-) -> int:
-    """Run ``ms-slam train NAME``; return the exit status: 0, 1, 2, 130 or 143."""
-    words = list(sys.argv[1:] if argv is None else argv)
-    prog = f"ms-slam train {name}"
-    return exit_code(
-        lambda: train(parse_options(args, words, prog, name, [algorithm]), algorithm, make), prog
-    )
 
 
 @contextmanager

@@ -310,7 +310,8 @@ def _observations(num_motions: int, num_configurations: int) -> str:
     from gymnasium.spaces import Dict
 
     from ms_slam_env.camera import xtion
-    from ms_slam_env.env.observations import OBSERVATIONS, make_observation
+    from ms_slam_env.env.observations import make_observation
+    from ms_slam_env.env.registry import OBSERVATIONS
 
     rows = []
     for name in OBSERVATIONS:

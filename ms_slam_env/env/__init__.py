@@ -6,9 +6,10 @@ from ms_slam_env.lazy import lazy_names
 
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv
-    from ms_slam_env.env.config import EnvConfig, LookaheadConfig, RewardConfig, TargetConfig
+    from ms_slam_env.env.config import EnvConfig, LookaheadConfig
     from ms_slam_env.env.episode import Episode
     from ms_slam_env.env.planners import Planner
+    from ms_slam_env.env.reward import RewardConfig, TargetConfig
     from ms_slam_env.env.robot_knowledge import STATE_NAMES
 else:
     __getattr__ = lazy_names(__name__)

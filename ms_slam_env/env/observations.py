@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable
 from typing import Any
 
 import cv2
@@ -12,6 +10,7 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.camera import Intrinsics, intensity_image
+from ms_slam_env.env.registry import POINT, Observation
 from ms_slam_env.env.robot_knowledge import (
     DIVERGENCE_CAP,
     POSITION_SCALE_M,
@@ -19,7 +18,6 @@ from ms_slam_env.env.robot_knowledge import (
     RobotKnowledge,
     state_vector,
 )
-from ms_slam_env.extension import ExtensionPoint
 from ms_slam_env.geometry import invert
 from ms_slam_env.mapping import (
     OccupancyGrid,
@@ -60,22 +58,6 @@ _SMALLEST_STEP = 1e-6  # a motion of no length is as many steps from everywhere
 
 
 _GOAL_LOW, _GOAL_HIGH = [-2.0] * 3 + [-1.0] * 3 + [0.0] * 2, [2.0] * 3 + [1.0] * 3 + [5.0] * 2
-
-
-class Observation(ABC):
-    """One observation variant."""
-
-    space: spaces.Space[Any]
-    needs_occupancy: bool = False
-    """Whether an occupancy grid is to be carved from the frames."""
-    candidate_numbers: int = 0
-    """Numbers of each motion at the end, motion by motion, for networks that look at them so."""
-    image_shape: tuple[int, ...] = ()
-    """Channels, rows and columns of an image at the end, for networks that look at it so."""
-
-    @abstractmethod
-    def build(self, knowledge: RobotKnowledge) -> Any:
-        """Return the observation, an element of ``space``."""
 
 
 class RGBDObservation(Observation):
@@ -324,22 +306,6 @@ class WithConfiguration(Observation):
         if isinstance(observation, dict):
             return {**observation, CONFIGURATION: configuration.copy()}
         return np.concatenate([observation, configuration])
-
-
-OBSERVATIONS: dict[str, Callable[[Intrinsics, int], Observation]] = {
-    "rgbd": RGBDObservation,
-    "pixels": PixelsObservation,
-    "features": FeaturesObservation,
-    "lookahead": LookaheadObservation,
-    "map": MapObservation,
-    "goals": GoalsObservation,
-    "held": HeldObservation,
-    "candidates": CandidatesObservation,
-}
-"""Name of the option ``observation`` to variant."""
-
-POINT = ExtensionPoint("observation", "ms_slam_env.observations", Observation, own=OBSERVATIONS)
-"""Where observations are found; each is made of intrinsics and the number of motions."""
 
 
 def make_observation(

@@ -8,10 +8,83 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.env.config import RewardConfig, TargetConfig
+from ms_slam_env.config import Checked, Named, bounded
 
 _DISTANCE_CAP = 0.4  # in units of M: one violent frame must not outweigh a whole episode
 _ERROR_CAP_M = 0.1  # a lost camera's error is arbitrary; the terms for lost tracking judge it
+
+
+@dataclass(frozen=True)
+class TargetConfig(Checked):
+    """Motion-and-structure parameters and thresholds of the paper's Algorithm 1, line 9.
+
+    M_I and M_D are the medians of the maxima of hand-held sequences of which every twelfth frame
+    was kept, the sparsest that SLAM tracked without a loss (``ms-slam experiment frame_skipping``).
+    The thresholds and lambda were chosen on validation seeds: with larger ones the greedy planner
+    loses track as random walk does, with smaller ones it maps little (BENCHMARK.md).
+
+    Attributes:
+        M_I: permitted maximum of the intensity divergence, equation (11), nats.
+        M_D: permitted maximum of the depth divergence, equation (12), nats.
+        rho_I: share of M_I to aim at, in [0, 1]; 0 keeps the camera almost still.
+        rho_D: share of M_D to aim at, in [0, 1].
+        depth_weight: lambda, significance of depth over intensity.
+    """
+
+    M_I: float = bounded(0.15, 1e-6, 100)
+    M_D: float = bounded(0.36, 1e-6, 100)
+    rho_I: float = bounded(0.07, 0, 1)
+    rho_D: float = bounded(1 / 6, 0, 1)
+    depth_weight: float = bounded(0.1, 0, 1e6)
+
+    @property
+    def maxima(self) -> NDArray[np.float64]:
+        """(M_I, M_D)."""
+        return np.array([self.M_I, self.M_D])
+
+    @property
+    def divergence(self) -> NDArray[np.float64]:
+        """The divergences to aim at, (rho_I M_I, rho_D M_D)."""
+        return np.array([self.rho_I * self.M_I, self.rho_D * self.M_D])
+
+    def distances(self, divergences: NDArray[np.float64]) -> NDArray[np.float64]:
+        """How far divergences (..., 2), nats, are from those to aim at, in units of (M_I, M_D)."""
+        return np.abs(divergences - self.divergence) / self.maxima
+
+
+@dataclass(frozen=True)
+class RewardConfig(Checked, Named):
+    """Weights of the reward terms; see :func:`reward_terms` for each term.
+
+    ``paper`` stands for what the paper's planner looks at, the distances to the divergence targets,
+    and its measure of success, the trajectory error; it asks for no map.
+
+    Attributes:
+        intensity_divergence: per M_I of distance to the intensity target.
+        depth_divergence: per M_D of distance to the depth target (times lambda).
+        trajectory_error: per metre of growth of the pose error.
+        new_surface: per square metre of surface newly mapped in its true place.
+        lost: per step with tracking lost.
+        lost_for_good: once, when the episode ends because tracking was lost beyond recovery.
+        blocked: per masked action chosen.
+        compute: per unit of the SLAM configuration's cost, where the agent chooses it
+            (``MSActiveSLAM-Adaptive-v0``).
+    """
+
+    intensity_divergence: float = bounded(0.5, 0, 1e6)
+    depth_divergence: float = bounded(0.5, 0, 1e6)
+    trajectory_error: float = bounded(10.0, 0, 1e6)
+    new_surface: float = bounded(1.0, 0, 1e6)
+    lost: float = bounded(0.5, 0, 1e6)
+    lost_for_good: float = bounded(10.0, 0, 1e6)
+    blocked: float = bounded(0.1, 0, 1e6)
+    compute: float = bounded(0.1, 0, 1e6)
+
+    @classmethod
+    def named(cls) -> Mapping[str, RewardConfig]:
+        """The weights by name."""
+        unasked = ("new_surface", "lost", "lost_for_good", "blocked", "compute")
+        return {"default": cls(), "paper": cls(**dict.fromkeys(unasked, 0.0))}
 
 
 @dataclass(frozen=True)

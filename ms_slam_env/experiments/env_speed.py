@@ -13,7 +13,7 @@ import numpy as np
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.env.embodiments import EMBODIMENTS
-from ms_slam_env.env.observations import OBSERVATIONS
+from ms_slam_env.env.registry import OBSERVATIONS
 from ms_slam_env.errors import unknown
 from ms_slam_env.experiments.harness.experiment import Experiment
 from ms_slam_env.report.records import Row

@@ -7,7 +7,16 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
-from ms_slam_agents import environments, imitation, options, ppo, qrdqn, resume, train_sb3
+from ms_slam_agents import (
+    environments,
+    imitation,
+    options,
+    ppo,
+    qrdqn,
+    resume,
+    train_sb3,
+    trainers,
+)
 
 from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.errors import InputError
@@ -67,7 +76,7 @@ def test_a_file_of_ones_own(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("ppo: {gama: 0.7}", "unknown option of Args 'gama'; valid choices"),
+        ("ppo: {gama: 0.7}", "unknown option of PpoArgs 'gama'; valid choices"),
         ("ppo: {gamma: 7}", "gamma"),
         ("ppo: {gamma: high}", "gamma"),
         ("problem: {scenes: 3}", "scenes"),
@@ -87,6 +96,21 @@ def test_what_a_file_cannot_say_is_one_line_with_its_name(tmp_path, text, said, 
         parsed(["--task", str(path)])
     assert ppo.main(["--task", str(path), "--out", str(tmp_path / "out")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_extra_that_is_missing_is_named_once_the_options_are_right(
+    tmp_path, capsys, monkeypatch
+):
+    def missing(name):
+        raise ModuleNotFoundError("No module named 'torch'", name="torch")
+
+    monkeypatch.setattr("ms_slam_env.extension.import_module", missing)
+    words = ["--out", str(tmp_path / "out")]
+    assert trainers.ppo([*words, "--typo"]) == 2
+    assert "Unrecognized options: --typo" in capsys.readouterr().err
+    assert trainers.ppo(words) == 2
+    assert "No module named 'torch'; pip install 'ms-slam-env[train]'" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

@@ -151,7 +151,7 @@ def test_what_the_task_of_the_command_line_names_counts_as_said(stranger):
         ({"hidden": 1e9}, "hidden"),
         ({"num_envs": "2"}, "num_envs"),
         ({"scenes": 3}, "scenes"),
-        ({"nope": 1}, "unknown option of Args 'nope'"),
+        ({"nope": 1}, "unknown option of PpoArgs 'nope'"),
         ({"scenes": [["table"]]}, "scenes"),
     ],
 )

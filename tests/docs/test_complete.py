@@ -11,7 +11,7 @@ import pytest
 
 from ms_slam_env import scenes, slam, tasks
 from ms_slam_env.cli import COMMANDS
-from ms_slam_env.env.observations import OBSERVATIONS
+from ms_slam_env.env.registry import OBSERVATIONS
 from ms_slam_env.experiments.harness import experiment_class, experiment_names
 from ms_slam_env.report.results import read_results
 from ms_slam_env.sequences.perturbations import PERTURBATIONS

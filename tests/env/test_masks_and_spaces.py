@@ -7,7 +7,7 @@ import pytest
 import ms_slam_env
 from ms_slam_env.env import STATE_NAMES
 from ms_slam_env.env.actions import MaskedDiscrete, MaskedMultiDiscrete
-from ms_slam_env.env.observations import OBSERVATIONS
+from ms_slam_env.env.registry import OBSERVATIONS
 from ms_slam_env.geometry import invert
 from ms_slam_env.robot import ROTATIONS, TRANSLATIONS
 

@@ -1,0 +1,294 @@
+"""``ms-slam train NAME``: the options of each trainer, and what trains once they are right.
+
+Torch, Stable-Baselines3 and Ray take seconds to load: an option that is refused waits for none.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal, get_args
+
+from ms_slam_agents.options import PpoTraining, Problem, Training
+from ms_slam_agents.resume import parse_options
+
+from ms_slam_env.command_line import exit_code, parse
+from ms_slam_env.config import bounded
+from ms_slam_env.errors import InputError
+from ms_slam_env.extension import ExtensionPoint
+
+Sb3Algorithm = Literal["maskable_ppo", "ppo"]
+
+
+@dataclass(frozen=True)
+class Sb3Args(PpoTraining):
+    """Train a camera-motion policy with PPO; these options are the command line.
+
+    Attributes:
+        algorithm: PPO over the actions that are not blocked, or over all of them.
+    """
+
+    out: Path = Path("runs/sb3")
+    algorithm: Sb3Algorithm = "maskable_ppo"
+    eval_every: int = bounded(10_000, 0, 1_000_000_000)
+    references: bool = True
+    batch_size: int = bounded(128, 2, 1_000_000)
+    n_epochs: int = bounded(8, 1, 1000)
+    learning_rate: float = bounded(3e-4, 0, 1)
+    hidden: int = bounded(128, 1, 4096)
+
+    algorithms = get_args(Sb3Algorithm)
+
+    @property
+    def layers(self) -> dict[str, Any]:
+        """See `Problem`; Stable-Baselines3 sees one long vector."""
+        return {**super().layers, "candidates": 0, "image": ()}
+
+
+@dataclass(frozen=True)
+class ImitationArgs(Problem):
+    """Learn from a planner; these options are the command line.
+
+    Attributes:
+        teacher: a planner, NAME,option=value,...
+        init: policy file to begin with, its network and normalisation; it may be of another task.
+        through: planner that the policy acts through in the rounds after the first, as its option
+            ``path``: `agent-home` has goals for the way to what is not near by. Then only the
+            decisions count that the teacher weighs. None: the policy acts by itself.
+        rounds: of episodes and fitting; in the first the teacher acts.
+        episodes: of each round.
+        share: of the decisions that are the teacher's in the second round; half as many in each
+            round after it.
+        epochs: passes over all episodes so far, each round.
+        batch_size: of the gradient steps.
+        learning_rate: of Adam.
+        value_weight: of the error of the value in the loss.
+        gamma: discount factor of the returns.
+        hidden: width of the two hidden layers.
+        dropout: share of what the layers see that is zero, drawn anew for each gradient step.
+        memory: width of the recurrent unit; 0: the policy sees the present observation alone. With
+            one, a batch is of whole episodes, as many as have ``batch_size`` steps together, one
+            at least.
+    """
+
+    out: Path = Path("runs/imitation")
+    teacher: str = "nbv"
+    init: Path | None = None
+    through: str | None = None
+    rounds: int = bounded(5, 1, 1000)
+    episodes: int = bounded(40, 1, 100_000)
+    share: float = bounded(0.5, 0, 1)
+    epochs: int = bounded(10, 1, 1000)
+    batch_size: int = bounded(256, 2, 1_000_000)
+    learning_rate: float = bounded(5e-4, 0, 1)
+    value_weight: float = bounded(0.1, 0, 1000)
+    gamma: float = bounded(0.98, 0, 1)
+    hidden: int = bounded(256, 1, 4096)
+    dropout: float = bounded(0.0, 0, 0.99)
+    memory: int = bounded(0, 0, 4096)
+
+    algorithms = ("imitation",)
+
+    @property
+    def layers(self) -> dict[str, Any]:
+        """See the base class; a policy to begin with has the same memory."""
+        return {**super().layers, "memory": self.memory}
+
+
+@dataclass(frozen=True)
+class PpoArgs(PpoTraining):
+    """Train with masked PPO, with memory or without; these options are the command line.
+
+    Attributes:
+        pull: weight of the divergence from the first policy, at the start; it falls to 0 linearly.
+        pull_steps: environment steps until then.
+        memory: width of the recurrent unit; 0: the policy sees the present observation alone.
+        chunk: steps over which gradients go back through the memory; ``n_steps`` is a multiple.
+        value_weight: of the error of the value in the loss.
+    """
+
+    out: Path = Path("runs/ppo")
+    pull: float = bounded(0.0, 0, 1000)
+    pull_steps: int = bounded(100_000, 1, 1_000_000_000)
+    memory: int = bounded(0, 0, 4096)
+    chunk: int = bounded(16, 1, 10_000)
+    value_weight: float = bounded(0.5, 0, 1000)
+
+    algorithms = ("masked_ppo",)
+    kept: ClassVar[tuple[str, ...]] = ("memory",)
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range, chunks that leave steps over, a pull to nothing."""
+        super().__post_init__()
+        if self.memory and self.n_steps % min(self.chunk, self.n_steps):
+            raise InputError(f"n_steps = {self.n_steps} is no multiple of chunk = {self.chunk}")
+        if self.pull and self.init is None:
+            raise InputError("pull needs init, the policy to be near")
+
+    @property
+    def layers(self) -> dict[str, Any]:
+        """See the base class; a policy to begin with has the same memory."""
+        return {**super().layers, "memory": self.memory}
+
+
+@dataclass(frozen=True)
+class QrdqnArgs(Training):
+    """Train with masked QR-DQN; these options are the command line.
+
+    Attributes:
+        quantiles: of the return of each action.
+        n_step: rewards of a return before the target network's word is taken.
+        buffer_size: transitions kept; each holds two observations of 4-byte numbers.
+        batch_size: of the gradient steps, in transitions.
+        learning_starts: environment steps before the first gradient step, of each run.
+        train_every: environment steps between gradient steps.
+        target_every: gradient steps between copies of the network to the target's.
+        epsilon: share of random actions in the end, from 1 at the start.
+        exploration: share of ``total_timesteps`` until then.
+        save_every: environment steps between savings.
+    """
+
+    out: Path = Path("runs/qrdqn")
+    quantiles: int = bounded(32, 1, 1000)
+    n_step: int = bounded(3, 1, 1000)
+    buffer_size: int = bounded(100_000, 2, 100_000_000)
+    batch_size: int = bounded(128, 1, 1_000_000)
+    learning_starts: int = bounded(5_000, 1, 1_000_000_000)
+    train_every: int = bounded(4, 1, 1_000_000)
+    target_every: int = bounded(500, 1, 1_000_000_000)
+    epsilon: float = bounded(0.02, 0, 1)
+    exploration: float = bounded(0.2, 0, 1)
+    save_every: int = bounded(2_000, 1, 1_000_000_000)
+
+    algorithms = ("qr_dqn",)
+    kept: ClassVar[tuple[str, ...]] = ("quantiles",)
+
+    @property
+    def layers(self) -> dict[str, int]:
+        """See `Problem`."""
+        return {**super().layers, "quantiles": self.quantiles}
+
+
+@dataclass(frozen=True)
+class RllibArgs(PpoTraining):
+    """Train with masked PPO on Ray; these options are the command line.
+
+    Attributes:
+        num_envs: environment runners, one process and one thread each, on all machines together.
+        envs_per_runner: environments that a runner steps one after the other.
+        address: of a Ray cluster, or ``auto``; None: one on this machine, for this run.
+        value_weight: of the error of the value in the loss.
+    """
+
+    out: Path = Path("runs/rllib")
+    envs_per_runner: int = bounded(1, 1, 10_000)
+    address: str | None = None
+    value_weight: float = bounded(0.5, 0, 1000)
+
+    algorithms = ("rllib_ppo",)
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range, and a batch that is larger than a round."""
+        super().__post_init__()
+        if self.batch_size > self.round_steps:
+            raise InputError(
+                f"batch_size = {self.batch_size} is larger than a round of {self.round_steps} "
+                "steps (n_steps x num_envs x envs_per_runner)"
+            )
+
+    @property
+    def round_steps(self) -> int:
+        """Steps of all environments between updates."""
+        return self.n_steps * max(1, self.fewest_runners) * self.envs_per_runner
+
+    @property
+    def fewest_runners(self) -> int:
+        """Environment runners that a round has at least."""
+        return self.num_envs
+
+
+@dataclass(frozen=True)
+class RllibScaling(RllibArgs):
+    """Measure steps a second with different numbers of runners; these options are the command line.
+
+    Attributes:
+        runners: numbers of environment runners, one after the other.
+        rounds: of ``n_steps`` steps of each runner and an update, that are measured; one more comes
+            before, in which scenes are built and kernels loaded.
+    """
+
+    out: Path = Path("runs/rllib-scaling")
+    runners: tuple[int, ...] = (1, 2, 4)
+    rounds: int = bounded(2, 1, 10_000)
+    n_steps: int = bounded(128, 2, 1_000_000)
+    batch_size: int = bounded(128, 2, 1_000_000)
+
+    @property
+    def fewest_runners(self) -> int:
+        """See `RllibArgs`."""
+        return min(self.runners, default=1)
+
+
+# -- Command lines -----------------------------------------------------------------------------
+
+_TRAINING = ExtensionPoint(
+    "trainer",
+    "ms_slam_env.trainers",
+    own={
+        "sb3": "ms_slam_agents.train_sb3:train",
+        "imitation": "ms_slam_agents.imitation:train",
+        "ppo": "ms_slam_agents.ppo:train",
+        "qrdqn": "ms_slam_agents.qrdqn:train",
+        "rllib": "ms_slam_agents.train_rllib:train",
+        "rllib scaling": "ms_slam_agents.rllib_scaling:scale",
+    },
+)
+"""What trains as its options, of the types above, say; returns the exit code."""
+
+
+def sb3(argv: Sequence[str] | None = None) -> int:
+    """``ms-slam train sb3``; return the exit code: 0, 1 if nothing was learnt, 2, 130, 143."""
+    return _run("sb3", Sb3Args, argv, "ms-slam train")
+
+
+def imitation(argv: Sequence[str] | None = None) -> int:
+    """``ms-slam train imitation``; return the exit code: 0, 1 if an episode failed, 2, 130."""
+    return _run("imitation", ImitationArgs, argv)
+
+
+def ppo(argv: Sequence[str] | None = None) -> int:
+    """``ms-slam train ppo``; return the exit code: 0, 1, 2, 130 or 143."""
+    return _run("ppo", PpoArgs, argv)
+
+
+def qrdqn(argv: Sequence[str] | None = None) -> int:
+    """``ms-slam train qrdqn``; return the exit code: 0, 1, 2, 130 or 143."""
+    return _run("qrdqn", QrdqnArgs, argv)
+
+
+def rllib(argv: Sequence[str] | None = None) -> int:
+    """``ms-slam train rllib [scaling]``; return the exit code: 0, 1, 2, 130 or 143."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    if words[:1] != ["scaling"]:
+        return _run("rllib", RllibArgs, words)
+    prog = "ms-slam train rllib scaling"
+
+    def run() -> int:
+        args = parse(RllibScaling, words[1:], prog)
+        return int(_TRAINING.find("rllib scaling")(args))
+
+    return exit_code(run, prog)
+
+
+def _run(name: str, cls: type[Problem], argv: Sequence[str] | None, prog: str = "") -> int:
+    """Read the options ``cls`` of a command line, then train."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    prog = prog or f"ms-slam train {name}"
+
+    def run() -> int:
+        args = parse_options(cls, words, prog, name, cls.algorithms)
+        return int(_TRAINING.find(name)(args))
+
+    return exit_code(run, prog)
