@@ -18,12 +18,16 @@ AT_IMPORT = """
 import os, signal, sys
 
 class Sender:
-    '''Sends a signal when a module is imported that its importer can do without.'''
+    '''Sends a signal when a module is imported, in code that goes on whatever is raised.'''
 
     def find_spec(self, name, path=None, target=None):
-        if name == "networkx":  # in trimesh.graph: try ... except BaseException
+        if name == "scipy":
             sys.meta_path.remove(self)
-            os.kill(os.getpid(), int(sys.argv[1]))
+            try:  # as trimesh imports what it can do without
+                os.kill(os.getpid(), int(sys.argv[1]))
+                sum(range(10**6))  # meanwhile it arrives
+            except BaseException:
+                pass
         return None
 
 sys.meta_path.insert(0, Sender())

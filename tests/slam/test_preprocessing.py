@@ -172,7 +172,7 @@ def test_a_batch_equals_its_frames_alone():
             )
 
 
-@pytest.mark.parametrize("value", [float("nan"), -0.1, 10.5])
+@pytest.mark.parametrize("value", [float("nan"), -0.1, 12.5])
 def test_bad_cutoff_is_refused(value):
     with pytest.raises(ValueError, match="depth_cutoff_m"):
         SurfelConfig(depth_cutoff_m=value)
