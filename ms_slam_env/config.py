@@ -133,7 +133,15 @@ def from_dict(cls: type[T], values: Mapping[str, Any], path: str = "") -> T:
         ):
             raise _no_mapping(where, value, hint, names)
         arguments[key] = value
+    missing = [name for name, field in fields.items() if _is_needed(field) and name not in values]
+    if missing:
+        raise InputError(f"{path or cls.__name__} lacks {', '.join(missing)}")
     return cls(**arguments)
+
+
+def _is_needed(field: dataclasses.Field[Any]) -> bool:
+    none = dataclasses.MISSING
+    return field.default is none and field.default_factory is none
 
 
 def _nested(values: Mapping[str, Any], path: str) -> Mapping[str, Any]:

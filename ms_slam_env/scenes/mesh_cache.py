@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import zipfile
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -30,8 +29,6 @@ MOST_BYTES = 2 * 1024**3
 """Of all entries together."""
 
 Arrays = dict[str, NDArray[Any]]
-
-_UNREADABLE = (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile)
 
 
 def folder() -> Path | None:
@@ -58,7 +55,8 @@ def remembered(name: str, work_out: Callable[[], Arrays]) -> Arrays:
     if place is None:
         return work_out()
     path = place / f"mesh-{name}.npz"
-    with suppress(*_UNREADABLE), np.load(path, allow_pickle=False) as stored:
+    # Whatever a damaged archive makes its readers raise: it is made anew.
+    with suppress(Exception), np.load(path, allow_pickle=False) as stored:
         found = {array: stored[array] for array in stored["names"].tolist()}
         os.utime(path)
         return found

@@ -70,9 +70,9 @@ def backend_name(cls_name: object) -> str:
         InputError: none of ours has.
     """
     names = {entry.backend: name for name, entry in _OWN.items()}
-    if cls_name not in names:
+    if not isinstance(cls_name, str) or cls_name not in names:
         raise unknown("SLAM backend", cls_name, names)
-    return names[str(cls_name)]
+    return names[cls_name]
 
 
 def check_parameters(name: object, params: object) -> Any:

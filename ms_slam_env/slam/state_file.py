@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
@@ -35,7 +36,7 @@ _CONTAINERS = {"list": list, "tuple": tuple}
 _BROKEN = (
     *(OSError, EOFError, ValueError, KeyError, TypeError, IndexError, AttributeError),
     *(NotImplementedError, RecursionError, MemoryError, OverflowError, RuntimeError),
-    *(zipfile.BadZipFile, zlib.error),
+    *(zipfile.BadZipFile, zlib.error, tokenize.TokenError, SyntaxError),  # headers are Python
 )
 """Whatever the readers of zip archives, of JSON and of arrays raise at what is none."""
 

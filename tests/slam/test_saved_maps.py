@@ -273,3 +273,26 @@ def test_a_map_with_room_for_more_than_there_is_memory_is_refused(saved, monkeyp
     monkeypatch.setattr("ms_slam_env.slam.surfel.surfels.roomy_zeros", no_memory)
     with pytest.raises(InputError, match=f"{path}: no memory for a map of max_surfels = 50000000"):
         slam.open_map(path)
+
+
+@pytest.mark.parametrize("old", [b"'shape'", b"(2, 4", b"{", b"}"])
+def test_a_broken_header_of_an_array_is_no_map(saved, old):
+    """NumPy reads it as Python and raises what Python's tokens raise."""
+    data = _array((2, 4)).replace(old, b"[" * len(old), 1)
+    path = _forged(saved, _with_poses({"array": 900}), **{"900": data})
+    assert "damaged, or no map" in _refusal(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda about: about["intrinsics"].pop("fy"), "intrinsics lacks fy"),
+        (lambda about: about["intrinsics"].clear(), "lacks fx, fy, cx, cy, width, height"),
+        (lambda about: about.update(backend=["surfel"]), "unknown SLAM backend"),
+        (lambda about: about.update(backend={}), "unknown SLAM backend"),
+    ],
+)
+def test_what_a_map_is_of_may_not_be_left_open(saved, change, said):
+    path = _forged(saved, lambda header: change(header["about"]))
+    with pytest.raises(InputError, match=said):
+        slam.open_map(path)
