@@ -217,3 +217,12 @@ def test_seven_scenes_takes_colour_as_jpeg(tmp_path: Path) -> None:
     recording = open_recording(tmp_path)
     assert recording.has_color
     assert abs(int(recording.frame(1).color[4, 4, 0]) - 9) < 3
+
+
+def test_an_id_of_any_length_is_compared_with_the_name(tmp_path: Path) -> None:
+    folder = make(tmp_path / "s", ["0", "1"], "rgb")
+    (folder / "times.txt").write_text("00000 0.0\n0001 0.1\n")
+    np.testing.assert_allclose(open_recording(folder).timestamps, [0.0, 0.1])
+    (folder / "times.txt").write_text(f"0 0.0\n{5000 * '1'} 0.1\n")  # more digits than int takes
+    with pytest.raises(InputError, match=r"times\.txt:2"):
+        open_recording(folder)

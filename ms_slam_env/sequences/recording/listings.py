@@ -137,9 +137,9 @@ def listed_times(path: Path, names: Sequence[str]) -> Float64:
 
 def _is_id(word: str, name: str) -> bool:
     """Whether a word is a name, or the number in it."""
-    numbers = re.findall(r"\d+", name)
-    is_number = word.isdecimal() and len(numbers) == 1 and int(word) == int(numbers[0])
-    return word.rpartition(".")[0] == name or word == name or is_number
+    numbers = [number.lstrip("0") for number in re.findall(r"[0-9]+", name)]
+    is_number = re.fullmatch("[0-9]+", word) and numbers == [word.lstrip("0")]
+    return word.rpartition(".")[0] == name or word == name or bool(is_number)
 
 
 def read_pose(path: Path) -> Float64 | None:
