@@ -125,7 +125,7 @@ class PpoArgs(PpoTraining):
         if self.memory and self.n_steps % min(self.chunk, self.n_steps):
             raise InputError(f"n_steps = {self.n_steps} is no multiple of chunk = {self.chunk}")
         if self.pull and self.init is None:
-            raise InputError("pull needs init, the policy to be near")
+            raise InputError("--pull needs --init (the policy to stay close to)")
 
     @property
     def layers(self) -> dict[str, Any]:

@@ -30,7 +30,7 @@ if CHECKED:
 
 @lru_cache
 def read_header(name: str) -> str:
-    """Text of a header, which includes no other one unless it holds functions."""
+    """Return the text of a header; what functions include must include nothing itself."""
     return (_HERE / f"{name}.h").read_text(encoding="utf-8")
 
 

@@ -317,7 +317,7 @@ def test_without_weight_the_value_is_left_as_it_is(tmp_path):
 @pytest.mark.parametrize(
     ("more", "said"),
     [
-        (("--pull", "1"), "pull needs init"),
+        (("--pull", "1"), "--pull needs --init"),
         (("--memory", "4", "--n-steps", "40", "--chunk", "16"), "no multiple of chunk = 16"),
         (("--seed", "-1"), "seed = -1"),
     ],
