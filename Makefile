@@ -13,7 +13,7 @@ export OPENBLAS_NUM_THREADS := 1
 CHECKED_TESTS := tests/slam/test_any_size.py tests/slam/test_splatting.py \
     tests/slam/test_frustum_culling.py tests/slam/test_fusion.py tests/sensor/test_depth_noise.py \
     tests/sensor/test_shading.py tests/divergence/test_batched_divergence.py \
-    tests/mapping/test_occupancy_grid.py tests/env/test_reward_and_coverage.py
+    tests/planning/test_occupancy_grid.py tests/env/test_reward_and_coverage.py
 
 .PHONY: install test benchmark docs lint types clean
 

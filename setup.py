@@ -1,10 +1,33 @@
-"""What pyproject.toml cannot say: found packages beside two that are installed under other names.
+"""What pyproject.toml cannot say: packages that are installed under other names, or not at all.
 
-`agents` and `baselines` are too general for site-packages (`agents` is another package there).
+`agents`, `baselines` and `experiments` are too general for site-packages (`agents` is another
+package there). The experiments are the project's own research: a checkout that is installed with
+``pip install -e`` has them, a wheel does not.
 """
 
 from setuptools import find_packages, setup
+from setuptools.command.build_py import build_py
 
-RENAMED = {"ms_slam_agents": "agents", "ms_slam_baselines": "baselines"}
+RENAMED = {
+    "ms_slam_agents": "agents",
+    "ms_slam_baselines": "baselines",
+    "ms_slam_experiments": "experiments",
+}
+CHECKOUT_ONLY = "ms_slam_experiments"
 
-setup(packages=[*find_packages(include=["ms_slam_env*"]), *RENAMED], package_dir=RENAMED)
+
+class BuildPy(build_py):
+    """Leave the experiments out of what is not editable."""
+
+    def finalize_options(self) -> None:
+        """Tell by what setuptools says of the build."""
+        super().finalize_options()
+        if not self.editable_mode:
+            self.packages = [name for name in self.packages if name != CHECKOUT_ONLY]
+
+
+setup(
+    packages=[*find_packages(include=["ms_slam_env*"]), *RENAMED],
+    package_dir=RENAMED,
+    cmdclass={"build_py": BuildPy},
+)

@@ -18,9 +18,9 @@ from typing import Any, TypeVar
 import gymnasium as gym
 import numpy as np
 
+from ms_slam_env._runtime.input_files import read_text
 from ms_slam_env.config import Checked, bounded, from_dict, load_yaml
 from ms_slam_env.errors import InputError
-from ms_slam_env.input_files import read_text
 from ms_slam_env.sequences.perturbations import make_perturbation
 
 P = TypeVar("P")

@@ -12,10 +12,10 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.input_files import MAX_MESH_BYTES, check_file
+from ms_slam_env._runtime.output_files import write_bytes
 from ms_slam_env.env.planners import Planner, make_planner
 from ms_slam_env.errors import InputError
-from ms_slam_env.input_files import MAX_MESH_BYTES, check_file
-from ms_slam_env.output_files import write_bytes
 from ms_slam_env.slam.state_file import check_expansion
 
 _PLANNER, _POLICY = 1, 2  # streams of an episode's seed; the environment draws from the seed itself

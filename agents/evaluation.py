@@ -20,7 +20,7 @@ from ms_slam_baselines.greedy import distance_to_targets
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from ms_slam_env.progress import Bar
+from ms_slam_env._runtime.progress import Bar
 
 Choose = Callable[
     [NDArray[Any], NDArray[np.bool_], Sequence[np.random.Generator], NDArray[np.bool_]], Actions

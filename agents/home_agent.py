@@ -10,9 +10,9 @@ from ms_slam_baselines.nbv import NextBestView
 from numpy.typing import NDArray
 
 from ms_slam_env.errors import unknown
-from ms_slam_env.mapping.candidates import GRID_NAMES
-from ms_slam_env.mapping.trackability import NEAR_SHARE, bearable, leads_on
-from ms_slam_env.mapping.view_goals import best_goal
+from ms_slam_env.planning.candidates import GRID_NAMES
+from ms_slam_env.planning.trackability import NEAR_SHARE, bearable, leads_on
+from ms_slam_env.planning.view_goals import best_goal
 
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv

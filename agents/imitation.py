@@ -33,14 +33,14 @@ from ms_slam_agents.trainers import ImitationArgs as Args
 from ms_slam_agents.trainers import imitation as main
 from ms_slam_agents.training_run import alone, read_run, read_similar, saved_curve
 
+from ms_slam_env._runtime.parallel import one_thread_unless_set, open_pool, run_each
+from ms_slam_env._runtime.progress import Bar
+from ms_slam_env._runtime.result_folders import own_folder
 from ms_slam_env.config import parse_named
 from ms_slam_env.env.planners import PLANNERS, check_planner
 from ms_slam_env.errors import InputError
-from ms_slam_env.parallel import one_thread_unless_set, open_pool, run_each
-from ms_slam_env.progress import Bar
 from ms_slam_env.report.records import to_plain
 from ms_slam_env.report.results import RESULTS
-from ms_slam_env.result_folders import own_folder
 
 _TRAINING_SEED = 500_000  # of the first episode
 _OWN_PROBLEM = {*KEPT, "teacher", "episodes", "epochs", "seed", "memory"}

@@ -8,12 +8,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
 
-from ms_slam_env.command_line import parse
+from ms_slam_env._runtime.command_line import parse
+from ms_slam_env._runtime.input_files import read_text
 from ms_slam_env.config import Checked, bounded, chosen, from_dict, load_yaml
 from ms_slam_env.env.registry import POINT as OBSERVATIONS
 from ms_slam_env.env.reward import RewardConfig
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.input_files import read_text
 from ms_slam_env.slam.configuration import is_file_name
 
 

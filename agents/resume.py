@@ -15,7 +15,7 @@ from typing import Any
 import gymnasium as gym
 from ms_slam_agents.options import P, Problem, named_in, of_task, of_types, shipped_tasks
 
-from ms_slam_env.command_line import parse
+from ms_slam_env._runtime.command_line import parse
 from ms_slam_env.config import from_dict, parse_named
 from ms_slam_env.env.planners import PLANNERS
 from ms_slam_env.env.registry import POINT as OBSERVATIONS

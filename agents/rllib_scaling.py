@@ -16,8 +16,8 @@ from ms_slam_agents.train_rllib import make_run
 from ms_slam_agents.trainers import RllibScaling as Scaling
 from ms_slam_agents.training_run import alone
 
+from ms_slam_env._runtime.progress import Bar
 from ms_slam_env.errors import InputError
-from ms_slam_env.progress import Bar
 from ms_slam_env.report.records import to_plain
 from ms_slam_env.report.results import RESULTS, write_result_folder
 from ms_slam_env.report.tables import make_table

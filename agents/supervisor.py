@@ -16,7 +16,7 @@ from ms_slam_agents.training_run import metadata_of, stage_of
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from ms_slam_env.progress import Bar
+from ms_slam_env._runtime.progress import Bar
 from ms_slam_env.report.provenance import provenance
 
 

@@ -40,8 +40,8 @@ from ms_slam_agents.training_run import (
 )
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
-from ms_slam_env.interrupts import kept
-from ms_slam_env.result_folders import own_folder
+from ms_slam_env._runtime.interrupts import kept
+from ms_slam_env._runtime.result_folders import own_folder
 
 
 def make_model(args: Args, venv: VecEnv, file: PolicyFile | None) -> Model:

@@ -14,10 +14,10 @@ from typing import Any, ClassVar, Literal, get_args
 from ms_slam_agents.options import PpoTraining, Problem, Training
 from ms_slam_agents.resume import parse_options
 
-from ms_slam_env.command_line import exit_code, parse
+from ms_slam_env._runtime.command_line import exit_code, parse
+from ms_slam_env._runtime.extension import ExtensionPoint
 from ms_slam_env.config import bounded
 from ms_slam_env.errors import InputError
-from ms_slam_env.extension import ExtensionPoint
 
 Sb3Algorithm = Literal["maskable_ppo", "ppo"]
 

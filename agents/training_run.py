@@ -39,13 +39,13 @@ from ms_slam_agents.resume import (
 from stable_baselines3.common.vec_env import VecEnv
 from torch.utils.tensorboard import SummaryWriter
 
+from ms_slam_env._runtime.interrupts import kept
+from ms_slam_env._runtime.progress import Bar
+from ms_slam_env._runtime.result_folders import alone_in, own_folder
 from ms_slam_env.errors import InputError
-from ms_slam_env.interrupts import kept
-from ms_slam_env.progress import Bar
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import to_plain
 from ms_slam_env.report.results import RESULTS
-from ms_slam_env.result_folders import alone_in, own_folder
 
 T = TypeVar("T", bound=Training)
 Train = TypeVar("Train", bound=Callable[..., int])

@@ -11,9 +11,9 @@ from ms_slam_baselines.nbv import NextBestView
 from ms_slam_baselines.view_goals import poses_between
 
 from ms_slam_env.geometry import adjoint, hat, invert
-from ms_slam_env.mapping import view_information
-from ms_slam_env.mapping.trackability import SCALE, mean_depth, risk_of
-from ms_slam_env.mapping.view_goals import distance_in_steps
+from ms_slam_env.planning import view_information
+from ms_slam_env.planning.trackability import SCALE, mean_depth, risk_of
+from ms_slam_env.planning.view_goals import distance_in_steps
 from ms_slam_env.slam.base import Views
 
 CORRECT_M = 0.05

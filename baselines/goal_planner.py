@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from ms_slam_env.config import check_range, check_whole
 from ms_slam_env.env import Planner
 from ms_slam_env.geometry import look_at, make_pose
-from ms_slam_env.mapping import FREE, OccupancyMap, expected_gain, shortest_ways
-from ms_slam_env.mapping.view_goals import distance_in_steps
+from ms_slam_env.planning import FREE, OccupancyMap, expected_gain, shortest_ways
+from ms_slam_env.planning.view_goals import distance_in_steps
 
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv

@@ -12,7 +12,7 @@ from ms_slam_baselines.view_goals import frontiers, poses_between, views_of
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import transform_points
-from ms_slam_env.mapping.view_goals import distance_in_steps
+from ms_slam_env.planning.view_goals import distance_in_steps
 
 _AWAY_M = 1.2  # from which a frontier is looked at
 _APART = 3.0  # steps between two keyframes

@@ -11,8 +11,8 @@ from ms_slam_baselines.greedy import distance_to_targets
 from numpy.typing import NDArray
 
 from ms_slam_env.divergence import make_divergence
-from ms_slam_env.mapping.trackability import SCALE
-from ms_slam_env.mapping.view_goals import distance_in_steps
+from ms_slam_env.planning.trackability import SCALE
+from ms_slam_env.planning.view_goals import distance_in_steps
 
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv

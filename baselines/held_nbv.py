@@ -8,7 +8,7 @@ import numpy as np
 from ms_slam_baselines.nbv import NextBestView
 from numpy.typing import NDArray
 
-from ms_slam_env.mapping import held_gain
+from ms_slam_env.planning import held_gain
 
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv

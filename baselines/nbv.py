@@ -9,9 +9,9 @@ import numpy as np
 from ms_slam_baselines.goal_planner import GoalPlanner
 from numpy.typing import NDArray
 
-from ms_slam_env.mapping import expected_gain
-from ms_slam_env.mapping.trackability import SCALE, bearable, follow_risks, leads_on
-from ms_slam_env.mapping.view_goals import distance_in_steps
+from ms_slam_env.planning import expected_gain
+from ms_slam_env.planning.trackability import SCALE, bearable, follow_risks, leads_on
+from ms_slam_env.planning.view_goals import distance_in_steps
 
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv

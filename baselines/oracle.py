@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.config import check_choice
 from ms_slam_env.evaluation.map_truth import reference_surface
-from ms_slam_env.mapping.expected_gain import held_ways
+from ms_slam_env.planning.expected_gain import held_ways
 from ms_slam_env.scenes.mesh_queries import RayCaster
 from ms_slam_env.tasks import REFERENCES
 

@@ -8,7 +8,7 @@ import numpy as np
 from ms_slam_baselines.nbv import NextBestView
 from numpy.typing import NDArray
 
-from ms_slam_env.mapping.view_goals import best_goal
+from ms_slam_env.planning.view_goals import best_goal
 
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv

@@ -10,7 +10,7 @@ from ms_slam_baselines.nbv import NextBestView
 from numpy.typing import NDArray
 
 from ms_slam_env.config import check_range
-from ms_slam_env.mapping import OccupancyGrid
+from ms_slam_env.planning import OccupancyGrid
 
 if TYPE_CHECKING:
     from ms_slam_env.camera import Intrinsics

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from ms_slam_env.geometry import look_at, make_pose, so3_exp, so3_log
-from ms_slam_env.mapping import OccupancyGrid
-from ms_slam_env.mapping.view_goals import upright_poses
+from ms_slam_env.planning import OccupancyGrid
+from ms_slam_env.planning.view_goals import upright_poses
 
 Float64 = NDArray[np.float64]
 

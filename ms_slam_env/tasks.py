@@ -11,9 +11,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from ms_slam_env._runtime.extension import ExtensionPoint
 from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.errors import InputError
-from ms_slam_env.extension import ExtensionPoint
 
 REFERENCES = ("nearby", "scene", "arm")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame

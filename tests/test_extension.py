@@ -20,16 +20,17 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ms_slam_env import extension, scenes, slam
+from ms_slam_env import scenes, slam
+from ms_slam_env._runtime import extension
+from ms_slam_env._runtime.extension import ExtensionPoint
+from ms_slam_env._runtime.parallel import open_pool, run_each
+from ms_slam_env.benchmark import EXPERIMENTS, experiment_class
 from ms_slam_env.camera import xtion
 from ms_slam_env.cli.train import TRAINERS
 from ms_slam_env.env import config, observations
 from ms_slam_env.env.planners import PLANNERS, check_planner
 from ms_slam_env.errors import InputError
-from ms_slam_env.experiments.harness import EXPERIMENTS, experiment_class
-from ms_slam_env.extension import ExtensionPoint
 from ms_slam_env.metrics import registry
-from ms_slam_env.parallel import open_pool, run_each
 from ms_slam_env.scenes import registry as scene_registry
 from ms_slam_env.sequences import naming, perturbations
 from ms_slam_env.tasks import TASKS

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from ms_slam_env._runtime.input_files import check_file, is_named, read_bytes, read_text
 from ms_slam_env.errors import InputError
-from ms_slam_env.input_files import check_file, is_named, read_bytes, read_text
 
 
 def test_a_file_is_read_to_its_bound(tmp_path: Path) -> None:

@@ -10,8 +10,8 @@ import time
 
 import pytest
 
-from ms_slam_env.command_line import exit_code
-from ms_slam_env.interrupts import Interrupts, kept, recorded
+from ms_slam_env._runtime.command_line import exit_code
+from ms_slam_env._runtime.interrupts import Interrupts, kept, recorded
 
 pytestmark = pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="needs POSIX signals")
 

@@ -18,16 +18,16 @@ from ms_slam_env.cli.train import TRAINERS
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "ms_slam_env"
 FLOW = (
-    "geometry -> camera -> divergence -> scenes, robot -> sensor -> slam -> mapping -> sequences"
-    " -> metrics -> report -> evaluation -> env -> exploration -> experiments -> cli"
+    "geometry -> camera -> divergence -> scenes, robot -> sensor -> slam -> planning -> sequences"
+    " -> metrics -> report -> evaluation -> env -> tuning -> benchmark -> cli"
 )
 LEVEL = {name: level for level, name in enumerate(re.split(r" -> |, ", FLOW))}
-BELOW_ALL = {
-    *("errors", "input_files", "output_files", "interrupts", "config", "command_line", "parallel"),
-    *("extension", "lazy", "native", "progress", "result_folders", "tasks", "timings", "_warp"),
-}
+BELOW_ALL = {"_runtime", "native", "errors", "config", "tasks"}
 ABOVE_ALL = {"registration", ""}  # "" is ms_slam_env/__init__.py
-NEVER = {"baselines", "agents", "ms_slam_baselines", "ms_slam_agents", "evo"}
+NEVER = {
+    *("baselines", "agents", "experiments", "evo"),
+    *("ms_slam_baselines", "ms_slam_agents", "ms_slam_experiments"),
+}
 ONLY_INSIDE_FUNCTIONS = {
     "open3d",
     "optuna",
@@ -158,7 +158,7 @@ def test_imports_point_to_the_left(path: Path) -> None:
         ("from ms_slam_env import env", "ms_slam_env.metrics.map"),
         ("import ms_slam_env.sensor", "ms_slam_env.scenes.base"),
         ("from ..env import EnvConfig", "ms_slam_env.slam.surfel"),
-        ("def f():\n    import ms_slam_baselines", "ms_slam_env.experiments.harness.episodes"),
+        ("def f():\n    import ms_slam_baselines", "ms_slam_env.benchmark.episodes"),
         ("import torch", "ms_slam_env.cli.train"),
         ("from open3d.core import Tensor", "ms_slam_env.slam.volumetric"),
         ("from ms_slam_env.geometry import hat", "ms_slam_env.errors"),

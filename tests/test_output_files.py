@@ -15,9 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from ms_slam_env import output_files
-from ms_slam_env.errors import InputError
-from ms_slam_env.output_files import (
+from ms_slam_env._runtime import output_files
+from ms_slam_env._runtime.output_files import (
     append_line,
     check_out_file,
     check_out_folder,
@@ -26,7 +25,8 @@ from ms_slam_env.output_files import (
     write_bytes,
     write_text,
 )
-from ms_slam_env.result_folders import alone_in, own_folder, result_folder
+from ms_slam_env._runtime.result_folders import alone_in, own_folder, result_folder
+from ms_slam_env.errors import InputError
 
 WRITE = os.write
 
@@ -110,7 +110,7 @@ def test_the_limit_of_a_file_s_size_is_like_a_full_disk(tmp_path: Path) -> None:
     code = """
 import errno, resource, sys
 from pathlib import Path
-from ms_slam_env.output_files import DISK_ERRORS, append_line, write_bytes
+from ms_slam_env._runtime.output_files import DISK_ERRORS, append_line, write_bytes
 resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
 path = Path(sys.argv[1])
 for k in range(30):
@@ -244,7 +244,7 @@ def test_what_a_killed_process_left_of_a_file_is_removed(tmp_path: Path) -> None
     code = """
 import os, signal, sys
 from pathlib import Path
-from ms_slam_env.output_files import new_file
+from ms_slam_env._runtime.output_files import new_file
 with new_file(Path(sys.argv[1]) / "a") as descriptor:
     os.write(descriptor, b"half")
     os.kill(os.getpid(), signal.SIGKILL)
@@ -318,8 +318,8 @@ def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
     code = """
 import os, signal, sys
 from pathlib import Path
-from ms_slam_env.output_files import write_text
-from ms_slam_env.result_folders import result_folder
+from ms_slam_env._runtime.output_files import write_text
+from ms_slam_env._runtime.result_folders import result_folder
 with result_folder(Path(sys.argv[1]), "result.json") as folder:
     write_text(folder / "result.json", "killed")
     os.kill(os.getpid(), signal.SIGKILL)
@@ -339,7 +339,7 @@ with result_folder(Path(sys.argv[1]), "result.json") as folder:
 HOLD = """
 import sys
 from pathlib import Path
-from ms_slam_env.result_folders import alone_in
+from ms_slam_env._runtime.result_folders import alone_in
 with alone_in(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.read()
@@ -459,7 +459,7 @@ def test_a_folder_that_takes_no_files_is_refused(tmp_path: Path) -> None:
 import os, sys
 from pathlib import Path
 from ms_slam_env.errors import InputError
-from ms_slam_env.output_files import check_out_folder
+from ms_slam_env._runtime.output_files import check_out_folder
 if os.geteuid() == 0:
     os.setgid(65534)
     os.setuid(65534)

@@ -173,7 +173,7 @@ def test_ci_runs_the_tests() -> None:
 
 def test_kernels_need_no_place_to_be_kept() -> None:
     """As in a home that cannot be written."""
-    code = "from ms_slam_env._warp import wp; print(wp.config.kernel_cache_dir)"
+    code = "from ms_slam_env._runtime.warp import wp; print(wp.config.kernel_cache_dir)"
     done = subprocess.run(
         [sys.executable, "-c", code],
         env={**os.environ, "WARP_CACHE_PATH": "/dev/null/nowhere"},

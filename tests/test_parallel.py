@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 from parallel_work import work
 
-from ms_slam_env.errors import InputError
-from ms_slam_env.parallel import (
+from ms_slam_env._runtime.parallel import (
     Outcome,
     available_cores,
     limited_threads,
@@ -21,6 +20,7 @@ from ms_slam_env.parallel import (
     run_each,
     thread_environment,
 )
+from ms_slam_env.errors import InputError
 
 
 class Unreadable:

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from ms_slam_env import progress
-from ms_slam_env.progress import Bar
+from ms_slam_env._runtime import progress
+from ms_slam_env._runtime.progress import Bar
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -60,7 +60,7 @@ def test_a_terminal_gets_a_bar() -> None:
     import struct
     import termios
 
-    code = "from ms_slam_env.progress import Bar\nfor _ in Bar(range(3), 'steps'): pass"
+    code = "from ms_slam_env._runtime.progress import Bar\nfor _ in Bar(range(3), 'steps'): pass"
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
     subprocess.run([sys.executable, "-c", code], stderr=theirs, check=True)

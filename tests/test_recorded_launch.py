@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ms_slam_env._warp import HostDeviceBuffer, RecordedLaunch, wp
+from ms_slam_env._runtime.warp import HostDeviceBuffer, RecordedLaunch, wp
 
 
 @wp.struct

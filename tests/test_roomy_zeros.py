@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ms_slam_env._warp import roomy_zeros, wp
+from ms_slam_env._runtime.warp import roomy_zeros, wp
 from ms_slam_env.metrics.cost.meter import forget_peak_memory, resident_mb
 
 

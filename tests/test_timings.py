@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from ms_slam_env.timings import Timings
+from ms_slam_env._runtime.timings import Timings
 
 
 def test_own_time_leaves_out_what_is_nested():

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from ms_slam_env import _warp
+from ms_slam_env._runtime import warp as _warp
 from ms_slam_env.errors import InputError
 from ms_slam_env.scenes import mesh_cache
 
@@ -61,7 +61,9 @@ def as_nobody(code: str, *words: str, place: Path, home: Path | None) -> tuple[i
 def test_a_read_only_home_costs_the_kernels_only(open_to_all: Path) -> None:
     home = open_to_all / "home"
     home.mkdir(mode=0o555)
-    code = "import os, ms_slam_env._warp as w; assert os.path.isdir(w.wp.config.kernel_cache_dir)"
+    code = """import os
+from ms_slam_env._runtime.warp import wp
+assert os.path.isdir(wp.config.kernel_cache_dir)"""
     status, said = as_nobody(code, place=open_to_all, home=home)
     assert status == 0
     assert "compiled kernels cannot be kept" in said
@@ -74,7 +76,7 @@ def test_no_home_leaves_no_folder_that_is_called_so(open_to_all: Path) -> None:
     code = (
         "import os, pwd\n"
         "pwd.getpwuid = lambda uid: {}[uid]\n"  # a user whom the system does not know
-        "import ms_slam_env._warp\n"
+        "import ms_slam_env._runtime.warp\n"
         "from ms_slam_env.scenes.mesh_cache import folder, remembered\n"
         "assert folder() is None\n"
         "assert remembered('a', lambda: {'x': 3}) == {'x': 3}"

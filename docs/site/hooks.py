@@ -37,8 +37,8 @@ API = {
     "ms_slam_env.metrics.registry": "what a key of a result means",
     "ms_slam_env.evaluation.run_sequence": "run a sequence",
     "ms_slam_env.evaluation.map_quality": "judge a map",
-    "ms_slam_env.exploration": "design-space exploration",
-    "ms_slam_env.experiments.harness": "experiments",
+    "ms_slam_env.tuning": "design-space exploration",
+    "ms_slam_env.benchmark": "experiments",
     "ms_slam_env.report.results": "result files",
     "ms_slam_env.report.tables": "tables",
     "ms_slam_env.report.charts": "charts",
@@ -201,7 +201,7 @@ GALLERY = """# Environments
 {own}
 
 The pictures are episodes of `nbv`, of `greedy` on the straight line, and of `random` where the SLAM
-configuration is chosen too; `python -m ms_slam_env.experiments.pictures.environments` makes them.
+configuration is chosen too; `python -m ms_slam_experiments.pictures.environments` makes them.
 
 ## Tasks
 

@@ -1,7 +1,7 @@
 """The drawing of the rooms: `python docs/site/rooms.py` writes docs/pictures/rooms.svg.
 
 Rooms are the folders of the package; an arrow leads from a room to one that uses it. Arrows that
-follow from others are left out, as is what lies below everything (config, errors, timings).
+follow from others are left out, as is what lies below everything (config, errors, _runtime).
 """
 
 from __future__ import annotations
@@ -23,16 +23,17 @@ ROOMS = {
     "robot": ("free camera, arm", 0),
     "sensor": ("rays, shading, noise", 1),
     "slam": ("tracking, mapping", 2),
-    "mapping": ("occupancy, gain", 3),
+    "planning": ("occupancy, gain", 3),
     "report": ("tables, charts, pages", 4),
     "sequences": ("recorded, rendered", 1),
-    "exploration": ("design-space search", 3),
+    "tuning": ("design-space search", 3),
     "evaluation": ("run and judge", 2),
     "env": ("the environment", 1),
-    "experiments": ("harness, one file each", 2),
+    "benchmark": ("compare, record, check", 2),
     "baselines": ("planners", 0),
     "cli": ("ms-slam COMMAND", 2),
     "agents": ("training", 0),
+    "experiments": ("the project's research", 3),
 }
 """Room to what is in it and its column in the drawing; its row follows from what it uses."""
 WIDTH, HEIGHT, GAP_X, GAP_Y, MARGIN = 150, 44, 18, 34, 8
@@ -49,13 +50,13 @@ def imported_rooms(folder: Path) -> set[str]:
                 found |= {alias.name for alias in node.names}
     inside = {name.split(".")[1] for name in found if name.startswith("ms_slam_env.")}
     outside = {name.split(".")[0].removeprefix("ms_slam_") for name in found}
-    return (inside | (outside & {"baselines", "agents"})) & set(ROOMS) - {folder.name}
+    return (inside | (outside & {"baselines", "agents", "experiments"})) & set(ROOMS) - {folder.name}
 
 
 def uses() -> dict[str, set[str]]:
     """Room to the rooms that it uses, for the rooms that there are."""
     folders = {name: ROOT / "ms_slam_env" / name for name in ROOMS}
-    folders |= {name: ROOT / name for name in ("baselines", "agents")}
+    folders |= {name: ROOT / name for name in ("baselines", "agents", "experiments")}
     return {name: imported_rooms(path) for name, path in folders.items() if path.is_dir()}
 
 

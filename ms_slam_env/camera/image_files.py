@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from ms_slam_env._runtime.input_files import MAX_IMAGE_BYTES, read_bytes
 from ms_slam_env.camera.intrinsics import Intrinsics
 from ms_slam_env.errors import InputError
-from ms_slam_env.input_files import MAX_IMAGE_BYTES, read_bytes
 
 SUFFIXES = (".png", ".pgm", ".jpg", ".jpeg", ".ppm", ".tif", ".tiff")
 """Endings of the names of images."""

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
-from ms_slam_env.command_line import exit_code
+from ms_slam_env._runtime.command_line import exit_code
 from ms_slam_env.errors import unknown
 
 COMMANDS = {

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from ms_slam_env.benchmark.compare import Compare
 from ms_slam_env.cli.experiment import run
-from ms_slam_env.experiments.compare import Compare
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import tyro
 
-from ms_slam_env.command_line import parse
+from ms_slam_env._runtime.command_line import parse
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,10 @@ class Arguments:
 def main(arguments: Sequence[str]) -> int:
     """Measure, write and print the table."""
     args = parse(Arguments, arguments, "ms-slam divergence")
+    from ms_slam_env._runtime.result_folders import alone_in
     from ms_slam_env.divergence import DivergenceConfig
     from ms_slam_env.errors import InputError
     from ms_slam_env.evaluation.sequence_divergence import sequence_divergence, write_divergences
-    from ms_slam_env.result_folders import alone_in
     from ms_slam_env.sequences import open_sequence
 
     if not args.sequences:

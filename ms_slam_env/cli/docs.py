@@ -9,7 +9,7 @@ from pathlib import Path
 
 import tyro
 
-from ms_slam_env.command_line import parse
+from ms_slam_env._runtime.command_line import parse
 from ms_slam_env.errors import InputError
 
 _PAGES = ("README.md", "BENCHMARK.md")

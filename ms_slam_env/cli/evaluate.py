@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from ms_slam_env.command_line import parse
+from ms_slam_env._runtime.command_line import parse
 from ms_slam_env.errors import InputError
 
 if TYPE_CHECKING:

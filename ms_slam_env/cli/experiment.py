@@ -10,16 +10,18 @@ from typing import Annotated, Any
 
 import tyro
 
-from ms_slam_env.command_line import parse, report_failures
-from ms_slam_env.errors import InputError
-from ms_slam_env.experiments.harness import (
+from ms_slam_env._runtime.command_line import parse, report_failures
+from ms_slam_env.benchmark import (
     EXPERIMENTS,
+    HAS_RESEARCH,
     Experiment,
     experiment_class,
     run_experiment,
 )
-from ms_slam_env.experiments.harness.checking import check_results, committed_results
+from ms_slam_env.benchmark.checking import check_results, committed_results
 from ms_slam_env.report.results import RESULTS, read_results
+
+ELSEWHERE = "the research of the project is not installed: clone it and pip install -e ."
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -83,13 +85,12 @@ def with_run_options(cls: type[Experiment], out: Path) -> type[Any]:
 def listing() -> str:
     """Every experiment and what it is."""
     names = EXPERIMENTS.names()
-    if not names:
-        raise InputError("no experiment is installed")
     width = max(map(len, names))
     return "\n".join(
         [
             "usage: ms-slam experiment NAME [options]; NAME --help lists the options",
             "",
             *(f"  {name:<{width}}  {experiment_class(name).title()}" for name in names),
+            *(() if HAS_RESEARCH else ("", ELSEWHERE)),
         ]
     )

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ms_slam_env.command_line import parse, report_failures
+from ms_slam_env._runtime.command_line import parse, report_failures
 
 
 @dataclass(frozen=True)
@@ -73,14 +73,14 @@ class Arguments:
 def main(arguments: Sequence[str]) -> int:
     """Explore, write, and print the table."""
     args = parse(Arguments, arguments, "ms-slam explore")
-    from ms_slam_env.exploration import (
+    from ms_slam_env.slam.configuration import SlamConfiguration, read_configuration
+    from ms_slam_env.tuning import (
         Exploration,
         ExplorationSettings,
         SlamEvaluator,
         run_exploration,
     )
-    from ms_slam_env.exploration.objectives import FAILURE
-    from ms_slam_env.slam.configuration import SlamConfiguration, read_configuration
+    from ms_slam_env.tuning.objectives import FAILURE
 
     names = " ".join((*args.objectives, *args.constraints))
     base = SlamConfiguration() if args.config is None else read_configuration(args.config)

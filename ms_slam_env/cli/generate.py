@@ -10,7 +10,7 @@ from typing import Any
 
 import tyro
 
-from ms_slam_env.command_line import parse
+from ms_slam_env._runtime.command_line import parse
 from ms_slam_env.errors import InputError
 from ms_slam_env.sequences.paths.handheld import HandheldPath
 
@@ -139,7 +139,7 @@ def _motion(args: Arguments, recorded: Any, scene: Any) -> tuple[Any, Any, dict[
 
 def _planned(args: Arguments, planner: str) -> tuple[Any, Any, dict[str, Any]]:
     """The same of a planner's episode."""
-    from ms_slam_env.experiments.harness.episodes import (
+    from ms_slam_env.benchmark.episodes import (
         EpisodeSpec,
         parse_options,
         planned_motion,

@@ -17,18 +17,18 @@ import gymnasium as gym
 import numpy as np
 
 import ms_slam_env
-from ms_slam_env.command_line import parse
+from ms_slam_env._runtime.command_line import parse
+from ms_slam_env._runtime.input_files import is_named
+from ms_slam_env._runtime.interrupts import kept
+from ms_slam_env._runtime.output_files import check_out_folder, naming
+from ms_slam_env._runtime.parallel import open_pool, run_each
+from ms_slam_env._runtime.progress import Bar
+from ms_slam_env._runtime.result_folders import alone_in, lock_beside, result_folder
 from ms_slam_env.config import Checked, bounded, chosen, free_options
 from ms_slam_env.env.lerobot_dataset import DatasetWriter, Steps
 from ms_slam_env.env.planners import check_planner, make_planner, planner_observation
 from ms_slam_env.errors import InputError
-from ms_slam_env.input_files import is_named
-from ms_slam_env.interrupts import kept
-from ms_slam_env.output_files import check_out_folder, naming
-from ms_slam_env.parallel import open_pool, run_each
-from ms_slam_env.progress import Bar
 from ms_slam_env.report.provenance import provenance
-from ms_slam_env.result_folders import alone_in, lock_beside, result_folder
 
 _STREAM = 2  # of an episode's seed, for the planner; the environment draws from the seed itself
 _VARIABLE = "MINARI_DATASETS_PATH"

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import tyro
 
-from ms_slam_env.command_line import parse
-from ms_slam_env.output_files import check_out_file
+from ms_slam_env._runtime.command_line import parse
+from ms_slam_env._runtime.output_files import check_out_file
 
 
 @dataclass(frozen=True)

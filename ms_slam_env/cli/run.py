@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from ms_slam_env.command_line import parse
+from ms_slam_env._runtime.command_line import parse
+from ms_slam_env._runtime.output_files import check_out_file
 from ms_slam_env.errors import InputError
-from ms_slam_env.output_files import check_out_file
 
 if TYPE_CHECKING:
     from ms_slam_env.sequences import Sequence as RGBDSequence
@@ -83,10 +83,10 @@ def main(arguments: Sequence[str]) -> int:
         from ms_slam_env.slam.registry import POINT
 
         POINT.find(args.backend)  # a typo is answered before all that a run needs is imported
+    from ms_slam_env._runtime.parallel import limit_threads
     from ms_slam_env.config import from_dict, nested_options
     from ms_slam_env.evaluation.run_sequence import lost_throughout
     from ms_slam_env.evaluation.run_to_folder import run_to_folder
-    from ms_slam_env.parallel import limit_threads
     from ms_slam_env.sequences import open_sequence
     from ms_slam_env.sequences.recording import Topics, parse_calibration
     from ms_slam_env.slam.configuration import (

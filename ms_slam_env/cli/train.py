@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ms_slam_env.extension import ExtensionPoint
+from ms_slam_env._runtime.extension import ExtensionPoint
 
 TRAINERS = ExtensionPoint("trainer", "ms_slam_env.trainers", form="module:function")
 DEFAULT_TRAINER = "sb3"

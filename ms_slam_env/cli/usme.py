@@ -7,12 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from ms_slam_env._runtime.command_line import parse
+from ms_slam_env.benchmark.usme import Usme, check_suite
 from ms_slam_env.cli.experiment import run
-from ms_slam_env.command_line import parse
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import unknown
-from ms_slam_env.experiments.usme import Usme, check_suite
-from ms_slam_env.output_files import check_out_file, check_out_folder
 from ms_slam_env.sequences.usme_suite import NAMES, make_suite
 
 
@@ -43,21 +42,11 @@ class Make(Checked):
         check_suite(self.sequences, self.image_size)
 
 
-@dataclass(frozen=True)
-class Picture:
-    """Draw two frames of each of the eight sequences."""
-
-    out: Path = Path("docs/pictures/usme.png")
-    """The PNG file to write."""
-    seed: int = 2000
-    """Of scenes, ways, noise and perturbations."""
-
-
-COMMANDS: dict[str, type[Make | Usme | Picture]] = {"make": Make, "run": Usme, "picture": Picture}
+COMMANDS: dict[str, type[Make | Usme]] = {"make": Make, "run": Usme}
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Do one of the three; 1 if a run failed."""
+    """Do one of the two; 1 if a run failed."""
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_usage(), file=sys.stdout if arguments else sys.stderr)
         return 0 if arguments else 2
@@ -66,22 +55,16 @@ def main(arguments: Sequence[str]) -> int:
         raise unknown("command of ms-slam usme", name, COMMANDS)
     if name == "run":
         return run(Usme, rest, "ms-slam usme run", Path("results/usme_run"))
-    check_out = check_out_file if name == "picture" else check_out_folder
-    command = parse(COMMANDS[name], rest, f"ms-slam usme {name}", check_out)
-    if isinstance(command, Make):
-        folders = make_suite(
-            command.out,
-            command.sequences,
-            command.image_size,
-            command.seed,
-            command.frames_scale,
-            command.truth,
-        )
-        print(f"{len(folders)} sequences in {command.out}")
-    if isinstance(command, Picture):
-        from ms_slam_env.experiments.pictures.usme import save_usme_picture
-
-        print(f"written: {save_usme_picture(command.out, command.seed)}")
+    command = parse(Make, rest, f"ms-slam usme {name}")
+    folders = make_suite(
+        command.out,
+        command.sequences,
+        command.image_size,
+        command.seed,
+        command.frames_scale,
+        command.truth,
+    )
+    print(f"{len(folders)} sequences in {command.out}")
     return 0
 
 

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any, cast
 import gymnasium as gym
 
 import ms_slam_env
-from ms_slam_env.command_line import parse
+from ms_slam_env._runtime.command_line import parse
+from ms_slam_env._runtime.interrupts import kept
+from ms_slam_env._runtime.output_files import check_out_file
+from ms_slam_env._runtime.progress import Bar
 from ms_slam_env.config import Checked, bounded, chosen, free_options
 from ms_slam_env.env.planners import check_planner, make_planner, planner_observation
-from ms_slam_env.interrupts import kept
-from ms_slam_env.output_files import check_out_file
-from ms_slam_env.progress import Bar
 
 if TYPE_CHECKING:
     from ms_slam_env.env import ActiveSlamEnv

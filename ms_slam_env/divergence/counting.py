@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env._warp import HostDeviceBuffer, RecordedLaunch, wp
+from ms_slam_env._runtime.warp import HostDeviceBuffer, RecordedLaunch, wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.divergence import kernels
 from ms_slam_env.divergence.config import DivergenceConfig

@@ -10,7 +10,7 @@ indexing, with any strides, takes longer than what they compute. So images must 
 
 from __future__ import annotations
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.native import native_source
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import slam as slam_backends
+from ms_slam_env._runtime.timings import Timings
 from ms_slam_env.env.actions import ActionDecoder, MotionActions, MotionAndConfigurationActions
 from ms_slam_env.env.camera_feed import CameraFeed, make_camera_feed
 from ms_slam_env.env.config import check_reset, make_config
@@ -25,14 +26,13 @@ from ms_slam_env.env.saved_state import load_state, save_state
 from ms_slam_env.env.simulation import Simulation
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.geometry import check_pose
-from ms_slam_env.mapping.candidates import PredictedViews
-from ms_slam_env.mapping.trackability import SCALE
+from ms_slam_env.planning.candidates import PredictedViews
+from ms_slam_env.planning.trackability import SCALE
 from ms_slam_env.robot import Embodiment
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sequences.perturbations.base import Perturbation
 from ms_slam_env.slam.base import SlamBackend, Views
-from ms_slam_env.timings import Timings
 
 Float64 = NDArray[np.float64]
 

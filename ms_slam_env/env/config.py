@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ms_slam_env._runtime.extension import ExtensionPoint
 from ms_slam_env.camera import Intrinsics, pinhole
 from ms_slam_env.config import (
     Checked,
@@ -25,7 +26,6 @@ from ms_slam_env.env.registry import POINT as OBSERVATION_POINT
 from ms_slam_env.env.registry import Observation
 from ms_slam_env.env.reward import RewardConfig, TargetConfig
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.extension import ExtensionPoint
 from ms_slam_env.robot.arm import ArmConfig
 from ms_slam_env.scenes import SCENES, SEED_SPLITS, seeds_of
 from ms_slam_env.scenes.registry import SceneName, check_name, name_of

@@ -12,7 +12,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env._warp import RecordedLaunch, wp
+from ms_slam_env._runtime.warp import RecordedLaunch, wp
 from ms_slam_env.native import native_source
 from ms_slam_env.scenes.base import Scene
 

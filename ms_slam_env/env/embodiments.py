@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from ms_slam_env._runtime.timings import Timings
 from ms_slam_env.env.config import EnvConfig
 from ms_slam_env.env.pose_sources import KINEMATIC_SOURCES
 from ms_slam_env.errors import InputError
@@ -13,7 +14,6 @@ from ms_slam_env.robot.arm import ArmConfig, load_arm
 from ms_slam_env.robot.arm.arm import ArmEmbodiment, KinematicArm
 from ms_slam_env.robot.arm.dynamic_arm import DynamicArm
 from ms_slam_env.scenes.base import Scene
-from ms_slam_env.timings import Timings
 
 
 @dataclass(frozen=True)

@@ -19,14 +19,14 @@ from ms_slam_env.env.robot_knowledge import (
     state_vector,
 )
 from ms_slam_env.geometry import invert
-from ms_slam_env.mapping import (
+from ms_slam_env.planning import (
     OccupancyGrid,
     expected_gain,
     held_gain,
     reachable_positions,
     surrounding_occupancy,
 )
-from ms_slam_env.mapping.candidates import (
+from ms_slam_env.planning.candidates import (
     GRID_HIGHS,
     GRID_LOWS,
     GRID_NAMES,
@@ -36,8 +36,8 @@ from ms_slam_env.mapping.candidates import (
     candidate_numbers,
     grid_numbers,
 )
-from ms_slam_env.mapping.goals_around import NUM_GOALS, gain_around
-from ms_slam_env.mapping.view_goals import GOAL_RADIUS_M, best_goal, distance_in_steps
+from ms_slam_env.planning.goals_around import NUM_GOALS, gain_around
+from ms_slam_env.planning.view_goals import GOAL_RADIUS_M, best_goal, distance_in_steps
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]

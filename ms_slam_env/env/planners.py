@@ -10,9 +10,9 @@ import numpy as np
 from gymnasium.spaces import MultiDiscrete
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.extension import ExtensionPoint, check_options
 from ms_slam_env.config import parse_named
 from ms_slam_env.errors import InputError
-from ms_slam_env.extension import ExtensionPoint, check_options
 
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from gymnasium import spaces
 
-from ms_slam_env.extension import ExtensionPoint
+from ms_slam_env._runtime.extension import ExtensionPoint
 
 if TYPE_CHECKING:
     from ms_slam_env.env.robot_knowledge import RobotKnowledge

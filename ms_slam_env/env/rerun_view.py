@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.output_files import write_bytes
 from ms_slam_env.env.planners import Planner, goal_of
 from ms_slam_env.env.third_person_view import ESTIMATE_COLOR, TRUE_COLOR, arm_dots
 from ms_slam_env.errors import InputError
-from ms_slam_env.output_files import write_bytes
 from ms_slam_env.robot import describe
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import RGBDFrame
-from ms_slam_env.mapping import OccupancyGrid
-from ms_slam_env.mapping.candidates import PredictedViews
+from ms_slam_env.planning import OccupancyGrid
+from ms_slam_env.planning.candidates import PredictedViews
 from ms_slam_env.robot import NUM_ROTATIONS, NUM_TRANSLATIONS, ROTATIONS, TRANSLATIONS
 from ms_slam_env.slam.base import Views
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.timings import Timings
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.divergence import Histograms, make_divergence
 from ms_slam_env.env.camera_feed import make_camera_feed
@@ -19,14 +20,13 @@ from ms_slam_env.env.episode import Episode
 from ms_slam_env.env.pose_sources import POSE_SOURCES
 from ms_slam_env.errors import InputError, UnreachableError, unknown
 from ms_slam_env.geometry import invert
-from ms_slam_env.mapping import OccupancyGrid
+from ms_slam_env.planning import OccupancyGrid
 from ms_slam_env.robot import Embodiment, MotionResult
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.registry import SCENES, SceneName, name_of
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sensor.scene_cache import get_scene, get_sensor
 from ms_slam_env.slam.base import SlamBackend, TrackResult
-from ms_slam_env.timings import Timings
 
 Float64 = NDArray[np.float64]
 

@@ -14,9 +14,9 @@ import imageio.v3 as iio
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.output_files import write_bytes
 from ms_slam_env.env.active_slam import ActiveSlamEnv
 from ms_slam_env.errors import InputError
-from ms_slam_env.output_files import write_bytes
 from ms_slam_env.sequences.perturbations import make_perturbation
 
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ms_slam_env._runtime.output_files import write_bytes
 from ms_slam_env.errors import InputError
-from ms_slam_env.output_files import write_bytes
 
 if TYPE_CHECKING:
     from ms_slam_env.evaluation.trajectory_files import Matched

@@ -29,11 +29,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ms_slam_env._runtime.progress import Bar
 from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.errors import InputError
 from ms_slam_env.metrics.cost import CostMeter
 from ms_slam_env.metrics.cost.meter import FrameCost
-from ms_slam_env.progress import Bar
 from ms_slam_env.sequences.sequence import Sequence
 from ms_slam_env.slam.base import SlamBackend, TrackResult
 

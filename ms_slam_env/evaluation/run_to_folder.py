@@ -12,6 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import metrics, slam
+from ms_slam_env._runtime.interrupts import recorded
+from ms_slam_env._runtime.output_files import growing_file, write_bytes
+from ms_slam_env._runtime.result_folders import alone_in, result_folder
 from ms_slam_env.evaluation.run_files import (
     COSTS,
     MESH,
@@ -38,12 +41,9 @@ from ms_slam_env.evaluation.tracking_diagnosis import (
 )
 from ms_slam_env.evaluation.trajectory_charts import error_panel, marked_panel, path_panel
 from ms_slam_env.geometry import invert
-from ms_slam_env.interrupts import recorded
-from ms_slam_env.output_files import growing_file, write_bytes
 from ms_slam_env.report.charts import Chart, Panel
 from ms_slam_env.report.results import write_results
 from ms_slam_env.report.tables import Table, make_table
-from ms_slam_env.result_folders import alone_in, result_folder
 from ms_slam_env.sequences import Sequence, associate
 from ms_slam_env.sequences.recording import Recording
 from ms_slam_env.sequences.trajectory import (

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.progress import Bar
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.divergence import MEASURES, DivergenceConfig, make_divergence
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.evaluation.observation_distance import observation_distance
 from ms_slam_env.evaluation.trajectory_charts import thinned
 from ms_slam_env.geometry import invert
-from ms_slam_env.progress import Bar
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.results import Results, write_result_folder
 from ms_slam_env.report.tables import Table, Value, make_table

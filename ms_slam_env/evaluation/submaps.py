@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import metrics
+from ms_slam_env._runtime.output_files import write_text
 from ms_slam_env.evaluation.run_sequence import SequenceRun
-from ms_slam_env.output_files import write_text
 
 Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]

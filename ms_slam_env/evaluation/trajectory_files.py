@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import metrics
+from ms_slam_env._runtime.input_files import read_text
 from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.errors import InputError, InputWarning
-from ms_slam_env.input_files import read_text
 from ms_slam_env.metrics.relative import (
     DELTA_UNITS,
     PAIRINGS,

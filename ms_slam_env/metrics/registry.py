@@ -19,8 +19,8 @@ from typing import Any
 
 import yaml
 
+from ms_slam_env._runtime.extension import ExtensionPoint
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.extension import ExtensionPoint
 
 RESULTS_VERSIONS = {
     1: "before results had a version: by algorithms and measures that have changed since",

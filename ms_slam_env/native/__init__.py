@@ -17,7 +17,7 @@ import re
 from functools import lru_cache
 from pathlib import Path
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 
 CHECKED = os.environ.get("MS_SLAM_ENV_CHECKED", "") not in ("", "0")
 """Whether kernels check the bounds of arrays."""

@@ -14,8 +14,8 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
+from ms_slam_env._runtime.output_files import write_bytes
 from ms_slam_env.metrics.registry import metric
-from ms_slam_env.output_files import write_bytes
 from ms_slam_env.report.charts import Chart, Panel, Series
 
 _PALETTE = matplotlib.color_sequences["petroff10"]

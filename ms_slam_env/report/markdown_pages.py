@@ -23,9 +23,9 @@ import shlex
 from collections.abc import Iterable
 from pathlib import Path
 
+from ms_slam_env._runtime.input_files import read_text
+from ms_slam_env._runtime.output_files import write_text
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.input_files import read_text
-from ms_slam_env.output_files import write_text
 from ms_slam_env.report.discovery import find_results
 from ms_slam_env.report.model_cards import model_cards
 from ms_slam_env.report.results import RESULTS, TABLE, Results, made_by, read_results

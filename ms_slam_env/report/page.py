@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from ms_slam_env import __version__
+from ms_slam_env._runtime.input_files import read_bytes
+from ms_slam_env._runtime.output_files import check_out_file, write_text
 from ms_slam_env.errors import InputError
-from ms_slam_env.input_files import read_bytes
 from ms_slam_env.metrics.registry import metric
-from ms_slam_env.output_files import check_out_file, write_text
 from ms_slam_env.report.charts import Chart
 from ms_slam_env.report.discovery import (
     MAX_PICTURE_BYTES,

@@ -14,9 +14,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from ms_slam_env._runtime.input_files import is_named, read_bytes
+from ms_slam_env._runtime.output_files import append_line, write_text
 from ms_slam_env.errors import InputError, InputWarning
-from ms_slam_env.input_files import is_named, read_bytes
-from ms_slam_env.output_files import append_line, write_text
 
 Row = dict[str, Any]
 T = TypeVar("T")

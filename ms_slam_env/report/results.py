@@ -17,20 +17,20 @@ from pathlib import Path
 from types import NoneType
 from typing import Any
 
+from ms_slam_env._runtime.input_files import read_json
+from ms_slam_env._runtime.output_files import write_text
+from ms_slam_env._runtime.result_folders import result_folder
 from ms_slam_env.errors import InputError
-from ms_slam_env.input_files import read_json
 from ms_slam_env.metrics.registry import (
     RESULTS_VERSION,
     RESULTS_VERSIONS,
     check_keys,
     versions_since,
 )
-from ms_slam_env.output_files import write_text
 from ms_slam_env.report.charts import Chart, chart_from_json
 from ms_slam_env.report.provenance import provenance
 from ms_slam_env.report.records import check_plain, from_plain, write_json
 from ms_slam_env.report.tables import Table, table_from_json
-from ms_slam_env.result_folders import result_folder
 
 RESULTS = "results.json"
 TABLE = "table.md"

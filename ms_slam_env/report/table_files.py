@@ -8,8 +8,8 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
+from ms_slam_env._runtime.output_files import write_text
 from ms_slam_env.errors import unknown
-from ms_slam_env.output_files import write_text
 from ms_slam_env.report.statistics import Interval
 from ms_slam_env.report.tables import Table, Value, format_value
 

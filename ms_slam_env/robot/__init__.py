@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from ms_slam_env.lazy import lazy_names
+from ms_slam_env._runtime.lazy import lazy_names
 
 if TYPE_CHECKING:
     from ms_slam_env.robot.action_primitives import (

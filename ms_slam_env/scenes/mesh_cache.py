@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.output_files import new_file
 from ms_slam_env.errors import InputError
-from ms_slam_env.output_files import new_file
 
 VERSION = 2
 """Of what is kept and how it is worked out; goes up when either changes."""

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ms_slam_env._runtime.extension import ExtensionPoint
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.extension import ExtensionPoint
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.mesh_formats import MESH_SUFFIXES, MeshFile
 

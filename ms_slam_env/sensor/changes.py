@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.geometry import Float64
 from ms_slam_env.scenes.base import TexturedMesh
 from ms_slam_env.sensor.bodies import Body, BodyCast

@@ -17,7 +17,7 @@ import numpy as np
 from embreex import rtcore_scene
 from numpy.typing import NDArray
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.native import native_source
 from ms_slam_env.sensor.native import VECTOR_FLAGS
 from ms_slam_env.sensor.rays import Hits, Pinhole, pose_of_row

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env._warp import HostDeviceBuffer, RecordedLaunch, wp
+from ms_slam_env._runtime.warp import HostDeviceBuffer, RecordedLaunch, wp
 from ms_slam_env.scenes.base import TexturedMesh
 from ms_slam_env.sensor.bodies import Body
 from ms_slam_env.sensor.casters import RayCaster

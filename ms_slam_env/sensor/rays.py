@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
 
 

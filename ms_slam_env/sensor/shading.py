@@ -6,7 +6,7 @@ Raw-Data", IEEE TIP 2008.
 
 from __future__ import annotations
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.native import native_source
 from ms_slam_env.sensor.native import VECTOR_FLAGS
 from ms_slam_env.sensor.rays import Hits, Pinhole, camera_centre, pose_of_row, world_ray

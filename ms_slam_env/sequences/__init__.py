@@ -23,7 +23,7 @@ FrameSkipping, MovingObjects, FastMotion, Illumination``, or
 
 from typing import TYPE_CHECKING
 
-from ms_slam_env.lazy import lazy_names
+from ms_slam_env._runtime.lazy import lazy_names
 
 if TYPE_CHECKING:
     from ms_slam_env.sequences.naming import check_sequence, open_sequence, parse_sequence

@@ -27,11 +27,11 @@ from typing import Any
 import numpy as np
 
 from ms_slam_env import scenes
+from ms_slam_env._runtime.extension import is_reference
 from ms_slam_env.camera import Intrinsics, xtion
 from ms_slam_env.camera.image_size import NATIVE
 from ms_slam_env.config import from_dict, parse_named
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.extension import is_reference
 from ms_slam_env.scenes.registry import check_name
 from ms_slam_env.sensor import NOISE_MODELS
 from ms_slam_env.sequences.paths import (

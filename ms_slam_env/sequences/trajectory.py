@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ms_slam_env._runtime.input_files import read_text, words_of
+from ms_slam_env._runtime.output_files import write_text
 from ms_slam_env.errors import InputError, InputWarning
 from ms_slam_env.geometry import (
     MAX_COORDINATE_M,
@@ -17,8 +19,6 @@ from ms_slam_env.geometry import (
     pose_from_quaternion,
     quaternion_from_pose,
 )
-from ms_slam_env.input_files import read_text, words_of
-from ms_slam_env.output_files import write_text
 
 Int64 = NDArray[np.int64]
 

@@ -23,10 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import __version__, scenes
+from ms_slam_env._runtime.input_files import read_json
 from ms_slam_env.camera import xtion
 from ms_slam_env.config import parse_named
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.input_files import read_json
 from ms_slam_env.scenes import Scene
 from ms_slam_env.sequences import HandheldPath, RoutePath
 from ms_slam_env.sequences.writing import DESCRIPTION, write_sequence

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.input_files import read_json
+from ms_slam_env._runtime.interrupts import kept
+from ms_slam_env._runtime.output_files import write_bytes, write_text
+from ms_slam_env._runtime.progress import Bar
+from ms_slam_env._runtime.result_folders import alone_in, lock_beside, own_folder
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
-from ms_slam_env.input_files import read_json
-from ms_slam_env.interrupts import kept
-from ms_slam_env.output_files import write_bytes, write_text
-from ms_slam_env.progress import Bar
-from ms_slam_env.result_folders import alone_in, lock_beside, own_folder
 from ms_slam_env.sequences.sequence import Sequence
 from ms_slam_env.sequences.trajectory import write_trajectory
 

@@ -11,12 +11,12 @@ from typing import Any
 
 import yaml
 
+from ms_slam_env._runtime.input_files import read_text
+from ms_slam_env._runtime.output_files import write_text
+from ms_slam_env._runtime.parallel import limited_threads
 from ms_slam_env.camera import Intrinsics, parse_image_size
 from ms_slam_env.config import Checked, bounded, from_dict, load_yaml
 from ms_slam_env.errors import InputError
-from ms_slam_env.input_files import read_text
-from ms_slam_env.output_files import write_text
-from ms_slam_env.parallel import limited_threads
 from ms_slam_env.slam.base import SlamBackend
 from ms_slam_env.slam.machine import CompilerOptions, compiled, limited_clock
 from ms_slam_env.slam.registry import backend_name, check_parameters, make_backend

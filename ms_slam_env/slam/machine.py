@@ -73,7 +73,7 @@ def compiled(options: CompilerOptions) -> Iterator[None]:
     if options == CompilerOptions():
         yield
         return
-    from ms_slam_env._warp import wp
+    from ms_slam_env._runtime.warp import wp
 
     import_module("ms_slam_env.slam.surfel")
     modules = [

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
+from ms_slam_env._runtime.extension import ExtensionPoint, check_options
 from ms_slam_env.camera import Intrinsics, check_camera
 from ms_slam_env.config import from_dict, is_options
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.extension import ExtensionPoint, check_options
 from ms_slam_env.slam.base import SlamBackend
 
 
@@ -97,7 +97,7 @@ def check_parameters(name: object, params: object) -> Any:
 
 
 def _check_device(device: object) -> None:
-    from ms_slam_env._warp import wp
+    from ms_slam_env._runtime.warp import wp
 
     devices = [found.alias for found in wp.get_devices()]
     if device not in (*devices, "cuda") or (device == "cuda" and not wp.is_cuda_available()):

@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.input_files import MAX_MESH_BYTES, check_file
+from ms_slam_env._runtime.output_files import write_bytes
 from ms_slam_env.errors import InputError
-from ms_slam_env.input_files import MAX_MESH_BYTES, check_file
-from ms_slam_env.output_files import write_bytes
 
 FORMAT, VERSION = "ms_slam_env map", 1
 MAX_TREE_BYTES = 16 * 1024 * 1024

@@ -9,7 +9,7 @@ from ms_slam_baselines.nbv import NextBestView
 import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env.env.planners import make_planner, planner_observation
 from ms_slam_env.errors import InputError
-from ms_slam_env.mapping.candidates import GRID_NAMES
+from ms_slam_env.planning.candidates import GRID_NAMES
 
 
 def make_env():

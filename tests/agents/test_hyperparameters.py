@@ -105,7 +105,7 @@ def test_an_extra_that_is_missing_is_named_once_the_options_are_right(
     def missing(name):
         raise ModuleNotFoundError("No module named 'torch'", name="torch")
 
-    monkeypatch.setattr("ms_slam_env.extension.import_module", missing)
+    monkeypatch.setattr("ms_slam_env._runtime.extension.import_module", missing)
     words = ["--out", str(tmp_path / "out")]
     assert trainers.ppo([*words, "--typo"]) == 2
     assert "Unrecognized options: --typo" in capsys.readouterr().err

@@ -88,7 +88,7 @@ class InThisProcess:
         return 1 - len(self.done)
 
     def give(self, key, spec):
-        from ms_slam_env.parallel import attempt
+        from ms_slam_env._runtime.parallel import attempt
 
         self.done.append(attempt(self.run, key, spec))
 

@@ -19,7 +19,7 @@ from ms_slam_agents.sb3_state import whole_batches
 from scipy.stats import sem
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from ms_slam_env import output_files
+from ms_slam_env._runtime import output_files
 from ms_slam_env.report.results import read_results
 
 

@@ -14,7 +14,7 @@ from ms_slam_baselines.belief import (
 
 import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env.geometry import invert, make_pose, se3_exp, se3_log, so3_exp, transform_points
-from ms_slam_env.mapping.trackability import SCALE, mean_depth, view_information
+from ms_slam_env.planning.trackability import SCALE, mean_depth, view_information
 
 RNG = np.random.default_rng(0)
 A = RNG.normal(size=(6, 6))

@@ -9,8 +9,8 @@ import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env.divergence import make_divergence
 from ms_slam_env.env.planners import make_planner
 from ms_slam_env.errors import InputError
-from ms_slam_env.mapping.trackability import SCALE
-from ms_slam_env.mapping.view_goals import distance_in_steps
+from ms_slam_env.planning.trackability import SCALE
+from ms_slam_env.planning.view_goals import distance_in_steps
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from ms_slam_baselines.nbv import NextBestView
 import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env.env.planners import make_planner
 from ms_slam_env.errors import InputError
-from ms_slam_env.mapping import held_gain
+from ms_slam_env.planning import held_gain
 
 
 def make_env():

@@ -16,9 +16,9 @@ from ms_slam_env.camera import xtion
 from ms_slam_env.env.planners import make_planner
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at, make_pose, relative_angle, so3_exp
-from ms_slam_env.mapping import FREE, UNKNOWN, OccupancyGrid, shortest_ways
-from ms_slam_env.mapping.trackability import SCALE, image_motion, slip_risk
-from ms_slam_env.mapping.view_goals import distance_in_steps
+from ms_slam_env.planning import FREE, UNKNOWN, OccupancyGrid, shortest_ways
+from ms_slam_env.planning.trackability import SCALE, image_motion, slip_risk
+from ms_slam_env.planning.view_goals import distance_in_steps
 from ms_slam_env.slam.base import Views
 
 STEPS = 0.12, math.radians(12)

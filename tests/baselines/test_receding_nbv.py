@@ -8,7 +8,7 @@ from ms_slam_baselines.receding_nbv import RecedingNextBestView
 
 import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env.env.planners import make_planner
-from ms_slam_env.mapping.view_goals import best_goal
+from ms_slam_env.planning.view_goals import best_goal
 
 
 def played(planner_class, steps=6, **options):

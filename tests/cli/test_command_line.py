@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ms_slam_env._runtime.command_line import exit_code
+from ms_slam_env._runtime.progress import Bar
+from ms_slam_env.benchmark import rows as harness_rows
+from ms_slam_env.benchmark.planners import DETAILS, HEADLINE
 from ms_slam_env.cli import COMMANDS, main
-from ms_slam_env.command_line import exit_code
 from ms_slam_env.errors import InputError
-from ms_slam_env.experiments.harness import rows as harness_rows
-from ms_slam_env.experiments.planners import DETAILS, HEADLINE
 from ms_slam_env.geometry import make_pose, so3_exp
-from ms_slam_env.progress import Bar
 from ms_slam_env.report.records import Row
 from ms_slam_env.sequences import associate, write_trajectory
 
@@ -259,7 +259,7 @@ def test_the_message_stands_below_the_bars_that_an_error_left_open(capsys):
 
 SLOW_WRITER = """
 import sys
-from ms_slam_env.command_line import exit_code
+from ms_slam_env._runtime.command_line import exit_code
 def run():
     for _ in range(100_000):
         print("a line", file=getattr(sys, sys.argv[1]), flush=True)
@@ -307,7 +307,7 @@ def test_an_output_that_is_closed_ends_a_command_quietly(
 
 def test_files_do_not_take_the_place_of_closed_streams(tmp_path) -> None:
     code = (
-        "import os, sys; from ms_slam_env.command_line import exit_code;"
+        "import os, sys; from ms_slam_env._runtime.command_line import exit_code;"
         "sys.exit(exit_code(lambda: 0 if open(sys.argv[1], 'w').fileno() > 2 else 1))"
     )
     line = f'exec {sys.executable} -c "$0" {tmp_path}/file >&- 2>&- <&-'

@@ -17,19 +17,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ms_slam_env import output_files
+from ms_slam_env._runtime import output_files
+from ms_slam_env._runtime.command_line import exit_code
+from ms_slam_env.benchmark import Experiment
 from ms_slam_env.camera import xtion
 from ms_slam_env.cli import COMMANDS, experiment, main
-from ms_slam_env.command_line import exit_code
-from ms_slam_env.experiments.harness import Experiment
-from ms_slam_env.exploration import ExplorationSettings, make_space
-from ms_slam_env.exploration.study_storage import StudyStorage
 from ms_slam_env.geometry import look_at
 from ms_slam_env.report.records import RecordFile, Row
 from ms_slam_env.report.tables import Table, make_table
 from ms_slam_env.sequences import render_sequence
 from ms_slam_env.sequences.writing import write_sequence
 from ms_slam_env.slam.configuration import SlamConfiguration
+from ms_slam_env.tuning import ExplorationSettings, make_space
+from ms_slam_env.tuning.study_storage import StudyStorage
 
 WRITE = os.write
 MARKERS = {"metrics.json", "evaluation.json", "divergence.json", "results.json", "sequence.json",
@@ -77,7 +77,7 @@ def run_here(specs: Any, run: Any, out: Path, *_: Any, **options: Any) -> list[R
 
 def run_tiny(arguments: list[str]) -> int:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("ms_slam_env.experiments.harness.rows.run_all", run_here)
+        patch.setattr("ms_slam_env.benchmark.rows.run_all", run_here)
         return exit_code(lambda: experiment.run(Tiny, arguments, "ms-slam experiment", Path("x")))
 
 
@@ -201,7 +201,7 @@ def test_a_study_says_that_the_disk_is_full(
 def test_an_output_that_takes_nothing_is_one_line(letters: int) -> None:
     """In a process of its own, whose standard output is written when it ends, or is much."""
     code = """import sys
-from ms_slam_env.command_line import exit_code
+from ms_slam_env._runtime.command_line import exit_code
 sys.exit(exit_code(lambda: print("x" * int(sys.argv[1])) or 0))"""
     with open("/dev/full", "w") as full:
         done = subprocess.run(

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from ms_slam_env.benchmark.rows import lost_runs
 from ms_slam_env.cli import main
-from ms_slam_env.experiments.harness.rows import lost_runs
 from ms_slam_env.sequences import open_sequence
 
 

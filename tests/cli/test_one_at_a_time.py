@@ -14,7 +14,7 @@ from ms_slam_env.cli import main
 HOLD = """
 import sys
 from pathlib import Path
-from ms_slam_env.result_folders import alone_in, lock_beside
+from ms_slam_env._runtime.result_folders import alone_in, lock_beside
 out = Path(sys.argv[1])
 with alone_in(out), alone_in(out, lock_beside(out)):
     print("held", flush=True)

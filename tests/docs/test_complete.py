@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from ms_slam_env import scenes, slam, tasks
+from ms_slam_env.benchmark import EXPERIMENTS, experiment_class
 from ms_slam_env.cli import COMMANDS
 from ms_slam_env.env.registry import OBSERVATIONS
-from ms_slam_env.experiments.harness import experiment_class, experiment_names
 from ms_slam_env.report.results import read_results
 from ms_slam_env.sequences.perturbations import PERTURBATIONS
 
@@ -24,7 +24,7 @@ PLANNERS = re.findall(r"^([\w-]+) = ", _SECTION[1], re.MULTILINE)
 COMMITTED = [
     path
     for path in sorted((ROOT / "docs" / "results").glob("*/results.json"))
-    if read_results(path).kind in experiment_names() and read_results(path).rows
+    if read_results(path).kind in EXPERIMENTS.own and read_results(path).rows
 ]
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from ms_slam_experiments.pictures.environments import SHOWN_IDS
 from PIL import Image
 
 from ms_slam_env import ENV_IDS
-from ms_slam_env.experiments.pictures.environments import SHOWN_IDS
 
 PICTURES = Path(__file__).resolve().parents[2] / "docs" / "pictures"
 FILMS = sorted((PICTURES / "environments").glob("*"))

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
+from ms_slam_env.benchmark import EXPERIMENTS, experiment_class
 from ms_slam_env.cli import COMMANDS
 from ms_slam_env.errors import InputError
-from ms_slam_env.experiments.harness import experiment_class, experiment_names
 from ms_slam_env.metrics.registry import metric
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -58,7 +58,7 @@ def test_commands_of_a_page_exist(page: Path) -> None:
     assert used <= set(COMMANDS)
     named = re.findall(r"ms-slam experiment (\w+)(?![\w:])", text)
     experiments = {name.replace("-", "_") for name in named}
-    assert experiments <= {*experiment_names(), "list", "NAME"}
+    assert experiments <= {*EXPERIMENTS.own, "list", "NAME"}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -78,7 +78,7 @@ def test_the_form_of_results_is_as_the_page_says() -> None:
         key = content["rows_key"]
         assert named <= {*content, *content[key][0]}
         assert f"`{key}`" in where
-    for name in experiment_names():
+    for name in EXPERIMENTS.own:
         key = experiment_class(name).rows_key
         assert f"`{key}`" in where
         of_own = re.findall(rf"`{key}` of ([^:]*?)(?:, `\w+` of|\. )", where, re.DOTALL)

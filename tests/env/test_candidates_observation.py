@@ -11,10 +11,10 @@ from ms_slam_baselines.greedy import GreedyDivergence, distance_to_targets
 
 import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env.geometry import invert, relative_angle
-from ms_slam_env.mapping import OccupancyGrid, expected_gain, view_information
-from ms_slam_env.mapping.candidates import NAMES
-from ms_slam_env.mapping.trackability import SCALE, slip_risk
-from ms_slam_env.mapping.view_goals import best_goal
+from ms_slam_env.planning import OccupancyGrid, expected_gain, view_information
+from ms_slam_env.planning.candidates import NAMES
+from ms_slam_env.planning.trackability import SCALE, slip_risk
+from ms_slam_env.planning.view_goals import best_goal
 
 OPTIONS = {"scene": "table", "scene_seed": 0, "image_size": "80x60", "disable_env_checker": True}
 FREE = "MSActiveSLAM-FreeCamera-v0"

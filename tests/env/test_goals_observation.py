@@ -8,12 +8,12 @@ import pytest
 
 import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env.geometry import invert, relative_angle
-from ms_slam_env.mapping import OccupancyGrid, expected_gain, held_gain, reachable_positions
-from ms_slam_env.mapping.candidates import GRID_NAMES, NAMES
-from ms_slam_env.mapping.expected_gain import look_from
-from ms_slam_env.mapping.goals_around import NUM_GOALS, gain_around
-from ms_slam_env.mapping.trackability import SCALE, remaining, slip_risk
-from ms_slam_env.mapping.view_goals import best_goal
+from ms_slam_env.planning import OccupancyGrid, expected_gain, held_gain, reachable_positions
+from ms_slam_env.planning.candidates import GRID_NAMES, NAMES
+from ms_slam_env.planning.expected_gain import look_from
+from ms_slam_env.planning.goals_around import NUM_GOALS, gain_around
+from ms_slam_env.planning.trackability import SCALE, remaining, slip_risk
+from ms_slam_env.planning.view_goals import best_goal
 
 OPTIONS = {"scene": "table", "scene_seed": 0, "image_size": "80x60", "disable_env_checker": True}
 STATE = 140 + 3 + NUM_GOALS + 1 + 8

@@ -6,7 +6,7 @@ import pytest
 
 import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env.errors import InputError
-from ms_slam_env.mapping import OccupancyGrid, expected_gain, surrounding_occupancy
+from ms_slam_env.planning import OccupancyGrid, expected_gain, surrounding_occupancy
 
 OPTIONS = {"scene": "table", "scene_seed": 0, "image_size": "80x60", "disable_env_checker": True}
 BLOCKS = 2 * 10 * 6 * 10, 2 * 8 * 4 * 8

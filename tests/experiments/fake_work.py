@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ms_slam_env.experiments.harness.rows import run_all
+from ms_slam_env.benchmark.rows import run_all
 
 
 @dataclass(frozen=True)

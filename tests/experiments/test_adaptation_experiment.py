@@ -6,11 +6,11 @@ import json
 from dataclasses import asdict
 
 import pytest
+from ms_slam_experiments.adaptation import Adaptation, AdaptationSpec, comparison, judge
 
 from ms_slam_env import slam
 from ms_slam_env.cli import main
 from ms_slam_env.config import from_dict
-from ms_slam_env.experiments.adaptation import Adaptation, AdaptationSpec, comparison, judge
 from ms_slam_env.report.records import spec_key, to_plain
 from ms_slam_env.report.tables import flattened
 from ms_slam_env.sequences import MotionSegments, open_sequence

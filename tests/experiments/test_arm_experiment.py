@@ -10,16 +10,16 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-
-from ms_slam_env.errors import InputError
-from ms_slam_env.experiments.arm_experiment import (
+from ms_slam_experiments.arm_experiment import (
     METRICS,
     ArmExperiment,
     RunSpec,
     compare,
     judge_episode,
 )
-from ms_slam_env.experiments.duplicate_objects import DuplicateObjects
+from ms_slam_experiments.duplicate_objects import DuplicateObjects
+
+from ms_slam_env.errors import InputError
 from ms_slam_env.metrics.consistency import ConsistencyRule
 from ms_slam_env.metrics.registry import check_keys, metric
 
@@ -77,7 +77,7 @@ def test_runs_of_one_scene_differ_in_light_and_noise_alone(monkeypatch: pytest.M
         seen.append((world.episode, world.scene.seed))
         return judge_episode(world, rule)
 
-    monkeypatch.setattr("ms_slam_env.experiments.arm_experiment.judge_episode", judge)
+    monkeypatch.setattr("ms_slam_experiments.arm_experiment.judge_episode", judge)
     specs = ArmExperiment(
         ("stationary",), ("table",), 2, seconds=0.1, env_id=FREE, seeds="train", same_scene=1000
     ).specs()

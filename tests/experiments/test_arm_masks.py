@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from ms_slam_experiments import arm_masks
+from ms_slam_experiments.arm_masks import ArmMasks, WalkSpec
+from ms_slam_experiments.shared.arm_truth import furniture_cloud
+from ms_slam_experiments.shared.mask_tables import mask_tables
 
 from ms_slam_env import scenes
-from ms_slam_env.experiments import arm_masks
-from ms_slam_env.experiments.arm_masks import ArmMasks, WalkSpec
-from ms_slam_env.experiments.harness.arm_truth import furniture_cloud
-from ms_slam_env.experiments.harness.mask_tables import mask_tables
 from ms_slam_env.metrics.registry import check_keys
 
 # reason, reached, stopped, gap_m, touches_itself: right where allowed and possible agree

@@ -6,12 +6,12 @@ import cv2
 import mujoco
 import numpy as np
 import pytest
+from ms_slam_experiments.pictures.arm import LABEL, Options, arm_sheet, scene_with
+from ms_slam_experiments.pictures.drawing import run_script
+from ms_slam_experiments.shared.arm_truth import floor_below
 from numpy.testing import assert_allclose
 
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.experiments.harness.arm_truth import floor_below
-from ms_slam_env.experiments.pictures.arm import LABEL, Options, arm_sheet, scene_with
-from ms_slam_env.experiments.pictures.drawing import run_script
 from ms_slam_env.geometry import look_at, make_pose, so3_exp
 from ms_slam_env.robot.arm import load_arm
 from ms_slam_env.robot.arm.shape import arm_parts, column_parts

@@ -3,15 +3,15 @@
 import mujoco
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
-
-from ms_slam_env.experiments.harness.arm_truth import (
+from ms_slam_experiments.shared.arm_truth import (
     ArmTruth,
     Cloud,
     column_cloud,
     furniture_cloud,
     signed_distance,
 )
+from numpy.testing import assert_allclose
+
 from ms_slam_env.geometry import make_pose
 from ms_slam_env.robot.arm import load_arm
 from ms_slam_env.robot.arm.chain import segment_distance

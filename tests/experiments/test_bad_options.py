@@ -4,8 +4,8 @@ import math
 
 import pytest
 
+from ms_slam_env.benchmark import experiment_class
 from ms_slam_env.errors import InputError
-from ms_slam_env.experiments.harness import experiment_class
 
 REFUSED = {
     "adaptation": [

@@ -14,11 +14,11 @@ from pathlib import Path
 import pytest
 
 from ms_slam_env import slam
+from ms_slam_env.benchmark.command_runs import check_command, run_command
+from ms_slam_env.benchmark.compare import Compare
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.run_sequence import run_sequence
-from ms_slam_env.experiments.compare import Compare
-from ms_slam_env.experiments.harness.command_runs import check_command, run_command
 from ms_slam_env.metrics import ate_rmse
 from ms_slam_env.sequences import HandheldPath, open_sequence, read_trajectory
 from ms_slam_env.slam.registry import POINT
@@ -112,7 +112,7 @@ def test_a_worker_that_is_ended_ends_its_program_and_leaves_no_frames(tmp_path) 
     words = f"pwd > {tmp_path}/folder; echo $$ > {known}; sleep 60 # {{sequence}} {{trajectory}}"
     code = (
         "from pathlib import Path; from test_command_backend import opened;"
-        "from ms_slam_env.experiments.harness.command_runs import run_command;"
+        "from ms_slam_env.benchmark.command_runs import run_command;"
         f"run_command({f'command:sh -c {words!r}'!r}, opened(), Path('x'), 60.0)"
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}

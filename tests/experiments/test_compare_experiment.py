@@ -12,16 +12,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ms_slam_env import sequences
-from ms_slam_env.cli import main
-from ms_slam_env.errors import InputError
-from ms_slam_env.experiments import compare
-from ms_slam_env.experiments.compare import PEERS, Compare
-from ms_slam_env.experiments.harness.compare_runs import CompareSpec
-from ms_slam_env.experiments.harness.compare_tables import (
+from ms_slam_env.benchmark import compare
+from ms_slam_env.benchmark.compare import PEERS, Compare
+from ms_slam_env.benchmark.compare_runs import CompareSpec
+from ms_slam_env.benchmark.compare_tables import (
     METRICS,
     comparison_tables,
     distinct_names,
 )
+from ms_slam_env.cli import main
+from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, se3_exp
 from ms_slam_env.metrics import ate_rmse
 from ms_slam_env.report.statistics import median_interval, share_interval

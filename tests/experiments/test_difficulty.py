@@ -8,21 +8,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
-
-from ms_slam_env.errors import InputError
-from ms_slam_env.evaluation.image_motion import MOTIONS
-from ms_slam_env.evaluation.sequence_divergence import statistics_of
-from ms_slam_env.experiments import difficulty
-from ms_slam_env.experiments.difficulty import RECORDING, Difficulty, DifficultySpec
-from ms_slam_env.experiments.harness.motion_difficulty import (
+from ms_slam_experiments import difficulty
+from ms_slam_experiments.difficulty import RECORDING, Difficulty, DifficultySpec
+from ms_slam_experiments.shared.motion_difficulty import (
     CORRELATIONS,
     EASY,
     HARD,
     judgements,
     statistics,
 )
-from ms_slam_env.experiments.harness.rows import write_all
+from PIL import Image
+
+from ms_slam_env.benchmark.rows import write_all
+from ms_slam_env.errors import InputError
+from ms_slam_env.evaluation.image_motion import MOTIONS
+from ms_slam_env.evaluation.sequence_divergence import statistics_of
 from ms_slam_env.report.results import read_results
 from ms_slam_env.sequences import write_trajectory
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ms_slam_env.benchmark.episode_scores import anchored_points, measure_losses
+from ms_slam_env.benchmark.episodes import EpisodeSpec, run_episode
 from ms_slam_env.errors import InputError
-from ms_slam_env.experiments.harness.episode_scores import anchored_points, measure_losses
-from ms_slam_env.experiments.harness.episodes import EpisodeSpec, run_episode
 from ms_slam_env.slam.submaps import Submaps
 
 

@@ -10,18 +10,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ms_slam_env.config import parse_named
-from ms_slam_env.env.embodiments import EMBODIMENTS
-from ms_slam_env.env.planners import PLANNERS, make_planner
-from ms_slam_env.errors import InputError
-from ms_slam_env.experiments.harness.episodes import (
+from ms_slam_env.benchmark.episodes import (
     EpisodeSpec,
     make_env,
     parse_options,
     play,
     run_episode,
 )
-from ms_slam_env.experiments.planners import DETAILS, HEADLINE
+from ms_slam_env.benchmark.planners import DETAILS, HEADLINE
+from ms_slam_env.config import parse_named
+from ms_slam_env.env.embodiments import EMBODIMENTS
+from ms_slam_env.env.planners import PLANNERS, make_planner
+from ms_slam_env.errors import InputError
 
 SPEC = EpisodeSpec("random", "table", seed=2000, steps=4)
 CLOCKS = ("decision_ms",)
@@ -87,7 +87,7 @@ def test_a_trained_policy_without_its_extra_says_what_to_install(monkeypatch):
     def missing(name):
         raise ModuleNotFoundError("No module named 'torch'", name="torch")
 
-    monkeypatch.setattr("ms_slam_env.extension.import_module", missing)
+    monkeypatch.setattr("ms_slam_env._runtime.extension.import_module", missing)
     with pytest.raises(
         InputError, match=r"No module named 'torch'; pip install 'ms-slam-env\[train"
     ):

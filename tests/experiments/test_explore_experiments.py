@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ms_slam_experiments.explore_divergence import ExploreDivergence
+from ms_slam_experiments.explore_rates import ExploreRates, front_of_trials
+from ms_slam_experiments.explore_samplers import ExploreSamplers, summarise
 
+from ms_slam_env.benchmark import Experiment
+from ms_slam_env.benchmark.rows import write_all
 from ms_slam_env.camera import xtion
-from ms_slam_env.experiments.explore_divergence import ExploreDivergence
-from ms_slam_env.experiments.explore_rates import ExploreRates, front_of_trials
-from ms_slam_env.experiments.explore_samplers import ExploreSamplers, summarise
-from ms_slam_env.experiments.harness import Experiment
-from ms_slam_env.experiments.harness.rows import write_all
 from ms_slam_env.geometry import look_at
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.results import Results

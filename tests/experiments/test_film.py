@@ -5,14 +5,14 @@ import itertools
 
 import numpy as np
 import pytest
+from ms_slam_experiments.pictures import environments, film
+from ms_slam_experiments.pictures.drawing import run_script
+from ms_slam_experiments.pictures.episode_views import Plan
 from PIL import Image, ImageSequence
 
+from ms_slam_env._runtime.output_files import check_out_folder
 from ms_slam_env.errors import InputError
-from ms_slam_env.experiments.pictures import environments, film
-from ms_slam_env.experiments.pictures.drawing import run_script
-from ms_slam_env.experiments.pictures.episode_views import Plan
-from ms_slam_env.mapping.occupancy_grid import OccupancyGrid
-from ms_slam_env.output_files import check_out_folder
+from ms_slam_env.planning.occupancy_grid import OccupancyGrid
 
 RNG = np.random.default_rng(0)
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from ms_slam_experiments.frame_selection import FilterSpec, FrameSelection
 
 from ms_slam_env import metrics, slam
 from ms_slam_env.camera import xtion
 from ms_slam_env.evaluation.run_sequence import run_sequence
-from ms_slam_env.experiments.frame_selection import FilterSpec, FrameSelection
 from ms_slam_env.geometry import look_at
 from ms_slam_env.sequences import open_sequence, render_sequence
 from ms_slam_env.sequences.writing import write_sequence

@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from ms_slam_env.camera import xtion
-from ms_slam_env.divergence import depth_divergence, intensity_divergence
-from ms_slam_env.errors import InputError
-from ms_slam_env.experiments.frame_skipping import (
+from ms_slam_experiments.frame_skipping import (
     DIVERGENCES,
     FrameSkipping,
     SkippingSpec,
     suggest_targets,
 )
+
+from ms_slam_env.camera import xtion
+from ms_slam_env.divergence import depth_divergence, intensity_divergence
+from ms_slam_env.errors import InputError
 from ms_slam_env.report.statistics import Interval
 from ms_slam_env.sensor.scene_cache import get_scene
 from ms_slam_env.sequences import handheld_trajectory, render_sequence, write_trajectory

@@ -12,13 +12,13 @@ from typing import Any
 
 import pytest
 
+from ms_slam_env.benchmark import EXPERIMENTS, Experiment, experiment_class, rows
+from ms_slam_env.benchmark.checking import check_results, compare, spec_type
+from ms_slam_env.benchmark.rows import run_experiment
+from ms_slam_env.benchmark.usme import Usme
 from ms_slam_env.cli import main
 from ms_slam_env.cli.experiment import run
 from ms_slam_env.errors import InputError
-from ms_slam_env.experiments.harness import Experiment, experiment_class, experiment_names, rows
-from ms_slam_env.experiments.harness.checking import check_results, compare, spec_type
-from ms_slam_env.experiments.harness.rows import run_experiment
-from ms_slam_env.experiments.usme import Usme
 from ms_slam_env.metrics.registry import RESULTS_VERSION, check_keys, registry
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.results import read_results
@@ -162,7 +162,7 @@ def test_every_metric_says_what_it_is() -> None:
         assert of.label
 
 
-@pytest.mark.parametrize("name", experiment_names())
+@pytest.mark.parametrize("name", EXPERIMENTS.own)
 def test_every_experiment_is_complete(name: str) -> None:
     cls = experiment_class(name.replace("_", "-"))
     assert cls.title()
@@ -174,7 +174,7 @@ def test_every_experiment_is_complete(name: str) -> None:
 def test_experiments_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["experiment", "list"]) == 0
     shown = capsys.readouterr().out
-    assert all(name in shown for name in experiment_names())
+    assert all(name in shown for name in EXPERIMENTS.own)
     assert main(["experiment", "nonsense"]) == 2
     assert "valid choices: " in capsys.readouterr().err
 

@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 from homes import SEED
+from ms_slam_experiments import homes
+from ms_slam_experiments.homes import Homes, HomeSpec
 
-from ms_slam_env.experiments import homes
-from ms_slam_env.experiments.homes import Homes, HomeSpec
 from ms_slam_env.scenes.homes.home import built
 
 

@@ -7,6 +7,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from ms_slam_experiments.pictures.judged_map import (
+    RED,
+    describe,
+    overview_pose,
+    save_map_picture,
+)
 
 from ms_slam_env import slam as slam_backends
 from ms_slam_env.camera import xtion
@@ -15,12 +21,6 @@ from ms_slam_env.evaluation.duplicate_objects import (
     judge_map,
     labelled_surface,
     labelled_view,
-)
-from ms_slam_env.experiments.pictures.judged_map import (
-    RED,
-    describe,
-    overview_pose,
-    save_map_picture,
 )
 from ms_slam_env.geometry import invert, make_pose, transform_points
 from ms_slam_env.metrics.consistency import MapConsistency, ObjectConsistency

@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-
-from ms_slam_env.experiments import lookahead_ranking as ranking
-from ms_slam_env.experiments.lookahead_ranking import JUDGED, KINDS, LookaheadRanking, RankingSpec
+from ms_slam_experiments import lookahead_ranking as ranking
+from ms_slam_experiments.lookahead_ranking import JUDGED, KINDS, LookaheadRanking, RankingSpec
 
 CHOSEN = ("default", "default, live reference")
 

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ms_slam_experiments.loop_closure import LoopClosure, LoopSpec
 
 from ms_slam_env import scenes
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.loop_closures import judge_closure
-from ms_slam_env.experiments.loop_closure import LoopClosure, LoopSpec
 from ms_slam_env.geometry import make_pose, relative_angle, so3_exp
 from ms_slam_env.sequences.loop_paths import returning_path
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from ms_slam_env.errors import InputError
-from ms_slam_env.evaluation.moving_objects import found_masks, mask_measures, true_masks
-from ms_slam_env.experiments.moving_objects import (
+from ms_slam_experiments.moving_objects import (
     MASKED,
     MovingObjectsExperiment,
     MovingObjectsSpec,
 )
+
+from ms_slam_env.errors import InputError
+from ms_slam_env.evaluation.moving_objects import found_masks, mask_measures, true_masks
 from ms_slam_env.metrics.registry import metric
 from ms_slam_env.report.records import Row
 from ms_slam_env.sequences import HandheldPath, open_sequence

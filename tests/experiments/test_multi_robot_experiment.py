@@ -6,13 +6,11 @@ import dataclasses
 
 import numpy as np
 import pytest
-from two_robots import TRUTHS, run_robot
-
-from ms_slam_env.cli import main
-from ms_slam_env.errors import InputError
-from ms_slam_env.experiments import multi_robot
-from ms_slam_env.experiments.harness import teams
-from ms_slam_env.experiments.harness.teams import (
+from ms_slam_experiments import multi_robot
+from ms_slam_experiments.multi_robot import MultiRobot
+from ms_slam_experiments.pictures import judged_map
+from ms_slam_experiments.shared import teams
+from ms_slam_experiments.shared.teams import (
     MultiRobotSpec,
     PairMerge,
     Team,
@@ -21,8 +19,10 @@ from ms_slam_env.experiments.harness.teams import (
     place_robots,
     team_paths,
 )
-from ms_slam_env.experiments.multi_robot import MultiRobot
-from ms_slam_env.experiments.pictures import judged_map
+from two_robots import TRUTHS, run_robot
+
+from ms_slam_env.cli import main
+from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, make_pose, so3_exp
 from ms_slam_env.sequences import HandheldPath
 from ms_slam_env.slam.map_hypotheses import RobotRun

@@ -9,20 +9,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ms_slam_experiments.paper_table2 import METRICS, PaperTable2
+from ms_slam_experiments.step_size import StepSize
 
-from ms_slam_env.errors import InputError
-from ms_slam_env.experiments.harness.episodes import seed_list, short_planner_names
-from ms_slam_env.experiments.harness.planner_tables import (
+from ms_slam_env.benchmark.episodes import seed_list, short_planner_names
+from ms_slam_env.benchmark.planner_tables import (
     DETAILS,
     HEADLINE,
     from_the_same_start,
     policies_together,
     score_matrices,
 )
-from ms_slam_env.experiments.harness.rows import write_all
-from ms_slam_env.experiments.paper_table2 import METRICS, PaperTable2
-from ms_slam_env.experiments.planners import PlannerBenchmark
-from ms_slam_env.experiments.step_size import StepSize
+from ms_slam_env.benchmark.planners import PlannerBenchmark
+from ms_slam_env.benchmark.rows import write_all
+from ms_slam_env.errors import InputError
 from ms_slam_env.report.records import Row, spec_key
 from ms_slam_env.report.results import read_results
 from ms_slam_env.report.statistics import Interval, share_interval

@@ -6,8 +6,7 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
-
-from ms_slam_env.experiments import pose_covariance as pc
+from ms_slam_experiments import pose_covariance as pc
 
 
 def _errors(factor: float, count: int = 20_000) -> np.ndarray:

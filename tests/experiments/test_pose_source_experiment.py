@@ -1,8 +1,7 @@
 """The comparison of pose sources, from rows of known content."""
 
 import pytest
-
-from ms_slam_env.experiments.pose_sources import METRICS, PoseSourceExperiment
+from ms_slam_experiments.pose_sources import METRICS, PoseSourceExperiment
 
 ERROR_M = {"slam": 0.010, "slam-kinematics": 0.008, "kinematics": 0.005, "ground_truth": 0.0}
 

@@ -7,9 +7,12 @@ import math
 import numpy as np
 import pytest
 from box_scene import BoxScene
-
-from ms_slam_env.camera import RGBDFrame
-from ms_slam_env.experiments.harness.interruptions import (
+from ms_slam_experiments.relocalization import (
+    Relocalization,
+    RelocalizationSpec,
+    about_the_maps,
+)
+from ms_slam_experiments.shared.interruptions import (
     SETTINGS,
     Interruption,
     MappedSpace,
@@ -17,11 +20,8 @@ from ms_slam_env.experiments.harness.interruptions import (
     interrupt,
     map_path,
 )
-from ms_slam_env.experiments.relocalization import (
-    Relocalization,
-    RelocalizationSpec,
-    about_the_maps,
-)
+
+from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.geometry import look_at, make_pose, relative_angle
 from ms_slam_env.report.records import from_plain, to_plain
 from ms_slam_env.slam import TrackResult

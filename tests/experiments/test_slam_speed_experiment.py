@@ -5,15 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ms_slam_experiments.env_speed import EnvSpeed, EnvSpeedSpec
+from ms_slam_experiments.lookahead_speed import STAGES, LookaheadSpeed
+from ms_slam_experiments.shared.slam_speed_child import APART_M, with_far_places
+from ms_slam_experiments.slam_batch import SlamBatch, device_bytes
+from ms_slam_experiments.slam_speed import SlamSpeed, backend_parameters, run_child, summarise
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
-from ms_slam_env.experiments.env_speed import EnvSpeed, EnvSpeedSpec
-from ms_slam_env.experiments.harness.slam_speed_child import APART_M, with_far_places
-from ms_slam_env.experiments.lookahead_speed import STAGES, LookaheadSpeed
-from ms_slam_env.experiments.slam_batch import SlamBatch, device_bytes
-from ms_slam_env.experiments.slam_speed import SlamSpeed, backend_parameters, run_child, summarise
 
 TINY = {"scene": "carpet", "seed": 1000, "sizes": ("80x60",), "frames": 5, "warm_up": 2}
 

@@ -3,9 +3,7 @@
 from dataclasses import asdict
 
 import numpy as np
-
-from ms_slam_env import ENV_IDS
-from ms_slam_env.experiments.soak import (
+from ms_slam_experiments.soak import (
     ARM_SHARE,
     IDS,
     PLAIN_IDS,
@@ -14,6 +12,8 @@ from ms_slam_env.experiments.soak import (
     SoakSpec,
     not_finite,
 )
+
+from ms_slam_env import ENV_IDS
 
 
 def test_steps_are_spread_over_all_environments():

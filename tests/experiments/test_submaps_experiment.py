@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-
-from ms_slam_env import scenes
-from ms_slam_env.camera import xtion
-from ms_slam_env.experiments.harness.interruptions import map_path
-from ms_slam_env.experiments.submaps import (
+from ms_slam_experiments.shared.interruptions import map_path
+from ms_slam_experiments.submaps import (
     DARK,
     RETURN,
     SubmapsExperiment,
     SubmapsSpec,
     _interruptions,
 )
+
+from ms_slam_env import scenes
+from ms_slam_env.camera import xtion
 
 SPEC = SubmapsSpec("table", 1000, "80x60", (RETURN, DARK), ("atlas", "off"), 1, 20, 10)
 
@@ -43,6 +43,6 @@ def test_a_wrong_joint_is_counted(monkeypatch):
     joined = [a for a in right.values() if a["joined_submaps"]]
     assert joined
     assert all(max(a["link_error_m"]) < 0.02 for a in joined)
-    monkeypatch.setattr("ms_slam_env.experiments.submaps.WRONG_M", 1e-6)
+    monkeypatch.setattr("ms_slam_experiments.submaps.WRONG_M", 1e-6)
     wrong = SubmapsExperiment.run(SPEC)["attempts"]
     assert sum(a["wrong_joins"] for a in wrong) == sum(a["joined_submaps"] for a in joined)

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 from ms_slam_baselines.team_nbv import TeamNextBestView, looked_at
+from ms_slam_experiments.team_mapping import TeamMapping, TeamMappingSpec, nearby_starts
 
 from ms_slam_env.camera import xtion
 from ms_slam_env.cli import main
 from ms_slam_env.env.coverage import CoverageGrid, team_share
-from ms_slam_env.experiments.team_mapping import TeamMapping, TeamMappingSpec, nearby_starts
 from ms_slam_env.geometry import look_at, make_pose
 from ms_slam_env.sensor import RGBDSensor
 

@@ -9,11 +9,10 @@ from large_scenes import SEED
 from PIL import Image
 
 from ms_slam_env import scenes, slam
+from ms_slam_env.benchmark import rows as harness_rows
+from ms_slam_env.benchmark import usme, usme_runs
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
-from ms_slam_env.experiments import usme
-from ms_slam_env.experiments.harness import rows as harness_rows
-from ms_slam_env.experiments.harness import usme_runs
 from ms_slam_env.sequences.usme_suite import NAMES, find
 
 make_scene = cache(scenes.make)

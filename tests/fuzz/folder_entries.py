@@ -32,21 +32,21 @@ from mutations import (
 from optuna.storages._rdb.storage import _VersionManager
 from policy_files import as_bytes
 
+from ms_slam_env._runtime.output_files import append_line, growing_file, write_bytes
+from ms_slam_env._runtime.result_folders import alone_in, own_folder, result_folder
 from ms_slam_env.errors import InputError
-from ms_slam_env.exploration import ExplorationSettings, explore, make_space
-from ms_slam_env.exploration.choices import choose
-from ms_slam_env.exploration.front import hypervolume_history, importances, points_of
-from ms_slam_env.exploration.space import SearchSpace
-from ms_slam_env.exploration.study_storage import StudyStorage
-from ms_slam_env.output_files import append_line, growing_file, write_bytes
 from ms_slam_env.report import page
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import RecordFile
 from ms_slam_env.report.results import write_results
 from ms_slam_env.report.statistics import Interval
 from ms_slam_env.report.tables import make_table
-from ms_slam_env.result_folders import alone_in, own_folder, result_folder
 from ms_slam_env.slam.configuration import SlamConfiguration
+from ms_slam_env.tuning import ExplorationSettings, explore, make_space
+from ms_slam_env.tuning.choices import choose
+from ms_slam_env.tuning.front import hypervolume_history, importances, points_of
+from ms_slam_env.tuning.space import SearchSpace
+from ms_slam_env.tuning.study_storage import StudyStorage
 
 # --- policies ----------------------------------------------------------------------------------
 

@@ -184,7 +184,7 @@ def _is_close(value: Any, truth: Any, relative: float, absolute: float) -> bool:
 
 
 def _episode(planner: str, env_id: str = FREE, steps: int = 3, **fields: Any) -> Any:
-    from ms_slam_env.experiments.harness.episodes import EpisodeSpec, run_episode
+    from ms_slam_env.benchmark.episodes import EpisodeSpec, run_episode
 
     return run_episode(EpisodeSpec(planner, "carpet", 1000, env_id, steps, **fields))
 
@@ -215,15 +215,15 @@ def pose_sources(_: Path) -> Any:
 
 @experiment("arm_experiment")
 def arm_experiment(_: Path) -> Any:
-    from ms_slam_env.experiments.arm_experiment import ArmExperiment, RunSpec
+    from ms_slam_experiments.arm_experiment import ArmExperiment, RunSpec
 
     return ArmExperiment.run(RunSpec("random", "carpet", 1000, ARM, steps=100, seconds=0.6))
 
 
 @experiment("arm_masks")
 def arm_mask_walk(_: Path) -> Any:
-    from ms_slam_env.experiments import arm_masks
-    from ms_slam_env.experiments.harness.arm_truth import furniture_cloud
+    from ms_slam_experiments import arm_masks
+    from ms_slam_experiments.shared.arm_truth import furniture_cloud
 
     coarse = furniture_cloud(_scene("carpet", 1000), spacing_m=0.04)  # quick to prepare
     with patch.object(arm_masks, "furniture_of", lambda *_: coarse):
@@ -234,7 +234,7 @@ def arm_mask_walk(_: Path) -> Any:
 
 @experiment("lookahead_ranking")
 def lookahead_ranking(_: Path) -> Any:
-    from ms_slam_env.experiments.lookahead_ranking import (
+    from ms_slam_experiments.lookahead_ranking import (
         JUDGED,
         KINDS,
         LookaheadRanking,
@@ -254,8 +254,8 @@ def lookahead_ranking(_: Path) -> Any:
 
 @experiment("compare")
 def compare(_: Path) -> Any:
-    from ms_slam_env.experiments.compare import Compare
-    from ms_slam_env.experiments.harness.compare_runs import CompareSpec
+    from ms_slam_env.benchmark.compare import Compare
+    from ms_slam_env.benchmark.compare_runs import CompareSpec
 
     text = "table:1000:kinect+exposure-ramp"
     return {
@@ -266,7 +266,7 @@ def compare(_: Path) -> Any:
 
 @experiment("usme", CHAOTIC)
 def usme(folder: Path) -> Any:
-    from ms_slam_env.experiments.harness.usme_runs import UsmeSpec, run_usme
+    from ms_slam_env.benchmark.usme_runs import UsmeSpec, run_usme
     from ms_slam_env.sequences.usme_suite import make_suite
 
     name, size, seed, scale = "room-fast-black", "80x60", 2000, 0.3
@@ -276,7 +276,8 @@ def usme(folder: Path) -> Any:
 
 @experiment("adaptation", CHAOTIC)
 def adaptation(_: Path) -> Any:
-    from ms_slam_env.experiments.adaptation import Adaptation, AdaptationSpec
+    from ms_slam_experiments.adaptation import Adaptation, AdaptationSpec
+
     from ms_slam_env.sequences import MotionSegments
     from ms_slam_env.slam.adaptation import DivergenceAdaptationConfig
 
@@ -287,7 +288,7 @@ def adaptation(_: Path) -> Any:
 
 @experiment("frame_selection")
 def frame_selection(_: Path) -> Any:
-    from ms_slam_env.experiments.frame_selection import FilterSpec, FrameSelection
+    from ms_slam_experiments.frame_selection import FilterSpec, FrameSelection
 
     filters = ("none", "regular,every=2", "divergence,threshold=0.02")
     return FrameSelection.run(FilterSpec("table:1000", filters, image_size="80x60", frames=30))
@@ -295,7 +296,7 @@ def frame_selection(_: Path) -> Any:
 
 @experiment("frame_skipping")
 def frame_skipping(_: Path) -> Any:
-    from ms_slam_env.experiments.frame_skipping import FrameSkipping, SkippingSpec
+    from ms_slam_experiments.frame_skipping import FrameSkipping, SkippingSpec
 
     return {
         f"every {interval}": FrameSkipping.run(SkippingSpec("table", 1000, interval, 18, "80x60"))
@@ -305,7 +306,7 @@ def frame_skipping(_: Path) -> Any:
 
 @experiment("relocalization", CHAOTIC)
 def relocalization(_: Path) -> Any:
-    from ms_slam_env.experiments.relocalization import Relocalization, RelocalizationSpec
+    from ms_slam_experiments.relocalization import Relocalization, RelocalizationSpec
 
     settings, variants = ("near", "black", "foreign"), ("ferns", "local")
     spec = RelocalizationSpec("table", 1001, "80x60", settings, variants, 1, 50, 3)
@@ -314,7 +315,7 @@ def relocalization(_: Path) -> Any:
 
 @experiment("submaps", CHAOTIC)
 def submaps(_: Path) -> Any:
-    from ms_slam_env.experiments.submaps import SubmapsExperiment, SubmapsSpec
+    from ms_slam_experiments.submaps import SubmapsExperiment, SubmapsSpec
 
     spec = SubmapsSpec("table", 1000, "80x60", ("return",), ("atlas",), 1, 20, 10)
     return SubmapsExperiment.run(spec)
@@ -322,7 +323,7 @@ def submaps(_: Path) -> Any:
 
 @experiment("loop_closure", CHAOTIC)
 def loop_closure(_: Path) -> Any:
-    from ms_slam_env.experiments.loop_closure import LoopClosure, LoopSpec
+    from ms_slam_experiments.loop_closure import LoopClosure, LoopSpec
 
     recording = ("living_room", 1002, "around", 0.06, 5.0, "kinect", "80x60")
     return LoopClosure.run(LoopSpec(*recording, closure="deformation"))
@@ -330,8 +331,9 @@ def loop_closure(_: Path) -> Any:
 
 @experiment("multi_robot", CHAOTIC)
 def multi_robot(_: Path) -> Any:
-    from ms_slam_env.experiments.harness.teams import MultiRobotSpec
-    from ms_slam_env.experiments.multi_robot import MultiRobot
+    from ms_slam_experiments.multi_robot import MultiRobot
+    from ms_slam_experiments.shared.teams import MultiRobotSpec
+
     from ms_slam_env.slam.map_merging import MergeConfig
 
     merge = MergeConfig(queries=6, lost_queries=1, patience=2)
@@ -343,7 +345,7 @@ def multi_robot(_: Path) -> Any:
 
 @experiment("pose_covariance", CHAOTIC)
 def pose_covariance(_: Path) -> Any:
-    from ms_slam_env.experiments.pose_covariance import PoseCovariance
+    from ms_slam_experiments.pose_covariance import PoseCovariance
 
     seeds = {"validation_seeds": (1000,), "test_seeds": (1001,)}
     experiment = PoseCovariance(("wall",), **seeds, size="80x60", frames=16)
@@ -356,7 +358,7 @@ def pose_covariance(_: Path) -> Any:
 
 @experiment("acceptance_roc", CHAOTIC)
 def acceptance_roc(_: Path) -> Any:
-    from ms_slam_env.experiments.acceptance_roc import AcceptanceRoc
+    from ms_slam_experiments.acceptance_roc import AcceptanceRoc
 
     experiment = AcceptanceRoc(("wall:1000",), image_size="80x60", frames=31)
     return AcceptanceRoc.run(experiment.specs()[0])
@@ -364,7 +366,7 @@ def acceptance_roc(_: Path) -> Any:
 
 @experiment("slam_batch")
 def slam_batch(_: Path) -> Any:
-    from ms_slam_env.experiments.slam_batch import SlamBatch
+    from ms_slam_experiments.slam_batch import SlamBatch
 
     sequence = {"scene": "table", "seed": 1000, "size": "80x60", "frames": 6, "sequences": 2}
     (spec,) = SlamBatch(batch=(3,), warm_up=1, max_surfels=8000, **sequence).specs()
@@ -374,8 +376,8 @@ def slam_batch(_: Path) -> Any:
 @experiment("slam_speed")
 def slam_speed(_: Path) -> Any:
     """Surfels and lost frames; the rest are times."""
-    from ms_slam_env.experiments.harness.slam_speed_child import measure
-    from ms_slam_env.experiments.slam_speed import stored_sequence
+    from ms_slam_experiments.shared.slam_speed_child import measure
+    from ms_slam_experiments.slam_speed import stored_sequence
 
     _, path = stored_sequence("table", 1000, 6, "80x60")
     rows = measure(path, "80x60", (1, 30_000), 2, {"compaction_interval": 7})
@@ -385,7 +387,7 @@ def slam_speed(_: Path) -> Any:
 @experiment("lookahead_speed")
 def lookahead_speed(_: Path) -> Any:
     """Size of the map and number of views; the rest are times."""
-    from ms_slam_env.experiments.lookahead_speed import LookaheadSpeed
+    from ms_slam_experiments.lookahead_speed import LookaheadSpeed
 
     (spec,) = LookaheadSpeed("table", 1000, "80x60", surfels=3000, repeats=1).specs()
     found = LookaheadSpeed.run(spec)
@@ -395,7 +397,7 @@ def lookahead_speed(_: Path) -> Any:
 @experiment("env_speed")
 def env_speed(_: Path) -> Any:
     """Frames a step; the rest are times."""
-    from ms_slam_env.experiments.env_speed import EnvSpeed, EnvSpeedSpec
+    from ms_slam_experiments.env_speed import EnvSpeed, EnvSpeedSpec
 
     spec = EnvSpeedSpec("free", 1, "features", scene="table", seconds=0.01, warm_up=1)
     return {"frames_per_step": EnvSpeed.run(spec)["frames_per_step"]}
@@ -439,7 +441,8 @@ def map_consistency(_: Path) -> Any:
 
 @experiment("duplicate_objects", CHAOTIC)
 def duplicate_objects(_: Path) -> Any:
-    from ms_slam_env.experiments.duplicate_objects import CopySpec, DuplicateObjects
+    from ms_slam_experiments.duplicate_objects import CopySpec, DuplicateObjects
+
     from ms_slam_env.metrics.consistency import ConsistencyRule
 
     return DuplicateObjects.run(CopySpec("table", 1000, 0.1, 0, ConsistencyRule()))
@@ -469,14 +472,14 @@ def map_evaluation(folder: Path) -> Any:
 
 @cache
 def _evaluator(*sequences: str) -> Any:
-    from ms_slam_env.exploration import SlamEvaluator
+    from ms_slam_env.tuning import SlamEvaluator
 
     return SlamEvaluator(sequences, 12, image_size="80x60", map_error=True)
 
 
 @experiment("explore", CHAOTIC)
 def explore(folder: Path) -> Any:
-    from ms_slam_env.exploration import Exploration, ExplorationSettings, run_exploration
+    from ms_slam_env.tuning import Exploration, ExplorationSettings, run_exploration
 
     exploration = Exploration(
         _evaluator("table:1000"),
@@ -506,7 +509,7 @@ def explore_evaluation(_: Path) -> Any:
 
 @experiment("explore_divergence")
 def explore_divergence(_: Path) -> Any:
-    from ms_slam_env.experiments.explore_divergence import METRICS, ExploreDivergence, RateSpec
+    from ms_slam_experiments.explore_divergence import METRICS, ExploreDivergence, RateSpec
 
     specs = [
         RateSpec(text, every, "80x60", 12)
@@ -538,9 +541,10 @@ class _Formula:
 @experiment("explore_samplers", EXACT)
 def explore_samplers(folder: Path) -> Any:
     """Samplers on a formula: with real runs, an objective is a time."""
-    from ms_slam_env.experiments.explore_samplers import run_study, summarise
-    from ms_slam_env.exploration import make_space
-    from ms_slam_env.exploration.samplers import Grid
+    from ms_slam_experiments.explore_samplers import run_study, summarise
+
+    from ms_slam_env.tuning import make_space
+    from ms_slam_env.tuning.samplers import Grid
 
     space = make_space(["icp_rgb_weight=0:1", "keep_every=1:6"])
     grid = Grid(space, _Formula(), 4, folder / "evaluations.jsonl")  # type: ignore[arg-type]
@@ -608,9 +612,9 @@ def sequence_divergence(folder: Path) -> Any:
 
 @experiment("difficulty", FEW_PIXELS)
 def difficulty(folder: Path) -> Any:
+    from ms_slam_experiments.difficulty import RECORDING, DifficultySpec, watch
     from PIL import Image
 
-    from ms_slam_env.experiments.difficulty import RECORDING, DifficultySpec, watch
     from ms_slam_env.sequences import write_trajectory
 
     data = folder / "icl_nuim"

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import ms_slam_env
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.native import native_source, read_header
 
 PACKAGE = Path(ms_slam_env.__file__).parent
@@ -86,7 +86,7 @@ def test_what_a_header_does_not_have_is_refused():
 PROGRAM = """
 import sys
 import numpy as np
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.slam.surfel.device import fetch, put
 @wp.kernel
 def copy(values: wp.array(dtype={dtype}), out: wp.array(dtype={dtype}), i: int):

@@ -19,9 +19,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ms_slam_env.benchmark.experiment import Experiment, experiment_class
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
-from ms_slam_env.experiments.harness.experiment import Experiment, experiment_class
 from ms_slam_env.metrics.registry import CHANGED_KINDS, metric
 from ms_slam_env.report.charts import Chart, Guide, Panel, Series
 from ms_slam_env.report.discovery import find_results

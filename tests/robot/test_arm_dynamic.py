@@ -5,10 +5,10 @@ import pytest
 from box_scene import BoxScene
 from numpy.testing import assert_allclose, assert_array_equal
 
+from ms_slam_env._runtime.timings import Timings
 from ms_slam_env.geometry import invert, relative_angle
 from ms_slam_env.robot.arm import ArmConfig, ArmNoise
 from ms_slam_env.robot.arm.dynamic_arm import DynamicArm
-from ms_slam_env.timings import Timings
 
 PERFECT = ArmNoise(0, 0, 0, 0, 0, 0)
 STEP = (0.08, np.radians(8))

@@ -11,13 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ms_slam_env import scenes
+from ms_slam_env._runtime.timings import Timings
 from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.geometry import look_at, relative_angle
 from ms_slam_env.robot.arm import ArmConfig
 from ms_slam_env.robot.arm.arm import KinematicArm, camera_poses, frame_times
 from ms_slam_env.robot.arm.clearance import LinkClearance
 from ms_slam_env.robot.arm.controller import Controller
-from ms_slam_env.timings import Timings
 
 START = look_at([0.0, -0.8, 1.2], [1.2, 0.2, 0.7])
 STEP_M, STEP_RAD = 0.12, np.radians(12)

@@ -8,7 +8,7 @@ from box_scene import ROOM_HIGH, ROOM_LOW, BoxScene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics, xtion
 from ms_slam_env.geometry import look_at, se3_exp
 from ms_slam_env.sensor import (

@@ -9,7 +9,7 @@ from box_scene import BoxScene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics, xtion
 from ms_slam_env.errors import InputError
 from ms_slam_env.sensor import RGBDSensor, depth_noise, images, rays, shading

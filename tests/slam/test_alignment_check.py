@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from surfel_scenes import ray_cast
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, make_pose, relative_angle, so3_exp
 from ms_slam_env.slam.alignment_check import (

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 
 HOPPER = 90
 MODULES = (

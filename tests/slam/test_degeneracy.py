@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ms_slam_env import slam
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.slam.surfel.degeneracy import eigen, mat66d, mat76d, remapped_step, vec6d
 

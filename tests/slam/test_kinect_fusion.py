@@ -12,13 +12,13 @@ from box_scene import BoxScene
 from ms_slam_env import slam
 from ms_slam_env.camera import xtion
 from ms_slam_env.errors import InputError
-from ms_slam_env.exploration import make_space
 from ms_slam_env.geometry import invert, look_at, make_pose, se3_exp, so3_exp, transform_points
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.configuration import SlamConfiguration
 from ms_slam_env.slam.volumetric import KinectFusionConfig
 from ms_slam_env.slam.volumetric.projective_icp import ProjectiveICP, frame_pyramid, model_surface
 from ms_slam_env.slam.volumetric.voxel_grid import CastView
+from ms_slam_env.tuning import make_space
 
 CAMERA = xtion("160x120")
 CORNER = look_at([-0.4, -0.7, 1.4], [1.6, 0.6, 0.4])

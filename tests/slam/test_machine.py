@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import xtion
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.configuration import (

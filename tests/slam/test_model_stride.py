@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from surfel_scenes import SMALL, build_map, device_poses
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import xtion
 from ms_slam_env.geometry import make_pose, so3_exp
 from ms_slam_env.slam.surfel.config import SurfelConfig

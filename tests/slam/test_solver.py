@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.geometry import se3_exp
 from ms_slam_env.slam.surfel.alignment_arrays import (
     NUM_SUMS,

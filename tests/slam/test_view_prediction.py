@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import maximum_filter, minimum_filter
 from surfel_scenes import SMALL, build_map, device_poses, ray_cast
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import make_pose, so3_exp

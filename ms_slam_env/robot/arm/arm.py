@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.timings import Timings
 from ms_slam_env.geometry import Float64
 from ms_slam_env.robot.action_primitives import NUM_MOTIONS, decompose
 from ms_slam_env.robot.arm.base_placement import place_arm, reach_m, standing_chain
@@ -17,7 +18,6 @@ from ms_slam_env.robot.arm.inverse_kinematics import solve_pose
 from ms_slam_env.robot.arm.model import load_arm
 from ms_slam_env.robot.base import Embodiment, MotionResult
 from ms_slam_env.scenes.base import Scene
-from ms_slam_env.timings import Timings
 
 
 def frame_times(duration_s: float, config: ArmConfig) -> Float64:

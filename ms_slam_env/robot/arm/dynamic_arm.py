@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ms_slam_env._runtime.timings import Timings
 from ms_slam_env.geometry import Float64, relative_angle, transform_points
 from ms_slam_env.robot.arm.arm import ArmEmbodiment, frame_times
 from ms_slam_env.robot.arm.config import ArmConfig
@@ -15,7 +16,6 @@ from ms_slam_env.robot.arm.dynamics import ArmDynamics, Imperfections, Motion
 from ms_slam_env.robot.arm.feasibility import MOST_STRETCH
 from ms_slam_env.robot.base import MotionResult
 from ms_slam_env.scenes.base import Scene
-from ms_slam_env.timings import Timings
 
 _SETTLE_S = 1.0  # before the first frame
 

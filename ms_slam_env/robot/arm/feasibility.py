@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.geometry import Float64, invert
 from ms_slam_env.robot.arm.cartesian_path import PEAK_SPEED, progress
 from ms_slam_env.robot.arm.chain import Chain

@@ -8,7 +8,7 @@ in the order of ``REASONS`` of :mod:`ms_slam_env.robot.arm.feasibility`.
 
 from __future__ import annotations
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.robot.arm.ik_kernels import Arm, Scratch, forward, solve_waypoint
 
 OK = wp.constant(0)

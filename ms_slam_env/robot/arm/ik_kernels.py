@@ -8,7 +8,7 @@ a candidate ``k``.
 
 from __future__ import annotations
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 
 _ITERATIONS = wp.constant(8)
 _CONVERGED_M = wp.constant(1.0e-4)

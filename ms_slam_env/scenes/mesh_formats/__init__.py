@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ms_slam_env._runtime.input_files import MAX_MESH_BYTES, read_bytes
 from ms_slam_env.config import Checked, bounded, chosen, from_dict, parse_named
 from ms_slam_env.errors import InputError
-from ms_slam_env.input_files import MAX_MESH_BYTES, read_bytes
 from ms_slam_env.scenes.base import Float64
 
 if TYPE_CHECKING:

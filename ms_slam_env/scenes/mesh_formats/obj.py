@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ms_slam_env._runtime.input_files import MAX_TEXT_BYTES
 from ms_slam_env.errors import InputError
-from ms_slam_env.input_files import MAX_TEXT_BYTES
 from ms_slam_env.scenes.base import Float64
 from ms_slam_env.scenes.mesh_formats.part import (
     Image,

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.input_files import MAX_IMAGE_BYTES, MAX_MESH_BYTES, read_bytes
 from ms_slam_env.camera.image_files import decode_texture
 from ms_slam_env.errors import InputError, InputWarning
-from ms_slam_env.input_files import MAX_IMAGE_BYTES, MAX_MESH_BYTES, read_bytes
 from ms_slam_env.scenes.base import Float64
 
 Int64 = NDArray[np.int64]

@@ -5,7 +5,7 @@ Seeded ones are frozen dataclasses, a `CameraPath` each, which names of sequence
 
 from typing import TYPE_CHECKING
 
-from ms_slam_env.lazy import lazy_names
+from ms_slam_env._runtime.lazy import lazy_names
 
 if TYPE_CHECKING:
     from ms_slam_env.sequences.paths.base import CameraPath

@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from ms_slam_env._runtime.extension import ExtensionPoint
 from ms_slam_env.config import from_dict
-from ms_slam_env.extension import ExtensionPoint
 from ms_slam_env.sequences.perturbations.base import Moment, Perturbation
 from ms_slam_env.sequences.perturbations.illumination import Illumination
 from ms_slam_env.sequences.perturbations.images import (

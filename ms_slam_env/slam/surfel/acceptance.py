@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.geometry import invert
 from ms_slam_env.slam.alignment_check import (
     AcceptanceThresholds,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 
 
 class Sum(IntEnum):

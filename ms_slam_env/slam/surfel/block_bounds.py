@@ -9,7 +9,7 @@ surfels a little; other boxes stay as they are. The same holds for the time of r
 
 from __future__ import annotations
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.native import native_source
 from ms_slam_env.slam.surfel.surfels import BLOCK_SIZE, CullingBlocks, Surfels
 

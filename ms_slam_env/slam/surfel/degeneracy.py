@@ -14,7 +14,7 @@ along a direction may be only that. On blank walls and corners, with 1 mm to 4 m
 
 from __future__ import annotations
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.native import native_source
 
 mat66d = wp.types.matrix(shape=(6, 6), dtype=wp.float64)

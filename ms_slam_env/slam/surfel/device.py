@@ -16,8 +16,8 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
-from ms_slam_env import _warp
-from ms_slam_env._warp import RecordedLaunch, wp
+from ms_slam_env._runtime import warp as _warp
+from ms_slam_env._runtime.warp import RecordedLaunch, wp
 from ms_slam_env.native import native_source
 from ms_slam_env.slam.state import Stateful
 

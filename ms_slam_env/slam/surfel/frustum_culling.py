@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from ms_slam_env._warp import RecordedLaunch, wp
+from ms_slam_env._runtime.warp import RecordedLaunch, wp
 from ms_slam_env.native import native_source
 from ms_slam_env.slam.surfel.block_bounds import num_blocks
 from ms_slam_env.slam.surfel.surfels import (

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.slam.surfel.device import fetch, put
 from ms_slam_env.slam.surfel.surfels import SplatCamera, Surfels, rotation_of, translation_of
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.surfel.alignment_arrays import (
     NUM_SUMS,

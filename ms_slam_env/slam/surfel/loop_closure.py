@@ -24,7 +24,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.geometry import invert
 from ms_slam_env.slam.alignment_check import TrackingStatus
 from ms_slam_env.slam.base import Loop

@@ -45,7 +45,7 @@ compiler turns into operations on eight points. A thread of a GPU takes one poin
 
 from __future__ import annotations
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.native import native_source
 from ms_slam_env.slam.surfel.alignment_arrays import (
     RUNNING,

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-from ms_slam_env._warp import RecordedLaunch, wp
+from ms_slam_env._runtime.warp import RecordedLaunch, wp
 from ms_slam_env.slam.surfel.device import fetch, put, threads_per_row
 
 EDGE_FRACTION = 0.03  # pixels of a block further behind the front one than this are another surface

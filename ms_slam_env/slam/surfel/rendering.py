@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from ms_slam_env._warp import RecordedLaunch, wp
+from ms_slam_env._runtime.warp import RecordedLaunch, wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.surfel import splatting
 from ms_slam_env.slam.surfel.frustum_culling import FrustumCuller

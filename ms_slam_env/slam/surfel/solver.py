@@ -7,7 +7,7 @@ Lie theory" (2018), equations (172) and (174).
 
 from __future__ import annotations
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.native import native_source
 from ms_slam_env.slam.surfel.alignment_arrays import (
     NUM_SUMS,

@@ -15,7 +15,7 @@ arithmetic.
 
 from __future__ import annotations
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.native import native_source
 from ms_slam_env.slam.surfel.device import fetch, put, raise_to
 from ms_slam_env.slam.surfel.surfels import (

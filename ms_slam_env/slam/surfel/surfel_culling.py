@@ -7,7 +7,7 @@ some frames, not all that is out of view: it may be all that a camera has mapped
 
 from __future__ import annotations
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.slam.surfel.block_bounds import num_blocks
 from ms_slam_env.slam.surfel.device import fetch, put
 from ms_slam_env.slam.surfel.fusion import FusedFrame

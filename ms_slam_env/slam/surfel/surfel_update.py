@@ -14,7 +14,7 @@ next ones are looked at, so that they are fetched once.
 
 from __future__ import annotations
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.native import native_source
 from ms_slam_env.slam.surfel.frustum_culling import frustum_of, list_some_visible
 from ms_slam_env.slam.surfel.fusion import COARSER, STEEPEST, FusedFrame, FusionParameters

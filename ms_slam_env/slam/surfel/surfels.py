@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ms_slam_env._warp import roomy_zeros, wp
+from ms_slam_env._runtime.warp import roomy_zeros, wp
 from ms_slam_env.errors import InputError
 
 BLOCK_SIZE = wp.constant(128)

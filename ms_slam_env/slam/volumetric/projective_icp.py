@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ms_slam_env._warp import wp
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.camera.frame import reduce_depth
 from ms_slam_env.geometry import Float64, se3_exp

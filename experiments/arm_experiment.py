@@ -1,0 +1,249 @@
+"""The paper's robot experiment, four settings, ten runs each: is the map consistent?
+
+Saeedi et al., ICRA 2017, section VI-C and figure 9.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from ms_slam_experiments.pictures.judged_map import save_map_picture
+
+from ms_slam_env.benchmark.episode_scores import LOST_ERROR_M, measure_trajectory
+from ms_slam_env.benchmark.episodes import (
+    DEFAULT_PLANNERS,
+    DEFAULT_STEP_DEG,
+    DEFAULT_STEP_M,
+    EpisodeSpec,
+    check_episodes,
+    check_names,
+    make_env,
+    parse_options,
+    play,
+    seed_list,
+    short_planner_names,
+)
+from ms_slam_env.benchmark.experiment import Experiment
+from ms_slam_env.config import check_range
+from ms_slam_env.env import ActiveSlamEnv
+from ms_slam_env.env.planners import make_planner
+from ms_slam_env.errors import InputError
+from ms_slam_env.evaluation.duplicate_objects import JudgedMap, judge_map, labelled_view
+from ms_slam_env.metrics.consistency import ConsistencyRule
+from ms_slam_env.report.charts import Chart, bars
+from ms_slam_env.report.records import Row
+from ms_slam_env.report.tables import Grouping, Table, finished, make_table
+
+SCENES = ("window", "table", "wall", "carpet")
+FRAME_RATE_HZ = 30  # no motion is shorter than a frame of the fastest camera
+MOST_VIEWS = 200  # of an episode's frames, evenly picked: the verdict costs some 3 s
+METRICS = (
+    *("success", "success_tracked", "lost", "lost_frames_share", "mapped_area_m2", "ate_m"),
+    *("ate_tracked_m", "tracked_share", "worst_apart_share", "path_length_m", "energy_j", "steps"),
+)
+LAMP = {"dim": 0.0, "lamp": 0.3, "speed_m_s": 0.001}  # "minor changes in illumination"
+ACTIVE, BASELINE = "greedy", "random"
+PAPER = {"carpet": f"{BASELINE} 0 of 10, {ACTIVE} 5 of 10"}
+"""Successes that the paper's text states; its other bars are in its figure 9 alone."""
+
+
+@dataclass(frozen=True)
+class RunSpec(EpisodeSpec):
+    """One run; see :class:`.episode.EpisodeSpec`.
+
+    Attributes:
+        seconds: simulated time after which the run ends.
+        rule: when its map has failed.
+        picture: where a picture of the judged map goes; empty for none.
+        same_start: whether the run begins where one with the scene's seed begins.
+    """
+
+    seconds: float = 60.0
+    rule: ConsistencyRule = field(default_factory=ConsistencyRule)
+    picture: str = ""
+    same_start: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse unknown choices and values out of range."""
+        super().__post_init__()
+        try:
+            check_range(self, "seconds", 0.1, 3600)
+        except InputError as error:
+            raise InputError(str(error).replace("RunSpec.", "")) from None
+
+
+@dataclass(frozen=True)
+class ArmExperiment(Experiment):
+    """The paper's robot experiment: does a planner's map show an object twice?
+
+    Standing still succeeds trivially: read success beside the mapped area.
+    """
+
+    planners: tuple[str, ...] = DEFAULT_PLANNERS
+    """NAME or module:Class, options appended as in greedy,rho_I=0.3."""
+    scenes: tuple[str, ...] = SCENES
+    """Names of scenes, or mesh files."""
+    episodes: int = 10
+    """Runs for each scene and planner, each with a seed of its own."""
+    seconds: float = 60.0
+    """Simulated time of a run."""
+    step_m: float = DEFAULT_STEP_M
+    """Translation of a motion, metres."""
+    step_deg: float = DEFAULT_STEP_DEG
+    """Rotation of a motion, degrees."""
+    env_id: str = "MSActiveSLAM-v0"
+    """Environment; the default one has the arm."""
+    embodiment: str | None = None
+    """What carries the camera, where it is not the environment's own."""
+    seeds: str = "test"
+    """Split that the seeds come from."""
+    options: tuple[str, ...] = ()
+    """Options of the environment, as in pose=kinematics."""
+    same_scene: int | None = None
+    """Seed of one scene and start for all runs, which then differ in light, noise and actuation."""
+    rule: ConsistencyRule = field(default_factory=ConsistencyRule)
+    """When an object counts as present twice."""
+    pictures: Path | None = None
+    """Folder of pictures of the judged maps; none by default."""
+
+    rows_key = "runs"
+
+    @staticmethod
+    def run(spec: RunSpec) -> dict[str, Any]:
+        """Play one run and judge its map."""
+        env = make_env(spec)
+        try:
+            world = cast(ActiveSlamEnv, env.unwrapped)
+            planner = make_planner(spec.planner, world, spec.seed)
+            start = None
+            if spec.same_start:
+                start = env.reset(seed=spec.options["scene_seed"])[1]["T_world_camera"]
+            played = play(env, planner, spec.seed, spec.seconds, start=start)
+            judged = judge_episode(world, spec.rule)
+            if spec.picture and len(judged.points):
+                cameras = world.episode.trajectory_estimate[:, :3, 3]
+                title = f"{Path(spec.scene).stem}, {spec.planner}, seed {spec.seed}"
+                save_map_picture(judged, cameras, Path(spec.picture), title)
+            return {
+                **{name: played[name] for name in ("steps", "decision_ms", "time_s", "energy_j")},
+                **measure_trajectory(world),
+                **_outcome(world, judged),
+            }
+        finally:
+            env.close()
+
+    def specs(self) -> list[RunSpec]:
+        """Every run; those of one scene and seed are neighbours and share its geometry."""
+        check_names(self.planners, self.scenes)
+        options = parse_options(self.options)
+        # A run goes on when tracking is lost, as the paper's did.
+        options.setdefault("lost_patience", 1_000_000)
+        if self.embodiment is not None:
+            options["embodiment"] = self.embodiment
+        if self.same_scene is not None:
+            options |= {"scene_seed": self.same_scene, "perturbed_by": "illumination"}
+            options["perturbation"] = LAMP
+        return [
+            self.spec(
+                RunSpec,
+                planner=planner,
+                scene=scene,
+                seed=seed,
+                steps=max(1, math.ceil(self.seconds * FRAME_RATE_HZ)),
+                options=options,
+                picture=self._picture(scene, planner, seed),
+                same_start=self.same_scene is not None,
+            )
+            for scene in self.scenes
+            for seed in seed_list(self.seeds, self.episodes)
+            for planner in self.planners
+        ]
+
+    def _picture(self, scene: str, planner: str, seed: int) -> str:
+        if self.pictures is None:
+            return ""
+        name = planner.replace("/", "_").replace(":", "_")
+        return str(self.pictures / f"{Path(scene).stem}_{name}_{seed}.png")
+
+    def prepare(self) -> None:
+        """Start one run of each planner."""
+        check_episodes(self.specs())
+
+    def tables(self, rows: Sequence[Row]) -> list[Table]:
+        """One line a scene and planner; successes beside the paper's."""
+        note = (
+            f"Runs of {self.seconds:g} simulated seconds. Shares of runs with 95 % Wilson "
+            "intervals, medians with 95 % bootstrap intervals."
+        )
+        medians = Grouping(("scene", "planner"), METRICS, count="episodes").table(rows, note=note)
+        columns = ["scene", f"{BASELINE}_successes", f"{ACTIVE}_successes", "better_planner"]
+        beside = make_table([*columns, "paper_claim"], compare(rows), "Beside the paper")
+        return [medians, beside]
+
+    def charts(self, rows: Sequence[Row]) -> list[Chart]:
+        """Success, success without being lost at the end, and the mapped area."""
+        label = short_planner_names(row["spec"]["planner"] for row in rows).__getitem__
+        keys = ("success", "success_tracked", "mapped_area_m2")
+        caption = (
+            "A map fails if it shows an object twice. Bars: share of runs (area: median); "
+            "lines: 95 % intervals."
+        )
+        panels = bars(rows, "scene", "planner", keys, label)
+        return [Chart("arm_experiment", "Maps that show no object twice", caption, panels)]
+
+
+def judge_episode(world: ActiveSlamEnv, rule: ConsistencyRule | None = None) -> JudgedMap:
+    """Judge the map of the episode just played.
+
+    The frames are rendered again without noise from their true poses, with the objects' labels.
+    """
+    frames = np.flatnonzero(world.episode.tracked & world.episode.processed)
+    picked = frames[np.unique(np.linspace(0, len(frames) - 1, MOST_VIEWS).astype(int))]
+    truth, estimate = world.episode.trajectory_truth, world.episode.trajectory_estimate
+    views = [labelled_view(world.sensor, truth[k], estimate[k]) for k in picked]
+    return judge_map(
+        world.slam.surface_points(), world.slam.surface_colors(), views, world.sensor, rule
+    )
+
+
+def _outcome(world: ActiveSlamEnv, judged: JudgedMap) -> dict[str, Any]:
+    lost = ~world.episode.tracked | (world.episode.pose_errors > LOST_ERROR_M)
+    return {
+        **judged.verdict(),
+        "success_tracked": judged.consistency.success and not lost[-1],
+        "lost": bool(lost.any()),
+        "lost_at_end": bool(lost[-1]),
+        "lost_frames_share": float(lost.mean()),
+        "mapped_area_m2": world.coverage.mapped_area,
+        "map_points": len(judged.points),
+        "frames": len(world.episode.timestamps),
+    }
+
+
+def compare(rows: Sequence[Row]) -> list[dict[str, str | None]]:
+    """Successes of the greedy planner and of random walk by scene, and who has the greater share.
+
+    Options of a planner do not count; nobody is better where one has no runs.
+    """
+    flags: dict[tuple[str, str], list[bool]] = {}
+    for row in finished(rows):
+        key = row["spec"]["scene"], row["spec"]["planner"].partition(",")[0]
+        flags.setdefault(key, []).append(bool(row["result"]["success"]))
+    lines = []
+    for scene in dict.fromkeys(scene for scene, _ in flags):
+        runs = {planner: flags.get((scene, planner), []) for planner in (BASELINE, ACTIVE)}
+        line: dict[str, str | None] = {
+            f"{planner}_successes": f"{sum(of)} of {len(of)}" for planner, of in runs.items()
+        }
+        better = None
+        if all(runs.values()):
+            random, greedy = (sum(of) / len(of) for of in runs.values())
+            better = BASELINE if random > greedy else ACTIVE if greedy > random else "equal"
+        claim = f"{ACTIVE} better" + (f": {PAPER[scene]}" if scene in PAPER else "")
+        lines.append({"scene": scene, **line, "better_planner": better, "paper_claim": claim})
+    return lines

@@ -1,0 +1,158 @@
+"""Does a measure of difficulty go with the error of SLAM? Rank correlations over all sequences."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ms_slam_env import metrics, slam
+from ms_slam_env._runtime.parallel import limit_threads
+from ms_slam_env.benchmark.compare import DEFAULT_SEQUENCES
+from ms_slam_env.benchmark.experiment import Experiment
+from ms_slam_env.camera import parse_image_size
+from ms_slam_env.config import Checked, bounded, parse_named
+from ms_slam_env.divergence import DivergenceConfig
+from ms_slam_env.errors import InputError
+from ms_slam_env.evaluation.image_motion import MOTIONS, watch_frames
+from ms_slam_env.evaluation.run_sequence import run_sequence
+from ms_slam_env.evaluation.sequence_divergence import KINDS, WASSERSTEIN, consecutive_distances
+from ms_slam_env.report.records import Row
+from ms_slam_env.report.statistics import rank_correlation
+from ms_slam_env.report.tables import Table, finished, flattened, make_table
+from ms_slam_env.sequences import HandheldPath, check_sequence, open_sequence
+from ms_slam_env.sequences import Sequence as RGBDSequence
+
+HISTOGRAMS = {
+    "kl, paper": DivergenceConfig.paper(),
+    "kl": DivergenceConfig(),
+    "windowed-kl": DivergenceConfig(measure="windowed-kl"),
+    "earth-movers": DivergenceConfig(measure="earth-movers"),
+}
+ERRORS = {"ate_m": "correlation_ate", "rpe_m": "correlation_rpe", "lost_share": "correlation_lost"}
+FAST = tuple(
+    f"{scene}:{seed}:kinect+fast-motion,factor={factor},share=0.5"
+    for scene, seed, factor in (("living_room", 2001, 3), ("table", 2001, 5), ("corridor", 2001, 4))
+)
+
+
+@dataclass(frozen=True)
+class DifficultySpec:
+    """Every backend on one sequence; see :class:`DifficultyErrors` for the fields."""
+
+    sequence: str
+    backends: tuple[str, ...]
+    image_size: str
+    frames: int
+
+
+@dataclass(frozen=True)
+class DifficultyErrors(Experiment, Checked):
+    """Measures of difficulty beside the errors of SLAM
+
+    A data set's difficulty is the mean over its frames of a distance between consecutive ones:
+    divergences of histograms (Saeedi et al., ICRA 2017, Table I), earth mover's distances, and the
+    Wasserstein distance of what is observed (Saeedi et al., ICRA 2019), beside how fast the image
+    moves. Each is set against the errors of each backend by Spearman's correlation over sequences.
+    """
+
+    sequences: tuple[str, ...] = (*DEFAULT_SEQUENCES, *FAST)
+    """Folders with true poses, or scene:seed[:word[+word ...]]."""
+    backends: tuple[str, ...] = tuple(slam.BACKENDS)
+    """NAME, parameters appended as in surfel,loop_closure=deformation."""
+    image_size: str = "160x120"
+    """Of the images."""
+    frames: int = bounded(150, 10, 100_000)
+    """Of a rendered sequence."""
+
+    unit = "sequences"
+
+    def specs(self) -> list[DifficultySpec]:
+        """Every sequence.
+
+        Raises:
+            InputError: a sequence, backend or size that does not exist, or fewer than three.
+        """
+        if len(self.sequences) < 3:
+            raise InputError("a correlation needs at least 3 sequences")
+        for text in self.sequences:
+            check_sequence(text)
+        for text in self.backends:
+            slam.check_parameters(*parse_named(text, "backend"))
+        parse_image_size(self.image_size)
+        return [self.spec(DifficultySpec, sequence=text) for text in self.sequences]
+
+    @staticmethod
+    def run(spec: DifficultySpec) -> dict[str, Any]:
+        """Measure the sequence and run every backend over it."""
+        limit_threads(1)
+        path = HandheldPath(spec.frames)
+        opened = open_sequence(spec.sequence, spec.image_size, path=path, with_truth=True)
+        opened = opened.where_known()
+        watched = watch_frames(opened, HISTOGRAMS)
+        distances = consecutive_distances(tuple(opened.frames), opened.poses, opened.intrinsics)
+        values = {
+            **{(name, kind): watched.divergences[name][:, k]
+               for name in HISTOGRAMS for k, kind in enumerate(KINDS)},
+            (WASSERSTEIN, "observation"): distances[~np.isnan(distances)],
+            **{("motion", name): watched.motion[name] for name in MOTIONS},
+        }  # fmt: skip
+        return {
+            "frames": len(opened),
+            "measures": [
+                {"measure": name, "divergence": kind, "difficulty": float(np.mean(of))}
+                for (name, kind), of in values.items()
+            ],
+            "backends": [_errors(text, opened) for text in spec.backends],
+        }
+
+    def tables(self, rows: Sequence[Row]) -> list[Table]:
+        """Correlations of every measure with every backend's error, then the sequences."""
+        count = len(finished(rows))
+        chance = 1.96 / max(1, count - 1) ** 0.5
+        note = f"Over {count} sequences; beyond +-{chance:.2f} it is unlikely (5 %) to be chance."
+        errors = flattened(rows, "backends")
+        lines = [{"sequence": one["spec"]["sequence"], **one["result"]} for one in errors]
+        columns = ("measure", "divergence", "backend", *ERRORS.values())
+        return [
+            make_table(columns, correlations(rows), note=note),
+            make_table(("sequence", "backend", *ERRORS), lines, "Errors"),
+            make_table(("sequence", "measure", "divergence", "difficulty"),
+                       [{**one["spec"], **one["result"]} for one in flattened(rows, "measures")],
+                       "Difficulty"),
+        ]  # fmt: skip
+
+
+def correlations(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Of every measure and backend: Spearman's correlation over the sequences with each error."""
+    results = [row["result"] for row in finished(rows)]
+    if not results:
+        return []
+    lines = []
+    for m, of in enumerate(results[0]["measures"]):
+        for b, backend in enumerate(results[0]["backends"]):
+            found = {ERRORS[key]: _correlation(results, m, b, key) for key in ERRORS}
+            labels = {key: of[key] for key in ("measure", "divergence")}
+            lines.append({**labels, "backend": backend["backend"], **found})
+    return lines
+
+
+def _correlation(results: Sequence[Row], m: int, b: int, key: str) -> float:
+    """Of a measure and an error, over the sequences that have both; NaN of fewer than three."""
+    pairs = [(r["measures"][m]["difficulty"], r["backends"][b][key]) for r in results]
+    known = [pair for pair in pairs if None not in pair and np.isfinite(pair).all()]
+    return rank_correlation(*zip(*known, strict=True)) if len(known) > 2 else float("nan")
+
+
+def _errors(backend: str, sequence: RGBDSequence) -> dict[str, Any]:
+    """Errors of a backend that starts at the true pose."""
+    name, params = parse_named(backend, "backend")
+    run = run_sequence(slam.make(name, sequence.intrinsics, **params), sequence)
+    return {
+        "backend": backend,
+        "ate_m": metrics.ate_rmse(run.estimates, run.true_poses),
+        "rpe_m": metrics.rpe_rmse(run.estimates, run.true_poses),
+        "lost_share": run.lost,
+    }

@@ -1,0 +1,166 @@
+"""Decisions a second of the environment, and where the time of a decision goes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+
+from ms_slam_env.benchmark.experiment import Experiment
+from ms_slam_env.config import Checked, bounded
+from ms_slam_env.env import ActiveSlamEnv
+from ms_slam_env.env.embodiments import EMBODIMENTS
+from ms_slam_env.env.registry import OBSERVATIONS
+from ms_slam_env.errors import unknown
+from ms_slam_env.report.records import Row
+from ms_slam_env.report.tables import Column, Table, finished, make_table
+
+ORDER = ("ik", "physics", "move", "mask", "render", "slam", "divergence", "coverage", "lookahead")
+"""Order of the stages in the table; others follow."""
+REST = "rest"
+WITHOUT_FRAMES = ("free", "fixed-translation")
+"""Embodiments that bring one frame a step, whatever ``frames_per_action`` says."""
+
+
+@dataclass(frozen=True)
+class EnvSpeedSpec:
+    """One measurement; see :class:`EnvSpeed` for the fields."""
+
+    embodiment: str
+    frames_per_action: int | None
+    observation: str
+    scene: str = "living_room"
+    scene_seed: int = 2000
+    image_size: str = "160x120"
+    seconds: float = 15
+    warm_up: int = 20
+
+
+@dataclass(frozen=True)
+class EnvSpeed(Experiment, Checked):
+    """Decisions a second with random permitted actions, and where their time goes
+
+    The clock runs during ``env.step`` alone; resets are not counted. Processor time is what a step
+    would take on a core of its own, where the measured time suffers from a busy machine.
+    """
+
+    embodiments: tuple[str, ...] = ("arm", "arm-kinematic", "free")
+    """What holds the camera."""
+    frames_per_action: tuple[int | None, ...] = (1, None)
+    """Frames of a motion of an arm; None for as many as arrive while it moves."""
+    observations: tuple[str, ...] = tuple(OBSERVATIONS)
+    """Observation variants."""
+    scene: str = "living_room"
+    """A scene's name, or a mesh file."""
+    scene_seed: int = 2000
+    """Of a procedural scene."""
+    image_size: str = "160x120"
+    """Of the camera, width x height."""
+    seconds: float = bounded(15.0, 0.01, 3600)
+    """Length of each measurement."""
+    warm_up: int = bounded(20, 0, 10_000)
+    """Steps before it: the first ones compile or load kernels."""
+
+    unit = "measurements"
+    workers = 1
+
+    def specs(self) -> list[EnvSpeedSpec]:
+        """Every combination that makes a difference."""
+        for names, kind, choices in (
+            (self.embodiments, "embodiment", EMBODIMENTS),
+            (self.observations, "observation", OBSERVATIONS),
+        ):
+            for name in names:
+                if name not in choices:
+                    raise unknown(kind, name, choices)
+        return [
+            self.spec(
+                EnvSpeedSpec,
+                embodiment=embodiment,
+                frames_per_action=frames,
+                observation=observation,
+            )
+            for embodiment in self.embodiments
+            for frames in ((1,) if embodiment in WITHOUT_FRAMES else self.frames_per_action)
+            for observation in self.observations
+        ]
+
+    @staticmethod
+    def run(spec: EnvSpeedSpec) -> dict[str, Any]:
+        """Speed and split of one case; stages are without those nested in them."""
+        has_arm = spec.embodiment not in WITHOUT_FRAMES
+        env = gym.make(
+            "MSActiveSLAM-v0",
+            embodiment=spec.embodiment,
+            arm={"frames_per_action": spec.frames_per_action} if has_arm else {},
+            scene=spec.scene,
+            scene_seed=spec.scene_seed,
+            image_size=spec.image_size,
+            observation=spec.observation,
+            disable_env_checker=True,
+        )
+        try:
+            return _drive(env, spec.seconds, spec.warm_up)
+        finally:
+            env.close()
+
+    def tables(self, rows: Sequence[Row]) -> list[Table]:
+        """One line a case, one column a stage that took time in any."""
+        lines, seen = [], set()
+        for row in finished(rows):
+            times = {one["stage"]: one["stage_ms"] for one in row["result"]["stages"]}
+            figures = {k: v for k, v in row["result"].items() if k != "stages"}
+            case = {key: row["spec"][key] for key in ("embodiment", "observation")}
+            lines.append({**case, **figures, **{f"{key}_ms": ms for key, ms in times.items()}})
+            seen |= set(times)
+        order = [*(s for s in ORDER if s in seen), *sorted(seen - {*ORDER, REST}), REST]
+        columns: list[Column | str] = [
+            *("embodiment", "frames_per_step", "observation", "steps_per_s", "step_cpu_ms"),
+            *(Column(f"{stage}_ms", "stage_ms", stage) for stage in order),
+        ]
+        return [make_table(columns, lines, note="Stages: mean time a step, by the clock.")]
+
+
+def _drive(env: gym.Env[Any, Any], length_s: float, warm_up: int) -> dict[str, Any]:
+    """Step at random for so long, after so many steps."""
+    world = cast(ActiveSlamEnv, env.unwrapped)
+    rng = np.random.default_rng(0)
+    _, info = env.reset(seed=0)
+    durations: list[float] = []
+    split: dict[str, float] = {}
+    frames, busy, begin = 0, 0.0, np.inf
+    for step in range(1_000_000_000):
+        if step == warm_up:
+            begin = time.perf_counter()
+        action = rng.choice(np.flatnonzero(info["action_mask"]))
+        before = len(world.episode.timestamps)
+        world.timings.clear()  # what happens between steps, such as a reset, is not counted
+        processor, start = time.process_time(), time.perf_counter()
+        _, _, terminated, truncated, info = env.step(action)
+        now = time.perf_counter()
+        if step >= warm_up:
+            durations.append(now - start)
+            busy += time.process_time() - processor
+            frames += len(world.episode.timestamps) - before
+            for name, seconds in world.timings.own.items():
+                split[name] = split.get(name, 0.0) + seconds
+            if now - begin > length_s:
+                break
+        if terminated or truncated:
+            _, info = env.reset()
+    total = float(np.sum(durations))
+    split[REST] = total - sum(split.values())
+    count = len(durations)
+    return {
+        "measured_steps": count,
+        "steps_per_s": count / total,
+        "frames_per_step": frames / count,
+        "step_ms": 1e3 * total / count,
+        "step_ms_p95": 1e3 * float(np.percentile(durations, 95)),
+        "step_cpu_ms": 1e3 * busy / count,
+        "stages": [{"stage": k, "stage_ms": 1e3 * v / count} for k, v in split.items()],
+    }

@@ -1,0 +1,110 @@
+"""Error and time of one configuration at several divergences, as in Figs. 3 and 5 of the paper."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ms_slam_env.benchmark.experiment import Experiment
+from ms_slam_env.report.charts import Chart, over_field, scatter
+from ms_slam_env.report.records import Row
+from ms_slam_env.report.tables import Grouping, Table
+from ms_slam_env.sequences import check_sequence
+from ms_slam_env.slam.configuration import SlamConfiguration, read_configuration
+from ms_slam_env.tuning import SlamEvaluator
+from ms_slam_env.tuning.objectives import FAILURE, as_metrics
+
+METRICS = ("M_I", "M_D", "ate_m", "ate_max_m", "cpu_ms_median", "load_cpu_ms", "failed")
+
+
+@dataclass(frozen=True)
+class RateSpec:
+    """One configuration on every n-th frame of a sequence.
+
+    Attributes:
+        sequence: a folder, or scene:seed[:word[+word ...]].
+        keep_every: every so many frames are processed.
+        image_size: of the camera.
+        frames: length of a whole rendered sequence.
+        base: fields of the configuration.
+    """
+
+    sequence: str
+    keep_every: int
+    image_size: str = "160x120"
+    frames: int = 90
+    base: dict[str, Any] = field(default_factory=dict)
+
+    def evaluator(self) -> SlamEvaluator:
+        """What measures it."""
+        return SlamEvaluator((self.sequence,), self.frames, image_size=self.image_size)
+
+
+@dataclass(frozen=True)
+class ExploreDivergence(Experiment):
+    """Error and time at different divergences
+
+    Every n-th frame of hand-held sequences is processed, which makes the divergence between
+    processed frames larger (Saeedi et al., ICRA 2017, Figs. 3 and 5).
+    """
+
+    sequences: tuple[str, ...] = ("living_room:1000", "corridor:1001", "table:1002", "carpet:1003")
+    """Folders, or scene:seed[:word[+word ...]]."""
+    keep_every: tuple[int, ...] = (1, 2, 3, 4, 6, 8, 10)
+    """Every so many frames are processed."""
+    config: Path | None = None
+    """Configuration file (YAML); by default the surfel backend's own."""
+    image_size: str = "160x120"
+    """Of the camera."""
+    frames: int = 90
+    """Length of a whole rendered sequence."""
+
+    workers = 1  # times are measured
+
+    def specs(self) -> list[RateSpec]:
+        """Every sequence at every rate."""
+        for text in self.sequences:
+            check_sequence(text)
+        base = SlamConfiguration() if self.config is None else read_configuration(self.config)
+        SlamEvaluator(self.sequences, self.frames, image_size=self.image_size)  # refuses bad input
+        return [
+            self.spec(
+                RateSpec,
+                sequence=sequence,
+                keep_every=dataclasses.replace(base, keep_every=every).keep_every,
+                base=asdict(base),
+            )
+            for sequence in self.sequences
+            for every in self.keep_every
+        ]
+
+    @staticmethod
+    def run(spec: RateSpec) -> dict[str, Any]:
+        """Measure the configuration on what is left of the sequence."""
+        configuration = SlamConfiguration(**{**spec.base, "keep_every": spec.keep_every})
+        evaluator = spec.evaluator()
+        measured = evaluator.measure(configuration, spec.sequence)
+        failed = bool(measured.get(FAILURE))
+        return {**as_metrics(measured, evaluator.clock), "failed": failed}
+
+    def tables(self, rows: Sequence[Row]) -> list[Table]:
+        """One line a rate."""
+        note = "Medians (of failures: the share) over sequences with their 95 % intervals."
+        return [Grouping(("keep_every",), METRICS, count="recordings").table(rows, note=note)]
+
+    def charts(self, rows: Sequence[Row]) -> list[Chart]:
+        """Fig. 3, ATE against divergence, and Fig. 5, largest error against time; medians."""
+        pairs = (("M_I", "ate_m", "xy"), ("cpu_ms_median", "ate_max_m", "y"))
+        panels = [
+            scatter(rows, x, y, "keep_every", log, label=lambda every: f"every {every}")
+            for x, y, log in pairs
+        ]
+        medians = over_field(rows, "keep_every", METRICS[:-1], log=("ate_m", "ate_max_m"))
+        caption = "Line: median over sequences; band: its 95 % interval."
+        return [
+            Chart("divergence", "Error against divergence and time", "One mark a run.", panels),
+            Chart("rates", "Medians over the rate", caption, medians),
+        ]

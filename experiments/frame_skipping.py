@@ -1,0 +1,241 @@
+"""Experiment (c): where M_I and M_D come from, as in Figs. 3 and 4 of Saeedi et al., ICRA 2017."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env import metrics, slam
+from ms_slam_env.benchmark.episode_scores import LOST_ERROR_M
+from ms_slam_env.benchmark.episodes import check_names, seed_list
+from ms_slam_env.benchmark.experiment import Experiment
+from ms_slam_env.camera import xtion
+from ms_slam_env.config import parse_named
+from ms_slam_env.divergence import DivergenceConfig
+from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.evaluation.run_sequence import run_sequence
+from ms_slam_env.evaluation.sequence_divergence import consecutive_divergences
+from ms_slam_env.report.charts import Chart, scatter
+from ms_slam_env.report.records import Row
+from ms_slam_env.report.tables import Grouping, Table, make_table
+from ms_slam_env.sensor.scene_cache import get_scene
+from ms_slam_env.sequences import handheld_trajectory, icl_nuim, place_trajectory, render_sequence
+
+Float64 = NDArray[np.float64]
+
+_FINEST = 12  # denominator of an interval: 1.333 is 4/3
+HISTOGRAMS = {"default": DivergenceConfig(), "paper": DivergenceConfig.paper()}
+DIVERGENCES = ("M_I", "M_D", "intensity_divergence_mean", "depth_divergence_mean")
+
+
+@dataclass(frozen=True)
+class SkippingSpec:
+    """One sequence at one interval.
+
+    Attributes:
+        scene: a scene's name or a mesh file.
+        seed: of the scene, the trajectory and the sensor noise.
+        keep_every: every so many frames one is kept; 1 keeps all, 1.5 drops one in three.
+        frames: length of the whole sequence at most.
+        image_size: width x height.
+        motion: ICL-NUIM's that is placed in the scene, such as ``lr_kt1``; empty: hand-held.
+        data: folder that holds it.
+        histograms: ``default`` or ``paper``, how divergence is measured.
+        backend: SLAM that runs on what is kept, with its parameters.
+    """
+
+    scene: str
+    seed: int
+    keep_every: float
+    frames: int
+    image_size: str = "160x120"
+    motion: str = ""
+    data: str = ""
+
+    @property
+    def kept(self) -> NDArray[np.int64]:
+        """Indices of the frames that are kept: floor(k n) for k = 0, 1, 2, ..."""
+        interval = Fraction(self.keep_every).limit_denominator(_FINEST)
+        count = math.ceil(self.frames / interval)
+        return np.array([math.floor(k * interval) for k in range(count)], dtype=np.int64)
+
+    def trajectory(self) -> Float64:
+        """Poses (N, 4, 4) of the frames that are kept."""
+        scene = get_scene(self.scene, self.seed)
+        if self.motion:
+            poses = icl_nuim.read_motion(self.data, self.motion)[1]
+            whole = place_trajectory(scene, poses, self.seed).poses
+        else:
+            whole = handheld_trajectory(scene, self.frames, self.seed)
+        return whole[self.kept[self.kept < len(whole)]]
+
+    histograms: str = "default"
+    backend: str = "surfel"
+
+
+@dataclass(frozen=True)
+class FrameSkipping(Experiment):
+    """Divergence against trajectory error when frames are skipped
+
+    Hand-held sequences, or ICL-NUIM's motions, of which every n-th frame is kept, or one in n
+    dropped, which makes the divergence between neighbours larger; SLAM runs on what is left. The
+    targets M_I and M_D are read at the largest interval up to which the error stays small and no
+    sequence is lost.
+    """
+
+    scenes: tuple[str, ...] = ("living_room", "corridor", "table")
+    """Names of scenes, or mesh files."""
+    intervals: tuple[float, ...] = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 30)
+    """Every so many frames one is kept; 1.5 drops one in three, 1.333 one in four."""
+    frames: int = 240
+    """Length of a whole sequence at most; hand-held, at most 1.5 cm and 1 degree a frame."""
+    motions: tuple[str, ...] = ()
+    """Motions of ICL-NUIM in place of hand-held ones, such as lr_kt1 lr_kt2."""
+    data: Path = Path("../shared/data")
+    """Folder that holds icl_nuim/trajectories/lr_kt1.tum.txt and so on."""
+    sequences: int = 4
+    """Sequences for each scene."""
+    seeds: str = "validation"
+    """Split that the seeds come from; a default read from them may not use the test seeds."""
+    desired_ate_m: float = 0.01
+    """Trajectory error for which the targets M_I and M_D are read."""
+    histograms: str = "default"
+    """Settings of the divergence: default, or paper (256 bins, no smoothing, every pixel)."""
+    backends: tuple[str, ...] = ("surfel",)
+    """NAME, parameters appended as in surfel,check_slips=true; of several no targets are read."""
+
+    unit = rows_key = "sequences"
+
+    def __post_init__(self) -> None:
+        """Refuse intervals that leave no sequence."""
+        for interval in self.intervals:
+            if not 1 <= interval <= self.frames // 3:
+                raise InputError(f"interval {interval:g} is outside [1, {self.frames // 3}]")
+        if not self.desired_ate_m > 0:
+            raise InputError(f"desired_ate_m = {self.desired_ate_m} must be > 0")
+        if self.histograms not in HISTOGRAMS:
+            raise unknown("setting of histograms", self.histograms, HISTOGRAMS)
+        if not self.backends:
+            raise InputError("backends is empty")
+        for text in self.backends:
+            slam.check_parameters(*parse_named(text, "backend"))
+
+    def specs(self) -> list[SkippingSpec]:
+        """Every sequence at every interval."""
+        check_names(("random",), self.scenes)
+        for motion in self.motions:
+            icl_nuim.read_motion(str(self.data), motion)  # refuses what is not there
+        data = str(self.data) if self.motions else ""
+        return [
+            SkippingSpec(
+                *(scene, seed, interval, self.frames),
+                motion=motion,
+                data=data,
+                histograms=self.histograms,
+                backend=backend,
+            )
+            for scene in self.scenes
+            for seed in seed_list(self.seeds, self.sequences)
+            for motion in self.motions or ("",)
+            for interval in self.intervals
+            for backend in self.backends
+        ]
+
+    @staticmethod
+    def run(spec: SkippingSpec) -> dict[str, Any]:
+        """Render the kept frames, run SLAM on them, and measure divergence and error."""
+        scene = get_scene(spec.scene, spec.seed)
+        camera = xtion(spec.image_size)
+        sequence = render_sequence(scene, spec.trajectory(), camera, seed=spec.seed)
+        K = sequence.intrinsics
+        measure = HISTOGRAMS[spec.histograms]
+        divergences = consecutive_divergences(sequence.frames, K, [measure])[:, 0]
+        name, options = parse_named(spec.backend, "backend")
+        run = run_sequence(slam.make(name, K, **options), sequence)
+        worst = metrics.absolute_errors(run.estimates, sequence.poses, align="none").max()
+        return {
+            "frames": len(sequence),
+            "ate_m": metrics.ate_rmse(run.estimates, sequence.poses),
+            **metrics.tracked_errors(run.estimates, sequence.poses, run.tracking_ok),
+            "lost": bool(worst > LOST_ERROR_M or run.lost_frames),
+            "M_I": float(divergences[:, 0].max()),
+            "M_D": float(divergences[:, 1].max()),
+            "intensity_divergence_mean": float(divergences[:, 0].mean()),
+            "depth_divergence_mean": float(divergences[:, 1].mean()),
+        }
+
+    def tables(self, rows: Sequence[Row]) -> list[Table]:
+        """One line an interval, and the targets."""
+        note = "Medians (of losses: the share) over sequences with their 95 % intervals."
+        if self._compared:
+            grouping = Grouping((*self._compared, "keep_every"), (*DIVERGENCES, "ate_m", "lost"))
+            return [grouping.table(rows, note=note)]
+        lines = by_interval(rows, note)
+        targets = suggest_targets(lines.rows, self.desired_ate_m)
+        wanted = f"For an ATE of {1000 * self.desired_ate_m:g} mm and no sequence lost"
+        if targets is None:
+            return [by_interval(rows, f"{note} {wanted} no interval suffices.")]
+        return [lines, make_table(("keep_every", *DIVERGENCES), [targets], "Targets", f"{wanted}.")]
+
+    def charts(self, rows: Sequence[Row]) -> list[Chart]:
+        """Error against the largest and the mean divergence."""
+        panels = [
+            scatter(rows, key, "ate_m", "keep_every", "xy", label=_every) for key in DIVERGENCES
+        ]
+        return [Chart("frame_skipping", "Error against divergence", "One mark a sequence.", panels)]
+
+    def content(self, rows: Sequence[Row]) -> Mapping[str, Any]:
+        """The seeds and the targets."""
+        seeds = {"seeds": seed_list(self.seeds, self.sequences)}
+        if self._compared:
+            return seeds
+        targets = suggest_targets(by_interval(rows).rows, self.desired_ate_m)
+        return {**seeds, "suggested_targets": targets}
+
+    @property
+    def _compared(self) -> tuple[str, ...]:
+        """What the sequences differ in besides the interval; targets are read where in nothing."""
+        has = {"motion": self.motions, "backend": self.backends[1:]}
+        return tuple(name for name, which in has.items() if which)
+
+
+def by_interval(rows: Sequence[Row], note: str = "") -> Table:
+    """Medians with intervals and share of lost sequences, a line an interval."""
+    keys = (*DIVERGENCES, "ate_m", "ate_tracked_m", "tracked_share", "lost")
+    grouping = Grouping(("keep_every",), keys, rank_by="keep_every")
+    return grouping.table(rows, note=note)
+
+
+def suggest_targets(
+    lines: Sequence[Mapping[str, Any]], desired_ate_m: float
+) -> dict[str, float] | None:
+    """Targets from the largest interval up to which SLAM copes.
+
+    At this interval, and at every smaller one, the median ATE is at most ``desired_ate_m`` and
+    no sequence is lost: a frame-to-frame SLAM error that stays small until tracking breaks makes
+    the median blind to the sequences that broke. M_I and M_D are the medians over sequences of
+    equations (11) and (12) at that interval; None if already the first interval fails.
+
+    Args:
+        lines: of :func:`by_interval`, in the order of the intervals.
+        desired_ate_m: largest median ATE.
+    """
+    best: Mapping[str, Any] | None = None
+    for line in lines:
+        if line["ate_m"].value > desired_ate_m or line["lost"].value > 0:
+            break
+        best = line
+    if best is None:
+        return None
+    return {"keep_every": best["keep_every"], **{key: best[key].value for key in DIVERGENCES}}
+
+
+def _every(interval: float) -> str:
+    return "every frame" if interval == 1 else f"every {interval:g}"

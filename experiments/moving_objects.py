@@ -1,0 +1,203 @@
+"""Does SLAM keep its pose, and know what moves, where boxes and people move about?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import cv2
+import numpy as np
+from ms_slam_experiments.pictures.drawing import save_image
+
+from ms_slam_env import metrics, slam
+from ms_slam_env.benchmark.experiment import Experiment
+from ms_slam_env.camera import xtion
+from ms_slam_env.config import Checked, bounded, parse_named
+from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.evaluation.moving_objects import found_masks, mask_measures, true_masks
+from ms_slam_env.evaluation.run_sequence import run_sequence
+from ms_slam_env.report.charts import Chart, scatter
+from ms_slam_env.report.records import Row
+from ms_slam_env.report.tables import Table, finished, make_table, summary
+from ms_slam_env.sequences import HandheldPath, RenderedSequence, check_sequence, open_sequence
+
+_BOXES = "kinect+moving-objects,kind=box,count"
+_PEOPLE = "kinect+moving-objects,kind=person,speed_m_s=1,count"
+MASKED = "surfel,motion_mask=geometric"
+DEFAULT_SEQUENCES = (
+    *(f"living_room:{2000 + k}:{_BOXES}={1 + k % 3}" for k in range(4)),
+    *(f"living_room:{2006 + k}:{_PEOPLE}={1 + k % 2}" for k in range(4)),
+    *(f"corridor:{2010 + k}:{_BOXES}={1 + k}" for k in range(3)),
+    f"table:2013:{_BOXES}=2",
+    *("living_room:2014", "corridor:2016", "table:2017", "carpet:2018"),
+)
+"""Rooms in which boxes or people move, and some in which nothing does."""
+KEYS = (
+    *("lost_share", "ate_m", "ate_max_m", "ate_tracked_m", "tracked_share"),
+    *("mask_precision", "mask_recall", "mask_iou", "mask_false_share", "cpu_ms_median"),
+)
+MOVING, STILL = "moving", "still"
+_WARM_UP = 5  # frames left out of the timing
+_SHOWN, _PER_ROW = 12, 6  # frames of the picture
+
+
+@dataclass(frozen=True)
+class MovingObjectsSpec:
+    """A sequence and what runs over it; see :class:`MovingObjectsExperiment` for the fields."""
+
+    sequence: str
+    backends: tuple[str, ...]
+    image_size: str
+    frames: int
+
+
+@dataclass(frozen=True)
+class MovingObjectsExperiment(Experiment, Checked):
+    """Moving boxes and people: pose, and mask against the renderer's labels
+
+    Every backend runs over the same frames from the true first pose. A mask is judged on the pixels
+    with depth; a thing that can move counts as moving also while it turns on the spot.
+    """
+
+    sequences: tuple[str, ...] = DEFAULT_SEQUENCES
+    """scene:seed[:word[+word ...]]."""
+    backends: tuple[str, ...] = ("surfel", MASKED, "sparse", "volumetric")
+    """NAME, parameters appended as in surfel,motion_mask=geometric."""
+    image_size: str = "160x120"
+    """Such as 160x120."""
+    frames: int = bounded(300, 10, 100_000)
+    """Of a sequence."""
+
+    unit = "sequences"
+    workers = 1
+
+    def __post_init__(self) -> None:
+        """Refuse what no run could use."""
+        super().__post_init__()
+        for text in self.sequences:
+            if Path(text).is_dir():
+                raise InputError(f"{text}: a recording does not say what moves in it")
+            check_sequence(text)
+        for text in self.backends:
+            name, _ = parse_named(text, "backend")
+            if name not in slam.BACKENDS:
+                raise unknown("SLAM backend", name, slam.BACKENDS)
+        xtion(self.image_size)
+
+    def specs(self) -> list[MovingObjectsSpec]:
+        """Every sequence."""
+        return [self.spec(MovingObjectsSpec, sequence=text) for text in self.sequences]
+
+    @staticmethod
+    def run(spec: MovingObjectsSpec) -> dict[str, Any]:
+        """Let every backend track the frames, rendered once."""
+        sequence = _rendered(spec)
+        frames, true = list(sequence.frames), true_masks(sequence.frames)
+        is_read = np.array([frame.depth > 0 for frame in frames])
+        runs = []
+        for text in spec.backends:
+            name, params = parse_named(text, "backend")
+            system = slam.make(name, sequence.intrinsics, **params)
+            run = run_sequence(system, frames, start=sequence.poses[0])
+            ate = metrics.ate_statistics(run.estimates, sequence.poses)
+            found = found_masks(run.results, sequence.intrinsics.shape)
+            runs.append(
+                {
+                    "backend": text,
+                    "lost_share": run.lost,
+                    "ate_m": ate.rmse,
+                    **metrics.tracked_errors(run.estimates, sequence.poses, run.tracking_ok),
+                    "ate_max_m": ate.max,
+                    "cpu_ms_median": float(np.median(run.cpu_ms[_WARM_UP:])),
+                    **({} if found is None else mask_measures(found, true, is_read)),
+                }
+            )
+        share = float((true & is_read).sum() / is_read.sum())
+        path_m = metrics.path_length(sequence.poses)
+        return {"moving_share": share, "path_m": path_m, "runs": runs}
+
+    def tables(self, rows: Sequence[Row]) -> list[Table]:
+        """Medians where something moves and where nothing does, then every run."""
+        lines = _lines(rows)
+        keys = [key for key in KEYS if any(key in line for line in lines)]
+        medians = []
+        for setting in (MOVING, STILL):
+            for backend in dict.fromkeys(line["backend"] for line in lines):
+                own = [x for x in lines if (x["setting"], x["backend"]) == (setting, backend)]
+                if own:
+                    cells = {key: summary(own, key) for key in keys if any(key in x for x in own)}
+                    worst = max(line["ate_m"] for line in own)
+                    medians.append(
+                        {"setting": setting, "backend": backend, **cells, "worst_ate_m": worst}
+                    )
+        columns = ("setting", "backend", *keys[:2], "worst_ate_m", *keys[3:])
+        note = "Medians over the sequences with 95 % intervals, and the largest ATE of one."
+        return [
+            make_table(columns, medians, note=note),
+            make_table(("sequence", "backend", "moving_share", *keys), lines, "Every run"),
+        ]
+
+    def charts(self, rows: Sequence[Row]) -> list[Chart]:
+        """Error against processor time, a mark for each sequence in which something moves."""
+        points = [
+            cast(Row, {"spec": {"backend": line["backend"]}, "result": line, "error": None})
+            for line in _lines(rows)
+            if line["setting"] == MOVING
+        ]
+        panel = scatter(points, "cpu_ms_median", "ate_m", "backend", log="xy")
+        caption = "One mark a sequence in which something moves."
+        return [Chart("moving_objects", "Error against time", caption, [panel])]
+
+    def write_pictures(self, rows: Sequence[Row], out: Path) -> None:
+        """The mask on frames of the sequence in which most moves."""
+        moving = [row for row in finished(rows) if row["result"]["moving_share"] > 0]
+        if not moving or MASKED not in self.backends:
+            return
+        most = max(moving, key=lambda row: row["result"]["moving_share"])["spec"]["sequence"]
+        spec = MovingObjectsSpec(most, (), self.image_size, self.frames)
+        save_image(out / "mask.png", _picture(_rendered(spec)), compression=9)
+
+
+def _rendered(spec: MovingObjectsSpec) -> RenderedSequence:
+    path = HandheldPath(spec.frames)
+    sequence = open_sequence(spec.sequence, spec.image_size, path=path, with_truth=True)
+    return cast(RenderedSequence, sequence)
+
+
+def _lines(rows: Sequence[Row]) -> list[Mapping[str, Any]]:
+    """A line for each run."""
+    return [
+        {
+            "sequence": row["spec"]["sequence"],
+            "setting": MOVING if row["result"]["moving_share"] > 0 else STILL,
+            "moving_share": row["result"]["moving_share"],
+            **run,
+        }
+        for row in finished(rows)
+        for run in row["result"]["runs"]
+    ]
+
+
+def _picture(sequence: RenderedSequence) -> np.ndarray:
+    """Frames with what was found in red, found wrongly in yellow and missed in blue."""
+    name, params = parse_named(MASKED, "backend")
+    system = slam.make(name, sequence.intrinsics, **params)
+    frames = list(sequence.frames)
+    run = run_sequence(system, frames, start=sequence.poses[0])
+    found, true = found_masks(run.results, sequence.intrinsics.shape), true_masks(sequence.frames)
+    assert found is not None
+    tiles = []
+    for k in np.linspace(0, len(frames) - 1, _SHOWN).astype(int):
+        image = frames[k].color.copy()
+        is_read = frames[k].depth > 0
+        for where, color in (
+            (found[k] & true[k], (255, 0, 0)),
+            (found[k] & ~true[k], (255, 220, 0)),
+            (~found[k] & true[k] & is_read, (0, 0, 255)),
+        ):
+            image[where] = image[where] // 2 + np.array(color, dtype=np.uint8) // 2
+        tiles.append(cv2.copyMakeBorder(image, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=(255,) * 3))
+    rows = [np.hstack(tiles[k : k + _PER_ROW]) for k in range(0, _SHOWN, _PER_ROW)]
+    return np.vstack(rows)

@@ -1,0 +1,131 @@
+"""USME's test of relocalisation: an orbit around an object, black frames after its first lap."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ms_slam_env import metrics, scenes, slam
+from ms_slam_env._runtime.parallel import limit_threads
+from ms_slam_env.benchmark.episodes import seed_list
+from ms_slam_env.benchmark.experiment import Experiment
+from ms_slam_env.camera import rendered_size, xtion
+from ms_slam_env.config import Checked, bounded, parse_named
+from ms_slam_env.errors import InputError
+from ms_slam_env.evaluation.run_sequence import run_sequence
+from ms_slam_env.report.records import Row
+from ms_slam_env.report.tables import Grouping, Table, finished, make_table
+from ms_slam_env.scenes.registry import check_name
+from ms_slam_env.sequences import make_perturbation, render_sequence
+from ms_slam_env.sequences.loop_paths import around_object
+
+METRICS = (
+    *("relocalisation_found_s", "relocalisations", "never_relocalised", "robustness"),
+    *("ate_m", "ate_tracked_m", "tracked_share"),
+)
+
+
+@dataclass(frozen=True)
+class OrbitSpec:
+    """A backend on an orbit; see :class:`Orbit` for the fields."""
+
+    scene: str
+    seed: int
+    backend: str
+    black_frames: int
+    stretches: int
+    laps: int
+    image_size: str
+
+
+@dataclass(frozen=True)
+class Orbit(Experiment, Checked):
+    """Relocalisation time on an orbit around an object
+
+    As USME describes it: the camera goes around a textured object a few times; after the first lap
+    stretches of frames are black. Time from the end of a stretch to the next pose (equation 11),
+    and apart from it after how many there was none before the next.
+    """
+
+    scenes: tuple[str, ...] = ("table", "living_room")
+    """Names of scenes."""
+    backends: tuple[str, ...] = ("surfel", "sparse", "odometry")
+    """NAME, parameters appended as in surfel,relocalisation=local."""
+    black_frames: tuple[int, ...] = (10, 40)
+    """Lengths of the black stretches, frames at 30 Hz."""
+    stretches: int = bounded(2, 1, 100)
+    """Black stretches in each lap after the first."""
+    laps: int = bounded(3, 2, 100)
+    """Times around the object."""
+    image_size: str = "160x120"
+    """Of the camera."""
+    seeds: str = "validation"
+    """Split that the seeds come from: train, validation or test; or your own, as 7000-7003."""
+    recordings: int = bounded(2, 1, 1000)
+    """Seeds for each scene."""
+
+    def specs(self) -> list[OrbitSpec]:
+        """Every run.
+
+        Raises:
+            InputError: a scene, backend, size or split that does not exist, or no length.
+        """
+        rendered_size(self.image_size)
+        if not self.black_frames or min(self.black_frames) < 1:
+            raise InputError(f"black_frames {self.black_frames} must be numbers of frames, >= 1")
+        for scene in self.scenes:
+            check_name(scene)
+        for backend in self.backends:
+            slam.check_parameters(*parse_named(backend, "backend"))
+        return [
+            self.spec(OrbitSpec, scene=scene, seed=seed, backend=backend, black_frames=black)
+            for scene in self.scenes
+            for seed in seed_list(self.seeds, self.recordings)
+            for black in self.black_frames
+            for backend in self.backends
+        ]
+
+    @staticmethod
+    def run(spec: OrbitSpec) -> dict[str, Any]:
+        """Track the orbit, in the dark too, and measure."""
+        limit_threads(1)
+        scene = scenes.make(spec.scene, spec.seed)
+        poses, lap = around_object(scene, spec.seed, spec.laps)
+        every = lap // spec.stretches
+        if spec.black_frames >= every:
+            raise InputError(f"{spec.black_frames} black frames leave nothing of {every} to see")
+        dark = make_perturbation(
+            "black-frames", {"start": lap, "length": spec.black_frames, "every": every}
+        )
+        K = xtion(spec.image_size)
+        sequence = render_sequence(scene, poses, K, "kinect", spec.seed, perturbations=[dark])
+        name, params = parse_named(spec.backend, "backend")
+        black: list[bool] = []
+        run = run_sequence(
+            slam.make(name, K, **params),
+            sequence,
+            on_step=lambda step: black.append(not step.frame.color.any()),
+        )
+        found = metrics.relocalisation(run.timestamps, black, run.anchored)
+        pieces = len(metrics.tracked_segments(run.tracking_ok))
+        error = metrics.tracking_robustness(run.estimates, poses, run.tracking_ok).error
+        return {
+            "frames": len(run),
+            "relocalisation_found_s": found.mean_s,
+            "relocalisations": found.found,
+            "never_relocalised": found.never,
+            "robustness": error if pieces else None,
+            "ate_m": metrics.ate_rmse(run.estimates, poses),
+            **metrics.tracked_errors(run.estimates, poses, run.tracking_ok),
+            "black_tracked": int((np.array(black) & run.tracking_ok).sum()),
+        }
+
+    def tables(self, rows: Sequence[Row]) -> list[Table]:
+        """Medians by length of the dark and backend, then every run."""
+        grouping = Grouping(("black_frames", "backend"), METRICS, count="recordings")
+        lines = [{**row["spec"], **row["result"]} for row in finished(rows)]
+        columns = ("scene", "seed", "black_frames", "backend", *METRICS, "black_tracked")
+        return [grouping.table(rows), make_table(columns, lines, "Runs")]

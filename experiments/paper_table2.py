@@ -1,0 +1,129 @@
+"""Experiment (b): Table II of Saeedi et al., ICRA 2017."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from ms_slam_env.benchmark.episode_experiment import DOTS, SteppedExperiment
+from ms_slam_env.benchmark.episodes import short_planner_names
+from ms_slam_env.report.charts import Chart, by_group
+from ms_slam_env.report.records import Row
+from ms_slam_env.report.statistics import relative_cut
+from ms_slam_env.report.tables import Column, Grouping, Table, complete_cases, grouped, make_table
+
+MOTIONS = {
+    "MSActiveSLAM-FreeCamera-v0": "free motion",
+    "MSActiveSLAM-FixedTranslation-v0": "fixed translation",
+}
+"""The environments of the two experiments of the table, and what they are called there."""
+PAPER_CUTS = {
+    "MSActiveSLAM-FreeCamera-v0": {"ate_m": 1 - 0.1549 / 0.2343, "rer_m": 1 - 0.0518 / 0.0773},
+    "MSActiveSLAM-FixedTranslation-v0": {
+        "ate_m": 1 - 0.0582 / 0.0854,
+        "rer_m": 1 - 0.0726 / 0.0809,
+    },
+}
+"""By how much active SLAM cuts the errors of random walk in the paper's table."""
+METRICS = (
+    *("ate_m", "ate_tracked_m", "tracked_share", "rer_m", "rcm", "path_length_m"),
+    *("rcm_tracked", "lost"),
+)
+_CUTS = ("ate_cut", "ate_cut_paper", "rer_cut", "rer_cut_paper")
+
+
+@dataclass(frozen=True)
+class PaperTable2(SteppedExperiment):
+    """Table II of the paper: an active planner against random walk
+
+    Errors of trajectory and map with free motion and with a fixed translation.
+    """
+
+    active: str = "greedy"
+    """The active planner, options appended as in greedy,rho_I=0.3."""
+    baseline: str = "random"
+    """What it is compared with."""
+    scenes: tuple[str, ...] = ("living_room",)
+    """Names of scenes, or mesh files; the paper has one living room."""
+    episodes: int = 20
+    steps: int = 100
+    seeds: str = "test"
+
+    @property
+    def planners(self) -> Sequence[str]:
+        """Both."""
+        return self.baseline, self.active
+
+    def compared(self) -> Sequence[Mapping[str, Any]]:
+        """Both planners with every motion."""
+        return [{"env_id": env_id, "planner": name} for env_id in MOTIONS for name in self.planners]
+
+    def tables(self, rows: Sequence[Row]) -> list[Table]:
+        """Medians by experiment and planner, and the cuts of the errors beside the paper's."""
+        order = list(MOTIONS)
+        pairs = sorted(
+            paired(rows),
+            key=lambda row: (
+                order.index(row["spec"]["env_id"]),
+                row["spec"]["planner"] == self.active,
+            ),
+        )
+        label = {"env_id": MOTIONS.__getitem__}
+        note = (
+            "Medians (of losses: the share) with 95 % intervals, over the episodes that both "
+            "planners finished."
+        )
+        medians = Grouping(("env_id", "planner"), METRICS, label, count="episodes")
+        columns = [Column(name, name.removesuffix("_paper"), _paper_heading(name))
+                   for name in _CUTS]  # fmt: skip
+        cuts = [self._cuts(pairs, env_id) for env_id in MOTIONS]
+        return [
+            medians.table(pairs, note=note),
+            make_table(["env_id", *columns], cuts, f"Cut of the errors by {self.active}"),
+        ]
+
+    def _cuts(self, pairs: Sequence[Row], env_id: str) -> dict[str, Any]:
+        results = grouped(pairs, ("env_id", "planner"))
+        line: dict[str, Any] = {"env_id": MOTIONS[env_id]}
+        for key, paper in PAPER_CUTS[env_id].items():
+            values, others = (
+                [result[key] for result in results.get((env_id, planner), [])]
+                for planner in (self.active, self.baseline)
+            )
+            name = key.replace("_m", "_cut")
+            line |= {name: relative_cut(values, others), f"{name}_paper": paper}
+        return line
+
+    def charts(self, rows: Sequence[Row]) -> list[Chart]:
+        """Errors of every episode, by experiment and planner."""
+        label = short_planner_names((self.baseline, self.active)).__getitem__
+        panels = [
+            replace(panel, title=name)
+            for env_id, name in MOTIONS.items()
+            for panel in by_group(
+                [row for row in rows if row["spec"]["env_id"] == env_id],
+                "planner",
+                ("ate_m", "rer_m"),
+                ("ate_m",),
+                label=label,
+            )
+        ]
+        return [Chart("paper_table2", "Errors of trajectory and map", DOTS, panels)]
+
+
+def _paper_heading(name: str) -> str:
+    return "in the paper" if name.endswith("_paper") else ""
+
+
+def paired(rows: Sequence[Row]) -> list[Row]:
+    """Rows of the episodes that both planners finished.
+
+    ``rcm_tracked`` is their completeness where tracking was never lost, else None.
+    """
+    pairs = complete_cases(rows, ("env_id", "scene", "seed"), "planner")
+    return [
+        {**row, "result": {**r, "rcm_tracked": None if r["lost"] else r["rcm"]}}
+        for row in pairs
+        for r in (row["result"],)
+    ]

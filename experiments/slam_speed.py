@@ -1,0 +1,247 @@
+"""Processor time of a frame of the surfel SLAM, by stage, image size and stored surfels."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from ms_slam_experiments.shared import slam_speed_child
+
+from ms_slam_env import scenes
+from ms_slam_env._runtime.parallel import thread_environment
+from ms_slam_env.benchmark.experiment import Experiment
+from ms_slam_env.camera import xtion
+from ms_slam_env.config import Checked, bounded, check_range
+from ms_slam_env.errors import InputError
+from ms_slam_env.report.charts import Chart, Panel, Series
+from ms_slam_env.report.records import Row
+from ms_slam_env.report.tables import Column, Table, finished, make_table
+from ms_slam_env.sequences import handheld_trajectory, render_sequence
+
+THIS, OTHER = "this", "other"
+REST = "rest"
+_START = "import runpy, sys; sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], None, '__main__')"
+
+
+@dataclass(frozen=True)
+class SpeedSpec:
+    """One process of round ``repeat``, with this checkout's package or another's (``version``)."""
+
+    version: str
+    size: str
+    repeat: int
+    scene: str
+    seed: int
+    stored: tuple[int, ...]
+    frames: int
+    warm_up: int
+    backend: tuple[str, ...]
+    checkout: str = ""
+
+
+@dataclass(frozen=True)
+class SlamSpeed(Experiment, Checked):
+    """Processor time of a frame of the surfel SLAM
+
+    By stage, image size and stored surfels; those beyond what the sequence makes lie in far places.
+    Every measurement is a process of its own on one core; rounds of all of them follow each other,
+    so that a busy machine disturbs all alike.
+    """
+
+    scene: str = "living_room"
+    """Where the sequence is rendered."""
+    seed: int = 2000
+    """Of scene, trajectory and noise."""
+    sizes: tuple[str, ...] = ("160x120", "320x240")
+    """Image sizes."""
+    stored: tuple[int, ...] = (10_000, 100_000, 300_000, 1_000_000)
+    """Surfels in the map; those beyond what the sequence makes lie in far places."""
+    frames: int = bounded(80, 2, 100_000)
+    """Length of the sequence."""
+    warm_up: int = 20
+    """Frames before the measurement, which fill the map and load the kernels."""
+    repeats: int = bounded(3, 1, 1000)
+    """Rounds; times are medians over them."""
+    against: Path | None = None
+    """Checkout with another version of the package, which runs in turns with this one."""
+    backend: tuple[str, ...] = ()
+    """Parameters of the SLAM that differ from the default, ``name=value`` each (JSON values)."""
+
+    unit = "measurements"
+    workers = 1
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range, or a checkout without the package."""
+        super().__post_init__()
+        check_range(self, "warm_up", 1, self.frames - 1)
+        if not self.stored or not all(1 <= count <= 40_000_000 for count in self.stored):
+            raise InputError(f"stored = {self.stored} must hold integers in [1, 40000000]")
+        if self.against is not None and not (self.against / "ms_slam_env").is_dir():
+            raise InputError(f"{self.against} holds no package ms_slam_env")
+
+    def specs(self) -> list[SpeedSpec]:
+        """Every round, size and version, in turns."""
+        backend_parameters(self.backend)
+        for size in self.sizes:
+            xtion(size)
+        checkouts = {THIS: ""}
+        if self.against is not None:
+            checkouts[OTHER] = str(self.against)
+        return [
+            self.spec(SpeedSpec, version=version, size=size, repeat=repeat, checkout=checkout)
+            for repeat in range(self.repeats)
+            for size in self.sizes
+            for version, checkout in checkouts.items()
+        ]
+
+    @staticmethod
+    def run(spec: SpeedSpec) -> dict[str, Any]:
+        """One process: a measurement for each number of stored surfels."""
+        _, path = stored_sequence(spec.scene, spec.seed, spec.frames, spec.size)
+        arguments = {
+            "sequence": path,
+            "size": spec.size,
+            "stored": list(spec.stored),
+            "warm_up": spec.warm_up,
+            "backend": backend_parameters(spec.backend),
+        }
+        found = run_child(arguments, Path(spec.checkout) if spec.checkout else None)
+        return {"runs": [_figures(one) for one in found]}
+
+    def tables(self, rows: Sequence[Row]) -> list[Table]:
+        """One line for each size, number of stored surfels and version."""
+        columns: list[Column | str] = ["image_size", "surfels_stored"]
+        if self.against is not None:
+            columns += ["version", "cpu_ratio", "same_poses"]
+        columns += ["cpu_ms_median", "cpu_ms_mean"]
+        columns += [Column(name, "stage_cpu_ms", name) for name in (*slam_speed_child.STAGES, REST)]
+        note = "Medians over the rounds; the stages are means over the frames."
+        return [make_table([*columns, "lost_frames"], summarise(rows), note=note)]
+
+    def charts(self, rows: Sequence[Row]) -> list[Chart]:
+        """The cost against stored surfels, and by stage with the smallest map."""
+        lines = summarise(rows)
+        names = dict.fromkeys((line["image_size"], line["version"]) for line in lines)
+        over, bars = [], []
+        for name in names:
+            own = [line for line in lines if (line["image_size"], line["version"]) == name]
+            label = name[0] if name[1] == THIS else f"{name[0]}, other version"
+            x, y = ([line[key] for line in own] for key in ("surfels_stored", "cpu_ms_mean"))
+            over.append(Series(label, x, y))
+            stages = [*slam_speed_child.STAGES, REST]
+            bars.append(Series(label, stages, [own[0][stage] for stage in stages], mode="bars"))
+        panels = [
+            Panel("surfels_stored", "cpu_ms_mean", over, "x"),
+            Panel("", "stage_cpu_ms", bars, title="smallest map"),
+        ]
+        caption = "Mean processor time of a frame on one core."
+        return [Chart("slam_speed", "Cost of a frame", caption, panels)]
+
+
+def _figures(one: Mapping[str, Any]) -> dict[str, Any]:
+    """What is kept of a measurement of the child, whose frames are single."""
+    mean = float(np.mean(one["frame_ms"]))
+    stages = {stage: float(np.mean(ms)) for stage, ms in one["stages_ms"].items()}
+    stages[REST] = mean - sum(stages.values())
+    return {
+        "target_surfels": one["target"],
+        "surfels_stored": one["surfels"],
+        "cpu_ms_mean": mean,
+        "cpu_ms_median": float(np.median(one["frame_ms"])),
+        "stages": [{"stage": name, "stage_cpu_ms": ms} for name, ms in stages.items()],
+        "lost_frames": one["lost_frames"],
+        "poses_sha256": one["estimates"],
+    }
+
+
+def summarise(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """A line for each (size, stored surfels, version): medians over the rounds.
+
+    ``cpu_ratio`` is the mean frame of this version over that of the other, the median over the
+    rounds; ``same_poses`` says whether the two found bit for bit the same poses. Both None without
+    another version.
+    """
+    groups: dict[tuple[str, int, str], list[dict[str, Any]]] = {}
+    for row in finished(rows):
+        for run in row["result"]["runs"]:
+            stages = {one["stage"]: one["stage_cpu_ms"] for one in run["stages"]}
+            key = (row["spec"]["size"], run["target_surfels"], row["spec"]["version"])
+            groups.setdefault(key, []).append({**run, **stages})
+    lines = []
+    for (size, target, version), group in groups.items():
+        other = groups.get((size, target, OTHER), []) if version == THIS else []
+        ratios = [a["cpu_ms_mean"] / b["cpu_ms_mean"] for a, b in zip(group, other, strict=False)]
+        times = ("cpu_ms_median", "cpu_ms_mean", *slam_speed_child.STAGES, REST)
+        line: dict[str, Any] = {
+            "image_size": size,
+            "version": version,
+            **{key: float(np.median([run[key] for run in group])) for key in times},
+            **{key: group[0][key] for key in ("surfels_stored", "lost_frames")},
+            "cpu_ratio": float(np.median(ratios)) if ratios else None,
+            "same_poses": group[0]["poses_sha256"] == other[0]["poses_sha256"] if other else None,
+        }
+        lines.append((_pixels(size), target, version, line))
+    return [line for *_, line in sorted(lines, key=lambda entry: entry[:3])]
+
+
+def _pixels(size: str) -> int:
+    return int(np.prod(xtion(size).shape))
+
+
+def backend_parameters(words: tuple[str, ...]) -> dict[str, Any]:
+    """Parameters of ``name=value`` words.
+
+    Raises:
+        InputError: a word of another form, or a value that is no JSON.
+    """
+    parameters = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        try:
+            parameters[name] = json.loads(value)
+        except json.JSONDecodeError:
+            equals = ""
+        if not equals:
+            raise InputError(f"a parameter is given as name=value, such as coverage_px=0.9: {word}")
+    return parameters
+
+
+@cache
+def stored_sequence(scene_name: str, seed: int, frames: int, size: str) -> tuple[Any, str]:
+    """A noisy sequence as a file, for as long as this process lives: its folder and its path."""
+    scene = scenes.make(scene_name, seed)
+    poses = handheld_trajectory(scene, frames, seed, 0.015, 1.0)
+    sequence = render_sequence(scene, poses, xtion(size), "kinect", seed)
+    shown = list(sequence.frames)
+    folder = tempfile.TemporaryDirectory()
+    path = Path(folder.name) / "sequence.npz"
+    color, depth = (np.stack([getattr(f, name) for f in shown]) for name in ("color", "depth"))
+    np.savez(path, color=color, depth=depth, poses=np.stack(list(sequence.poses)))
+    return folder, str(path)
+
+
+def run_child(arguments: dict[str, Any], checkout: Path | None) -> list[dict[str, Any]]:
+    """Measure in a process on one core, with the package of ``checkout`` (None: this one's).
+
+    Raises:
+        RuntimeError: the process failed.
+    """
+    root = (checkout or Path(__file__).parents[2]).resolve()
+    environment = os.environ | thread_environment(1) | {"PYTHONPATH": str(root)}
+    # Not as a script: its folder, first on the path, would hide modules of Python. In the checkout:
+    # the current folder comes before PYTHONPATH.
+    words = [sys.executable, "-c", _START, str(slam_speed_child.__file__), json.dumps(arguments)]
+    done = subprocess.run(words, env=environment, cwd=root, capture_output=True, text=True)
+    if done.returncode != 0:
+        lines = done.stderr.strip().splitlines() or ["no message"]
+        raise RuntimeError(f"the measurement in {root} failed: {lines[-1]}")
+    return list(json.loads(done.stdout.strip().splitlines()[-1]))

@@ -1,0 +1,166 @@
+"""A soak: many steps of every environment, in which nothing becomes NaN and no memory is lost."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from ms_slam_env import ENV_IDS, PERTURBED_ENV_IDS, TASK_IDS
+from ms_slam_env.benchmark.experiment import Experiment
+from ms_slam_env.config import Checked, bounded
+from ms_slam_env.errors import unknown
+from ms_slam_env.metrics.cost.meter import resident_mb
+from ms_slam_env.report.records import Row
+from ms_slam_env.report.tables import Table, finished, make_table
+
+IDS = (*ENV_IDS, *TASK_IDS, *PERTURBED_ENV_IDS)
+
+PLAIN_IDS = ("MSActiveSLAM-FreeCamera-v0", "MSActiveSLAM-FixedTranslation-v0")
+"""The two whose steps are cheapest: nothing disturbs the camera, and a motion is a frame."""
+
+SHARE, ARM_SHARE = 10, 250
+"""Steps of a plain environment for one of another, and for one of the arm, which is ten frames and
+the physics of a motion."""
+
+
+@dataclass(frozen=True)
+class SoakSpec:
+    """One piece: so many steps of one environment, in a process of its own."""
+
+    env_id: str
+    piece: int
+    steps: int
+    image_size: str
+
+
+@dataclass(frozen=True)
+class Soak(Experiment, Checked):
+    """Steps of every environment with random permitted actions
+
+    Every number in observation, reward and info is looked at. Memory is that of the process after
+    each step: its peak in the second half of a piece over that in the first, which is the warm-up.
+    Pieces are finished one by one, and those that are there already are not run again. Most of the
+    steps are of the two environments whose steps cost least: of a million 272,000 of each, 27,200
+    of each other one without the arm, and 1,088 of each with it, in one piece: there a warm-up of
+    less would end before every scene was seen.
+    """
+
+    env_ids: tuple[str, ...] = IDS
+    """Environments."""
+    steps: int = bounded(1_000_000, 1, 10**9)
+    """Of all environments together, rounded up to whole pieces of each."""
+    piece_steps: int = bounded(68_000, 2, 10**7)
+    """Of a piece of the free camera; a tenth if it is disturbed or has a task, a 250th for the arm
+    (whose pieces are one); at least 2."""
+    image_sizes: tuple[str, ...] = ("80x60",)
+    """Of the camera, width x height: environments and their pieces take them in turn."""
+
+    unit = "pieces"
+    workers = 1
+    fresh_process = True
+
+    def specs(self) -> list[SoakSpec]:
+        """Pieces of all environments in turn, and one of each with the arm."""
+        for env_id in self.env_ids:
+            if env_id not in IDS:
+                raise unknown("environment", env_id, IDS)
+        steps = {one: max(2, self.piece_steps // share(one)) for one in self.env_ids}
+        pieces = -(-self.steps // sum(steps.values()))
+        arms = [one for one in steps if share(one) == ARM_SHARE]
+        found = [
+            *(
+                (one, piece, steps[one])
+                for piece in range(pieces)
+                for one in steps
+                if one not in arms
+            ),
+            *((one, 0, pieces * steps[one]) for one in arms),
+        ]
+        sizes = self.image_sizes
+        return [
+            SoakSpec(one, piece, count, sizes[(piece + list(steps).index(one)) % len(sizes)])
+            for one, piece, count in found
+        ]
+
+    @staticmethod
+    def run(spec: SoakSpec) -> dict[str, Any]:
+        """Take the steps of a piece, in a scene and with actions of its own."""
+        env = gym.make(spec.env_id, scene_seed=spec.piece, image_size=spec.image_size)
+        memory_mb: list[float] = []
+        bad: list[str] = []
+        episodes = 0
+        try:
+            for info, is_first, *numbers in _steps(env, spec):
+                episodes += is_first
+                memory_mb.append(resident_mb() or np.nan)
+                covariance = info["pose_covariance"]  # infinite where SLAM gave none, never NaN
+                known = {
+                    **info,
+                    "pose_covariance": np.where(np.isposinf(covariance), 0, covariance),
+                }
+                bad += not_finite({"info": known, "step": numbers})
+        finally:
+            env.close()
+        half = len(memory_mb) // 2
+        first, second = max(memory_mb[:half]), max(memory_mb[half:])
+        return {
+            "measured_steps": len(memory_mb),
+            "soak_episodes": episodes,
+            "not_finite": len(bad),
+            "not_finite_first": bad[0] if bad else "",
+            "mem_process_mb": second,
+            "mem_growth": second / first - 1.0,
+        }
+
+    def tables(self, rows: Sequence[Row]) -> list[Table]:
+        """One line an environment."""
+        done = list(finished(rows))
+        lines = []
+        for env_id in dict.fromkeys(row["spec"]["env_id"] for row in done):
+            own = [row["result"] for row in done if row["spec"]["env_id"] == env_id]
+            totals = {key: sum(one[key] for one in own) for key in _SUMMED}
+            worst = {key: max(one[key] for one in own) for key in ("mem_process_mb", "mem_growth")}
+            lines.append({"env_id": env_id, **totals, **worst})
+        sums = {key: sum(line[key] for line in lines) for key in _SUMMED}
+        note = f"{sums['measured_steps']} steps in all. Memory is that of the worst piece."
+        return [make_table(["env_id", *_SUMMED, "mem_process_mb", "mem_growth"], lines, note=note)]
+
+
+_SUMMED = ("measured_steps", "soak_episodes", "not_finite")
+
+
+def share(env_id: str) -> int:
+    """Steps of the free camera for one of this environment."""
+    if env_id in PLAIN_IDS:
+        return 1
+    return ARM_SHARE if gym.spec(env_id).kwargs["embodiment"] == "arm" else SHARE
+
+
+def _steps(env: gym.Env[Any, Any], spec: SoakSpec) -> Iterator[tuple[Any, ...]]:
+    """Info, whether an episode begins, observation and reward, of so many steps."""
+    observation, info = env.reset(seed=spec.piece)
+    env.action_space.seed(spec.piece)
+    begins = True
+    for _ in range(spec.steps):
+        action = env.action_space.sample(mask=info["action_mask"])
+        observation, reward, terminated, truncated, info = env.step(action)
+        yield info, begins, observation, reward
+        begins = terminated or truncated
+        if begins:
+            observation, info = env.reset()
+
+
+def not_finite(value: Any, where: str = "") -> Iterator[str]:
+    """Places in nested mappings, sequences and arrays that hold NaN or infinity."""
+    if isinstance(value, Mapping):
+        for name, one in value.items():
+            yield from not_finite(one, f"{where}.{name}" if where else str(name))
+    elif isinstance(value, (list, tuple)):
+        for k, one in enumerate(value):
+            yield from not_finite(one, f"{where}[{k}]")
+    elif np.asarray(value).dtype.kind == "f" and not np.isfinite(value).all():
+        yield where

@@ -1,0 +1,1 @@
+"""Below all stages: files in and out, processes, interrupts, Warp, extension points."""

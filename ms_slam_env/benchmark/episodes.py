@@ -1,0 +1,312 @@
+"""One episode of one planner: what to run, and what came of it."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, cast
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+import ms_slam_env
+from ms_slam_env import slam
+from ms_slam_env.config import Checked, bounded, chosen, nested_options
+from ms_slam_env.env import Planner
+from ms_slam_env.env.planners import check_planner, make_planner, planner_observation
+from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.registration import ADAPTIVE_ID
+from ms_slam_env.scenes import SEED_SPLITS, seeds_of
+from ms_slam_env.scenes.registry import check_name, is_mesh_file
+from ms_slam_env.tasks import find_task
+
+if TYPE_CHECKING:
+    from ms_slam_env.env import ActiveSlamEnv
+
+Float64 = NDArray[np.float64]
+
+DEFAULT_PLANNERS = ("random", "stationary", "greedy", "max-information")
+DEFAULT_SCENES = ("living_room", "corridor", "table", "wall")
+DEFAULT_STEP_M = 0.12
+DEFAULT_STEP_DEG = 12.0
+
+
+OWN_OPTIONS = (
+    *("scene", "scene_seed", "split", "observation", "step_m", "step_rad"),
+    *("render_mode", "max_episode_steps", "frame_divergences"),
+)
+"""Options of ``gym.make`` that an episode has other options for, or that its planner decides."""
+
+
+@dataclass(frozen=True)
+class EpisodeSpec(Checked):
+    """Everything that an episode depends on.
+
+    Attributes:
+        planner: ``NAME,option=value,...``.
+        scene: a scene's name or a mesh file.
+        seed: of the scene, the start pose, the sensor noise and, by way of a child of its own, the
+            planner.
+        env_id: one of ``ms_slam_env.ENV_IDS``.
+        steps: length of the episode.
+        step_m: translation of a motion.
+        step_deg: rotation of a motion.
+        options: further options of the environment.
+        task: whose are the options that are not given, the perturbations and the reference.
+    """
+
+    planner: str
+    scene: str = "living_room"
+    seed: int = 2000
+    env_id: str = chosen("MSActiveSLAM-FreeCamera-v0", *ms_slam_env.ENV_IDS)
+    steps: int = bounded(100, 1, 1_000_000)
+    step_m: float = bounded(DEFAULT_STEP_M, 0, 1)
+    step_deg: float = bounded(DEFAULT_STEP_DEG, 0, 90)
+    options: dict[str, Any] = field(default_factory=dict)
+    task: str = "room"
+
+    def __post_init__(self) -> None:
+        """Refuse unknown choices and values out of range."""
+        try:
+            super().__post_init__()
+        except InputError as error:
+            # Users know the fields as options of a command, not this class.
+            raise InputError(str(error).replace("EpisodeSpec.", "")) from None
+        find_task(self.task)
+        name = self.planner.partition(",")[0]
+        if self.env_id == ADAPTIVE_ID and ":" not in name:
+            raise InputError(
+                f"planner {name!r} chooses motions only, {ADAPTIVE_ID} asks for a SLAM "
+                "configuration too; valid choices: module:Class"
+            )
+
+
+def run_episode(spec: EpisodeSpec) -> dict[str, Any]:
+    """Run one episode and measure it.
+
+    Returns:
+        the metrics by name, see :mod:`.episode_scores`, with
+        ``steps``, ``return``, ``decision_ms`` (mean time of a decision), ``ate_over_steps``
+        (running RMSE, unaligned, metres, when the map was looked at), ``time_s`` (simulated) and
+        ``energy_j`` (mechanical work of the motion).
+    """
+    from ms_slam_env.benchmark.episode_scores import (
+        MapScores,
+        measure_losses,
+        measure_trajectory,
+    )
+
+    env = make_env(spec)
+    try:
+        world = cast("ActiveSlamEnv", env.unwrapped)
+        planner = make_planner(spec.planner, world, spec.seed)
+        maps = MapScores(world, spec.scene, spec.seed, find_task(spec.task).reference)
+        progress = play(env, planner, spec.seed, after_step=maps.after_step)
+        trajectory = measure_trajectory(world)
+        trajectory["lost"] |= progress["lost_steps_share"] > 0
+        planned = spec.steps if progress["terminated"] else progress["steps"]
+        map_scores = maps.result(progress["steps"], planned)
+        ate = [0.0, *progress.pop("ate_over_time")]
+        map_scores["ate_over_steps"] = [ate[step] for step in map_scores["looks_at_steps"]]
+        return {**progress, **trajectory, **measure_losses(world), **map_scores}
+    finally:
+        env.close()
+
+
+def planned_motion(spec: EpisodeSpec) -> tuple[Float64, Float64, dict[str, Any]]:
+    """Where a planner moves the camera in an episode, to be rendered again as a sequence.
+
+    Returns:
+        simulated seconds (N,) of each frame from the episode's start, true poses (N, 4, 4) of every
+        frame, those within a step among them, and what to note of the episode beside the sequence.
+
+    Raises:
+        InputError: an unknown planner, scene or option, or no start pose.
+    """
+    check_planner(spec.planner)
+    env = make_env(spec)
+    try:
+        world = cast("ActiveSlamEnv", env.unwrapped)
+        progress = play(env, make_planner(spec.planner, world, spec.seed), spec.seed)
+        lost = int((~world.episode.tracked).sum())
+        about = {"episode_steps": progress["steps"], "episode_lost_frames": lost}
+        return world.episode.timestamps, world.episode.trajectory_truth, about
+    finally:
+        env.close()
+
+
+def check_episodes(specs: Sequence[EpisodeSpec]) -> None:
+    """Refuse now what would make episodes fail at their start, by starting one of each planner.
+
+    Scenes are not built.
+
+    Raises:
+        InputError: options that the environment, SLAM or a planner refuses, or a planner that
+            fails as it is made.
+    """
+    different = {
+        (spec.planner, spec.env_id, spec.step_m, spec.step_deg, str(spec.options)): spec
+        for spec in specs
+    }
+    for spec in different.values():
+        env = make_env(spec)
+        try:
+            make_planner(spec.planner, env.unwrapped, spec.seed)
+        except InputError:
+            raise
+        except Exception as error:  # a planner of somebody else may raise anything
+            reason = f"{type(error).__name__}: {error}".splitlines()[0]
+            raise InputError(f"planner {spec.planner!r} cannot be made: {reason}") from error
+        finally:
+            env.close()
+
+
+def make_env(spec: EpisodeSpec) -> gym.Env[Any, Any]:
+    """The environment of an episode."""
+    return gym.make(
+        spec.env_id,
+        max_episode_steps=spec.steps,
+        disable_env_checker=True,
+        **{
+            "scene": spec.scene,
+            "scene_seed": spec.seed,
+            "step_m": spec.step_m,
+            "step_rad": math.radians(spec.step_deg),
+            "observation": planner_observation(spec.planner),
+            "task": spec.task,
+            **spec.options,
+        },
+    )
+
+
+def play(
+    env: gym.Env[Any, Any],
+    planner: Planner,
+    seed: int,
+    seconds: float = math.inf,
+    start: Float64 | None = None,
+    after_step: Callable[[int], None] = lambda step: None,
+) -> dict[str, Any]:
+    """Play one episode to its end, or until ``seconds`` of simulated time have passed.
+
+    It begins at ``start`` (4, 4) if that is given, else at a pose that the seed draws.
+    ``after_step`` is called with 0 after the reset, then with the number of each step after it.
+    """
+    options = None if start is None else {"T_world_camera": start}
+    observation, info = env.reset(seed=seed, options=options)
+    planner.reset()
+    after_step(0)
+    total, decision_s, lost = 0.0, 0.0, []
+    ate: list[float] = []
+    over = False
+    while not over:
+        began = time.perf_counter()
+        action = planner.act(observation, info)
+        decision_s += time.perf_counter() - began
+        observation, reward, terminated, truncated, info = env.step(action)
+        over = terminated or truncated or info["time"] >= seconds
+        total += float(reward)
+        ate.append(round(float(info["ate"]), 6))
+        lost.append(not info["tracking_ok"])
+        after_step(len(ate))
+    return {
+        "steps": len(ate),
+        "return": total,
+        "decision_ms": 1e3 * decision_s / len(ate),
+        "lost_steps_share": float(np.mean(lost)),
+        "terminated": bool(terminated),
+        "time_s": float(info["time"]),
+        "energy_j": float(info["energy"]),
+        "ate_over_time": ate,
+    }
+
+
+def parse_options(texts: Sequence[str]) -> dict[str, Any]:
+    """Nested mapping of ``EnvConfig``, and ``embodiment``, from texts ``name.name=value``.
+
+    Values are YAML.
+
+    Raises:
+        InputError: no ``=``, an unknown name (the message lists the valid ones), a value out of
+            range, or a name that the benchmark sets itself.
+    """
+    from ms_slam_env.env.config import make_config
+    from ms_slam_env.env.embodiments import EMBODIMENTS
+
+    result = nested_options(texts)
+    for name in result:
+        if name in OWN_OPTIONS:
+            raise InputError(f"option {name!r} is not free: the benchmark sets it")
+    embodiment = result.get("embodiment", next(iter(EMBODIMENTS)))
+    if embodiment not in EMBODIMENTS:
+        raise unknown("embodiment", embodiment, EMBODIMENTS)
+    configured = {name: value for name, value in result.items() if name != "embodiment"}
+    slam.POINT.find(make_config(configured, ("embodiment",), OWN_OPTIONS).slam)
+    return result
+
+
+def check_names(planners: Sequence[str], scenes: Sequence[str]) -> None:
+    """Refuse unknown planners and scenes, and mesh files that cannot be read.
+
+    Raises:
+        InputError: naming the valid choices, or what is wrong with the file.
+    """
+    for kind, names in (("planner", planners), ("scene", scenes)):
+        if not names:
+            raise InputError(f"no {kind} given")
+        if len(set(names)) < len(names):
+            raise InputError(f"a {kind} is given twice: {', '.join(names)}")
+    for scene in scenes:  # the cheapest first: a planner may take seconds to import
+        check_name(scene)
+    for planner in planners:
+        check_planner(planner)
+    for scene in scenes:
+        if is_mesh_file(scene):
+            from ms_slam_env.scenes.mesh_file import load_soup
+
+            load_soup(scene)
+
+
+def seed_list(split: str, count: int) -> list[int]:
+    """The first ``count`` seeds of a split; seeds of one's own are all meant.
+
+    Raises:
+        InputError: neither a split nor seeds, or more seeds than it has.
+    """
+    seeds = seeds_of(split)
+    if split not in SEED_SPLITS:
+        return list(seeds)
+    if not 1 <= count <= len(seeds):
+        raise InputError(f"episodes = {count} is outside [1, {len(seeds)}] of split {split}")
+    return list(seeds[:count])
+
+
+def short_planner_names(planners: Iterable[str]) -> dict[str, str]:
+    """A short text for each planner: its name, with options only where names are the same.
+
+    Paths among the options lose the folders that are not needed to tell planners apart.
+    """
+    names = {planner: planner.split(",") for planner in planners}
+    count = Counter(name for name, *_ in names.values())
+
+    def texts(folders: int) -> dict[str, str]:
+        return {
+            planner: ", ".join([name, *(_with_folders(option, folders) for option in options)])
+            if count[name] > 1
+            else name
+            for planner, (name, *options) in names.items()
+        }
+
+    most = max((planner.count("/") for planner in names), default=0)
+    some = map(texts, range(most))
+    return next((found for found in some if len(set(found.values())) == len(names)), texts(most))
+
+
+def _with_folders(option: str, count: int) -> str:
+    """An option whose value has the last ``count`` of its folders."""
+    name, equals, value = option.partition("=")
+    return name + equals + "/".join(value.split("/")[-1 - count :])

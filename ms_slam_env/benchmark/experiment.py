@@ -1,0 +1,162 @@
+"""What an experiment is: specifications, what one measures, tables, charts; and where they are."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import inspect
+import pkgutil
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar
+
+from ms_slam_env._runtime.extension import ExtensionPoint
+from ms_slam_env._runtime.parallel import one_thread_unless_set
+from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.report.charts import Chart
+from ms_slam_env.report.records import Row
+from ms_slam_env.report.tables import Table
+
+S = TypeVar("S")
+
+
+class Experiment(ABC):
+    """A frozen dataclass whose fields are the options of its command line.
+
+    The first line of its docstring is the title of its results, the rest says what they show.
+
+    Attributes:
+        unit: what a row is, in the plural, for the progress bar.
+        rows_key: of the rows in ``results.json``.
+        workers: processes by default; None: one a core. 1 where times are measured.
+        fresh_process: run each row in a process of its own, because peak memory is one number for
+            the life of a process.
+        tracks: rows are runs of a backend over a sequence; one that is lost all along is complained
+            about.
+        check_rows: how many rows ``--check`` runs again.
+    """
+
+    unit: ClassVar[str] = "runs"
+    rows_key: ClassVar[str] = "rows"
+    workers: ClassVar[int | None] = None
+    fresh_process: ClassVar[bool] = False
+    tracks: ClassVar[bool] = False
+    check_rows: ClassVar[int] = 2
+
+    @abstractmethod
+    def specs(self) -> Sequence[Any]:
+        """One frozen dataclass a row, with everything that the row depends on.
+
+        Raises:
+            InputError: options that no row could be run with.
+        """
+
+    @staticmethod
+    @abstractmethod
+    def run(spec: Any) -> dict[str, Any]:
+        """Measure one row: keys of the registry to numbers, flags, texts, or lists of them.
+
+        It runs in a process of its own and depends on ``spec`` alone.
+        """
+
+    @abstractmethod
+    def tables(self, rows: Sequence[Row]) -> Sequence[Table]:
+        """The tables, the most important first, from rows of which some may have failed."""
+
+    def charts(self, rows: Sequence[Row]) -> Sequence[Chart]:
+        """The charts; none by default."""
+        return ()
+
+    def content(self, rows: Sequence[Row]) -> Mapping[str, Any]:
+        """What else belongs into ``results.json``; nothing by default."""
+        return {}
+
+    def write_pictures(self, rows: Sequence[Row], out: Path) -> None:  # noqa: B027
+        """Draw into folder ``out`` what no chart can show; nothing by default."""
+
+    def spec(self, kind: type[S], **own: Any) -> S:
+        """One of the `specs`: fields ``own``, and the options that are named as its others."""
+        options = {field.name for field in dataclasses.fields(self)}  # type: ignore[arg-type]
+        names = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
+        shared = {name: getattr(self, name) for name in names if name in options - own.keys()}
+        return kind(**shared, **own)
+
+    def prepare(self) -> None:  # noqa: B027
+        """Refuse, in seconds, what would make every row fail; nothing by default.
+
+        Raises:
+            InputError: what is wrong.
+        """
+
+    def environment(self) -> Mapping[str, str]:
+        """Variables of the processes that run the rows: one thread each, unless set already."""
+        return one_thread_unless_set()
+
+    @classmethod
+    def title(cls) -> str:
+        """First line of the docstring."""
+        return _paragraphs(cls)[0]
+
+    @classmethod
+    def about(cls) -> str:
+        """The docstring without its first line."""
+        return " ".join(_paragraphs(cls)[1:])
+
+
+def check_each(kind: str, given: Sequence[str], valid: Iterable[str]) -> None:
+    """Refuse a list of a ``kind`` of thing that is empty, or has one twice or an unknown one.
+
+    Raises:
+        InputError: naming it; of an unknown one, with the valid choices.
+    """
+    if not given or len(set(given)) < len(given):
+        raise InputError(f"{kind}s {', '.join(given)!r} must be different, at least one")
+    valid = tuple(valid)
+    for one in given:
+        if one not in valid:
+            raise unknown(kind, one, valid)
+
+
+def _paragraphs(cls: type) -> list[str]:
+    """Paragraphs of a docstring, each on one line."""
+    text = cls.__doc__ or cls.__name__
+    return [" ".join(part.split()) for part in text.strip().split("\n\n")]
+
+
+_RESEARCH = importlib.util.find_spec("ms_slam_experiments")
+HAS_RESEARCH = _RESEARCH is not None
+"""Whether this is a checkout, which has the experiments of the project besides."""
+
+
+def _own() -> dict[str, str]:
+    """Modules by name."""
+    own = {name: f"ms_slam_env.benchmark.{name}" for name in ("compare", "planners", "usme")}
+    if _RESEARCH and _RESEARCH.submodule_search_locations:
+        modules = pkgutil.iter_modules(_RESEARCH.submodule_search_locations)
+        own |= {m.name: f"{_RESEARCH.name}.{m.name}" for m in modules if not m.ispkg}
+    return dict(sorted(own.items()))
+
+
+EXPERIMENTS = ExtensionPoint("experiment", "ms_slam_env.experiments", Experiment, own=_own())
+"""Where experiments are found; ours are modules that are not imported before."""
+
+
+def experiment_class(name: str) -> type[Experiment]:
+    """The experiment of a name; ``step-size`` and ``step_size`` are the same.
+
+    Raises:
+        InputError: an unknown name; the message lists the valid ones.
+    """
+    module_name = name.replace("-", "_")
+    found: Any = EXPERIMENTS.find(module_name if module_name in EXPERIMENTS.own else name)
+    if not isinstance(found, str):
+        return found
+    module = import_module(found)
+    (own,) = [
+        cls
+        for _, cls in inspect.getmembers(module, inspect.isclass)
+        if issubclass(cls, Experiment) and cls.__module__ == module.__name__
+    ]
+    return own

@@ -1,0 +1,246 @@
+"""Tables that compare planners: losses together, and what rliable says across scenes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.benchmark.episodes import short_planner_names
+from ms_slam_env.report import statistics
+from ms_slam_env.report.tables import (
+    Column,
+    Row,
+    Table,
+    complete_cases,
+    finished,
+    grouped,
+    make_table,
+)
+
+RANKED_BY = "f_score_5cm"
+"""Standing still loses it by recall, getting lost by precision."""
+HEADLINE = (
+    *("f_score_5cm", "f_score_5cm_area", "f_score_2cm", "rcm", "ate_m", "ate_tracked_m"),
+    *("tracked_share", "lost", "violations", "path_length_m", "energy_j", "decision_ms"),
+)
+DETAILS = ("ate_max_m", "rpe_m", "rer_m", "mapped_area_m2", "M_I", "M_D", "return")
+
+
+def with_losses(table: Table, rows: Sequence[Row]) -> Table:
+    """The table with the losses of each planner's episodes together, and those not recovered.
+
+    Without the energy where nothing with a mass was moved. Results of a time when losses were not
+    counted have none.
+    """
+    results = grouped(rows, ("planner",))
+    lines = []
+    for line in table.rows:
+        counted = [result for result in results[(line["planner"],)] if "losses" in result]
+        losses = sum(result["losses"] for result in counted)
+        for_good = sum(result["losses_not_recovered"] for result in counted)
+        share = statistics.share_interval(np.arange(losses) < for_good)
+        total = losses if counted else None
+        lines.append({**line, "losses": total, "not_recovered_share": share})
+    moved = any(result.get("energy_j") for of in results.values() for result in of)
+    columns = [column for column in table.columns if moved or column.name != "energy_j"]
+    after = 1 + [column.name for column in columns].index("lost")
+    columns[after:after] = [Column("losses"), Column("not_recovered_share")]
+    return replace(table, columns=tuple(columns), rows=tuple(lines))
+
+
+def score_matrices(rows: Sequence[Row], metric: str = RANKED_BY) -> dict[str, NDArray[np.float64]]:
+    """Scores (episodes, scenes) of each planner that finished an episode in every scene.
+
+    Scenes with more finished episodes than another lose the surplus, as rliable needs a matrix.
+    """
+    scenes = list(dict.fromkeys(row["spec"]["scene"] for row in rows))
+    matrices = {}
+    for planner in dict.fromkeys(map(_planner, rows)):
+        columns: list[list[float]] = [
+            [
+                row["result"][metric]
+                for row in finished(rows)
+                if (_planner(row), row["spec"]["scene"]) == (planner, scene)
+                and metric in row["result"]  # older results have no area
+            ]
+            for scene in scenes
+        ]
+        count = min(map(len, columns))
+        if count:
+            matrices[planner] = np.array([column[:count] for column in columns]).T
+    return matrices
+
+
+def across_scenes(rows: Sequence[Row], title: str = "") -> list[Table]:
+    """rliable's interquartile means, best first; nothing without rliable."""
+    scores = score_matrices(rows)
+    if not statistics.has_rliable() or not scores:
+        return []
+    means = statistics.interquartile_means(scores)
+    lines: list[dict[str, Any]] = [
+        {"planner": name, "f_score_5cm_iqm": means[name]}
+        for name in _ranked({name: of.value for name, of in means.items()})
+    ]
+    return [make_table(["planner", "f_score_5cm_iqm"], lines, title)]
+
+
+COMPARED = {
+    RANKED_BY: ("Better than each other", "better F-score"),
+    "f_score_5cm_area": ("Sooner than each other", "larger area under F-score over steps"),
+    "return": ("Better rewarded than each other", "larger return"),
+}
+"""Metrics by which planners are compared two by two; the title of the table, what it is about."""
+
+
+def better_than_each_other(
+    rows: Sequence[Row], prefix: str = "", metric: str = RANKED_BY
+) -> list[Table]:
+    """rliable's probability that a line's planner has a better score than a column's.
+
+    Nothing without rliable, or of a single planner.
+    """
+    title, what = COMPARED[metric]
+    scores = score_matrices(rows, metric)
+    if not statistics.has_rliable() or len(scores) < 2:
+        return []
+    ranked = _best_first(scores)
+    note = f"Probability that a line's planner has the {what}, with 95 % intervals."
+    return [_two_by_two(ranked, statistics.improvement_matrix(ranked), prefix + title, note)]
+
+
+def trainings_compared(
+    rows: Sequence[Row], prefix: str = "", metric: str = RANKED_BY
+) -> list[Table]:
+    """``better_than_each_other`` of trainings, of which the policies are resampled, too.
+
+    Nothing of a single training or planner.
+    """
+    title, what = COMPARED[metric]
+    name_of = _names_of_trainings(rows)
+    members: dict[str, list[NDArray[np.float64]]] = {}
+    for planner, of in score_matrices(rows, metric).items():
+        members.setdefault(name_of[planner], []).append(of)
+    if len(members) < 2:
+        return []
+    scores = {
+        name: np.stack([of[: min(map(len, policies))] for of in policies])
+        for name, policies in members.items()
+    }
+    ranked = _best_first(scores)
+    note = (
+        f"Probability that a line's planner has the {what}, with 95 % intervals over episodes "
+        "and, of several policies, over these."
+    )
+    return [_two_by_two(ranked, statistics.improvement_of_trainings(ranked), prefix + title, note)]
+
+
+def _best_first(scores: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
+    names = _ranked({name: statistics.interquartile_mean(of) for name, of in scores.items()})
+    return {name: scores[name] for name in names}
+
+
+def _two_by_two(
+    names: Iterable[str],
+    pairs: Mapping[tuple[str, str], statistics.Interval],
+    title: str,
+    note: str,
+) -> Table:
+    """A line and a column for each planner, in this order."""
+    names = tuple(names)
+    label = short_planner_names(names)
+    columns = [Column(name, "improvement", label[name]) for name in names]
+    lines: list[dict[str, Any]] = [
+        {"planner": name, **{other: pairs.get((name, other)) for other in names}} for name in names
+    ]
+    return make_table(["planner", *columns], lines, title, note)
+
+
+def from_the_same_start(rows: Sequence[Row], prefix: str = "") -> list[Table]:
+    """Share of starts from which a line's planner has the larger area than a column's.
+
+    Where a seed makes another place, as in `home`, this is what tells planners apart: between two
+    places the areas differ more than between two planners. Only the starts count that every planner
+    finished, and of two planners those with other areas. Nothing of a single planner.
+    """
+    area = "f_score_5cm_area"
+    known = [row for row in finished(rows) if area in row["result"]]  # older results have no area
+    pairs = complete_cases(known, ("scene", "seed"), "planner")
+    pairs.sort(key=lambda row: (row["spec"]["scene"], row["spec"]["seed"]))
+    results = {name: of for (name,), of in grouped(pairs, ("planner",)).items()}
+    if len(results) < 2:
+        return []
+    values = {name: np.array([result[area] for result in of]) for name, of in results.items()}
+    names = sorted(values, key=lambda name: -float(np.median(values[name])))
+    label, count = short_planner_names(names), len(values[names[0]])
+
+    def share(one: str, other: str) -> statistics.Interval | None:
+        more = np.sign(values[one] - values[other])
+        return statistics.share_interval(more[more != 0] > 0) if more.any() else None
+
+    lines = [{"planner": one, **{other: share(one, other) for other in names}} for one in names]
+    columns = [Column(name, "sooner_share", label[name]) for name in names]
+    note = (
+        f"Share of {count} starts from which a line's planner has the larger area under "
+        "F-score over steps than a column's, with 95 % Wilson intervals."
+    )
+    title = f"{prefix}Sooner from the same start"
+    return [make_table(["planner", *columns], lines, title, note)]
+
+
+def policies_together(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """The rows with planners that differ in ``path`` alone as one; nothing if there are none.
+
+    So several policies of one training, each begun with another seed, are judged as what that
+    training leads to. Files in several folders are those of several trainings; of a file that is
+    the only one in its folder, as a training leaves it, the folder above counts.
+    """
+    names = _names_of_trainings(rows)
+    if all(name == planner for planner, name in names.items()):
+        return []
+    return [{**row, "spec": {**row["spec"], "planner": names[_planner(row)]}} for row in rows]
+
+
+def _names_of_trainings(rows: Sequence[Row]) -> dict[str, str]:
+    """What planners are called in ``policies_together``: as before those that stand alone."""
+    members: dict[str, list[str]] = {}
+    for planner in dict.fromkeys(map(_planner, rows)):
+        members.setdefault(_without_path(planner)[0], []).append(planner)
+    trainings: dict[str, list[str]] = {}
+    for name, of in members.items():
+        paths = {planner: _without_path(planner)[1] for planner in of}
+        files = Counter(path.parent for path in paths.values() if path)
+        folders = {
+            planner: path and (path.parent if files[path.parent] > 1 else path.parent.parent)
+            for planner, path in paths.items()
+        }
+        several = len(set(folders.values()) - {None}) > 1
+        for planner, folder in folders.items():
+            training = f"{name},path={folder}" if several and folder else name
+            trainings.setdefault(training, []).append(planner)
+    return {
+        planner: f"{name} ({len(of)} policies)" if len(of) > 1 else planner
+        for name, of in trainings.items()
+        for planner in of
+    }
+
+
+def _without_path(planner: str) -> tuple[str, PurePosixPath | None]:
+    """A planner without its option ``path``, and that; None without one."""
+    parts = planner.split(",")
+    paths = [PurePosixPath(part[5:]) for part in parts if part.startswith("path=")]
+    rest = [part for part in parts if not part.startswith("path=")]
+    return ",".join(rest), paths[0] if paths else None
+
+
+def _ranked(means: Mapping[str, float]) -> list[str]:
+    return sorted(means, key=lambda name: -means[name])
+
+
+def _planner(row: Mapping[str, Any]) -> str:
+    return str(row["spec"]["planner"])

@@ -1,0 +1,266 @@
+"""Run what is missing of an experiment in parallel, then write all that is made of the rows."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ms_slam_env._runtime.interrupts import kept
+from ms_slam_env._runtime.output_files import check_out_folder
+from ms_slam_env._runtime.parallel import Outcome as Done
+from ms_slam_env._runtime.parallel import one_thread_unless_set, open_pool, run_each
+from ms_slam_env._runtime.progress import Bar
+from ms_slam_env._runtime.result_folders import alone_in
+from ms_slam_env.benchmark.experiment import Experiment
+from ms_slam_env.benchmark.file_hashes import file_hashes
+from ms_slam_env.errors import InputError, one_line
+from ms_slam_env.evaluation.run_sequence import lost_throughout
+from ms_slam_env.metrics.registry import RESULTS_VERSION, versions_since
+from ms_slam_env.report.provenance import git_commit
+from ms_slam_env.report.records import RecordFile, Row, from_plain, spec_key, to_plain
+from ms_slam_env.report.results import RESULTS, Results, write_result_folder
+from ms_slam_env.report.tables import finished
+
+RECORDS = "rows.jsonl"
+_NAMING = ("planner", "scene", "sequence", "backend", "seed")  # what a person calls the work by
+
+
+def run_all(
+    specs: Sequence[Any],
+    run: Callable[[Any], dict[str, Any]],
+    out: Path,
+    workers: int | None = None,
+    description: str = "episodes",
+    *,
+    ray: str | None = None,
+    fresh: bool = False,
+    environment: Mapping[str, str] | None = None,
+    kind: str = "",
+) -> list[Row]:
+    """Run every spec once, in parallel, and return one row for each, in the order of ``specs``.
+
+    One that is given twice has one row: twice it would count twice.
+
+    Rows that an earlier call left in ``out`` are taken from there, except failed ones, which are
+    tried again, and those whose numbers an algorithm of today would make otherwise, or that were
+    made when a file that they name held something else. A row has ``key``, ``spec``, ``result``
+    (what ``run`` returned, None if it raised or its process died), ``error`` (None or the message),
+    ``elapsed_s``, ``commit`` (of the code that made it), ``results_version`` and ``files`` (hashes
+    by name).
+
+    Args:
+        specs: dataclasses; the key of the work is made of all their fields.
+        run: a function that a new process can import.
+        out: folder of the results.
+        workers: processes, each of one thread; None for one a core.
+        description: shown at the progress bar.
+        ray: address of a Ray cluster whose workers run the specs; None: processes of this machine.
+        fresh: whether each spec has a process of its own.
+        environment: variables of the processes; None: one thread each, unless set already.
+        kind: of the result, by which it is known what has changed since a row was made.
+
+    Raises:
+        InputError: fewer than one worker, no Ray or no cluster at the address, a folder that cannot
+            be made, or a file of results that cannot be read.
+    """
+    if workers is not None and workers < 1:
+        raise InputError(f"workers = {workers} must be at least 1")
+    check_out_folder(out)
+    records = RecordFile(out / RECORDS)
+    keys = [spec_key(spec) for spec in specs]
+    files = {key: file_hashes(spec) for key, spec in zip(keys, specs, strict=True)}
+    rows = {
+        key: row
+        for key, row in records.load().items()
+        if row.get("error", "") is None
+        and not versions_since(row.get("results_version", RESULTS_VERSION), kind)
+    }
+    changed = {key for key, now in files.items() if rows.get(key, {}).get("files", now) != now}
+    rows = {key: row for key, row in rows.items() if key not in changed}
+    if changed:
+        again = f"{len(changed)} of {len(files)} are made again: a file that they name has changed"
+        print(f"{description}: {again}", file=sys.stderr)
+    todo = {key: spec for key, spec in zip(keys, specs, strict=True) if key not in rows}
+    done = len(set(keys)) - len(todo)
+    commit = git_commit()
+    if done:
+        older = sum(rows[key].get("commit") != commit for key in set(keys) & rows.keys())
+        by = f", {older} of them made by other code" if older else ""
+        print(f"{description}: {done} of {len(set(keys))} already in {out}{by}", file=sys.stderr)
+    if todo:
+        with Bar(total=len(set(keys)), initial=done, desc=description, unit="") as bar:
+            name_of = names(
+                {key: dataclasses.asdict(spec) for key, spec in zip(keys, specs, strict=True)}
+            )
+
+            def finish(row: Row) -> None:
+                row |= {"commit": commit, "results_version": RESULTS_VERSION}
+                row |= {"files": files[row["key"]]} if files[row["key"]] else {}
+                records.append(row)
+                rows[row["key"]] = row
+                bar.update()
+                if row["error"] is not None:
+                    name = name_of[row["key"]]
+                    bar.write(one_line(f"failed: {name}: {row['error']}"), file=sys.stderr)
+
+            variables = one_thread_unless_set() if environment is None else environment
+            pool = open_pool(run, workers, ray, environment=variables, fresh=fresh)
+            with kept(f"finished {description} are kept in {out}; the same command goes on"), pool:
+                for outcome in run_each(pool, todo):
+                    finish(_row(outcome, todo[outcome.key]))
+    return [rows[key] for key in dict.fromkeys(keys)]
+
+
+def failures(rows: Sequence[Row]) -> list[str]:
+    """The errors among ``rows``, one line each."""
+    failed = [row for row in rows if row["error"] is not None]
+    if not failed:
+        return []
+    name_of = names({row["key"]: row["spec"] for row in rows})
+    return [f"{name_of[row['key']]}: {row['error']}" for row in failed]
+
+
+def lost_runs(rows: Sequence[Row]) -> list[str]:
+    """The runs over sequences, with ``frames`` and ``lost_share``, that were lost all along."""
+    found = []
+    for row in finished(rows):
+        frames, share = row["result"]["frames"], row["result"]["lost_share"]
+        complaint = lost_throughout(frames, round(share * frames))
+        if complaint:
+            spec = row["spec"]
+            found.append(f"sequence {spec['sequence']}, backend {spec['backend']}: {complaint}")
+    return found
+
+
+def names(specs: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
+    """Words for pieces of work, given and returned by key.
+
+    As in ``planner greedy, scene table, seed 2000``, then what else differs among them.
+    """
+    every = list(dict.fromkeys(name for spec in specs.values() for name in spec))
+    shown = [
+        name
+        for name in every
+        if name in _NAMING or len({str(spec.get(name)) for spec in specs.values()}) > 1
+    ]
+    shown.sort(key=lambda name: (name not in _NAMING, every.index(name)))
+    return {
+        key: ", ".join(f"{name} {spec[name]}" for name in shown if name in spec) or key
+        for key, spec in specs.items()
+    }
+
+
+def check_any_finished(rows: Sequence[Row]) -> None:
+    """Refuse to go on where all work failed, so that no good report is overwritten by an empty one.
+
+    Raises:
+        RuntimeError: with the first error.
+    """
+    errors = failures(rows)
+    if rows and len(errors) == len(rows):
+        raise RuntimeError(f"all {len(rows)} failed, the first: {errors[0]}; no report is written")
+
+
+def _row(outcome: Done, spec: Any) -> Row:
+    """An outcome as it is recorded."""
+    row: Row = {
+        "key": outcome.key,
+        "spec": dataclasses.asdict(spec),
+        "result": outcome.value,
+        "error": outcome.error,
+    }
+    if outcome.traceback:
+        row["traceback"] = outcome.traceback
+    return {**row, "elapsed_s": outcome.elapsed_s}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run of an experiment came to.
+
+    Attributes:
+        results: as written.
+        failures: errors of the rows that failed and complaints of the others, one line each.
+    """
+
+    results: Results
+    failures: Sequence[str]
+
+
+def run_experiment(
+    experiment: Experiment, out: Path, workers: int | None = None, ray: str | None = None
+) -> Outcome:
+    """Run the rows that ``out`` does not hold yet; write ``results.json``, ``table.md``, figures.
+
+    Args:
+        experiment: with its options.
+        out: folder of the results; finished rows stand there at once, in ``rows.jsonl``.
+        workers: processes; None for the experiment's own default.
+        ray: address of a Ray cluster whose workers run the rows; None: processes of this machine.
+
+    Raises:
+        InputError: options that no row could be run with, no cluster at the address, or another
+            process that works in ``out``.
+        RuntimeError: every row failed; the files of an earlier run are left as they are.
+    """
+    specs = experiment.specs()
+    if not specs:
+        raise InputError(f"no {experiment.unit} to run: an option is an empty list")
+    with alone_in(out):
+        return _run_specs(experiment, specs, out, workers, ray)
+
+
+def _run_specs(
+    experiment: Experiment, specs: Sequence[Any], out: Path, workers: int | None, ray: str | None
+) -> Outcome:
+    experiment.prepare()
+    rows = run_all(
+        specs,
+        type(experiment).run,
+        out,
+        experiment.workers if workers is None else workers,
+        experiment.unit,
+        ray=ray,
+        fresh=experiment.fresh_process,
+        environment=experiment.environment(),
+        kind=_kind(experiment),
+    )
+    check_any_finished(rows)
+    wrong = [*failures(rows), *(lost_runs(rows) if experiment.tracks else [])]
+    return Outcome(write_all(experiment, rows, out), wrong)
+
+
+def write_all(experiment: Experiment, rows: Sequence[Row], out: Path) -> Results:
+    """Write everything that is made of the rows into folder ``out``."""
+    # Where in the code a row failed is for who runs it, with the paths of that machine; the version
+    # is that of the whole, and what files held tells whether a row is to be made again.
+    left_out = ("traceback", "results_version", "files")
+    rows = [{k: v for k, v in row.items() if k not in left_out} for row in rows]
+    rows = from_plain(to_plain(rows))
+    return write_result_folder(
+        out,
+        RESULTS,
+        lambda folder: experiment.write_pictures(rows, folder),
+        kind=_kind(experiment),
+        title=experiment.title(),
+        about=experiment.about(),
+        tables=experiment.tables(rows),
+        charts=experiment.charts(rows),
+        rows=rows,
+        rows_key=experiment.rows_key,
+        content={"config": as_config(experiment), **experiment.content(rows)},
+    )
+
+
+def _kind(experiment: Experiment) -> str:
+    return type(experiment).__module__.rpartition(".")[2]
+
+
+def as_config(experiment: Any) -> dict[str, Any]:
+    """The options of an experiment as JSON's types."""
+    names = [field.name for field in dataclasses.fields(experiment)]
+    return {name: to_plain(getattr(experiment, name)) for name in names}

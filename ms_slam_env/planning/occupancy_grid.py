@@ -1,0 +1,230 @@
+"""Occupancy of space: carved from depth, followed where SLAM moves frames, seen from a camera."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env._runtime.warp import wp
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.geometry import transform_points
+from ms_slam_env.planning.kernels import BLANK, PASSED, STRUCK, count_states, mark_rays
+from ms_slam_env.slam.base import SlamBackend
+from ms_slam_env.slam.submaps import Submaps
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+UNKNOWN, FREE, OCCUPIED = 0, 1, 2
+
+_CHANGE = np.array([0, -1, 3, 0], dtype=np.int8)  # of the log-odds, by mark
+_LIMIT = 9  # of the log-odds: what was wrong for long is unlearned in as many frames
+_PAD = 16  # cells by which the arrays grow beyond what is asked: they are copied seldom
+
+
+class OccupancyGrid:
+    """Occupancy of cells; it grows with what is seen.
+
+    Args:
+        cell_m: edge of a cell, metres.
+        reach_m: depth up to which a ray carves and strikes, metres.
+    """
+
+    def __init__(self, cell_m: float = 0.1, reach_m: float = 3.5) -> None:
+        self.cell_m = cell_m
+        self.reach_m = reach_m
+        self.first: Int64 = np.zeros(3, dtype=np.int64)
+        """(3,) the first cell of the arrays, counted from the one that begins at the origin."""
+        self.log_odds: NDArray[np.int8] = np.zeros((0, 0, 0), dtype=np.int8)
+        """(X, Y, Z) above 0: occupied; below: free; 0: unknown."""
+        self.blanks: NDArray[np.int8] = np.zeros((0, 0, 0), dtype=np.int8)
+        """(X, Y, Z) in how many frames (at most 100) only rays without a reading crossed a cell."""
+
+    def copy(self) -> OccupancyGrid:
+        """An independent copy."""
+        other = OccupancyGrid(self.cell_m, self.reach_m)
+        other.first = self.first.copy()
+        other.log_odds, other.blanks = self.log_odds.copy(), self.blanks.copy()
+        return other
+
+    def cells_of(self, points: Float64) -> Int64:
+        """Indices into the arrays (..., 3) of points (..., 3), metres; they may lie outside."""
+        return np.floor(points / self.cell_m).astype(np.int64) - self.first
+
+    def centres_of(self, cells: Int64) -> Float64:
+        """Centres (..., 3), metres, of cells given by their indices into the arrays (..., 3)."""
+        return np.asarray((cells + self.first + 0.5) * self.cell_m, dtype=np.float64)
+
+    def states_of(self, points: Float64) -> NDArray[np.int8]:
+        """``UNKNOWN``, ``FREE`` or ``OCCUPIED`` (N,) at points (N, 3), metres."""
+        cells = self.cells_of(points)
+        inside = ((cells >= 0) & (cells < self.log_odds.shape)).all(axis=-1)
+        states = np.full(len(points), UNKNOWN, dtype=np.int8)
+        value = self.log_odds[tuple(cells[inside].T)]
+        states[inside] = np.where(value > 0, OCCUPIED, np.where(value < 0, FREE, UNKNOWN))
+        return states
+
+    def integrate(
+        self, depth: NDArray[np.float32], T_world_camera: Float64, intrinsics: Intrinsics
+    ) -> None:
+        """Carve a depth image (H, W), metres, 0 = no reading, taken at a pose (4, 4)."""
+        # As few pixels as leave no cell out between two rays, up to the reach.
+        stride = max(1, int(intrinsics.fx * self.cell_m / self.reach_m))
+        every = slice(None, None, stride)
+        rays = intrinsics.rays()[every, every]
+        low, high = self._include(rays, T_world_camera)
+        directions = rays.reshape(-1, 3) @ T_world_camera[:3, :3].T / self.cell_m
+        start = T_world_camera[:3, 3] / self.cell_m - self.first - low
+        with wp.ScopedDevice("cpu"):
+            marks = wp.zeros(tuple(high - low), dtype=wp.int8)
+            given = [
+                wp.array(directions.astype(np.float32), dtype=wp.vec3),
+                wp.array(np.ascontiguousarray(depth[every, every], np.float32).reshape(-1)),
+                wp.vec3(*start),
+                wp.vec3i(*marks.shape),
+                self.cell_m,
+                self.reach_m,
+            ]
+            # In this order: surface outweighs free space, and that a ray without a reading.
+            for mark in (BLANK, PASSED, STRUCK):
+                wp.launch(mark_rays, len(directions), [*given, mark], [marks])
+        self._apply(marks.numpy(), low, high)
+
+    def _apply(self, marks: NDArray[np.int8], low: Int64, high: Int64) -> None:
+        box = tuple(map(slice, low, high))
+        change = _CHANGE[marks]
+        old = self.log_odds[box]
+        new = np.clip(old + change, -_LIMIT, _LIMIT)
+        # No measurement leads back to "unknown".
+        self.log_odds[box] = np.where((new == 0) & (old != 0), np.sign(change), new)
+        self.blanks[box] = np.minimum(self.blanks[box] + (marks == BLANK), 100)
+
+    def _include(self, rays: Float64, T_world_camera: Float64) -> tuple[Int64, Int64]:
+        """Hold the whole of a view; return the indices from and up to which it reaches."""
+        corners = self.reach_m * rays[[0, 0, -1, -1], [0, -1, 0, -1]]
+        points = transform_points(T_world_camera, np.concatenate([np.zeros((1, 3)), corners]))
+        cells = np.floor(points / self.cell_m).astype(np.int64)
+        low, high = cells.min(axis=0) - 1, cells.max(axis=0) + 2
+        self._grow(low, high)
+        return low - self.first, high - self.first
+
+    def _grow(self, low: Int64, high: Int64) -> None:
+        shape = np.array(self.log_odds.shape)
+        if not shape.any():
+            self.first = low
+        end = self.first + shape
+        if (low >= self.first).all() and (high <= end).all():
+            return
+        first = np.where(low < self.first, low - _PAD, self.first)
+        grown = np.where(high > end, high + _PAD, end) - first
+        box = tuple(slice(a, a + n) for a, n in zip(self.first - first, shape, strict=True))
+        log_odds, blanks = np.zeros(grown, np.int8), np.zeros(grown, np.int8)
+        log_odds[box], blanks[box] = self.log_odds, self.blanks
+        self.first, self.log_odds, self.blanks = first, log_odds, blanks
+
+
+Float32 = NDArray[np.float32]
+
+_MOST_SAMPLES = 5
+
+
+def surrounding_occupancy(
+    grid: OccupancyGrid, T_world_camera: Float64, blocks: tuple[int, int, int], block_m: float
+) -> Float32:
+    """Shares of free and of occupied space in blocks around a camera, (2, X, Y, Z) in [0, 1].
+
+    The rest of a block is unknown. Blocks lie along the camera's axes (x right, y down, z forward),
+    as many on either side of it; each is looked at in as many places as leave no cell out, but no
+    more than five along an edge.
+
+    Args:
+        grid: what is known.
+        T_world_camera: (4, 4).
+        blocks: X, Y, Z, how many along each axis.
+        block_m: edge of a block, metres.
+    """
+    samples = min(_MOST_SAMPLES, math.ceil(block_m / grid.cell_m - 1e-9))
+    corner = -0.5 * block_m * np.array(blocks)
+    start = T_world_camera[:3, :3] @ corner + T_world_camera[:3, 3]
+    with wp.ScopedDevice("cpu"):
+        shares = wp.zeros((2, *blocks), dtype=float)
+        given = [
+            wp.array(grid.log_odds, dtype=wp.int8, copy=False),
+            wp.mat33(*(T_world_camera[:3, :3] * block_m / grid.cell_m).ravel()),
+            wp.vec3(*(start / grid.cell_m - grid.first)),
+            samples,
+        ]
+        wp.launch(count_states, blocks, given, [shares])
+    return np.asarray(shares.numpy())
+
+
+class _Carved(NamedTuple):
+    """A frame and where it was carved."""
+
+    number: int  # as SLAM counts
+    depth: NDArray[np.float32]
+    T_world_camera: Float64
+
+
+class OccupancyMap:
+    """Keeps the frames that it was carved from, and carves anew what SLAM has moved.
+
+    ``grid`` holds the frames of the present submap and of those joined to it: where another lies is
+    a guess, and what it saw would be carved in the wrong place.
+
+    Args:
+        cell_m: edge of a cell, metres.
+        reach_m: depth up to which a ray carves and strikes, metres.
+    """
+
+    def __init__(self, cell_m: float = 0.1, reach_m: float = 3.5) -> None:
+        self.cell_m, self.reach_m = cell_m, reach_m
+        self.grid = OccupancyGrid(cell_m, reach_m)
+        self._frames: list[_Carved] = []
+        self._in_grid: set[int] = set()
+
+    def add(
+        self,
+        slam: SlamBackend,
+        depth: NDArray[np.float32],
+        T_world_camera: Float64,
+        intrinsics: Intrinsics,
+    ) -> None:
+        """Take the frame (H, W), metres, that ``slam`` tracked last, at its pose (4, 4)."""
+        number = slam.frames_counted - 1 if slam.frames_counted else len(self._frames)
+        moved = self._follow(slam)
+        self._frames.append(_Carved(number, depth, T_world_camera))
+        present = _of_present_submap(slam.submaps(), [frame.number for frame in self._frames])
+        if moved or self._in_grid | {number} != present:
+            self.grid = OccupancyGrid(self.cell_m, self.reach_m)
+            self._in_grid = set()
+        missing = present - self._in_grid
+        for frame in self._frames if len(missing) > 1 else self._frames[-1:]:
+            if frame.number in missing:
+                self.grid.integrate(frame.depth, frame.T_world_camera, intrinsics)
+        self._in_grid = present
+
+    def _follow(self, slam: SlamBackend) -> bool:
+        """Put the frames where SLAM has them now; whether one in the grid has moved by that."""
+        numbers, poses = slam.corrected_trajectory()
+        now = dict(zip(numbers.tolist(), poses, strict=True))
+        moved = False
+        for index, frame in enumerate(self._frames):
+            pose = now.get(frame.number)
+            if pose is None:
+                continue
+            # Each entry of the rotation tells how far the depths along an axis have turned.
+            apart = np.abs(pose - frame.T_world_camera)[:3] @ [*[self.reach_m] * 3, 1.0]
+            if apart.max() > 0.5 * self.cell_m:
+                self._frames[index] = frame._replace(T_world_camera=pose)
+                moved |= frame.number in self._in_grid
+        return moved
+
+
+def _of_present_submap(submaps: Submaps, numbers: list[int]) -> set[int]:
+    """Which of the frames belong to the submap of the last one, or to one that it is joined to."""
+    roots = submaps.joined_to[np.searchsorted(submaps.first_frames, numbers, side="right") - 1]
+    return {number for number, root in zip(numbers, roots, strict=True) if root == roots[-1]}

@@ -1,0 +1,314 @@
+"""What proposes the configurations to be tried out: Optuna's samplers and one more."""
+
+from __future__ import annotations
+
+import importlib.util
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ms_slam_env.errors import InputError
+from ms_slam_env.report.records import RecordFile, spec_key
+from ms_slam_env.tuning.evaluator import Row, SlamEvaluator
+from ms_slam_env.tuning.objectives import FAILURE, METRICS, Measured, objective_values
+from ms_slam_env.tuning.parameters import Float, Integer
+from ms_slam_env.tuning.space import SearchSpace
+
+if TYPE_CHECKING:
+    from optuna.samplers import BaseSampler
+
+Maker = Callable[[int, int], "BaseSampler"]
+
+
+def _random(seed: int, population: int) -> BaseSampler:
+    from optuna.samplers import RandomSampler
+
+    return RandomSampler(seed=seed)
+
+
+def _nsga2(seed: int, population: int) -> BaseSampler:
+    from optuna.samplers import NSGAIISampler
+
+    return NSGAIISampler(seed=seed, population_size=population)
+
+
+def _tpe(seed: int, population: int) -> BaseSampler:
+    from optuna.samplers import TPESampler
+
+    return TPESampler(seed=seed, multivariate=True)
+
+
+def _gp(seed: int, population: int) -> BaseSampler:
+    """Gaussian processes, on one thread.
+
+    PyTorch's pool and OpenBLAS's take each other's cores: on two busy cores a proposal took 8.7 s,
+    2.5 s of processor time, and studies did not finish; on one thread it took 1.2 s and 0.4 s
+    (seven parameters, a constraint, 10 to 30 trials).
+    """
+    from optuna.samplers import GPSampler
+    from threadpoolctl import threadpool_limits
+
+    class OneThread(GPSampler):
+        def sample_relative(self, *arguments: Any) -> dict[str, Any]:
+            with threadpool_limits(1):
+                return super().sample_relative(*arguments)
+
+    return OneThread(seed=seed)
+
+
+def _forest(seed: int, population: int) -> BaseSampler:
+    from optuna.samplers import BaseSampler, RandomSampler
+    from optuna.search_space import IntersectionSearchSpace
+    from optuna.trial import TrialState
+
+    class RandomForestSampler(BaseSampler):
+        """``propose`` after the first trials, which are random."""
+
+        def __init__(self) -> None:
+            self._rng = np.random.default_rng(seed)
+            self._random = RandomSampler(seed=seed)
+
+        def infer_relative_search_space(self, study: Any, trial: Any) -> dict[str, Any]:
+            space = IntersectionSearchSpace().calculate(study)
+            return {name: kind for name, kind in space.items() if not kind.single()}
+
+        def sample_relative(self, study: Any, trial: Any, space: Any) -> dict[str, Any]:
+            done = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+            too_early = len(done) < _STARTUP or self._rng.random() < _AT_RANDOM
+            return {} if too_early or not space else propose(space, done, self._rng)
+
+        def sample_independent(self, *arguments: Any) -> Any:
+            return self._random.sample_independent(*arguments)
+
+    return RandomForestSampler()
+
+
+SAMPLERS: dict[str, Maker] = {
+    "random": _random,
+    "nsga2": _nsga2,
+    "tpe": _tpe,
+    "gp": _gp,
+    "forest": _forest,
+}
+"""Name to maker; a maker takes the seed and the size of a population.
+
+``random`` is the paper's; ``nsga2`` evolves a population; ``tpe``, ``gp`` and ``forest`` fit a
+model, the last as HyperMapper does.
+"""
+_NEEDS = {"gp": ("torch", "PyTorch"), "forest": ("sklearn", "scikit-learn")}
+
+
+def make_sampler(name: str, seed: int, population: int) -> BaseSampler:
+    """Make the sampler ``name``.
+
+    Raises:
+        InputError: its library is not installed.
+    """
+    from optuna.exceptions import ExperimentalWarning
+
+    module, library = _NEEDS.get(name, ("", ""))
+    if module and importlib.util.find_spec(module) is None:
+        raise InputError(f"sampler {name} needs {library}: pip install 'ms-slam-env[explore]'")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ExperimentalWarning)
+        return SAMPLERS[name](seed, population)
+
+
+# -- Active learning with random forests --------------------------------------------------------
+
+_STARTUP = 10  # random trials before there is a model
+_AT_RANDOM = 0.05  # of the later ones: a model that is wrong somewhere learns of it
+_POOL = 1000  # random configurations that are predicted, and as many close to the front
+_TREES = 32
+_LIKELY = 0.5  # probability from which on a configuration is taken for feasible
+
+
+def propose(space: Mapping[str, Any], done: list[Any], rng: np.random.Generator) -> dict[str, Any]:
+    """The next configuration: at random of the Pareto front that random forests predict.
+
+    One forest predicts each objective, another whether a configuration is feasible: whether it
+    keeps the constraints and does not fail. Nardi, Koeplinger, Olukotun: Practical Design Space
+    Exploration (HyperMapper), MASCOTS 2019; there all of the predicted front is evaluated before
+    the forests grow anew, here one at a time. A pool of configurations stands for the space, half
+    of them drawn from it, half changed from the front so far.
+
+    Args:
+        space: Optuna's distributions by name.
+        done: finished trials of Optuna.
+        rng: what chance there is.
+
+    Returns:
+        values of ``space``.
+    """
+    from optuna._transform import _SearchSpaceTransform
+    from optuna.study._multi_objective import _is_pareto_front
+    from sklearn.ensemble import RandomForestClassifier, RandomForestRegressor
+
+    def front(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+        return _is_pareto_front(values, assume_unique_lexsorted=False)
+
+    coded = _SearchSpaceTransform(dict(space), transform_0_1=True)
+    points = np.array([coded.transform({n: t.params[n] for n in space}) for t in done])
+    values = np.array([trial.values for trial in done], dtype=np.float64)
+    kept = np.array([all(v <= 0 for v in trial.constraints.values()) for trial in done])
+    learnt = kept if kept.sum() >= 2 else np.ones(len(done), dtype=bool)
+    best = points[learnt][front(values[learnt])]
+    pool = np.vstack([rng.random((_POOL, points.shape[1])), _changed(best, rng)])
+    seed = int(rng.integers(2**31))
+    if kept.any() and not kept.all():
+        judge = RandomForestClassifier(_TREES, random_state=seed).fit(points, kept)
+        likely = judge.predict_proba(pool)[:, 1]
+        pool = pool[likely >= min(_LIKELY, likely.max())]
+    predicted = np.stack(
+        [
+            RandomForestRegressor(_TREES, max_features=0.75, random_state=seed)
+            .fit(points[learnt], column)
+            .predict(pool)
+            for column in values[learnt].T
+        ],
+        axis=1,
+    )
+    found = [coded.untransform(row) for row in pool[front(predicted)]]
+    known = [{name: trial.params[name] for name in space} for trial in done]
+    fresh = [params for params in found if params not in known]
+    return fresh[rng.integers(len(fresh))] if fresh else {}
+
+
+def _changed(best: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+    """(_POOL, d) of points (n, d), one or two coordinates of each drawn anew or shifted."""
+    rows = best[rng.integers(len(best), size=_POOL)]
+    drawn = np.where(
+        rng.random(rows.shape) < 0.5,
+        rng.random(rows.shape),
+        np.clip(rows + rng.normal(0.0, 0.1, rows.shape), 0.0, 1.0),
+    )
+    is_other = rng.random(rows.shape) < 1.5 / rows.shape[1]
+    return np.where(is_other, drawn, rows)
+
+
+@dataclass(frozen=True)
+class _Point:
+    """A point of the grid with everything that decides its measurement."""
+
+    evaluator: SlamEvaluator
+    base: dict[str, Any]
+    values: dict[str, Any]
+
+
+class Grid:
+    """Measures the point of a grid that is nearest to the values asked for, each point once.
+
+    Args:
+        space: ranges; no choices.
+        evaluator: measures a point.
+        count: points along each parameter, the default among them; ranges of integers may hold
+            fewer.
+        path: of what has been measured.
+
+    Raises:
+        InputError: a parameter without an order.
+    """
+
+    def __init__(
+        self, space: SearchSpace, evaluator: SlamEvaluator, count: int, path: Path
+    ) -> None:
+        self.space, self.evaluator = space, evaluator
+        self.levels = {name: _levels(space, name, count) for name in space.parameters}
+        self._records = RecordFile(path)
+        self._known = self._records.load()
+
+    def nearest(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """The point of the grid nearest to ``values``; on a logarithmic range, in ratio."""
+        point = {}
+        for name, value in values.items():
+            levels = np.array([*self.levels[name], value], dtype=np.float64)
+            scaled = np.log(levels) if _range(self.space, name).log else levels
+            point[name] = self.levels[name][int(np.argmin(np.abs(scaled[:-1] - scaled[-1])))]
+        return point
+
+    def __call__(self, values: Mapping[str, Any]) -> Row:
+        """What was measured at the point nearest to ``values``."""
+        point = self.nearest(values)
+        key = spec_key(_Point(self.evaluator, asdict(self.space.base), point))
+        if key not in self._known:
+            row = {"key": key, "params": point, **self.evaluator(self.space.configuration(point))}
+            self._records.append(row)
+            self._known[key] = row
+        return self._known[key]
+
+    @property
+    def measured(self) -> int:
+        """Number of points measured so far."""
+        return len(self._known)
+
+    @property
+    def size(self) -> int:
+        """Number of points of the grid."""
+        return int(np.prod([len(levels) for levels in self.levels.values()]))
+
+
+def _levels(space: SearchSpace, name: str, count: int) -> list[Any]:
+    """Values of a parameter in order; the one nearest to the default is the default itself."""
+    kind = _range(space, name)
+    default = space.defaults()[name]
+    spaced = (np.geomspace if kind.log else np.linspace)(kind.low, kind.high, count)
+    values = [round(v) if isinstance(kind, Integer) else float(v) for v in spaced]
+    scaled = np.log([*values, default]) if kind.log else np.array([*values, default])
+    values[int(np.argmin(np.abs(scaled[:-1] - scaled[-1])))] = default
+    return sorted(set(values))
+
+
+def _range(space: SearchSpace, name: str) -> Float | Integer:
+    kind = space.parameters[name]
+    if not isinstance(kind, (Float, Integer)):
+        raise InputError(f"parameter {name!r} has no order, which a grid needs")
+    return kind
+
+
+_POPULATION = 10  # of NSGA-II: several generations within a budget of tens
+
+
+def explore_in_memory(
+    space: SearchSpace,
+    measure: Callable[[Mapping[str, Any]], Measured],
+    objectives: Sequence[str],
+    sampler: str,
+    seed: int,
+    trials: int,
+    reference: Mapping[str, float] | None = None,
+) -> list[tuple[dict[str, Any], Measured]]:
+    """So many trials, the default first.
+
+    Args:
+        space: the parameters.
+        measure: values of the parameters in, what was measured out.
+        objectives: names in ``METRICS``, two or more.
+        sampler: name in ``SAMPLERS``.
+        seed: of the sampler.
+        trials: how many.
+        reference: where each objective stops to count; None for the worst there is.
+
+    Returns:
+        the values of the parameters and what was measured, trial by trial.
+    """
+    import optuna
+
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    limits = reference or {name: METRICS[name].worst for name in objectives}
+    study = optuna.create_study(
+        directions=["minimize"] * len(objectives), sampler=make_sampler(sampler, seed, _POPULATION)
+    )
+    study.enqueue_trial(space.defaults())
+    found = []
+    for _ in range(trials):
+        trial = study.ask(space.distributions())
+        measured = measure(trial.params)
+        trial.set_constraint("failed", 1.0 if measured.get(FAILURE) else 0.0)
+        study.tell(trial, objective_values(measured, objectives, limits))
+        found.append((trial.params, measured))
+    return found
