@@ -16,7 +16,7 @@ from ms_slam_env._runtime.input_files import MAX_MESH_BYTES, check_file
 from ms_slam_env._runtime.output_files import write_bytes
 from ms_slam_env.env.planners import Planner, make_planner
 from ms_slam_env.errors import InputError
-from ms_slam_env.slam.state_file import check_expansion
+from ms_slam_env.slam.shared.state_file import check_expansion
 
 _PLANNER, _POLICY = 1, 2  # streams of an episode's seed; the environment draws from the seed itself
 _ARRAYS = {"observations": 2, "masks": 2, "preferences": 2, "rewards": 1, "is_tracked": 1}

@@ -14,7 +14,7 @@ from ms_slam_env.geometry import adjoint, hat, invert
 from ms_slam_env.planning import view_information
 from ms_slam_env.planning.trackability import SCALE, mean_depth, risk_of
 from ms_slam_env.planning.view_goals import distance_in_steps
-from ms_slam_env.slam.base import Views
+from ms_slam_env.slam.slam_backend import Views
 
 CORRECT_M = 0.05
 """How far from its place surface may be to count."""

@@ -18,7 +18,7 @@ from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished, make_table
 from ms_slam_env.sequences import HandheldPath, check_sequence, open_sequence
-from ms_slam_env.slam.alignment_check import (
+from ms_slam_env.slam.shared.alignment_check import (
     DISPUTED,
     AcceptanceThresholds,
     TrackingStatus,

@@ -32,8 +32,8 @@ from ms_slam_env.sequences import MotionSegments, open_sequence
 from ms_slam_env.sequences.trajectory import PoseInterpolation
 from ms_slam_env.slam.adaptation import AdaptiveSlam, AgentConfig, DivergenceAdaptationConfig
 from ms_slam_env.slam.adaptation.controllers import DivergenceController
-from ms_slam_env.slam.base import SlamBackend
 from ms_slam_env.slam.configuration import SlamConfiguration
+from ms_slam_env.slam.slam_backend import SlamBackend
 
 ADAPTIVE = "adaptive"
 ALSO = (

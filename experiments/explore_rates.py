@@ -17,7 +17,7 @@ from ms_slam_env.report.tables import Column, Table, finished, make_table
 from ms_slam_env.sequences import check_sequence
 from ms_slam_env.slam.configuration import SlamConfiguration, read_configuration
 from ms_slam_env.slam.surfel import SurfelConfig
-from ms_slam_env.slam.surfel.config import PAPER
+from ms_slam_env.slam.surfel.surfel_config import PAPER
 from ms_slam_env.tuning import SlamEvaluator, make_space
 from ms_slam_env.tuning.objectives import FAILURE, as_metrics
 from ms_slam_env.tuning.samplers import SAMPLERS, explore_in_memory

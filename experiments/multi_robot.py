@@ -38,7 +38,7 @@ from ms_slam_env.report.tables import (
 )
 from ms_slam_env.scenes.registry import check_name
 from ms_slam_env.sensor.noise import noise_config
-from ms_slam_env.slam.map_merging import MergeConfig
+from ms_slam_env.slam.team.map_merging import MergeConfig
 
 _MERGED = ("merged", "wrong_merge")
 _BESIDE = {

@@ -38,7 +38,7 @@ from ms_slam_env.report.tables import Table, Value, finished, format_value, make
 from ms_slam_env.scenes import PUBLISHED_ROOMS, Scene
 from ms_slam_env.scenes.registry import check_name
 from ms_slam_env.sensor import RGBDSensor
-from ms_slam_env.slam.surfel.config import RELOCALISATIONS
+from ms_slam_env.slam.surfel.surfel_config import RELOCALISATIONS
 
 Float64 = NDArray[np.float64]
 

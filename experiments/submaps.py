@@ -26,7 +26,7 @@ from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, Value, finished, make_table, summary
 from ms_slam_env.scenes import SCENES, Scene
 from ms_slam_env.sensor import RGBDSensor
-from ms_slam_env.slam.surfel.config import SUBMAPS
+from ms_slam_env.slam.surfel.surfel_config import SUBMAPS
 
 Float64 = NDArray[np.float64]
 

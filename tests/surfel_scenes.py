@@ -6,8 +6,8 @@ import numpy as np
 
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
+from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 
 SMALL = Intrinsics(fx=40.0, fy=42.0, cx=19.3, cy=14.8, width=40, height=30)

@@ -8,7 +8,7 @@ from ms_slam_env import slam
 from ms_slam_env.camera import xtion
 from ms_slam_env.geometry import invert, look_at
 from ms_slam_env.sequences import render_sequence
-from ms_slam_env.slam.map_hypotheses import RobotRun
+from ms_slam_env.slam.team.relative_map_poses import RobotRun
 
 K = xtion("160x120")
 

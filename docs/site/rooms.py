@@ -50,7 +50,9 @@ def imported_rooms(folder: Path) -> set[str]:
                 found |= {alias.name for alias in node.names}
     inside = {name.split(".")[1] for name in found if name.startswith("ms_slam_env.")}
     outside = {name.split(".")[0].removeprefix("ms_slam_") for name in found}
-    return (inside | (outside & {"baselines", "agents", "experiments"})) & set(ROOMS) - {folder.name}
+    return (inside | (outside & {"baselines", "agents", "experiments"})) & set(ROOMS) - {
+        folder.name
+    }
 
 
 def uses() -> dict[str, set[str]]:

@@ -20,15 +20,15 @@ from ms_slam_env.geometry.point_clouds import voxel_downsample
 from ms_slam_env.scenes import Scene
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sequences import HandheldPath, render_sequence
-from ms_slam_env.slam.map_hypotheses import RobotRun
-from ms_slam_env.slam.map_merging import (
+from ms_slam_env.slam.team.map_merging import (
     Merge,
     MergeConfig,
     decide,
     find_hypotheses,
     pose_difference,
 )
-from ms_slam_env.slam.team_server import fuse_team, optimise_team
+from ms_slam_env.slam.team.relative_map_poses import RobotRun
+from ms_slam_env.slam.team.team_server import fuse_team, optimise_team
 
 Float64 = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from ms_slam_env import metrics
 from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.evaluation.map_quality import SURFACE_SPACING_M, ScoreCurve, map_quality
 from ms_slam_env.evaluation.map_truth import reference_surface, true_surface
-from ms_slam_env.slam.base import SlamBackend
+from ms_slam_env.slam.slam_backend import SlamBackend
 
 Float64 = NDArray[np.float64]
 

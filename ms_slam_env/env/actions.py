@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.adaptation import AdaptationConfig, AdaptiveSlam, AgentConfig
-from ms_slam_env.slam.base import SlamBackend
+from ms_slam_env.slam.slam_backend import SlamBackend
 
 Bool = NDArray[np.bool_]
 

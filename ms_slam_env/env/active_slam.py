@@ -32,7 +32,7 @@ from ms_slam_env.robot import Embodiment
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sequences.perturbations.base import Perturbation
-from ms_slam_env.slam.base import SlamBackend, Views
+from ms_slam_env.slam.slam_backend import SlamBackend, Views
 
 Float64 = NDArray[np.float64]
 

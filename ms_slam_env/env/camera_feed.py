@@ -18,7 +18,7 @@ from ms_slam_env.sequences.perturbations.base import Perturbation
 from ms_slam_env.sequences.perturbations.movers import Mover
 from ms_slam_env.sequences.perturbed_camera import Imperfections, PerturbedCamera
 from ms_slam_env.sequences.trajectory import PoseInterpolation
-from ms_slam_env.slam.state_check import MOST, SEED, ListOf, Real
+from ms_slam_env.slam.shared.state_check import MOST, SEED, ListOf, Real
 
 Float64 = NDArray[np.float64]
 

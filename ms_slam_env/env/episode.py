@@ -15,7 +15,7 @@ from ms_slam_env.env.pose_sources import FrameObservation
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert
 from ms_slam_env.planning import OccupancyGrid
-from ms_slam_env.slam.base import TrackResult
+from ms_slam_env.slam.slam_backend import TrackResult
 
 Float64 = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.divergence import DivergenceConfig, Histograms, make_divergence
 from ms_slam_env.env.config import LookaheadConfig
-from ms_slam_env.slam.base import SlamBackend, Views
+from ms_slam_env.slam.slam_backend import SlamBackend, Views
 
 Float64 = NDArray[np.float64]
 

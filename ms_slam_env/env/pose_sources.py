@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import RGBDFrame
-from ms_slam_env.slam.base import SlamBackend, TrackResult
+from ms_slam_env.slam.slam_backend import SlamBackend, TrackResult
 
 Float64 = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from ms_slam_env.env.point_renderer import BACKGROUND
 from ms_slam_env.env.third_person_view import ESTIMATE_COLOR, draw_third_person
 from ms_slam_env.robot import Embodiment, describe
 from ms_slam_env.scenes.base import Scene
-from ms_slam_env.slam.base import SlamBackend
+from ms_slam_env.slam.slam_backend import SlamBackend
 
 Image = NDArray[np.uint8]
 Float64 = NDArray[np.float64]

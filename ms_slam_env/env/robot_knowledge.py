@@ -12,7 +12,7 @@ from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.planning import OccupancyGrid
 from ms_slam_env.planning.candidates import PredictedViews
 from ms_slam_env.robot import NUM_ROTATIONS, NUM_TRANSLATIONS, ROTATIONS, TRANSLATIONS
-from ms_slam_env.slam.base import Views
+from ms_slam_env.slam.slam_backend import Views
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]

@@ -11,7 +11,7 @@ import numpy as np
 from ms_slam_env.env.simulation import Simulation, World
 from ms_slam_env.env.state import check_episode, check_parts, check_same_settings
 from ms_slam_env.errors import InputError
-from ms_slam_env.slam.state_check import check_like, is_open
+from ms_slam_env.slam.shared.state_check import check_like, is_open
 
 
 def save_state(

@@ -26,7 +26,7 @@ from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.registry import SCENES, SceneName, name_of
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sensor.scene_cache import get_scene, get_sensor
-from ms_slam_env.slam.base import SlamBackend, TrackResult
+from ms_slam_env.slam.slam_backend import SlamBackend, TrackResult
 
 Float64 = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from ms_slam_env.divergence import Histograms
 from ms_slam_env.env.episode import Episode, FrameRecord
 from ms_slam_env.errors import InputError
 from ms_slam_env.planning import OccupancyGrid
-from ms_slam_env.slam.state_check import (
+from ms_slam_env.slam.shared.state_check import (
     MOST,
     SEED,
     ArrayOf,

@@ -14,7 +14,7 @@ from ms_slam_env.robot import Embodiment
 from ms_slam_env.robot.arm.arm import ArmEmbodiment
 from ms_slam_env.robot.arm.shape import arm_parts, column_parts, surface_dots
 from ms_slam_env.scenes.base import Scene, floor_height
-from ms_slam_env.slam.base import SlamBackend
+from ms_slam_env.slam.slam_backend import SlamBackend
 
 Image = NDArray[np.uint8]
 Float64 = NDArray[np.float64]

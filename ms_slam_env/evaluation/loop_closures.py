@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.evaluation.seen_surface import back_projected
 from ms_slam_env.geometry import Float64, invert, relative_angle
-from ms_slam_env.slam.base import Loop
+from ms_slam_env.slam.slam_backend import Loop
 
 Int32 = NDArray[np.int32]
 Bool = NDArray[np.bool_]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.sequences.rendering import RenderedFrames
-from ms_slam_env.slam.base import TrackResult
+from ms_slam_env.slam.slam_backend import TrackResult
 
 Bool = NDArray[np.bool_]
 

@@ -16,7 +16,7 @@ from ms_slam_env._runtime.output_files import write_bytes, write_text
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.run_sequence import SequenceRun
 from ms_slam_env.evaluation.tracking_diagnosis import alignment_columns
-from ms_slam_env.slam.base import SlamBackend
+from ms_slam_env.slam.slam_backend import SlamBackend
 from ms_slam_env.slam.volumetric.voxel_grid import load_open3d
 
 Float64 = NDArray[np.float64]

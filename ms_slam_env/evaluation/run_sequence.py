@@ -35,7 +35,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.metrics.cost import CostMeter
 from ms_slam_env.metrics.cost.meter import FrameCost
 from ms_slam_env.sequences.sequence import Sequence
-from ms_slam_env.slam.base import SlamBackend, TrackResult
+from ms_slam_env.slam.slam_backend import SlamBackend, TrackResult
 
 Float64 = NDArray[np.float64]
 

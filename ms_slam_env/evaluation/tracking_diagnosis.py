@@ -15,7 +15,7 @@ from ms_slam_env.evaluation.trajectory_charts import marked_panel
 from ms_slam_env.report import figures
 from ms_slam_env.report.charts import Chart
 from ms_slam_env.report.tables import Table, make_table
-from ms_slam_env.slam.base import TrackResult, Views
+from ms_slam_env.slam.slam_backend import TrackResult, Views
 
 Float64 = NDArray[np.float64]
 

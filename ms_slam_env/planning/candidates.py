@@ -20,7 +20,7 @@ from ms_slam_env.planning.trackability import (
     view_information,
 )
 from ms_slam_env.planning.view_goals import distance_in_steps
-from ms_slam_env.slam.base import Views
+from ms_slam_env.slam.slam_backend import Views
 
 Float64 = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import transform_points
 from ms_slam_env.planning.kernels import BLANK, PASSED, STRUCK, count_states, mark_rays
-from ms_slam_env.slam.base import SlamBackend
-from ms_slam_env.slam.submaps import Submaps
+from ms_slam_env.slam.shared.submap_frames import Submaps
+from ms_slam_env.slam.slam_backend import SlamBackend
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]

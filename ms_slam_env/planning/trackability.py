@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.planning.kernels import mat66, sum_information, sum_remaining
-from ms_slam_env.slam.base import Views
+from ms_slam_env.slam.slam_backend import Views
 
 Float64 = NDArray[np.float64]
 

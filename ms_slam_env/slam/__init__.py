@@ -1,6 +1,5 @@
 """SLAM: backends by name, and what they have in common."""
 
-from ms_slam_env.slam.base import SlamBackend, TrackResult, Views
 from ms_slam_env.slam.configuration import (
     SlamConfiguration,
     is_file_name,
@@ -10,6 +9,7 @@ from ms_slam_env.slam.configuration import (
     write_configuration,
 )
 from ms_slam_env.slam.registry import BACKENDS, POINT, check_parameters
+from ms_slam_env.slam.slam_backend import SlamBackend, TrackResult, Views
 
 __all__ = [
     "BACKENDS",

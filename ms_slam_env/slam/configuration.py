@@ -17,10 +17,10 @@ from ms_slam_env._runtime.parallel import limited_threads
 from ms_slam_env.camera import Intrinsics, parse_image_size
 from ms_slam_env.config import Checked, bounded, from_dict, load_yaml
 from ms_slam_env.errors import InputError
-from ms_slam_env.slam.base import SlamBackend
 from ms_slam_env.slam.machine import CompilerOptions, compiled, limited_clock
 from ms_slam_env.slam.registry import backend_name, check_parameters, make_backend
-from ms_slam_env.slam.state_file import read_about
+from ms_slam_env.slam.shared.state_file import read_about
+from ms_slam_env.slam.slam_backend import SlamBackend
 
 SUFFIXES = (".yaml", ".yml")
 _MAX_BYTES = 1_000_000

@@ -14,7 +14,7 @@ from ms_slam_env._runtime.extension import ExtensionPoint, check_options
 from ms_slam_env.camera import Intrinsics, check_camera
 from ms_slam_env.config import from_dict, is_options
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.slam.base import SlamBackend
+from ms_slam_env.slam.slam_backend import SlamBackend
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.slam import check_parameters
 from ms_slam_env.slam.configuration import SlamConfiguration, merged
 from ms_slam_env.slam.machine import clock_range_mhz, why_no_clock
-from ms_slam_env.slam.surfel.config import PAPER
+from ms_slam_env.slam.surfel.surfel_config import PAPER
 from ms_slam_env.tuning.parameters import Choice, Float, Integer, Parameter
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from ms_slam_env.geometry import look_at, make_pose, relative_angle, so3_exp
 from ms_slam_env.planning import FREE, UNKNOWN, OccupancyGrid, shortest_ways
 from ms_slam_env.planning.trackability import SCALE, image_motion, slip_risk
 from ms_slam_env.planning.view_goals import distance_in_steps
-from ms_slam_env.slam.base import Views
+from ms_slam_env.slam.slam_backend import Views
 
 STEPS = 0.12, math.radians(12)
 

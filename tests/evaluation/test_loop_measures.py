@@ -8,7 +8,7 @@ import pytest
 from ms_slam_env.camera import xtion
 from ms_slam_env.evaluation.loop_closures import AWAY_S, find_revisits, loop_measures
 from ms_slam_env.geometry import make_pose, so3_exp
-from ms_slam_env.slam.base import Loop
+from ms_slam_env.slam.slam_backend import Loop
 
 CAMERA = xtion("80x60")
 RADIUS_M = 3.0

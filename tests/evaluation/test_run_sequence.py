@@ -15,7 +15,7 @@ from ms_slam_env.evaluation.run_to_folder import measure
 from ms_slam_env.geometry import look_at
 from ms_slam_env.metrics import CostMeter
 from ms_slam_env.sequences import Sequence, render_sequence
-from ms_slam_env.slam.base import SlamBackend, TrackResult
+from ms_slam_env.slam.slam_backend import SlamBackend, TrackResult
 
 
 @pytest.fixture(scope="module")

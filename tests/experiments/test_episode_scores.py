@@ -11,7 +11,7 @@ import pytest
 from ms_slam_env.benchmark.episode_scores import anchored_points, measure_losses
 from ms_slam_env.benchmark.episodes import EpisodeSpec, run_episode
 from ms_slam_env.errors import InputError
-from ms_slam_env.slam.submaps import Submaps
+from ms_slam_env.slam.shared.submap_frames import Submaps
 
 
 def world_of(states: str) -> Any:

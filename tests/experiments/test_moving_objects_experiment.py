@@ -15,7 +15,7 @@ from ms_slam_env.evaluation.moving_objects import found_masks, mask_measures, tr
 from ms_slam_env.metrics.registry import metric
 from ms_slam_env.report.records import Row
 from ms_slam_env.sequences import HandheldPath, open_sequence
-from ms_slam_env.slam.base import TrackResult
+from ms_slam_env.slam.slam_backend import TrackResult
 
 SEQUENCE = "living_room:110:kinect+moving-objects,kind=box,count=3"
 

@@ -25,8 +25,8 @@ from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, make_pose, so3_exp
 from ms_slam_env.sequences import HandheldPath
-from ms_slam_env.slam.map_hypotheses import RobotRun
-from ms_slam_env.slam.map_merging import Fit, Merge, MergeConfig
+from ms_slam_env.slam.team.map_merging import Fit, Merge, MergeConfig
+from ms_slam_env.slam.team.relative_map_poses import RobotRun
 
 
 @pytest.fixture(scope="module")

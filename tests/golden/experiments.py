@@ -334,7 +334,7 @@ def multi_robot(_: Path) -> Any:
     from ms_slam_experiments.multi_robot import MultiRobot
     from ms_slam_experiments.shared.teams import MultiRobotSpec
 
-    from ms_slam_env.slam.map_merging import MergeConfig
+    from ms_slam_env.slam.team.map_merging import MergeConfig
 
     merge = MergeConfig(queries=6, lost_queries=1, patience=2)
     spec = MultiRobotSpec(

@@ -7,7 +7,7 @@ from ms_slam_env.camera import xtion
 from ms_slam_env.geometry import invert, se3_exp, transform_points
 from ms_slam_env.planning import view_information
 from ms_slam_env.planning.trackability import remaining
-from ms_slam_env.slam.base import Views
+from ms_slam_env.slam.slam_backend import Views
 
 K = xtion("80x60").scaled(0.5)
 

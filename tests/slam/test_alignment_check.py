@@ -13,7 +13,7 @@ from surfel_scenes import ray_cast
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, make_pose, relative_angle, so3_exp
-from ms_slam_env.slam.alignment_check import (
+from ms_slam_env.slam.shared.alignment_check import (
     VIEW_THRESHOLDS,
     AcceptanceThresholds,
     AlignmentStatistics,
@@ -24,8 +24,8 @@ from ms_slam_env.slam.alignment_check import (
     evaluate_on_device,
     status_on_appeal,
 )
-from ms_slam_env.slam.alignment_measures import DepthImage, measure_alignment, overlay
-from ms_slam_env.slam.pose_hypotheses import MOTIONS, motion_hypotheses
+from ms_slam_env.slam.shared.alignment_measures import DepthImage, measure_alignment, overlay
+from ms_slam_env.slam.shared.search_poses import MOTIONS, motion_hypotheses
 
 CAMERA = Intrinsics(fx=80.0, fy=84.0, cx=39.3, cy=29.8, width=80, height=60)
 REST = np.eye(4)

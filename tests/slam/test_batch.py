@@ -12,7 +12,7 @@ from box_scene import BoxScene
 from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.geometry import look_at, make_pose, so3_exp
 from ms_slam_env.sensor import RGBDSensor
-from ms_slam_env.slam.base import TrackResult
+from ms_slam_env.slam.slam_backend import TrackResult
 from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
 
 CAMERA = xtion("80x60")

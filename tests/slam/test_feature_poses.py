@@ -10,7 +10,7 @@ from ms_slam_env import slam
 from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.geometry import invert, look_at, make_pose, relative_angle, so3_exp
 from ms_slam_env.sensor import RGBDSensor
-from ms_slam_env.slam.feature_poses import LastFrames
+from ms_slam_env.slam.shared.feature_poses import LastFrames
 
 CAMERA = xtion("160x120")
 TURN = make_pose(so3_exp(np.radians([4.0, 12.0, 3.0])), np.array([0.12, 0.03, 0.06]))

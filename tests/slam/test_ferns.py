@@ -14,7 +14,7 @@ from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at, make_pose, so3_exp
 from ms_slam_env.sensor import RGBDSensor
-from ms_slam_env.slam.ferns import (
+from ms_slam_env.slam.shared.ferns import (
     MEAN_LEVEL,
     FernCode,
     FernConfig,

@@ -19,7 +19,6 @@ from ms_slam_env.divergence import DivergenceConfig, depth_divergence, intensity
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, look_at, make_pose, se3_exp, se3_log, so3_exp
 from ms_slam_env.sensor import RGBDSensor
-from ms_slam_env.slam.base import Loop, SlamBackend, TrackResult, Views
 from ms_slam_env.slam.frame_selection import (
     BudgetConfig,
     DivergenceFilterConfig,
@@ -30,6 +29,7 @@ from ms_slam_env.slam.frame_selection import (
 )
 from ms_slam_env.slam.frame_selection.budget import BudgetFilter
 from ms_slam_env.slam.frame_selection.filters import Change, ChangeConfig, RegularSkipping
+from ms_slam_env.slam.slam_backend import Loop, SlamBackend, TrackResult, Views
 
 CAMERA = xtion("80x60")
 START = look_at([-0.8, -0.8, 1.2], [1.2, 0.1, 0.5])

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from surfel_scenes import SMALL, device_poses, fuse, live_frame
 
 from ms_slam_env.geometry import invert, make_pose, so3_exp, transform_points
-from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.surfels import BLOCK_SIZE
 

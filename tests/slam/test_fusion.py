@@ -7,7 +7,7 @@ import pytest
 from surfel_scenes import SMALL, WALL_NORMAL, WALL_POINT, build_map, fuse, live_frame, ray_cast
 
 from ms_slam_env.geometry import invert, make_pose, so3_exp, transform_points
-from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 
 NEARBY = np.stack(

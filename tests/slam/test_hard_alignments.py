@@ -23,14 +23,14 @@ from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sensor.scene_cache import get_scene
 from ms_slam_env.sequences import HandheldPath, Sequence, open_sequence
 from ms_slam_env.slam import SlamBackend
-from ms_slam_env.slam.alignment_check import TrackingStatus
+from ms_slam_env.slam.shared.alignment_check import TrackingStatus
 from ms_slam_env.slam.surfel import localization
 from ms_slam_env.slam.surfel.acceptance import Alignment, acceptance_thresholds
-from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.photometry import is_leap, same_exposure
 from ms_slam_env.slam.surfel.pose_hypotheses import NUM_HYPOTHESES, tracking_hypotheses
 from ms_slam_env.slam.surfel.preprocessing import Preprocessor
 from ms_slam_env.slam.surfel.rendering import ModelView
+from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 from ms_slam_env.slam.surfel.tracker import Tracker
 
 CONFIG = SurfelConfig(depth_cutoff_m=5.0)

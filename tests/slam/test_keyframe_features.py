@@ -10,8 +10,8 @@ from ms_slam_env import slam
 from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.geometry import look_at, make_pose, so3_exp
 from ms_slam_env.sensor import RGBDSensor
-from ms_slam_env.slam import feature_poses
-from ms_slam_env.slam.feature_poses import KeyframeImages
+from ms_slam_env.slam.shared import feature_poses
+from ms_slam_env.slam.shared.feature_poses import KeyframeImages
 from ms_slam_env.slam.surfel.keyframe_search import FernRelocalization
 
 CAMERA = xtion("160x120")

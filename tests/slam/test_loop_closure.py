@@ -12,9 +12,8 @@ from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, look_at, make_pose, relative_angle, se3_exp
 from ms_slam_env.sequences import render_sequence
-from ms_slam_env.slam.ferns import Candidate
+from ms_slam_env.slam.shared.ferns import Candidate
 from ms_slam_env.slam.surfel import SurfelConfig
-from ms_slam_env.slam.surfel.config import LoopConfig
 from ms_slam_env.slam.surfel.deformation_graph import (
     Deformation,
     identity,
@@ -24,6 +23,7 @@ from ms_slam_env.slam.surfel.deformation_graph import (
 )
 from ms_slam_env.slam.surfel.map_deformation import creation_times
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
+from ms_slam_env.slam.surfel.surfel_config import LoopConfig
 
 CAMERA = xtion("160x120")
 TURN = 60  # frames for a whole turn

@@ -12,7 +12,16 @@ from two_robots import TRUTHS, K, path_past, run_robot
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, make_pose, se3_exp, so3_exp, transform_points
 from ms_slam_env.sequences import render_sequence
-from ms_slam_env.slam.map_hypotheses import (
+from ms_slam_env.slam.team.map_merging import (
+    MergeConfig,
+    consensus,
+    decide,
+    mean_pose,
+    measure_fit,
+    merge_maps,
+    pose_difference,
+)
+from ms_slam_env.slam.team.relative_map_poses import (
     FEATURES,
     RELOCALISATION,
     Hypothesis,
@@ -22,15 +31,6 @@ from ms_slam_env.slam.map_hypotheses import (
     landmarks,
     match_landmarks,
     query_frames,
-)
-from ms_slam_env.slam.map_merging import (
-    MergeConfig,
-    consensus,
-    decide,
-    mean_pose,
-    measure_fit,
-    merge_maps,
-    pose_difference,
 )
 
 CONFIG = MergeConfig(queries=5, lost_queries=2, patience=3)

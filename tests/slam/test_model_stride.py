@@ -9,8 +9,8 @@ from surfel_scenes import SMALL, build_map, device_poses
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import xtion
 from ms_slam_env.geometry import make_pose, so3_exp
-from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer
+from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.tracker import model_stride
 

@@ -14,7 +14,6 @@ from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
 from ms_slam_env.geometry import look_at, make_pose, so3_exp
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.surfel.alignment_arrays import NUM_SUMS, RUNNING, Hypotheses, Photometry, Sum
-from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.photometry import (
     ExposureCorrection,
     correction,
@@ -24,6 +23,7 @@ from ms_slam_env.slam.surfel.photometry import (
 )
 from ms_slam_env.slam.surfel.preprocessing import Preprocessor
 from ms_slam_env.slam.surfel.solver import gauss_newton_step
+from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 
 CAMERA = xtion("160x120")
 START = look_at([-0.8, -0.8, 1.2], [1.2, 0.1, 0.5])

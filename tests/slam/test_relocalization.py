@@ -13,8 +13,8 @@ from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at, make_pose, relative_angle, so3_exp
 from ms_slam_env.sensor import RGBDSensor
-from ms_slam_env.slam.alignment_check import is_photometrically_consistent
-from ms_slam_env.slam.alignment_measures import measure_photometric_consistency
+from ms_slam_env.slam.shared.alignment_check import is_photometrically_consistent
+from ms_slam_env.slam.shared.alignment_measures import measure_photometric_consistency
 from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
 from ms_slam_env.slam.surfel.keyframe_search import FernRelocalization
 from ms_slam_env.slam.surfel.relocalization import Images

@@ -17,7 +17,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at, make_pose, so3_exp
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.frame_selection import make_config
-from ms_slam_env.slam.state_file import read_state, write_state
+from ms_slam_env.slam.shared.state_file import read_state, write_state
 
 CAMERA = xtion("160x120")
 START = look_at([-0.8, -0.8, 1.2], [1.2, 0.1, 0.5])

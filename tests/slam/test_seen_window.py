@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from surfel_scenes import SMALL, device_poses, fuse, live_frame
 
-from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.surfels import any_time
 

@@ -11,8 +11,8 @@ from ms_slam_env.camera import intensity_image, xtion
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, look_at, make_pose, se3_exp, so3_exp
 from ms_slam_env.sensor import RGBDSensor
-from ms_slam_env.slam.alignment_measures import DepthImage
-from ms_slam_env.slam.semi_dense import SemiDenseAligner, normal_equations
+from ms_slam_env.slam.odometry.semi_dense import SemiDenseAligner, normal_equations
+from ms_slam_env.slam.shared.alignment_measures import DepthImage
 
 CAMERA = xtion("160x120")
 POSE = look_at([-0.8, -0.8, 1.2], [1.2, 0.1, 0.5])

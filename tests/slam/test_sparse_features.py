@@ -13,16 +13,16 @@ from surfel_scenes import WALL_NORMAL, WALL_POINT
 
 from ms_slam_env.camera import intensity_image, xtion
 from ms_slam_env.geometry import invert, make_pose, se3_exp, so3_exp
-from ms_slam_env.slam.alignment_measures import DepthImage
-from ms_slam_env.slam.feature_matching import (
+from ms_slam_env.slam.shared.alignment_measures import DepthImage
+from ms_slam_env.slam.shared.feature_matching import (
     hamming_distance,
     match_anywhere,
     match_near,
     most_alike,
     thumbnail,
 )
-from ms_slam_env.slam.features import FeatureExtractor, Features, InverseDepth
-from ms_slam_env.slam.sparse.features import Patches, cut, find_patches, warp
+from ms_slam_env.slam.shared.orb_features import FeatureExtractor, Features, InverseDepth
+from ms_slam_env.slam.sparse.patches import Patches, cut, find_patches, warp
 from ms_slam_env.slam.sparse.sparse_map import Keyframe, SparseMap
 
 CAMERA = xtion("160x120")

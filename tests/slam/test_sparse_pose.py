@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 
 from ms_slam_env.camera import xtion
 from ms_slam_env.geometry import invert, make_pose, relative_angle, se3_exp, so3_exp
-from ms_slam_env.slam.point_poses import (
+from ms_slam_env.slam.shared.point_poses import (
     Sightings,
     pose_from_matches,
     refine_pose,
@@ -21,7 +21,7 @@ from ms_slam_env.slam.point_poses import (
     weighted_residuals,
 )
 from ms_slam_env.slam.sparse.local_mapping import Bundle, adjust_bundle
-from ms_slam_env.slam.sparse.loop_closure import Edge, optimise_poses
+from ms_slam_env.slam.sparse.pose_graph import Edge, optimise_poses
 
 CAMERA = xtion("320x240")
 SIGMA_PX, SIGMA_PER_M = 0.5, 0.003

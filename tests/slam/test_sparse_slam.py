@@ -14,8 +14,8 @@ from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, look_at, make_pose, relative_angle, se3_exp, so3_exp
 from ms_slam_env.sensor import RGBDSensor
+from ms_slam_env.slam.shared.state_check import check_like
 from ms_slam_env.slam.sparse import SparseConfig, SparseSlam
-from ms_slam_env.slam.state_check import check_like
 
 CAMERA = xtion("160x120")
 OPEN = 34  # frames of the turn before it meets its beginning

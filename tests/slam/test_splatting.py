@@ -6,7 +6,7 @@ import numpy as np
 from surfel_scenes import SMALL, WALL_NORMAL, build_map, device_poses, ray_cast
 
 from ms_slam_env.geometry import invert, make_pose, so3_exp, transform_points
-from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 
 CLOSE = np.stack([make_pose(so3_exp([0, 0.01 * k, 0]), [0.01 * k, 0, 0]) for k in range(5)])

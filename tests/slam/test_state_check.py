@@ -6,7 +6,7 @@ import pytest
 from ms_slam_env import slam
 from ms_slam_env.camera import xtion
 from ms_slam_env.errors import InputError
-from ms_slam_env.slam.state_check import (
+from ms_slam_env.slam.shared.state_check import (
     ArrayOf,
     Depending,
     Fields,

@@ -20,7 +20,7 @@ from ms_slam_env.geometry import (
     transform_points,
 )
 from ms_slam_env.sensor import RGBDSensor
-from ms_slam_env.slam.submaps import SubmapLedger
+from ms_slam_env.slam.shared.submap_frames import SubmapLedger
 from ms_slam_env.slam.surfel.detached_map import DetachedMap
 
 CAMERA = xtion("160x120")

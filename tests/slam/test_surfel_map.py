@@ -6,8 +6,8 @@ import numpy as np
 from surfel_scenes import SMALL, build_map, device_poses, fuse, live_frame
 
 from ms_slam_env.geometry import make_pose, so3_exp
-from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
+from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 
 CONFIG = SurfelConfig(max_surfels=6000, compaction_interval=3, unstable_window=4)

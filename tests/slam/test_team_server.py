@@ -11,7 +11,7 @@ from two_robots import TRUTHS, K, run_robot
 from ms_slam_env import slam
 from ms_slam_env.geometry import make_pose, se3_exp, so3_exp
 from ms_slam_env.metrics import inter_robot_rpe
-from ms_slam_env.slam.team_server import (
+from ms_slam_env.slam.team.team_server import (
     ServerConfig,
     TeamEstimate,
     _carried_along,

@@ -13,7 +13,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import make_pose, so3_exp
 from ms_slam_env.robot.action_primitives import decompose
 from ms_slam_env.slam.surfel import view_prediction
-from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.surfels import SplatCamera
 from ms_slam_env.slam.surfel.view_prediction import mean_pose, wide_intrinsics

@@ -25,7 +25,7 @@ def processes():
     context.set_forkserver_preload(
         [
             "ms_slam_env.tuning",
-            "ms_slam_env.slam.odometry",
+            "ms_slam_env.slam.odometry.odometry",
             "optuna.storages",
             "alembic.command",
             "sqlalchemy.dialects.sqlite",

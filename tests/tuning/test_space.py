@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.configuration import SlamConfiguration
 from ms_slam_env.slam.surfel import SurfelConfig
-from ms_slam_env.slam.surfel.config import PAPER
+from ms_slam_env.slam.surfel.surfel_config import PAPER
 from ms_slam_env.tuning import Choice, Float, Integer, make_space
 from ms_slam_env.tuning.space import GROUPS, KNOWN, absences, why_absent
 

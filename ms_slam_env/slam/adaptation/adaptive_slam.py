@@ -11,11 +11,11 @@ from typing import Any, ClassVar
 from ms_slam_env.camera import XTION_SIZES, Intrinsics, RGBDFrame, rendered_size
 from ms_slam_env.config import from_dict
 from ms_slam_env.errors import InputError
-from ms_slam_env.slam.base import SlamBackend
 from ms_slam_env.slam.configuration import SlamConfiguration, merged, read_configuration
 from ms_slam_env.slam.frame_selection import FrameFilter, SelectiveSlam
-from ms_slam_env.slam.state import Stateful
-from ms_slam_env.slam.state_check import Depending, WholeNumber
+from ms_slam_env.slam.shared.state import Stateful
+from ms_slam_env.slam.shared.state_check import Depending, WholeNumber
+from ms_slam_env.slam.slam_backend import SlamBackend
 from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
 
 _NEVER = 1_000_000_000  # frames in a row that are dropped at most

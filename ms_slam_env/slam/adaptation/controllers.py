@@ -24,12 +24,12 @@ from ms_slam_env.slam.adaptation.adaptive_slam import (
     default_configurations,
     make_levels,
 )
-from ms_slam_env.slam.base import SlamBackend
 from ms_slam_env.slam.configuration import SlamConfiguration, read_levels
 from ms_slam_env.slam.frame_selection import ChangeConfig
 from ms_slam_env.slam.frame_selection.filters import Change
-from ms_slam_env.slam.state import Saved
-from ms_slam_env.slam.state_check import ListOf, OrNone, Real, WholeNumber
+from ms_slam_env.slam.shared.state import Saved
+from ms_slam_env.slam.shared.state_check import ListOf, OrNone, Real, WholeNumber
+from ms_slam_env.slam.slam_backend import SlamBackend
 
 
 def rising(values: Any, name: str, count: int) -> tuple[float, ...]:

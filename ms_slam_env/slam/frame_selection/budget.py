@@ -11,8 +11,8 @@ from ms_slam_env.config import bounded, check_range
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.frame_selection.filters import Change, ChangeConfig, DroppingConfig
 from ms_slam_env.slam.frame_selection.selective_slam import FrameFilter
-from ms_slam_env.slam.state import Saved
-from ms_slam_env.slam.state_check import OrNone
+from ms_slam_env.slam.shared.state import Saved
+from ms_slam_env.slam.shared.state_check import OrNone
 
 
 class ThresholdController(Saved):

@@ -17,11 +17,11 @@ from ms_slam_env.camera import Intrinsics, RGBDFrame, check_frame, intensity_ima
 from ms_slam_env.config import Checked, Family, bounded, chosen
 from ms_slam_env.divergence import DivergenceConfig, Histograms, make_divergence
 from ms_slam_env.errors import InputError
-from ms_slam_env.slam.base import SlamBackend
 from ms_slam_env.slam.configuration import read_levels
 from ms_slam_env.slam.frame_selection.selective_slam import PREDICTIONS, FrameFilter, SelectiveSlam
-from ms_slam_env.slam.state import Saved, Stateful
-from ms_slam_env.slam.state_check import ArrayOf, Fields, OrNone
+from ms_slam_env.slam.shared.state import Saved, Stateful
+from ms_slam_env.slam.shared.state_check import ArrayOf, Fields, OrNone
+from ms_slam_env.slam.slam_backend import SlamBackend
 
 _ROUNDING = 1e-9  # 13 / 1.3 is less than 10
 

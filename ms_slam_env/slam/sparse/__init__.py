@@ -1,6 +1,6 @@
 """Sparse SLAM: ORB features, local bundle adjustment, a pose graph; depth of keyframes as map."""
 
-from ms_slam_env.slam.sparse.config import SparseConfig
+from ms_slam_env.slam.sparse.sparse_config import SparseConfig
 from ms_slam_env.slam.sparse.sparse_slam import SparseSlam
 
 __all__ = ["SparseConfig", "SparseSlam"]

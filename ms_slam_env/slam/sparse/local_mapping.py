@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, orthonormal
-from ms_slam_env.slam.base import Float64
-from ms_slam_env.slam.feature_matching import Int64
-from ms_slam_env.slam.point_poses import (
+from ms_slam_env.slam.shared.feature_matching import Int64
+from ms_slam_env.slam.shared.point_poses import (
     CHI2_PIXEL,
     CHI2_PIXEL_AND_DEPTH,
     Sightings,
     residuals,
 )
-from ms_slam_env.slam.sparse.config import SparseConfig
+from ms_slam_env.slam.slam_backend import Float64
+from ms_slam_env.slam.sparse.sparse_config import SparseConfig
 from ms_slam_env.slam.sparse.sparse_map import SparseMap
 
 _BASELINE_M = 0.1  # of the imagined second camera; the result does not depend on it

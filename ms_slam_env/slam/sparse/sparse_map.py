@@ -12,13 +12,13 @@ from scipy.sparse import csr_array
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, transform_points
-from ms_slam_env.slam.alignment_measures import DepthImage
-from ms_slam_env.slam.base import Float32, Float64
-from ms_slam_env.slam.feature_matching import Int64, thumbnail
-from ms_slam_env.slam.features import Features, InverseDepth
-from ms_slam_env.slam.sparse.features import Templates, cut
-from ms_slam_env.slam.state import Saved
-from ms_slam_env.slam.state_check import ArrayOf, Fields, ListOf, WholeNumber
+from ms_slam_env.slam.shared.alignment_measures import DepthImage
+from ms_slam_env.slam.shared.feature_matching import Int64, thumbnail
+from ms_slam_env.slam.shared.orb_features import Features, InverseDepth
+from ms_slam_env.slam.shared.state import Saved
+from ms_slam_env.slam.shared.state_check import ArrayOf, Fields, ListOf, WholeNumber
+from ms_slam_env.slam.slam_backend import Float32, Float64
+from ms_slam_env.slam.sparse.patches import Templates, cut
 
 _TRIED_FRAMES = 8  # frames after which a point that is hardly ever found again is dropped
 _FOUND_SHARE = 0.25  # as in ORB-SLAM

@@ -17,19 +17,19 @@ from scipy.spatial import cKDTree
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.geometry import relative_angle
-from ms_slam_env.slam.alignment_measures import DepthImage
-from ms_slam_env.slam.base import BorrowedMap, Float64, Loop, TrackResult
-from ms_slam_env.slam.feature_matching import most_alike, thumbnail
-from ms_slam_env.slam.features import FeatureExtractor, InverseDepth
-from ms_slam_env.slam.sparse.config import SparseConfig
+from ms_slam_env.slam.shared.alignment_measures import DepthImage
+from ms_slam_env.slam.shared.feature_matching import most_alike, thumbnail
+from ms_slam_env.slam.shared.orb_features import FeatureExtractor, InverseDepth
+from ms_slam_env.slam.shared.state import Saved
+from ms_slam_env.slam.shared.state_check import Fields, ListOf, WholeNumber
+from ms_slam_env.slam.shared.tracking_template import Attempt, FrameByFrameSlam
+from ms_slam_env.slam.slam_backend import BorrowedMap, Float64, Loop, TrackResult
 from ms_slam_env.slam.sparse.local_mapping import adjust_around, load_gtsam
 from ms_slam_env.slam.sparse.localization import Fix, LiveFrame, Localizer, keyframe_features
-from ms_slam_env.slam.sparse.loop_closure import LoopCloser
+from ms_slam_env.slam.sparse.pose_graph import LoopCloser
+from ms_slam_env.slam.sparse.sparse_config import SparseConfig
 from ms_slam_env.slam.sparse.sparse_map import Keyframe, SparseMap
-from ms_slam_env.slam.state import Saved
-from ms_slam_env.slam.state_check import Fields, ListOf, WholeNumber
 from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
-from ms_slam_env.slam.tracking_template import Attempt, FrameByFrameSlam
 
 
 class DenseMap(Saved):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.geometry import invert
-from ms_slam_env.slam.alignment_check import (
+from ms_slam_env.slam.shared.alignment_check import (
     AcceptanceThresholds,
     AlignmentStatistics,
     DeviceStatistics,
@@ -20,9 +20,8 @@ from ms_slam_env.slam.alignment_check import (
     evaluate_alignment,
     evaluate_on_device,
 )
-from ms_slam_env.slam.base import Float64
+from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.surfel.alignment_arrays import Hypotheses, Sum
-from ms_slam_env.slam.surfel.config import AcceptanceConfig
 from ms_slam_env.slam.surfel.degeneracy import (
     eigen,
     is_constrained,
@@ -40,6 +39,7 @@ from ms_slam_env.slam.surfel.solver import (
     se3_exp,
     se3_log,
 )
+from ms_slam_env.slam.surfel.surfel_config import AcceptanceConfig
 
 
 @wp.func

@@ -11,14 +11,14 @@ from ms_slam_env.camera import Intrinsics, RGBDFrame, check_frame
 from ms_slam_env.camera.frame import reduce_color, reduce_depth
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose
-from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult, Views, check_views
-from ms_slam_env.slam.state import check_has
-from ms_slam_env.slam.submaps import Submaps
+from ms_slam_env.slam.shared.state import check_has
+from ms_slam_env.slam.shared.submap_frames import Submaps
+from ms_slam_env.slam.slam_backend import Float64, SlamBackend, TrackResult, Views, check_views
 from ms_slam_env.slam.surfel.color_cameras import make_color_camera
-from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.relocalization import Images
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
 from ms_slam_env.slam.surfel.submaps import make_submaps
+from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ms_slam_env.slam.base import Float64
-from ms_slam_env.slam.state import Saved
+from ms_slam_env.slam.shared.state import Saved
+from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.surfel.acceptance import Alignment
 from ms_slam_env.slam.surfel.photometry import next_photometry, same_exposure
 from ms_slam_env.slam.surfel.pose_hypotheses import damped

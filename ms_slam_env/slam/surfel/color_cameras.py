@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.camera.registration import Registration
-from ms_slam_env.slam.base import Float32, Float64, TrackResult
-from ms_slam_env.slam.color_registration import depth_edges, estimate_registration
-from ms_slam_env.slam.state import Saved
-from ms_slam_env.slam.state_check import ArrayOf, ListOf
+from ms_slam_env.slam.shared.state import Saved
+from ms_slam_env.slam.shared.state_check import ArrayOf, ListOf
+from ms_slam_env.slam.slam_backend import Float32, Float64, TrackResult
+from ms_slam_env.slam.surfel.color_registration import depth_edges, estimate_registration
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
 
 UInt8 = NDArray[np.uint8]

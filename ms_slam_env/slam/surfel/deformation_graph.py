@@ -32,8 +32,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from ms_slam_env.slam.base import Float64
-from ms_slam_env.slam.rows import Rows
+from ms_slam_env.slam.shared.rows import Rows
+from ms_slam_env.slam.slam_backend import Float64
 
 Int64 = NDArray[np.int64]
 NEIGHBOURS = 4  # k: of a node, and nodes that influence a point

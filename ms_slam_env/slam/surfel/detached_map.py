@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ms_slam_env.geometry import transform_points
-from ms_slam_env.slam.base import Float64
-from ms_slam_env.slam.state import Saved
+from ms_slam_env.slam.shared.state import Saved
+from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.surfel.trajectory_history import TrajectoryHistory
 
 _LEAST_COSINE = 0.7  # of the normals of two surfels of one surface

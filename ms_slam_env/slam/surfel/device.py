@@ -19,7 +19,7 @@ from typing import Any
 from ms_slam_env._runtime import warp as _warp
 from ms_slam_env._runtime.warp import RecordedLaunch, wp
 from ms_slam_env.native import native_source
-from ms_slam_env.slam.state import Stateful
+from ms_slam_env.slam.shared.state import Stateful
 
 Dim = int | Sequence[int]
 

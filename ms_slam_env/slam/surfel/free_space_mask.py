@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert
-from ms_slam_env.slam.base import Float64
-from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer, KernelLaunchCache
 from ms_slam_env.slam.surfel.image_pieces import Pieces
 from ms_slam_env.slam.surfel.motion_evidence import (
@@ -44,6 +43,7 @@ from ms_slam_env.slam.surfel.motion_evidence import (
 from ms_slam_env.slam.surfel.motion_mask import Bool, Float32, MotionMask
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
 from ms_slam_env.slam.surfel.rendering import ModelView
+from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 
 INTERVAL = 4  # frames between two that are remembered
 NEW = 3  # of the earlier frames; slow things have hardly moved since

@@ -19,11 +19,11 @@ from ms_slam_env.slam.surfel.alignment_arrays import (
     Photometry,
     Weights,
 )
-from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer, KernelLaunchCache, threads_per_row
 from ms_slam_env.slam.surfel.normal_equations import accumulate_normal_equations
 from ms_slam_env.slam.surfel.pyramid import Level
 from ms_slam_env.slam.surfel.solver import gauss_newton_step, iterate_at_once, reduce_sums
+from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 
 SMALLEST_STEP = (2.0e-4, 4.0e-4, 1.0e-3)  # metres and radians, per level, finest first
 DAMPING = 1.0e-6

@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.slam.alignment_check import is_photometrically_consistent
-from ms_slam_env.slam.base import Float64
-from ms_slam_env.slam.feature_poses import KeyframeImages, pose_from_features
-from ms_slam_env.slam.ferns import Candidate, FernConfig, FernDatabase, dissimilarities
+from ms_slam_env.slam.shared.alignment_check import is_photometrically_consistent
+from ms_slam_env.slam.shared.feature_poses import KeyframeImages, pose_from_features
+from ms_slam_env.slam.shared.ferns import Candidate, FernConfig, FernDatabase, dissimilarities
+from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.surfel.acceptance import Alignment, acceptance_thresholds
-from ms_slam_env.slam.surfel.config import AcceptanceConfig, SurfelConfig
 from ms_slam_env.slam.surfel.pose_hypotheses import (
     KEYFRAME_HYPOTHESES,
     NUM_HYPOTHESES,
@@ -29,6 +28,7 @@ from ms_slam_env.slam.surfel.relocalization import (
     Relocalization,
     measure_consistency,
 )
+from ms_slam_env.slam.surfel.surfel_config import AcceptanceConfig, SurfelConfig
 
 TRIALS = 3  # keyframes tried a frame
 ROUNDS = 3  # frames until the same ones are tried again

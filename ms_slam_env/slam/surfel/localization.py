@@ -7,14 +7,14 @@ from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, se3_log
-from ms_slam_env.slam.alignment_check import (
+from ms_slam_env.slam.shared.alignment_check import (
     DISPUTED,
     AlignmentStatistics,
     TrackingStatus,
     status_on_appeal,
 )
-from ms_slam_env.slam.base import Float64
-from ms_slam_env.slam.feature_poses import FeaturePose, LastFrames
+from ms_slam_env.slam.shared.feature_poses import FeaturePose, LastFrames
+from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.surfel.acceptance import Alignment, accept_any_fit, is_nearly_accepted
 from ms_slam_env.slam.surfel.camera_states import CameraStates
 from ms_slam_env.slam.surfel.map_alignment import MapAligner

@@ -26,12 +26,11 @@ from numpy.typing import NDArray
 
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.geometry import invert
-from ms_slam_env.slam.alignment_check import TrackingStatus
-from ms_slam_env.slam.base import Loop
-from ms_slam_env.slam.ferns import Candidate
-from ms_slam_env.slam.state import Saved
+from ms_slam_env.slam.shared.alignment_check import TrackingStatus
+from ms_slam_env.slam.shared.ferns import Candidate
+from ms_slam_env.slam.shared.state import Saved
+from ms_slam_env.slam.slam_backend import Loop
 from ms_slam_env.slam.surfel.acceptance import Alignment, acceptance_thresholds
-from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer
 from ms_slam_env.slam.surfel.map_deformation import MapDeformer
 from ms_slam_env.slam.surfel.pose_hypotheses import (
@@ -42,6 +41,7 @@ from ms_slam_env.slam.surfel.pose_hypotheses import (
 )
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
 from ms_slam_env.slam.surfel.rendering import SplatRenderer
+from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.surfels import EARLIEST, any_time
 from ms_slam_env.slam.surfel.tracker import Tracker, model_stride

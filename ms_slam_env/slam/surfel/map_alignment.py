@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env._runtime.warp import wp
-from ms_slam_env.slam.alignment_check import TrackingStatus
-from ms_slam_env.slam.base import Float64
+from ms_slam_env.slam.shared.alignment_check import TrackingStatus
+from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.surfel.acceptance import (
     Alignment,
     acceptance_thresholds,

@@ -12,9 +12,8 @@ from scipy.spatial import cKDTree
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, transform_points
-from ms_slam_env.slam.base import Float64
-from ms_slam_env.slam.rows import Rows, join
-from ms_slam_env.slam.surfel.config import SurfelConfig
+from ms_slam_env.slam.shared.rows import Rows, join
+from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.surfel.deformation_graph import (
     FEWEST_NODES,
     Constraints,
@@ -25,6 +24,7 @@ from ms_slam_env.slam.surfel.deformation_graph import (
 )
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer
 from ms_slam_env.slam.surfel.rendering import SplatRenderer
+from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.surfels import (
     SplatCamera,

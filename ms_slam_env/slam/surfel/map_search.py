@@ -11,17 +11,17 @@ from numpy.typing import NDArray
 
 from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.geometry import invert
-from ms_slam_env.slam.alignment_check import AlignmentStatistics
-from ms_slam_env.slam.base import Float64, Views
-from ms_slam_env.slam.map_fit import FitConfig, measure_fit, why_not_believed
-from ms_slam_env.slam.state import Saved
-from ms_slam_env.slam.state_check import Fields, ListOf, OrNone, WholeNumber
+from ms_slam_env.slam.shared.alignment_check import AlignmentStatistics
+from ms_slam_env.slam.shared.map_fit import FitConfig, measure_fit, why_not_believed
+from ms_slam_env.slam.shared.state import Saved
+from ms_slam_env.slam.shared.state_check import Fields, ListOf, OrNone, WholeNumber
+from ms_slam_env.slam.slam_backend import Float64, Views
 from ms_slam_env.slam.surfel.acceptance import Alignment
-from ms_slam_env.slam.surfel.config import SubmapConfig
 from ms_slam_env.slam.surfel.detached_map import DetachedMap
 from ms_slam_env.slam.surfel.pose_hypotheses import is_within, tracking_hypotheses
 from ms_slam_env.slam.surfel.relocalization import Images, measure_consistency
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
+from ms_slam_env.slam.surfel.surfel_config import SubmapConfig
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.view_prediction import mean_pose
 

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.slam.base import Float64
-from ms_slam_env.slam.state import Saved
+from ms_slam_env.slam.shared.state import Saved
+from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
 from ms_slam_env.slam.surfel.rendering import ModelView
 

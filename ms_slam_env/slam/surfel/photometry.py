@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.slam.state import Saved
+from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.surfel.alignment_arrays import Photometry
 from ms_slam_env.slam.surfel.device import (
     HostDeviceBuffer,

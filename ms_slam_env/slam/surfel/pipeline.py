@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
-from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.photometry import ExposureCorrection
 from ms_slam_env.slam.surfel.pose_hypotheses import NUM_HYPOTHESES
 from ms_slam_env.slam.surfel.preprocessing import Preprocessor
+from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_map import MapKernels, SurfelMap
 from ms_slam_env.slam.surfel.tracker import Tracker, model_stride
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose, make_pose, relative_angle, se3_exp, se3_log, so3_exp
-from ms_slam_env.slam.base import Float64
+from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.surfel.alignment_arrays import OFF, RUNNING, Hypotheses, Sum
 
 NUM_HYPOTHESES = 8

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from ms_slam_env._runtime.warp import RecordedLaunch, wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
-from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer, fetch, put, threads_per_row
+from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 
 FLATTEST = wp.constant(5.67)  # tangent of 80 degrees, of the view onto a plane close by
 

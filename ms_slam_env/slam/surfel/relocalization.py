@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.slam.alignment_check import AlignmentStatistics
-from ms_slam_env.slam.alignment_measures import measure_photometric_consistency
-from ms_slam_env.slam.base import Float64
-from ms_slam_env.slam.ferns import Candidate
-from ms_slam_env.slam.state import Saved
+from ms_slam_env.slam.shared.alignment_check import AlignmentStatistics
+from ms_slam_env.slam.shared.alignment_measures import measure_photometric_consistency
+from ms_slam_env.slam.shared.ferns import Candidate
+from ms_slam_env.slam.shared.state import Saved
+from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.surfel.acceptance import Alignment
 from ms_slam_env.slam.surfel.rendering import ModelView
 

@@ -25,8 +25,8 @@ from ms_slam_env._runtime.warp import RecordedLaunch, wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import se3_log
 from ms_slam_env.native import native_source
-from ms_slam_env.slam.base import Float64
-from ms_slam_env.slam.state import Saved
+from ms_slam_env.slam.shared.state import Saved
+from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer
 from ms_slam_env.slam.surfel.preprocessing import check_images
 from ms_slam_env.slam.surfel.relocalization import Images

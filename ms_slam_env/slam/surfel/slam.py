@@ -19,13 +19,12 @@ from numpy.typing import ArrayLike, NDArray
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import check_pose, invert
-from ms_slam_env.slam.alignment_check import MAP_REASONS, TrackingStatus
-from ms_slam_env.slam.base import Float64, TrackResult
-from ms_slam_env.slam.ferns import Candidate
-from ms_slam_env.slam.state import Saved, check_has
+from ms_slam_env.slam.shared.alignment_check import MAP_REASONS, TrackingStatus
+from ms_slam_env.slam.shared.ferns import Candidate
+from ms_slam_env.slam.shared.state import Saved, check_has
+from ms_slam_env.slam.slam_backend import Float64, TrackResult
 from ms_slam_env.slam.surfel.acceptance import Alignment, with_doubt
 from ms_slam_env.slam.surfel.camera_states import CameraStates
-from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.detached_map import DetachedMap
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer
 from ms_slam_env.slam.surfel.free_space_mask import make_motion_mask
@@ -39,6 +38,7 @@ from ms_slam_env.slam.surfel.pose_hypotheses import check_guesses, check_poses, 
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
 from ms_slam_env.slam.surfel.relocalization import Images
 from ms_slam_env.slam.surfel.rolling_shutter import make_shutter
+from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.tracker import model_stride
 

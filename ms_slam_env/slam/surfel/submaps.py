@@ -18,15 +18,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.geometry import invert, se3_exp, se3_log
-from ms_slam_env.slam.base import Float64, TrackResult
-from ms_slam_env.slam.state import Saved
-from ms_slam_env.slam.state_check import ListOf, WholeNumber
-from ms_slam_env.slam.submaps import SubmapLedger, Submaps, one_submap
-from ms_slam_env.slam.surfel.config import SubmapConfig
+from ms_slam_env.slam.shared.state import Saved
+from ms_slam_env.slam.shared.state_check import ListOf, WholeNumber
+from ms_slam_env.slam.shared.submap_frames import SubmapLedger, Submaps, one_submap
+from ms_slam_env.slam.slam_backend import Float64, TrackResult
 from ms_slam_env.slam.surfel.detached_map import DetachedMap
 from ms_slam_env.slam.surfel.map_search import JointSearch, MapFinder
 from ms_slam_env.slam.surfel.relocalization import Images
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
+from ms_slam_env.slam.surfel.surfel_config import SubmapConfig
 from ms_slam_env.slam.surfel.trajectory_history import TrajectoryHistory
 
 CARRIED_ON = 0.95

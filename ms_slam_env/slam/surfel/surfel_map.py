@@ -12,12 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from ms_slam_env._runtime.warp import RecordedLaunch, wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
-from ms_slam_env.slam.base import Float64, Views
-from ms_slam_env.slam.state import Stateful
-from ms_slam_env.slam.state_check import ArrayOf, Fields
+from ms_slam_env.slam.shared.state import Stateful
+from ms_slam_env.slam.shared.state_check import ArrayOf, Fields
+from ms_slam_env.slam.slam_backend import Float64, Views
 from ms_slam_env.slam.surfel import fusion, surfel_culling, surfel_update
 from ms_slam_env.slam.surfel.block_bounds import bound_blocks, set_bounded
-from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.frustum_culling import FrustumCuller
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
 from ms_slam_env.slam.surfel.rendering import (
@@ -26,6 +25,7 @@ from ms_slam_env.slam.surfel.rendering import (
     SplatRenderer,
     splat_camera,
 )
+from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 from ms_slam_env.slam.surfel.surfels import ATTRIBUTES, COUNTERS, MapBuffers, SeenWindow
 from ms_slam_env.slam.surfel.view_prediction import DeviceViews, ViewPredictor
 

@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert
-from ms_slam_env.slam.alignment_check import DeviceStatistics, DeviceThresholds
-from ms_slam_env.slam.base import Float64
+from ms_slam_env.slam.shared.alignment_check import DeviceStatistics, DeviceThresholds
+from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.surfel.acceptance import Alignment, assess_alignment
 from ms_slam_env.slam.surfel.alignment_arrays import OFF, RUNNING
-from ms_slam_env.slam.surfel.config import SurfelConfig
 from ms_slam_env.slam.surfel.degeneracy import mat66d
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer, KernelLaunchCache
 from ms_slam_env.slam.surfel.gauss_newton import GaussNewton, HypothesisBuffers
@@ -29,6 +28,7 @@ from ms_slam_env.slam.surfel.pose_hypotheses import NUM_FIRST, expand_hypotheses
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
 from ms_slam_env.slam.surfel.pyramid import Level, Pyramid
 from ms_slam_env.slam.surfel.rendering import ModelView
+from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 
 SEARCH_POINTS = 400
 SEARCH_ITERATIONS = 5

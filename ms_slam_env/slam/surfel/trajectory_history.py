@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.geometry import invert, relative_angle, transform_points
-from ms_slam_env.slam.base import Float64, Loop
-from ms_slam_env.slam.rows import join
-from ms_slam_env.slam.state import Saved
-from ms_slam_env.slam.state_check import ArrayOf, ListOf, OrNone, WholeNumber
+from ms_slam_env.slam.shared.rows import join
+from ms_slam_env.slam.shared.state import Saved
+from ms_slam_env.slam.shared.state_check import ArrayOf, ListOf, OrNone, WholeNumber
+from ms_slam_env.slam.slam_backend import Float64, Loop
 from ms_slam_env.slam.surfel.deformation_graph import Constraints, Deformation, no_constraints
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 

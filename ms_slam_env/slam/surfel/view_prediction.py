@@ -11,7 +11,7 @@ from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert
-from ms_slam_env.slam.base import Float64
+from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.surfel import view_warping
 from ms_slam_env.slam.surfel.rendering import (
     ModelView,
@@ -30,7 +30,7 @@ SIZE_STEP_PX = 8  # reference views come in such steps, so that few sets of buff
 
 @dataclass(frozen=True)
 class DeviceViews:
-    """Predicted images on the device; see ``ms_slam_env.slam.base.Views``."""
+    """Predicted images on the device; see ``ms_slam_env.slam.slam_backend.Views``."""
 
     intensity: wp.array  # (V, h, w) float32 in [0, 255]
     depth: wp.array  # (V, h, w) float32 metres

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ms_slam_env.slam.alignment_measures import DepthImage
-from ms_slam_env.slam.base import Float32, Float64
+from ms_slam_env.slam.shared.alignment_measures import DepthImage
+from ms_slam_env.slam.slam_backend import Float32, Float64
 
 Int64 = NDArray[np.int64]
 Descriptors = NDArray[np.uint64]

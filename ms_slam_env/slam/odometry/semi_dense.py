@@ -20,8 +20,8 @@ import numpy as np
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.camera.frame import reduce_depth
 from ms_slam_env.geometry import Float64, invert, se3_exp
-from ms_slam_env.slam.alignment_measures import DepthImage
-from ms_slam_env.slam.base import Float32
+from ms_slam_env.slam.shared.alignment_measures import DepthImage
+from ms_slam_env.slam.slam_backend import Float32
 
 ITERATIONS = (8, 12, 20)  # at most, finest level first
 _GRADIENT = 5.0  # grey levels a pixel, from which on a pixel is a point, as in LSD-SLAM

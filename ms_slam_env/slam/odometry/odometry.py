@@ -18,14 +18,14 @@ from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, relative_angle
-from ms_slam_env.slam.alignment_check import NO_ALIGNMENT, AcceptanceThresholds
-from ms_slam_env.slam.alignment_measures import DepthImage, check_alignment
-from ms_slam_env.slam.base import LARGEST_CUTOFF_M, BorrowedMap, Float64
-from ms_slam_env.slam.pose_hypotheses import motion_hypotheses
-from ms_slam_env.slam.semi_dense import SemiDenseAligner
-from ms_slam_env.slam.state_check import ArrayOf, OrNone
+from ms_slam_env.slam.odometry.semi_dense import SemiDenseAligner
+from ms_slam_env.slam.shared.alignment_check import NO_ALIGNMENT, AcceptanceThresholds
+from ms_slam_env.slam.shared.alignment_measures import DepthImage, check_alignment
+from ms_slam_env.slam.shared.search_poses import motion_hypotheses
+from ms_slam_env.slam.shared.state_check import ArrayOf, OrNone
+from ms_slam_env.slam.shared.tracking_template import Attempt, FrameByFrameSlam
+from ms_slam_env.slam.slam_backend import LARGEST_CUTOFF_M, BorrowedMap, Float64
 from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
-from ms_slam_env.slam.tracking_template import Attempt, FrameByFrameSlam
 
 _TOO_LITTLE_IN_VIEW = "too little of the map is in view"
 

@@ -19,8 +19,8 @@ from ms_slam_env.errors import unknown
 from ms_slam_env.geometry import invert, relative_angle, se3_exp, se3_log, transform_points
 from ms_slam_env.geometry.cloud_registration import register_clouds
 from ms_slam_env.geometry.point_clouds import voxel_downsample
-from ms_slam_env.slam.map_fit import Fit, FitConfig, measure_fit, why_not_believed
-from ms_slam_env.slam.map_hypotheses import (
+from ms_slam_env.slam.shared.map_fit import Fit, FitConfig, measure_fit, why_not_believed
+from ms_slam_env.slam.team.relative_map_poses import (
     SOURCES,
     Hypothesis,
     RobotRun,

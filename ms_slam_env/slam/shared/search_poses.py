@@ -6,8 +6,8 @@ import numpy as np
 
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import make_pose, orthonormal, so3_exp
-from ms_slam_env.slam.alignment_measures import DepthImage, overlay
-from ms_slam_env.slam.base import Float64
+from ms_slam_env.slam.shared.alignment_measures import DepthImage, overlay
+from ms_slam_env.slam.slam_backend import Float64
 
 TURN_RAD = np.radians(10.0)
 STEP_M = 0.1

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from ms_slam_env.config import Checked, bounded, check_counts, chosen
-from ms_slam_env.slam.base import LARGEST_CUTOFF_M
+from ms_slam_env.slam.slam_backend import LARGEST_CUTOFF_M
 
 
 @dataclass(frozen=True)

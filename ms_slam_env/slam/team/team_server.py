@@ -21,10 +21,10 @@ from ms_slam_env.config import Checked, bounded
 from ms_slam_env.geometry import invert, relative_angle, se3_exp, se3_log, transform_points
 from ms_slam_env.geometry.cloud_registration import register_clouds
 from ms_slam_env.geometry.point_clouds import voxel_downsample
-from ms_slam_env.slam.base import SlamBackend
-from ms_slam_env.slam.map_fit import query_frames
-from ms_slam_env.slam.map_hypotheses import RobotRun
-from ms_slam_env.slam.sparse.loop_closure import Edge, optimise_poses
+from ms_slam_env.slam.shared.map_fit import query_frames
+from ms_slam_env.slam.slam_backend import SlamBackend
+from ms_slam_env.slam.sparse.pose_graph import Edge, optimise_poses
+from ms_slam_env.slam.team.relative_map_poses import RobotRun
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]

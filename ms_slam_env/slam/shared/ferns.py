@@ -18,8 +18,8 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose
-from ms_slam_env.slam.state import Stateful
-from ms_slam_env.slam.state_check import ArrayOf
+from ms_slam_env.slam.shared.state import Stateful
+from ms_slam_env.slam.shared.state_check import ArrayOf
 
 _THRESHOLDS = (32.0, 224.0)  # on colours, after that
 _AVERAGED = 8  # rows and columns of the image, at least, that a reduced pixel is the mean of

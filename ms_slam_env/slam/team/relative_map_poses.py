@@ -19,9 +19,9 @@ from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, make_pose, transform_points
 from ms_slam_env.geometry.point_clouds import umeyama
-from ms_slam_env.slam.base import SlamBackend
-from ms_slam_env.slam.features import InverseDepth
-from ms_slam_env.slam.map_fit import query_frames
+from ms_slam_env.slam.shared.map_fit import query_frames
+from ms_slam_env.slam.shared.orb_features import InverseDepth
+from ms_slam_env.slam.slam_backend import SlamBackend
 
 Float64 = NDArray[np.float64]
 

@@ -12,15 +12,15 @@ from numpy.typing import ArrayLike
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame, check_frame
 from ms_slam_env.geometry import check_pose, invert
-from ms_slam_env.slam.alignment_check import (
+from ms_slam_env.slam.shared.alignment_check import (
     FEWEST_READINGS,
     NO_ALIGNMENT,
     VIEW_THRESHOLDS,
     AcceptanceThresholds,
     AlignmentStatistics,
 )
-from ms_slam_env.slam.base import Float64, SlamBackend, TrackResult
-from ms_slam_env.slam.state import Saved
+from ms_slam_env.slam.shared.state import Saved
+from ms_slam_env.slam.slam_backend import Float64, SlamBackend, TrackResult
 
 
 class PreparedFrame(Protocol):

@@ -15,10 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import as_numbers
-from ms_slam_env.slam.state import Stateful
-from ms_slam_env.slam.state_check import check_like
-from ms_slam_env.slam.state_file import read_state, write_state
-from ms_slam_env.slam.submaps import Submaps, one_submap
+from ms_slam_env.slam.shared.state import Stateful
+from ms_slam_env.slam.shared.state_check import check_like
+from ms_slam_env.slam.shared.state_file import read_state, write_state
+from ms_slam_env.slam.shared.submap_frames import Submaps, one_submap
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]

@@ -1,0 +1,1 @@
+"""What the backends share: features, places seen before, decisions on alignments, states."""
