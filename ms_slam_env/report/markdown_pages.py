@@ -7,7 +7,7 @@ Between two comments, each on a line of its own, stands what a result says::
 
 The first word is a folder of results, whose ``results.json`` is read, or a JSON file in one. The
 options: ``table``, number or title of a table (by default the first); ``columns``, their names (by
-default all); ``where``, a column and the text that it must have, as in ``where=sequence=median``;
+default all); ``where``, a column and the texts that it may have, as in ``where=planner=a|b``;
 ``rows``, at most so many of the first; ``made_by=yes``, the command in a line below.
 Where the result is older than the code, the first of its tables on the page says so above.
 
@@ -167,7 +167,7 @@ def _cut(table: Table, options: dict[str, str]) -> Table:
     column, _, wanted = options.get("where", "").partition("=")
     if column and column not in columns:
         raise unknown("column", column, columns)
-    rows = [row for row in table.rows if not column or str(row.get(column)) == wanted]
+    rows = [row for row in table.rows if not column or str(row.get(column)) in wanted.split("|")]
     count = options.get("rows", str(len(rows)))
     if not count.isdecimal():
         raise InputError(f"rows = {count!r} is no number")
