@@ -1,0 +1,353 @@
+"""How often SLAM succeeds over sequences, image sizes and changes that should not matter."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ms_slam_env import metrics, slam
+from ms_slam_env._runtime.parallel import limit_threads
+from ms_slam_env.benchmark.experiment import Experiment, check_each
+from ms_slam_env.camera import RGBDFrame, parse_image_size
+from ms_slam_env.camera.image_size import NATIVE
+from ms_slam_env.config import Checked, bounded, parse_named
+from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import Float64
+from ms_slam_env.report.charts import Chart, Panel, Series
+from ms_slam_env.report.records import Row
+from ms_slam_env.report.tables import Table, finished, make_table, summary
+from ms_slam_env.sequences.sequence import Frames
+from ms_slam_env.sequences.sequence import Sequence as Recording
+
+MOST_LOST = 0.05
+"""Share of the frames that a successful run may lose."""
+WORSE = 2.0
+"""Times the best median error of the sequence that a successful run may have."""
+_SIGMAS = 3.0  # that an error may have before the covariance is taken to be wrong
+_ONE_IN = 1_000_000  # pixels
+_UNIT_M = 0.001  # of depth, in the images of most recordings
+USME = "usme:"
+"""Before the name of one of the eight USME sequences and a seed, as in usme:city-traffic:2000."""
+
+ROOMS = ("living_room", "table", "office", "corridor", "carpet")
+PERTURBED = (
+    *("rolling-shutter", "misregistration", "motion-blur", "auto-exposure", "depth-dropout"),
+    *("depth-quantisation", "illumination"),
+    "moving-objects,kind=box,count=1",
+    "moving-objects,kind=box,count=2",
+    "moving-objects,kind=person,count=1",
+)
+
+
+def default_sequences(seed: int) -> tuple[str, ...]:
+    """Rooms, a room with each perturbation, and the USME sequences, of one seed."""
+    from ms_slam_env.sequences.usme_suite import NAMES
+
+    rooms = [f"{scene}:{seed}" for scene in ROOMS]
+    perturbed = [f"living_room:{seed}:kinect+{words}" for words in PERTURBED]
+    return (*rooms, *perturbed, *(f"{USME}{name}:{seed}" for name in NAMES))
+
+
+class ChangedFrames(Frames):
+    """Frames of another sequence, some of them and each changed.
+
+    Args:
+        frames: to change.
+        indices: (M,) of those that are taken, in this order.
+        times: (M,) seconds.
+        change: of one frame, with its number among those taken.
+    """
+
+    def __init__(
+        self,
+        frames: Sequence[RGBDFrame],
+        indices: Sequence[int],
+        times: Float64,
+        change: Callable[[RGBDFrame, int], RGBDFrame],
+    ) -> None:
+        self._frames, self._indices, self._times = frames, indices, times
+        self._change = change
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self._indices)
+
+    def frame(self, index: int) -> RGBDFrame:
+        """Take a frame and change it."""
+        taken = replace(self._frames[self._indices[index]], timestamp=float(self._times[index]))
+        return self._change(taken, index)
+
+
+def _same(frame: RGBDFrame, index: int) -> RGBDFrame:
+    return frame
+
+
+def _brighter(frame: RGBDFrame, index: int) -> RGBDFrame:
+    return replace(frame, color=np.minimum(frame.color, 254) + np.uint8(1))
+
+
+def _one_column_less(frame: RGBDFrame, index: int) -> RGBDFrame:
+    return replace(
+        frame,
+        color=np.ascontiguousarray(frame.color[:, :-1]),
+        depth=np.ascontiguousarray(frame.depth[:, :-1]),
+    )
+
+
+def _one_unit_of_depth(frame: RGBDFrame, index: int) -> RGBDFrame:
+    """One pixel of a million is a millimetre farther, and one of the second frame."""
+    is_moved = np.random.default_rng([index, 7]).random(frame.depth.shape) < 1.0 / _ONE_IN
+    if index == 1:
+        is_moved.flat[np.flatnonzero(frame.depth)[: 1 if frame.depth.any() else 0]] = True
+    depth = frame.depth.copy()
+    depth[is_moved & (depth > 0)] += np.float32(_UNIT_M)
+    return replace(frame, depth=depth)
+
+
+def _changed(
+    given: Recording,
+    indices: Sequence[int] | None = None,
+    change: Callable[[RGBDFrame, int], RGBDFrame] = _same,
+    width: int = 0,
+    mirrored: bool = False,
+) -> Recording:
+    indices = range(len(given)) if indices is None else indices
+    times = given.timestamps
+    chosen = times[indices]
+    frames = ChangedFrames(
+        given.frames, indices, times[0] + times[-1] - chosen if mirrored else chosen, change
+    )
+    K = replace(given.intrinsics, width=given.intrinsics.width + width)
+    return Recording(frames, given.poses[list(indices)], K, given.name)
+
+
+VARIATIONS: dict[str, Callable[[Recording], Recording]] = {
+    "none": _changed,
+    "depth-unit": lambda given: _changed(given, change=_one_unit_of_depth),
+    "first-dropped": lambda given: _changed(given, range(1, len(given))),
+    "five-dropped": lambda given: _changed(given, range(5, len(given))),
+    "column-cropped": lambda given: _changed(given, change=_one_column_less, width=-1),
+    "brighter": lambda given: _changed(given, change=_brighter),
+    "reversed": lambda given: _changed(given, range(len(given) - 1, -1, -1), mirrored=True),
+}
+"""Name to change: none of them makes a sequence harder."""
+
+
+@dataclass(frozen=True)
+class RobustnessSpec:
+    """A run; see :class:`Robustness` for the fields."""
+
+    sequence: str
+    source: str
+    layout: str
+    image_size: str
+    variation: str
+    backend: str
+    frames: int
+
+    def opened(self) -> Recording:
+        """The sequence, changed."""
+        from ms_slam_env import scenes
+        from ms_slam_env.sequences import HandheldPath, open_sequence, usme_suite
+
+        if self.source.startswith(USME):
+            name, _, seed = self.source.removeprefix(USME).rpartition(":")
+            entry = usme_suite.find(name)
+            size = "640x480" if self.image_size == NATIVE else self.image_size
+            given: Recording = usme_suite.render(entry, scenes.make(entry.scene, int(seed)), size)
+        else:
+            path = HandheldPath(self.frames)
+            size = self.image_size
+            if self.layout:  # a recording may have another aspect
+                size = size if size == NATIVE else f"{size}+crop"
+            elif size == NATIVE:
+                size = "640x480"
+            given = open_sequence(
+                self.source, size, path=path, with_truth=True, layout=self.layout or "auto"
+            )
+        return VARIATIONS[self.variation](given)
+
+
+@dataclass(frozen=True)
+class Robustness(Experiment, Checked):
+    """How often SLAM succeeds when nothing that matters changes
+
+    Every backend runs over every sequence at every image size, as it is and with small changes that
+    make it no harder: one pixel of depth in a million a millimetre farther, the first frame or five
+    of them left out, a column cropped, one grey value brighter, mirrored in time. A run succeeds
+    that loses at most 5 % of the frames and has at most twice the best median error of its
+    sequence, over sizes and backends. A failed run is told where it lost frames, or its covariance
+    explains the error.
+    """
+
+    sequences: tuple[str, ...] = ()
+    """scene:seed[:word[+word ...]] or usme:NAME:seed; by default rooms, a room with each
+    perturbation, and the USME sequences, of ``seeds``."""
+    seeds: tuple[int, ...] = (1000, 2000)
+    """Of the default sequences: below 2000 options are tuned, from there on judged."""
+    recordings: tuple[str, ...] = ()
+    """NAME=FOLDER, NAME=LAYOUT:FOLDER where the layout must be said, as in
+    hololens=folder:data/hololens."""
+    image_sizes: tuple[str, ...] = (
+        *("100x75", "128x96", "160x120", "213x160", "240x180", "320x240"),
+        NATIVE,
+    )
+    """Such as 160x120; of recordings with another aspect the central part."""
+    variations: tuple[str, ...] = tuple(VARIATIONS)
+    """Changes of a sequence that make it no harder."""
+    backends: tuple[str, ...] = ("surfel",)
+    """NAME, parameters appended as in surfel,check_slips=true."""
+    frames: int = bounded(150, 10, 100_000)
+    """Of a rendered sequence but for those of USME."""
+
+    tracks = True
+
+    def __post_init__(self) -> None:
+        """Refuse what no run could use."""
+        super().__post_init__()
+        check_each("variation", self.variations, VARIATIONS)
+        for size in self.image_sizes:
+            parse_image_size(size)
+        for text in self.backends:
+            slam.check_parameters(*parse_named(text, "backend"))
+        for text in self.recordings:
+            _recording(text)
+
+    def sources(self) -> list[tuple[str, str, str]]:
+        """Name, source and layout of every sequence; the layout is empty for rendered ones."""
+        rendered = self.sequences
+        if not rendered and not self.recordings:
+            rendered = tuple(name for seed in self.seeds for name in default_sequences(seed))
+        return [*((text, text, "") for text in rendered), *map(_recording, self.recordings)]
+
+    def specs(self) -> list[RobustnessSpec]:
+        """Every run."""
+        return [
+            RobustnessSpec(name, source, layout, size, variation, backend, self.frames)
+            for name, source, layout in self.sources()
+            for size in self.image_sizes
+            for variation in self.variations
+            for backend in self.backends
+        ]
+
+    @staticmethod
+    def run(spec: RobustnessSpec) -> dict[str, Any]:
+        """Track the changed sequence from its true first pose."""
+        from ms_slam_env.evaluation.run_sequence import run_sequence
+
+        limit_threads(1)
+        given = spec.opened()
+        name, params = parse_named(spec.backend, "backend")
+        run = run_sequence(slam.make(name, given.intrinsics, **params), given)
+        ate = metrics.ate_statistics(run.estimates, given.poses)
+        return {
+            "frames": len(run),
+            "path_m": metrics.path_length(given.poses),
+            "lost_share": run.lost,
+            "uncertain_frames": run.uncertain_frames,
+            "ate_m": ate.rmse,
+            "ate_max_m": ate.max,
+            **metrics.tracked_errors(run.estimates, given.poses, run.tracking_ok),
+            "position_sigma_m": position_sigma([one.covariance for one in run.results]),
+            "cpu_ms_median": float(np.median(run.cpu_ms)),
+        }
+
+    def tables(self, rows: Sequence[Row]) -> list[Table]:
+        """Shares of success by backend, then by sequence, size and change."""
+        lines = judged(rows)
+        tables = [_shares(lines, ("backend", "part"), "")]
+        for field in ("sequence", "image_size", "variation"):
+            tables.append(_shares(lines, ("backend", field), f"By {field.replace('_', ' ')}"))
+        failed = [line for line in lines if not line["succeeded"]]
+        shown = ("backend", "sequence", "image_size", "variation", "lost_share", "ate_m", "told")
+        return [*tables, make_table(shown, failed, "Runs that failed")]
+
+    def charts(self, rows: Sequence[Row]) -> list[Chart]:
+        """Share of runs that succeed at each image size, a line a backend."""
+        lines = judged(rows)
+        series = []
+        for backend in dict.fromkeys(line["backend"] for line in lines):
+            own = [line for line in lines if line["backend"] == backend]
+            groups = {
+                size: [x for x in own if x["image_size"] == size] for size in self.image_sizes
+            }
+            shares = {size: summary(x, "succeeded").value for size, x in groups.items() if x}
+            series.append(Series(backend, list(shares), list(shares.values())))
+        panel = Panel("", "succeeded", series)
+        return [Chart("robustness", "Success by image size", "Share of the runs.", [panel])]
+
+
+def _recording(text: str) -> tuple[str, str, str]:
+    """Name, folder and layout of NAME=FOLDER or NAME=LAYOUT:FOLDER."""
+    name, sign, place = text.partition("=")
+    if not (name and sign and place):
+        raise InputError(f"recording {text!r} is not NAME=FOLDER or NAME=LAYOUT:FOLDER")
+    layout, colon, folder = place.partition(":")
+    if not colon or Path(place).exists():
+        return name, place, "auto"
+    return name, folder, layout
+
+
+def position_sigma(covariances: Iterable[Float64 | None]) -> float | None:
+    """RMS over frames of the predicted standard deviation of the position, m; None: never said."""
+    said = [np.trace(one[:3, :3]) for one in covariances if one is not None]
+    return float(np.sqrt(np.mean(said))) if said else None
+
+
+def judged(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Every finished run with whether it succeeded, and whether a failure was told."""
+    lines = [{**row["spec"], **row["result"]} for row in finished(rows)]
+    cells: dict[tuple[str, ...], list[float]] = {}
+    for line in lines:
+        key = tuple(line[name] for name in ("sequence", "image_size", "backend"))
+        cells.setdefault(key, []).append(line["ate_m"])
+    best: dict[str, float] = {}
+    for (sequence, *_), errors in cells.items():
+        best[sequence] = min(best.get(sequence, np.inf), float(np.median(errors)))
+    for line in lines:
+        is_near = line["ate_m"] <= WORSE * best[line["sequence"]]
+        line["succeeded"] = line["lost_share"] <= MOST_LOST and is_near
+        sigma = line["position_sigma_m"]
+        explained = sigma is not None and line["ate_m"] <= _SIGMAS * sigma
+        line["told"] = None if line["succeeded"] else line["lost_share"] > MOST_LOST or explained
+        line["part"] = part_of(line["source"])
+    return lines
+
+
+def part_of(source: str) -> str:
+    """Which part a sequence belongs to: on ``tuning`` ones options are chosen, never on others."""
+    seeds = [word for word in source.split(":")[1:] if word.isdecimal()]
+    return "tuning" if seeds and int(seeds[0]) < 2000 else "judging"
+
+
+def _shares(lines: Sequence[Mapping[str, Any]], by: Sequence[str], title: str) -> Table:
+    """Shares of success, medians and the worst, of lines that have the same ``by``."""
+    groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for line in lines:
+        groups.setdefault(tuple(line[name] for name in by), []).append(line)
+    made = [
+        {
+            **dict(zip(by, group, strict=True)),
+            "runs_counted": len(own),
+            **{key: summary(own, key) for key in ("succeeded", "ate_m", "lost_share")},
+            "ate_worst_m": max(line["ate_m"] for line in own),
+            "lost_share_worst": max(line["lost_share"] for line in own),
+            "told": summary([x for x in own if not x["succeeded"]], "told"),
+            "cpu_ms_median": summary(own, "cpu_ms_median"),
+        }
+        for group, own in groups.items()
+    ]
+    columns = (
+        *by,
+        "runs_counted",
+        "succeeded",
+        "ate_m",
+        "ate_worst_m",
+        "lost_share",
+        "lost_share_worst",
+    )
+    return make_table((*columns, "told", "cpu_ms_median"), made, title)

@@ -1,0 +1,76 @@
+"""Variations change what they say and nothing else; success is judged as defined."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from ms_slam_experiments.robustness import VARIATIONS, RobustnessSpec, judged, part_of
+
+from ms_slam_env.errors import InputError
+from ms_slam_env.sequences import open_sequence
+
+
+@pytest.fixture(scope="module")
+def given():
+    return open_sequence("table:1000:kinect+handheld,frames=8", "40x31")
+
+
+def test_what_is_left_out_is_left_out(given) -> None:
+    for name, start in (("none", 0), ("first-dropped", 1), ("five-dropped", 5)):
+        varied = VARIATIONS[name](given)
+        assert len(varied) == len(given) - start
+        assert np.array_equal(varied.poses, given.poses[start:])
+        assert np.array_equal(varied.timestamps, given.timestamps[start:])
+        assert np.array_equal(varied.frames[0].depth, given.frames[start].depth)
+
+
+def test_mirrored_in_time_ends_where_it_began_at_the_same_pace(given) -> None:
+    varied = VARIATIONS["reversed"](given)
+    assert np.array_equal(varied.poses, given.poses[::-1])
+    assert np.allclose(np.diff(varied.timestamps), np.diff(given.timestamps)[::-1])
+    assert np.array_equal(varied.frames[0].color, given.frames[7].color)
+
+
+def test_images_change_by_a_column_a_grey_value_or_a_millimetre(given) -> None:
+    cropped = VARIATIONS["column-cropped"](given)
+    assert cropped.intrinsics.shape == (31, 39)
+    assert np.array_equal(cropped.frames[2].depth, given.frames[2].depth[:, :-1])
+    brighter = VARIATIONS["brighter"](given).frames[2].color
+    assert np.array_equal(brighter, np.minimum(given.frames[2].color.astype(int) + 1, 255))
+    varied = VARIATIONS["depth-unit"](given)
+    changes = [a.depth - b.depth for a, b in zip(varied.frames, given.frames, strict=True)]
+    assert np.count_nonzero(changes[1]) == 1
+    assert sum(map(np.count_nonzero, changes)) <= 2  # one of 10,000 pixels by chance at most
+    assert np.max(changes) == pytest.approx(0.001, rel=1e-3)
+
+
+def row(sequence: str, size: str, ate_m: float, lost: float = 0.0, sigma: float = 1e-4):
+    spec = {"sequence": sequence, "source": sequence, "image_size": size, "backend": "surfel"}
+    result = {"ate_m": ate_m, "lost_share": lost, "position_sigma_m": sigma}
+    return {"spec": spec, "result": result, "error": None}
+
+
+def test_success_is_few_losses_and_an_error_near_the_best_median() -> None:
+    rows = [
+        *(row("a:1000", "80x60", ate) for ate in (0.010, 0.011, 0.0225)),  # median 11 mm: the best
+        row("a:1000", "160x120", 0.021),
+        row("a:1000", "160x120", 0.010, lost=0.06),
+        row("a:1000", "160x120", 0.030, sigma=0.010),
+        row("a:1000", "160x120", 0.0301, sigma=0.010),
+    ]
+    lines = judged(rows)
+    assert [line["succeeded"] for line in lines] == [True, True, False, True, False, False, False]
+    assert [line["told"] for line in lines] == [None, None, False, None, True, True, False]
+    assert {line["part"] for line in lines} == {"tuning"}
+    assert part_of("usme:city-traffic:2000") == part_of("../hololens") == "judging"
+
+
+def test_a_recording_is_named_with_its_folder() -> None:
+    from ms_slam_experiments.robustness import Robustness
+
+    made = Robustness(recordings=("h=folder:some/where",), image_sizes=("80x60",))
+    (first, *_) = made.specs()
+    assert isinstance(first, RobustnessSpec)
+    assert (first.sequence, first.source, first.layout) == ("h", "some/where", "folder")
+    with pytest.raises(InputError, match="NAME=FOLDER"):
+        Robustness(recordings=("some/where",))
