@@ -334,7 +334,7 @@ def _shares(lines: Sequence[Mapping[str, Any]], by: Sequence[str], title: str) -
             **dict(zip(by, group, strict=True)),
             "runs_counted": len(own),
             **{key: summary(own, key) for key in ("succeeded", "ate_m", "lost_share")},
-            "ate_worst_m": max(line["ate_m"] for line in own),
+            "worst_ate_m": max(line["ate_m"] for line in own),
             "lost_share_worst": max(line["lost_share"] for line in own),
             "told": summary([x for x in own if not x["succeeded"]], "told"),
             "cpu_ms_median": summary(own, "cpu_ms_median"),
@@ -346,7 +346,7 @@ def _shares(lines: Sequence[Mapping[str, Any]], by: Sequence[str], title: str) -
         "runs_counted",
         "succeeded",
         "ate_m",
-        "ate_worst_m",
+        "worst_ate_m",
         "lost_share",
         "lost_share_worst",
     )
