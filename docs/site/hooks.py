@@ -16,7 +16,7 @@ from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "docs" / "results"
-ROOT_TEXTS = ("BENCHMARK", "CHANGELOG", "CONTRIBUTING", "SECURITY")
+ROOT_TEXTS = ("CHANGELOG", "CONTRIBUTING", "SECURITY")
 
 API = {
     "ms_slam_env": "registration of the environments",
@@ -49,7 +49,7 @@ API = {
 
 def on_config(config: Any) -> Any:
     """Put the made pages into the places that the navigation keeps for them."""
-    made = {"Gallery": _gallery(), "API": _api(), "Results": _results()}
+    made = {"Gallery": _gallery(), "API": _api(), "Records": _results()}
     for group in (config.nav, *(next(iter(entry.values())) for entry in config.nav)):
         for entry in group if isinstance(group, list) else ():
             for title in made.keys() & entry.keys():
@@ -58,7 +58,7 @@ def on_config(config: Any) -> Any:
 
 
 def _nav_entry(name: str) -> str | dict[str, str]:
-    """A page by its name; results by their folder, since several have one title."""
+    """A page by its name; records by their folder, since several have one title."""
     folder, *rest = name.removesuffix("/index.md").split("/")
     return {"/".join(rest): name} if folder == "results" and rest else name
 
@@ -93,7 +93,7 @@ def on_page_content(html: str, **_: Any) -> str:
 
 
 def _root_pages() -> Iterator[tuple[str, str]]:
-    """BENCHMARK.md and other texts of the root as pages beside those of docs/."""
+    """CHANGELOG.md and other texts of the root as pages beside those of docs/."""
     for name in ROOT_TEXTS:
         text = (ROOT / f"{name}.md").read_text(encoding="utf-8")
         yield f"{name.lower()}.md", text.replace("(docs/", "(")
@@ -130,10 +130,10 @@ def _results() -> Iterator[tuple[str, str]]:
         version = content.get("results_version", 1)
         is_old = versions_since(version, content.get("kind", ""))
         age = f"version {version} of {RESULTS_VERSION}" if is_old else "today"
-        rows.append((f"[{name}]({name}/index.md)", title, age))
-    listing = _table(["results", "what they show", "made by the algorithms of"], rows)
+        rows.append((f"[{name}](results/{name}/index.md)", title, age))
+    listing = _table(["record", "what it shows", "made by the algorithms of"], rows)
     about = "What the experiments wrote, as it is committed in `docs/results`."
-    yield "results/index.md", f"# Results\n\n{about}\n\n{listing}"
+    yield "records.md", f"# Records\n\n{about}\n\n{listing}"
     yield from pages
 
 

@@ -12,7 +12,7 @@ import tyro
 from ms_slam_env._runtime.command_line import parse
 from ms_slam_env.errors import InputError
 
-_PAGES = ("README.md", "BENCHMARK.md")
+_PAGES = ("README.md",)
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Arguments:
     """
 
     pages: tyro.conf.Positional[tuple[Path, ...]] = ()
-    """Pages; by default README.md, BENCHMARK.md, those in docs, and the tables beside results."""
+    """Pages; by default README.md, those in docs, and the tables beside results."""
     root: Path = Path()
     """Root of the clone."""
     check: bool = False
@@ -39,7 +39,7 @@ def main(arguments: Sequence[str]) -> int:
 
     pages = args.pages or pages_of(args.root)
     if not pages:
-        raise InputError(f"{args.root} holds no pages: neither {' nor '.join(_PAGES)}")
+        raise InputError(f"{args.root} holds no pages: no {_PAGES[0]} and no Markdown in docs")
     results = args.root / "docs" / "results"
     changed = [] if args.pages else update_tables(results, write=not args.check)
     changed += update_pages(pages, results, write=not args.check)
@@ -52,8 +52,12 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def pages_of(root: Path) -> tuple[Path, ...]:
-    """The pages of a clone; the Markdown beside results is no page."""
+    """The pages of a clone; Markdown in a folder of docs/results is no page."""
     results = root / "docs" / "results"
     found = [root / name for name in _PAGES if (root / name).is_file()]
-    found += [p for p in sorted((root / "docs").rglob("*.md")) if not p.is_relative_to(results)]
+    found += [
+        path
+        for path in sorted((root / "docs").rglob("*.md"))
+        if path.parent == results or not path.is_relative_to(results)
+    ]
     return tuple(found)

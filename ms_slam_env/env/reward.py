@@ -21,7 +21,7 @@ class TargetConfig(Checked):
     M_I and M_D are the medians of the maxima of hand-held sequences of which every twelfth frame
     was kept, the sparsest that SLAM tracked without a loss (``ms-slam experiment frame_skipping``).
     The thresholds and lambda were chosen on validation seeds: with larger ones the greedy planner
-    loses track as random walk does, with smaller ones it maps little (BENCHMARK.md).
+    loses track as random walk does, with smaller ones it maps little.
 
     Attributes:
         M_I: permitted maximum of the intensity divergence, equation (11), nats.

@@ -18,8 +18,12 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.metrics.registry import metric
 
 ROOT = Path(__file__).resolve().parents[2]
-AT_ROOT = [ROOT / f"{name}.md" for name in ("README", "BENCHMARK", "CONTRIBUTING")]
-PAGES = [*AT_ROOT, *sorted((ROOT / "docs").glob("*.md"))]
+AT_ROOT = [ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING")]
+PAGES = [
+    *AT_ROOT,
+    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "docs" / "results").glob("*.md")),
+]
 FILE = re.compile(r"`((?:ms_slam_env|baselines|agents|tests|docs|notebooks)/[\w./-]*)`")
 WORDS = {
     word
