@@ -213,6 +213,12 @@ class PolicyFile:
         metadata = replace(self.metadata, timesteps=0, epochs=0)
         return replace(self.without_optimizer(), metadata=metadata)
 
+    def at_half_precision(self) -> PolicyFile:
+        """The same policy with the network's numbers at 16 bits, to keep: half the size."""
+        tensors = self.without_optimizer().tensors
+        half = {k: v.astype(np.float16) for k, v in tensors.items() if k.startswith("policy.")}
+        return PolicyFile(self.metadata, tensors | half)
+
     def without_optimizer(self) -> PolicyFile:
         """The same policy, to run alone: a third of the size."""
         kept = {k: v for k, v in self.tensors.items() if not k.startswith(_OF_TRAINING)}
@@ -276,7 +282,7 @@ def write_policy(path: Path, policy: PolicyFile) -> None:
     Raises:
         InputError: tensors that do not fit the metadata, or numbers that no training goes on from.
     """
-    _check_values(path, policy.tensors)
+    _check_values(path, {k: _at_least_single(v) for k, v in policy.tensors.items()})
     shapes = tensor_shapes(policy.metadata, STEP in policy.tensors)
     _check_shapes({name: np.shape(value) for name, value in policy.tensors.items()}, shapes)
     text = json.dumps(to_plain(policy.metadata), allow_nan=False)
@@ -287,6 +293,8 @@ def write_policy(path: Path, policy: PolicyFile) -> None:
 
 def read_policy(path: str | Path) -> PolicyFile:
     """Read a policy file. Nothing in it is executed, whoever wrote it.
+
+    Numbers of half precision come as float32.
 
     Raises:
         InputError: no such file, or one that is not a policy, whole and of this version.
@@ -301,7 +309,7 @@ def read_policy(path: str | Path) -> PolicyFile:
             # Before any is read into memory.
             _check_shapes({name: tuple(t.get_shape()) for name, t in found.items()}, shapes)
             _check_types({name: t.get_dtype() for name, t in found.items()})
-            tensors = {name: file.get_tensor(name) for name in shapes}
+            tensors = {name: _at_least_single(file.get_tensor(name)) for name in shapes}
     except InputError as error:
         raise InputError(f"{str(path)!r} is not a policy: {error}") from None
     except (SafetensorError, OSError) as error:
@@ -309,6 +317,10 @@ def read_policy(path: str | Path) -> PolicyFile:
         raise InputError(f"{str(path)!r} is not a policy: {reason}") from None
     _check_values(path, tensors)
     return PolicyFile(metadata, tensors)
+
+
+def _at_least_single(value: NDArray[Any]) -> NDArray[Any]:
+    return value.astype(np.float32) if np.asarray(value).dtype == np.float16 else value
 
 
 def _check_file(path: Path) -> None:
@@ -365,8 +377,8 @@ def _check_shapes(found: Shapes, shapes: Shapes) -> None:
 
 def _check_types(found: Mapping[str, str]) -> None:
     for name, kind in found.items():
-        if kind not in ("F32", "F64"):
-            raise InputError(f"tensor {name} has type {kind}, not F32 or F64")
+        if kind not in ("F16", "F32", "F64"):
+            raise InputError(f"tensor {name} has type {kind}, not F16, F32 or F64")
 
 
 def _check_values(path: Path, tensors: Tensors) -> None:

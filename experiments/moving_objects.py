@@ -157,7 +157,7 @@ class MovingObjectsExperiment(Experiment, Checked):
             return
         most = max(moving, key=lambda row: row["result"]["moving_share"])["spec"]["sequence"]
         spec = MovingObjectsSpec(most, (), self.image_size, self.frames)
-        save_image(out / "mask.png", _picture(_rendered(spec)), compression=9)
+        save_image(out / "mask.png", _picture(_rendered(spec)))
 
 
 def _rendered(spec: MovingObjectsSpec) -> RenderedSequence:

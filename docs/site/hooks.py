@@ -6,7 +6,6 @@ MkDocs calls the functions ``on_...`` while it builds (``make docs``).
 from __future__ import annotations
 
 import inspect
-import json
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -81,7 +80,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
         *((rf"\((\.\./)?{name}\.md", f"({up}{name.lower()}.md") for name in ROOT_TEXTS),
         (r"\((\.\./)?README\.md", f"({up}index.md"),
         (r"\(\.\./notebooks/", f"({up}notebooks/"),
-        (r"(\(results/[^)]*/)table\.md", r"\1index.md"),
+        (r"\((results/\w+)/?\)", r"(\1/index.md)"),
     ):
         markdown = re.sub(here, there, markdown)
     return markdown
@@ -116,34 +115,22 @@ def _api() -> Iterator[tuple[str, str]]:
 
 def _results() -> Iterator[tuple[str, str]]:
     """A page for each folder of committed results, and one that lists them."""
-    from ms_slam_env.metrics.registry import RESULTS_VERSION, versions_since
+    from ms_slam_env.metrics.registry import RESULTS_VERSION
+    from ms_slam_env.report.discovery import find_results
 
     rows, pages = [], []
-    for table in sorted(RESULTS.rglob("table.md")):
-        name = table.parent.relative_to(RESULTS).as_posix()
-        content = _content(table.parent)
-        title, about = content.get("title", name), content.get("about", "")
-        figures = "".join(f"![{p.stem}]({p.name})\n\n" for p in sorted(table.parent.glob("*.png")))
-        text = table.read_text(encoding="utf-8")
-        page = f"# {title}\n\n{about}\n\n{text}\n\n{figures}"
+    for found in find_results(RESULTS)[0]:
+        folder, result = found.path.parent, found.results
+        name = folder.name
+        figures = "".join(f"![{p.stem}]({p.name})\n\n" for p in sorted(folder.glob("*.png")))
+        page = f"# {result.title}\n\n{result.about}\n\n{result.as_markdown()}\n\n{figures}"
         pages.append((f"results/{name}/index.md", page))
-        version = content.get("results_version", 1)
-        is_old = versions_since(version, content.get("kind", ""))
-        age = f"version {version} of {RESULTS_VERSION}" if is_old else "today"
-        rows.append((f"[{name}](results/{name}/index.md)", title, age))
+        age = f"version {result.version} of {RESULTS_VERSION}" if result.stale else "today"
+        rows.append((f"[{name}](results/{name}/index.md)", result.title, age))
     listing = _table(["record", "what it shows", "made by the algorithms of"], rows)
     about = "What the experiments wrote, as it is committed in `docs/results`."
     yield "records.md", f"# Records\n\n{about}\n\n{listing}"
     yield from pages
-
-
-def _content(folder: Path) -> dict[str, Any]:
-    """The result file of a folder; empty where there is none."""
-    for path in sorted(folder.glob("*.json")):
-        content = json.loads(path.read_text(encoding="utf-8"))
-        if isinstance(content, dict) and "kind" in content:
-            return content
-    return {}
 
 
 def _metrics() -> str:

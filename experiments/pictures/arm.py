@@ -64,7 +64,7 @@ class Options(Checked):
     """Of one image, pixels."""
     arm: ArmConfig = field(default_factory=ArmConfig)
     """The arm."""
-    out: Path = Path("docs/pictures/arm.png")
+    out: Path = Path("docs/pictures/arm.webp")
     """The PNG file to write."""
 
 

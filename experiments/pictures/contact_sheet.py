@@ -29,11 +29,11 @@ class Options:
     """Draw the contact sheet of all procedural scenes.
 
     Attributes:
-        out: the PNG file to write.
+        out: the file to write.
         width: of one image, pixels.
     """
 
-    out: Path = Path("docs/pictures/scenes.png")
+    out: Path = Path("docs/pictures/scenes.webp")
     width: int = 200
 
 

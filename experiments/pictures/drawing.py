@@ -1,4 +1,4 @@
-"""What the hand-drawn pictures share: a command each, titled rows of images, a PNG file."""
+"""What the hand-drawn pictures share: a command each, titled rows of images, a small file."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def run_script(
 ) -> int:
     """Draw by the command line of dataclass ``options``; return the exit code.
 
-    ``draw`` returns an RGB picture, which is written to the PNG file ``out`` of the options, or has
+    ``draw`` returns an RGB picture, which is written to the file ``out`` of the options, or has
     written ``out`` and returns a line to print.
     """
     name = f"python -m ms_slam_experiments.pictures.{Path(inspect.getfile(options)).stem}"
@@ -38,15 +38,17 @@ def run_script(
         if isinstance(drawn, str):
             print(f"{args.out}: {drawn}")
         else:
-            save_image(args.out, drawn, compression=9)
+            save_image(args.out, drawn)
         return 0
 
     return exit_code(run, name)
 
 
-def save_image(path: Path, image: Image, compression: int = 1) -> Path:
-    """Write an RGB image (H, W, 3) as PNG, whole or not at all."""
-    _, data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, compression])
+def save_image(path: Path, image: Image) -> Path:
+    """Write an RGB image (H, W, 3) as WebP if the name says so, else PNG; whole or not at all."""
+    kind = ".webp" if path.suffix == ".webp" else ".png"
+    how = {".webp": [cv2.IMWRITE_WEBP_QUALITY, 85], ".png": [cv2.IMWRITE_PNG_COMPRESSION, 9]}
+    _, data = cv2.imencode(kind, image[..., ::-1], how[kind])
     write_bytes(path, data.tobytes())
     return path
 

@@ -55,13 +55,15 @@ def film_of(env_id: str, options: Options) -> film.Options:
         view="moment",
         scene=_SCENES.get(env_id, "living_room"),
         steps=options.steps,
-        every=1,
+        every=2,
         width=640,
-        most_kb=400,
+        picture_ms=300,
+        most_kb=200,
     )
     if env_id in ENV_IDS:
         return plain
-    return replace(plain, view="camera", steps=options.camera_steps, width=400, most_kb=250)
+    camera = replace(plain, view="camera", steps=options.camera_steps, width=400, most_kb=170)
+    return replace(camera, every=1, picture_ms=150)
 
 
 def draw(options: Options) -> str:

@@ -60,7 +60,7 @@ class Options(Checked):
     """Of the picture, pixels."""
     picture_ms: int = bounded(150, 20, 10_000)
     """How long each picture is shown."""
-    most_kb: int = bounded(1200, 10, 100_000)
+    most_kb: int = bounded(600, 10, 100_000)
     """Size that the file is kept below, by the quality of a WebP."""
 
     def __post_init__(self) -> None:

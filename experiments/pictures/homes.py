@@ -31,13 +31,13 @@ class Options:
     """Draw floor plans and views of homes.
 
     Attributes:
-        out: the PNG file to write.
+        out: the file to write.
         seeds: of the homes.
         views: of each home.
         width: of a view, pixels.
     """
 
-    out: Path = Path("docs/pictures/homes.png")
+    out: Path = Path("docs/pictures/homes.webp")
     seeds: tuple[int, ...] = (2000, 2002)
     views: int = 6
     width: int = 180

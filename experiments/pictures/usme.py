@@ -26,11 +26,11 @@ class Options:
     """Draw two frames of each of the eight sequences.
 
     Attributes:
-        out: the PNG file.
+        out: the file to write.
         seed: of scenes, ways, noise and perturbations.
     """
 
-    out: Path = Path("docs/pictures/usme.png")
+    out: Path = Path("docs/pictures/usme.webp")
     seed: int = 2000
 
 

@@ -17,7 +17,7 @@ _PAGES = ("README.md",)
 
 @dataclass(frozen=True)
 class Arguments:
-    """Write the tables of a clone's Markdown pages, and those beside its results, from the results.
+    """Write the tables of a clone's Markdown pages from its results, or pack results to commit.
 
     A table stands between <!-- results: FOLDER table=0 columns=planner,ate_m --> and
     <!-- end -->; FOLDER is one of docs/results. Model cards stand between <!-- agents: FILE -->
@@ -25,24 +25,31 @@ class Arguments:
     """
 
     pages: tyro.conf.Positional[tuple[Path, ...]] = ()
-    """Pages; by default README.md, those in docs, and the tables beside results."""
+    """Pages; by default README.md and those in docs."""
     root: Path = Path()
     """Root of the clone."""
     check: bool = False
     """Change nothing; exit with 1 if a page is out of date."""
+    pack: tuple[Path, Path] | None = None
+    """A folder that --out named, and the one of docs/results that is to hold it, compressed; files
+    that are in both, as a picture that a page shows, are renewed. No page is written."""
 
 
 def main(arguments: Sequence[str]) -> int:
     """Write the tables, or check them, and print the pages that were out of date."""
     args = parse(Arguments, arguments, "ms-slam docs")
-    from ms_slam_env.report.markdown_pages import update_pages, update_tables
+    from ms_slam_env.report.markdown_pages import update_pages
+    from ms_slam_env.report.results import pack_results
 
+    if args.pack:
+        for path in pack_results(*args.pack):
+            print(f"{path}: {path.stat().st_size:,} bytes")
+        return 0
     pages = args.pages or pages_of(args.root)
     if not pages:
         raise InputError(f"{args.root} holds no pages: no {_PAGES[0]} and no Markdown in docs")
     results = args.root / "docs" / "results"
-    changed = [] if args.pages else update_tables(results, write=not args.check)
-    changed += update_pages(pages, results, write=not args.check)
+    changed = update_pages(pages, results, write=not args.check)
     for page in changed:
         print(f"{page}: {'out of date' if args.check else 'written'}")
     if args.check and changed:

@@ -49,8 +49,8 @@ def run(cls: type[Experiment], arguments: Sequence[str], program: str, out: Path
 def check(cls: type[Experiment], folder: Path) -> int:
     """Compare some committed rows with what the code makes of them today."""
     committed = read_results(folder / RESULTS)
-    if committed.stale:
-        print(committed.stale)
+    if committed.caveats:
+        print(committed.caveats)
     count, differences = check_results(cls, committed)
     print("\n".join(differences) or f"{folder}: {count} rows run again, nothing differs")
     return 1 if differences else 0

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ms_slam_env.errors import InputError
-from ms_slam_env.report.results import Results, read_results
+from ms_slam_env.report.results import PACKED, Results, read_results
 
 PICTURES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".gif": "image/gif"}
 _TEXTS = (".yaml", ".yml", ".md", ".txt", ".csv")
@@ -63,7 +63,7 @@ def find_results(folder: Path) -> tuple[list[FoundResult], list[NotShown]]:
             by_folder.setdefault(path.parent, []).append(path)
     for parent, paths in by_folder.items():
         own: dict[Path, Results] = {}
-        for path in (path for path in paths if path.suffix == ".json"):
+        for path in _records(paths):
             try:
                 own[path] = read_results(path)
             except InputError as error:
@@ -72,7 +72,7 @@ def find_results(folder: Path) -> tuple[list[FoundResult], list[NotShown]]:
         beside = _neighbours(own, paths) if own else {}
         for path, results in own.items():
             title = top.name if parent == folder else parent.relative_to(folder).as_posix()
-            title = f"{title}: {path.stem}" if len(own) > 1 else title
+            title = f"{title}: {_stem(path)}" if len(own) > 1 else title
             pictures, texts, too_large = beside[path]
             found.append(FoundResult(path, title, results, pictures, texts))
             absent += [
@@ -83,6 +83,17 @@ def find_results(folder: Path) -> tuple[list[FoundResult], list[NotShown]]:
         seen = "".join(f"; {missing.name} {missing.reason}" for missing in absent[:3])
         raise InputError(f"{folder} holds no results{seen}")
     return found, absent
+
+
+def _records(paths: Sequence[Path]) -> list[Path]:
+    """The JSON files, and the compressed ones whose content is not beside them."""
+    plain = [path for path in paths if path.suffix == ".json"]
+    packed = [path for path in paths if path.name.endswith(f".json{PACKED}")]
+    return plain + [path for path in packed if path.with_suffix("") not in plain]
+
+
+def _stem(path: Path) -> str:
+    return path.name.removesuffix(PACKED).removesuffix(".json")
 
 
 def _neighbours(
@@ -103,7 +114,7 @@ def _neighbours(
         size = path.stat().st_size
         left -= size if is_picture and size <= most else 0
         kind = 2 if size > most or left < 0 else 0 if is_picture else 1
-        owner = max(results, key=lambda result: _likeness(result.stem, path.stem))
+        owner = max(results, key=lambda result: _likeness(_stem(result), path.stem))
         found[owner][kind].append(path)
     return found
 

@@ -5,11 +5,13 @@ Between two comments, each on a line of its own, stands what a result says::
     <!-- results: planners table=0 columns=planner,ate_m,f_score_5cm -->
     <!-- end -->
 
-The first word is a folder of results, whose ``results.json`` is read, or a JSON file in one. The
-options: ``table``, number or title of a table (by default the first); ``columns``, their names (by
-default all); ``where``, a column and the texts that it may have, as in ``where=planner=a|b``;
-``rows``, at most so many of the first; ``made_by=yes``, the command in a line below.
-Where the result is older than the code, the first of its tables on the page says so above.
+The first word is a folder of results, whose ``results.json`` is read, or a JSON file in one,
+compressed or not. The options: ``table``, number or title of a table (by default the first);
+``columns``, their names (by default all); ``where``, a column and the texts that it may have, as in
+``where=planner=a|b``; ``rows``, at most so many of the first; ``made_by=yes``, the command in a
+line below.
+Where the result is older than the code, or made from an uncommitted state of it, the first of its
+tables on the page says so above.
 
 After ``agents:`` in place of ``results:`` stand policy files or folders of them, from the root of
 the clone on; what follows are their model cards.
@@ -26,9 +28,8 @@ from pathlib import Path
 from ms_slam_env._runtime.input_files import read_text
 from ms_slam_env._runtime.output_files import write_text
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.report.discovery import find_results
 from ms_slam_env.report.model_cards import model_cards
-from ms_slam_env.report.results import RESULTS, TABLE, Results, made_by, read_results
+from ms_slam_env.report.results import RESULTS, Results, made_by, read_results
 from ms_slam_env.report.tables import Table
 
 _START = re.compile(r"^<!-- (?P<kind>results|agents): (?P<what>.*) -->$")
@@ -55,27 +56,6 @@ def update_pages(pages: Iterable[Path], results: Path, write: bool = True) -> li
             changed.append(page)
             if write:
                 write_text(page, after)
-    return changed
-
-
-def update_tables(results: Path, write: bool = True) -> list[Path]:
-    """Write the tables that lie beside results; return those that were out of date.
-
-    They say how old their figures are, which changes with the code.
-
-    Raises:
-        InputError: a folder without results.
-    """
-    changed = []
-    found, _ = find_results(results)
-    for result in found:
-        alone = sum(other.path.parent == result.path.parent for other in found) == 1
-        path = result.path.with_name(TABLE if alone else f"{result.path.stem}.md")
-        text = result.results.as_markdown()
-        if not path.is_file() or read_text(path, "table") != text:
-            changed.append(path)
-            if write:
-                write_text(path, text)
     return changed
 
 
@@ -140,7 +120,7 @@ def _inserted(what: str, folder: Path, warned: set[Path]) -> str:
     path = path if path.suffix == ".json" else path / RESULTS
     results = read_results(path)
     table = _cut(_chosen(results, options.get("table", "0")), options)
-    parts = [f"*{results.stale}*\n"] if results.stale and path not in warned else []
+    parts = [f"*{results.caveats}*\n"] if results.caveats and path not in warned else []
     warned.add(path)
     parts.append(table.as_markdown())
     if options.get("made_by") == "yes":

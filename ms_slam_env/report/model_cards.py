@@ -236,8 +236,8 @@ def _scores(one: FoundResult, policy: Policy) -> list[_Score]:
 def _score_text(score: _Score, policy: Policy) -> Iterator[str]:
     others, results = score.others, score.one.results
     yield f"### In `{score.task}`\n"
-    if results.stale:
-        yield f"*{results.stale}*\n"
+    if results.caveats:
+        yield f"*{results.caveats}*\n"
     seeds = _config(score.one).get("seeds", "test")
     if seeds != "test":
         yield f"On {seeds} seeds:\n" if seeds in SEED_SPLITS else f"On the seeds {seeds}:\n"
@@ -326,6 +326,8 @@ def _limits(
         if one.results.stale:
             version = one.results.version
             yield f"- Its training is of results version {version}, older than the code."
+        if one.results.uncommitted:
+            yield "- It was trained from an uncommitted state of the code."
     yield ""
 
 

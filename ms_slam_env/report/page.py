@@ -158,7 +158,7 @@ def _section(found: FoundResult, anchor: str, is_alone: bool) -> str:
     parts = [f'<h2 id="{anchor}-title">{escape(title)}</h2>']
     parts += [] if is_alone else [f'<p class="kind">{escape(kind)}</p>']
     parts += [f"<p>{escape(results.about)}</p>"] if results.about else []
-    parts += [f'<p class="stale">{escape(results.stale)}</p>'] if results.stale else []
+    parts += [f'<p class="stale">{escape(results.caveats)}</p>'] if results.caveats else []
     charts = [chart for chart in results.charts if chart.panels]
     parts += [_chart(chart, charts, f"{anchor}-c{n}") for n, chart in enumerate(charts)]
     parts += [_table(table, f"{anchor}-t{n}") for n, table in enumerate(results.tables)]

@@ -26,6 +26,10 @@ _PACKAGES = (
 )
 
 
+DIRTY = "-dirty"
+"""What follows a commit whose files were changed."""
+
+
 def provenance() -> dict[str, Any]:
     """Command, time (UTC), versions, git commit (None outside its checkout) and platform."""
     return {
@@ -55,7 +59,7 @@ def git_commit(package: Path = _PACKAGE) -> str | None:
     if commit is None or "__init__.py" not in blobs:
         return None
     is_dirty = any(not _is_blob(package / name, blob) for name, blob in blobs.items())
-    return f"{commit}-dirty" if is_dirty else commit
+    return f"{commit}{DIRTY}" if is_dirty else commit
 
 
 def _git(folder: Path, *command: str) -> str | None:

@@ -7,18 +7,23 @@
      "tables": [...], "charts": [...]}
 
 Whatever has a kind and tables is shown by ``ms-slam report``, which knows nothing else of it.
+
+Committed, the file stands alone and compressed, as ``results.json.xz``: what lay beside it was made
+of it. Every reader takes either form.
 """
 
 from __future__ import annotations
 
+import json
+import lzma
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import NoneType
 from typing import Any
 
-from ms_slam_env._runtime.input_files import read_json
-from ms_slam_env._runtime.output_files import write_text
+from ms_slam_env._runtime.input_files import is_named, read_bytes, read_json
+from ms_slam_env._runtime.output_files import check_out_folder, write_bytes, write_text
 from ms_slam_env._runtime.result_folders import result_folder
 from ms_slam_env.errors import InputError
 from ms_slam_env.metrics.registry import (
@@ -28,12 +33,15 @@ from ms_slam_env.metrics.registry import (
     versions_since,
 )
 from ms_slam_env.report.charts import Chart, chart_from_json
-from ms_slam_env.report.provenance import provenance
+from ms_slam_env.report.provenance import DIRTY, provenance
 from ms_slam_env.report.records import check_plain, from_plain, write_json
 from ms_slam_env.report.tables import Table, table_from_json
 
 RESULTS = "results.json"
 TABLE = "table.md"
+PACKED = ".xz"
+"""What the name of a compressed result ends with."""
+
 _MAX_BYTES = 200_000_000
 
 
@@ -77,9 +85,23 @@ class Results:
             f"{RESULTS_VERSIONS[self.version]}). Since then {newer}."
         )
 
+    @property
+    def uncommitted(self) -> str:
+        """A sentence where files differed from the commit that is named, else empty."""
+        rows = [str(row.get("commit")).endswith(DIRTY) for row in self.rows]
+        if any(rows):
+            return f"Made from an uncommitted state of the code: {sum(rows)} of {len(rows)} rows."
+        is_dirty = str(self.provenance.get("commit")).endswith(DIRTY)
+        return "Made from an uncommitted state of the code." if is_dirty else ""
+
+    @property
+    def caveats(self) -> str:
+        """What is to be known before a figure is believed: its age, its code; empty if nothing."""
+        return " ".join(filter(None, (self.stale, self.uncommitted)))
+
     def as_markdown(self) -> str:
-        """The tables, a note where they are out of date, and what made them."""
-        parts = [f"*{self.stale}*\n"] if self.stale else []
+        """The tables, a note with what is to be known first, and what made them."""
+        parts = [f"*{self.caveats}*\n"] if self.caveats else []
         parts += [table.as_markdown() for table in self.tables]
         parts.append(made_by(self.provenance, self.rows))
         return "\n".join(parts)
@@ -178,13 +200,17 @@ def _figures_of(path: Path) -> set[str]:
 
 
 def read_results(path: Path) -> Results:
-    """Read a result file.
+    """Read a result file, or the compressed one, ``path.xz``, that stands in its place.
 
     Raises:
         InputError: no such file, not a result, or keys that the registry does not know.
     """
+    packed = path if path.suffix == PACKED else path.with_name(path.name + PACKED)
     try:
-        content = from_plain(read_json(path, "result", _MAX_BYTES))
+        if path == packed or (is_named(packed) and not is_named(path)):
+            content = from_plain(_unpacked(packed))
+        else:
+            content = from_plain(read_json(path, "result", _MAX_BYTES))
     except RecursionError:
         raise InputError(f"{path} is not a result of ms-slam: it is nested too deeply") from None
     if not is_result(content):
@@ -208,6 +234,44 @@ def read_results(path: Path) -> Results:
         if isinstance(error, InputError):
             raise InputError(f"{path}: {error}") from None
         raise InputError(f"{path} is not a result of ms-slam: {error!r}") from None
+
+
+def _unpacked(path: Path) -> Any:
+    """JSON of a compressed file, which a stranger may have written."""
+    data = read_bytes(path, "result", _MAX_BYTES)
+    unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_MAX_BYTES)
+    try:
+        text = unpacker.decompress(data, max_length=_MAX_BYTES)
+        if not unpacker.eof:
+            raise lzma.LZMAError(f"cut short, or larger than {_MAX_BYTES / 1e6:.0f} MB unpacked")
+        return json.loads(text)
+    except (lzma.LZMAError, ValueError) as error:
+        raise InputError(f"{path} is not a packed JSON file: {error}") from None
+
+
+def pack_results(source: Path, target: Path) -> list[Path]:
+    """Write the results of folder ``source`` into ``target``, compressed; return what was written.
+
+    Other files of ``target`` that ``source`` has, too (a picture that a page shows), are renewed.
+
+    Raises:
+        InputError: no result in ``source``, or a JSON file that is none.
+    """
+    files = {}
+    for path in sorted(source.glob("*.json")):
+        read_results(path)
+        data = read_bytes(path, "result", _MAX_BYTES)
+        files[f"{path.name}{PACKED}"] = lzma.compress(data, preset=lzma.PRESET_EXTREME)
+    if not files:
+        raise InputError(f"{source} holds no results")
+    check_out_folder(target)
+    names = [path.name for path in target.iterdir()] if target.is_dir() else []
+    beside = [name for name in sorted(names) if name not in files and (source / name).is_file()]
+    files |= {name: read_bytes(source / name, "file", _MAX_BYTES) for name in beside}
+    target.mkdir(parents=True, exist_ok=True)
+    for name, data in files.items():
+        write_bytes(target / name, data)
+    return [target / name for name in files]
 
 
 def _checked_rows(rows: Any) -> list[Mapping[str, Any]]:

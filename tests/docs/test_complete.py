@@ -13,6 +13,7 @@ from ms_slam_env import scenes, slam, tasks
 from ms_slam_env.benchmark import EXPERIMENTS, experiment_class
 from ms_slam_env.cli import COMMANDS
 from ms_slam_env.env.registry import OBSERVATIONS
+from ms_slam_env.report.discovery import find_results
 from ms_slam_env.report.results import read_results
 from ms_slam_env.sequences.perturbations import PERTURBATIONS
 
@@ -22,9 +23,9 @@ _SECTION = re.search(r'entry-points\."ms_slam_env.planners"\]\n(.*?)\n\n', _PYPR
 assert _SECTION
 PLANNERS = re.findall(r"^([\w-]+) = ", _SECTION[1], re.MULTILINE)
 COMMITTED = [
-    path
-    for path in sorted((ROOT / "docs" / "results").glob("*/results.json"))
-    if read_results(path).kind in EXPERIMENTS.own and read_results(path).rows
+    one.path
+    for one in find_results(ROOT / "docs" / "results")[0]
+    if one.results.kind in EXPERIMENTS.own and one.results.rows
 ]
 
 

@@ -17,8 +17,8 @@ FILMS = sorted((PICTURES / "environments").glob("*"))
 @pytest.mark.parametrize("path", FILMS, ids=lambda path: path.stem)
 def test_a_film_moves_and_is_small(path: Path) -> None:
     assert path.stem in SHOWN_IDS
-    assert path.stat().st_size <= 400_000
-    assert Image.open(path).n_frames > 10
+    assert path.stat().st_size <= 200_000
+    assert Image.open(path).n_frames > 7
 
 
 def test_every_environment_is_filmed() -> None:
@@ -27,5 +27,5 @@ def test_every_environment_is_filmed() -> None:
 
 def test_the_picture_on_top_of_the_readme_is_small() -> None:
     path = PICTURES / "home.webp"
-    assert path.stat().st_size <= 1_200_000
+    assert path.stat().st_size <= 600_000
     assert Image.open(path).n_frames > 50

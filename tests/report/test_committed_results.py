@@ -1,46 +1,42 @@
-"""What is committed under docs/results: of the one form, by known metrics, with its tables."""
+"""What is committed under docs/results: packed results by known metrics, and what pages show."""
 
 from __future__ import annotations
 
-import json
+import re
 from pathlib import Path
 
 import pytest
 
 from ms_slam_env.metrics.registry import check_keys
-from ms_slam_env.report.results import Results, is_result, read_results
+from ms_slam_env.report.discovery import find_results
+from ms_slam_env.report.results import read_results
 
-FOLDER = Path(__file__).resolve().parents[2] / "docs" / "results"
-PATHS = sorted(FOLDER.rglob("*.json"))
-
-
-def is_converted(path: Path) -> bool:
-    return is_result(json.loads(path.read_text(encoding="utf-8")))
+ROOT = Path(__file__).resolve().parents[2]
+FOLDER = ROOT / "docs" / "results"
+PATHS = sorted(FOLDER.rglob("*.json.xz"))
 
 
-RESULTS = [path for path in PATHS if is_converted(path)]
-
-
-def test_every_file_is_a_result() -> None:
-    assert [path for path in PATHS if path not in RESULTS] == []
-
-
-@pytest.mark.parametrize("path", RESULTS, ids=lambda path: str(path.relative_to(FOLDER)))
-def test_a_result_can_be_read_and_its_tables_are_beside_it(path: Path) -> None:
+@pytest.mark.parametrize("path", PATHS, ids=lambda path: str(path.relative_to(FOLDER)))
+def test_a_result_can_be_read(path: Path) -> None:
     results = read_results(path)
     for row in results.rows:
         check_keys(row.get("result") or {})
     assert results.tables
     assert results.provenance.get("command"), "which command made it?"
-    assert results.as_markdown() in tables_beside(path), "table.md says something else"
-    tell_age(path, results)
-
-
-def tables_beside(path: Path) -> list[str]:
-    return [table.read_text(encoding="utf-8") for table in path.parent.glob("*.md")]
-
-
-def tell_age(path: Path, results: Results) -> None:
-    """Say which results are older than the code; they say so themselves above their tables."""
-    if results.stale:
+    if results.stale:  # as it says above its tables
         print(f"{path.relative_to(FOLDER)}: {results.stale}")
+
+
+def test_every_result_is_found_with_its_tables() -> None:
+    found, absent = find_results(FOLDER)
+    assert [one.path for one in found] == PATHS
+    assert absent == []
+
+
+def test_beside_results_lies_only_what_pages_name() -> None:
+    """Tables and figures are made of the results; `ms-slam docs --pack` leaves them out."""
+    pages = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]
+    named = "\n".join(page.read_text(encoding="utf-8") for page in pages)
+    others = [path for path in FOLDER.rglob("*") if path.is_file() and path not in PATHS]
+    places = [path.relative_to(FOLDER).as_posix() for path in others]
+    assert [p for p in places if not re.search(rf"results/{re.escape(p)}\b", named)] == []

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import lzma
+import shutil
 from pathlib import Path
 
 import pytest
@@ -10,7 +12,7 @@ import pytest
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
 from ms_slam_env.report.markdown_pages import with_tables
-from ms_slam_env.report.results import write_results
+from ms_slam_env.report.results import pack_results, read_results, write_results
 from ms_slam_env.report.tables import make_table
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -37,13 +39,6 @@ def test_a_table_is_written_between_its_comments(clone: Path) -> None:
     expected = PAGE.format("x columns=ate_m,planner rows=2", table)
     assert (clone / "README.md").read_text() == expected
     assert main([*arguments, "--check"]) == 0
-    beside = clone / "docs/results/x/table.md"
-    now = beside.read_text()
-    beside.write_text("older\n")
-    assert main([*arguments, "--check"]) == 1
-    assert beside.read_text() == "older\n"
-    assert main(arguments) == 0
-    assert beside.read_text() == now
 
 
 def test_age_and_command_stand_with_the_table(clone: Path) -> None:
@@ -74,6 +69,55 @@ def test_a_comment_that_says_nothing_useful_is_refused(
 ) -> None:
     with pytest.raises(InputError, match=f"page, {message}"):
         with_tables(page, clone / "docs/results")
+
+
+def test_packed_results_make_the_same_pages(
+    clone: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    results, away = clone / "docs/results", clone / "away"
+    (results / "x/chart.png").write_bytes(b"new")
+    shutil.move(results / "x", away)
+    (results / "x").mkdir()
+    (results / "x/chart.png").write_bytes(b"old")
+    assert main(["docs", "--pack", str(away), str(results / "x")]) == 0
+    assert "results.json.xz: " in capsys.readouterr().out
+    packed = results / "x/results.json.xz"
+    assert lzma.decompress(packed.read_bytes()) == (away / "results.json").read_bytes()
+    assert (results / "x/chart.png").read_bytes() == b"new"
+    assert sorted(path.name for path in (results / "x").iterdir()) == ["chart.png", packed.name]
+    page = PAGE.format("x made_by=yes", "") + PAGE.format("x/results.json table=1", "")
+    of_packed = with_tables(page, results)
+    shutil.copy(away / "results.json", results / "x")
+    packed.write_bytes(b"")  # what is not packed comes first
+    assert with_tables(page, results) == of_packed
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"{}", "not a packed JSON file"),
+        (lzma.compress(b"{}")[:-4], "cut short"),
+        (lzma.compress(b"{"), "not a packed JSON file"),
+        (lzma.compress(b"[" * 100_000), "nested too deeply"),
+        (lzma.compress(b" " * 30_000_000, preset=0), "larger than 20 MB unpacked"),
+    ],
+)
+def test_a_pack_of_a_stranger_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, data: bytes, message: str
+) -> None:
+    monkeypatch.setattr("ms_slam_env.report.results._MAX_BYTES", 20_000_000)
+    (tmp_path / "results.json.xz").write_bytes(data)
+    with pytest.raises(InputError, match=message):
+        read_results(tmp_path / "results.json")
+
+
+def test_what_is_no_result_is_not_packed(tmp_path: Path) -> None:
+    for content, message in (("", "holds no results"), ("[]", "not a result")):
+        if content:
+            (tmp_path / "a.json").write_text(content)
+        with pytest.raises(InputError, match=message):
+            pack_results(tmp_path, tmp_path / "packed")
+    assert not (tmp_path / "packed").exists()
 
 
 def test_a_folder_without_pages_is_one_line(

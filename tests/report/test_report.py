@@ -191,6 +191,22 @@ def test_only_what_a_version_changed_is_older_than_it(tmp_path: Path) -> None:
     assert read_results(path).stale == ""
 
 
+def test_what_an_uncommitted_state_made_says_so(tmp_path: Path) -> None:
+    path = write_example(tmp_path / "results.json")
+    content = json.loads(path.read_text())
+    said = "Made from an uncommitted state of the code"
+    content["provenance"]["commit"] = "0123abcd"
+    path.write_text(json.dumps(content))
+    assert said not in read_results(path).as_markdown()
+    content["provenance"]["commit"] = "0123abcd-dirty"
+    path.write_text(json.dumps(content))
+    assert f"*{said}.*" in read_results(path).as_markdown()
+    content[content["rows_key"]][0]["commit"] = "0123abcd-dirty"
+    path.write_text(json.dumps(content))
+    assert f"{said}: 1 of " in read_results(path).as_markdown()
+    assert f"{said}: 1 of " in report_of(tmp_path)
+
+
 @pytest.mark.parametrize("kind", sorted(set(chain(*CHANGED_KINDS.values())) - {"train"}))
 def test_kinds_that_a_version_changed_are_experiments(kind: str) -> None:
     assert issubclass(experiment_class(kind), Experiment)
