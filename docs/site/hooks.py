@@ -9,6 +9,7 @@ import inspect
 import json
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,8 @@ API = {
 
 
 def on_config(config: Any) -> Any:
-    """Put the made pages into the places that the navigation keeps for them."""
+    """Put the version into the title, and the made pages into their places of the navigation."""
+    config.site_name = f"{config.site_name} {metadata.version('ms-slam-env')}"
     made = {"Gallery": _gallery(), "API": _api(), "Results": _results()}
     for group in (config.nav, *(next(iter(entry.values())) for entry in config.nav)):
         for entry in group if isinstance(group, list) else ():
