@@ -77,7 +77,9 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Lead links that hold in a clone to the pages of the site."""
+    """Lead links that hold in a clone to the pages of the site; let search find guides first."""
+    if re.match("api/|gallery/|results/.*/", page.file.src_uri):
+        page.meta.setdefault("search", {"boost": 1e-3})
     up = "../" * page.file.src_uri.count("/")
     for here, there in (
         *((rf"\((\.\./)?{name}\.md", f"({up}{name.lower()}.md") for name in ROOT_TEXTS),
