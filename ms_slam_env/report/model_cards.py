@@ -330,10 +330,12 @@ def _limits(
 
 
 def _training(one: FoundResult, page: Path) -> Iterator[str]:
+    """The training curve as figures; where there is none, as a table."""
     yield "### Training curve\n"
-    for chart in one.results.charts:
-        figure = one.path.with_name(f"{chart.name}.png")
-        if figure.is_file():
-            link = Path(os.path.relpath(figure, page.parent)).as_posix()
-            yield f"![{chart.title}]({link})\n\n*{chart.caption}.*\n"
-    yield replace(one.results.tables[0], title="").as_markdown()
+    figures = [(chart, one.path.with_name(f"{chart.name}.png")) for chart in one.results.charts]
+    shown = [(chart, figure) for chart, figure in figures if figure.is_file()]
+    for chart, figure in shown:
+        link = Path(os.path.relpath(figure, page.parent)).as_posix()
+        yield f"![{chart.title}]({link})\n\n*{chart.caption}.*\n"
+    if not shown:
+        yield replace(one.results.tables[0], title="").as_markdown()
