@@ -8,6 +8,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,8 @@ API = {
 
 
 def on_config(config: Any) -> Any:
-    """Put the made pages into the places that the navigation keeps for them."""
+    """Put the version into the title, and the made pages into their places of the navigation."""
+    config.site_name = f"{config.site_name} {metadata.version('ms-slam-env')}"
     made = {"Gallery": _gallery(), "API": _api(), "Records": _results()}
     for group in (config.nav, *(next(iter(entry.values())) for entry in config.nav)):
         for entry in group if isinstance(group, list) else ():
@@ -74,7 +76,9 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Lead links that hold in a clone to the pages of the site."""
+    """Lead links that hold in a clone to the pages of the site; let search find guides first."""
+    if re.match("api/|gallery/|results/.*/", page.file.src_uri):
+        page.meta.setdefault("search", {"boost": 1e-3})
     up = "../" * page.file.src_uri.count("/")
     for here, there in (
         *((rf"\((\.\./)?{name}\.md", f"({up}{name.lower()}.md") for name in ROOT_TEXTS),

@@ -33,7 +33,7 @@ _SCORES = (
 _ACROSS = "over all scenes"
 _VERDICTS = (
     ("Better than each other", "f_score_5cm", "F-score"),
-    ("Sooner than each other", "f_score_5cm_area", "area under F-score over steps"),
+    ("Sooner than each other", "f_score_5cm_area", "area under F-score"),
     ("Better rewarded than each other", "return", "return"),
 )
 """A table of probabilities, by what the best classical planner is chosen, and what it is."""
@@ -168,22 +168,22 @@ def _facts(policy: Policy) -> str:
     scenes = ", ".join(f"`{name}`" for name in where)
     actions = " x ".join(map(str, known["actions"]))
     lines = {
-        "Run it": f"`ms-slam benchmark --planners {policy.planner}`",
+        "Run": f"`ms-slam benchmark --planners {policy.planner}`",
         "File": f"`{policy.path.name}`, {policy.path.stat().st_size / 1e3:.0f} kB",
         "Environment": f"`{known['env_id']}`{changed}",
-        "Sees": f"`{known['observation']}`, {known['inputs']} numbers; has {actions} actions",
+        "Observation": f"`{known['observation']}`, {known['inputs']} numbers; {actions} actions",
         "Network": network,
-        "Learnt by": f"`{known['algorithm']}`, {known['timesteps']:,} steps in "
+        "Trained by": f"`{known['algorithm']}`, {known['timesteps']:,} steps in "
         f"{known['minutes']:.0f} minutes, seed {options.get('seed', 'unknown')}",
     }
     if scenes:
         seeds, steps = options.get("scene_seeds", "?"), options.get("episode_steps", "?")
-        lines["In"] = f"{scenes}, {seeds} training seeds each, episodes of {steps} steps"
+        lines["Trained in"] = f"{scenes}, {seeds} training seeds each, episodes of {steps} steps"
     if options.get("also"):
         tasks = ", ".join(f"`{name}`" for name in options["also"])
-        lines["And in"] = f"{tasks}, of the parallel environments in turn"
+        lines["Also trained in"] = f"{tasks}; the parallel environments take turns"
     if options.get("init"):
-        lines["Begun from"] = f"`{options['init']}`"
+        lines["Started from"] = f"`{options['init']}`"
     return "".join(f"- {what}: {value}\n" for what, value in lines.items())
 
 
@@ -253,7 +253,7 @@ def _score_text(score: _Score, policy: Policy) -> Iterator[str]:
             if chance is not None:
                 shown = format_value(chance, "improvement")
                 verdict = _verdict(chance, f"`{best}`, {which}")
-                yield f"By {what} {verdict}: its own is better in {shown} % of pairs.\n"
+                yield f"By {what}: {verdict} (better in {shown} % of pairs).\n"
 
 
 def _task(one: FoundResult, table: Table) -> str:
@@ -284,8 +284,8 @@ def _verdict(chance: Interval, rival: str) -> str:
     if chance.low > 0.5:
         return f"it beats {rival}"
     if chance.high < 0.5:
-        return f"it does not beat {rival}"
-    return f"neither it nor {rival}, is shown to be better"
+        return f"it loses to {rival}"
+    return f"no difference from {rival}, is shown"
 
 
 # -- Where it ends ---------------------------------------------------------------------------------
@@ -308,34 +308,36 @@ def _limits(
 ) -> Iterator[str]:
     known, options = policy.known, policy.options
     sees, actions = known["observation"], " x ".join(map(str, known["actions"]))
-    yield f"- It fits observations `{sees}` and {actions} actions; anything else is refused."
+    yield f"- It fits only the observation `{sees}` with {actions} actions."
     rows = [row for one in benchmarks for row in one.results.rows]
     met = {row["spec"].get("scene") for row in rows if _is_of(policy, row["spec"].get("planner"))}
     new = sorted(str(name) for name in met - set(options.get("scenes") or ()))
     if options.get("scenes") and new and not options.get("also"):  # whose scenes it does not say
-        yield f"- Of the scenes of its scores it was not trained in {', '.join(new)}."
+        yield f"- It is scored in scenes that it was not trained in: {', '.join(new)}."
     if benchmarks and not any(map(_may_be_of_training, benchmarks)):
-        yield "- No score is on a seed that it was trained with."
+        yield "- All scores are on seeds that it was not trained on."
     if not trainings:
-        yield "- The curve of its training is not among the results."
+        yield "- Its training curve is not among the results."
     if training_seeds > 1:
         yield f"- Trained with {training_seeds} seeds; this is one of them."
     else:
-        yield "- One training run: how much of it is luck is not known."
+        yield "- One training run: how much the result varies between runs is not known."
     for one in trainings:
         if one.results.stale:
             version = one.results.version
-            yield f"- Its training is of results version {version}, older than the code."
+            yield f"- Its training curve is of results version {version}, older than the code."
         if one.results.uncommitted:
             yield "- It was trained from an uncommitted state of the code."
     yield ""
 
 
 def _training(one: FoundResult, page: Path) -> Iterator[str]:
-    yield "### While it learnt\n"
-    for chart in one.results.charts:
-        figure = one.path.with_name(f"{chart.name}.png")
-        if figure.is_file():
-            link = Path(os.path.relpath(figure, page.parent)).as_posix()
-            yield f"![{chart.title}]({link})\n\n*{chart.caption}.*\n"
-    yield replace(one.results.tables[0], title="").as_markdown()
+    """The training curve as figures; where there is none, as a table."""
+    yield "### Training curve\n"
+    figures = [(chart, one.path.with_name(f"{chart.name}.png")) for chart in one.results.charts]
+    shown = [(chart, figure) for chart, figure in figures if figure.is_file()]
+    for chart, figure in shown:
+        link = Path(os.path.relpath(figure, page.parent)).as_posix()
+        yield f"![{chart.title}]({link})\n\n*{chart.caption}.*\n"
+    if not shown:
+        yield replace(one.results.tables[0], title="").as_markdown()

@@ -116,18 +116,18 @@ def test_a_card_says_what_the_file_and_the_results_say(clone: Path) -> None:
     scores(clone / "docs/results/judged", Interval(0.1, 0.02, 0.3))
     text = card(clone)
     assert "## `agent-hand`" in text
-    assert "- Sees: `features`, 5 numbers; has 7 actions" in text
+    assert "- Observation: `features`, 5 numbers; 7 actions" in text
     assert "- Environment: `MSActiveSLAM-FreeCamera-v0`, step_m 0.1" in text
     assert "100 steps in 2 minutes, seed 3" in text
     assert "ms-slam train ppo --seed 3\n" in text
     assert "### In `kitchen`" in text
     assert "| nbv | 10 | 90 | 30 [10, 60] |" in text
     assert "| random |" not in text  # the best classical planner alone
-    assert "By area under F-score over steps it beats `random`" in text
-    assert "its own is better in 70 [55, 80] % of pairs" in text
-    assert "By F-score it does not beat `nbv`, the best classical planner: its own is" in text
+    assert "By area under F-score: it beats `random`" in text
+    assert "better in 70 [55, 80] % of pairs" in text
+    assert "By F-score: it loses to `nbv`, the best classical planner (better in" in text
     assert "10 [2.0, 30] % of pairs" in text
-    assert "not trained in wall." in text
+    assert "not trained in: wall." in text
     assert text.count("| 100 | 12 |") == 1
     assert "| 64 |" not in text
     assert main(["docs", "--root", str(clone), "--check"]) == 0
@@ -136,10 +136,10 @@ def test_a_card_says_what_the_file_and_the_results_say(clone: Path) -> None:
 @pytest.mark.parametrize(
     ("chance", "verdict"),
     [
-        (Interval(0.8, 0.6, 0.9), "it beats `nbv`, the best classical planner: "),
+        (Interval(0.8, 0.6, 0.9), "it beats `nbv`, the best classical planner (better in 80"),
         (
             Interval(0.6, 0.4, 0.8),
-            "neither it nor `nbv`, the best classical planner, is shown to be better: ",
+            "no difference from `nbv`, the best classical planner, is shown (better in 60",
         ),
     ],
 )
@@ -158,13 +158,13 @@ def test_a_score_on_other_seeds_than_those_of_tests_says_so(clone: Path, seeds: 
 def test_a_score_on_ones_own_seeds_says_which(clone: Path, seeds: str, is_new: bool) -> None:
     scores(clone / "docs/results/judged", Interval(0.8, 0.6, 0.9), seeds=seeds)
     assert f"On the seeds {seeds}:\n" in card(clone)
-    assert ("No score is on a seed that it was trained with" in card(clone)) == is_new
+    assert ("All scores are on seeds that it was not trained on" in card(clone)) == is_new
 
 
 def test_one_rival_is_not_called_the_best(clone: Path) -> None:
     scores(clone / "docs/results/judged", Interval(0.8, 0.6, 0.9), names=("nbv",))
     text = card(clone)
-    assert "it beats `nbv`, the only classical planner judged: " in text
+    assert "it beats `nbv`, the only classical planner judged (better in 80" in text
     assert "the best classical planner" not in text
 
 
@@ -207,7 +207,7 @@ def test_training_seeds_are_counted(clone: Path) -> None:
     training(clone / "docs/results/other_way", seed=6, scenes=["wall"])
     text = card(clone)
     assert "Trained with 3 seeds" in text
-    assert text.count("### While it learnt") == 1
+    assert text.count("### Training curve") == 1
 
 
 def test_a_policy_taken_before_its_run_went_on_has_the_curve_of_the_run(clone: Path) -> None:
@@ -217,8 +217,8 @@ def test_a_policy_taken_before_its_run_went_on_has_the_curve_of_the_run(clone: P
     training(clone / "docs/results/own", rounds=7)
     training(clone / "docs/results/not_so_far", rounds=2, steps=50)
     text = card(clone)
-    assert text.count("### While it learnt") == 1
-    assert "The curve of its training is not" not in text
+    assert text.count("### Training curve") == 1
+    assert "Its training curve is not" not in text
 
 
 def test_a_policy_trained_in_further_tasks_names_them_and_no_scene_that_it_missed(
@@ -230,7 +230,10 @@ def test_a_policy_trained_in_further_tasks_names_them_and_no_scene_that_it_misse
     known = replace(METADATA, options={**OPTIONS, "also": ["arm-kinematic", "x.yaml"]})
     policy.write_bytes(as_bytes(json.dumps(asdict(known)), **dict.fromkeys(["optimizer.step"])))
     text = card(clone)
-    assert "- And in: `arm-kinematic`, `x.yaml`, of the parallel environments in turn\n" in text
+    assert (
+        "- Also trained in: `arm-kinematic`, `x.yaml`; the parallel environments take turns\n"
+        in text
+    )
     assert "not trained in" not in text
 
 
@@ -248,8 +251,8 @@ def test_by_return_the_rival_is_the_first_of_the_ranked(clone: Path) -> None:
         clone / "docs/results/judged", Interval(0.1, 0.02, 0.3), by_return=Interval(0.3, 0.2, 0.4)
     )
     text = card(clone)
-    assert "By return it does not beat `random`" in text
-    assert "its own is better in 30 [20, 40] % of pairs" in text
+    assert "By return: it loses to `random`" in text
+    assert "better in 30 [20, 40] % of pairs" in text
 
 
 @pytest.mark.parametrize("content", [b"", b"\xff" * 64, as_bytes("[]"), b"{}"])
