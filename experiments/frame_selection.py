@@ -13,7 +13,7 @@ from ms_slam_env import metrics, slam
 from ms_slam_env._runtime.parallel import limit_threads
 from ms_slam_env.benchmark.episode_scores import LOST_ERROR_M
 from ms_slam_env.benchmark.experiment import Experiment
-from ms_slam_env.camera import RGBDFrame, parse_image_size
+from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.map_quality import map_quality
@@ -23,7 +23,7 @@ from ms_slam_env.report.charts import Chart, Guide, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Column, Grouping, Table, flattened, make_table, summary
 from ms_slam_env.sequences import Sequence as FrameSequence
-from ms_slam_env.sequences import UnevenPath, check_sequence, open_sequence
+from ms_slam_env.sequences import UnevenPath, open_sequence
 from ms_slam_env.slam.frame_selection import (
     FrameSelectionConfig,
     RegularConfig,
@@ -90,14 +90,11 @@ class FrameSelection(Experiment, Checked):
         for name in ("sequences", "managements"):
             if not getattr(self, name):
                 raise InputError(f"{name} is empty")
-        for text in self.sequences:
-            check_sequence(text)
         for text in self.managements:
             if parse_frame_selection(text).uses_clock:
                 raise InputError(f"{text!r} measures time: no two runs are alike")
         slam.POINT.find(self.backend)
-        parse_image_size(self.image_size)
-        return [self.spec(FilterSpec, sequence=sequence) for sequence in self.sequences]
+        return self.each(FilterSpec, sequence=self.sequences)
 
     @staticmethod
     def run(spec: FilterSpec) -> dict[str, Any]:

@@ -23,7 +23,6 @@ from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished, format_number, make_table
 from ms_slam_env.sensor import RGBDSensor
-from ms_slam_env.sensor.noise import noise_config
 from ms_slam_env.sensor.scene_cache import get_scene
 from ms_slam_env.sequences import handheld_trajectory
 
@@ -81,14 +80,11 @@ class PoseCovariance(Experiment, Checked):
 
     def specs(self) -> list[CovarianceSpec]:
         """Every sequence."""
-        xtion(self.size)
-        noise_config(self.noise)
         split = {VALIDATION: self.validation_seeds, TEST: self.test_seeds}
         return [
-            self.spec(CovarianceSpec, seeds=seeds, scene=scene, seed=seed)
+            spec
             for seeds, numbers in split.items()
-            for scene in self.scenes
-            for seed in numbers
+            for spec in self.each(CovarianceSpec, seeds=(seeds,), scene=self.scenes, seed=numbers)
         ]
 
     @staticmethod

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import subprocess
@@ -18,7 +19,7 @@ from ms_slam_experiments.shared import slam_speed_child
 
 from ms_slam_env import scenes
 from ms_slam_env._runtime.parallel import thread_environment
-from ms_slam_env.benchmark.experiment import Experiment
+from ms_slam_env.benchmark.experiment import Experiment, check_names
 from ms_slam_env.camera import xtion
 from ms_slam_env.config import Checked, bounded, check_range
 from ms_slam_env.errors import InputError
@@ -91,16 +92,15 @@ class SlamSpeed(Experiment, Checked):
     def specs(self) -> list[SpeedSpec]:
         """Every round, size and version, in turns."""
         backend_parameters(self.backend)
-        for size in self.sizes:
-            xtion(size)
         checkouts = {THIS: ""}
         if self.against is not None:
             checkouts[OTHER] = str(self.against)
+        versions = [{"version": name, "checkout": path} for name, path in checkouts.items()]
+        turns = itertools.product(range(self.repeats), self.sizes, versions)
+        check_names(self)
         return [
-            self.spec(SpeedSpec, version=version, size=size, repeat=repeat, checkout=checkout)
-            for repeat in range(self.repeats)
-            for size in self.sizes
-            for version, checkout in checkouts.items()
+            self.spec(SpeedSpec, repeat=repeat, size=size, **version)
+            for repeat, size, version in turns
         ]
 
     @staticmethod
@@ -235,7 +235,7 @@ def run_child(arguments: dict[str, Any], checkout: Path | None) -> list[dict[str
     Raises:
         RuntimeError: the process failed.
     """
-    root = (checkout or Path(__file__).parents[2]).resolve()
+    root = (checkout or Path(__file__).parents[1]).resolve()
     environment = os.environ | thread_environment(1) | {"PYTHONPATH": str(root)}
     # Not as a script: its folder, first on the path, would hide modules of Python. In the checkout:
     # the current folder comes before PYTHONPATH.
