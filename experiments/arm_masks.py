@@ -30,7 +30,7 @@ from ms_slam_env.geometry import invert, make_pose, relative_angle, transform_po
 from ms_slam_env.report.statistics import bootstrap_interval, share_interval
 from ms_slam_env.report.tables import Column, Row, Table, finished, make_table
 from ms_slam_env.robot.arm import ArmModel
-from ms_slam_env.robot.arm.arm import KinematicArm
+from ms_slam_env.robot.arm.arm import ArmEmbodiment
 from ms_slam_env.robot.arm.base_placement import COLUMN_RADIUS_M
 from ms_slam_env.robot.arm.dynamic_arm import DynamicArm
 from ms_slam_env.robot.arm.feasibility import REASONS
@@ -38,7 +38,7 @@ from ms_slam_env.scenes import Scene
 from ms_slam_env.sensor import RGBDSensor
 
 Float64 = NDArray[np.float64]
-A = TypeVar("A", bound=KinematicArm)
+A = TypeVar("A", bound=ArmEmbodiment)
 
 DEFAULT_SCENES = ("window", "table", "wall", "carpet", "living_room")
 _START_TRIES = 20

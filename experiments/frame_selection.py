@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ms_slam_env import metrics, slam
+from ms_slam_env import metrics, sequences, slam
 from ms_slam_env._runtime.parallel import limit_threads
 from ms_slam_env.benchmark.episode_scores import LOST_ERROR_M
 from ms_slam_env.benchmark.experiment import Experiment
@@ -22,8 +22,6 @@ from ms_slam_env.evaluation.seen_surface import seen_surface
 from ms_slam_env.report.charts import Chart, Guide, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Column, Grouping, Table, flattened, make_table, summary
-from ms_slam_env.sequences import Sequence as FrameSequence
-from ms_slam_env.sequences import UnevenPath, open_sequence
 from ms_slam_env.slam.frame_selection import (
     FrameSelectionConfig,
     RegularConfig,
@@ -100,11 +98,11 @@ class FrameSelection(Experiment, Checked):
     def run(spec: FilterSpec) -> dict[str, Any]:
         """Every filter; beside each that is no regular skipping, that at the filter's share."""
         limit_threads(1)
-        path = UnevenPath(spec.frames)
-        opened = open_sequence(spec.sequence, spec.image_size, path=path, with_truth=True)
+        path = sequences.UnevenPath(spec.frames)
+        opened = sequences.open_sequence(spec.sequence, spec.image_size, path=path, with_truth=True)
         surface = seen_surface(opened)
         frames = tuple(opened.frames)
-        sequence = FrameSequence(frames, opened.poses, opened.intrinsics, opened.name)
+        sequence = sequences.Sequence(frames, opened.poses, opened.intrinsics, opened.name)
         runs = []
         for text in spec.managements:
             config = parse_frame_selection(text)
@@ -136,7 +134,7 @@ class FrameSelection(Experiment, Checked):
 
 
 def measure(
-    config: FrameSelectionConfig, backend: str, sequence: FrameSequence, surface: Any
+    config: FrameSelectionConfig, backend: str, sequence: sequences.Sequence, surface: Any
 ) -> dict[str, Any]:
     """Track the sequence from its true first pose behind a filter.
 
@@ -166,7 +164,7 @@ def measure(
 
 
 def _filter_ms(
-    config: FrameSelectionConfig, sequence: FrameSequence, frames: list[RGBDFrame]
+    config: FrameSelectionConfig, sequence: sequences.Sequence, frames: list[RGBDFrame]
 ) -> float:
     """Processor time in which the filter judges a frame."""
     judge = config.make_filter(sequence.intrinsics)

@@ -15,7 +15,7 @@ import numpy as np
 from ms_slam_experiments.shared.loop_paths import PATHS, returning_path
 from numpy.typing import NDArray
 
-from ms_slam_env import scenes
+from ms_slam_env import metrics, scenes, sensor, sequences
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.camera import xtion
 from ms_slam_env.config import from_dict, nested_options
@@ -24,15 +24,12 @@ from ms_slam_env.evaluation.loop_closures import WRONG_DEG, pose_error
 from ms_slam_env.evaluation.map_quality import map_quality
 from ms_slam_env.geometry import invert
 from ms_slam_env.geometry.point_clouds import voxel_downsample
-from ms_slam_env.metrics import ate_rmse, path_length, tracked_errors
 from ms_slam_env.metrics.registry import metric
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.figures import caption, new_figure, save
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished, make_table, measured, summary
 from ms_slam_env.scenes import Scene
-from ms_slam_env.sensor import NoiseConfig
-from ms_slam_env.sequences import render_sequence
 from ms_slam_env.slam.surfel import SurfelConfig
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
 
@@ -58,9 +55,9 @@ METRICS = (
 )
 TRACKED = ("ate_tracked_m", "tracked_share")
 GAPS = ("before_m", "after_m")  # between new and old map
-NOISES: dict[str, str | NoiseConfig] = {
+NOISES: dict[str, str | sensor.NoiseConfig] = {
     "kinect": "kinect",
-    "coarse": NoiseConfig(axial=2.0, lateral=1.5),  # times that of a Kinect
+    "coarse": sensor.NoiseConfig(axial=2.0, lateral=1.5),  # times that of a Kinect
 }
 _WARM_UP = 5  # frames left out of the timing
 WRONG_M = 0.05  # a closure is wrong if it leaves new and old map further apart than this
@@ -123,7 +120,7 @@ class LoopClosure(Experiment):
         scene = scenes.make(spec.scene, spec.seed)
         truth = returning_path(scene, spec.path, spec.seed, spec.step_m, spec.step_deg)
         camera = xtion(spec.size)
-        sequence = render_sequence(scene, truth, camera, NOISES[spec.noise], spec.seed)
+        sequence = sequences.render_sequence(scene, truth, camera, NOISES[spec.noise], spec.seed)
         options = from_dict(SurfelConfig, spec.options, "options")
         config = replace(options, loop_closure=spec.closure)
         system = BatchedSurfelSlam(1, camera, config)
@@ -157,12 +154,12 @@ class LoopClosure(Experiment):
         error_m = np.linalg.norm(estimate[:, :3, 3] - truth[:, :3, 3], axis=1)
         return {
             "frames": len(truth),
-            "path_m": path_length(truth),
-            "ate_unaligned_m": ate_rmse(estimate, truth, align="none"),
-            "ate_m": ate_rmse(estimate, truth),
-            **tracked_errors(estimate, truth, tracked),
-            "final_ate_unaligned_m": ate_rmse(final, truth, align="none"),
-            "final_ate_m": ate_rmse(final, truth),
+            "path_m": metrics.path_length(truth),
+            "ate_unaligned_m": metrics.ate_rmse(estimate, truth, align="none"),
+            "ate_m": metrics.ate_rmse(estimate, truth),
+            **metrics.tracked_errors(estimate, truth, tracked),
+            "final_ate_unaligned_m": metrics.ate_rmse(final, truth, align="none"),
+            "final_ate_m": metrics.ate_rmse(final, truth),
             "end_error_m": float(error_m[-1]),
             "largest_error_m": float(error_m.max()),
             **map_quality(system.map.points(stable=False), surface, ("map_error_capped_rms_m",)),

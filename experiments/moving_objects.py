@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env import metrics, slam
+from ms_slam_env import metrics, sequences, slam
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.config import Checked, bounded, parse_named
 from ms_slam_env.errors import InputError
@@ -19,9 +18,10 @@ from ms_slam_env.evaluation.run_sequence import run_sequence
 from ms_slam_env.report.charts import Chart, scatter
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished, make_table, summary
-from ms_slam_env.sequences import HandheldPath, RenderedSequence, open_sequence
-from ms_slam_env.sequences.rendering import RenderedFrames
 from ms_slam_env.slam.base import TrackResult
+
+if TYPE_CHECKING:
+    from ms_slam_env.sequences.rendering import RenderedFrames
 
 _BOXES = "kinect+moving-objects,kind=box,count"
 _PEOPLE = "kinect+moving-objects,kind=person,speed_m_s=1,count"
@@ -156,10 +156,10 @@ class MovingObjectsExperiment(Experiment, Checked):
         save_image(out / "mask.png", _picture(_rendered(spec)), compression=9)
 
 
-def _rendered(spec: MovingObjectsSpec) -> RenderedSequence:
-    path = HandheldPath(spec.frames)
-    sequence = open_sequence(spec.sequence, spec.image_size, path=path, with_truth=True)
-    return cast(RenderedSequence, sequence)
+def _rendered(spec: MovingObjectsSpec) -> sequences.RenderedSequence:
+    path = sequences.HandheldPath(spec.frames)
+    sequence = sequences.open_sequence(spec.sequence, spec.image_size, path=path, with_truth=True)
+    return cast(sequences.RenderedSequence, sequence)
 
 
 def _lines(rows: Sequence[Row]) -> list[Mapping[str, Any]]:
@@ -176,8 +176,10 @@ def _lines(rows: Sequence[Row]) -> list[Mapping[str, Any]]:
     ]
 
 
-def _picture(sequence: RenderedSequence) -> np.ndarray:
+def _picture(sequence: sequences.RenderedSequence) -> np.ndarray:
     """Frames with what was found in red, found wrongly in yellow and missed in blue."""
+    import cv2
+
     name, params = parse_named(MASKED, "backend")
     system = slam.make(name, sequence.intrinsics, **params)
     frames = list(sequence.frames)

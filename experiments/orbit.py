@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from ms_slam_experiments.shared.loop_paths import around_object
 
-from ms_slam_env import metrics, scenes
+from ms_slam_env import metrics, scenes, sequences
 from ms_slam_env._runtime.parallel import limit_threads
 from ms_slam_env.benchmark.episodes import seed_list
 from ms_slam_env.benchmark.experiment import Experiment
@@ -19,7 +18,6 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.run_sequence import run_backend
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Grouping, Table, finished, make_table
-from ms_slam_env.sequences import make_perturbation, render_sequence
 
 METRICS = (
     *("relocalisation_found_s", "relocalisations", "never_relocalised", "robustness"),
@@ -85,16 +83,18 @@ class Orbit(Experiment, Checked):
     @staticmethod
     def run(spec: OrbitSpec) -> dict[str, Any]:
         """Track the orbit, in the dark too, and measure."""
+        from ms_slam_experiments.shared.loop_paths import around_object
+
         limit_threads(1)
         scene = scenes.make(spec.scene, spec.seed)
         poses, lap = around_object(scene, spec.seed, spec.laps)
         every = lap // spec.stretches
         if spec.black_frames >= every:
             raise InputError(f"{spec.black_frames} black frames leave nothing of {every} to see")
-        dark = make_perturbation(
+        dark = sequences.make_perturbation(
             "black-frames", {"start": lap, "length": spec.black_frames, "every": every}
         )
-        sequence = render_sequence(
+        sequence = sequences.render_sequence(
             scene, poses, xtion(spec.image_size), "kinect", spec.seed, perturbations=[dark]
         )
         black: list[bool] = []

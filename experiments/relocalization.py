@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env import scenes, slam
+from ms_slam_env import metrics, scenes, sensor, sequences, slam
 from ms_slam_env.benchmark.episodes import seed_list
 from ms_slam_env.benchmark.experiment import Experiment, check_each
 from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
@@ -20,16 +20,12 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.loop_closures import pose_error
 from ms_slam_env.evaluation.run_sequence import SequenceRun, run_sequence
 from ms_slam_env.geometry import invert, make_pose, relative_angle, so3_exp, transform_points
-from ms_slam_env.metrics import ate_rmse, relocalisation_times
 from ms_slam_env.report.charts import Chart, Panel, interval_series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.statistics import median_interval
 from ms_slam_env.report.tables import Table, Value, finished, format_value, make_table, summary
 from ms_slam_env.scenes import PUBLISHED_ROOMS, Scene
-from ms_slam_env.sensor import FRAME_RATE_HZ, RGBDSensor
-from ms_slam_env.sequences import handheld_trajectory
 from ms_slam_env.slam import SlamBackend
-from ms_slam_env.slam.surfel.config import RELOCALISATIONS
 
 Float64 = NDArray[np.float64]
 
@@ -91,7 +87,7 @@ class Interruption:
 
 def map_path(scene: Scene, frames: int, seed: int) -> Float64:
     """Poses (frames, 4, 4) of the stretch that is mapped."""
-    return handheld_trajectory(scene, frames, seed)
+    return sequences.handheld_trajectory(scene, frames, seed)
 
 
 class MappedSpace:
@@ -99,7 +95,7 @@ class MappedSpace:
 
     def __init__(self, scene: Scene, path: Float64, intrinsics: Intrinsics = _VIEW) -> None:
         """Look from every few poses of ``path`` (N, 4, 4)."""
-        self._sensor = RGBDSensor(scene, intrinsics, noise="none")
+        self._sensor = sensor.RGBDSensor(scene, intrinsics, noise="none")
         self._intrinsics = intrinsics
         some = path[::_EVERY]
         self._world_to_camera = [invert(pose) for pose in some]
@@ -166,7 +162,7 @@ def draw_interruption(
 
 def foreign_interruption(other: Scene, after: int, seed: int) -> Interruption:
     """The camera reappears on a path of its own in scene ``other``."""
-    return Interruption(0, handheld_trajectory(other, after, seed), -1, 0.0)
+    return Interruption(0, sequences.handheld_trajectory(other, after, seed), -1, 0.0)
 
 
 def _random_motion(setting: Setting, rng: np.random.Generator) -> Float64:
@@ -208,7 +204,7 @@ def interrupt(
     errors = []
     if expected is not None:
         errors = [pose_error(run.estimates[i], expected[i]) for i in np.flatnonzero(tracked)]
-    seconds = np.arange(len(frames) + 1) / FRAME_RATE_HZ
+    seconds = np.arange(len(frames) + 1) / sensor.FRAME_RATE_HZ
     interrupted = [True] + [False] * len(frames)
     first = int(tracked.argmax()) if tracked.any() else None
     far = [m > WRONG_M or deg > WRONG_DEG for m, deg in errors]
@@ -217,7 +213,7 @@ def interrupt(
         "wrong": any(far) or (expected is None and bool(tracked.any())),
         "frames_to_pose": math.inf if first is None else first,
         "relocalisation_s": float(
-            relocalisation_times(seconds, interrupted, [False, *tracked.tolist()])[0]
+            metrics.relocalisation_times(seconds, interrupted, [False, *tracked.tolist()])[0]
         ),
         "first_error_m": errors[0][0] if errors else None,
         "first_error_deg": errors[0][1] if errors else None,
@@ -282,6 +278,8 @@ class Relocalization(Experiment, Checked):
 
     def specs(self) -> list[RelocalizationSpec]:
         """Every map."""
+        from ms_slam_env.slam.surfel.config import RELOCALISATIONS
+
         check_each("scene", self.scenes, self.scenes)
         check_each("setting", self.settings, ALL_SETTINGS)
         check_each("variant", self.variants, RELOCALISATIONS)
@@ -392,7 +390,7 @@ class _Recorder:
     """Takes frames in a scene, each with noise of its own."""
 
     def __init__(self, scene: Scene, intrinsics: Intrinsics, seed: int) -> None:
-        self._sensor = RGBDSensor(scene, intrinsics, seed=seed)
+        self._sensor = sensor.RGBDSensor(scene, intrinsics, seed=seed)
         self._taken = 0
 
     def record(self, poses: Float64) -> list[RGBDFrame]:
@@ -418,7 +416,7 @@ def _draw(spec: RelocalizationSpec, scene: Scene, path: Float64) -> list[tuple[s
 
 def _figures(mapping: SequenceRun, path: Float64) -> dict[str, Any]:
     return {
-        "ate_unaligned_m": ate_rmse(mapping.estimates, path, align="none"),
+        "ate_unaligned_m": metrics.ate_rmse(mapping.estimates, path, align="none"),
         "lost_frames": mapping.lost_frames,
         "cpu_ms_median": float(np.median(mapping.cpu_ms)),
     }

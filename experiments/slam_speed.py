@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from ms_slam_experiments.shared import slam_speed_child
 
-from ms_slam_env import scenes
+from ms_slam_env import scenes, sequences
 from ms_slam_env._runtime.parallel import thread_environment
 from ms_slam_env.benchmark.experiment import Experiment, check_names
 from ms_slam_env.camera import xtion
@@ -26,7 +26,6 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Column, Table, finished, make_table
-from ms_slam_env.sequences import handheld_trajectory, render_sequence
 
 THIS, OTHER = "this", "other"
 REST = "rest"
@@ -219,8 +218,8 @@ def backend_parameters(words: tuple[str, ...]) -> dict[str, Any]:
 def stored_sequence(scene_name: str, seed: int, frames: int, size: str) -> tuple[Any, str]:
     """A noisy sequence as a file, for as long as this process lives: its folder and its path."""
     scene = scenes.make(scene_name, seed)
-    poses = handheld_trajectory(scene, frames, seed, 0.015, 1.0)
-    sequence = render_sequence(scene, poses, xtion(size), "kinect", seed)
+    poses = sequences.handheld_trajectory(scene, frames, seed, 0.015, 1.0)
+    sequence = sequences.render_sequence(scene, poses, xtion(size), "kinect", seed)
     shown = list(sequence.frames)
     folder = tempfile.TemporaryDirectory()
     path = Path(folder.name) / "sequence.npz"

@@ -12,7 +12,8 @@ import numpy as np
 from ms_slam_experiments.relocalization import FOREIGN, map_path
 from numpy.typing import NDArray
 
-from ms_slam_env import scenes, slam
+from ms_slam_env import metrics, scenes, slam
+from ms_slam_env import sensor as sensors
 from ms_slam_env.benchmark.episodes import seed_list
 from ms_slam_env.benchmark.experiment import Experiment, check_each, check_names
 from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
@@ -21,12 +22,10 @@ from ms_slam_env.evaluation.loop_closures import pose_error
 from ms_slam_env.evaluation.run_sequence import SequenceRun, run_sequence
 from ms_slam_env.evaluation.submaps import submap_errors, submap_measures, submap_numbers
 from ms_slam_env.geometry import invert, so3_exp
-from ms_slam_env.metrics import ate_rmse
 from ms_slam_env.report.charts import Chart, Panel, interval_series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, Value, finished, make_table, summary
 from ms_slam_env.scenes import SCENES, Scene
-from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.surfel.config import SUBMAPS
 
 Float64 = NDArray[np.float64]
@@ -191,7 +190,7 @@ def _black(frame: RGBDFrame) -> RGBDFrame:
 def _record(
     scene: Scene, intrinsics: Intrinsics, seed: int, first: int, poses: Float64
 ) -> list[RGBDFrame]:
-    sensor = RGBDSensor(scene, intrinsics, seed=seed)
+    sensor = sensors.RGBDSensor(scene, intrinsics, seed=seed)
     return [sensor.capture(pose, first + index) for index, pose in enumerate(poses)]
 
 
@@ -216,8 +215,8 @@ def _measure(run: SequenceRun, one: Interruption, mapped: int, drift: Float64) -
         "link_error_m": [m for m, _ in errors],
         "link_error_deg": [deg for _, deg in errors],
         "frames_to_join": float(anchored[0]) if len(anchored) else math.inf,
-        "ate_unaligned_m": ate_rmse(run.estimates, one.truth, align="none"),
-        "final_ate_unaligned_m": ate_rmse(final, one.truth, align="none"),
+        "ate_unaligned_m": metrics.ate_rmse(run.estimates, one.truth, align="none"),
+        "final_ate_unaligned_m": metrics.ate_rmse(final, one.truth, align="none"),
         **submap_errors(final, one.truth, submap_numbers(run)),
     }
 

@@ -253,8 +253,7 @@ def lookahead_ranking(_: Path) -> Any:
 
 @experiment("compare")
 def compare(_: Path) -> Any:
-    from ms_slam_env.benchmark.compare import Compare
-    from ms_slam_env.benchmark.compare_runs import CompareSpec
+    from ms_slam_env.benchmark.compare import Compare, CompareSpec
 
     text = "table:1000:kinect+exposure-ramp"
     return {
@@ -265,7 +264,7 @@ def compare(_: Path) -> Any:
 
 @experiment("usme", CHAOTIC)
 def usme(folder: Path) -> Any:
-    from ms_slam_env.benchmark.usme_runs import UsmeSpec, run_usme
+    from ms_slam_env.benchmark.usme import UsmeSpec, run_usme
     from ms_slam_env.sequences.usme_suite import make_suite
 
     name, size, seed, scale = "room-fast-black", "80x60", 2000, 0.3
