@@ -17,7 +17,7 @@ from ms_slam_env.geometry import invert, make_pose, relative_angle, so3_exp
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished, make_table
-from ms_slam_env.sequences import HandheldPath, check_sequence, open_sequence
+from ms_slam_env.sequences import HandheldPath, open_sequence
 from ms_slam_env.slam.shared.alignment_check import (
     DISPUTED,
     AcceptanceThresholds,
@@ -92,9 +92,7 @@ class AcceptanceRoc(Experiment, Checked):
 
     def specs(self) -> list[RocSpec]:
         """Every sequence."""
-        for name in self.sequences:
-            check_sequence(name)
-        return [self.spec(RocSpec, sequence=name) for name in self.sequences]
+        return self.each(RocSpec, sequence=self.sequences)
 
     @staticmethod
     def run(spec: RocSpec) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import metrics, slam
-from ms_slam_env.benchmark.episodes import check_names, seed_list
+from ms_slam_env.benchmark.episodes import seed_list
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.camera import XTION_SIZES, Intrinsics, RGBDFrame, xtion
 from ms_slam_env.config import Checked, bounded
@@ -108,13 +108,10 @@ class Adaptation(Experiment, Checked):
     def specs(self) -> list[AdaptationSpec]:
         """Every sequence."""
         xtion(self.image_size)
-        check_names(("random",), self.scenes)
-        adaptation = self.adaptation()
-        return [
-            self.spec(AdaptationSpec, scene=scene, seed=seed, adaptation=adaptation)
-            for scene in self.scenes
-            for seed in seed_list(self.seeds, self.sequences)
-        ]
+        seeds = seed_list(self.seeds, self.sequences)
+        return self.each(
+            AdaptationSpec, scene=self.scenes, seed=seeds, adaptation=(self.adaptation(),)
+        )
 
     @staticmethod
     def run(spec: AdaptationSpec) -> dict[str, Any]:

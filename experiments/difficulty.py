@@ -5,38 +5,34 @@ Saeedi et al., ICRA 2017, section V-C: the harder a sequence, the larger its div
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from ms_slam_experiments.shared.motion_difficulty import (
-    CORRELATIONS,
-    ORDERED,
-    SEEN,
-    STATISTICS,
-    WHERE,
-    judgements,
-    statistics,
-)
+from ms_slam_experiments.shared import icl_nuim
+from numpy.typing import NDArray
 
 from ms_slam_env.benchmark.experiment import Experiment
-from ms_slam_env.camera import XTION_SIZES
+from ms_slam_env.camera import XTION_SIZES, Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.divergence import DivergenceConfig
-from ms_slam_env.evaluation.image_motion import MOTIONS, WatchedSequence, by_second, watch_frames
-from ms_slam_env.evaluation.sequence_divergence import KINDS, statistics_of
+from ms_slam_env.evaluation.sequence_divergence import KINDS, consecutive_divergences, statistics_of
+from ms_slam_env.geometry import invert, relative_angle, transform_points
 from ms_slam_env.metrics.registry import metric
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.statistics import rank_correlation
-from ms_slam_env.report.tables import Column, Table, finished, make_table
+from ms_slam_env.report.tables import Column, Table, finished, flattened, grouped, make_table
 from ms_slam_env.sensor.noise import noise_config
 from ms_slam_env.sensor.scene_cache import get_scene
 from ms_slam_env.sequences import Sequence as RGBDSequence
-from ms_slam_env.sequences import icl_nuim, place_trajectory, render_sequence
+from ms_slam_env.sequences import place_trajectory, render_sequence
+
+Float64 = NDArray[np.float64]
 
 HISTOGRAMS = {"paper": DivergenceConfig.paper(), "default": DivergenceConfig()}
 PAPER = {
@@ -243,3 +239,228 @@ def _open(spec: DifficultySpec) -> RGBDSequence:
     times, poses = all_times[number][picked], placed[start + picked]
     K = icl_nuim.INTRINSICS.scaled(XTION_SIZES[spec.image_size][0] / icl_nuim.INTRINSICS.width)
     return render_sequence(scene, poses, K, spec.noise, spec.placement, timestamps=times)
+
+
+Line = dict[str, Any]
+
+HARD, EASY = ("lr_kt2", "lr_kt3"), ("lr_kt0", "lr_kt1")
+"""What the paper finds: every motion of the first pair harder than every one of the second."""
+STATISTICS = tuple(
+    f"divergence_{name}"
+    for name in ("max", "mean", "variance", "std", "max_per_s", "mean_per_s", "std_per_s")
+)
+ORDERED = ("max", "mean", "std")
+SEEN = ("contrast", "depth_m")
+CORRELATIONS = ("turn_correlation", "speed_correlation", "image_motion_correlation")
+"""Of the divergence with each of ``MOTIONS``."""
+WHERE = ("scene", "noise", "histograms", "divergence")
+
+
+def statistics(rows: Sequence[Row]) -> list[Line]:
+    """Of every motion in a scene, histogram and kind: means over its places.
+
+    Of a motion that was also recorded there is a second line, over as many frames as that.
+    """
+    fields = (*WHERE, "motion")
+    keys = (*STATISTICS, *MOTIONS, *SEEN)
+    return [
+        {
+            **dict(zip(fields, group, strict=True)),
+            **{key: float(np.mean([line[key] for line in lines])) for key in keys},
+            "frames": lines[0]["frames"],
+            "places": len(lines),
+        }
+        for group, lines in grouped(_lines(rows), fields).items()
+    ]
+
+
+def judgements(rows: Sequence[Row]) -> list[Line]:
+    """Of every scene, histogram and kind: whether the paper's order holds, and correlations.
+
+    ``pairs_max``, ``pairs_mean``, ``pairs_std``: of the four pairs of a motion that the paper finds
+    hard and one that it finds easy, in how many the former has the larger statistic (means over
+    the places); ``places_max`` and so on: in how many single places all four pairs hold.
+
+    Spearman correlations of the divergence with how the camera and the image move: frame by frame
+    within one motion at one place, the median over motions and places; and ``motions_...``, of the
+    motions' means over all places of a scene.
+    """
+    lines = _lines([row for row in rows if not row["spec"]["first"]])
+    found = []
+    for where in grouped(lines, WHERE):
+        own = [line for line in lines if tuple(map(line["spec"].get, WHERE)) == where]
+        by_motion = {motion: them for (motion,), them in grouped(own, ("motion",)).items()}
+        known = set(HARD + EASY) <= set(by_motion)
+        found.append({
+            **dict(zip(WHERE, where, strict=True)),
+            **(_order(by_motion) if known else {}),
+            **_correlations(by_motion),
+        })  # fmt: skip
+    return found
+
+
+def _order(by_motion: Mapping[str, Sequence[Mapping[str, Any]]]) -> Line:
+    found: Line = {"places": min(map(len, by_motion.values()))}
+    for name in ORDERED:
+        values = {
+            motion: np.array([line[f"divergence_{name}"] for line in by_motion[motion]])
+            for motion in HARD + EASY
+        }
+        pairs = [(values[hard], values[easy]) for hard in HARD for easy in EASY]
+        found[f"pairs_{name}"] = sum(int(h.mean() > e.mean()) for h, e in pairs)
+        found[f"places_{name}"] = int(np.all([h > e for h, e in pairs], axis=0).sum())
+    return found
+
+
+def _correlations(by_motion: Mapping[str, Sequence[Mapping[str, Any]]]) -> Line:
+    found: Line = {}
+    for motion, key in zip(MOTIONS, CORRELATIONS, strict=True):
+        single = [line[key] for lines in by_motion.values() for line in lines]
+        found[key] = None if None in single else float(np.median(single))
+        means = [
+            [np.mean([line[name] for line in lines]) for name in ("divergence_mean", motion)]
+            for lines in by_motion.values()
+        ]
+        if len(means) > 2:
+            found[f"motions_{key}"] = rank_correlation(*np.array(means).T)
+    return found
+
+
+def _lines(rows: Sequence[Row]) -> list[Row]:
+    """A row for each histogram and kind of each finished row, with what those have in common."""
+    lines: list[Row] = []
+    for row in finished(rows):
+        spec, result = row["spec"], row["result"]
+        cut = f", first {spec['first']} frames" if spec["first"] else ""
+        named = {"scene": Path(spec["scene"]).stem, "motion": spec["motion"] + cut}
+        shared = {key: result[key] for key in ("frames", *MOTIONS, *SEEN)}
+        lines += [
+            {
+                "spec": {**line["spec"], **named},
+                "result": {**shared, **line["result"]},
+                "error": None,
+            }
+            for line in flattened([row], "statistics")
+        ]
+    return lines
+
+
+MOTIONS = ("turn_deg_s", "speed_m_s", "image_motion_deg_s")
+"""Columns of `frame_motion`."""
+
+_PIXELS_ACROSS = 40  # of the grid of points that are followed
+
+
+@dataclass(frozen=True)
+class WatchedSequence:
+    """How T + 1 frames follow each other.
+
+    Attributes:
+        times_s: (T,) of the later frame of each pair, since the first.
+        gaps_s: (T,) between the frames of each pair.
+        divergences: by name of the histograms, (T, 2) intensity and depth, nats.
+        motion: by ``MOTIONS``, (T,).
+        contrast: mean over the frames of the grey values' standard deviation.
+        depth_m: mean over the frames of their mean depth.
+    """
+
+    times_s: Float64
+    gaps_s: Float64
+    divergences: dict[str, Float64]
+    motion: dict[str, Float64]
+    contrast: float
+    depth_m: float
+
+
+def watch_frames(
+    sequence: RGBDSequence, histograms: Mapping[str, DivergenceConfig]
+) -> WatchedSequence:
+    """Measure each frame against the one before, once through; without colour intensity is NaN.
+
+    Args:
+        sequence: with true poses.
+        histograms: settings of the divergence by name.
+    """
+    times, poses, K = sequence.timestamps, sequence.poses, sequence.intrinsics
+    motion, shades, depths = [], [], []
+
+    def seen() -> Iterator[RGBDFrame]:
+        for index, frame in enumerate(sequence.frames):
+            shades.append(contrast(frame))
+            depths.append(float(frame.depth[frame.depth > 0].mean()) if frame.depth.any() else 0.0)
+            if index + 1 < len(poses):
+                gap_s = float(times[index + 1] - times[index])
+                motion.append(frame_motion(frame, poses[index], poses[index + 1], K, gap_s))
+            yield frame
+
+    values = consecutive_divergences(seen(), K, list(histograms.values()))
+    if not sequence.has_color:
+        values[..., 0] = np.nan
+    return WatchedSequence(
+        times[1:] - times[0],
+        np.diff(times),
+        {name: values[:, k] for k, name in enumerate(histograms)},
+        dict(zip(MOTIONS, np.array(motion).T, strict=True)),
+        float(np.mean(shades)),
+        float(np.mean(depths)),
+    )
+
+
+def by_second(
+    times_s: Float64, values: Float64, gaps_s: Float64
+) -> tuple[list[float], list[float]]:
+    """Middles of the seconds, and the rates in them: sum of the values by that of the gaps.
+
+    Args:
+        times_s: (T,) since the first frame.
+        values: (T,) between two frames.
+        gaps_s: (T,) between the two frames.
+    """
+    second = times_s.astype(int)
+    filled = np.bincount(second) > 0
+    rates = np.bincount(second, values)[filled] / np.bincount(second, gaps_s)[filled]
+    return (np.flatnonzero(filled) + 0.5).tolist(), rates.tolist()
+
+
+def frame_motion(
+    frame: RGBDFrame, T_world_camera: Float64, T_world_next: Float64, K: Intrinsics, gap_s: float
+) -> Float64:
+    """How fast the camera and its image move from a frame to the next, (3,) as in ``MOTIONS``.
+
+    ``turn_deg_s`` and ``speed_m_s`` are the camera's; ``image_motion_deg_s`` is the mean angle by
+    which the surface points of the frame move in the camera's view, which depends on how far away
+    they are; without a depth reading it is NaN.
+
+    Args:
+        frame: with depth.
+        T_world_camera: (4, 4) its pose.
+        T_world_next: (4, 4) pose of the next frame.
+        K: intrinsics of the frame.
+        gap_s: seconds between the two.
+    """
+    T_next_camera = invert(T_world_next) @ T_world_camera
+    turn_deg = np.degrees(relative_angle(np.eye(3), T_next_camera[:3, :3]))
+    distance_m = np.linalg.norm(T_world_next[:3, 3] - T_world_camera[:3, 3])
+    moved_deg = np.nan
+    step = max(1, K.width // _PIXELS_ACROSS)
+    depth = frame.depth[::step, ::step]
+    rays = _rays(K, step)[depth > 0]
+    if len(rays):
+        points = transform_points(T_next_camera, rays * depth[depth > 0][:, None])
+        moved_deg = np.degrees(_angles(rays, points).mean())
+    return np.array([turn_deg, distance_m, moved_deg]) / gap_s
+
+
+def contrast(frame: RGBDFrame) -> float:
+    """Standard deviation of the frame's grey values, in grey levels."""
+    return float(intensity_image(frame.color).std())
+
+
+@lru_cache(maxsize=4)
+def _rays(K: Intrinsics, step: int) -> Float64:
+    return K.rays()[::step, ::step].copy()
+
+
+def _angles(a: Float64, b: Float64) -> Float64:
+    """Angles (N,) in radians between directions (N, 3)."""
+    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(axis=1))

@@ -7,22 +7,21 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from ms_slam_experiments.difficulty import MOTIONS, watch_frames
 
 from ms_slam_env import metrics, slam
 from ms_slam_env._runtime.parallel import limit_threads
 from ms_slam_env.benchmark.compare import DEFAULT_SEQUENCES
 from ms_slam_env.benchmark.experiment import Experiment
-from ms_slam_env.camera import parse_image_size
-from ms_slam_env.config import Checked, bounded, parse_named
+from ms_slam_env.config import Checked, bounded
 from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.errors import InputError
-from ms_slam_env.evaluation.image_motion import MOTIONS, watch_frames
-from ms_slam_env.evaluation.run_sequence import run_sequence
+from ms_slam_env.evaluation.run_sequence import run_backend
 from ms_slam_env.evaluation.sequence_divergence import KINDS, WASSERSTEIN, consecutive_distances
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.statistics import rank_correlation
 from ms_slam_env.report.tables import Table, finished, flattened, make_table
-from ms_slam_env.sequences import HandheldPath, check_sequence, open_sequence
+from ms_slam_env.sequences import HandheldPath, open_sequence
 from ms_slam_env.sequences import Sequence as RGBDSequence
 
 HISTOGRAMS = {
@@ -73,16 +72,11 @@ class DifficultyErrors(Experiment, Checked):
         """Every sequence.
 
         Raises:
-            InputError: a sequence, backend or size that does not exist, or fewer than three.
+            InputError: fewer than three.
         """
         if len(self.sequences) < 3:
             raise InputError("a correlation needs at least 3 sequences")
-        for text in self.sequences:
-            check_sequence(text)
-        for text in self.backends:
-            slam.check_parameters(*parse_named(text, "backend"))
-        parse_image_size(self.image_size)
-        return [self.spec(DifficultySpec, sequence=text) for text in self.sequences]
+        return self.each(DifficultySpec, sequence=self.sequences)
 
     @staticmethod
     def run(spec: DifficultySpec) -> dict[str, Any]:
@@ -148,8 +142,7 @@ def _correlation(results: Sequence[Row], m: int, b: int, key: str) -> float:
 
 def _errors(backend: str, sequence: RGBDSequence) -> dict[str, Any]:
     """Errors of a backend that starts at the true pose."""
-    name, params = parse_named(backend, "backend")
-    run = run_sequence(slam.make(name, sequence.intrinsics, **params), sequence)
+    run = run_backend(backend, sequence)
     return {
         "backend": backend,
         "ate_m": metrics.ate_rmse(run.estimates, run.true_poses),

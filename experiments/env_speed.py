@@ -10,12 +10,11 @@ from typing import Any, cast
 import gymnasium as gym
 import numpy as np
 
-from ms_slam_env.benchmark.experiment import Experiment
+from ms_slam_env.benchmark.experiment import Experiment, check_each
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.env.registry import OBSERVATIONS
-from ms_slam_env.errors import unknown
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Column, Table, finished, make_table
 
@@ -70,23 +69,17 @@ class EnvSpeed(Experiment, Checked):
 
     def specs(self) -> list[EnvSpeedSpec]:
         """Every combination that makes a difference."""
-        for names, kind, choices in (
-            (self.embodiments, "embodiment", EMBODIMENTS),
-            (self.observations, "observation", OBSERVATIONS),
-        ):
-            for name in names:
-                if name not in choices:
-                    raise unknown(kind, name, choices)
+        check_each("embodiment", self.embodiments, EMBODIMENTS)
+        check_each("observation", self.observations, OBSERVATIONS)
         return [
-            self.spec(
-                EnvSpeedSpec,
-                embodiment=embodiment,
-                frames_per_action=frames,
-                observation=observation,
-            )
+            spec
             for embodiment in self.embodiments
-            for frames in ((1,) if embodiment in WITHOUT_FRAMES else self.frames_per_action)
-            for observation in self.observations
+            for spec in self.each(
+                EnvSpeedSpec,
+                embodiment=(embodiment,),
+                frames_per_action=(1,) if embodiment in WITHOUT_FRAMES else self.frames_per_action,
+                observation=self.observations,
+            )
         ]
 
     @staticmethod

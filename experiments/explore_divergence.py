@@ -12,7 +12,6 @@ from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.report.charts import Chart, over_field, scatter
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Grouping, Table
-from ms_slam_env.sequences import check_sequence
 from ms_slam_env.slam.configuration import SlamConfiguration, read_configuration
 from ms_slam_env.tuning import SlamEvaluator
 from ms_slam_env.tuning.objectives import FAILURE, as_metrics
@@ -66,20 +65,10 @@ class ExploreDivergence(Experiment):
 
     def specs(self) -> list[RateSpec]:
         """Every sequence at every rate."""
-        for text in self.sequences:
-            check_sequence(text)
         base = SlamConfiguration() if self.config is None else read_configuration(self.config)
         SlamEvaluator(self.sequences, self.frames, image_size=self.image_size)  # refuses bad input
-        return [
-            self.spec(
-                RateSpec,
-                sequence=sequence,
-                keep_every=dataclasses.replace(base, keep_every=every).keep_every,
-                base=asdict(base),
-            )
-            for sequence in self.sequences
-            for every in self.keep_every
-        ]
+        rates = [dataclasses.replace(base, keep_every=n).keep_every for n in self.keep_every]
+        return self.each(RateSpec, sequence=self.sequences, keep_every=rates, base=(asdict(base),))
 
     @staticmethod
     def run(spec: RateSpec) -> dict[str, Any]:

@@ -8,13 +8,12 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ms_slam_env.benchmark.experiment import Experiment
+from ms_slam_env.benchmark.experiment import Experiment, check_each
 from ms_slam_env.config import Checked, bounded
-from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.errors import InputError
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Column, Table, finished, make_table
-from ms_slam_env.sequences import check_sequence
 from ms_slam_env.slam.configuration import SlamConfiguration, read_configuration
 from ms_slam_env.slam.surfel import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_config import PAPER
@@ -86,28 +85,21 @@ class ExploreRates(Checked, Experiment):
 
     def specs(self) -> list[FrontSpec]:
         """Every rate with every sampler and seed."""
-        for text in self.sequences:
-            check_sequence(text)
-        for name in self.samplers:
-            if name not in SAMPLERS:
-                raise unknown("sampler", name, SAMPLERS)
         if not (self.samplers and self.keep_every):
             raise InputError("no sampler or no rate given")
+        check_each("sampler", self.samplers, SAMPLERS)
         base = paper_configuration() if self.config is None else read_configuration(self.config)
         SlamEvaluator(self.sequences, self.frames, image_size=self.image_size)  # refuses bad input
         make_space(self.parameters, base)
-        return [
-            self.spec(
-                FrontSpec,
-                keep_every=dataclasses.replace(base, keep_every=every).keep_every,
-                sampler=name,
-                seed=seed,
-                base=asdict(base),
-            )
-            for every in self.keep_every
-            for seed in range(self.seeds)
-            for name in self.samplers
-        ]
+        return self.each(
+            FrontSpec,
+            keep_every=[
+                dataclasses.replace(base, keep_every=n).keep_every for n in self.keep_every
+            ],
+            seed=range(self.seeds),
+            sampler=self.samplers,
+            base=(asdict(base),),
+        )
 
     @staticmethod
     def run(spec: FrontSpec) -> dict[str, Any]:

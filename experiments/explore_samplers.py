@@ -10,14 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from ms_slam_env.benchmark.experiment import Experiment
+from ms_slam_env.benchmark.experiment import Experiment, check_each
 from ms_slam_env.config import Checked, bounded
-from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.errors import InputError
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.statistics import Interval, bootstrap_interval
 from ms_slam_env.report.tables import Column, Table, finished, make_table
-from ms_slam_env.sequences import check_sequence
 from ms_slam_env.tuning import SlamEvaluator, make_space
 from ms_slam_env.tuning.front import hypervolume
 from ms_slam_env.tuning.objectives import FAILURE, objective_values
@@ -105,19 +104,12 @@ class ExploreSamplers(Checked, Experiment):
         """Every sampler with every seed."""
         if not self.samplers:
             raise InputError("no sampler given")
-        for name in self.samplers:
-            if name not in SAMPLERS:
-                raise unknown("sampler", name, SAMPLERS)
-        return [
-            self.spec(StudySpec, sampler=name, seed=seed, evaluations=str(self.evaluations))
-            for seed in range(self.seeds)
-            for name in self.samplers
-        ]
+        check_each("sampler", self.samplers, SAMPLERS)
+        file = (str(self.evaluations),)
+        return self.each(StudySpec, seed=range(self.seeds), sampler=self.samplers, evaluations=file)
 
     def prepare(self) -> None:
-        """Refuse parameters without an order and sequences that nobody knows."""
-        for text in self.sequences:
-            check_sequence(text)
+        """Refuse parameters without an order."""
         self.specs()[0].grid()
 
     @staticmethod

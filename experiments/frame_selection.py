@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from ms_slam_env import metrics, slam
+from ms_slam_env import metrics, sequences, slam
 from ms_slam_env._runtime.parallel import limit_threads
 from ms_slam_env.benchmark.episode_scores import LOST_ERROR_M
 from ms_slam_env.benchmark.experiment import Experiment
-from ms_slam_env.camera import RGBDFrame, parse_image_size
+from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.map_quality import map_quality
@@ -22,8 +22,6 @@ from ms_slam_env.evaluation.seen_surface import seen_surface
 from ms_slam_env.report.charts import Chart, Guide, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Column, Grouping, Table, flattened, make_table, summary
-from ms_slam_env.sequences import Sequence as FrameSequence
-from ms_slam_env.sequences import UnevenPath, check_sequence, open_sequence
 from ms_slam_env.slam.frame_selection import (
     FrameSelectionConfig,
     RegularConfig,
@@ -90,24 +88,21 @@ class FrameSelection(Experiment, Checked):
         for name in ("sequences", "managements"):
             if not getattr(self, name):
                 raise InputError(f"{name} is empty")
-        for text in self.sequences:
-            check_sequence(text)
         for text in self.managements:
             if parse_frame_selection(text).uses_clock:
                 raise InputError(f"{text!r} measures time: no two runs are alike")
         slam.POINT.find(self.backend)
-        parse_image_size(self.image_size)
-        return [self.spec(FilterSpec, sequence=sequence) for sequence in self.sequences]
+        return self.each(FilterSpec, sequence=self.sequences)
 
     @staticmethod
     def run(spec: FilterSpec) -> dict[str, Any]:
         """Every filter; beside each that is no regular skipping, that at the filter's share."""
         limit_threads(1)
-        path = UnevenPath(spec.frames)
-        opened = open_sequence(spec.sequence, spec.image_size, path=path, with_truth=True)
+        path = sequences.UnevenPath(spec.frames)
+        opened = sequences.open_sequence(spec.sequence, spec.image_size, path=path, with_truth=True)
         surface = seen_surface(opened)
         frames = tuple(opened.frames)
-        sequence = FrameSequence(frames, opened.poses, opened.intrinsics, opened.name)
+        sequence = sequences.Sequence(frames, opened.poses, opened.intrinsics, opened.name)
         runs = []
         for text in spec.managements:
             config = parse_frame_selection(text)
@@ -139,7 +134,7 @@ class FrameSelection(Experiment, Checked):
 
 
 def measure(
-    config: FrameSelectionConfig, backend: str, sequence: FrameSequence, surface: Any
+    config: FrameSelectionConfig, backend: str, sequence: sequences.Sequence, surface: Any
 ) -> dict[str, Any]:
     """Track the sequence from its true first pose behind a filter.
 
@@ -169,7 +164,7 @@ def measure(
 
 
 def _filter_ms(
-    config: FrameSelectionConfig, sequence: FrameSequence, frames: list[RGBDFrame]
+    config: FrameSelectionConfig, sequence: sequences.Sequence, frames: list[RGBDFrame]
 ) -> float:
     """Processor time in which the filter judges a frame."""
     judge = config.make_filter(sequence.intrinsics)

@@ -10,23 +10,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from ms_slam_experiments.shared import icl_nuim
 from numpy.typing import NDArray
 
-from ms_slam_env import metrics, slam
+from ms_slam_env import metrics
 from ms_slam_env.benchmark.episode_scores import LOST_ERROR_M
-from ms_slam_env.benchmark.episodes import check_names, seed_list
+from ms_slam_env.benchmark.episodes import seed_list
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.camera import xtion
-from ms_slam_env.config import parse_named
 from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.evaluation.run_sequence import run_sequence
+from ms_slam_env.evaluation.run_sequence import run_backend
 from ms_slam_env.evaluation.sequence_divergence import consecutive_divergences
 from ms_slam_env.report.charts import Chart, scatter
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Grouping, Table, make_table
 from ms_slam_env.sensor.scene_cache import get_scene
-from ms_slam_env.sequences import handheld_trajectory, icl_nuim, place_trajectory, render_sequence
+from ms_slam_env.sequences import handheld_trajectory, place_trajectory, render_sequence
 
 Float64 = NDArray[np.float64]
 
@@ -122,31 +122,20 @@ class FrameSkipping(Experiment):
             raise InputError(f"desired_ate_m = {self.desired_ate_m} must be > 0")
         if self.histograms not in HISTOGRAMS:
             raise unknown("setting of histograms", self.histograms, HISTOGRAMS)
-        if not self.backends:
-            raise InputError("backends is empty")
-        for text in self.backends:
-            slam.check_parameters(*parse_named(text, "backend"))
 
     def specs(self) -> list[SkippingSpec]:
         """Every sequence at every interval."""
-        check_names(("random",), self.scenes)
         for motion in self.motions:
             icl_nuim.read_motion(str(self.data), motion)  # refuses what is not there
-        data = str(self.data) if self.motions else ""
-        return [
-            SkippingSpec(
-                *(scene, seed, interval, self.frames),
-                motion=motion,
-                data=data,
-                histograms=self.histograms,
-                backend=backend,
-            )
-            for scene in self.scenes
-            for seed in seed_list(self.seeds, self.sequences)
-            for motion in self.motions or ("",)
-            for interval in self.intervals
-            for backend in self.backends
-        ]
+        return self.each(
+            SkippingSpec,
+            scene=self.scenes,
+            seed=seed_list(self.seeds, self.sequences),
+            motion=self.motions or ("",),
+            keep_every=self.intervals,
+            backend=self.backends,
+            data=(str(self.data) if self.motions else "",),
+        )
 
     @staticmethod
     def run(spec: SkippingSpec) -> dict[str, Any]:
@@ -157,8 +146,7 @@ class FrameSkipping(Experiment):
         K = sequence.intrinsics
         measure = HISTOGRAMS[spec.histograms]
         divergences = consecutive_divergences(sequence.frames, K, [measure])[:, 0]
-        name, options = parse_named(spec.backend, "backend")
-        run = run_sequence(slam.make(name, K, **options), sequence)
+        run = run_backend(spec.backend, sequence)
         worst = metrics.absolute_errors(run.estimates, sequence.poses, align="none").max()
         return {
             "frames": len(sequence),

@@ -19,7 +19,6 @@ from ms_slam_env.evaluation.sequence_divergence import consecutive_divergences
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Grouping, Table, flattened
 from ms_slam_env.scenes import PUBLISHED_ROOMS
-from ms_slam_env.scenes.registry import check_name
 from ms_slam_env.sequences import HandheldPath, open_sequence
 
 GAMMA = 2.2
@@ -65,15 +64,12 @@ class LightTolerance(Experiment, Checked):
         """One piece of work a scene.
 
         Raises:
-            InputError: a scene or split that does not exist, a gain that is not positive, or
-                nothing that changes the light.
+            InputError: a gain that is not positive, or nothing that changes the light.
         """
         if not all(gain > 0 for gain in self.gains) or not (self.gains or self.offsets):
             raise InputError(f"gains {self.gains} must be > 0, and there must be gains or offsets")
-        for scene in self.scenes:
-            check_name(scene)
         seed = seed_list(self.seeds, 1)[0]
-        return [self.spec(LightSpec, sequence=f"{scene}:{seed}") for scene in self.scenes]
+        return self.each(LightSpec, sequence=[f"{scene}:{seed}" for scene in self.scenes])
 
     @staticmethod
     def run(spec: LightSpec) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
 from ms_slam_env import slam as slam_backends
-from ms_slam_env.benchmark.episodes import check_names, seed_list
+from ms_slam_env.benchmark.episodes import seed_list
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.camera import RGBDFrame, intensity_image, xtion
 from ms_slam_env.divergence import Divergence, DivergenceConfig, make_divergence
@@ -153,14 +153,9 @@ class LookaheadRanking(Experiment):
 
     def specs(self) -> list[RankingSpec]:
         """Every path."""
-        check_names(("random",), self.scenes)
         if self.states < 1:
             raise InputError(f"states = {self.states} must be at least 1")
-        return [
-            self.spec(RankingSpec, scene=scene, seed=seed)
-            for scene in self.scenes
-            for seed in seed_list(self.seeds, self.paths)
-        ]
+        return self.each(RankingSpec, scene=self.scenes, seed=seed_list(self.seeds, self.paths))
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
         """One line a setting, over the states of all paths."""

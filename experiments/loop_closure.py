@@ -12,27 +12,28 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from ms_slam_experiments.pictures.loop_maps import MapView, map_view, save_picture
+from ms_slam_experiments.shared.loop_paths import PATHS, returning_path
+from numpy.typing import NDArray
 
-from ms_slam_env import scenes
+from ms_slam_env import metrics, scenes, sensor, sequences
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.camera import xtion
 from ms_slam_env.config import from_dict, nested_options
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.evaluation.loop_closures import Closure, judge_closure
+from ms_slam_env.evaluation.loop_closures import WRONG_DEG, pose_error
 from ms_slam_env.evaluation.map_quality import map_quality
 from ms_slam_env.geometry import invert
 from ms_slam_env.geometry.point_clouds import voxel_downsample
-from ms_slam_env.metrics import ate_rmse, path_length, tracked_errors
 from ms_slam_env.metrics.registry import metric
 from ms_slam_env.report.charts import Chart, Panel, Series
+from ms_slam_env.report.figures import caption, new_figure, save
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished, make_table, measured, summary
-from ms_slam_env.sensor import NoiseConfig
-from ms_slam_env.sequences import render_sequence
-from ms_slam_env.sequences.loop_paths import PATHS, returning_path
+from ms_slam_env.scenes import Scene
 from ms_slam_env.slam.surfel import SurfelConfig
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
+
+Float64 = NDArray[np.float64]
 
 VARIANTS = ("none", "deformation")
 DEFAULT_RECORDINGS = (
@@ -54,11 +55,12 @@ METRICS = (
 )
 TRACKED = ("ate_tracked_m", "tracked_share")
 GAPS = ("before_m", "after_m")  # between new and old map
-NOISES: dict[str, str | NoiseConfig] = {
+NOISES: dict[str, str | sensor.NoiseConfig] = {
     "kinect": "kinect",
-    "coarse": NoiseConfig(axial=2.0, lateral=1.5),  # times that of a Kinect
+    "coarse": sensor.NoiseConfig(axial=2.0, lateral=1.5),  # times that of a Kinect
 }
 _WARM_UP = 5  # frames left out of the timing
+WRONG_M = 0.05  # a closure is wrong if it leaves new and old map further apart than this
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,7 @@ class LoopClosure(Experiment):
         scene = scenes.make(spec.scene, spec.seed)
         truth = returning_path(scene, spec.path, spec.seed, spec.step_m, spec.step_deg)
         camera = xtion(spec.size)
-        sequence = render_sequence(scene, truth, camera, NOISES[spec.noise], spec.seed)
+        sequence = sequences.render_sequence(scene, truth, camera, NOISES[spec.noise], spec.seed)
         options = from_dict(SurfelConfig, spec.options, "options")
         config = replace(options, loop_closure=spec.closure)
         system = BatchedSurfelSlam(1, camera, config)
@@ -152,12 +154,12 @@ class LoopClosure(Experiment):
         error_m = np.linalg.norm(estimate[:, :3, 3] - truth[:, :3, 3], axis=1)
         return {
             "frames": len(truth),
-            "path_m": path_length(truth),
-            "ate_unaligned_m": ate_rmse(estimate, truth, align="none"),
-            "ate_m": ate_rmse(estimate, truth),
-            **tracked_errors(estimate, truth, tracked),
-            "final_ate_unaligned_m": ate_rmse(final, truth, align="none"),
-            "final_ate_m": ate_rmse(final, truth),
+            "path_m": metrics.path_length(truth),
+            "ate_unaligned_m": metrics.ate_rmse(estimate, truth, align="none"),
+            "ate_m": metrics.ate_rmse(estimate, truth),
+            **metrics.tracked_errors(estimate, truth, tracked),
+            "final_ate_unaligned_m": metrics.ate_rmse(final, truth, align="none"),
+            "final_ate_m": metrics.ate_rmse(final, truth),
             "end_error_m": float(error_m[-1]),
             "largest_error_m": float(error_m.max()),
             **map_quality(system.map.points(stable=False), surface, ("map_error_capped_rms_m",)),
@@ -248,3 +250,114 @@ def _parse(text: str) -> tuple[str, int, str, float, float, str]:
         return scene, int(seed), path, float(step_m), float(step_deg), noise
     except ValueError:
         raise InputError(f"recording {text!r}: seed and steps must be numbers") from None
+
+
+BAND_M = (0.9, 1.5)  # heights shown: walls and furniture, neither floor nor ceiling
+NEW_FRAMES = 40  # surfels younger than this are the present part
+CELL_M = 0.2  # places compared for how much of both parts they show
+ZOOM_M = 0.1  # half of what the lower row shows
+_COLOURS = {"old": "#3366bb", "new": "#cc3311", "true": "#bbbbbb"}
+
+
+@dataclass(frozen=True)
+class MapView:
+    """Points (N, 3) of a map and the age (N,) in frames of each."""
+
+    points: Float64
+    age: NDArray[np.int32]
+
+
+def map_view(system: BatchedSurfelSlam, frame: int) -> MapView:
+    """All points of a map as of a frame."""
+    surfel_map = system.map
+    points = surfel_map.points(stable=False)
+    created = surfel_map.attribute("created", stable=False)
+    return MapView(points, (frame - created).astype(np.int32))
+
+
+def save_picture(
+    views: tuple[MapView, MapView], scene: Scene, T_world_camera: Float64, path: Path, title: str
+) -> Path:
+    """Draw both maps within a band of heights; the lower row shows a part in view, enlarged."""
+    surface = _band(scene.surface_points(0.01)[0])
+    centre = _joined_part(views[0], T_world_camera)
+    figure = new_figure(2, width=5.2, height=9.0)
+    axes = figure.subplots(2, 2)
+    for column, (view, name) in enumerate(zip(views, ("before", "after"), strict=True)):
+        points, age = view.points, view.age
+        inside = _in_band(points)
+        points, age = points[inside], age[inside]
+        for row, dot in enumerate((0.3, 4.0)):
+            ax = axes[row, column]
+            ax.scatter(surface[:, 0], surface[:, 1], s=dot, c=_COLOURS["true"], linewidths=0)
+            for label, part in (("old", age > NEW_FRAMES), ("new", age <= NEW_FRAMES)):
+                ax.scatter(*points[part, :2].T, s=dot, c=_COLOURS[label], linewidths=0)
+            ax.set_aspect("equal")
+            ax.set(xlabel="x [m]", ylabel="y [m]")
+        axes[0, column].set_title(f"{name} the closure")
+        axes[1, column].set_xlim(centre[0] - ZOOM_M, centre[0] + ZOOM_M)
+        axes[1, column].set_ylim(centre[1] - ZOOM_M, centre[1] + ZOOM_M)
+    caption(
+        figure,
+        f"{title}: surfels {BAND_M[0]} to {BAND_M[1]} m above the floor; blue: old, "
+        f"red: of the last {NEW_FRAMES} frames, grey: true surface; below: enlarged",
+    )
+    return save(figure, path)
+
+
+def _in_band(points: Float64) -> NDArray[np.bool_]:
+    return (points[:, 2] > BAND_M[0]) & (points[:, 2] < BAND_M[1])
+
+
+def _band(points: Float64) -> Float64:
+    return points[_in_band(points)]
+
+
+def _joined_part(view: MapView, pose: Float64) -> Float64:
+    """Middle (2,) of the place, in view, with most old and new surfels together."""
+    camera = (view.points - pose[:3, 3]) @ pose[:3, :3]
+    u, v = camera[:, 0] / camera[:, 2], camera[:, 1] / camera[:, 2]
+    seen = (camera[:, 2] > 0.3) & (np.abs(u) < 0.5) & (np.abs(v) < 0.4) & _in_band(view.points)
+    places = view.points[seen, :2]
+    names, index = np.unique(np.floor(places / CELL_M), axis=0, return_inverse=True)
+    is_new = view.age[seen] <= NEW_FRAMES
+    counts = [np.bincount(index.ravel()[part], minlength=len(names)) for part in (is_new, ~is_new)]
+    return np.median(places[index.ravel() == np.minimum(*counts).argmax()], axis=0)
+
+
+@dataclass(frozen=True)
+class Closure:
+    """One closed loop: how far new and old map were apart before and after, and when."""
+
+    frame: int
+    before_m: float
+    before_deg: float
+    after_m: float
+    after_deg: float
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether they do not fit after it."""
+        return self.after_m > WRONG_M or self.after_deg > WRONG_DEG
+
+
+def judge_closure(
+    frame: int,
+    past: tuple[NDArray[np.int32], Float64],
+    truth: Float64,
+    unclosed: Float64,
+    closed: Float64,
+    window: int,
+) -> Closure:
+    """Compare the poses before and after a closure with where the old map says the camera is.
+
+    That is the true motion from the nearest old frame, applied to its estimate.
+    """
+    frames, poses = past
+    old = frames < frame - window
+    frames, poses = frames[old], poses[old]
+    motions = invert(truth[frames]) @ truth[frame]
+    cosines = np.clip((np.trace(motions[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1)
+    nearest = int((np.linalg.norm(motions[:, :3, 3], axis=1) + np.arccos(cosines)).argmin())
+    ideal = poses[nearest] @ motions[nearest]
+    return Closure(frame, *pose_error(ideal, unclosed), *pose_error(ideal, closed))

@@ -5,23 +5,23 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
-import cv2
 import numpy as np
-from ms_slam_experiments.pictures.drawing import save_image
+from numpy.typing import NDArray
 
-from ms_slam_env import metrics, slam
+from ms_slam_env import metrics, sequences, slam
 from ms_slam_env.benchmark.experiment import Experiment
-from ms_slam_env.camera import xtion
 from ms_slam_env.config import Checked, bounded, parse_named
-from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.evaluation.moving_objects import found_masks, mask_measures, true_masks
+from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.run_sequence import run_sequence
 from ms_slam_env.report.charts import Chart, scatter
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished, make_table, summary
-from ms_slam_env.sequences import HandheldPath, RenderedSequence, check_sequence, open_sequence
+from ms_slam_env.slam.slam_backend import TrackResult
+
+if TYPE_CHECKING:
+    from ms_slam_env.sequences.rendering import RenderedFrames
 
 _BOXES = "kinect+moving-objects,kind=box,count"
 _PEOPLE = "kinect+moving-objects,kind=person,speed_m_s=1,count"
@@ -79,16 +79,10 @@ class MovingObjectsExperiment(Experiment, Checked):
         for text in self.sequences:
             if Path(text).is_dir():
                 raise InputError(f"{text}: a recording does not say what moves in it")
-            check_sequence(text)
-        for text in self.backends:
-            name, _ = parse_named(text, "backend")
-            if name not in slam.BACKENDS:
-                raise unknown("SLAM backend", name, slam.BACKENDS)
-        xtion(self.image_size)
 
     def specs(self) -> list[MovingObjectsSpec]:
         """Every sequence."""
-        return [self.spec(MovingObjectsSpec, sequence=text) for text in self.sequences]
+        return self.each(MovingObjectsSpec, sequence=self.sequences)
 
     @staticmethod
     def run(spec: MovingObjectsSpec) -> dict[str, Any]:
@@ -152,6 +146,8 @@ class MovingObjectsExperiment(Experiment, Checked):
 
     def write_pictures(self, rows: Sequence[Row], out: Path) -> None:
         """The mask on frames of the sequence in which most moves."""
+        from ms_slam_experiments.pictures.stills import save_image
+
         moving = [row for row in finished(rows) if row["result"]["moving_share"] > 0]
         if not moving or MASKED not in self.backends:
             return
@@ -160,10 +156,10 @@ class MovingObjectsExperiment(Experiment, Checked):
         save_image(out / "mask.png", _picture(_rendered(spec)))
 
 
-def _rendered(spec: MovingObjectsSpec) -> RenderedSequence:
-    path = HandheldPath(spec.frames)
-    sequence = open_sequence(spec.sequence, spec.image_size, path=path, with_truth=True)
-    return cast(RenderedSequence, sequence)
+def _rendered(spec: MovingObjectsSpec) -> sequences.RenderedSequence:
+    path = sequences.HandheldPath(spec.frames)
+    sequence = sequences.open_sequence(spec.sequence, spec.image_size, path=path, with_truth=True)
+    return cast(sequences.RenderedSequence, sequence)
 
 
 def _lines(rows: Sequence[Row]) -> list[Mapping[str, Any]]:
@@ -180,8 +176,10 @@ def _lines(rows: Sequence[Row]) -> list[Mapping[str, Any]]:
     ]
 
 
-def _picture(sequence: RenderedSequence) -> np.ndarray:
+def _picture(sequence: sequences.RenderedSequence) -> np.ndarray:
     """Frames with what was found in red, found wrongly in yellow and missed in blue."""
+    import cv2
+
     name, params = parse_named(MASKED, "backend")
     system = slam.make(name, sequence.intrinsics, **params)
     frames = list(sequence.frames)
@@ -201,3 +199,49 @@ def _picture(sequence: RenderedSequence) -> np.ndarray:
         tiles.append(cv2.copyMakeBorder(image, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=(255,) * 3))
     rows = [np.hstack(tiles[k : k + _PER_ROW]) for k in range(0, _SHOWN, _PER_ROW)]
     return np.vstack(rows)
+
+
+Bool = NDArray[np.bool_]
+
+
+def true_masks(frames: RenderedFrames) -> Bool:
+    """Where (N, H, W) a moving object is in each frame, also while it stands still."""
+    movers = tuple(frames.object_trajectories)
+    moving = [
+        index
+        for index, label in enumerate(frames.labels)
+        if any(label == name or label.startswith(f"{name} ") for name in movers)
+    ]
+    return np.array([np.isin(frames.truth(k).labels, moving) for k in range(len(frames))])
+
+
+def found_masks(results: Sequence[TrackResult], shape: tuple[int, int]) -> Bool | None:
+    """The masks (N, H, W) that SLAM found; None if it looks for none, empty where it was lost."""
+    known = [result.moving for result in results if result.moving is not None]
+    if not known:
+        return None
+    nothing = np.zeros_like(known[0])
+    step = -(-shape[0] // nothing.shape[0])
+    rows, columns = (
+        np.minimum((np.arange(size) + step // 2) // step, small - 1)
+        for size, small in zip(shape, nothing.shape, strict=True)
+    )
+    masks = [nothing if result.moving is None else result.moving for result in results]
+    return np.array(masks)[:, rows][:, :, columns]
+
+
+def mask_measures(found: Bool, true: Bool, is_read: Bool) -> dict[str, float | None]:
+    """Precision, recall, overlap and false share of masks (N, H, W), of the pixels with depth.
+
+    None where nothing is there to be found.
+    """
+    found, true = found & is_read, true & is_read
+    both, either = int((found & true).sum()), int((found | true).sum())
+    moves = true.any()
+    return {
+        "mask_precision": both / int(found.sum()) if moves and found.any() else None,
+        "mask_recall": both / int(true.sum()) if moves else None,
+        "mask_iou": both / either if moves else None,
+        "mask_false_share": int((found & ~true).sum()) / max(int(is_read.sum()), 1),
+        "moving_share": int(true.sum()) / max(int(is_read.sum()), 1),
+    }

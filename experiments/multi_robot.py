@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from ms_slam_experiments.pictures.judged_map import save_team_picture
-from ms_slam_experiments.shared.teams import (
-    SETTINGS,
-    SHARED,
-    MultiRobotSpec,
-    judge_team,
-    make_team,
-    merge_pairs,
-    place_robots,
-)
+from numpy.typing import NDArray
 
+from ms_slam_env import metrics, scenes, slam
 from ms_slam_env.benchmark.episodes import seed_list
-from ms_slam_env.benchmark.experiment import Experiment
+from ms_slam_env.benchmark.experiment import Experiment, check_each
 from ms_slam_env.camera import xtion
 from ms_slam_env.config import Checked, bounded
-from ms_slam_env.errors import unknown
+from ms_slam_env.errors import InputError
+from ms_slam_env.evaluation.map_quality import map_quality
+from ms_slam_env.evaluation.run_sequence import run_sequence
+from ms_slam_env.geometry import invert, transform_points
+from ms_slam_env.geometry.point_clouds import voxel_downsample
 from ms_slam_env.metrics.registry import metric
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import (
@@ -36,9 +32,374 @@ from ms_slam_env.report.tables import (
     make_table,
     measured,
 )
-from ms_slam_env.scenes.registry import check_name
-from ms_slam_env.sensor.noise import noise_config
-from ms_slam_env.slam.team.map_merging import MergeConfig
+from ms_slam_env.scenes import Scene
+from ms_slam_env.sensor import RGBDSensor
+from ms_slam_env.sequences import HandheldPath, render_sequence
+from ms_slam_env.slam.team.map_merging import (
+    Merge,
+    MergeConfig,
+    decide,
+    find_hypotheses,
+    pose_difference,
+)
+from ms_slam_env.slam.team.relative_map_poses import RobotRun
+from ms_slam_env.slam.team.team_server import fuse_team, optimise_team
+
+Float64 = NDArray[np.float64]
+
+SHARED, FOREIGN = "shared", "foreign"
+SETTINGS = (SHARED, FOREIGN)
+"""All robots in one scene; or the last one in another scene of the same kind."""
+
+WRONG_M, WRONG_DEG = 0.10, 5.0  # a merge that is off by more is wrong
+_OTHER_SEED = 50_000
+_SURFACE_M = 0.01
+_LOOK_EVERY = 5  # frames between views that the surface to be mapped is made of
+
+VOXEL_M = 0.10
+_ATTEMPTS = 30
+_SEEDS_A_ROBOT = 1000
+_LOOKS = 25  # poses of a path that are looked from
+_REACH_M = 4.0  # of the sensor
+
+
+@dataclass(frozen=True)
+class MultiRobotSpec:
+    """A team.
+
+    Attributes:
+        scene: name or mesh file.
+        seed: of the scene, the paths and the noise.
+        robots: how many, 2 or 3.
+        setting: one of ``SETTINGS``.
+        frames: of each robot.
+        image_size: such as 160x120.
+        noise: of the sensors.
+        least_overlap: of the surfaces that they see.
+        params: of the SLAM.
+        merge: how maps are merged.
+        server: whether trajectories and map are optimised after merging, too.
+    """
+
+    scene: str = "living_room"
+    seed: int = 1000
+    robots: int = 2
+    setting: str = SHARED
+    frames: int = 200
+    image_size: str = "160x120"
+    noise: str = "kinect"
+    least_overlap: float = 0.3
+    params: dict[str, Any] = field(default_factory=dict)
+    merge: MergeConfig = field(default_factory=MergeConfig)
+    server: bool = False
+
+
+@dataclass(frozen=True)
+class Team:
+    """Robots that have mapped their paths.
+
+    Attributes:
+        robots: M runs, each in the frame of its first camera.
+        truths: M true trajectories (N, 4, 4), T_world_camera.
+        times: M time stamps (N,), seconds.
+        surface: (P, 3) points of the whole scene's surface, world frame.
+        seen: (Q, 3) points of the surface that the true trajectories saw.
+        overlaps: of every robot but the first with one before.
+    """
+
+    robots: list[RobotRun]
+    truths: list[Float64]
+    times: list[Float64]
+    surface: Float64
+    seen: Float64
+    overlaps: list[float]
+
+    def true_pose(self, a: int, b: int) -> Float64:
+        """True T_a_b (4, 4) of two robots' frames."""
+        return invert(self.truths[a][0]) @ self.truths[b][0]
+
+
+def make_team(spec: MultiRobotSpec) -> Team:
+    """Render what each robot sees and let its SLAM map it.
+
+    Raises:
+        InputError: a scene, size, noise or parameter that does not exist, or no paths.
+    """
+    scene = scenes.make(spec.scene, spec.seed)
+    own = [scene] * spec.robots
+    path = HandheldPath(frames=spec.frames)
+    if spec.setting == FOREIGN:
+        own[-1] = scenes.make(spec.scene, spec.seed + _OTHER_SEED)
+        together = spec.robots - 1
+        poses, overlaps = team_paths(scene, path, spec.seed, together, spec.least_overlap)
+        poses += team_paths(own[-1], path, spec.seed + _OTHER_SEED, 1, 0.0)[0]
+        overlaps.append(0.0)
+    else:
+        poses, overlaps = team_paths(scene, path, spec.seed, spec.robots, spec.least_overlap)
+    K = xtion(spec.image_size)
+    runs = []
+    for number, (place, truth) in enumerate(zip(own, poses, strict=True)):
+        noise_seed = 10 * spec.seed + number
+        frames = tuple(render_sequence(place, truth, K, spec.noise, noise_seed).frames)
+        backend = slam.make("surfel", K, **spec.params)
+        run = run_sequence(backend, frames)
+        runs.append(RobotRun(backend, frames, run.estimates, run.tracking_ok))
+    here = [truth for place, truth in zip(own, poses, strict=True) if place is scene]
+    seen = Views(scene).points(np.concatenate(here)[::_LOOK_EVERY], _SURFACE_M)
+    surface = scene.surface_points(_SURFACE_M)[0]
+    return Team(runs, poses, [path.timestamps] * spec.robots, surface, seen, overlaps)
+
+
+class Views:
+    """Which surface a path sees, as occupied voxels of ``VOXEL_M``."""
+
+    def __init__(self, scene: Scene) -> None:
+        """Prepare to look around in a scene."""
+        self._sensor = RGBDSensor(scene, xtion("80x60"), noise="none")
+
+    def of(self, poses: Float64) -> set[tuple[int, ...]]:
+        """Voxels seen from poses (N, 4, 4)."""
+        points = self.points(poses[:: max(1, len(poses) // _LOOKS)], VOXEL_M)
+        return set(map(tuple, np.floor(points / VOXEL_M).astype(int).tolist()))
+
+    def points(self, poses: Float64, voxel_m: float) -> Float64:
+        """Points (M, 3) of the true surface that poses (N, 4, 4) see, one a voxel."""
+        seen = []
+        for pose in poses:
+            view = self._sensor.ground_truth(pose)
+            near = (view.depth > 0) & (view.depth <= _REACH_M)
+            seen.append(view.points[near].astype(np.float64))
+        return voxel_downsample(np.concatenate(seen), voxel_m)
+
+
+def overlap(a: set[tuple[int, ...]], b: set[tuple[int, ...]]) -> float:
+    """Share of the smaller of two sets of voxels that is in the other too."""
+    return len(a & b) / max(1, min(len(a), len(b)))
+
+
+def team_paths(
+    scene: Scene, path: HandheldPath, seed: int, robots: int, least_overlap: float
+) -> tuple[list[Float64], list[float]]:
+    """A path for each robot, each seeing enough of what one before it sees.
+
+    Args:
+        scene: where.
+        path: how they are carried.
+        seed: of the paths.
+        robots: how many.
+        least_overlap: share of the smaller set of surfaces seen, [0, 1]; 0 = any path will do.
+
+    Returns:
+        paths (N, 4, 4), and for every robot but the first its largest overlap with one before.
+
+    Raises:
+        InputError: no free path, or none that overlaps.
+    """
+    views = Views(scene)
+    paths: list[Float64] = []
+    seen: list[set[tuple[int, ...]]] = []
+    overlaps: list[float] = []
+    for robot in range(robots):
+        for attempt in range(_ATTEMPTS):
+            number = (seed * robots + robot) * _SEEDS_A_ROBOT + attempt
+            poses = path.poses(scene, number)
+            voxels = views.of(poses)
+            shared = max((overlap(voxels, other) for other in seen), default=1.0)
+            if shared >= least_overlap:
+                break
+        else:
+            raise InputError(
+                f"found no path of robot {robot} in scene {scene.name!r}, seed {scene.seed}, that "
+                f"shares {100 * least_overlap:.0f} % of what another sees"
+            )
+        paths.append(poses)
+        seen.append(voxels)
+        overlaps.append(shared)
+    return paths, overlaps[1:]
+
+
+@dataclass(frozen=True)
+class PairMerge:
+    """What came of merging two maps, from all guesses and from those of each source alone."""
+
+    merge: Merge
+    alone: dict[str, Merge] = field(default_factory=dict)
+
+
+def merge_pairs(robots: list[RobotRun], config: MergeConfig) -> dict[tuple[int, int], PairMerge]:
+    """Merge every pair of maps; the result by pair (a, b), a < b."""
+    found = {}
+    for a, b in itertools.combinations(range(len(robots)), 2):
+        guesses = find_hypotheses(robots[a], robots[b], config)
+        merge = decide(robots[a], robots[b], guesses, config)
+        alone = {}
+        for source in config.sources:
+            some = [guess for guess in guesses if guess.source == source]
+            is_all = len(some) == len(guesses)
+            alone[source] = merge if is_all else decide(robots[a], robots[b], some, config)
+        found[a, b] = PairMerge(merge, alone)
+    return found
+
+
+def place_robots(count: int, merges: dict[tuple[int, int], PairMerge]) -> dict[int, Float64]:
+    """T_0_b (4, 4) by robot b, of those that can be brought into the first one's frame.
+
+    Links that more guesses agree on are taken first.
+    """
+    placed = {0: np.eye(4)}
+    while True:
+        links = [
+            (pair.merge.agreeing, a, b, T)
+            for (i, j), pair in merges.items()
+            if pair.merge.T_a_b is not None
+            for a, b, T in ((i, j, pair.merge.T_a_b), (j, i, invert(pair.merge.T_a_b)))
+            if a in placed and b not in placed
+        ]
+        if not links:
+            return dict(sorted(placed.items()))
+        _, a, b, T_a_b = max(links, key=lambda link: link[0])
+        placed[b] = placed[a] @ T_a_b
+
+
+def judge_team(
+    team: Team, merges: dict[tuple[int, int], PairMerge], spec: MultiRobotSpec
+) -> dict[str, Any]:
+    """Figures of a team, of the robots that were merged with the first and of each alone.
+
+    Keys as in the registry of metrics: what came of each pair, and ``by_source`` from the guesses
+    of one source; the trajectories (one SE(3) alignment for all, and the first robot's start as the
+    only tie); the merged map against all that the robots saw; ``alone``: each robot without the
+    others, its map tied by its own true start.
+    """
+    foreign = len(team.robots) - 1 if spec.setting == FOREIGN else None
+    pairs = []
+    for (a, b), pair in merges.items():
+        same_scene = foreign not in (a, b)
+        by_source = [
+            {"source": name, **_judge_merge(team, a, b, merge, same_scene)}
+            for name, merge in pair.alone.items()
+        ]
+        entry = _judge_merge(team, a, b, pair.merge, same_scene)
+        about = {"pair": f"{a}-{b}", "same_scene": same_scene}
+        pairs.append({**about, **entry, "by_source": by_source})
+    T_first = {k: team.truths[0][0] @ T for k, T in place_robots(len(team.robots), merges).items()}
+    members = list(T_first)
+    estimates = [T @ team.robots[k].estimates for k, T in T_first.items()]
+    points = [
+        transform_points(T, team.robots[k].backend.surface_points()) for k, T in T_first.items()
+    ]
+    truths = [team.truths[k] for k in members]
+    return {
+        "pairs": pairs,
+        "path_overlaps": team.overlaps,
+        "merged_robots": len(members),
+        **team_errors(estimates, truths, [team.robots[k].tracked for k in members]),
+        "task_time_s": metrics.task_time([team.times[k] for k in members]),
+        "mean_path_m": metrics.mean_path_length(truths),
+        **map_quality(np.concatenate(points), team.surface, reference=team.seen),
+        **({"server": serve(team, T_first, spec)} if spec.server else {}),
+        "alone": [_alone(team, k) for k in range(len(team.robots)) if k != foreign],
+    }
+
+
+def team_errors(
+    estimates: list[Float64], truths: list[Float64], tracked: list[NDArray[np.bool_]]
+) -> dict[str, Any]:
+    """Errors of the trajectories (N, 4, 4) of a team in one world, by keys of the registry."""
+    ate = metrics.team_ate(estimates, truths)
+    joined = np.concatenate(estimates), np.concatenate(truths), np.concatenate(tracked)
+    own = metrics.tracked_errors(*joined)
+    return {
+        "team_ate_m": ate.rmse,
+        "team_ate_tracked_m": own["ate_tracked_m"],
+        "tracked_share": own["tracked_share"],
+        "team_ate_max_m": ate.max,
+        "team_ate_unaligned_m": metrics.team_ate(estimates, truths, "none").rmse,
+        "team_rpe_m": metrics.team_rpe(estimates, truths).rmse,
+    }
+
+
+def serve(team: Team, T_world_map: dict[int, Float64], spec: MultiRobotSpec) -> dict[str, Any]:
+    """The same figures after the server has optimised the trajectories and fused the map anew.
+
+    ``server_cpu_s`` is the processor time of the pose graph, without that of the fusion;
+    ``noise_ratio`` is that of the fused map, ``merged_noise_ratio`` of the maps laid together.
+    """
+    began = time.process_time()
+    made = optimise_team(team.robots, T_world_map)
+    seconds = time.process_time() - began
+    estimates = list(made.trajectories.values())
+    truths = [team.truths[k] for k in made.trajectories]
+    before = [T @ team.robots[k].estimates for k, T in T_world_map.items()]
+    K = team.robots[0].backend.intrinsics
+    fused = fuse_team(slam.make("surfel", K, **spec.params), team.robots, made).surface_points()
+    laid = np.concatenate([
+        transform_points(T, team.robots[k].backend.surface_points())
+        for k, T in T_world_map.items()
+    ])  # fmt: skip
+    several = len(estimates) > 1
+    return {
+        **team_errors(estimates, truths, [team.robots[k].tracked for k in made.trajectories]),
+        "between_robots_m": metrics.inter_robot_rpe(estimates, truths).rmse if several else None,
+        "merged_between_robots_m": (
+            metrics.inter_robot_rpe(before, truths).rmse if several else None
+        ),
+        "server_links": made.links,
+        "server_cpu_s": seconds,
+        "noise_ratio": metrics.noise_ratio(fused),
+        "merged_noise_ratio": metrics.noise_ratio(laid),
+        **map_quality(fused, team.surface, reference=team.seen),
+    }
+
+
+def _judge_merge(team: Team, a: int, b: int, merge: Merge, same_scene: bool) -> dict[str, Any]:
+    """Figures of one attempt to merge robot b's map into robot a's."""
+    fit = merge.fit
+    entry: dict[str, Any] = {
+        "merged": merge.T_a_b is not None,
+        "merge_refusal": merge.reason,
+        "wrong_merge": False,
+        "hypotheses": merge.found,
+        "agreeing_hypotheses": merge.agreeing,
+        "refined_m": merge.refined_m,
+        "overlap_share": fit.overlap,
+        "consistent_share": fit.consistent,
+        "photometric_correlation": fit.alike,
+    }
+    if merge.T_a_b is not None:
+        entry |= pair_error(team, a, b, merge.T_a_b)
+        off = entry["merge_error_m"] > WRONG_M or entry["merge_error_deg"] > WRONG_DEG
+        entry["wrong_merge"] = bool(off or not same_scene)
+    return entry
+
+
+def pair_error(team: Team, a: int, b: int, T_a_b: Float64) -> dict[str, float]:
+    """Error of a relative pose, at robot b's mean camera position and at its frame's origin."""
+    true = team.true_pose(a, b)
+    centre = team.robots[b].estimates[:, :3, 3].mean(axis=0)
+    error_m, error_deg = pose_difference(T_a_b, true, centre)
+    origin_m = pose_difference(T_a_b, true, np.zeros(3))[0]
+    return {
+        "merge_error_m": error_m,
+        "merge_error_origin_m": origin_m,
+        "merge_error_deg": error_deg,
+    }
+
+
+def _alone(team: Team, k: int) -> dict[str, Any]:
+    """A robot without the others."""
+    robot, truth = team.robots[k], team.truths[k]
+    points = transform_points(truth[0], robot.backend.surface_points())
+    return {
+        "ate_m": metrics.ate_rmse(robot.estimates, truth),
+        **metrics.tracked_errors(robot.estimates, truth, robot.tracked),
+        "ate_unaligned_m": metrics.ate_rmse(truth[0] @ robot.estimates, truth, align="none"),
+        "rpe_m": metrics.rpe_rmse(robot.estimates, truth),
+        "lost_share": 1.0 - float(robot.tracked.mean()),
+        "path_length_m": metrics.path_length(truth),
+        **map_quality(points, team.surface, reference=team.seen),
+    }
+
 
 _MERGED = ("merged", "wrong_merge")
 _BESIDE = {
@@ -86,30 +447,14 @@ class MultiRobot(Experiment, Checked):
     """How maps are merged."""
     server: bool = False
     """Optimise trajectories and map jointly after merging, and compare."""
-    picture: bool = True
-    """Draw the map of the first team, which is run once more for it."""
 
     unit = "teams"
 
     def specs(self) -> list[MultiRobotSpec]:
-        """Every team.
-
-        Raises:
-            InputError: a scene, split, size, noise or setting that does not exist.
-        """
-        xtion(self.image_size)
-        noise_config(self.noise)
-        for scene in self.scenes:
-            check_name(scene)
-        for setting in self.settings:
-            if setting not in SETTINGS:
-                raise unknown("setting", setting, SETTINGS)
-        return [
-            self.spec(MultiRobotSpec, scene=scene, seed=seed, setting=setting)
-            for setting in self.settings
-            for scene in self.scenes
-            for seed in seed_list(self.seeds, self.teams)
-        ]
+        """Every team."""
+        check_each("setting", self.settings, SETTINGS)
+        seeds = seed_list(self.seeds, self.teams)
+        return self.each(MultiRobotSpec, setting=self.settings, scene=self.scenes, seed=seeds)
 
     @staticmethod
     def run(spec: MultiRobotSpec) -> dict[str, Any]:
@@ -134,19 +479,6 @@ class MultiRobot(Experiment, Checked):
             make_table(_PAIR, [{**pair["spec"], **pair["result"]} for pair in pairs], "Pairs"),
             *([_served(rows)] if any("server" in row["result"] for row in finished(rows)) else []),
         ]
-
-    def write_pictures(self, rows: Sequence[Row], out: Path) -> None:
-        """The merged map of the first team."""
-        if not self.picture:
-            return
-        spec = self.specs()[0]
-        team = make_team(spec)
-        merges = merge_pairs(team.robots, spec.merge)
-        placed, found = place_robots(spec.robots, merges), judge_team(team, merges, spec)
-        name = Path(spec.scene).stem
-        path = out / f"map_{name}_{spec.seed}_{spec.robots}.png"
-        title = f"{name}, seed {spec.seed}, {spec.robots} robots"
-        save_team_picture(team, placed, found, path, title)
 
 
 def _teams(rows: Sequence[Row]) -> Table:

@@ -8,19 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from ms_slam_env import metrics, scenes, slam
+from ms_slam_env import metrics, scenes, sequences
 from ms_slam_env._runtime.parallel import limit_threads
 from ms_slam_env.benchmark.episodes import seed_list
 from ms_slam_env.benchmark.experiment import Experiment
-from ms_slam_env.camera import rendered_size, xtion
-from ms_slam_env.config import Checked, bounded, parse_named
+from ms_slam_env.camera import xtion
+from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
-from ms_slam_env.evaluation.run_sequence import run_sequence
+from ms_slam_env.evaluation.run_sequence import run_backend
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Grouping, Table, finished, make_table
-from ms_slam_env.scenes.registry import check_name
-from ms_slam_env.sequences import make_perturbation, render_sequence
-from ms_slam_env.sequences.loop_paths import around_object
 
 METRICS = (
     *("relocalisation_found_s", "relocalisations", "never_relocalised", "robustness"),
@@ -71,41 +68,38 @@ class Orbit(Experiment, Checked):
         """Every run.
 
         Raises:
-            InputError: a scene, backend, size or split that does not exist, or no length.
+            InputError: a name that stands for nothing, or no length.
         """
-        rendered_size(self.image_size)
         if not self.black_frames or min(self.black_frames) < 1:
             raise InputError(f"black_frames {self.black_frames} must be numbers of frames, >= 1")
-        for scene in self.scenes:
-            check_name(scene)
-        for backend in self.backends:
-            slam.check_parameters(*parse_named(backend, "backend"))
-        return [
-            self.spec(OrbitSpec, scene=scene, seed=seed, backend=backend, black_frames=black)
-            for scene in self.scenes
-            for seed in seed_list(self.seeds, self.recordings)
-            for black in self.black_frames
-            for backend in self.backends
-        ]
+        return self.each(
+            OrbitSpec,
+            scene=self.scenes,
+            seed=seed_list(self.seeds, self.recordings),
+            black_frames=self.black_frames,
+            backend=self.backends,
+        )
 
     @staticmethod
     def run(spec: OrbitSpec) -> dict[str, Any]:
         """Track the orbit, in the dark too, and measure."""
+        from ms_slam_experiments.shared.loop_paths import around_object
+
         limit_threads(1)
         scene = scenes.make(spec.scene, spec.seed)
         poses, lap = around_object(scene, spec.seed, spec.laps)
         every = lap // spec.stretches
         if spec.black_frames >= every:
             raise InputError(f"{spec.black_frames} black frames leave nothing of {every} to see")
-        dark = make_perturbation(
+        dark = sequences.make_perturbation(
             "black-frames", {"start": lap, "length": spec.black_frames, "every": every}
         )
-        K = xtion(spec.image_size)
-        sequence = render_sequence(scene, poses, K, "kinect", spec.seed, perturbations=[dark])
-        name, params = parse_named(spec.backend, "backend")
+        sequence = sequences.render_sequence(
+            scene, poses, xtion(spec.image_size), "kinect", spec.seed, perturbations=[dark]
+        )
         black: list[bool] = []
-        run = run_sequence(
-            slam.make(name, K, **params),
+        run = run_backend(
+            spec.backend,
             sequence,
             on_step=lambda step: black.append(not step.frame.color.any()),
         )

@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from ms_slam_env.benchmark.episode_experiment import DOTS, SteppedExperiment
-from ms_slam_env.benchmark.episodes import short_planner_names
+from ms_slam_env.benchmark.episodes import DOTS, SteppedExperiment, short_planner_names
 from ms_slam_env.report.charts import Chart, by_group
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.statistics import relative_cut

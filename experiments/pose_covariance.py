@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import chi2
 
-from ms_slam_env import slam
+from ms_slam_env import scenes, sequences, slam
+from ms_slam_env import sensor as sensors
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.config import Checked, bounded
@@ -22,10 +22,6 @@ from ms_slam_env.geometry import invert, se3_log
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished, format_number, make_table
-from ms_slam_env.sensor import RGBDSensor
-from ms_slam_env.sensor.noise import noise_config
-from ms_slam_env.sensor.scene_cache import get_scene
-from ms_slam_env.sequences import handheld_trajectory
 
 Float64 = NDArray[np.float64]
 
@@ -81,22 +77,21 @@ class PoseCovariance(Experiment, Checked):
 
     def specs(self) -> list[CovarianceSpec]:
         """Every sequence."""
-        xtion(self.size)
-        noise_config(self.noise)
         split = {VALIDATION: self.validation_seeds, TEST: self.test_seeds}
         return [
-            self.spec(CovarianceSpec, seeds=seeds, scene=scene, seed=seed)
+            spec
             for seeds, numbers in split.items()
-            for scene in self.scenes
-            for seed in numbers
+            for spec in self.each(CovarianceSpec, seeds=(seeds,), scene=self.scenes, seed=numbers)
         ]
 
     @staticmethod
     def run(spec: CovarianceSpec) -> dict[str, Any]:
         """Errors of one sequence."""
-        scene, intrinsics = get_scene(spec.scene, spec.seed), xtion(spec.size)
-        poses = handheld_trajectory(scene, spec.frames, spec.seed, spec.speed_m, spec.rot_deg)
-        sensor = RGBDSensor(scene, intrinsics, noise=spec.noise, seed=spec.seed)
+        scene, intrinsics = scenes.make(spec.scene, spec.seed), xtion(spec.size)
+        poses = sequences.handheld_trajectory(
+            scene, spec.frames, spec.seed, spec.speed_m, spec.rot_deg
+        )
+        sensor = sensors.RGBDSensor(scene, intrinsics, noise=spec.noise, seed=spec.seed)
         frames = [sensor.capture(pose, index) for index, pose in enumerate(poses)]
         return measure(slam.make("surfel", intrinsics), frames, list(poses))
 
@@ -119,7 +114,7 @@ class PoseCovariance(Experiment, Checked):
     def charts(self, rows: Sequence[Row]) -> list[Chart]:
         """The share of errors within an ellipsoid over the share that it promises."""
         promised = np.linspace(0.01, 0.99, 99)
-        limits = chi2.ppf(promised, DEGREES_OF_FREEDOM)
+        limits = chi2_limits(promised)
         series = [Series("right", [0.0, 1.0], [0.0, 1.0], mode="lines")]
         for seeds, results in _by_split(rows).items():
             squared = squared_errors(results)
@@ -179,9 +174,16 @@ def squared(twists: Float64, covariances: Float64) -> Float64:
     return np.asarray((twists * solved).sum(axis=1))
 
 
+def chi2_limits(shares: ArrayLike) -> Float64:
+    """What so large a share of right squared errors is below."""
+    from scipy.stats import chi2
+
+    return np.asarray(chi2.ppf(shares, DEGREES_OF_FREEDOM))
+
+
 def coverage(squared: Float64, factor: float = 1.0) -> list[float]:
     """Share of errors within the ellipsoids of ``BOUNDS``, covariances times ``factor``."""
-    limits = factor * chi2.ppf(list(BOUNDS.values()), DEGREES_OF_FREEDOM)
+    limits = factor * chi2_limits(list(BOUNDS.values()))
     return [float((squared < limit).mean()) if len(squared) else np.nan for limit in limits]
 
 
@@ -189,7 +191,7 @@ def scale(squared: Float64) -> float:
     """Factor of the covariances with which nine tenths of the errors are within that bound."""
     if not len(squared):
         return float("nan")
-    return float(np.quantile(squared, 0.9) / chi2.ppf(0.9, DEGREES_OF_FREEDOM))
+    return float(np.quantile(squared, 0.9) / chi2_limits(0.9))
 
 
 def squared_errors(results: Iterable[Mapping[str, Any]]) -> Float64:

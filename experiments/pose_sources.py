@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ms_slam_env.benchmark.episode_experiment import DOTS, SteppedExperiment
-from ms_slam_env.benchmark.episodes import parse_options
+from ms_slam_env.benchmark.episodes import DOTS, SteppedExperiment, parse_options
 from ms_slam_env.benchmark.experiment import check_each
 from ms_slam_env.env.pose_sources import POSE_SOURCES
 from ms_slam_env.errors import InputError

@@ -9,38 +9,220 @@ from itertools import cycle
 from typing import Any
 
 import numpy as np
-from ms_slam_experiments.shared.interruptions import (
-    ALL_SETTINGS,
-    FOREIGN,
-    SETTINGS,
-    Interruption,
-    MappedSpace,
-    draw_interruption,
-    foreign_interruption,
-    interrupt,
-    map_path,
-)
 from numpy.typing import NDArray
 
-from ms_slam_env import scenes, slam
+from ms_slam_env import metrics, scenes, sensor, sequences, slam
 from ms_slam_env.benchmark.episodes import seed_list
 from ms_slam_env.benchmark.experiment import Experiment, check_each
 from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
+from ms_slam_env.evaluation.loop_closures import pose_error
 from ms_slam_env.evaluation.run_sequence import SequenceRun, run_sequence
-from ms_slam_env.geometry import invert
-from ms_slam_env.metrics import ate_rmse
+from ms_slam_env.geometry import invert, make_pose, relative_angle, so3_exp, transform_points
 from ms_slam_env.report.charts import Chart, Panel, interval_series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.statistics import median_interval
 from ms_slam_env.report.tables import Table, Value, finished, format_value, make_table, summary
 from ms_slam_env.scenes import PUBLISHED_ROOMS, Scene
-from ms_slam_env.scenes.registry import check_name
-from ms_slam_env.sensor import RGBDSensor
-from ms_slam_env.slam.surfel.surfel_config import RELOCALISATIONS
+from ms_slam_env.slam import SlamBackend
 
 Float64 = NDArray[np.float64]
+
+DEPTH_LIMIT_M = 3.0  # readings beyond count neither as mapped nor as not
+FOUND_M, FOUND_DEG = 0.05, 5.0
+WRONG_M, WRONG_DEG = 0.10, 10.0
+_CLEARANCE_M = 0.1
+_AWAY_M, _AWAY_DEG = 0.3, 30.0  # a kidnapping ends at least so far from where it began
+_DRAWS = 300
+_VIEW = xtion("80x60").scaled(0.5)  # of the images by which mapped space is known
+_EVERY = 4  # mapped frames that are looked at
+_SAME_M = 0.05  # a point this close to the surface that a mapped frame saw was seen
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A kind of interruption.
+
+    Attributes:
+        offset_m: the camera reappears up to so far from a random earlier pose
+        offset_deg: and turned by up to so much.
+        mapped: least share of the view's readings there that the map holds.
+        black: fewest and most black frames in between; while they last the camera goes back along
+            its path, else it jumps to anywhere on it.
+    """
+
+    offset_m: float
+    offset_deg: float
+    mapped: float
+    black: tuple[int, int] | None = None
+
+
+SETTINGS: dict[str, Setting] = {
+    "near": Setting(0.20, 15.0, 0.6),
+    "far": Setting(0.40, 30.0, 0.5),
+    "black": Setting(0.05, 4.0, 0.6, (5, 20)),
+}
+FOREIGN = "foreign"
+"""One more kind: the camera reappears in another scene, and nothing there may be recognised."""
+ALL_SETTINGS = (*SETTINGS, FOREIGN)
+
+
+@dataclass(frozen=True)
+class Interruption:
+    """One interruption.
+
+    Attributes:
+        black: number of black frames before the camera sees again.
+        poses: (N, 4, 4) true poses from then on.
+        source: index of the mapped pose that the first of them is near; -1 for none.
+        mapped: share of the first view's readings that lie in mapped space.
+    """
+
+    black: int
+    poses: Float64
+    source: int
+    mapped: float
+
+
+def map_path(scene: Scene, frames: int, seed: int) -> Float64:
+    """Poses (frames, 4, 4) of the stretch that is mapped."""
+    return sequences.handheld_trajectory(scene, frames, seed)
+
+
+class MappedSpace:
+    """What a camera has seen from the poses of a path."""
+
+    def __init__(self, scene: Scene, path: Float64, intrinsics: Intrinsics = _VIEW) -> None:
+        """Look from every few poses of ``path`` (N, 4, 4)."""
+        self._sensor = sensor.RGBDSensor(scene, intrinsics, noise="none")
+        self._intrinsics = intrinsics
+        some = path[::_EVERY]
+        self._world_to_camera = [invert(pose) for pose in some]
+        self._depths = [self._sensor.ground_truth(pose).depth for pose in some]
+
+    def share(self, T_world_camera: Float64) -> float:
+        """Share of the readings from a pose (4, 4) that the path has seen.
+
+        0 where less than half of the pixels have a reading in the range of the map.
+        """
+        view = self._sensor.ground_truth(T_world_camera)
+        reading = (view.depth > 0) & (view.depth <= DEPTH_LIMIT_M)
+        if reading.mean() < 0.5:
+            return 0.0
+        points = view.points[reading].astype(np.float64)
+        seen = np.zeros(len(points), dtype=bool)
+        height, width = self._intrinsics.shape
+        for T_camera_world, depth in zip(self._world_to_camera, self._depths, strict=True):
+            local = transform_points(T_camera_world, points)
+            z = np.maximum(local[:, 2], 1e-6)
+            u, v = np.rint(self._intrinsics.project(np.c_[local[:, :2], z])).T
+            inside = (local[:, 2] > 0.05) & (local[:, 2] <= DEPTH_LIMIT_M)
+            inside &= (u >= 0) & (u < width) & (v >= 0) & (v < height)
+            at = depth[v[inside].astype(int), u[inside].astype(int)]
+            # One pixel is centimetres of a slanted surface.
+            near = np.abs(at - z[inside]) < _SAME_M * np.maximum(1.0, z[inside])
+            seen[np.flatnonzero(inside)[near]] = True
+        return float(seen.mean())
+
+
+def draw_interruption(
+    scene: Scene,
+    path: Float64,
+    space: MappedSpace,
+    setting: Setting,
+    after: int,
+    rng: np.random.Generator,
+) -> Interruption | None:
+    """Draw one interruption at the end of ``path`` (M, 4, 4) with ``after`` frames behind it.
+
+    None if no pose was found that satisfies the setting.
+    """
+    for _ in range(_DRAWS):
+        offset = _random_motion(setting, rng)
+        if setting.black is None:
+            black, forwards = 0, rng.random() < 0.5
+            source = int(rng.integers(0, len(path)))
+        else:
+            black, forwards = int(rng.integers(setting.black[0], setting.black[1] + 1)), False
+            source = len(path) - 1 - black
+        steps = source + np.arange(after) * (1 if forwards else -1)
+        if steps.min() < 0 or steps.max() >= len(path):
+            continue
+        poses = path[steps] @ offset
+        if scene.clearance(poses[:, :3, 3]).min() < _CLEARANCE_M:
+            continue
+        if setting.black is None and not _is_away(path[-1], poses[0]):
+            continue
+        share = space.share(poses[0])
+        if share >= setting.mapped:
+            return Interruption(black, poses, source, share)
+    return None
+
+
+def foreign_interruption(other: Scene, after: int, seed: int) -> Interruption:
+    """The camera reappears on a path of its own in scene ``other``."""
+    return Interruption(0, sequences.handheld_trajectory(other, after, seed), -1, 0.0)
+
+
+def _random_motion(setting: Setting, rng: np.random.Generator) -> Float64:
+    """A motion (4, 4) of uniform size up to the setting's in a uniform direction."""
+    turn, step = rng.normal(size=3), rng.normal(size=3)
+    turn *= np.radians(setting.offset_deg) * rng.random() / np.linalg.norm(turn)
+    step *= setting.offset_m * rng.random() / np.linalg.norm(step)
+    return make_pose(so3_exp(turn), step)
+
+
+def _is_away(a: Float64, b: Float64) -> bool:
+    moved = np.linalg.norm(a[:3, 3] - b[:3, 3]) >= _AWAY_M
+    return bool(moved or relative_angle(a[:3, :3], b[:3, :3]) >= np.radians(_AWAY_DEG))
+
+
+def interrupt(
+    backend: SlamBackend, one: Interruption, frames: list[RGBDFrame], expected: Float64 | None
+) -> dict[str, Any]:
+    """Put a SLAM that has mapped a path through an interruption.
+
+    Args:
+        backend: the SLAM.
+        one: the interruption.
+        frames: N, taken after it.
+        expected: (N, 4, 4) their poses in the map; None if they show nothing that it holds.
+
+    Returns:
+        ``found``: a pose within 5 cm and 5 degrees of the expected one was given; ``wrong``: one
+        farther than 10 cm or 10 degrees off was, or any where none is expected; the others as the
+        registry defines them.
+    """
+    height, width = frames[0].depth.shape
+    nothing = RGBDFrame(
+        np.zeros((height, width, 3), np.uint8), np.zeros((height, width), np.float32)
+    )
+    dark = run_sequence(backend, [nothing] * one.black, reset=False)
+    run = run_sequence(backend, frames, reset=False)
+    tracked = run.anchored  # in a submap of its own the camera is not found yet
+    errors = []
+    if expected is not None:
+        errors = [pose_error(run.estimates[i], expected[i]) for i in np.flatnonzero(tracked)]
+    seconds = np.arange(len(frames) + 1) / sensor.FRAME_RATE_HZ
+    interrupted = [True] + [False] * len(frames)
+    first = int(tracked.argmax()) if tracked.any() else None
+    far = [m > WRONG_M or deg > WRONG_DEG for m, deg in errors]
+    return {
+        "found": any(m < FOUND_M and deg < FOUND_DEG for m, deg in errors),
+        "wrong": any(far) or (expected is None and bool(tracked.any())),
+        "frames_to_pose": math.inf if first is None else first,
+        "relocalisation_s": float(
+            metrics.relocalisation_times(seconds, interrupted, [False, *tracked.tolist()])[0]
+        ),
+        "first_error_m": errors[0][0] if errors else None,
+        "first_error_deg": errors[0][1] if errors else None,
+        "lost_frame_cpu_ms": float(np.mean(run.cpu_ms[: None if first is None else first + 1])),
+        "black_frames": one.black,
+        "black_tracked": len(dark) - dark.lost_frames,
+        "mapped_share": one.mapped,
+    }
+
 
 EVERY = "all"
 COLUMNS = (
@@ -96,20 +278,19 @@ class Relocalization(Experiment, Checked):
 
     def specs(self) -> list[RelocalizationSpec]:
         """Every map."""
-        for scene in self.scenes:
-            check_name(scene)
+        from ms_slam_env.slam.surfel.surfel_config import RELOCALISATIONS
+
         check_each("scene", self.scenes, self.scenes)
         check_each("setting", self.settings, ALL_SETTINGS)
         check_each("variant", self.variants, RELOCALISATIONS)
         if self.after > self.map_frames:
             raise InputError(f"after = {self.after} is more than map_frames = {self.map_frames}")
-        for size in self.sizes:
-            xtion(size)
         seeds = seed_list(self.seeds, self.maps)
         return [
-            self.spec(RelocalizationSpec, scene=scene, seed=seed, size=size)
+            spec
             for size in self.sizes
             for scene, seed in zip(cycle(self.scenes), seeds, strict=False)
+            for spec in self.each(RelocalizationSpec, size=(size,), scene=(scene,), seed=(seed,))
         ]
 
     @staticmethod
@@ -209,7 +390,7 @@ class _Recorder:
     """Takes frames in a scene, each with noise of its own."""
 
     def __init__(self, scene: Scene, intrinsics: Intrinsics, seed: int) -> None:
-        self._sensor = RGBDSensor(scene, intrinsics, seed=seed)
+        self._sensor = sensor.RGBDSensor(scene, intrinsics, seed=seed)
         self._taken = 0
 
     def record(self, poses: Float64) -> list[RGBDFrame]:
@@ -235,7 +416,7 @@ def _draw(spec: RelocalizationSpec, scene: Scene, path: Float64) -> list[tuple[s
 
 def _figures(mapping: SequenceRun, path: Float64) -> dict[str, Any]:
     return {
-        "ate_unaligned_m": ate_rmse(mapping.estimates, path, align="none"),
+        "ate_unaligned_m": metrics.ate_rmse(mapping.estimates, path, align="none"),
         "lost_frames": mapping.lost_frames,
         "cpu_ms_median": float(np.median(mapping.cpu_ms)),
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import subprocess
@@ -16,16 +17,15 @@ from typing import Any
 import numpy as np
 from ms_slam_experiments.shared import slam_speed_child
 
-from ms_slam_env import scenes
+from ms_slam_env import scenes, sequences
 from ms_slam_env._runtime.parallel import thread_environment
-from ms_slam_env.benchmark.experiment import Experiment
+from ms_slam_env.benchmark.experiment import Experiment, check_names
 from ms_slam_env.camera import xtion
 from ms_slam_env.config import Checked, bounded, check_range
 from ms_slam_env.errors import InputError
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Column, Table, finished, make_table
-from ms_slam_env.sequences import handheld_trajectory, render_sequence
 
 THIS, OTHER = "this", "other"
 REST = "rest"
@@ -91,16 +91,15 @@ class SlamSpeed(Experiment, Checked):
     def specs(self) -> list[SpeedSpec]:
         """Every round, size and version, in turns."""
         backend_parameters(self.backend)
-        for size in self.sizes:
-            xtion(size)
         checkouts = {THIS: ""}
         if self.against is not None:
             checkouts[OTHER] = str(self.against)
+        versions = [{"version": name, "checkout": path} for name, path in checkouts.items()]
+        turns = itertools.product(range(self.repeats), self.sizes, versions)
+        check_names(self)
         return [
-            self.spec(SpeedSpec, version=version, size=size, repeat=repeat, checkout=checkout)
-            for repeat in range(self.repeats)
-            for size in self.sizes
-            for version, checkout in checkouts.items()
+            self.spec(SpeedSpec, repeat=repeat, size=size, **version)
+            for repeat, size, version in turns
         ]
 
     @staticmethod
@@ -219,8 +218,8 @@ def backend_parameters(words: tuple[str, ...]) -> dict[str, Any]:
 def stored_sequence(scene_name: str, seed: int, frames: int, size: str) -> tuple[Any, str]:
     """A noisy sequence as a file, for as long as this process lives: its folder and its path."""
     scene = scenes.make(scene_name, seed)
-    poses = handheld_trajectory(scene, frames, seed, 0.015, 1.0)
-    sequence = render_sequence(scene, poses, xtion(size), "kinect", seed)
+    poses = sequences.handheld_trajectory(scene, frames, seed, 0.015, 1.0)
+    sequence = sequences.render_sequence(scene, poses, xtion(size), "kinect", seed)
     shown = list(sequence.frames)
     folder = tempfile.TemporaryDirectory()
     path = Path(folder.name) / "sequence.npz"
@@ -235,7 +234,7 @@ def run_child(arguments: dict[str, Any], checkout: Path | None) -> list[dict[str
     Raises:
         RuntimeError: the process failed.
     """
-    root = (checkout or Path(__file__).parents[2]).resolve()
+    root = (checkout or Path(__file__).parents[1]).resolve()
     environment = os.environ | thread_environment(1) | {"PYTHONPATH": str(root)}
     # Not as a script: its folder, first on the path, would hide modules of Python. In the checkout:
     # the current folder comes before PYTHONPATH.

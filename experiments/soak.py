@@ -10,9 +10,8 @@ import gymnasium as gym
 import numpy as np
 
 from ms_slam_env import ENV_IDS, PERTURBED_ENV_IDS, TASK_IDS
-from ms_slam_env.benchmark.experiment import Experiment
+from ms_slam_env.benchmark.experiment import Experiment, check_each
 from ms_slam_env.config import Checked, bounded
-from ms_slam_env.errors import unknown
 from ms_slam_env.metrics.cost.meter import resident_mb
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished, make_table
@@ -65,9 +64,7 @@ class Soak(Experiment, Checked):
 
     def specs(self) -> list[SoakSpec]:
         """Pieces of all environments in turn, and one of each with the arm."""
-        for env_id in self.env_ids:
-            if env_id not in IDS:
-                raise unknown("environment", env_id, IDS)
+        check_each("environment", self.env_ids, IDS)
         steps = {one: max(2, self.piece_steps // share(one)) for one in self.env_ids}
         pieces = -(-self.steps // sum(steps.values()))
         arms = [one for one in steps if share(one) == ARM_SHARE]

@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ms_slam_env.benchmark.episode_experiment import EpisodeExperiment
-from ms_slam_env.benchmark.episodes import DEFAULT_PLANNERS, short_planner_names
+from ms_slam_env.benchmark.episodes import DEFAULT_PLANNERS, EpisodeExperiment, short_planner_names
 from ms_slam_env.report.charts import Chart, over_field
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Grouping, Table

@@ -9,23 +9,23 @@ from itertools import cycle
 from typing import Any
 
 import numpy as np
-from ms_slam_experiments.shared.interruptions import FOREIGN, map_path
+from ms_slam_experiments.relocalization import FOREIGN, map_path
 from numpy.typing import NDArray
 
-from ms_slam_env import scenes, slam
+from ms_slam_env import metrics, scenes, slam
+from ms_slam_env import sensor as sensors
 from ms_slam_env.benchmark.episodes import seed_list
-from ms_slam_env.benchmark.experiment import Experiment, check_each
+from ms_slam_env.benchmark.experiment import Experiment, check_each, check_names
 from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
 from ms_slam_env.config import Checked, bounded
+from ms_slam_env.evaluation.loop_closures import pose_error
 from ms_slam_env.evaluation.run_sequence import SequenceRun, run_sequence
 from ms_slam_env.evaluation.submaps import submap_errors, submap_measures, submap_numbers
-from ms_slam_env.geometry import invert, relative_angle, so3_exp
-from ms_slam_env.metrics import ate_rmse
+from ms_slam_env.geometry import invert, so3_exp
 from ms_slam_env.report.charts import Chart, Panel, interval_series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, Value, finished, make_table, summary
 from ms_slam_env.scenes import SCENES, Scene
-from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.surfel.surfel_config import SUBMAPS
 
 Float64 = NDArray[np.float64]
@@ -92,6 +92,7 @@ class SubmapsExperiment(Experiment, Checked):
         check_each("scene", self.scenes, SCENES)
         check_each("setting", self.settings, KINDS)
         check_each("variant", self.variants, SUBMAPS)
+        check_names(self)
         seeds = seed_list(self.seeds, self.maps)
         return [
             self.spec(SubmapsSpec, scene=scene, seed=seed, kinds=self.settings)
@@ -189,7 +190,7 @@ def _black(frame: RGBDFrame) -> RGBDFrame:
 def _record(
     scene: Scene, intrinsics: Intrinsics, seed: int, first: int, poses: Float64
 ) -> list[RGBDFrame]:
-    sensor = RGBDSensor(scene, intrinsics, seed=seed)
+    sensor = sensors.RGBDSensor(scene, intrinsics, seed=seed)
     return [sensor.capture(pose, first + index) for index, pose in enumerate(poses)]
 
 
@@ -206,7 +207,7 @@ def _measure(run: SequenceRun, one: Interruption, mapped: int, drift: Float64) -
     numbers, poses = run.backend.corrected_trajectory()
     final = run.estimates
     final[numbers[numbers >= mapped] - mapped] = poses[numbers >= mapped]
-    errors = [_error(run.estimates[k], drift @ one.truth[k]) for k in joints]
+    errors = [pose_error(run.estimates[k], drift @ one.truth[k]) for k in joints]
     anchored = np.flatnonzero(run.anchored[one.black :])
     return {
         **figures,
@@ -214,16 +215,10 @@ def _measure(run: SequenceRun, one: Interruption, mapped: int, drift: Float64) -
         "link_error_m": [m for m, _ in errors],
         "link_error_deg": [deg for _, deg in errors],
         "frames_to_join": float(anchored[0]) if len(anchored) else math.inf,
-        "ate_unaligned_m": ate_rmse(run.estimates, one.truth, align="none"),
-        "final_ate_unaligned_m": ate_rmse(final, one.truth, align="none"),
+        "ate_unaligned_m": metrics.ate_rmse(run.estimates, one.truth, align="none"),
+        "final_ate_unaligned_m": metrics.ate_rmse(final, one.truth, align="none"),
         **submap_errors(final, one.truth, submap_numbers(run)),
     }
-
-
-def _error(a: Float64, b: Float64) -> tuple[float, float]:
-    """Distance in metres and angle in degrees between two poses (4, 4)."""
-    angle = relative_angle(a[:3, :3], b[:3, :3])
-    return float(np.linalg.norm(a[:3, 3] - b[:3, 3])), float(np.degrees(angle))
 
 
 def _line(key: tuple[str, str], attempts: list[Row]) -> dict[str, Value]:

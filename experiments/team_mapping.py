@@ -18,7 +18,7 @@ from ms_slam_env.benchmark.episodes import (
     make_env,
     seed_list,
 )
-from ms_slam_env.benchmark.experiment import Experiment
+from ms_slam_env.benchmark.experiment import Experiment, check_names
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.env.coverage import team_share
@@ -28,7 +28,6 @@ from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Grouping, Table, finished, make_table
 from ms_slam_env.scenes import HOMES, Scene
-from ms_slam_env.scenes.registry import check_name
 from ms_slam_env.tasks import find_task
 
 Float64 = NDArray[np.float64]
@@ -93,8 +92,7 @@ class TeamMapping(Experiment, Checked):
             raise InputError(f"goals {self.goals} must be shares in (0, 1], one for each scene")
         if not self.robots or not all(1 <= number <= 10 for number in self.robots):
             raise InputError(f"robots {self.robots} must be sizes of teams from 1 to 10")
-        for scene in self.scenes:
-            check_name(scene)
+        check_names(self)
         return [
             self.spec(TeamMappingSpec, scene=scene, seed=seed, robots=robots, goal=goal)
             for scene, goal in zip(self.scenes, self.goals, strict=True)

@@ -221,9 +221,13 @@ def test_importing_loads_nothing_heavy(module: str) -> None:
 
 LIGHT_EXPERIMENTS = [
     "compare",
+    "moving_objects",
+    "orbit",
     "paper_table2",
     "planners",
+    "pose_covariance",
     "pose_sources",
+    "relocalization",
     "soak",
     "step_size",
     "usme",

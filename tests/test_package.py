@@ -18,6 +18,8 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
+from ms_slam_env.cli.experiment import ELSEWHERE
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -28,7 +30,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
     out = tmp_path_factory.mktemp("wheel")
     for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
         (source / name).write_bytes((ROOT / name).read_bytes())
-    for folder in ("ms_slam_env", "agents", "baselines"):
+    for folder in ("ms_slam_env", "agents", "baselines", "experiments"):
         for path in (ROOT / folder).rglob("*"):
             if path.suffix in (".py", ".typed"):
                 target = source / path.relative_to(ROOT)
@@ -47,6 +49,18 @@ def test_wheel_has_every_module_under_its_name(wheel: zipfile.ZipFile) -> None:
         expected |= {f"ms_slam_{folder}/{path.name}" for path in (ROOT / folder).glob("*.py")}
     content = {name for name in wheel.namelist() if ".dist-info/" not in name}
     assert content == expected
+
+
+def test_the_wheel_lists_the_experiments_of_the_product(wheel: zipfile.ZipFile, tmp_path) -> None:
+    """And one line says where the others are; the wheel itself holds none of them."""
+    wheel.extractall(tmp_path)
+    code = f"""import sys; sys.path.insert(0, {str(tmp_path)!r})
+sys.meta_path[:] = [finder for finder in sys.meta_path if "Editable" not in repr(finder)]
+from ms_slam_env.cli import main; main(["experiment", "list"])"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    _, *names, empty, said = done.stdout.splitlines()[1:]
+    assert [line.split()[0] for line in names] == ["compare", "planners", "usme"], done.stderr
+    assert (empty, said) == ("", ELSEWHERE)
 
 
 def test_wheel_takes_no_general_names(wheel: zipfile.ZipFile) -> None:

@@ -5,15 +5,17 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 import inspect
+import itertools
 import pkgutil
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 from ms_slam_env._runtime.extension import ExtensionPoint
 from ms_slam_env._runtime.parallel import one_thread_unless_set
+from ms_slam_env.config import parse_named
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.report.charts import Chart
 from ms_slam_env.report.records import Row
@@ -83,6 +85,16 @@ class Experiment(ABC):
         shared = {name: getattr(self, name) for name in names if name in options - own.keys()}
         return kind(**shared, **own)
 
+    def each(self, kind: type[S], **axes: Sequence[Any]) -> list[S]:
+        """A `spec` of every combination of what ``axes`` say of its fields, the last turning first.
+
+        Raises:
+            InputError: an option that many experiments have names what there is not.
+        """
+        check_names(self)
+        values = itertools.product(*axes.values())
+        return [self.spec(kind, **dict(zip(axes, of, strict=True))) for of in values]
+
     def prepare(self) -> None:  # noqa: B027
         """Refuse, in seconds, what would make every row fail; nothing by default.
 
@@ -103,6 +115,35 @@ class Experiment(ABC):
     def about(cls) -> str:
         """The docstring without its first line."""
         return " ".join(_paragraphs(cls)[1:])
+
+
+def check_names(experiment: Experiment) -> None:
+    """Refuse scenes, sequences, backends, image sizes and noise that there are not.
+
+    They are known by the names of the options: an experiment has no need to check them itself.
+
+    Raises:
+        InputError: with the valid choices.
+    """
+    from ms_slam_env import slam
+    from ms_slam_env.camera import parse_image_size
+    from ms_slam_env.scenes.registry import check_name
+    from ms_slam_env.sensor.noise import noise_config
+    from ms_slam_env.sequences import check_sequence
+
+    def check_backend(text: str) -> None:
+        slam.check_parameters(*parse_named(text, "backend"))
+
+    checks: Mapping[str, Callable[[str], object]] = {
+        **dict.fromkeys(("scene", "scenes"), check_name),
+        **dict.fromkeys(("image_size", "size", "sizes"), parse_image_size),
+        **{"sequences": check_sequence, "backends": check_backend, "noise": noise_config},
+    }
+    for name, check in checks.items():
+        given = getattr(experiment, name, ())
+        for one in given if isinstance(given, tuple) else (given,):
+            if isinstance(one, str):
+                check(one)
 
 
 def check_each(kind: str, given: Sequence[str], valid: Iterable[str]) -> None:

@@ -7,13 +7,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-from ms_slam_env.benchmark.episode_experiment import DOTS, episode_specs
 from ms_slam_env.benchmark.episodes import (
     DEFAULT_STEP_DEG,
     DEFAULT_STEP_M,
+    DOTS,
     EpisodeSpec,
     check_episodes,
     check_names,
+    episode_specs,
     run_episode,
     seed_list,
     short_planner_names,

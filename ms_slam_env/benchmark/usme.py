@@ -2,26 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from ms_slam_env import slam
+from ms_slam_env import metrics, scenes, slam
 from ms_slam_env._runtime.parallel import limit_threads, thread_environment
 from ms_slam_env.benchmark.experiment import Experiment
-from ms_slam_env.benchmark.usme_runs import UsmeSpec, run_usme
-from ms_slam_env.camera import rendered_size
+from ms_slam_env.camera import RGBDFrame, rendered_size, xtion
 from ms_slam_env.config import Checked, bounded, parse_named
 from ms_slam_env.errors import InputError
+from ms_slam_env.evaluation.loop_closures import find_revisits, loop_measures
+from ms_slam_env.evaluation.map_quality import ComparedMap
+from ms_slam_env.evaluation.run_sequence import SequenceRun, run_sequence
+from ms_slam_env.evaluation.trajectory_charts import thinned
+from ms_slam_env.geometry import transform_points
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished, make_table, measured
-from ms_slam_env.sequences.usme_suite import NAMES, SUITE, find, made_with
+from ms_slam_env.scenes import Scene
+from ms_slam_env.sequences.usme_suite import NAMES, SUITE, UsmeSequence, find, made_with, render
+
+if TYPE_CHECKING:
+    from ms_slam_env.sequences import RenderedSequence
 
 Float64 = NDArray[np.float64]
 
@@ -205,3 +213,229 @@ def check_suite(sequences: Sequence[str], image_size: str) -> None:
     for name in sequences:
         find(name)
     rendered_size(image_size)
+
+
+LARGE_OPTIONS: Mapping[str, Mapping[str, Any]] = {
+    "surfel": {
+        "depth_cutoff_m": 10.0,
+        "bilateral_sigma_m": 0.003,
+        "fusion_distance_m": 0.01,
+        "depth_noise_m": 0.001,
+        "max_surfels": 2_000_000,
+    },
+    "odometry": {"depth_cutoff_m": 10.0, "max_surfels": 2_000_000},
+    "volumetric": {"depth_cutoff_m": 10.0, "voxel_m": 0.06},
+    "kinectfusion": {"depth_cutoff_m": 10.0, "volume_size_m": 20.0},
+    "sparse": {"depth_cutoff_m": 10.0},
+}
+"""Options that a backend needs in a large scene, beside what the user asks for.
+
+The defaults of the backends are for a Kinect in a room; streets and halls need a farther cut-off,
+and the surfel SLAM widths of its filters that fit the noise of the camera there: with its own it
+was lost 66 frames into a city street (seed 1000, 160x120), with these never.
+"""
+
+_WARM_UP = 5  # frames left out of the timing: buffers grow, kernels are loaded
+_LOOP_VIEW_SIZE = "80x60"  # of the true depth by which places are seen again
+_PATH_POINTS = 200  # of a path, that are drawn
+_VIEW_EVERY_M = 1.5  # along the true path, for the true surface
+_VIEW_SIZE = "320x240"
+_MOST_VIEWS = 150
+_MOST_POINTS = 1_000_000
+
+
+@dataclass(frozen=True)
+class UsmeSpec:
+    """A backend on a sequence.
+
+    Attributes:
+        sequence: its name in the suite.
+        backend: ``NAME`` or ``NAME,parameter=value,...``, beside what the scene needs.
+        image_size: such as 160x120.
+        seed: of scene, path, noise and perturbations.
+        frames_scale: share of the frames that the same path takes.
+        folder: of the rendered sequence; None renders the frames as they are needed.
+    """
+
+    sequence: str
+    backend: str
+    image_size: str = "160x120"
+    seed: int = 2000
+    frames_scale: float = 1.0
+    folder: str | None = None
+
+
+def run_usme(spec: UsmeSpec) -> dict[str, Any]:
+    """Track a sequence from its true first pose and measure.
+
+    Returns:
+        metrics by key, None where a measure does not apply or cannot be had. Accuracy: USME
+        equations 1 to 5, the last pose's error over the path, the finished map's poses. Map, after
+        outlier removal (6) and ICP: distances, ``hausdorff_directed_m`` (7, what the map has too
+        much), ``recall_near``, ``noise_ratio`` (8). Robustness (9 to 11, infinite: never found
+        again), and of a backend that closes loops all of ``loop_measures``. Start (12, 13). Cost:
+        all of ``CostMeter.summary``. Paths, to be drawn.
+    """
+    entry = find(spec.sequence)
+    scene = scenes.make(entry.scene, spec.seed)
+    sequence = render(entry, scene, spec.image_size, spec.frames_scale)
+    name, params = parse_named(spec.backend, "backend")
+    options = {**slam_options(entry, name), **params}
+    costs = metrics.CostMeter(str(options.get("device", "cpu")))
+    system = slam.make(name, sequence.intrinsics, **options)
+    black: list[bool] = []
+    run = run_sequence(
+        system,
+        _frames(sequence, spec.folder),
+        start=sequence.poses[0],
+        meter=costs,
+        on_step=lambda step: black.append(not step.frame.color.any()),
+    )
+    poses, truth = run.estimates, sequence.poses
+    tracked, seconds = run.tracking_ok, np.array(run.timestamps)
+    ate = metrics.ate_statistics(poses, truth)
+    start = metrics.initialisation(seconds, poses, truth, global_scale=1.0)
+    end_error = float(np.linalg.norm(poses[-1, :3, 3] - truth[-1, :3, 3]))
+    path = metrics.path_length(truth)
+    surface = _seen_surface(scene, sequence.poses, options)
+    loops: dict[str, Any] = {}
+    if system.closes_loops:
+        loops = _loop_measures(run, scene, truth, options)
+    drawn = thinned(len(poses), _PATH_POINTS)
+    return {
+        "frames": len(poses),
+        "duration_s": float(seconds[-1] - seconds[0]),
+        "path_m": path,
+        "ate_m": ate.rmse,
+        **metrics.tracked_errors(poses, truth, tracked),
+        "ate_max_m": ate.max,
+        "end_error_m": end_error,
+        "end_error_share": end_error / path,
+        "rpe_m": metrics.rpe_rmse(poses, truth),
+        "rpe_rad": metrics.rpe_rmse(poses, truth, kind="rotation"),
+        "final_ate_m": _final_ate(run, truth),
+        "lost_share": run.lost,
+        "robustness": _robustness(poses, truth, tracked),
+        "relocalisation_s": metrics.mean_relocalisation_time(
+            seconds, np.array(black), run.anchored
+        ),
+        "initialisation_s": start.time_s,
+        "scale_error": start.scale_error,
+        **costs.summary(skip=min(_WARM_UP, len(poses) - 1)),
+        **map_measures(system.surface_points(), surface, entry.scene),
+        **loops,
+        **_positions("path", poses[drawn]),
+        **_positions("true", truth[drawn]),
+    }
+
+
+def slam_options(sequence: UsmeSequence, backend: str) -> dict[str, Any]:
+    """Options of ``backend``: those of large scenes, and a mask where something moves."""
+    is_large = sequence.scene in scenes.LARGE_SCENES
+    options = dict(LARGE_OPTIONS.get(backend, {})) if is_large else {}
+    if backend == "surfel" and any(t.startswith("moving-objects") for t in sequence.perturbations):
+        options["motion_mask"] = "geometric"
+    return options
+
+
+def _positions(name: str, poses: Float64) -> dict[str, list[float]]:
+    return {f"{name}_{axis}_m": np.round(poses[:, k, 3], 3).tolist() for k, axis in enumerate("xy")}
+
+
+def _loop_measures(
+    run: SequenceRun, scene: Scene, truth: Float64, options: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Precision and recall of the loops of a run, by true views without moving objects."""
+    from ms_slam_env.sensor import RGBDSensor
+
+    sensor = RGBDSensor(scene, xtion(_LOOP_VIEW_SIZE), noise="none")
+    depths = np.stack([sensor.ground_truth(pose).depth for pose in truth])
+    seconds = np.array(run.timestamps)
+    revisits = find_revisits(depths, sensor.intrinsics, truth, seconds, _reach_m(options))
+    loops = {k: result.loop for k, result in enumerate(run.results) if result.loop is not None}
+    return dict(loop_measures(loops, truth, revisits, 5 * voxel_m(scene.name)))
+
+
+def _reach_m(options: Mapping[str, Any]) -> float:
+    return float(options.get("depth_cutoff_m", 8.0))
+
+
+def _frames(sequence: RenderedSequence, folder: str | None) -> Iterator[RGBDFrame]:
+    """The frames, from a folder if there is one.
+
+    Raises:
+        InputError: the folder holds another number of frames than the sequence has, or none with a
+            depth reading.
+    """
+    from ms_slam_env.sequences.recording import open_recording, recorded_sequence
+
+    if folder is None:
+        yield from sequence.frames
+        return
+    recording = recorded_sequence(open_recording(Path(folder)))
+    if len(recording) != len(sequence):
+        raise InputError(
+            f"{folder} holds {len(recording)} frames, but the sequence has {len(sequence)}"
+        )
+    recording.check_depth()
+    yield from recording.frames
+
+
+def _final_ate(run: SequenceRun, truth: Float64) -> float | None:
+    corrected = run.corrected()
+    return None if corrected is None else metrics.ate_rmse(corrected, truth)
+
+
+def _robustness(poses: Float64, truth: Float64, tracked: NDArray[np.bool_]) -> float | None:
+    if not len(metrics.tracked_segments(tracked)):
+        return None
+    return metrics.tracking_robustness(poses, truth, tracked).error
+
+
+def _seen_surface(scene: Scene, poses: Float64, options: dict[str, Any]) -> Float64:
+    """True surface (M, 3) that the camera saw within the reach of SLAM, moving objects left out."""
+    from ms_slam_env.sensor import RGBDSensor
+
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    walked = np.concatenate([[0.0], np.cumsum(steps)])
+    count = int(min(_MOST_VIEWS, max(20, walked[-1] / _VIEW_EVERY_M)))
+    picked = np.searchsorted(walked, np.linspace(0.0, walked[-1], count))
+    sensor = RGBDSensor(scene, xtion(_VIEW_SIZE), noise="none")
+    reach, voxel = _reach_m(options), voxel_m(scene.name)
+    clouds = []
+    for index in np.unique(picked):
+        view = sensor.ground_truth(poses[index])
+        near = (view.depth > 0) & (view.depth <= reach)
+        clouds.append(metrics.voxel_downsample(view.points[near].astype(np.float64), voxel))
+    return metrics.voxel_downsample(np.concatenate(clouds), voxel)
+
+
+def voxel_m(scene: str) -> float:
+    """Edge of the voxels in which clouds keep one point: by them a surface counts by its area."""
+    return 0.05 if scene in scenes.LARGE_SCENES else 0.01
+
+
+def map_measures(points: Float64, surface: Float64, scene: str) -> dict[str, Any]:
+    """Measures of the map (N, 3) against the true surface (M, 3); see `run_usme`."""
+    near = 5 * voxel_m(scene)
+    nothing = dict.fromkeys(
+        ("c2c_mean_m", "c2c_std_m", "hausdorff_directed_m", "recall_near", "noise_ratio")
+    )
+    result: dict[str, Any] = {"map_points": len(points), "near_m": near, **nothing}
+    result["spacing_m"] = None
+    cloud = metrics.voxel_downsample(points, voxel_m(scene)) if len(points) else points
+    if len(cloud) < 100:
+        return result
+    if len(cloud) > _MOST_POINTS:
+        cloud = cloud[np.linspace(0, len(cloud) - 1, _MOST_POINTS).astype(np.int64)]
+    inliers = metrics.statistical_inliers(cloud)
+    kept = cloud[inliers]
+    found = metrics.register_clouds(kept, surface, "icp", cutoff_m=10 * near)
+    placed = ComparedMap(transform_points(found.T_target_source, kept), surface, voxel_m=0)
+    return {
+        **result,
+        **placed.measure(("c2c_mean_m", "c2c_std_m", "hausdorff_directed_m")),
+        "recall_near": placed.recall(near),
+        "noise_ratio": 1.0 - float(inliers.mean()),
+        "spacing_m": metrics.point_spacing(cloud),
+    }

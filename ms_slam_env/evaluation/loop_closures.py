@@ -7,7 +7,6 @@ of the true one. What there was to close: frames that see a view again after hav
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +19,7 @@ from ms_slam_env.slam.slam_backend import Loop
 Int32 = NDArray[np.int32]
 Bool = NDArray[np.bool_]
 
-WRONG_M, WRONG_DEG = 0.05, 3.0
-"""A closure is wrong if it leaves new and old map further apart than this."""
+WRONG_DEG = 3.0  # a loop is wrong if it is off by more
 
 SEEN_AGAIN, OUT_OF_SIGHT = 0.5, 0.1
 """Share of a view's readings that a frame shows: at least this, and at most this."""
@@ -33,45 +31,8 @@ _FEWEST = 20  # readings of a view
 _DEPTH_SHARE = 0.05  # difference of depth at which a point is shown
 
 
-@dataclass(frozen=True)
-class Closure:
-    """One closed loop: how far new and old map were apart before and after, and when."""
-
-    frame: int
-    before_m: float
-    before_deg: float
-    after_m: float
-    after_deg: float
-
-    @property
-    def is_wrong(self) -> bool:
-        """Whether they do not fit after it."""
-        return self.after_m > WRONG_M or self.after_deg > WRONG_DEG
-
-
-def judge_closure(
-    frame: int,
-    past: tuple[NDArray[np.int32], Float64],
-    truth: Float64,
-    unclosed: Float64,
-    closed: Float64,
-    window: int,
-) -> Closure:
-    """Compare the poses before and after a closure with where the old map says the camera is.
-
-    That is the true motion from the nearest old frame, applied to its estimate.
-    """
-    frames, poses = past
-    old = frames < frame - window
-    frames, poses = frames[old], poses[old]
-    motions = invert(truth[frames]) @ truth[frame]
-    cosines = np.clip((np.trace(motions[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1)
-    nearest = int((np.linalg.norm(motions[:, :3, 3], axis=1) + np.arccos(cosines)).argmin())
-    ideal = poses[nearest] @ motions[nearest]
-    return Closure(frame, *_apart(ideal, unclosed), *_apart(ideal, closed))
-
-
-def _apart(a: Float64, b: Float64) -> tuple[float, float]:
+def pose_error(a: Float64, b: Float64) -> tuple[float, float]:
+    """Distance in metres and angle in degrees between two poses (4, 4)."""
     distance = float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
     return distance, float(np.degrees(relative_angle(a[:3, :3], b[:3, :3])))
 
@@ -173,5 +134,5 @@ def loop_measures(
 
 def _is_right(frame: int, loop: Loop, truth: Float64, tolerance_m: float) -> bool:
     motion = invert(truth[loop.reference]) @ truth[frame]
-    error_m, error_deg = _apart(motion, loop.T_reference_camera)
+    error_m, error_deg = pose_error(motion, loop.T_reference_camera)
     return error_m <= tolerance_m and error_deg <= WRONG_DEG

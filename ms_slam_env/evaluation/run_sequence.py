@@ -25,12 +25,15 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sized
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ms_slam_env import slam
 from ms_slam_env._runtime.progress import Bar
 from ms_slam_env.camera import RGBDFrame
+from ms_slam_env.config import parse_named
 from ms_slam_env.errors import InputError
 from ms_slam_env.metrics.cost import CostMeter
 from ms_slam_env.metrics.cost.meter import FrameCost
@@ -226,6 +229,12 @@ def run_sequence(
     for step in run:
         on_step(step)
     return run
+
+
+def run_backend(backend: str, sequence: Sequence, **how: Any) -> SequenceRun:
+    """``run_sequence`` of a backend by name, parameters appended as in ``surfel,submaps=off``."""
+    name, params = parse_named(backend, "backend")
+    return run_sequence(slam.make(name, sequence.intrinsics, **params), sequence, **how)
 
 
 def lost_throughout(processed: int, lost: int) -> str:

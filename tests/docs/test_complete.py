@@ -14,6 +14,7 @@ from ms_slam_env.benchmark import EXPERIMENTS, experiment_class
 from ms_slam_env.cli import COMMANDS
 from ms_slam_env.env.registry import OBSERVATIONS
 from ms_slam_env.report.discovery import find_results
+from ms_slam_env.report.records import to_plain
 from ms_slam_env.report.results import read_results
 from ms_slam_env.sequences.perturbations import PERTURBATIONS
 
@@ -61,10 +62,12 @@ def test_a_new_room_does_not_widen_published_commands() -> None:
 
 @pytest.mark.parametrize("path", COMMITTED, ids=lambda path: path.parent.name)
 def test_tables_of_today_can_be_made_from_committed_rows(path: Path) -> None:
-    """A column that came later has no value there, and must not be an error."""
+    """A column that came later has no value there, and must not be an error; charts as well."""
     results = read_results(path)
-    tables = experiment_class(results.kind)().tables([dict(row) for row in results.rows])
-    assert all(table.as_markdown() for table in tables)
+    experiment, rows = experiment_class(results.kind)(), [dict(row) for row in results.rows]
+    assert all(table.as_markdown() for table in experiment.tables(rows))
+    assert all(chart.panels for chart in experiment.charts(rows))
+    to_plain(experiment.content(rows))
 
 
 def test_units_of_columns_come_from_the_registry_alone() -> None:

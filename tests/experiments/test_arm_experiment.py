@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import math
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -13,61 +11,15 @@ import pytest
 from ms_slam_experiments.arm_experiment import (
     METRICS,
     ArmExperiment,
-    RunSpec,
     compare,
     judge_episode,
 )
-from ms_slam_experiments.duplicate_objects import DuplicateObjects
+from ms_slam_experiments.shared.duplicate_objects import ConsistencyRule
 
 from ms_slam_env.errors import InputError
-from ms_slam_env.metrics.consistency import ConsistencyRule
-from ms_slam_env.metrics.registry import check_keys, metric
+from ms_slam_env.metrics.registry import metric
 
 FREE = "MSActiveSLAM-FreeCamera-v0"
-
-
-@pytest.fixture(scope="module")
-def result() -> dict[str, Any]:
-    return ArmExperiment.run(RunSpec("random", "table", 1000, FREE, steps=100, seconds=0.19))
-
-
-def test_a_run_ends_after_its_seconds(result: dict[str, Any]) -> None:
-    assert result["time_s"] == pytest.approx(0.2)
-    assert result["steps"] == 6
-    assert result["frames"] == 7
-
-
-def test_a_run_has_every_reported_metric(result: dict[str, Any]) -> None:
-    check_keys(result)
-    assert all(math.isfinite(result[key]) for key in METRICS)
-    assert result["success"] is not bool(result["duplicated"])
-    assert result["objects"] > 3
-    assert result["energy_j"] == 0  # nobody carries a free camera
-    json.dumps(result)
-
-
-def test_same_spec_same_result(result: dict[str, Any]) -> None:
-    again = ArmExperiment.run(RunSpec("random", "table", 1000, FREE, steps=100, seconds=0.19))
-    clocks = ("decision_ms",)
-    assert {k: v for k, v in again.items() if k not in clocks} == {
-        k: v for k, v in result.items() if k not in clocks
-    }
-
-
-def test_a_run_draws_its_map(tmp_path: Path) -> None:
-    (spec,) = ArmExperiment(
-        ("stationary",),
-        ("table",),
-        1,
-        seconds=0.1,
-        env_id=FREE,
-        seeds="train",
-        pictures=tmp_path / "maps",
-    ).specs()
-    found = ArmExperiment.run(spec)
-    assert found["success"]
-    assert found["path_length_m"] == 0
-    assert cv2.imread(str(tmp_path / "maps" / "table_stationary_0.png")) is not None
 
 
 def test_runs_of_one_scene_differ_in_light_and_noise_alone(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -120,18 +72,6 @@ ROWS = [
 ]
 
 
-def test_shares_have_wilson_intervals() -> None:
-    lines: Any = ArmExperiment().tables(ROWS)[0].rows
-    random, greedy = lines[:2]
-    # z = 1.959964, n = 10, p = 1/2: centre 1/2, half width z sqrt(1/40 + z^2 / 400) / (1 + z^2/10)
-    z = 1.959964
-    half = z * math.sqrt(1 / 40 + z**2 / 400) / (1 + z**2 / 10)
-    assert greedy["success"].value == 0.5
-    assert greedy["success"].low == pytest.approx(0.5 - half, abs=1e-6)
-    assert greedy["success_tracked"].value == 0.4
-    assert random["success"].value == 0.0
-
-
 def test_the_comparison_names_the_better_planner() -> None:
     better = {line["scene"]: line["better_planner"] for line in compare(ROWS)}
     assert better == {"carpet": "greedy", "wall": "equal", "table": None}
@@ -163,24 +103,3 @@ def test_bad_input_is_refused_before_anything_runs(fields: dict[str, Any], messa
         ArmExperiment(**fields).prepare()
     with pytest.raises(InputError, match="share"):
         ConsistencyRule(share=2)
-
-
-def test_the_check_of_the_rule_counts_by_distance() -> None:
-    rows = [
-        {
-            "spec": {"offset_m": offset},
-            "result": {"success": success, "worst_apart_share": share},
-            "error": None,
-        }
-        for offset, success, share in ((0.1, False, 0.4), (0.1, True, 0.0), (0.0, True, math.nan))
-    ]
-    (table,) = DuplicateObjects().tables(rows)
-    assert [line["offset_m"] for line in table.rows] == [0.0, 0.1]
-    assert "| 0 | 1 | 100 [21, 100] | - |" in table.as_markdown()
-    assert "| 10 | 2 | 50 [9.5, 91] | 20 [0, 40] |" in table.as_markdown()
-
-
-def test_one_good_map_is_enough_for_no_distance() -> None:
-    specs = DuplicateObjects(scenes=("wall",), episodes=1).specs()
-    assert [(s.offset_m, s.axis) for s in specs[:2]] == [(0.0, 0), (0.03, 0)]
-    assert len(specs) == 1 + 4 * 3

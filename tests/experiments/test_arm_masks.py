@@ -1,14 +1,7 @@
 """The mask experiment: its summary from cases of known content, and one real walk."""
 
-import numpy as np
 import pytest
-from ms_slam_experiments import arm_masks
-from ms_slam_experiments.arm_masks import ArmMasks, WalkSpec
-from ms_slam_experiments.shared.arm_truth import furniture_cloud
-from ms_slam_experiments.shared.mask_tables import mask_tables
-
-from ms_slam_env import scenes
-from ms_slam_env.metrics.registry import check_keys
+from ms_slam_experiments.arm_masks import mask_tables
 
 # reason, reached, stopped, gap_m, touches_itself: right where allowed and possible agree
 CASES = [
@@ -71,33 +64,3 @@ def test_tables():
     (sag,) = [line for line in errors.rows if "sag" in line["error_kind"]]
     assert (sag["values"], sag["median_m"]) == (4, pytest.approx(0.003))
     assert "view at 0 % of stops" in masks.note
-
-
-SPEC = WalkSpec("carpet", 1000, states=1, moves=1)
-
-
-@pytest.fixture(scope="module")
-def walk():
-    """Two runs of the same walk, in one scene and with a truth that is quick to prepare."""
-    scene = scenes.make(SPEC.scene, SPEC.seed)
-    cloud = furniture_cloud(scene, spacing_m=0.04)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(arm_masks.scene_library, "make", lambda name, seed: scene)
-        patch.setattr(arm_masks, "furniture_of", lambda name, seed: cloud)
-        return ArmMasks.run(SPEC), ArmMasks.run(SPEC)
-
-
-def test_a_walk_attempts_every_motion(walk):
-    cases = {name: np.array(values) for name, values in walk[0]["cases"].items()}
-    assert (cases["action"] == np.arange(49)).all()
-    assert (cases["stop"] == 0).all()
-    check_keys(walk[0])
-    allowed = cases["reason"] == "ok"
-    assert allowed[0]  # standing still is always possible
-    assert cases["reached"][allowed].mean() > 0.9
-    assert (cases["error_m"] < 0.02).all()
-    assert all(len(column) == 1 for column in walk[0]["stops"].values())
-
-
-def test_a_walk_can_be_repeated(walk):
-    assert walk[0] == walk[1]

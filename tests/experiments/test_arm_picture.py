@@ -6,11 +6,12 @@ import cv2
 import mujoco
 import numpy as np
 import pytest
-from ms_slam_experiments.pictures.arm import LABEL, Options, arm_sheet, scene_with
-from ms_slam_experiments.pictures.drawing import run_script
-from ms_slam_experiments.shared.arm_truth import floor_below
+from ms_slam_experiments.arm_masks import floor_below
+from ms_slam_experiments.pictures import stills
+from ms_slam_experiments.pictures.stills import LABEL, Options, run_script, save, scene_with
 from numpy.testing import assert_allclose
 
+from ms_slam_env._runtime.output_files import check_out_folder
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import look_at, make_pose, so3_exp
 from ms_slam_env.robot.arm import load_arm
@@ -81,10 +82,13 @@ def test_column_stands_between_floor_and_base(box_scene):
     assert_allclose(floor, below[below[:, 2] < base[2], 2].max(), atol=0.02)
 
 
-def test_command_writes_the_picture(tmp_path):
-    path = tmp_path / "deep" / "arm.png"
-    words = ["--out", str(path), "--scenes", "carpet", "--width", "32", "--moves", "1"]
-    assert run_script(Options, arm_sheet, words) == 0
-    image = cv2.imread(str(path))
+def test_command_writes_the_picture(tmp_path, monkeypatch, capsys):
+    draw = lambda: stills.arm_picture({"carpet": 1004}, 1, 32)  # noqa: E731
+    monkeypatch.setitem(stills.PICTURES, "arm", draw)
+    words = ["arm", "--out", str(tmp_path / "deep")]
+    assert run_script(Options, save, check_out_folder, words) == 0
+    image = cv2.imread(str(tmp_path / "deep" / "arm.png"))
     assert image.shape == (18 + 24 + 4, 3 * 36, 3)
     assert image[18:].std() > 5
+    assert run_script(Options, save, check_out_folder, ["leg"]) == 2
+    assert "unknown picture 'leg'; valid choices: scenes" in capsys.readouterr().err

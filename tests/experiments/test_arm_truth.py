@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
-from ms_slam_experiments.shared.arm_truth import (
+from ms_slam_experiments.arm_masks import (
     ArmTruth,
     Cloud,
     column_cloud,

@@ -1,7 +1,5 @@
 """Bad options of experiments are refused before anything runs."""
 
-import math
-
 import pytest
 
 from ms_slam_env.benchmark import experiment_class
@@ -37,11 +35,6 @@ REFUSED = {
         ({"trajectories": ("surfel={sequence}.txt",)}, "must differ"),
         ({"reference": "orb"}, "unknown reference 'orb'; valid choices: surfel"),
         ({"threads": 0}, "outside"),
-    ],
-    "duplicate_objects": [
-        ({"offsets_cm": ()}, "offsets_cm"),
-        ({"offsets_cm": (-1.0,)}, "offsets_cm"),
-        ({"offsets_cm": (math.inf,)}, "offsets_cm"),
     ],
     "env_speed": [
         ({"embodiments": ("tripod",)}, "unknown embodiment 'tripod'"),
@@ -122,11 +115,6 @@ REFUSED = {
         ({"sizes": ("1x1",)}, "image size"),
         ({"maps": 0}, "maps"),
         ({"after": 300}, "after"),
-    ],
-    "slam_batch": [
-        ({"device": "tpu"}, "device"),
-        ({"batch": (0,)}, "must hold"),
-        ({"frames": 1}, "frames"),
     ],
     "slam_speed": [
         ({"frames": 1}, "SlamSpeed.frames = 1 is outside"),

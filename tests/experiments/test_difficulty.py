@@ -9,21 +9,20 @@ from typing import Any
 import numpy as np
 import pytest
 from ms_slam_experiments import difficulty
-from ms_slam_experiments.difficulty import RECORDING, Difficulty, DifficultySpec
-from ms_slam_experiments.shared.motion_difficulty import (
+from ms_slam_experiments.difficulty import (
     CORRELATIONS,
     EASY,
     HARD,
+    MOTIONS,
+    Difficulty,
+    DifficultySpec,
     judgements,
     statistics,
 )
 from PIL import Image
 
-from ms_slam_env.benchmark.rows import write_all
 from ms_slam_env.errors import InputError
-from ms_slam_env.evaluation.image_motion import MOTIONS
 from ms_slam_env.evaluation.sequence_divergence import statistics_of
-from ms_slam_env.report.results import read_results
 from ms_slam_env.sequences import write_trajectory
 
 
@@ -90,24 +89,6 @@ def data(tmp_path):
 def experiment(data, box_scene, monkeypatch):
     monkeypatch.setattr(difficulty, "get_scene", lambda *_: box_scene)
     return Difficulty(data=data, scenes=("box",), placements=1, image_size="80x60")
-
-
-def test_the_experiment_makes_tables_and_charts(experiment, tmp_path):
-    rows = [
-        {"spec": asdict(spec), "result": Difficulty.run(spec), "error": None, "commit": ""}
-        for spec in experiment.specs()
-    ]
-    write_all(experiment, rows, tmp_path)
-    found = read_results(tmp_path / "results.json")
-    lines: Any = found.tables[0].rows
-    assert {line["scene"] for line in lines} == {RECORDING, "box"}
-    assert {line["divergence"] for line in lines if line["scene"] == RECORDING} == {"depth"}
-    # lr_kt0 stands still, and without noise nothing diverges then.
-    still = [line["divergence_max"] for line in lines if line["motion"] == "lr_kt0"]
-    assert still == [0.0] * 4
-    assert len(found.tables[3].rows) == 4
-    for name in ("box_none_paper", "recorded_depth_none_paper"):
-        assert (tmp_path / f"{name}.png").stat().st_size > 1000
 
 
 def test_what_was_recorded_only_in_part_is_also_rendered_in_part(experiment, data):

@@ -7,12 +7,12 @@ import pytest
 from ms_slam_experiments.difficulty_errors import DifficultyErrors, correlations
 from ms_slam_experiments.light_tolerance import LightSpec, LightTolerance, relit
 from ms_slam_experiments.orbit import Orbit
+from ms_slam_experiments.shared.loop_paths import around_object
 from scipy.stats import spearmanr
 
 from ms_slam_env import scenes
 from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.cli import main
-from ms_slam_env.sequences.loop_paths import around_object
 
 
 def rows(count: int = 8) -> list[dict]:

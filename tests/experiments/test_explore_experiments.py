@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ms_slam_experiments.explore_divergence import ExploreDivergence
 from ms_slam_experiments.explore_rates import ExploreRates, front_of_trials
 from ms_slam_experiments.explore_samplers import ExploreSamplers, summarise
 
@@ -80,16 +79,6 @@ def test_samplers_explore_one_function(sequence, tmp_path):
         assert history[0] == pytest.approx(0.25)  # the default: half the reference
     assert [line["sampler"] for line in results.tables[0].rows] == ["random", "nsga2", "tpe"]
     assert (tmp_path / "hypervolume.png").stat().st_size > 0
-
-
-def test_divergence_grows_when_frames_are_left_out(sequence, tmp_path):
-    experiment = ExploreDivergence((sequence,), (1, 4), image_size="80x60")
-    _, results = results_of(experiment, tmp_path)
-    every, fourth = results.tables[0].rows
-    values: Any = (every["M_I"], fourth["M_I"], every["load_cpu_ms"], fourth["load_cpu_ms"])
-    assert values[1].value > values[0].value
-    assert values[3].value < values[2].value
-    assert (tmp_path / "divergence.png").stat().st_size > 0
 
 
 def test_rates_have_a_front_each(sequence, tmp_path):

@@ -2,41 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
-from ms_slam_experiments.frame_selection import FilterSpec, FrameSelection
-
-from ms_slam_env import metrics, slam
-from ms_slam_env.camera import xtion
-from ms_slam_env.evaluation.run_sequence import run_sequence
-from ms_slam_env.geometry import look_at
-from ms_slam_env.sequences import open_sequence, render_sequence
-from ms_slam_env.sequences.writing import write_sequence
-
-
-def test_each_filter_runs_beside_regular_skipping_at_its_share():
-    filters = ("none", "regular,every=2", "divergence,threshold=0.02")
-    runs = FrameSelection.run(FilterSpec("wall:1000", filters, "surfel", "80x60", 40))["runs"]
-    whole, half, own = runs
-    assert whole["processed_share"] == 1.0
-    assert whole["ate_m"] == whole["ate_processed_m"]
-    assert half["processed_share"] == 0.5
-    assert whole["regular"] is half["regular"] is None
-    assert 0 < own["processed_share"] < 1
-    assert own["regular"]["processed_share"] >= own["processed_share"] - 1 / 40
-
-
-def test_recorded_frames_are_as_good_as_rendered_ones(box_scene, tmp_path):
-    eye = box_scene.sample_start(np.random.default_rng(0))[:3, 3]
-    middle = box_scene.mesh.vertices.mean(axis=0)
-    poses = np.stack([look_at(eye + np.array([0.01 * k, 0.0, 0.0]), middle) for k in range(12)])
-    write_sequence(render_sequence(box_scene, poses, xtion("80x60")), tmp_path / "recorded", {})
-    spec = FilterSpec(str(tmp_path / "recorded"), ("none", "regular,every=2"), "surfel", "80x60")
-    runs = FrameSelection.run(spec)["runs"]
-    assert [run["frames"] for run in runs] == [12, 12]
-    recorded = open_sequence(str(tmp_path / "recorded"))
-    by_hand = run_sequence(slam.make("surfel", recorded.intrinsics), recorded)
-    assert runs[0]["ate_m"] == pytest.approx(metrics.ate_rmse(by_hand.estimates, recorded.poses))
+from ms_slam_experiments.frame_selection import FrameSelection
 
 
 def test_tables_take_medians_and_count_pairs():

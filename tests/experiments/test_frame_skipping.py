@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,20 +14,9 @@ from ms_slam_experiments.frame_skipping import (
     suggest_targets,
 )
 
-from ms_slam_env.camera import xtion
-from ms_slam_env.divergence import depth_divergence, intensity_divergence
 from ms_slam_env.errors import InputError
 from ms_slam_env.report.statistics import Interval
-from ms_slam_env.sensor.scene_cache import get_scene
-from ms_slam_env.sequences import handheld_trajectory, render_sequence, write_trajectory
-
-
-def test_skipping_frames_raises_divergence() -> None:
-    every = FrameSkipping.run(SkippingSpec("table", 1000, 1, 9, "80x60"))
-    third = FrameSkipping.run(SkippingSpec("table", 1000, 3, 9, "80x60"))
-    assert (every["frames"], third["frames"]) == (9, 3)
-    assert third["depth_divergence_mean"] > every["depth_divergence_mean"]
-    assert 0 < every["ate_m"] < 0.05
+from ms_slam_env.sequences import write_trajectory
 
 
 @pytest.mark.parametrize(
@@ -78,37 +66,6 @@ def test_motions_are_placed_as_they_were_and_skipped(tmp_path: Path) -> None:
     ]
     with pytest.raises(InputError, match="lr_kt9"):
         FrameSkipping(motions=("lr_kt9",), data=tmp_path).specs()
-
-
-def test_backends_are_compared_on_the_same_frames() -> None:
-    backends = ("surfel", "surfel,check_slips=true")
-    experiment = FrameSkipping(("table",), intervals=(3,), frames=9, backends=backends, sequences=1)
-    specs = [replace(spec, image_size="80x60") for spec in experiment.specs()]
-    rows = [
-        {"spec": vars(spec), "error": None, "result": FrameSkipping.run(spec)} for spec in specs
-    ]
-    assert rows[0]["result"]["M_I"] == rows[1]["result"]["M_I"]
-    (table,) = experiment.tables(rows)
-    assert [line["backend"] for line in table.rows] == list(backends)
-    assert "suggested_targets" not in experiment.content(rows)
-    with pytest.raises(InputError, match="nothing"):
-        FrameSkipping(backends=("nothing",))
-    with pytest.raises(InputError, match="nothing"):
-        FrameSkipping(backends=("surfel,nothing=1",))
-    with pytest.raises(InputError, match="backends is empty"):
-        FrameSkipping(backends=())
-
-
-def test_the_papers_histograms_have_divergences_of_their_own() -> None:
-    experiment = FrameSkipping(("table",), intervals=(3,), frames=9, histograms="paper")
-    found = FrameSkipping.run(replace(experiment.specs()[0], image_size="80x60"))
-    scene = get_scene("table", 1000)
-    poses = handheld_trajectory(scene, 9, 1000)[::3]
-    frames = render_sequence(scene, poses, xtion("80x60"), seed=1000).frames
-    pairs = list(zip(frames[1:], frames[:-1], strict=True))
-    M_I = max(intensity_divergence(*pair) for pair in pairs)
-    M_D = max(depth_divergence(*pair, xtion("80x60")) for pair in pairs)
-    assert (found["M_I"], found["M_D"]) == pytest.approx((M_I, M_D), rel=1e-5)
 
 
 def line(interval: int, ate_m: float, lost: float, M: float) -> dict[str, Any]:

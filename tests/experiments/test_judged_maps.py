@@ -7,23 +7,24 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from ms_slam_experiments.pictures.judged_map import (
+from ms_slam_experiments.arm_experiment import (
     RED,
     describe,
     overview_pose,
     save_map_picture,
 )
-
-from ms_slam_env import slam as slam_backends
-from ms_slam_env.camera import xtion
-from ms_slam_env.evaluation.duplicate_objects import (
+from ms_slam_experiments.shared.duplicate_objects import (
     JudgedMap,
+    MapConsistency,
+    ObjectConsistency,
     judge_map,
     labelled_surface,
     labelled_view,
 )
+
+from ms_slam_env import slam as slam_backends
+from ms_slam_env.camera import xtion
 from ms_slam_env.geometry import invert, make_pose, transform_points
-from ms_slam_env.metrics.consistency import MapConsistency, ObjectConsistency
 from ms_slam_env.sensor.scene_cache import get_sensor
 
 

@@ -7,14 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ms_slam_experiments.loop_closure import LoopClosure, LoopSpec
+from ms_slam_experiments.loop_closure import LoopClosure, LoopSpec, judge_closure
+from ms_slam_experiments.shared.loop_paths import returning_path
 
 from ms_slam_env import scenes
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
-from ms_slam_env.evaluation.loop_closures import judge_closure
 from ms_slam_env.geometry import make_pose, relative_angle, so3_exp
-from ms_slam_env.sequences.loop_paths import returning_path
 
 SPEC = LoopSpec("living_room", 1002, "around", 0.06, 5.0, "kinect", "160x120", "deformation")
 
@@ -88,10 +87,3 @@ def test_parameters_of_the_slam_reach_it_and_bad_ones_are_refused() -> None:
     assert specs[0].options == {"loops": {"window": 70}, "max_surfels": 5000}
     with pytest.raises(InputError, match="window"):
         LoopClosure(options=("loops.windows=70",)).specs()
-
-
-def test_both_variants_of_every_recording_are_run() -> None:
-    specs = LoopClosure(recordings=("corridor:2000:corridor:0.04:3:kinect",)).specs()
-    assert [(spec.size, spec.closure) for spec in specs] == [
-        (size, closure) for size in ("160x120", "320x240") for closure in ("none", "deformation")
-    ]

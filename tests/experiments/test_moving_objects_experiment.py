@@ -8,10 +8,12 @@ from ms_slam_experiments.moving_objects import (
     MASKED,
     MovingObjectsExperiment,
     MovingObjectsSpec,
+    found_masks,
+    mask_measures,
+    true_masks,
 )
 
 from ms_slam_env.errors import InputError
-from ms_slam_env.evaluation.moving_objects import found_masks, mask_measures, true_masks
 from ms_slam_env.metrics.registry import metric
 from ms_slam_env.report.records import Row
 from ms_slam_env.sequences import HandheldPath, open_sequence
@@ -92,5 +94,5 @@ def test_a_recording_and_an_unknown_backend_are_refused(tmp_path) -> None:
     with pytest.raises(InputError, match="does not say what moves"):
         MovingObjectsExperiment(sequences=(str(tmp_path),))
     with pytest.raises(InputError, match="unknown SLAM backend"):
-        MovingObjectsExperiment(backends=("none",))
+        MovingObjectsExperiment(backends=("none",)).specs()
     assert isinstance(MovingObjectsExperiment().specs()[0], MovingObjectsSpec)

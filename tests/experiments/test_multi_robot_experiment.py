@@ -7,10 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 from ms_slam_experiments import multi_robot
-from ms_slam_experiments.multi_robot import MultiRobot
-from ms_slam_experiments.pictures import judged_map
-from ms_slam_experiments.shared import teams
-from ms_slam_experiments.shared.teams import (
+from ms_slam_experiments.multi_robot import (
     MultiRobotSpec,
     PairMerge,
     Team,
@@ -19,19 +16,13 @@ from ms_slam_experiments.shared.teams import (
     place_robots,
     team_paths,
 )
-from two_robots import TRUTHS, run_robot
 
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, make_pose, so3_exp
 from ms_slam_env.sequences import HandheldPath
-from ms_slam_env.slam.team.map_merging import Fit, Merge, MergeConfig
+from ms_slam_env.slam.team.map_merging import Fit, Merge
 from ms_slam_env.slam.team.relative_map_poses import RobotRun
-
-
-@pytest.fixture(scope="module")
-def robots(box_scene):
-    return [run_robot(box_scene, truth, seed) for seed, truth in enumerate(TRUTHS)]
 
 
 class _Map:
@@ -115,45 +106,9 @@ def test_paths_of_a_team_share_what_they_see(box_scene, monkeypatch) -> None:
     np.testing.assert_array_equal(paths, again)
     assert not np.allclose(paths[0], paths[1])
     assert overlap({(0,), (1,)}, {(1,), (2,), (3,)}) == 0.5
-    monkeypatch.setattr(teams, "_ATTEMPTS", 2)
+    monkeypatch.setattr(multi_robot, "_ATTEMPTS", 2)
     with pytest.raises(InputError, match=r"shares 100 %"):
         team_paths(box_scene, path, 3, 2, 1.0)
-
-
-def test_a_team_maps_its_paths_in_frames_of_its_own(box_scene, monkeypatch) -> None:
-    monkeypatch.setattr(teams.scenes, "make", lambda *_: box_scene)
-    spec = MultiRobotSpec(frames=4, image_size="80x60", least_overlap=0.0)
-    team = teams.make_team(spec)
-    for robot, truth in zip(team.robots, team.truths, strict=True):
-        np.testing.assert_array_equal(robot.estimates[0], np.eye(4))
-        assert robot.tracked.all()
-        own = invert(truth[0]) @ truth
-        np.testing.assert_allclose(robot.estimates, own, atol=0.03)
-    assert box_scene.clearance(team.seen.astype(float)).max() < 1e-4
-
-
-def test_tables_and_the_picture_of_a_team(robots, tmp_path, monkeypatch) -> None:
-    def judged(points, *_, **__):
-        return {"f_score_2cm": 0.5, "f_score_5cm": 1.0, "map_points": len(points)}
-
-    floor = np.zeros((1, 3))
-    team = Team(robots, list(TRUTHS), [np.arange(10) / 30] * 2, floor, floor, [0.5])
-    monkeypatch.setattr(teams, "map_quality", judged)  # takes seconds
-    monkeypatch.setattr(multi_robot, "make_team", lambda _: team)
-    monkeypatch.setattr(judged_map, "CAMERA", judged_map.CAMERA.scaled(0.125))
-    merge = MergeConfig(sources=("features",))
-    experiment = MultiRobot(scenes=("table",), merge=merge)
-    (spec,) = experiment.specs()
-    result = MultiRobot.run(spec)
-    rows = [{"spec": dataclasses.asdict(spec), "result": result, "error": None}]
-    settings, sources, (line,), (pair,) = (table.rows for table in experiment.tables(rows))
-    assert (settings[0]["merged"].value, settings[0]["wrong_merge"].value) == (1, 0)
-    assert sources[0]["source"] == "features"
-    assert line["merged_robots"] == 2
-    assert line["alone_f_score_2cm"] == 0.5
-    assert pair["pair"] == "0-1"
-    experiment.write_pictures(rows, tmp_path)
-    assert (tmp_path / "map_table_1000_2.png").stat().st_size > 1000
 
 
 @pytest.mark.parametrize(

@@ -8,14 +8,11 @@ import numpy as np
 import pytest
 from box_scene import BoxScene
 from ms_slam_experiments.relocalization import (
-    Relocalization,
-    RelocalizationSpec,
-    about_the_maps,
-)
-from ms_slam_experiments.shared.interruptions import (
     SETTINGS,
     Interruption,
     MappedSpace,
+    Relocalization,
+    about_the_maps,
     draw_interruption,
     interrupt,
     map_path,
@@ -23,7 +20,6 @@ from ms_slam_experiments.shared.interruptions import (
 
 from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.geometry import look_at, make_pose, relative_angle
-from ms_slam_env.report.records import from_plain, to_plain
 from ms_slam_env.slam import TrackResult
 
 AFTER = 5
@@ -168,15 +164,3 @@ def test_maps_take_the_scenes_in_turns():
         ("160", "table", 1002),
         ("320", "table", 1000),
     ]
-
-
-@pytest.mark.slow
-def test_one_map_is_interrupted():
-    settings = ("near", "foreign")
-    result = Relocalization.run(
-        RelocalizationSpec("carpet", 1001, "80x60", settings, ("ferns",), 1, 60, 3)
-    )
-    assert {attempt["setting"] for attempt in result["attempts"]} == set(settings)
-    assert not any(attempt["wrong"] for attempt in result["attempts"])
-    assert result["maps"][0]["ate_unaligned_m"] < 0.03
-    assert from_plain(to_plain(result)) == result

@@ -5,14 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ms_slam_experiments.env_speed import EnvSpeed, EnvSpeedSpec
+from ms_slam_experiments.env_speed import EnvSpeed
 from ms_slam_experiments.lookahead_speed import STAGES, LookaheadSpeed
 from ms_slam_experiments.shared.slam_speed_child import APART_M, with_far_places
-from ms_slam_experiments.slam_batch import SlamBatch, device_bytes
 from ms_slam_experiments.slam_speed import SlamSpeed, backend_parameters, run_child, summarise
 
-from ms_slam_env._runtime.warp import wp
-from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
 
 TINY = {"scene": "carpet", "seed": 1000, "sizes": ("80x60",), "frames": 5, "warm_up": 2}
@@ -106,34 +103,6 @@ def test_bad_checkout_and_parameter(tmp_path):
     assert backend_parameters(("iterations=[1, 2]",)) == {"iterations": [1, 2]}
 
 
-TINY_BATCH = {"scene": "carpet", "seed": 1000, "size": "80x60", "frames": 4, "sequences": 2}
-
-
-def test_batches_are_measured_with_their_memory():
-    specs = SlamBatch(batch=(1, 3), warm_up=1, max_surfels=8000, **TINY_BATCH).specs()
-    results = [SlamBatch.run(spec) for spec in specs]
-    for spec, result in zip(specs, results, strict=True):
-        assert result["lost_frames"] == 0
-        assert result["ate_unaligned_m"] > 0
-        assert result["frames_per_s"] == pytest.approx(1000 * spec.batch / result["batch_ms"])
-        assert 0.5 < result["mb_per_env"] < 20
-    assert results[1]["mb_per_env"] == pytest.approx(results[0]["mb_per_env"], rel=0.2)
-
-
-@pytest.mark.skipif(wp.is_cuda_available(), reason="there is a GPU")
-def test_says_that_nothing_was_measured_without_a_gpu(tmp_path, capsys):
-    words = ["experiment", "slam-batch", "--device", "cuda", "--out", str(tmp_path / "out")]
-    assert main(words) == 2
-    assert "not measured on a GPU" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
-def test_bytes_of_arrays_and_their_views():
-    made, size = device_bytes(lambda: (array := wp.zeros((5, 4), dtype=wp.vec3), array.flatten()))
-    assert made[0].shape == (5, 4)
-    assert size == 5 * 4 * 12
-
-
 def test_a_free_camera_is_measured_once_whatever_the_frames():
     specs = EnvSpeed(
         embodiments=("free", "fixed-translation"),
@@ -144,23 +113,6 @@ def test_a_free_camera_is_measured_once_whatever_the_frames():
         ("free", 1),
         ("fixed-translation", 1),
     ]
-
-
-def test_split_adds_up_to_the_step():
-    spec = EnvSpeedSpec("free", 1, "lookahead", scene="carpet", seconds=0.05, warm_up=1)
-    result = EnvSpeed.run(spec)
-    stages = {one["stage"]: one["stage_ms"] for one in result["stages"]}
-    assert result["measured_steps"] >= 1
-    assert result["frames_per_step"] == 1
-    assert result["steps_per_s"] == pytest.approx(1000 / result["step_ms"])
-    assert sum(stages.values()) == pytest.approx(result["step_ms"])
-    assert min(stages.values()) >= 0
-    assert {"render", "slam", "lookahead", "rest"} <= set(stages)
-    (table,) = EnvSpeed().tables([{"spec": asdict(spec), "result": result, "error": None}])
-    names = [column.name for column in table.columns]
-    assert names.index("render_ms") < names.index("slam_ms") < names.index("lookahead_ms")
-    assert table.rows[0]["observation"] == "lookahead"
-    assert names[-1] == "rest_ms"
 
 
 def test_every_stage_of_the_lookahead_is_found_by_the_profiler():

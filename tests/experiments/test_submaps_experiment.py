@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from ms_slam_experiments.shared.interruptions import map_path
+from ms_slam_experiments.relocalization import map_path
 from ms_slam_experiments.submaps import (
     DARK,
     RETURN,

@@ -223,9 +223,8 @@ def arm_experiment(_: Path) -> Any:
 @experiment("arm_masks")
 def arm_mask_walk(_: Path) -> Any:
     from ms_slam_experiments import arm_masks
-    from ms_slam_experiments.shared.arm_truth import furniture_cloud
 
-    coarse = furniture_cloud(_scene("carpet", 1000), spacing_m=0.04)  # quick to prepare
+    coarse = arm_masks.furniture_cloud(_scene("carpet", 1000), spacing_m=0.04)  # quick to prepare
     with patch.object(arm_masks, "furniture_of", lambda *_: coarse):
         found = arm_masks.ArmMasks.run(arm_masks.WalkSpec("carpet", 1000, states=1, moves=1))
     reasons = Counter(found["cases"].pop("reason"))
@@ -254,8 +253,7 @@ def lookahead_ranking(_: Path) -> Any:
 
 @experiment("compare")
 def compare(_: Path) -> Any:
-    from ms_slam_env.benchmark.compare import Compare
-    from ms_slam_env.benchmark.compare_runs import CompareSpec
+    from ms_slam_env.benchmark.compare import Compare, CompareSpec
 
     text = "table:1000:kinect+exposure-ramp"
     return {
@@ -266,7 +264,7 @@ def compare(_: Path) -> Any:
 
 @experiment("usme", CHAOTIC)
 def usme(folder: Path) -> Any:
-    from ms_slam_env.benchmark.usme_runs import UsmeSpec, run_usme
+    from ms_slam_env.benchmark.usme import UsmeSpec, run_usme
     from ms_slam_env.sequences.usme_suite import make_suite
 
     name, size, seed, scale = "room-fast-black", "80x60", 2000, 0.3
@@ -331,8 +329,7 @@ def loop_closure(_: Path) -> Any:
 
 @experiment("multi_robot", CHAOTIC)
 def multi_robot(_: Path) -> Any:
-    from ms_slam_experiments.multi_robot import MultiRobot
-    from ms_slam_experiments.shared.teams import MultiRobotSpec
+    from ms_slam_experiments.multi_robot import MultiRobot, MultiRobotSpec
 
     from ms_slam_env.slam.team.map_merging import MergeConfig
 
@@ -411,9 +408,10 @@ def _glide(frames: int, offset_m: float) -> tuple[Any, list[Any], Any]:
 
     From half way on, the poses are off by ``offset_m`` to the left.
     """
+    from ms_slam_experiments.shared.duplicate_objects import labelled_view
+
     from ms_slam_env import scenes, slam
     from ms_slam_env.camera import xtion
-    from ms_slam_env.evaluation.duplicate_objects import labelled_view
     from ms_slam_env.geometry import make_pose
     from ms_slam_env.sensor import RGBDSensor
 
@@ -431,21 +429,12 @@ def _glide(frames: int, offset_m: float) -> tuple[Any, list[Any], Any]:
 
 @experiment("map_consistency")
 def map_consistency(_: Path) -> Any:
-    from ms_slam_env.evaluation.duplicate_objects import judge_map
+    from ms_slam_experiments.shared.duplicate_objects import judge_map
 
     sensor, views, system = _glide(8, 0.15)
     judged = judge_map(system.surface_points(), system.surface_colors(), views, sensor)
     objects = {judged.name(item): item for item in judged.consistency.objects}
     return {"points": len(judged.points), "success": judged.consistency.success, **objects}
-
-
-@experiment("duplicate_objects", CHAOTIC)
-def duplicate_objects(_: Path) -> Any:
-    from ms_slam_experiments.duplicate_objects import CopySpec, DuplicateObjects
-
-    from ms_slam_env.metrics.consistency import ConsistencyRule
-
-    return DuplicateObjects.run(CopySpec("table", 1000, 0.1, 0, ConsistencyRule()))
 
 
 @experiment("map_evaluation", EXACT)

@@ -11,7 +11,10 @@ from ms_slam_env.camera import intensity_image, xtion
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, look_at, make_pose, se3_exp, so3_exp
 from ms_slam_env.sensor import RGBDSensor
-from ms_slam_env.slam.odometry.semi_dense import SemiDenseAligner, normal_equations
+from ms_slam_env.slam.odometry.semi_dense import (
+    SemiDenseAligner,
+    normal_equations,
+)
 from ms_slam_env.slam.shared.alignment_measures import DepthImage
 
 CAMERA = xtion("160x120")

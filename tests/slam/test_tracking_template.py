@@ -9,7 +9,7 @@ from surfel_scenes import ray_cast
 from ms_slam_env import slam
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.geometry import make_pose, so3_exp
-from ms_slam_env.slam.odometry import odometry
+from ms_slam_env.slam.odometry.odometry import odometry
 from ms_slam_env.slam.shared.tracking_template import SEARCHED_FRAMES
 
 CAMERA = Intrinsics(fx=60.0, fy=60.0, cx=39.5, cy=29.5, width=80, height=60)

@@ -10,7 +10,7 @@ from PIL import Image
 
 from ms_slam_env import scenes, slam
 from ms_slam_env.benchmark import rows as harness_rows
-from ms_slam_env.benchmark import usme, usme_runs
+from ms_slam_env.benchmark import usme
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
 from ms_slam_env.sequences.usme_suite import NAMES, find
@@ -22,23 +22,23 @@ make_scene = cache(scenes.make)
 def cheap(monkeypatch):
     """Scenes are built once, the true surface is seen in small images."""
     monkeypatch.setattr(scenes, "make", make_scene)
-    monkeypatch.setattr(usme_runs, "_VIEW_SIZE", "80x60")
+    monkeypatch.setattr(usme, "_VIEW_SIZE", "80x60")
 
 
 def test_options_of_a_backend_are_those_of_the_sequence():
-    assert usme_runs.slam_options(find("room-fast"), "surfel") == {}
+    assert usme.slam_options(find("room-fast"), "surfel") == {}
     for backend in slam.BACKENDS:
-        options = usme_runs.slam_options(find("city-traffic"), backend)
+        options = usme.slam_options(find("city-traffic"), backend)
         assert options["depth_cutoff_m"] == 10.0
         assert options.get("motion_mask") == ("geometric" if backend == "surfel" else None)
-    assert "motion_mask" not in usme_runs.slam_options(find("residential-no-loop"), "surfel")
+    assert "motion_mask" not in usme.slam_options(find("residential-no-loop"), "surfel")
 
 
 @pytest.mark.usefixtures("cheap")
 def test_one_run_has_every_measure():
     backend = "surfel,loop_closure=deformation"
-    spec = usme_runs.UsmeSpec("room-fast-black", backend, "80x60", SEED, frames_scale=0.12)
-    result = usme_runs.run_usme(spec)
+    spec = usme.UsmeSpec("room-fast-black", backend, "80x60", SEED, frames_scale=0.12)
+    result = usme.run_usme(spec)
     assert result["frames"] > 30
     assert 0.0 <= result["lost_share"] <= 1.0
     assert not np.isnan(result["relocalisation_s"])
@@ -66,10 +66,10 @@ def test_one_run_has_every_measure():
 def test_a_map_against_itself_is_without_error():
     rng = np.random.default_rng(0)
     plane = np.column_stack([rng.uniform(0, 2, (20_000, 2)), 0.003 * rng.standard_normal(20_000)])
-    found = usme_runs.map_measures(plane, plane, "living_room")
+    found = usme.map_measures(plane, plane, "living_room")
     assert found["c2c_mean_m"] < 1e-3
     assert found["recall_near"] > 0.99
-    empty = usme_runs.map_measures(np.zeros((0, 3)), plane, "living_room")
+    empty = usme.map_measures(np.zeros((0, 3)), plane, "living_room")
     assert (empty["map_points"], empty["c2c_mean_m"]) == (0, None)
 
 
@@ -120,7 +120,7 @@ def test_make_writes_what_run_reads(tmp_path, capsys, monkeypatch):
         Image.fromarray(np.zeros((60, 80), np.uint16)).save(path)
     (blank,) = usme.Usme(tmp_path / "made", ("odometry",)).specs()
     with pytest.raises(InputError, match="sequence room-fast: no frame has a depth reading"):
-        usme_runs.run_usme(blank)
+        usme.run_usme(blank)
     (tmp_path / "made/room-fast/sequence.json").write_text('{"suite": "usme"}')
     assert main([*ran, "--out", str(tmp_path / "other")]) == 2
     assert "describes no sequence" in capsys.readouterr().err
@@ -129,7 +129,7 @@ def test_make_writes_what_run_reads(tmp_path, capsys, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["fly"], "make, run, picture"),
+        (["fly"], "valid choices: make, run"),
         (["run", "--backends", "magic"], "unknown SLAM backend 'magic'"),
         (["run", "--backends", "odometry,magic=1"], "slam_config.magic"),
         (["make", "--sequences", "x"], "unknown USME sequence 'x'"),

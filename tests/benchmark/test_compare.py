@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from ms_slam_env import sequences
 from ms_slam_env.benchmark import compare
-from ms_slam_env.benchmark.compare import PEERS, Compare
-from ms_slam_env.benchmark.compare_runs import CompareSpec
+from ms_slam_env.benchmark.compare import PEERS, Compare, CompareSpec
 from ms_slam_env.benchmark.compare_tables import (
     METRICS,
     comparison_tables,

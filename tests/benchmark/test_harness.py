@@ -106,6 +106,43 @@ def test_the_command_line_is_made_of_the_fields(
         run(Wobbles, ["--episods", "1"], "test", tmp_path)
 
 
+@dataclass(frozen=True)
+class Ride:
+    scene: str
+    seed: int
+    image_size: str = ""
+
+
+@dataclass(frozen=True)
+class Rides(Wobbles):
+    """Rides
+
+    Of nothing.
+    """
+
+    backends: tuple[str, ...] = ("surfel",)
+    image_size: str = "80x60"
+    noise: str = "none"
+    sequences: tuple[str, ...] | int = 3
+
+    def specs(self) -> list[Ride]:  # type: ignore[override]
+        return self.each(Ride, scene=self.scenes, seed=range(2))
+
+
+def test_specifications_are_every_combination_of_what_there_is() -> None:
+    found = [Ride(scene, seed, "80x60") for scene in ("table", "wall") for seed in (0, 1)]
+    assert Rides().specs() == found
+    for options, message in (
+        ({"scenes": ("mars",)}, "unknown scene 'mars'; valid choices: living_room"),
+        ({"backends": ("lidar",)}, "unknown SLAM backend 'lidar'; valid choices: surfel"),
+        ({"sequences": ("table:x",)}, "neither a folder nor scene:seed"),
+        ({"image_size": "1x1"}, "unknown image size '1x1'"),
+        ({"noise": "loud"}, "unknown noise model 'loud'"),
+    ):
+        with pytest.raises(InputError, match=message):
+            Rides(**options).specs()
+
+
 def test_a_check_finds_what_changed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,16 +1,12 @@
-"""Does an object appear twice in a map? The paper's rule for a failed map, as a program.
-
-Saeedi et al., ICRA 2017, section VI-C: "the consistency of the generated map was evaluated manually
-as either a success or failure of SLAM. If duplicates of one object were present in the map, it was
-considered as failure." Which object a point of the map was seen on is asked of the frames that made
-the map; where the true surface of every object is known, what was seen on an object either lies on
-its surface or is a second copy of it.
-"""
+"""The duplicate-object check: does a map of a rendered scene show an object twice?"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,10 +15,17 @@ from scipy.spatial import cKDTree
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import Float64, check_pose, invert, transform_points
-from ms_slam_env.geometry.point_clouds import check_points
+from ms_slam_env.evaluation.map_truth import SURFACE_SPACING_M
+from ms_slam_env.geometry import check_pose, invert, transform_points
+from ms_slam_env.geometry.point_clouds import check_points, voxel_firsts
+from ms_slam_env.scenes.mesh_queries import sample_surface
+from ms_slam_env.sensor import RGBDSensor
+from ms_slam_env.sensor.scene_cache import get_scene
+
+Float64 = NDArray[np.float64]
 
 Int64 = NDArray[np.int64]
+Bool = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -150,8 +153,6 @@ def distinct_placements(
             placed.append(moved)
     return np.stack(found)
 
-
-Bool = NDArray[np.bool_]
 
 _POINTS_TO_PLACE = 1500  # of an object, evenly picked, decide where it fits best
 
@@ -289,3 +290,88 @@ def _beyond(points: Float64, tree: cKDTree, distance_m: float) -> Bool:
     """Which points (N,) are farther than ``distance_m`` from all points of the tree."""
     # With a bound the search gives up early on points that are far away; those are at infinity.
     return np.isinf(tree.query(points, distance_upper_bound=distance_m)[0])
+
+
+MAP_VOXEL_M = 0.01
+
+
+@dataclass(frozen=True)
+class JudgedMap:
+    """A map and the verdict on it.
+
+    Attributes:
+        points: (N, 3) of the map that were judged, world frame.
+        colors: (N, 3) uint8, theirs.
+        consistency: the verdict.
+        labels: names of the scene's objects.
+    """
+
+    points: Float64
+    colors: NDArray[np.uint8]
+    consistency: MapConsistency
+    labels: tuple[str, ...]
+
+    def name(self, item: ObjectConsistency) -> str:
+        """Name of an object."""
+        return self.labels[item.label]
+
+    def verdict(self) -> dict[str, Any]:
+        """Metrics: ``success``, ``objects`` (judged), ``worst_apart_share``, ``duplicated``."""
+        found = self.consistency
+        return {
+            "success": found.success,
+            "objects": len(found.objects),
+            "worst_apart_share": max((o.apart_share for o in found.objects), default=math.nan),
+            "duplicated": [
+                {"object": self.name(item), "apart_share": item.apart_share}
+                for item in found.duplicated
+            ],
+        }
+
+
+def labelled_view(
+    sensor: RGBDSensor, T_world_camera: Float64, T_world_camera_estimate: Float64
+) -> LabelledView:
+    """What a frame from a true pose (4, 4) showed, for SLAM that put it at an estimated one."""
+    view = sensor.ground_truth(T_world_camera)
+    return LabelledView(
+        T_world_camera, T_world_camera_estimate, view.color, view.depth, view.labels
+    )
+
+
+def judge_map(
+    map_points: ArrayLike,
+    map_colors: ArrayLike,
+    views: list[LabelledView],
+    sensor: RGBDSensor,
+    rule: ConsistencyRule | None = None,
+) -> JudgedMap:
+    """Judge a map, points (N, 3) and colours (N, 3), made of ``views`` of the sensor's scene.
+
+    An empty map shows nothing twice.
+    """
+    rule = rule or ConsistencyRule()
+    scene = sensor.scene
+    labels = scene.mesh.labels
+    if len(np.asarray(map_points)) == 0:
+        nothing = MapConsistency((), np.zeros(0, dtype=bool))
+        return JudgedMap(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), nothing, labels)
+    kept = voxel_firsts(map_points, MAP_VOXEL_M)
+    points, colors = np.asarray(map_points)[kept], np.asarray(map_colors)[kept]
+    votes = count_votes(points, colors, views, sensor.intrinsics, len(labels))
+    surface, owner = labelled_surface(scene.name, scene.seed)
+    placements = distinct_placements(views, points, rule.apart_m / 2)
+    verdict = judge_consistency(points, votes, surface, owner, rule, placements)
+    return JudgedMap(points, colors, verdict, labels)
+
+
+@lru_cache(maxsize=2)
+def labelled_surface(scene: str, seed: int) -> tuple[Float64, NDArray[np.int32]]:
+    """The whole surface of a scene: points (N, 3) and the object (N,) of each.
+
+    Also what ``Scene.surface_points`` leaves out as hidden: cameras do see into the narrow places
+    that it takes for closed, and to a seat's inner side.
+    """
+    mesh = get_scene(scene, seed).mesh
+    points, face = sample_surface(mesh.vertices, mesh.faces, SURFACE_SPACING_M)
+    return points, mesh.face_label[face]

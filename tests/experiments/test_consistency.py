@@ -8,11 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from ms_slam_env.camera import Intrinsics
-from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import invert, look_at, make_pose, so3_exp, transform_points
-from ms_slam_env.metrics.consistency import (
+from ms_slam_experiments.shared.duplicate_objects import (
     ConsistencyRule,
     LabelledView,
     MapConsistency,
@@ -21,6 +17,10 @@ from ms_slam_env.metrics.consistency import (
     distinct_placements,
     judge_consistency,
 )
+
+from ms_slam_env.camera import Intrinsics
+from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import invert, look_at, make_pose, so3_exp, transform_points
 
 CAMERA = Intrinsics(fx=50.0, fy=50.0, cx=31.5, cy=23.5, width=64, height=48)
 GREY = np.full((*CAMERA.shape, 3), 128, dtype=np.uint8)

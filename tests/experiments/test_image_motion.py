@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from ms_slam_experiments.difficulty import MOTIONS, by_second, contrast, frame_motion
 
 from ms_slam_env.camera import RGBDFrame, xtion
-from ms_slam_env.evaluation.image_motion import MOTIONS, by_second, contrast, frame_motion
 from ms_slam_env.geometry import make_pose, so3_exp
 
 K = xtion("160x120")

@@ -21,8 +21,7 @@ from hypothesis import strategies as st
 
 from ms_slam_env.benchmark import rows as rows_module
 from ms_slam_env.benchmark.episodes import EpisodeSpec
-from ms_slam_env.benchmark.file_hashes import file_hashes
-from ms_slam_env.benchmark.rows import RECORDS, failures, names, run_all
+from ms_slam_env.benchmark.rows import RECORDS, failures, file_hashes, names, run_all
 from ms_slam_env.errors import InputError, InputWarning
 from ms_slam_env.metrics.registry import RESULTS_VERSION
 from ms_slam_env.report.records import RecordFile, spec_key, write_json
