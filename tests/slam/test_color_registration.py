@@ -9,7 +9,7 @@ from ms_slam_env import slam
 from ms_slam_env.metrics import ate_rmse
 from ms_slam_env.sequences import HandheldPath, Sequence, open_sequence
 from ms_slam_env.slam.surfel import color_cameras
-from ms_slam_env.slam.surfel.color_registration import depth_edges, estimate_registration
+from ms_slam_env.slam.surfel.color_cameras import depth_edges, estimate_registration
 
 PATH = HandheldPath(40)
 FOCAL_RATIO, BASELINE_M = 525 / 585, 0.025  # of the perturbation

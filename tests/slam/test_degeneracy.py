@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from ms_slam_env import slam
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics, RGBDFrame
-from ms_slam_env.slam.surfel.degeneracy import eigen, mat66d, mat76d, remapped_step, vec6d
+from ms_slam_env.slam.surfel.solver import eigen, mat66d, mat76d, remapped_step, vec6d
 
 CAMERA = Intrinsics(fx=146.0, fy=146.0, cx=79.5, cy=59.5, width=160, height=120)
 

@@ -14,14 +14,14 @@ from ms_slam_env.geometry import invert, look_at, make_pose, relative_angle, se3
 from ms_slam_env.sequences import render_sequence
 from ms_slam_env.slam.shared.ferns import Candidate
 from ms_slam_env.slam.surfel import SurfelConfig
-from ms_slam_env.slam.surfel.deformation_graph import (
+from ms_slam_env.slam.surfel.map_deformation import (
     Deformation,
+    creation_times,
     identity,
     pack,
     sample_graph,
     unpack,
 )
-from ms_slam_env.slam.surfel.map_deformation import creation_times
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
 from ms_slam_env.slam.surfel.surfel_config import LoopConfig
 

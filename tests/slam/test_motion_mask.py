@@ -13,7 +13,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.metrics import ate_rmse
 from ms_slam_env.sequences import HandheldPath, open_sequence
 from ms_slam_env.slam.surfel.backend import SurfelSlam
-from ms_slam_env.slam.surfel.image_pieces import Pieces
+from ms_slam_env.slam.surfel.preprocessing import Pieces
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
 from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 

@@ -13,7 +13,7 @@ from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
 from ms_slam_env.geometry import look_at, make_pose, so3_exp
 from ms_slam_env.sensor import RGBDSensor
-from ms_slam_env.slam.surfel.alignment_arrays import NUM_SUMS, RUNNING, Hypotheses, Photometry, Sum
+from ms_slam_env.slam.surfel.normal_equations import NUM_SUMS, RUNNING, Hypotheses, Photometry, Sum
 from ms_slam_env.slam.surfel.photometry import (
     ExposureCorrection,
     correction,

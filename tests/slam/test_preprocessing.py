@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics, xtion
-from ms_slam_env.slam.surfel.preprocessing import Preprocessor
-from ms_slam_env.slam.surfel.pyramid import EDGE_FRACTION, Pyramid
+from ms_slam_env.slam.surfel.preprocessing import EDGE_FRACTION, Preprocessor, Pyramid
 from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 
 CAMERA = Intrinsics(fx=20.0, fy=21.0, cx=11.3, cy=7.7, width=24, height=16)

@@ -16,8 +16,7 @@ from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.shared.alignment_check import is_photometrically_consistent
 from ms_slam_env.slam.shared.alignment_measures import measure_photometric_consistency
 from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
-from ms_slam_env.slam.surfel.keyframe_search import FernRelocalization
-from ms_slam_env.slam.surfel.relocalization import Images
+from ms_slam_env.slam.surfel.keyframe_search import FernRelocalization, Images
 
 CAMERA = xtion("160x120")
 OPTIONS = {"max_surfels": 120_000, "depth_cutoff_m": 4.0}

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.geometry import se3_exp
-from ms_slam_env.slam.surfel.alignment_arrays import (
+from ms_slam_env.slam.surfel.normal_equations import (
     NUM_SUMS,
     OFF,
     RESTING,

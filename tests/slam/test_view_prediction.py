@@ -16,8 +16,13 @@ from ms_slam_env.slam.surfel import view_prediction
 from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.surfels import SplatCamera
-from ms_slam_env.slam.surfel.view_prediction import mean_pose, wide_intrinsics
-from ms_slam_env.slam.surfel.view_warping import EMPTY, PointCloud, scatter_points
+from ms_slam_env.slam.surfel.view_prediction import (
+    EMPTY,
+    PointCloud,
+    mean_pose,
+    scatter_points,
+    wide_intrinsics,
+)
 
 LUMA = np.array([0.299, 0.587, 0.114])
 WIDE_PATH = np.stack(

@@ -21,23 +21,21 @@ from ms_slam_env.slam.shared.alignment_check import (
     evaluate_on_device,
 )
 from ms_slam_env.slam.slam_backend import Float64
-from ms_slam_env.slam.surfel.alignment_arrays import Hypotheses, Sum
-from ms_slam_env.slam.surfel.degeneracy import (
-    eigen,
-    is_constrained,
-    mat66d,
-    mat76d,
-    pose_covariance,
-    vec6d,
-)
+from ms_slam_env.slam.surfel.normal_equations import Hypotheses, Sum
 from ms_slam_env.slam.surfel.solver import (
     cholesky,
     cholesky_solve,
+    eigen,
     invert_rigid,
+    is_constrained,
     load_terms,
+    mat66d,
+    mat76d,
     orthonormalise,
+    pose_covariance,
     se3_exp,
     se3_log,
+    vec6d,
 )
 from ms_slam_env.slam.surfel.surfel_config import AcceptanceConfig
 

@@ -15,7 +15,7 @@ from ms_slam_env.slam.shared.state import check_has
 from ms_slam_env.slam.shared.submap_frames import Submaps
 from ms_slam_env.slam.slam_backend import Float64, SlamBackend, TrackResult, Views, check_views
 from ms_slam_env.slam.surfel.color_cameras import make_color_camera
-from ms_slam_env.slam.surfel.relocalization import Images
+from ms_slam_env.slam.surfel.keyframe_search import Images
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
 from ms_slam_env.slam.surfel.submaps import make_submaps
 from ms_slam_env.slam.surfel.surfel_config import SurfelConfig

@@ -17,8 +17,9 @@ from ms_slam_env.slam.shared.feature_poses import FeaturePose, LastFrames
 from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.surfel.acceptance import Alignment, accept_any_fit, is_nearly_accepted
 from ms_slam_env.slam.surfel.camera_states import CameraStates
+from ms_slam_env.slam.surfel.free_space_mask import MotionMask
+from ms_slam_env.slam.surfel.keyframe_search import Images, Relocalization, measure_consistency
 from ms_slam_env.slam.surfel.map_alignment import MapAligner
-from ms_slam_env.slam.surfel.motion_mask import MotionMask
 from ms_slam_env.slam.surfel.photometry import InvalidFrameDetector, is_leap
 from ms_slam_env.slam.surfel.pipeline import Pipeline
 from ms_slam_env.slam.surfel.pose_hypotheses import (
@@ -27,7 +28,6 @@ from ms_slam_env.slam.surfel.pose_hypotheses import (
     tracking_hypotheses,
 )
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
-from ms_slam_env.slam.surfel.relocalization import Images, Relocalization, measure_consistency
 
 MOSTLY_MOVING = 0.6  # share of the readings: rather the pose is wrong, or too little is left
 CLEARLY_APART = 30.0  # squared Mahalanobis distance; below 20 where nothing leads a pose

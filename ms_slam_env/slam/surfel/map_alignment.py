@@ -17,7 +17,7 @@ from ms_slam_env.slam.surfel.acceptance import (
 )
 from ms_slam_env.slam.surfel.camera_states import CameraStates
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer
-from ms_slam_env.slam.surfel.motion_mask import MotionMask
+from ms_slam_env.slam.surfel.free_space_mask import MotionMask
 from ms_slam_env.slam.surfel.photometry import geometry_only
 from ms_slam_env.slam.surfel.pipeline import Pipeline
 from ms_slam_env.slam.surfel.pose_hypotheses import (

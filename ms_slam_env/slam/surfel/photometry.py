@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.shared.state import Saved
-from ms_slam_env.slam.surfel.alignment_arrays import Photometry
 from ms_slam_env.slam.surfel.device import (
     HostDeviceBuffer,
     KernelLaunchCache,
@@ -24,6 +23,7 @@ from ms_slam_env.slam.surfel.device import (
     put,
     threads_per_row,
 )
+from ms_slam_env.slam.surfel.normal_equations import Photometry
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
 
 Bool = NDArray[np.bool_]

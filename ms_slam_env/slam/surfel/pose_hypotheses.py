@@ -14,7 +14,7 @@ from ms_slam_env._runtime.warp import wp
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose, make_pose, relative_angle, se3_exp, se3_log, so3_exp
 from ms_slam_env.slam.slam_backend import Float64
-from ms_slam_env.slam.surfel.alignment_arrays import OFF, RUNNING, Hypotheses, Sum
+from ms_slam_env.slam.surfel.normal_equations import OFF, RUNNING, Hypotheses, Sum
 
 NUM_HYPOTHESES = 8
 AT_REST, CONSTANT_VELOCITY, INITIAL_GUESS = (wp.constant(i) for i in range(3))

@@ -28,8 +28,8 @@ from ms_slam_env.native import native_source
 from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer
+from ms_slam_env.slam.surfel.keyframe_search import Images
 from ms_slam_env.slam.surfel.preprocessing import check_images
-from ms_slam_env.slam.surfel.relocalization import Images
 
 PIECE = 64  # columns that are worked on together, by short loops over several of them at once
 

@@ -1,10 +1,10 @@
 """The surfel SLAM of B envs: track a frame against the map's view, fuse it, close loops.
 
-ElasticFusion (Whelan et al., RSS 2015, figure 2). While tracking is lost the
-pose is held, nothing is fused, and every frame is tried against the map around the last good pose
-and around keyframes that resemble it (``localization``, ``relocalization``).
-The view that frames are tracked against shows living surfels of every age: with steps of
-centimetres a view seldom lasts until its surfels are stable.
+ElasticFusion (Whelan et al., RSS 2015, figure 2). While tracking is lost the pose is held, nothing
+is fused, and every frame is tried against the map around the last good pose and around keyframes
+that resemble it (``localization``, ``keyframe_search``). The view that frames are tracked against
+shows living surfels of every age: with steps of centimetres a view seldom lasts until its surfels
+are stable.
 """
 
 from __future__ import annotations
@@ -25,10 +25,9 @@ from ms_slam_env.slam.shared.state import Saved, check_has
 from ms_slam_env.slam.slam_backend import Float64, TrackResult
 from ms_slam_env.slam.surfel.acceptance import Alignment, with_doubt
 from ms_slam_env.slam.surfel.camera_states import CameraStates
-from ms_slam_env.slam.surfel.detached_map import DetachedMap
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer
 from ms_slam_env.slam.surfel.free_space_mask import make_motion_mask
-from ms_slam_env.slam.surfel.keyframe_search import make_relocalization
+from ms_slam_env.slam.surfel.keyframe_search import Images, make_relocalization
 from ms_slam_env.slam.surfel.localization import Localizer
 from ms_slam_env.slam.surfel.loop_closure import make_loop_closure
 from ms_slam_env.slam.surfel.map_alignment import MapAligner
@@ -36,11 +35,11 @@ from ms_slam_env.slam.surfel.photometry import is_invalid_frame, same_exposure
 from ms_slam_env.slam.surfel.pipeline import Pipeline, PipelineCache, check_change
 from ms_slam_env.slam.surfel.pose_hypotheses import check_guesses, check_poses, motion_weight
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
-from ms_slam_env.slam.surfel.relocalization import Images
 from ms_slam_env.slam.surfel.rolling_shutter import make_shutter
 from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.tracker import model_stride
+from ms_slam_env.slam.surfel.trajectory_history import DetachedMap
 
 FEWEST_READINGS = 0.05  # share of the first frame's pixels that must have depth
 

@@ -89,7 +89,7 @@ class SplatFootprints:
 
 @wp.struct
 class Compaction:
-    """Working memory of ``surfel_culling``."""
+    """Working memory of ``surfel_map``."""
 
     survivors: wp.array2d(dtype=wp.int32)  # (B, capacity) slots to keep
     kept: wp.array(dtype=wp.int32)  # (B,) how many those are, -1 where no compaction is due
@@ -98,7 +98,7 @@ class Compaction:
 
 @wp.struct
 class SurfelAges:
-    """How many unstable surfels of a crowded map are how old, see ``surfel_culling``."""
+    """How many unstable surfels of a crowded map are how old, see ``surfel_map``."""
 
     count: wp.array2d(dtype=wp.int32)  # (B, NUM_AGES) the oldest first
 
