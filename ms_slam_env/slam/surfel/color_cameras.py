@@ -119,30 +119,8 @@ ENOUGH_EDGES = 6000  # points on depth steps, or
 MOST_FRAMES = 60  # frames after which the offset of the cameras is estimated
 
 
-class ColorCamera(Saved):
-    """The colour of one camera's frames. This is the variant "given": it is taken as it comes."""
-
-    def reset(self, T_world_camera: ArrayLike | None) -> None:
-        """Begin anew at a pose (4, 4)."""
-
-    def registered(self, slam: BatchedSurfelSlam, color: UInt8, depth: Float32) -> UInt8:
-        """Colour (1, H, W, 3) as the depth camera would see it."""
-        return color
-
-    def track(
-        self,
-        slam: BatchedSurfelSlam,
-        color: UInt8,
-        depth: Float32,
-        guess: ArrayLike | None,
-        time_s: float,
-    ) -> TrackResult:
-        """Let a frame be tracked."""
-        return slam.track(color, depth, [guess], [time_s])[0]
-
-
-class EstimatedColorCamera(ColorCamera):
-    """The variant "estimated": the offset is looked for in the first frames, and then undone.
+class EstimatedColorCamera(Saved):
+    """Where the colour camera is: looked for in the first frames, and then undone.
 
     Once it is found those frames, of which at most ``MOST_FRAMES`` are kept until then, are tracked
     once more with their colour registered, as a new map. Should one of them have been lost or fused
@@ -157,7 +135,7 @@ class EstimatedColorCamera(ColorCamera):
         self.reset(None)
 
     def reset(self, T_world_camera: ArrayLike | None) -> None:
-        """See the base class."""
+        """Begin anew at a pose (4, 4)."""
         self._start: Float64 = np.eye(4) if T_world_camera is None else np.array(T_world_camera)
         self._offset: Float64 = np.full(2, np.nan)  # focal ratio and baseline; NaN: not known yet
         self._is_whole = True  # nothing but the frames kept is in the map
@@ -181,7 +159,7 @@ class EstimatedColorCamera(ColorCamera):
         self._times: list[float] = []
 
     def registered(self, slam: BatchedSurfelSlam, color: UInt8, depth: Float32) -> UInt8:
-        """See the base class."""
+        """Colour (1, H, W, 3) as the depth camera would see it."""
         focal_ratio, baseline_m = self._offset.tolist()
         if not self._is_known or (focal_ratio, baseline_m) == (1.0, 0.0):
             return color
@@ -200,8 +178,8 @@ class EstimatedColorCamera(ColorCamera):
         guess: ArrayLike | None,
         time_s: float,
     ) -> TrackResult:
-        """See the base class."""
-        result = super().track(slam, color, depth, guess, time_s)
+        """Let a frame be tracked."""
+        result = slam.track(color, depth, [guess], [time_s])[0]
         if self._is_known:
             return result
         if self._depths and self._depths[0].shape != depth[0].shape:
@@ -230,10 +208,5 @@ class EstimatedColorCamera(ColorCamera):
         for color, depth, guess, time_s in kept:
             registered = self.registered(slam, color[None], depth[None])
             known = guess if np.isfinite(guess).all() else None
-            result = super().track(slam, registered, depth[None], known, time_s)
+            result = slam.track(registered, depth[None], [known], [time_s])[0]
         return result
-
-
-def make_color_camera(variant: str) -> ColorCamera:
-    """The variant ``SurfelConfig.color_registration``."""
-    return EstimatedColorCamera() if variant == "estimated" else ColorCamera()

@@ -54,6 +54,8 @@ Bool = NDArray[np.bool_]
 
 SimilarViews = Callable[[int, int], list[Candidate]]
 """Keyframes of an env, taken before a frame, that resemble the one just tracked, best first."""
+ClosedLoop = tuple[Loop, Float64]
+"""A loop, and the camera's pose (4, 4) after it was closed."""
 
 
 class LoopClosure(Saved):
@@ -81,10 +83,10 @@ class LoopClosure(Saved):
 
     def close(
         self, live: LiveFrame, poses: Float64, time: Int32, tracked: Bool, similar: SimilarViews
-    ) -> Mapping[int, Loop]:
+    ) -> Mapping[int, ClosedLoop]:
         """Look for loops after the frames ``time`` (B,) were recorded; those closed, by env.
 
-        Maps and ``poses`` (B, 4, 4) are corrected in place.
+        Maps are corrected in place; ``poses`` (B, 4, 4) stay as they are.
         """
         return {}
 
@@ -221,9 +223,9 @@ class DeformationLoopClosure(LoopClosure):
 
     def close(
         self, live: LiveFrame, poses: Float64, time: Int32, tracked: Bool, similar: SimilarViews
-    ) -> Mapping[int, Loop]:
+    ) -> Mapping[int, ClosedLoop]:
         """Look for loops where it is time to, and close them; see the base class."""
-        found: dict[int, Loop | None] = {}
+        found: dict[int, ClosedLoop | None] = {}
         due = tracked & (time > self.config.window) & (time % self.config.interval == 0)
         if not due.any():
             return {}
@@ -240,7 +242,9 @@ class DeformationLoopClosure(LoopClosure):
             found[int(env)] = self._close_from_keyframes(int(env), poses, similar)
         return {env: loop for env, loop in found.items() if loop is not None}
 
-    def _close_from_keyframes(self, env: int, poses: Float64, similar: SimilarViews) -> Loop | None:
+    def _close_from_keyframes(
+        self, env: int, poses: Float64, similar: SimilarViews
+    ) -> ClosedLoop | None:
         """Look for the frame where similar ones were taken, and close a loop there."""
         history = self._histories[env]
         for candidate in similar(env, history.last - self.config.window):
@@ -260,14 +264,14 @@ class DeformationLoopClosure(LoopClosure):
                 return self._close(env, poses, there)
         return None
 
-    def _close(self, env: int, poses: Float64, there: Alignment) -> Loop | None:
-        """Deform map, pose and history of one env; returns the loop if it was accepted."""
+    def _close(self, env: int, poses: Float64, there: Alignment) -> ClosedLoop | None:
+        """Deform map and history of one env; the loop and where the camera is, if accepted."""
         history, corrected = self._histories[env], there.T_world_live[env]
         loop = history.loop_at(corrected, history.last - self.config.window)
         drift = motion_size(invert(poses[env]) @ corrected)
         if drift < self.config.smallest_m:
             self._deformer.join_parts(env, poses[env], history.last)
-            return replace(loop, bent=False)
+            return replace(loop, bent=False), poses[env]
         if drift < SIGNIFICANT * there.statistics["sigma_m"][env] or not history.confirms(
             poses[env], corrected, self.config.agreement_m, 2 * self.config.global_interval
         ):
@@ -277,9 +281,8 @@ class DeformationLoopClosure(LoopClosure):
             return None
         deformation, joined = deformed
         history.move(deformation, joined, corrected)
-        poses[env] = corrected
         self._deformer.join_parts(env, corrected, history.last)
-        return loop
+        return loop, corrected
 
     def trajectory(self, env: int) -> tuple[Int32, Float64]:
         """Tracked frames (N,) and their poses (N, 4, 4), moved by the closures since."""

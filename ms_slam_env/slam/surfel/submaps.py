@@ -23,7 +23,7 @@ from ms_slam_env.slam.shared.alignment_check import AlignmentStatistics
 from ms_slam_env.slam.shared.map_fit import FitConfig, measure_fit, why_not_believed
 from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.shared.state_check import Fields, ListOf, OrNone, WholeNumber
-from ms_slam_env.slam.shared.submap_frames import SubmapLedger, Submaps, one_submap
+from ms_slam_env.slam.shared.submap_frames import SubmapLedger, Submaps
 from ms_slam_env.slam.slam_backend import Float64, TrackResult, Views
 from ms_slam_env.slam.surfel.acceptance import Alignment
 from ms_slam_env.slam.surfel.keyframe_search import Images, measure_consistency
@@ -248,44 +248,17 @@ UNFORESEEN = 0.3
 """Standard deviation of a coordinate of that pose, in last motions, by every frame carried on."""
 
 
-class NoSubmaps(Saved):
-    """The variant "off": a lost camera stands still until it finds its map again."""
+class AtlasSubmaps(Saved):
+    """The submaps of a SLAM of one camera: one that is lost goes on in a new submap.
 
-    def __init__(self, slam: BatchedSurfelSlam) -> None:
-        self._slam = slam
-
-    def reset(self) -> None:
-        """Forget all submaps."""
-
-    def follow(self, frames: Images, guess: ArrayLike | None, result: TrackResult) -> TrackResult:
-        """Do what is to be done after a frame was tracked or not; the result to return for it."""
-        return result
-
-    def detached(self) -> Sequence[DetachedMap]:
-        """The maps put aside."""
-        return ()
-
-    @property
-    def present(self) -> int:
-        """Number of the submap that frames are tracked in."""
-        return 0
-
-    def trajectory(self) -> tuple[NDArray[np.int32], Float64]:
-        """Frames (N,) and their poses (N, 4, 4) as the maps have them now."""
-        return self._slam.loops.trajectory(0)
-
-    def summary(self) -> Submaps:
-        """The submaps as they hang together."""
-        return one_submap()
-
-
-class AtlasSubmaps(NoSubmaps):
-    """The variant "atlas": a lost camera goes on in a new submap."""
+    With ``SurfelConfig.submaps`` "off" it stands still until it finds its map again, the only one.
+    """
 
     saved = ("_ledger", "_search", "_present", "_refused", "_expected", "_motion")
 
     def __init__(self, slam: BatchedSurfelSlam) -> None:
-        super().__init__(slam)
+        self._slam = slam
+        self._is_on = slam.config.submaps == "atlas"
         self._finder: MapFinder | None = None  # made when there is something to find
         self.reset()
 
@@ -308,12 +281,15 @@ class AtlasSubmaps(NoSubmaps):
         """Number of the submap that frames are tracked in."""
         return self._present
 
+    @property
     def detached(self) -> Sequence[DetachedMap]:
         """The maps put aside."""
         return self._detached
 
     def trajectory(self) -> tuple[NDArray[np.int32], Float64]:
         """Frames (N,) and their poses (N, 4, 4) as the maps have them now."""
+        if not self._ledger.has_several:
+            return self._slam.loops.trajectory(0)
         poses: dict[int, Float64] = {}
         for frames, stack in (self._ledger.trajectory(), self._slam.loops.trajectory(0)):
             poses |= dict(zip(frames.tolist(), stack, strict=True))
@@ -328,7 +304,12 @@ class AtlasSubmaps(NoSubmaps):
     # -- After every frame ---------------------------------------------------------------------
 
     def follow(self, frames: Images, guess: ArrayLike | None, result: TrackResult) -> TrackResult:
-        """Start a submap after a few refused frames, look for older ones while there are any."""
+        """Start a submap after a few refused frames, look for older ones while there are any.
+
+        Returns the result for the frame that was just tracked or not.
+        """
+        if not self._is_on:
+            return result
         if not result.tracking_ok:
             return self._labelled(self._after_refusal(frames, guess, result))
         self._refused = 0
@@ -434,11 +415,15 @@ class AtlasSubmaps(NoSubmaps):
         return replace(result, T_world_camera=slam.poses[0].copy(), submaps_joined=True)
 
     def get_state(self) -> dict[str, Any]:
-        """Everything, as NumPy arrays and plain values."""
+        """Everything, as NumPy arrays and plain values; nothing with submaps "off"."""
+        if not self._is_on:
+            return {}
         return super().get_state() | {"detached": [each.get_state() for each in self._detached]}
 
     def state_like(self) -> Any:
         """See ``Stateful``."""
+        if not self._is_on:
+            return {}
         submap = WholeNumber(most="submaps")
         detached = {
             "surfels": self._slam.map.surfels_like(),
@@ -452,14 +437,11 @@ class AtlasSubmaps(NoSubmaps):
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state."""
+        if not self._is_on:
+            return
         super().set_state(state)
         self._detached = [DetachedMap() for _ in state["detached"]]
         for each, values in zip(self._detached, state["detached"], strict=True):
             each.set_state(values)
         if self._finder is not None:
             self._finder.forget()
-
-
-def make_submaps(slam: BatchedSurfelSlam) -> NoSubmaps:
-    """The variant ``config.submaps`` for a SLAM of one camera."""
-    return AtlasSubmaps(slam) if slam.config.submaps == "atlas" else NoSubmaps(slam)
