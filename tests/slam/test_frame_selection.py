@@ -27,7 +27,11 @@ from ms_slam_env.slam.frame_selection import (
     SelectiveSlam,
     make_config,
 )
-from ms_slam_env.slam.frame_selection.budget import BudgetFilter
+from ms_slam_env.slam.frame_selection.budget import (
+    HIGHEST_THRESHOLD,
+    LOWEST_THRESHOLD,
+    BudgetFilter,
+)
 from ms_slam_env.slam.frame_selection.filters import Change, ChangeConfig, RegularSkipping
 from ms_slam_env.slam.slam_backend import Loop, SlamBackend, TrackResult, Views
 
@@ -292,7 +296,7 @@ def test_the_budget_converges_to_its_share(levels, share, gain):
     processed = _processed(config, changes)
     # What is owed stays between ln(lowest / start) / gain and ln(highest / start) / gain; the
     # forced frames of a long gap come on top of a debt that is paid back.
-    bound = np.log(config.highest_threshold / config.lowest_threshold) / gain + config.max_skip
+    bound = np.log(HIGHEST_THRESHOLD / LOWEST_THRESHOLD) / gain + config.max_skip
     assert abs(processed.sum() - share * len(changes)) <= bound
 
 
@@ -318,8 +322,8 @@ def test_a_budget_a_second_is_kept_in_its_own_unit():
 
 
 def test_what_lies_below_the_lowest_threshold_is_dropped_however_rich_one_is():
-    config = BudgetConfig(share=0.9, lowest_threshold=0.005, max_skip=1000)
-    assert _processed(config, [0.001] * 300).sum() == 1
+    config = BudgetConfig(share=0.9, max_skip=1000)
+    assert _processed(config, [LOWEST_THRESHOLD / 2] * 300).sum() == 1
 
 
 def test_measured_costs_are_kept_too(monkeypatch):
@@ -498,7 +502,7 @@ def test_a_state_goes_on_bit_exactly(name, frames):
         ({"name": "budget", "cost_per_frame": 3.0}, "of use with budget_per_s only"),
         ({"name": "budget", "measured": "yes"}, "must be true or false"),
         ({"name": "budget", "threshold": 1e-5}, "threshold = 1e-05 is outside"),
-        ({"name": "budget", "highest_threshold": 1e-3}, "highest_threshold = 0.001 is outside"),
+        ({"name": "budget", "threshold": 20.0}, "threshold = 20.0 is outside"),
     ],
 )
 def test_bad_options_are_named(options, message):

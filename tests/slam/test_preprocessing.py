@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics, xtion
-from ms_slam_env.slam.surfel.preprocessing import EDGE_FRACTION, Preprocessor, Pyramid
+from ms_slam_env.slam.surfel.preprocessing import EDGE_FRACTION, SIGMA_PX, Preprocessor, Pyramid
 from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 
 CAMERA = Intrinsics(fx=20.0, fy=21.0, cx=11.3, cy=7.7, width=24, height=16)
@@ -40,7 +40,7 @@ def _bilateral_along(inverse: np.ndarray, axis: int, config: SurfelConfig) -> np
             near = inverse[tuple(place)]
             ratio = (near - inverse[index]) / (2 * config.bilateral_sigma_m)
             if abs(ratio) < 1:
-                spatial = np.exp(-(offset**2) / (2 * config.bilateral_sigma_px**2))
+                spatial = np.exp(-(offset**2) / (2 * SIGMA_PX**2))
                 weight_sum += spatial * (1 - ratio**2) ** 2
                 value_sum += spatial * (1 - ratio**2) ** 2 * near
         result[index] = value_sum / weight_sum

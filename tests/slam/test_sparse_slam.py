@@ -262,13 +262,8 @@ def test_parameters_are_checked():
     for name, value in (
         ("features", 5),
         ("levels", 0),
-        ("hamming", 0),
-        ("pixel_noise", 0.0),
-        ("inverse_depth_noise", float("nan")),
-        ("least_matches", 3),
-        ("keyframe_deg", 120.0),
+        ("depth_cutoff_m", float("nan")),
         ("window", 1),
-        ("loop_gap", 0),
         ("loops", 1),
         ("max_surfels", 3.5),
     ):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from dataclasses import dataclass
+from typing import ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -66,18 +66,11 @@ class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
         self.intrinsics = intrinsics
         self.reset()
 
-    def _judge_views(self, config: Any) -> None:
-        """Demand of an alignment with a view the shares in ``config``; nothing of a stock one."""
-        self._thresholds = AcceptanceThresholds()
-        if config.stock:
+    def _judge_views(self, is_stock: bool) -> None:
+        """Demand ``VIEW_THRESHOLDS`` of an alignment with a view; nothing of a stock one."""
+        self._thresholds = AcceptanceThresholds() if is_stock else VIEW_THRESHOLDS
+        if is_stock:
             self.fewest_readings = 0.0
-        else:
-            self._thresholds = replace(
-                VIEW_THRESHOLDS,
-                overlap=config.least_overlap,
-                inlier_ratio=config.least_inliers,
-                photometric_inlier_ratio=config.least_alike,
-            )
 
     def reset(self, T_world_camera: ArrayLike | None = None) -> None:
         """Forget everything; the next frame is taken at ``T_world_camera`` (identity if None)."""

@@ -158,6 +158,9 @@ def assess_alignment(
     statistics[b] = found
 
 
+LARGEST_SIGMA = 0.04  # (metres, radians) of the worst direction that the view constrains
+
+
 def acceptance_thresholds(
     config: AcceptanceConfig, strict: NDArray[np.bool_], lost: NDArray[np.int32]
 ) -> NDArray[Any]:
@@ -184,7 +187,7 @@ def _acceptance_thresholds(
     least = {"overlap": config.overlap, "inlier_ratio": config.inliers}
     least["photometric_inlier_ratio"] = config.alike
     most = {"depth_conflict_ratio": config.conflicts, "cost": config.cost}
-    ordinary = AcceptanceThresholds(config.points, sigma_m=config.sigma, **least, **most)
+    ordinary = AcceptanceThresholds(config.points, sigma_m=LARGEST_SIGMA, **least, **most)
     thresholds = ordinary.repeated(len(strict))
     for name, value in least.items():
         thresholds[name] = np.where(strict, max(_STRICT[name], value), value)
@@ -286,7 +289,7 @@ def is_nearly_accepted(alignment: Alignment, env: int, config: AcceptanceConfig)
         depth_conflict_ratio=max(doubted.conflicts, config.conflicts),
         photometric_inlier_ratio=min(doubted.alike, config.alike),
         cost=max(doubted.cost, config.cost),
-        sigma_m=config.sigma,
+        sigma_m=LARGEST_SIGMA,
     )
     return alignment.status_under(thresholds, env) == TrackingStatus.OK
 

@@ -284,6 +284,7 @@ MENDED = 0.9  # of the cost of an alignment that may have slipped
 # Of the cost of one that left a direction open, in which it is no judge: of 36 such frames of
 # validation seeds for which features led to an alignment it takes 34, 30 nearer, 2 farther.
 AS_GOOD = 1.5
+LONGEST_DOUBT = 10  # frames in a row that may be uncertain; after them tracking is lost
 RETRIES = 2  # further searches within a frame whose tracking failed
 
 
@@ -474,11 +475,11 @@ class Localizer:
 
         One that the thresholds accept is at worst uncertain.
         """
-        status, longest = status_on_appeal(found), self._config.acceptance.doubted.longest
+        status = status_on_appeal(found)
         if not was_refused:
             is_refuted = status == TrackingStatus.PHOTOMETRIC_MISMATCH
             status = TrackingStatus.UNCERTAIN if is_refuted else TrackingStatus.OK
-        is_over = status == TrackingStatus.UNCERTAIN and self._states.doubted[env] >= longest
+        is_over = status == TrackingStatus.UNCERTAIN and self._states.doubted[env] >= LONGEST_DOUBT
         return TrackingStatus.PHOTOMETRIC_MISMATCH if is_over else status
 
     def _search_by_features(self, alignment: Alignment, frames: Images) -> Alignment:
@@ -502,8 +503,7 @@ class Localizer:
         alignment = alignment.replace(taken, again.seen_from(states.poses))
         alone = np.zeros(len(origins), dtype=bool)
         for env in np.flatnonzero(self._failed(alignment) & ~alignment.uncertain & where):
-            longest = self._config.acceptance.doubted.longest
-            may_doubt = states.lost[env] == 0 and states.doubted[env] < longest
+            may_doubt = states.lost[env] == 0 and states.doubted[env] < LONGEST_DOUBT
             alone[env] = may_doubt and found[int(env)].is_strong
         there = again.doubtful_at(origins, states.photometry)
         return alignment.replace(alone, there.seen_from(states.poses))

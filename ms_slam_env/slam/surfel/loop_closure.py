@@ -105,6 +105,11 @@ class LoopClosure(Saved):
         """Remember this of one env."""
 
 
+LARGEST_SIGMA = 0.01  # standard deviation (metres, radians) of a registration's worst direction
+LEAST_INLIERS = 0.7  # share of matched points that a registration explains
+LARGEST_DEG = 20.0  # correction of the camera's rotation that is believed
+LARGEST_DISSIMILARITY = 0.3  # of a frame and a keyframe of the same place, share of the ferns
+AGREEMENT_M = 0.01  # a loop is closed when two looks agree so far on the correction, at 1 m
 SETTLED = 0.02, np.radians(2.0)  # largest motion of a repeated registration
 
 
@@ -173,10 +178,10 @@ class InactiveRegistration:
         stack = np.tile(hypotheses, (self.batch, 1, 1, 1))
         strict, lost = np.ones(self.batch, dtype=bool), np.zeros(self.batch, dtype=np.int32)
         thresholds = acceptance_thresholds(self._acceptance, strict, lost)
-        thresholds["sigma_m"] = self.config.sigma
-        thresholds["inlier_ratio"] = self.config.inliers
+        thresholds["sigma_m"] = LARGEST_SIGMA
+        thresholds["inlier_ratio"] = LEAST_INLIERS
         thresholds["motion_m"] = largest_m
-        thresholds["rotation_cos"] = np.cos(np.radians(self.config.largest_deg))
+        thresholds["rotation_cos"] = np.cos(np.radians(LARGEST_DEG))
         return self._tracker.align(self._inactive.view, origins, stack, thresholds)
 
 
@@ -248,7 +253,7 @@ class DeformationLoopClosure(LoopClosure):
         """Look for the frame where similar ones were taken, and close a loop there."""
         history = self._histories[env]
         for candidate in similar(env, history.last - self.config.window):
-            if candidate.dissimilarity > self.config.dissimilarity:
+            if candidate.dissimilarity > LARGEST_DISSIMILARITY:
                 break
             allowed_m = self.config.drift_share * history.path_m(candidate.time)
             apart = VIEW_APART_M + allowed_m, VIEW_APART_RAD
@@ -273,7 +278,7 @@ class DeformationLoopClosure(LoopClosure):
             self._deformer.join_parts(env, poses[env], history.last)
             return replace(loop, bent=False), poses[env]
         if drift < SIGNIFICANT * there.statistics["sigma_m"][env] or not history.confirms(
-            poses[env], corrected, self.config.agreement_m, 2 * self.config.global_interval
+            poses[env], corrected, AGREEMENT_M, 2 * self.config.global_interval
         ):
             return None
         deformed = self._deformer.deform(env, poses[env], corrected, history.joined)

@@ -334,6 +334,14 @@ def _rows(values: Float64, columns: NDArray[np.int64], nodes: int) -> sparse.csr
 Int64 = NDArray[np.int64]
 
 FEWEST_CONSTRAINTS = 12
+SURFELS_PER_NODE, MAX_NODES = 400, 100
+CONSTRAINT_COLUMNS = 16
+"""The image is divided into so many columns, with rows as high as they are wide.
+
+Each cell gives one constraint and one pin.
+"""
+ERROR_M = 0.01  # largest RMS distance that the constraints may keep after the graph was optimised
+ERROR_SHARE = 0.3  # the same as a share of the distance before
 NEAREST = wp.constant(5)  # NEIGHBOURS that move a point, and the next one
 
 
@@ -568,7 +576,7 @@ class MapDeformer:
         surface = surface_constraints(new, old, corrected @ invert(pose))
         constraints = join([surface, earlier])
         positions = self.map.surfels.position[env, :used].numpy()
-        count = min(self.config.max_nodes, used // self.config.surfels_per_node)
+        count = min(MAX_NODES, used // SURFELS_PER_NODE)
         graph = sample_graph(positions[order], ordered_times, count)
         deformation = optimise(graph, constraints)
         if not self._is_acceptable(constraints, deformation):
@@ -580,8 +588,8 @@ class MapDeformer:
         """Whether the graph could do what the constraints ask."""
         before = _rms(constraints.errors(identity(deformation.graph)))
         after = _rms(constraints.errors(deformation))
-        allowed = max(self.config.smallest_m, self.config.error_share * before)
-        return after <= min(self.config.error_m, allowed)
+        allowed = max(self.config.smallest_m, ERROR_SHARE * before)
+        return after <= min(ERROR_M, allowed)
 
     def _look(
         self, renderer: SplatRenderer, env: int, pose: Float64, times: Float64
@@ -605,8 +613,8 @@ class MapDeformer:
 
     def _choose(self, points: VisiblePoints, depth: NDArray[np.float32]) -> Int64:
         """Some of the points on a surface, spread over the image."""
-        columns = self.config.constraint_columns
-        return choose_points(points, self._inactive.intrinsics, depth, columns, self._tolerance_m)
+        intrinsics, tolerance_m = self._inactive.intrinsics, self._tolerance_m
+        return choose_points(points, intrinsics, depth, CONSTRAINT_COLUMNS, tolerance_m)
 
     def _move_surfels(self, env: int, deformation: Deformation, times: Float64) -> None:
         graph = deformation.graph

@@ -16,7 +16,7 @@ With the right perturbation T <- T exp(xi), xi = (rho, phi):
 Residuals are divided by their standard deviations, which makes both terms free of units:
 
     s_icp = depth_noise_m z^2                        axial noise of the sensor
-    s_rgb^2 = intensity_noise^2 + (lateral_noise_px |grad I|)^2
+    s_rgb^2 = intensity_noise^2 + (LATERAL_NOISE_PX |grad I|)^2
 
 The second part of s_rgb is the error of the place in the image where the grey value was sampled
 (aliasing, depth, pose of the map). Without it strong edges, the best features, look like outliers.

@@ -28,6 +28,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer, fetch, put, threads_per_row
 from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 
+SIGMA_PX = 1.5  # width of the bilateral depth filter in the image
 FLATTEST = wp.constant(5.67)  # tangent of 80 degrees, of the view onto a plane close by
 
 
@@ -261,7 +262,7 @@ class Preprocessor:
             wp.zeros_like(self._inverse_depth) for _ in range(3)
         )
         offsets = np.arange(config.bilateral_radius_px + 1, dtype=np.float32)
-        weights = np.exp(-(offsets**2) / (2 * config.bilateral_sigma_px**2))
+        weights = np.exp(-(offsets**2) / (2 * SIGMA_PX**2))
         self._spatial_weights = wp.array(weights, dtype=wp.float32, device=device)
         # A finer image has noisier slopes over one pixel; keep the baseline of 160 columns.
         self._normal_step = max(1, intrinsics.width // 160)

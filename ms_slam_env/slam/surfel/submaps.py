@@ -115,7 +115,7 @@ class MapFinder:
         present = MapViews.of(slam.map, own, pose)
         there = MapViews.of(self.map, self.keyframe_poses(), T_other_present @ pose)
         fit = measure_fit(there, present, T_other_present, _FIT)
-        return not why_not_believed(fit, _FIT)
+        return not why_not_believed(fit)
 
     def _lookup(self, other: DetachedMap, frames: Images) -> FrameLookup:
         self._slam.reconfigure(self._present.config, self._present.intrinsics)

@@ -42,6 +42,7 @@ from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 SMALLEST_STEP = (2.0e-4, 4.0e-4, 1.0e-3)  # metres and radians, per level, finest first
 DAMPING = 1.0e-6
 COARSE_TOLERANCE = 2.5
+LATERAL_NOISE_PX = 0.3  # standard deviation of where a grey value was sampled
 DEPTH_REDUNDANCY = 50.0  # see normal_equations
 Passes = Sequence[tuple[int, int]]
 
@@ -204,7 +205,7 @@ def weights_of(config: SurfelConfig, level: int) -> Weights:
     weights.per_cauchy_icp = 1.0 / (config.cauchy_icp * widening)
     weights.per_cauchy_rgb = 1.0 / (config.cauchy_rgb * widening)
     weights.grey_variance = config.intensity_noise**2
-    weights.pixel_variance = config.lateral_noise_px**2
+    weights.pixel_variance = LATERAL_NOISE_PX**2
     weights.distance_m = config.icp_distance_m
     weights.cos_angle = float(np.cos(np.radians(config.icp_angle_deg)))
     for rule in ("inlier_sigmas", "conflict_sigmas", "texture", "photometric_inlier"):

@@ -33,6 +33,7 @@ from ms_slam_env.slam.volumetric.voxel_grid import (
 )
 
 _ITERATIONS = (10, 5, 3)  # coarse to fine
+_ASSOCIATION_M = 0.07  # largest difference of depth between associated points
 _STOCK_ITERATIONS = (6, 3, 1)
 
 
@@ -56,7 +57,7 @@ class Open3DAlignment(FrameToModel):
         self._odometry = grid.open3d.t.pipelines.odometry
         counts = _STOCK_ITERATIONS if grid.config.stock else _ITERATIONS
         self._criteria = [self._odometry.OdometryConvergenceCriteria(count) for count in counts]
-        self._loss = self._odometry.OdometryLossParams(grid.config.association_m)
+        self._loss = self._odometry.OdometryLossParams(_ASSOCIATION_M)
         self._start = grid.tensor(np.eye(4))
 
     def align(self, frame: DepthImage, view: CastView) -> Float64 | None:
@@ -126,7 +127,7 @@ class VolumetricSlam(FrameByFrameSlam[FusedImage, None]):
     def _assemble(self, grid: VoxelGrid, aligner: FrameToModel) -> None:
         """Start empty at the identity pose, with these parts and what ``config`` demands."""
         self._grid, self._aligner = grid, aligner
-        self._judge_views(self.config)
+        self._judge_views(self.config.stock)
         self._fresh = True  # whether the grid is as allocated
         super().__init__(grid.intrinsics)
 
