@@ -9,7 +9,6 @@ import pytest
 
 from ms_slam_env import scenes, slam
 from ms_slam_env.camera import RGBDFrame, xtion
-from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, look_at, make_pose, relative_angle, se3_exp
 from ms_slam_env.sequences import render_sequence
 from ms_slam_env.slam.shared.ferns import Candidate
@@ -239,17 +238,3 @@ def test_without_loop_closure_no_trajectory_is_kept() -> None:
     frame = RGBDFrame(np.zeros((120, 160, 3), np.uint8), np.ones((120, 160), np.float32))
     assert not system.track(frame).loop_closed
     assert len(system.corrected_trajectory()[1]) == 0
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"loop_closure": "perfect"}, "deformation"),
-        ({"loops": {"windows": 3}}, "window"),
-        ({"loops": {"window": 0}}, "window"),
-        ({"loops": {"coverage": 2.0}}, "coverage"),
-    ],
-)
-def test_bad_parameters_are_refused(values: dict, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        slam.make("surfel", CAMERA, **values)

@@ -10,7 +10,6 @@ from surfel_scenes import ray_cast
 
 from ms_slam_env import slam
 from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
-from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at, make_pose, relative_angle, so3_exp
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.shared.alignment_check import is_photometrically_consistent
@@ -173,11 +172,6 @@ def test_a_camera_at_rest_is_not_encoded_again(monkeypatch):
     ferns.clear(1)
     ferns.add_keyframes(nothing, poses, np.zeros(2, np.int32), np.array([False, True]))
     assert seen == [0, 1, 0, 1, 1]
-
-
-def test_an_unknown_variant_is_refused():
-    with pytest.raises(InputError, match="ferns, features, local"):
-        slam.make("surfel", CAMERA, relocalisation="sift")
 
 
 VIEW = Intrinsics(fx=80.0, fy=84.0, cx=39.3, cy=29.8, width=80, height=60)
