@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env._runtime.warp import wp
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.geometry import invert
 from ms_slam_env.slam.shared.alignment_check import (
     AcceptanceThresholds,
@@ -41,7 +41,7 @@ from ms_slam_env.slam.surfel.surfel_config import AcceptanceConfig
 
 
 @wp.func
-def _squared_norm(H: mat66d, g: vec6d):
+def _squared_norm(H: mat66d, g: vec6d) -> wp.float64:
     """Value of g^T H^-1 g."""
     L = cholesky(H)
     total = wp.float64(0.0)
@@ -53,7 +53,7 @@ def _squared_norm(H: mat66d, g: vec6d):
 
 
 @wp.func
-def _conflict(A: mat66d, B: mat66d, g_a: vec6d, g_b: vec6d):
+def _conflict(A: mat66d, B: mat66d, g_a: vec6d, g_b: vec6d) -> wp.float64:
     """Chi squared of the difference between the minima of the geometric and photometric terms.
 
     min (x - x_a)^T A (x - x_a) + (x - x_b)^T B (x - x_b): what the joint minimum costs more than
@@ -66,7 +66,7 @@ def _conflict(A: mat66d, B: mat66d, g_a: vec6d, g_b: vec6d):
 
 
 @wp.func
-def in_metres_twist(xi: vec6d, length: wp.float64):
+def in_metres_twist(xi: vec6d, length: wp.float64) -> vec6d:
     """Twist with its rotation times ``length``."""
     scaled = xi
     for i in range(3, 6):
@@ -75,7 +75,7 @@ def in_metres_twist(xi: vec6d, length: wp.float64):
 
 
 @wp.func
-def _ratio(sums: wp.array3d(dtype=wp.float64), b: int, part: int, whole: int):
+def _ratio(sums: wp.array3d[wp.float64], b: int, part: int, whole: int) -> wp.float64:
     """Ratio of two sums of env b, of which the second is a count."""
     return sums[b, 0, part] / wp.max(sums[b, 0, whole], wp.float64(1.0))
 
@@ -89,7 +89,7 @@ def _without_open_directions(
     tilted: wp.float64,
     matched: wp.float64,
     length: wp.float64,
-):
+) -> wp.mat44d:
     """The pose T, but the predicted one along the directions that the view leaves open.
 
     Coarser levels may have moved along what turns out to be open.
@@ -108,14 +108,14 @@ def _without_open_directions(
 @wp.kernel
 def assess_alignment(
     hypotheses: Hypotheses,  # (B, 1); out: the pose where it is degenerate
-    predicted: wp.array(dtype=wp.mat44d),  # (B,) T_model_live
-    thresholds: wp.array(dtype=DeviceThresholds),  # (B,)
-    T_world_model: wp.array(dtype=wp.mat44d),  # in: pose of the model view
-    T_world_live: wp.array(dtype=wp.mat44d),  # out
-    status: wp.array(dtype=wp.int32),
-    statistics: wp.array(dtype=DeviceStatistics),
-    covariance: wp.array(dtype=mat66d),  # (B,) of the twist xi, T_world_live exp(xi)
-):
+    predicted: wp.array[wp.mat44d],  # (B,) T_model_live
+    thresholds: wp.array[DeviceThresholds],  # (B,)
+    T_world_model: wp.array[wp.mat44d],  # in: pose of the model view
+    T_world_live: wp.array[wp.mat44d],  # out
+    status: wp.array[wp.int32],
+    statistics: wp.array[DeviceStatistics],
+    covariance: wp.array[mat66d],  # (B,) of the twist xi, T_world_live exp(xi)
+) -> None:
     """Compare what the alignment explained with the thresholds; write status, figures and pose.
 
     Along directions that the view leaves open the pose is the predicted one.

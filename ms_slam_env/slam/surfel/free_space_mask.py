@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env._runtime.warp import wp
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert
 from ms_slam_env.slam.shared.state import Saved
@@ -64,13 +64,13 @@ def make_grid(intrinsics: Intrinsics, columns: int, sigma: float) -> Grid:
 
 
 @wp.func
-def tolerance(z: float, grid: Grid):
+def tolerance(z: float, grid: Grid) -> float:
     """Difference of depth, metres, that is neither noise nor an inexact pose."""
     return wp.max(grid.sigma * z * z, NEAREST_M)
 
 
 @wp.func
-def place(p: wp.vec3, grid: Grid):
+def place(p: wp.vec3, grid: Grid) -> int:
     """Pixel of the grid where a point of the camera's frame is seen; -1 outside."""
     if p[2] < 0.05:
         return -1
@@ -82,7 +82,7 @@ def place(p: wp.vec3, grid: Grid):
 
 
 @wp.func
-def point(u: int, v: int, z: float, grid: Grid):
+def point(u: int, v: int, z: float, grid: Grid) -> wp.vec3:
     """Point of the camera's frame at a pixel of the grid."""
     x = (float(u) - grid.centre[0]) / grid.focal[0]
     y = (float(v) - grid.centre[1]) / grid.focal[1]
@@ -90,7 +90,7 @@ def point(u: int, v: int, z: float, grid: Grid):
 
 
 @wp.func
-def times(T: wp.mat44, p: wp.vec3):
+def times(T: wp.mat44, p: wp.vec3) -> wp.vec3:
     """Point p moved by T."""
     return wp.vec3(
         T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3],
@@ -101,12 +101,12 @@ def times(T: wp.mat44, p: wp.vec3):
 
 @wp.kernel
 def sample_depth(
-    filtered: wp.array(dtype=wp.float32),
-    raw: wp.array(dtype=wp.float32),
+    filtered: wp.array[wp.float32],
+    raw: wp.array[wp.float32],
     grid: Grid,
-    depth: wp.array(dtype=wp.float32),
-    nearest: wp.array(dtype=wp.float32),
-):
+    depth: wp.array[wp.float32],
+    nearest: wp.array[wp.float32],
+) -> None:
     """Filtered depth on the grid, and the smallest raw reading around each of its pixels.
 
     Where the pixel itself has no reading it is 0: what lies there is not known.
@@ -135,14 +135,14 @@ def sample_depth(
 
 @wp.kernel
 def find_appeared(
-    depth: wp.array(dtype=wp.float32),
-    past_nearest: wp.array(dtype=wp.float32),
-    past_depth: wp.array(dtype=wp.float32),
-    T_past_live: wp.array2d(dtype=wp.mat44),  # (B, PAST)
-    age: wp.array2d(dtype=wp.int32),  # (B, PAST)
+    depth: wp.array[wp.float32],
+    past_nearest: wp.array[wp.float32],
+    past_depth: wp.array[wp.float32],
+    T_past_live: wp.array2d[wp.mat44],  # (B, PAST)
+    age: wp.array2d[wp.int32],  # (B, PAST)
     grid: Grid,
-    found: wp.array(dtype=wp.int32),
-):
+    found: wp.array[wp.int32],
+) -> None:
     """Which readings are where an earlier frame saw free space, and of which that is known."""
     b, v = wp.tid()
     row = (b * grid.height + v) * grid.width
@@ -171,14 +171,14 @@ def find_appeared(
 
 @wp.kernel
 def find_vanished(
-    nearest: wp.array(dtype=wp.float32),
-    past_depth: wp.array(dtype=wp.float32),
-    masked: wp.array(dtype=wp.int32),  # (B * h * w), of the live frames as far as is known
-    T_live_past: wp.array2d(dtype=wp.mat44),  # (B, PAST)
-    age: wp.array2d(dtype=wp.int32),  # (B, PAST)
+    nearest: wp.array[wp.float32],
+    past_depth: wp.array[wp.float32],
+    masked: wp.array[wp.int32],  # (B * h * w), of the live frames as far as is known
+    T_live_past: wp.array2d[wp.mat44],  # (B, PAST)
+    age: wp.array2d[wp.int32],  # (B, PAST)
     grid: Grid,
-    found: wp.array(dtype=wp.int32),
-):
+    found: wp.array[wp.int32],
+) -> None:
     """Mark where the live frame looks through a point of an earlier frame.
 
     What was known to move has left its place anyway: that says nothing of what it has uncovered.
@@ -206,13 +206,13 @@ def find_vanished(
 
 @wp.kernel
 def carry_log_odds(
-    depth: wp.array(dtype=wp.float32),
-    last_depth: wp.array(dtype=wp.float32),
-    last_odds: wp.array(dtype=wp.float32),
-    T_last_live: wp.array(dtype=wp.mat44),
+    depth: wp.array[wp.float32],
+    last_depth: wp.array[wp.float32],
+    last_odds: wp.array[wp.float32],
+    T_last_live: wp.array[wp.mat44],
     grid: Grid,
-    odds: wp.array(dtype=wp.float32),
-):
+    odds: wp.array[wp.float32],
+) -> None:
     """Log-odds of the last frame at the live readings: from the pixel around of the next depth."""
     b, v = wp.tid()
     row = (b * grid.height + v) * grid.width
@@ -244,13 +244,13 @@ def carry_log_odds(
 
 @wp.kernel
 def hide(
-    T_live_model: wp.array(dtype=wp.mat44),
-    masked: wp.array(dtype=wp.int32),  # (B * h * w) of the grid
+    T_live_model: wp.array[wp.mat44],
+    masked: wp.array[wp.int32],  # (B * h * w) of the grid
     grid: Grid,
-    vertices: wp.array2d(dtype=wp.vec3),  # (B, pixels) of the model view
-    normals: wp.array2d(dtype=wp.vec3),
-    intensity: wp.array2d(dtype=wp.float32),
-):
+    vertices: wp.array2d[wp.vec3],  # (B, pixels) of the model view
+    normals: wp.array2d[wp.vec3],
+    intensity: wp.array2d[wp.float32],
+) -> None:
     """Leave what the masked readings lie upon out of a view of the map."""
     b, i = wp.tid()
     p = vertices[b, i]
@@ -264,7 +264,7 @@ def hide(
 
 
 @wp.kernel
-def enlarge(masked: wp.array(dtype=wp.int32), grid: Grid, image: wp.array(dtype=wp.int32)):
+def enlarge(masked: wp.array[wp.int32], grid: Grid, image: wp.array[wp.int32]) -> None:
     """The mask of the grid at the size of the live images."""
     b, v = wp.tid()
     half = grid.stride / 2

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import math
 
-from ms_slam_env._runtime.warp import RecordedLaunch, wp
+from ms_slam_env._runtime.warp import RecordedLaunch
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.native import native_source
 from ms_slam_env.slam.surfel.surfels import (
     BLOCK_SIZE,
@@ -28,13 +29,15 @@ from ms_slam_env.slam.surfel.surfels import (
 
 
 @wp.func
-def num_blocks(count: int):
+def num_blocks(count: int) -> int:
     """Blocks that ``count`` slots fill or begin."""
     return (count + BLOCK_SIZE - 1) / BLOCK_SIZE
 
 
 @wp.func_native(native_source("block_bounds", "bound", BLOCK_SIZE=BLOCK_SIZE))
-def bound(surfels: Surfels, blocks: CullingBlocks, b: int, first: int, n: int, threshold: float):
+def bound(
+    surfels: Surfels, blocks: CullingBlocks, b: int, first: int, n: int, threshold: float
+) -> None:
     """Set box and expiry of the block of the ``n`` surfels from ``first`` on."""
 
 
@@ -87,7 +90,7 @@ class Frustum:
 
 
 @wp.func
-def frustum_of(T_world_camera: wp.mat44, camera: SplatCamera, margin_px: float):
+def frustum_of(T_world_camera: wp.mat44, camera: SplatCamera, margin_px: float) -> Frustum:
     """Frustum of a camera's image with a margin around."""
     frustum = Frustum()
     frustum.R = wp.transpose(rotation_of(T_world_camera))
@@ -118,7 +121,7 @@ def list_visible_blocks(
     surfels: Surfels,
     blocks: CullingBlocks,
     first_env: int,
-    poses: wp.array(dtype=wp.mat44),
+    poses: wp.array[wp.mat44],
     camera: SplatCamera,
     margin_px: float,
     workers: int,
@@ -165,7 +168,7 @@ def cull(
     surfels: Surfels,
     blocks: CullingBlocks,
     first_env: int,
-    poses: wp.array(dtype=wp.mat44),
+    poses: wp.array[wp.mat44],
     camera: SplatCamera,
     margin_px: float,
     workers: int,

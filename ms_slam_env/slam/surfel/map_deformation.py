@@ -35,7 +35,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
-from ms_slam_env._runtime.warp import wp
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, transform_points
 from ms_slam_env.slam.shared.rows import Rows, join
@@ -331,8 +331,6 @@ def _rows(values: Float64, columns: NDArray[np.int64], nodes: int) -> sparse.csr
     )
 
 
-Int64 = NDArray[np.int64]
-
 FEWEST_CONSTRAINTS = 12
 SURFELS_PER_NODE, MAX_NODES = 400, 100
 CONSTRAINT_COLUMNS = 16
@@ -429,9 +427,9 @@ def relative_to(
 class Nodes:
     """A deformation of one map: position (M,), linear part and translation of the nodes."""
 
-    position: wp.array(dtype=wp.vec3)
-    R: wp.array(dtype=wp.mat33)
-    t: wp.array(dtype=wp.vec3)
+    position: wp.array[wp.vec3]
+    R: wp.array[wp.mat33]
+    t: wp.array[wp.vec3]
 
 
 @wp.kernel
@@ -439,7 +437,7 @@ def deform_surfels(
     surfels: Surfels,
     b: int,
     nodes: Nodes,
-    first: wp.array(dtype=wp.int32),  # of each surfel's candidate nodes
+    first: wp.array[wp.int32],  # of each surfel's candidate nodes
     window: int,  # number of candidates
 ) -> None:
     """Move position and normal of every surfel of env b: ``Deformation.points`` in float32.
@@ -485,7 +483,7 @@ def deform_surfels(
 
 
 @wp.func
-def pixel_of(p: wp.vec3, camera: SplatCamera):
+def pixel_of(p: wp.vec3, camera: SplatCamera) -> wp.vec2i:
     """Pixel (u, v) of the image nearest to the projection of a point."""
     u = floor_int(camera.focal[0] * p[0] / p[2] + camera.centre[0] + 0.5)
     v = floor_int(camera.focal[1] * p[1] / p[2] + camera.centre[1] + 0.5)
@@ -507,8 +505,8 @@ def merge(
     b: int,
     visible: VisibleList,  # of the active surfels
     camera: SplatCamera,
-    vertices: wp.array3d(dtype=wp.vec3),  # image of the inactive surfels
-    normals: wp.array3d(dtype=wp.vec3),
+    vertices: wp.array3d[wp.vec3],  # image of the inactive surfels
+    normals: wp.array3d[wp.vec3],
     min_cosine: float,
     stable: float,  # confidence
 ) -> None:

@@ -47,7 +47,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from ms_slam_env._runtime.warp import wp
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.native import native_source
 
 
@@ -119,23 +119,23 @@ class Photometry:
 class Hypotheses:
     """K pose hypotheses of B envs."""
 
-    pose: wp.array2d(dtype=wp.mat44d)  # (B, K) T_model_live
-    photometry: wp.array2d(dtype=Photometry)  # (B, K)
-    state: wp.array2d(dtype=wp.int32)  # (B, K) OFF, RUNNING or RESTING
-    partial: wp.array4d(dtype=wp.float32)  # (B, K, rows * pieces, NUM_SUMS) of the parts of a pass
-    sums: wp.array3d(dtype=wp.float64)  # (B, K, NUM_SUMS) of the last pass, see ``Sum``
+    pose: wp.array2d[wp.mat44d]  # (B, K) T_model_live
+    photometry: wp.array2d[Photometry]  # (B, K)
+    state: wp.array2d[wp.int32]  # (B, K) OFF, RUNNING or RESTING
+    partial: wp.array4d[wp.float32]  # (B, K, rows * pieces, NUM_SUMS) of the parts of a pass
+    sums: wp.array3d[wp.float64]  # (B, K, NUM_SUMS) of the last pass, see ``Sum``
 
 
 @wp.struct
 class AlignedImages:
     """Images of B envs at one pyramid level, flat, and the camera of the live ones."""
 
-    model_vertices: wp.array(dtype=wp.vec3)
-    model_normals: wp.array(dtype=wp.vec3)
-    model_intensity: wp.array(dtype=wp.float32)
-    live_vertices: wp.array(dtype=wp.vec3)
-    live_normals: wp.array(dtype=wp.vec3)
-    live_gradient: wp.array(dtype=wp.vec3)  # (I, dI/du, dI/dv)
+    model_vertices: wp.array[wp.vec3]
+    model_normals: wp.array[wp.vec3]
+    model_intensity: wp.array[wp.float32]
+    live_vertices: wp.array[wp.vec3]
+    live_normals: wp.array[wp.vec3]
+    live_gradient: wp.array[wp.vec3]  # (I, dI/du, dI/dv)
     model_size: wp.vec2i  # (width, height); ``live_size`` likewise
     live_size: wp.vec2i
     focal: wp.vec2  # (fx, fy)
@@ -159,9 +159,9 @@ def accumulate_points(
     t: wp.vec3,
     weights: Weights,
     photometry: Photometry,
-    partial: wp.array4d(dtype=wp.float32),
+    partial: wp.array4d[wp.float32],
     row: int,
-):
+) -> None:
     """Sum the terms of the model points from ``start`` to ``end`` into a row of ``partial``.
 
     ``R`` and ``t`` are T_live_model.
@@ -179,7 +179,7 @@ def accumulate_row(
     k: int,
     row_index: int,
     piece: int,
-):
+) -> None:
     """Sum the terms of one piece of a row of model points for hypothesis k of env b."""
     width = images.model_size[0]
     T = hypotheses.pose[b, k]
@@ -213,7 +213,7 @@ def accumulate_row(
 @wp.kernel
 def accumulate_normal_equations(
     images: AlignedImages, weights: Weights, stride: int, columns: int, hypotheses: Hypotheses
-):
+) -> None:
     """Sum the terms of one piece of a row of model points, for every active hypothesis."""
     b, k, row_index, piece = wp.tid()
     if hypotheses.state[b, k] == RUNNING:

@@ -22,7 +22,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env._runtime.warp import RecordedLaunch, wp
+from ms_slam_env._runtime.warp import RecordedLaunch
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer, fetch, put, threads_per_row
@@ -48,15 +49,15 @@ class LiveFrame:
 
 @wp.kernel
 def _convert(
-    raw_depth: wp.array(dtype=wp.float32),
-    raw_color: wp.array(dtype=wp.uint8),
+    raw_depth: wp.array[wp.float32],
+    raw_color: wp.array[wp.uint8],
     cutoff_m: wp.float32,
     width: wp.int32,
     columns: wp.int32,  # per thread
-    inverse_depth: wp.array(dtype=wp.float32),
-    color: wp.array(dtype=wp.vec3),
-    intensity: wp.array(dtype=wp.float32),
-):
+    inverse_depth: wp.array[wp.float32],
+    color: wp.array[wp.vec3],
+    intensity: wp.array[wp.float32],
+) -> None:
     """Inverse depth (0 for no reading or one beyond the cutoff), colour and its BT.601 luma."""
     row, piece = wp.tid()
     i = row * width + piece * columns
@@ -75,17 +76,17 @@ def _convert(
 
 @wp.kernel
 def _filter(
-    inverse_depth: wp.array(dtype=wp.float32),
+    inverse_depth: wp.array[wp.float32],
     height: wp.int32,
     width: wp.int32,
     columns: wp.int32,
     along_rows: wp.int32,  # 1: neighbours are in the same row; 0: in the same column
-    spatial_weights: wp.array(dtype=wp.float32),  # (radius + 1,)
+    spatial_weights: wp.array[wp.float32],  # (radius + 1,)
     per_cutoff_squared: wp.float32,  # 1 / (difference of inverse depth that weighs nothing)^2
-    weights: wp.array(dtype=wp.float32),  # working memory, per pixel
-    shifts: wp.array(dtype=wp.float32),
-    filtered: wp.array(dtype=wp.float32),
-):
+    weights: wp.array[wp.float32],  # working memory, per pixel
+    shifts: wp.array[wp.float32],
+    filtered: wp.array[wp.float32],
+) -> None:
     """Bilateral filter along the rows or the columns of the image.
 
     The loop over neighbours is outside, the one over pixels inside and without branches: the
@@ -133,7 +134,7 @@ def _filter(
 
 
 @wp.func
-def _slope(before: float, here: float, after: float, largest: float, steepest: float):
+def _slope(before: float, here: float, after: float, largest: float, steepest: float) -> wp.vec2:
     """Difference per step of inverse depth to valid neighbours; (slope, 1), or (0, 0) if none.
 
     Inputs are inverse depths, 0 where invalid. A side that jumps by more than ``largest`` is an
@@ -162,7 +163,7 @@ def _normal(
     largest: float,
     ray: wp.vec2,
     focal_per_step: wp.vec2,
-):
+) -> wp.vec3:
     """Unit normal of a pixel from its inverse depth and its neighbours'; 0 where invalid."""
     slope_u = _slope(left, inverse, right, largest, FLATTEST / focal_per_step[0])
     slope_v = _slope(above, inverse, below, largest, FLATTEST / focal_per_step[1])
@@ -178,7 +179,7 @@ def _normal(
 
 @wp.kernel
 def _surface(
-    inverse_depth: wp.array(dtype=wp.float32),
+    inverse_depth: wp.array[wp.float32],
     height: wp.int32,
     width: wp.int32,
     columns: wp.int32,
@@ -186,10 +187,10 @@ def _surface(
     largest: wp.float32,
     focal: wp.vec2,
     centre: wp.vec2,
-    depth: wp.array(dtype=wp.float32),
-    vertices: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
-):
+    depth: wp.array[wp.float32],
+    vertices: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
+) -> None:
     """Depth, vertices and normals of filtered inverse depth."""
     row, piece = wp.tid()
     v = row % height
@@ -320,30 +321,30 @@ EDGE_FRACTION = 0.03  # pixels of a block further behind the front one than this
 
 
 @wp.func
-def _share(p: wp.vec3, limit: float):
+def _share(p: wp.vec3, limit: float) -> float:
     """1 for a valid pixel that is not behind the limit, else 0."""
     return wp.where(p[2] > 0.0 and p[2] <= limit, 1.0, 0.0)
 
 
 @wp.func
-def _distance(p: wp.vec3):
+def _distance(p: wp.vec3) -> float:
     """Depth of a pixel; very far where invalid."""
     return wp.where(p[2] > 0.0, p[2], 1.0e9)
 
 
 @wp.kernel
 def _downsample(
-    vertices: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
-    intensity: wp.array(dtype=wp.float32),
+    vertices: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
+    intensity: wp.array[wp.float32],
     height: wp.int32,  # of the fine image
     width: wp.int32,
     edge_fraction: wp.float32,
     columns: wp.int32,  # of the coarse image, per thread
-    coarse_vertices: wp.array(dtype=wp.vec3),
-    coarse_normals: wp.array(dtype=wp.vec3),
-    coarse_intensity: wp.array(dtype=wp.float32),
-):
+    coarse_vertices: wp.array[wp.vec3],
+    coarse_normals: wp.array[wp.vec3],
+    coarse_intensity: wp.array[wp.float32],
+) -> None:
     row, piece = wp.tid()
     coarse_height = height / 2
     coarse_width = width / 2
@@ -389,12 +390,12 @@ def _downsample(
 
 @wp.kernel
 def _intensity_gradient(
-    intensity: wp.array(dtype=wp.float32),
+    intensity: wp.array[wp.float32],
     height: wp.int32,
     width: wp.int32,
     columns: wp.int32,
-    gradient: wp.array(dtype=wp.vec3),
-):
+    gradient: wp.array[wp.vec3],
+) -> None:
     """Write (intensity, d/du, d/dv) by central differences, one-sided at the border."""
     row, piece = wp.tid()
     v = row % height

@@ -19,7 +19,8 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from ms_slam_env._runtime.warp import RecordedLaunch, wp
+from ms_slam_env._runtime.warp import RecordedLaunch
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.native import native_source
 from ms_slam_env.slam.surfel.device import fetch, put, raise_to
@@ -37,7 +38,9 @@ from ms_slam_env.slam.surfel.surfels import (
 
 
 @wp.func
-def half_extent(p: wp.vec3, n: wp.vec3, across: float, tilt: float, radius: float, focal: float):
+def half_extent(
+    p: wp.vec3, n: wp.vec3, across: float, tilt: float, radius: float, focal: float
+) -> float:
     """How far a disc at p reaches from its centre in columns or rows.
 
     A tilted disc is an ellipse: an offset d in its plane moves the column by (f / z) a . d with
@@ -51,7 +54,7 @@ def half_extent(p: wp.vec3, n: wp.vec3, across: float, tilt: float, radius: floa
 
 
 @wp.func
-def drawn_radius(radius: float, z: float, camera: SplatCamera):
+def drawn_radius(radius: float, z: float, camera: SplatCamera) -> float:
     """Radius in metres after the limits in pixels."""
     pixel = z / camera.focal[0]
     return wp.clamp(radius, camera.min_px * pixel, camera.max_px * pixel)
@@ -118,7 +121,7 @@ def project_footprints(
         j += 1
 
 
-Sums = wp.types.vector(length=8, dtype=wp.float32)
+Sums: Any = wp.types.vector(length=8, dtype=wp.float32)
 """Weighted sums of a pixel: normal (3), weight, colour (3), depth."""
 
 
@@ -139,7 +142,7 @@ def splat_depth(
     camera: SplatCamera,
     workers: int,
     footprints: SplatFootprints,
-    z_buffer: wp.array(dtype=wp.float32),
+    z_buffer: wp.array[wp.float32],
 ) -> None:
     """Inverse depth (E * H * W) of the nearest disc at every pixel; list the discs on a pixel."""
     k, worker = wp.tid()
@@ -189,8 +192,8 @@ def splat_attributes(
     camera: SplatCamera,
     workers: int,
     footprints: SplatFootprints,
-    z_buffer: wp.array(dtype=wp.float32),
-    sums: wp.array(dtype=Sums),
+    z_buffer: wp.array[wp.float32],
+    sums: wp.array[Sums],
 ) -> None:
     """Sum the discs of the front surface at every pixel.
 
@@ -248,7 +251,7 @@ def list_hidden(
     visible: VisibleList,
     camera: SplatCamera,
     workers: int,
-    z_buffer: wp.array(dtype=wp.float32),
+    z_buffer: wp.array[wp.float32],
     hidden: VisibleList,
 ) -> None:
     """List the visible surfels well behind the front surface at their own pixel."""
@@ -272,26 +275,26 @@ def list_hidden(
 
 @wp.func_native(native_source("splatting", "resolve_row"))
 def resolve_row(
-    sums: wp.array(dtype=Sums),
+    sums: wp.array[Sums],
     camera: SplatCamera,
     y: float,
     first: int,
-    vertices: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
-    intensity: wp.array(dtype=wp.float32),
-    color: wp.array(dtype=wp.vec3),
-):
+    vertices: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
+    intensity: wp.array[wp.float32],
+    color: wp.array[wp.vec3],
+) -> None:
     """Resolve the row of pixels from ``first`` on, on which the rays have ``y`` at z = 1."""
 
 
 @wp.kernel
 def resolve(
-    sums: wp.array(dtype=Sums),
+    sums: wp.array[Sums],
     camera: SplatCamera,
-    vertices: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
-    intensity: wp.array(dtype=wp.float32),
-    color: wp.array(dtype=wp.vec3),
+    vertices: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
+    intensity: wp.array[wp.float32],
+    color: wp.array[wp.vec3],
 ) -> None:
     """Divide the sums by their weights; pixels that no disc covers become 0."""
     k, v = wp.tid()

@@ -21,7 +21,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ms_slam_env._runtime.warp import RecordedLaunch, wp
+from ms_slam_env._runtime.warp import RecordedLaunch
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import se3_log
 from ms_slam_env.native import native_source
@@ -38,10 +39,10 @@ PIECE = 64  # columns that are worked on together, by short loops over several o
 class Rows:
     """Frames of B envs as they were read, flat, and the motion that goes with them."""
 
-    color: wp.array(dtype=wp.uint8)
-    depth: wp.array(dtype=wp.float32)
-    turn: wp.array(dtype=wp.vec3)  # (B,) over the time from the first row to the last, radians
-    step: wp.array(dtype=wp.vec3)  # metres
+    color: wp.array[wp.uint8]
+    depth: wp.array[wp.float32]
+    turn: wp.array[wp.vec3]  # (B,) over the time from the first row to the last, radians
+    step: wp.array[wp.vec3]  # metres
     size: wp.vec2i  # (width, height)
     focal: wp.vec2
     centre: wp.vec2
@@ -53,18 +54,18 @@ def level_piece(
     b: int,
     v: int,
     piece: int,
-    color: wp.array(dtype=wp.uint8),
-    depth: wp.array(dtype=wp.float32),
-):
+    color: wp.array[wp.uint8],
+    depth: wp.array[wp.float32],
+) -> None:
     """Fill a piece of row v of the levelled images of env b, all of its pixels step by step."""
 
 
 @wp.kernel
 def _level(
     rows: Rows,
-    color: wp.array(dtype=wp.uint8),  # out
-    depth: wp.array(dtype=wp.float32),  # out
-):
+    color: wp.array[wp.uint8],  # out
+    depth: wp.array[wp.float32],  # out
+) -> None:
     """Fill a piece of a row of the levelled images."""
     b, v, piece = wp.tid()
     level_piece(rows, b, v, piece, color, depth)

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ms_slam_env._runtime.warp import RecordedLaunch, wp
+from ms_slam_env._runtime.warp import RecordedLaunch
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.shared.state import Stateful
@@ -74,13 +75,13 @@ class CullingRule:
 
 
 @wp.func
-def is_crowded(slots: int, capacity: int):
+def is_crowded(slots: int, capacity: int) -> bool:
     """Whether nine tenths of a map's slots are taken."""
     return slots > capacity - capacity / 10
 
 
 @wp.func
-def age_span(rule: CullingRule, time: int):
+def age_span(rule: CullingRule, time: int) -> int:
     """Frames that the ages of unstable surfels are counted over."""
     return wp.max(wp.min(rule.window, time), 1)
 
@@ -107,7 +108,7 @@ def count_ages(
 
 
 @wp.func
-def oldest_that_stay(ages: SurfelAges, rule: CullingRule, b: int, time: int):
+def oldest_that_stay(ages: SurfelAges, rule: CullingRule, b: int, time: int) -> int:
     """The frame from which on unstable surfels stay in a crowded map.
 
     As many have not been seen since as must go, or all that are not in view.
@@ -192,7 +193,7 @@ def list_survivors(
 
 
 @wp.func
-def copy_surfel(source: Surfels, target: Surfels, b: int, i: int, j: int):
+def copy_surfel(source: Surfels, target: Surfels, b: int, i: int, j: int) -> None:
     """Copy slot i of one map to slot j of the other."""
     put(target.position, b, j, fetch(source.position, b, i))
     put(target.normal, b, j, fetch(source.normal, b, i))

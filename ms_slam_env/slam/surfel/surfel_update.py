@@ -24,7 +24,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env._runtime.warp import wp
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.native import native_source
 from ms_slam_env.slam.surfel.device import fetch, put
 from ms_slam_env.slam.surfel.frustum_culling import frustum_of, list_some_visible
@@ -60,30 +60,30 @@ class FusionParameters:
 class FusedFrame:
     """The frames that are fused, images flat; poses, time, weight and mask are (B,)."""
 
-    poses: wp.array(dtype=wp.mat44)  # T_world_camera
-    mask: wp.array(dtype=wp.int32)  # 0 leaves an env's map as it is
-    time: wp.array(dtype=wp.int32)  # number of the frame in its episode
-    weight: wp.array(dtype=wp.float32)  # in (0, 1], lower for a fast camera
-    depth: wp.array(dtype=wp.float32)  # (B * H * W) metres
-    normals: wp.array(dtype=wp.vec3)  # camera frame
-    color: wp.array(dtype=wp.vec3)  # RGB
-    radial: wp.array(dtype=wp.float32)  # (H * W) weights of the pixels
-    covered: wp.array(dtype=wp.int32)  # 1 where a surfel of the map covers the pixel
-    moving: wp.array(dtype=wp.int32)  # 1 where something moves, which is no part of the map
+    poses: wp.array[wp.mat44]  # T_world_camera
+    mask: wp.array[wp.int32]  # 0 leaves an env's map as it is
+    time: wp.array[wp.int32]  # number of the frame in its episode
+    weight: wp.array[wp.float32]  # in (0, 1], lower for a fast camera
+    depth: wp.array[wp.float32]  # (B * H * W) metres
+    normals: wp.array[wp.vec3]  # camera frame
+    color: wp.array[wp.vec3]  # RGB
+    radial: wp.array[wp.float32]  # (H * W) weights of the pixels
+    covered: wp.array[wp.int32]  # 1 where a surfel of the map covers the pixel
+    moving: wp.array[wp.int32]  # 1 where something moves, which is no part of the map
 
 
 CENTRALITY = 1.0 / (2.0 * 0.6 * 0.6)  # of the radial weight, Keller section 4.1
 
 
 @wp.func
-def reading_radius(z: float, n: wp.vec3, vertex: wp.vec3, focal: float, radius_px: float):
+def reading_radius(z: float, n: wp.vec3, vertex: wp.vec3, focal: float, radius_px: float) -> float:
     """Radius of the disc that covers a pixel's footprint on a surface seen at an angle."""
     cosine = -wp.dot(n, vertex) / wp.length(vertex)
     return radius_px * z / (focal * wp.max(cosine, STEEPEST))
 
 
 @wp.func
-def range_weight(z: float, full_m: float):
+def range_weight(z: float, full_m: float) -> float:
     """Weight of a reading at depth z: the inverse of its variance, which grows with z^4."""
     nearness = wp.min(full_m / z, 1.0)
     return nearness * nearness * nearness * nearness

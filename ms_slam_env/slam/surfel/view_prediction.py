@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ms_slam_env._runtime.warp import wp
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert
@@ -47,18 +47,18 @@ class PointCloud:
     The first ``front_count`` (E,) of ``count`` (E,) points are on the front surface.
     """
 
-    position: wp.array2d(dtype=wp.vec3)
-    normal: wp.array2d(dtype=wp.vec3)
-    intensity: wp.array2d(dtype=wp.float32)
-    count: wp.array(dtype=wp.int32)
-    front_count: wp.array(dtype=wp.int32)
+    position: wp.array2d[wp.vec3]
+    normal: wp.array2d[wp.vec3]
+    intensity: wp.array2d[wp.float32]
+    count: wp.array[wp.int32]
+    front_count: wp.array[wp.int32]
 
 
 @wp.kernel
 def collect_points(
-    vertices: wp.array3d(dtype=wp.vec3),
-    normals: wp.array3d(dtype=wp.vec3),
-    intensity: wp.array3d(dtype=wp.float32),
+    vertices: wp.array3d[wp.vec3],
+    normals: wp.array3d[wp.vec3],
+    intensity: wp.array3d[wp.float32],
     points: PointCloud,
 ) -> None:
     """Append the surface points of one layer."""
@@ -76,10 +76,10 @@ def collect_points(
 def scatter_points(
     points: PointCloud,
     views_per_env: int,
-    motions: wp.array(dtype=wp.mat44),
+    motions: wp.array[wp.mat44],
     camera: SplatCamera,
     workers: int,
-    keys: wp.array(dtype=wp.int64),
+    keys: wp.array[wp.int64],
 ) -> None:
     """Z-buffer of the points: per pixel the smallest key of the points within a pixel of it.
 
@@ -140,7 +140,7 @@ def scatter_points(
 
 @wp.func
 def gap_key(
-    keys: wp.array(dtype=wp.int64), image: int, v: int, u: int, height: int, width: int
+    keys: wp.array[wp.int64], image: int, v: int, u: int, height: int, width: int
 ) -> wp.int64:
     """Key of the farthest neighbour of an empty pixel that enough neighbours surround."""
     found = int(0)
@@ -160,12 +160,12 @@ def gap_key(
 def resolve_views(
     points: PointCloud,
     views_per_env: int,
-    motions: wp.array(dtype=wp.mat44),
+    motions: wp.array[wp.mat44],
     camera: SplatCamera,
-    keys: wp.array(dtype=wp.int64),
-    intensity: wp.array(dtype=wp.float32),
-    depth: wp.array(dtype=wp.float32),
-    normals: wp.array(dtype=wp.vec3),
+    keys: wp.array[wp.int64],
+    intensity: wp.array[wp.float32],
+    depth: wp.array[wp.float32],
+    normals: wp.array[wp.vec3],
 ) -> None:
     """Images of the winning points; small gaps take the farthest neighbour, the rest is 0.
 
@@ -210,14 +210,14 @@ def resolve_views(
 
 @wp.kernel
 def copy_view(
-    vertices: wp.array3d(dtype=wp.vec3),
-    normals_of_view: wp.array3d(dtype=wp.vec3),
-    intensity_of_view: wp.array3d(dtype=wp.float32),
+    vertices: wp.array3d[wp.vec3],
+    normals_of_view: wp.array3d[wp.vec3],
+    intensity_of_view: wp.array3d[wp.float32],
     views_per_env: int,
     n: int,
-    intensity: wp.array3d(dtype=wp.float32),
-    depth: wp.array3d(dtype=wp.float32),
-    normals: wp.array3d(dtype=wp.vec3),
+    intensity: wp.array3d[wp.float32],
+    depth: wp.array3d[wp.float32],
+    normals: wp.array3d[wp.vec3],
 ) -> None:
     """Copy the n-th rendered view of every env to its place among the predicted ones."""
     e, v, u = wp.tid()
