@@ -140,23 +140,6 @@ def test_a_fused_frame_without_depth_leaves_the_map_to_start(frames):
     np.testing.assert_array_equal(backend.track(frames[0]).T_world_camera, START)
 
 
-def test_state_with_fused_frames_goes_on_bit_exactly(frames):
-    path = arc(10)
-    backend = _new()
-    for index in range(4):
-        backend.fuse(frames[index], path[index])
-    state = backend.get_state()
-    ends = []
-    for other in (backend, _new()):
-        other.set_state(state)
-        poses = [other.track(frames[4]).T_world_camera, other.track(frames[5], path[5])]
-        other.fuse(frames[6], path[6])
-        ends.append((poses[0], poses[1].T_world_camera, other.track(frames[7]).T_world_camera))
-        ends[-1] += (other.map_points(),)
-    for a, b in zip(*ends, strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
 def test_bad_poses_are_refused(frames):
     backend = _new()
     for bad in (np.eye(3), np.full((4, 4), np.nan), 2 * np.eye(4), "here"):

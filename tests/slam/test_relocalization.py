@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from box_scene import BoxScene
 from surfel_scenes import ray_cast
 
 from ms_slam_env import slam
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
 from ms_slam_env.geometry import look_at, make_pose, relative_angle, so3_exp
 from ms_slam_env.sensor import RGBDSensor
@@ -209,6 +212,25 @@ def test_a_frame_is_consistent_with_the_view_from_its_pose_only():
     ahead = _consistency(frame, _view(make_pose(np.eye(3), [0.0, 0.0, 0.3])))
     assert ahead.inlier_ratio < 0.05
     assert not is_photometrically_consistent(ahead)
+
+
+def test_only_poses_from_which_the_map_looks_like_the_frame_are_verified():
+    """Both frames are those from the first place; the second map is seen from beside it."""
+    tangent = np.cross([0.3, -0.2, -1.0], [0.0, 1.0, 0.0])
+    beside = make_pose(np.eye(3), 0.3 * tangent / np.linalg.norm(tangent))
+    color, depth = (np.stack(pair) for pair in zip(*[_view(np.eye(4))] * 2, strict=True))
+    views = [_view(pose) for pose in (np.eye(4), beside)]
+    grey = np.stack(
+        [view[0].astype(np.float32) @ np.float32([0.299, 0.587, 0.114]) for view in views]
+    )
+    vertices = np.zeros((2, *VIEW.shape, 3), dtype=np.float32)
+    vertices[..., 2] = [view[1] for view in views]
+    shown = SimpleNamespace(intensity=wp.array(grey), vertices=wp.array(vertices))
+    aligner = SimpleNamespace(render=lambda poses: shown)
+    ferns = FernRelocalization(2, VIEW, 10.0)
+    poses, found = np.tile(np.eye(4), (2, 1, 1)), np.ones(2, dtype=bool)
+    verified = ferns.verify(Images(color, depth), poses, found, aligner)
+    assert verified.tolist() == [True, False]
 
 
 def test_consistency_asks_neither_for_exposure_nor_for_texture():

@@ -21,9 +21,8 @@ from ms_slam_env.geometry import invert, relative_angle
 from ms_slam_env.slam.odometry.semi_dense import SemiDenseAligner
 from ms_slam_env.slam.shared.alignment_check import NO_ALIGNMENT, AcceptanceThresholds
 from ms_slam_env.slam.shared.alignment_measures import DepthImage, check_alignment
-from ms_slam_env.slam.shared.search_poses import motion_hypotheses
 from ms_slam_env.slam.shared.state_check import ArrayOf, OrNone
-from ms_slam_env.slam.shared.tracking_template import Attempt, FrameByFrameSlam
+from ms_slam_env.slam.shared.tracking_template import Attempt, FrameByFrameSlam, motion_hypotheses
 from ms_slam_env.slam.slam_backend import LARGEST_CUTOFF_M, BorrowedMap, Float64
 from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
 

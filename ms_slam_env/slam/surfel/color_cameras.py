@@ -23,7 +23,7 @@ from ms_slam_env.slam.shared.state_check import ArrayOf, ListOf
 from ms_slam_env.slam.slam_backend import Float32, Float64, TrackResult
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
 
-FEWEST_EDGES = 500  # points on depth steps that a registration is estimated from
+FEWEST_EDGES = 500  # points on depth steps that the offset is estimated from
 LEAST_GAIN = 1.1  # of their mean gradient, by which cameras are believed to be apart
 _STEP = 0.04  # of inverse depth, 1/m
 _RANGES = ((0.85, 1.15), (-0.06, 0.06))  # of focal ratio and baseline, metres
@@ -48,7 +48,7 @@ def depth_edges(depth: Float32, intrinsics: Intrinsics) -> Float64:
     return np.concatenate(points)
 
 
-def estimate_registration(
+def estimate_camera_offset(
     colors: Sequence[NDArray[np.uint8]], edges: Sequence[Float64], intrinsics: Intrinsics
 ) -> Registration | None:
     """Focal ratio and baseline of the colour camera.
@@ -193,7 +193,7 @@ class EstimatedColorCamera(Saved):
         if self._edges < ENOUGH_EDGES and len(self._times) < MOST_FRAMES:
             return result
         edges = [depth_edges(one, slam.intrinsics) for one in self._depths]
-        found = estimate_registration(self._colors, edges, slam.intrinsics)
+        found = estimate_camera_offset(self._colors, edges, slam.intrinsics)
         camera = found or Registration(1.0, 0.0)
         self._offset = np.array([camera.focal_ratio, camera.baseline_m])
         if found is not None and self._is_whole:

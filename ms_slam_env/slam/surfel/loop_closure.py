@@ -3,13 +3,13 @@
 ElasticFusion (Whelan et al., RSS 2015, sections IV to VI). Surfels not seen for ``window`` frames
 are inactive: frames are neither tracked against them nor fused into them. Every few frames
 
-- local: where the inactive part is in view, the live frame is registered with it as it was with
+- local: where the inactive part is in view, the live frame is aligned with it as it was with
   the active part before; both poses differ by the drift since;
 - global: where that gave nothing, keyframes that resemble the frame say where else in the inactive
-  part it may be, and it is registered there.
+  part it may be, and it is aligned there.
 
-If the registration is good, the deformation graph takes the active part there while it holds the
-inactive one, and what is in view becomes one surface, active again. The paper registers the active
+If the alignment is good, the deformation graph takes the active part there while it holds the
+inactive one, and what is in view becomes one surface, active again. The paper aligns the active
 part's rendering in place of the live frame; the frame has no holes, and its noise is common to
 both poses.
 
@@ -105,16 +105,16 @@ class LoopClosure(Saved):
         """Remember this of one env."""
 
 
-LARGEST_SIGMA = 0.01  # standard deviation (metres, radians) of a registration's worst direction
-LEAST_INLIERS = 0.7  # share of matched points that a registration explains
+LARGEST_SIGMA = 0.01  # standard deviation (metres, radians) of an alignment's worst direction
+LEAST_INLIERS = 0.7  # share of matched points that an alignment explains
 LARGEST_DEG = 20.0  # correction of the camera's rotation that is believed
 LARGEST_DISSIMILARITY = 0.3  # of a frame and a keyframe of the same place, share of the ferns
 AGREEMENT_M = 0.01  # a loop is closed when two looks agree so far on the correction, at 1 m
-SETTLED = 0.02, np.radians(2.0)  # largest motion of a repeated registration
+SETTLED = 0.02, np.radians(2.0)  # largest motion of a repeated alignment
 
 
-class InactiveRegistration:
-    """Registers the frames of B envs with the inactive part of their maps."""
+class InactiveAligner:
+    """Aligns the frames of B envs with the inactive part of their maps."""
 
     def __init__(
         self, surfel_map: SurfelMap, inactive: SplatRenderer, config: SurfelConfig, device: str
@@ -129,7 +129,7 @@ class InactiveRegistration:
         self._poses = HostDeviceBuffer(self.batch, wp.mat44, device)
 
     def set_frame(self, live: LiveFrame) -> None:
-        """Take the frames that are registered next."""
+        """Take the frames that are aligned next."""
         self._tracker.set_frame(live)
 
     def covered(self, poses: Float64, due: Bool) -> Bool:
@@ -149,11 +149,11 @@ class InactiveRegistration:
         return due & (shares >= self.config.coverage)
 
     def near(self, poses: Float64) -> Alignment:
-        """Register with the view that ``covered`` rendered from ``poses``."""
+        """Align with the view that ``covered`` rendered from ``poses``."""
         return self._align(poses, tracking_hypotheses(np.eye(4)), self.config.largest_m)
 
     def from_keyframes(self, starts: Float64) -> Alignment | None:
-        """Register from poses (B, 4, 4) that are rough and may be wrong, NaN for an env without.
+        """Align from poses (B, 4, 4) that are rough and may be wrong, NaN for an env without.
 
         What is found must be found again from there; None if nothing was.
         """
@@ -185,7 +185,7 @@ class InactiveRegistration:
         return self._tracker.align(self._inactive.view, origins, stack, thresholds)
 
 
-SIGNIFICANT = 3.0  # drift, in standard deviations of the registration, that is worth deforming for
+SIGNIFICANT = 3.0  # drift, in standard deviations of the alignment, that is worth deforming for
 VIEW_APART_M, VIEW_APART_RAD = 1.0, np.radians(60.0)  # views of one place differ by less
 
 
@@ -202,7 +202,7 @@ class DeformationLoopClosure(LoopClosure):
         self._window = any_time(self.batch, device)  # of the inactive surfels
         inactive = surfel_map.model_renderer(stride, self._window)
         active = surfel_map.model_renderer(stride, surfel_map.active)
-        self._registration = InactiveRegistration(surfel_map, inactive, config, device)
+        self._aligner = InactiveAligner(surfel_map, inactive, config, device)
         self._deformer = MapDeformer(surfel_map, inactive, active, config, device)
         self._seen_from = np.full(self.batch, EARLIEST, dtype=np.int32)
         self._histories = [TrajectoryHistory() for _ in range(self.batch)]
@@ -235,10 +235,10 @@ class DeformationLoopClosure(LoopClosure):
         if not due.any():
             return {}
         self._window.seen_to.assign(time - self.config.window - 1)
-        self._registration.set_frame(live)
-        near = self._registration.covered(poses, due)
+        self._aligner.set_frame(live)
+        near = self._aligner.covered(poses, due)
         if near.any():
-            there = self._registration.near(poses)
+            there = self._aligner.near(poses)
             for env in np.flatnonzero(near & there.tracked):
                 found[int(env)] = self._close(int(env), poses, there)
                 due[env] = False
@@ -261,7 +261,7 @@ class DeformationLoopClosure(LoopClosure):
                 continue
             starts = np.full((self.batch, 4, 4), np.nan)
             starts[env] = candidate.T_world_camera
-            there = self._registration.from_keyframes(starts)
+            there = self._aligner.from_keyframes(starts)
             if there is None:
                 continue
             drift = np.linalg.norm(there.T_world_live[env, :3, 3] - poses[env, :3, 3])

@@ -67,7 +67,7 @@ class TrajectoryHistory(Saved):
     def confirms(self, pose: Float64, corrected: Float64, agreement_m: float, memory: int) -> bool:
         """Whether the last loop found within ``memory`` frames asks for the same correction.
 
-        A registration that slides along a surface comes out differently from frame to frame. If
+        An alignment that slides along a surface comes out differently from frame to frame. If
         not, this one waits to be confirmed.
         """
         is_recent = self.found is not None and self.last - self.found <= memory

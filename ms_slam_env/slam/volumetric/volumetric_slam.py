@@ -20,8 +20,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.slam.odometry.odometry import Aligner
 from ms_slam_env.slam.shared.alignment_check import NO_ALIGNMENT, AcceptanceThresholds
 from ms_slam_env.slam.shared.alignment_measures import DepthImage, check_alignment
-from ms_slam_env.slam.shared.search_poses import motion_hypotheses
-from ms_slam_env.slam.shared.tracking_template import Attempt, FrameByFrameSlam
+from ms_slam_env.slam.shared.tracking_template import Attempt, FrameByFrameSlam, motion_hypotheses
 from ms_slam_env.slam.slam_backend import Float64, Views, check_views
 from ms_slam_env.slam.volumetric.voxel_grid import (
     DEPTH_SCALE,
