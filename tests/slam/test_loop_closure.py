@@ -11,8 +11,10 @@ from ms_slam_env import scenes
 from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.geometry import invert, look_at, make_pose, relative_angle, se3_exp
 from ms_slam_env.sequences import render_sequence
+from ms_slam_env.slam.shared.alignment_check import TrackingStatus
 from ms_slam_env.slam.shared.ferns import Candidate
 from ms_slam_env.slam.surfel import SurfelConfig
+from ms_slam_env.slam.surfel.acceptance import Alignment
 from ms_slam_env.slam.surfel.map_deformation import (
     Deformation,
     creation_times,
@@ -137,14 +139,23 @@ def test_a_keyframe_closes_a_loop_that_is_out_of_sight(
     assert errors(results[-1].T_world_camera, poses[TURN + 5]) < 0.005
 
 
-def test_a_drift_greater_than_the_way_permits_is_refused(
-    turn: tuple[list[RGBDFrame], np.ndarray],
+@pytest.mark.parametrize("by", ["drift", "status"])
+def test_a_keyframe_too_far_for_the_way_or_a_refused_alignment_closes_nothing(
+    turn: tuple[list[RGBDFrame], np.ndarray], by: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     frames, poses = turn
-    strict = replace(
-        CONFIG, loops=replace(CONFIG.loops, largest_m=0.001, global_interval=2, drift_share=0.001)
-    )
-    system = map_with_drift(frames, poses, strict)
+    loops = replace(CONFIG.loops, largest_m=0.001, global_interval=2)
+    if by == "drift":
+        loops = replace(loops, drift_share=0.001)
+    system = map_with_drift(frames, poses, replace(CONFIG, loops=loops))
+    if by == "status":
+        align, refused = system.loops._aligner.from_keyframes, TrackingStatus.IMPLAUSIBLE_MOTION
+
+        def all_refused(starts: np.ndarray) -> Alignment | None:
+            found = align(starts)
+            return None if found is None else found.with_status(np.ones(1, dtype=bool), refused)
+
+        monkeypatch.setattr(system.loops._aligner, "from_keyframes", all_refused)
     for k in range(KNOWN, TURN + 6):
         assert not system.track(*images(frames, k))[0].loop_closed
 
